@@ -6,40 +6,22 @@ Only what is measured of the driving counts here, nothing that the terrain shake
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 
 from features.cross_channel import left_right
 from features.windows import wheel_speeds
+from terrain.classify.regimes import Motion
 from terrain.logs.schema import signal_set_of
 from terrain.records import Array, Windows
+
+__all__ = ["NO_MOTION", "Motion", "fastest_wheel", "wheel_stream", "window_motion"]
 
 NO_MOTION = "the windows hold no wheel speed, so that how the robot moved is not known"
 """Why there is no :class:`Motion`."""
 
 MIN_SIDE_SPEED_MPS = 1e-6
 """Sides that are slower together stand: their ratio is not defined."""
-
-
-class Motion(NamedTuple):
-    """How the robot moved in each of n windows.
-
-    Parameters
-    ----------
-    speed_mps : (n,) magnitude of the speed of the fastest wheel, mean over the window
-    yaw_rate_radps : (n,) magnitude of the mean yaw rate; NaN where no gyroscope measures it
-    turn_ratio : (n,) ``|v_right - v_left| / (|v_right| + |v_left|)`` of the mean speeds of the two sides: 0
-        straight on, 1 where one side stands or they turn against each other; NaN without two sides
-    """
-
-    speed_mps: Array
-    yaw_rate_radps: Array
-    turn_ratio: Array
-
-    def of(self, rows: Array) -> Motion:
-        """Return the motion in some of the windows."""
-        return Motion(self.speed_mps[rows], self.yaw_rate_radps[rows], self.turn_ratio[rows])
 
 
 def window_motion(windows: Windows) -> Motion | None:
@@ -64,6 +46,13 @@ def window_motion(windows: Windows) -> Motion | None:
         _yaw_rate(windows, unknown),
         _turn_ratio(windows.values[stream], windows.channels[stream], unknown),
     )
+
+
+def fastest_wheel(windows: Windows) -> Array:
+    """Return the speed (n, samples) in m/s of the faster wheel at each sample; NaN (n, 1) where none is measured."""
+    if wheel_stream(windows.channels) is None:
+        return np.full((len(windows), 1), np.nan)
+    return np.asarray(np.abs(wheel_speeds(windows.values, windows.channels)).max(axis=1))
 
 
 def wheel_stream(channels: Mapping[str, tuple[str, ...]]) -> str | None:

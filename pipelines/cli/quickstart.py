@@ -35,7 +35,7 @@ from terrain.errors import DataError
 
 if TYPE_CHECKING:
     from pipelines.data.convert import ImportResult
-    from pipelines.learn.crossval import CrossvalResult
+    from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.predict import Predictions
     from pipelines.learn.train import TrainResult
     from terrain.estimation.labelled import TerrainSlip

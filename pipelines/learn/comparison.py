@@ -2,64 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from pipelines.learn.evaluation import (
     MAX_ROWS,
     PERCENT,
     CrossvalResult,
-    evaluate_recipe,
     held_out_words,
+    notes,
     recall_figure,
     recall_table,
 )
 from pipelines.learn.settings import EvaluationSettings
 from pipelines.report import (
     Column,
+    Later,
+    Part,
     Progress,
     Report,
     Result,
     Section,
     Table,
-    Text,
     described,
     enumerated,
     format_value,
     plural,
-    silent,
 )
 from terrain.errors import DataError
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.learn.evaluate import HeldOut
     from pipelines.learn.model_file import TerrainModel
     from pipelines.learn.protocols import Samples
     from pipelines.learn.recipes import WindowPipeline
-    from terrain.classify.paired import Difference, Outcome, RunDifference
+    from terrain.classify.paired import Comparison, Difference
     from terrain.records import RunLog
 
 POINTS = "+.1f"
-
-
-class PairedDifferences(NamedTuple):
-    """Differences of b minus a, paired by run.
-
-    ``by_support`` has those of accuracy by how many training runs drove the true terrain with the motion of a
-    window; empty of models, and where the motion is not known.
-    """
-
-    a: str
-    b: str
-    accuracy: Difference
-    macro_run_accuracy: Difference
-    confidence_auc: Difference
-    by_class: Mapping[str, Difference]
-    by_run: tuple[RunDifference, ...]
-    by_support: Mapping[str, Difference]
 
 
 @dataclass(frozen=True, repr=False)
@@ -68,7 +50,7 @@ class ComparisonResult(Result):
 
     kind: str = described("recipes or models")
     contenders: tuple[CrossvalResult, ...] = described("the evaluation of each")
-    differences: tuple[PairedDifferences, ...] = described("of each of the others less the first")
+    differences: tuple[Comparison, ...] = described("of each of the others less the first")
     excluded_runs: tuple[str, ...] = described("runs that one of the models was trained on")
     notes: tuple[str, ...] = described("what a reader has to know")
     dataset: str = described("name of the data", default="")
@@ -82,59 +64,41 @@ class ComparisonResult(Result):
         return pd.concat([Result.to_pandas(each) for each in self.contenders], ignore_index=True)
 
 
-def compare_recipes(
-    runs: Sequence[RunLog], settings: EvaluationSettings, progress: Progress = silent
+def side_by_side(
+    contenders: Sequence[tuple[str, WindowPipeline, Samples]],
+    settings: EvaluationSettings,
+    progress: Progress,
 ) -> ComparisonResult:
-    """Compare recipes on the same folds.
+    """Evaluate recipes, each with the windows of its own signals, on the same folds.
 
     Raises
     ------
     DataError
         if the data do not suffice, or two recipes cut different windows from them.
     """
-    from pipelines.learn.protocols import samples_of
-    from pipelines.learn.recipes import recipe_of
-
-    contenders = []
-    for name in settings.recipes:
-        recipe = recipe_of(settings, name)
-        of_recipe = settings.with_(signal_sets=tuple(recipe[0].signal_sets), extras=False)
-        contenders.append((name, recipe, samples_of(runs, of_recipe, settings.protocol, settings.speed_mps)))
-    return side_by_side(contenders, settings.with_(extras=False), progress)
-
-
-def side_by_side(
-    contenders: Sequence[tuple[str, WindowPipeline, Samples]],
-    settings: EvaluationSettings,
-    progress: Progress,
-) -> ComparisonResult:
-    """Evaluate recipes, each with the windows of its own signals, on the same folds."""
     import numpy as np
 
     from features.motion import window_motion
-    from pipelines.learn.coverage import held_out_coverage
+    from pipelines.learn.evaluate import evaluate_recipe
+    from terrain.classify.paired import Outcome, compare_with_first
     from terrain.classify.support import support_levels
+    from terrain.classify.support_figures import held_out_support
 
-    samples = contenders[0][2]
+    first, _, samples = contenders[0]
     for name, _, other in contenders[1:]:
         if not np.array_equal(samples.windows.start_s, other.windows.start_s):
             raise DataError(
-                f"{contenders[0][0]} and {name} keep different windows of these runs, whose streams end at "
+                f"{first} and {name} keep different windows of these runs, whose streams end at "
                 "different times: compare them on signal sets of the same streams"
             )
     found = [evaluate_recipe(recipe, name, each, settings, progress) for name, recipe, each in contenders]
-    motion, levels = window_motion(samples.windows), None
+    (_, held_out), motion, levels = found[0], window_motion(samples.windows), None
     if motion is not None and settings.protocol != "published":
-        true_runs = held_out_coverage(found[0][1], samples, motion).true_runs
-        levels = support_levels(np.median(true_runs, axis=0))
-    outcomes = [_outcome(held_out, samples) for _, held_out in found]
-    return ComparisonResult(
-        "recipes",
-        tuple(result for result, _ in found),
-        _differences([name for name, *_ in contenders], outcomes, settings.seed, levels),
-        (),
-        (),
-    )
+        true_runs = held_out_support(held_out, samples.run_id, motion).true_runs
+        levels = support_levels(np.median(true_runs, axis=0))[held_out.tested]
+    outcomes = [Outcome.of(each, samples.run_id) for _, each in found]
+    differences = compare_with_first([name for name, *_ in contenders], outcomes, settings.seed, levels)
+    return ComparisonResult("recipes", tuple(result for result, _ in found), differences, (), ())
 
 
 def compare_models(
@@ -151,8 +115,10 @@ def compare_models(
 
     from features.windows import cut_windows
     from pipelines.data.datasets import data_digest
-    from pipelines.learn.evaluate import HeldOut, figures_of, weaknesses
+    from pipelines.learn.evaluate import evaluation_of
     from pipelines.learn.protocols import Samples
+    from terrain.classify.held_out import HeldOut
+    from terrain.classify.paired import Outcome, compare_with_first
 
     trained = {digest for model in models for digest in model.info.run_digests}
     excluded = tuple(each.run_id for each in runs if data_digest([each]) in trained)
@@ -163,82 +129,39 @@ def compare_models(
             "no run is left to compare on"
         )
     shared = sorted(set.intersection(*(set(model.info.classes) for model in models)))
-    notes = []
+    classes, notes = ", ".join(shared), []
     if any(model.info.classes != models[0].info.classes for model in models):
-        notes.append(
-            f"the models have other classes: compared on windows of {', '.join(shared) or 'no terrain'}"
-        )
+        notes.append(f"the models have other classes: compared on windows of {classes or 'no terrain'}")
     results, outcomes = [], []
     for name, model in zip(settings.model, models, strict=True):
-        cut = cut_windows(kept, model.rule, layout=model.layout)
+        rule = model.rule
+        cut = cut_windows(kept, rule, layout=model.layout)
         windows = cut.windows[np.isin(cut.windows.terrain.astype(str), shared)]
         if not len(windows):
-            raise DataError(
-                f"no window of these runs is labelled as a class of all models ({', '.join(shared)})"
-            )
-        samples = Samples(windows, cut.dropped, windows.run_id, model.rule.overlap)
-        probability = np.asarray(model.recipe.predict_proba(windows))[None]
-        classes = np.asarray(model.recipe.classes_, dtype=str)
-        number = np.zeros(probability.shape[:2], dtype=int)
-        held_out = HeldOut(classes, probability, number, samples.terrain, [])
-        figures = figures_of(held_out, samples, settings.seed)
-        rule = model.rule
-        result = CrossvalResult(
-            **figures,
+            raise DataError(f"no window of these runs is labelled as a class of all models ({classes})")
+        samples = Samples(windows, cut.dropped, windows.run_id, rule.overlap)
+        probability = np.asarray(model.recipe.predict_proba(windows))
+        held_out = HeldOut.of_model(
+            np.asarray(model.recipe.classes_, dtype=str), probability, samples.terrain
+        )
+        result = evaluation_of(
+            held_out,
+            samples,
+            settings.seed,
             protocol="runs not trained on",
             recipe=name,
-            window_s=rule.length_s,
             stride_s=rule.step_s,
             steady=rule.steady is not None,
             signal_sets=tuple(model.info.signal_sets),
-            seed=settings.seed,
             n_features=0,
-            dropped=dict(cut.dropped),
-            repaired={},
-            notes=(),
         )
-        results.append(replace(result, notes=weaknesses(result.accuracy_ci, result.chance)))
-        outcomes.append(_outcome(held_out, samples))
+        results.append(result)
+        outcomes.append(Outcome.of(held_out, samples.run_id))
     if len(results) == 1:
         left_out = f"{plural(len(excluded), 'run')} left out: the model was trained on them"
         return replace(results[0], notes=(*results[0].notes, *([left_out] if excluded else [])))
-    differences = _differences(settings.model, outcomes, settings.seed, None)
+    differences = compare_with_first(settings.model, outcomes, settings.seed)
     return ComparisonResult("models", tuple(results), differences, excluded, tuple(notes))
-
-
-def _outcome(held_out: HeldOut, samples: Samples) -> Outcome:
-    """Return which windows were classified correctly, and how confidently."""
-    from terrain.classify.paired import Outcome
-
-    predicted = held_out.classes[held_out.probability.argmax(axis=2)]
-    confidence = held_out.probability.max(axis=2)
-    return Outcome(samples.run_id, samples.terrain, predicted == samples.terrain, confidence)
-
-
-def _differences(
-    names: Sequence[str], outcomes: Sequence[Outcome], seed: int, levels: Any
-) -> tuple[PairedDifferences, ...]:
-    """Compare each outcome with the first; of recipes also by the coverage ``levels`` (n,) of the windows."""
-    import numpy as np
-
-    from terrain.classify.paired import Outcome, compare_outcomes
-    from terrain.classify.support import SupportLevel
-
-    def rows_of(outcome: Outcome, rows: Any) -> Outcome:
-        run_id, terrain, correct, confidence = outcome
-        return Outcome(run_id[rows], terrain[rows], correct[:, rows], confidence[:, rows])
-
-    first, found = outcomes[0], []
-    for name, other in zip(names[1:], outcomes[1:], strict=True):
-        compared = compare_outcomes(first, other, np.random.default_rng(seed))
-        by_support = {}
-        for level in SupportLevel if levels is not None else ():
-            rows = np.flatnonzero(levels == level.value)
-            if len(rows):
-                parts = rows_of(first, rows), rows_of(other, rows)
-                by_support[level.value] = compare_outcomes(*parts, np.random.default_rng(seed)).accuracy
-        found.append(PairedDifferences(names[0], name, *compared, by_support))
-    return tuple(found)
 
 
 def report(result: ComparisonResult) -> Report:
@@ -272,17 +195,12 @@ def report(result: ComparisonResult) -> Report:
                 rows,
                 note=f"Differences are to {first.recipe}; confidence: area from confidence to correctness.",
             ),
-            *(Text(note, "note") for note in (*result.notes, *([left_out] if result.excluded_runs else ()))),
+            *notes(*result.notes, *([left_out] if result.excluded_runs else ())),
         ],
-        details=(
-            *(_paired(each) for each in result.differences),
-            *(
-                Section(
-                    f"{each.recipe} alone", [recall_table(each), *(Text(note, "note") for note in each.notes)]
-                )
-                for each in result.contenders
-            ),
-        ),
+        details=[
+            *(Section(f"{each.b} less {each.a}", Later(_paired, each)) for each in result.differences),
+            *(Section(f"{each.recipe} alone", Later(_alone, each)) for each in result.contenders),
+        ],
         next_step=f"terrain train --data {result.data or 'DIR'} --recipe RECIPE --name NAME"
         if result.kind == "recipes"
         else f"terrain predict --model {best.b if apart > 0 else best.a} --data DIR",
@@ -299,7 +217,11 @@ def _points(found: Difference) -> tuple[float, tuple[float, float], str]:
     return 100 * found.difference, (100 * low, 100 * high), str(found.verdict)
 
 
-def _paired(found: PairedDifferences) -> Section:
+def _alone(result: CrossvalResult) -> list[Part]:
+    return [recall_table(result), *notes(*result.notes)]
+
+
+def _paired(found: Comparison) -> list[Part]:
     figures = {
         "accuracy": found.accuracy,
         "mean over terrains then runs": found.macro_run_accuracy,
@@ -310,8 +232,7 @@ def _paired(found: PairedDifferences) -> Section:
     both = Column(found.a, PERCENT), Column(found.b, PERCENT)
     rows = [(name, row.a, row.b, *_points(row), row.n_runs) for name, row in figures.items()]
     runs = sorted((row for row in found.by_run if row.a != row.b), key=lambda row: -abs(row.b - row.a))
-    parts = [
+    return [
         Table(("figure", *both, DIFFERENCE, INTERVAL, f"{found.b} is", "runs"), rows),
         Table(("run", "terrain", *both), [tuple(row) for row in runs[:MAX_ROWS]], "Runs that differ most"),
     ]
-    return Section(f"{found.b} less {found.a}", parts)

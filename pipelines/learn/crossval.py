@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import model_validator
 
 from pipelines.data.settings import AlignedRunsSettings, load
-from pipelines.learn.comparison import ComparisonResult, compare_models, compare_recipes, side_by_side
-from pipelines.learn.evaluation import CrossvalResult, crossval, evaluate_recipe
-from pipelines.learn.parallel import ComputeSettings
+from pipelines.learn.evaluation import CrossvalResult
+from pipelines.learn.parallel import ComputeSettings, computing
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings
 from pipelines.report import Progress, silent
 from pipelines.report.settings import Settings as BaseSettings
@@ -24,22 +23,13 @@ from pipelines.report.settings import setting
 from terrain.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from terrain.records import Windows
-
-__all__ = [
-    "ComparisonResult",
-    "CrossvalResult",
-    "EvaluationSettings",
-    "Settings",
-    "compare_models",
-    "compare_recipes",
-    "cross_validate",
-    "crossval",
-    "evaluate_recipe",
-    "run",
-]
+    from pipelines.learn.comparison import ComparisonResult
+    from pipelines.learn.protocols import Samples
+    from pipelines.learn.recipes import WindowPipeline
+    from terrain.records import RunLog, Windows
 
 EXAMPLE = "terrain crossval --data runs/ --recipe svm"
+RESULTS = ("pipelines.learn.comparison",)
 
 
 class CacheSettings(BaseSettings):
@@ -74,20 +64,18 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
     ConfigError, LogError, DataError
         if a setting is not accepted, a run cannot be read, or the data cannot answer.
     """
-    from pipelines.data.datasets import data_digest
-    from pipelines.learn.parallel import computing
-
-    if settings.cache is not None:
-        return _of_cache(settings, settings.cache, progress)
-    runs, skipped = load(settings)
-    asked = settings.with_(skip_short=settings.repair)
     with computing(settings.compute):
+        if settings.cache is not None:
+            return _of_cache(settings, settings.cache, progress)
+        from pipelines.data.datasets import data_digest
+
+        runs, skipped = load(settings)
+        asked = settings.with_(skip_short=settings.repair)
         if settings.model:
+            from pipelines.learn.comparison import compare_models
             from pipelines.learn.load import load_model
 
             found = compare_models(runs, [load_model(each) for each in settings.model], asked)
-        elif len(asked.recipes) > 1:
-            found = compare_recipes(runs, asked, progress)
         else:
             found = crossval(runs, asked, progress)
     named = replace(found, dataset=settings.dataset, data_digest=data_digest(runs), data=str(settings.data))
@@ -97,28 +85,53 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
 def _of_cache(settings: Settings, folder: Path, progress: Progress) -> CrossvalResult:
     """Evaluate the SVM on cached features; what is missing among them is computed first."""
     from pipelines.learn.cache import cached_features, loaders_of
-    from pipelines.learn.parallel import computing
+    from pipelines.learn.evaluate import evaluate_recipe
     from pipelines.learn.recipes import recipe_of
 
-    with computing(settings.compute):
-        cached = cached_features(
-            loaders_of(settings),
-            settings.rule,
-            settings.signal_sets,
-            folder,
-            settings.jobs,
-            progress,
-            settings,
-        )
-        given = cached.features, cached.motion
-        recipe, samples = recipe_of(settings, FEATURE_RECIPE), cached.samples
-        found, _ = evaluate_recipe(recipe, FEATURE_RECIPE, samples, settings, progress, given)
-    named: dict[str, Any] = {
-        "dataset": settings.dataset,
-        "data_digest": cached.digest,
-        "data": str(settings.data),
-    }
-    return replace(found, **named, skipped=cached.skipped)
+    cut = settings.rule, settings.signal_sets, folder
+    cached = cached_features(loaders_of(settings), *cut, settings.jobs, progress, settings)
+    recipe, given = recipe_of(settings, FEATURE_RECIPE), (cached.features, cached.motion)
+    found, _ = evaluate_recipe(recipe, FEATURE_RECIPE, cached.samples, settings, progress, given)
+    of_data: dict[str, Any] = {"dataset": settings.dataset, "data_digest": cached.digest}
+    return replace(found, **of_data, data=str(settings.data), skipped=cached.skipped)
+
+
+def crossval(
+    runs: Sequence[RunLog], settings: EvaluationSettings, progress: Progress = silent
+) -> CrossvalResult | ComparisonResult:
+    """Cross-validate one recipe on labelled runs, or compare several on the same folds, then without extras.
+
+    Raises
+    ------
+    DataError
+        if the data cannot answer: one class, fewer runs than folds, a run shorter than a window; or if two
+        recipes cut different windows from them.
+    """
+    from pipelines.learn.protocols import samples_of
+    from pipelines.learn.recipes import recipe_of
+
+    several, contenders = len(settings.recipes) > 1, []
+    settings = settings.with_(extras=settings.extras and not several)
+    for name in settings.recipes:
+        recipe = recipe_of(settings, name)
+        cut = settings.with_(signal_sets=tuple(recipe[0].signal_sets)) if several else settings
+        contenders.append((name, recipe, samples_of(runs, cut, settings.protocol, settings.speed_mps)))
+    return _evaluated(contenders, settings, progress)
+
+
+def _evaluated(
+    contenders: Sequence[tuple[str, WindowPipeline, Samples]],
+    settings: EvaluationSettings,
+    progress: Progress,
+) -> CrossvalResult | ComparisonResult:
+    if len(contenders) > 1:
+        from pipelines.learn.comparison import side_by_side
+
+        return side_by_side(contenders, settings, progress)
+    from pipelines.learn.evaluate import evaluate_recipe
+
+    name, recipe, samples = contenders[0]
+    return evaluate_recipe(recipe, name, samples, settings, progress)[0]
 
 
 def cross_validate(
@@ -168,6 +181,4 @@ def cross_validate(
     ]
     texts = names or [each if isinstance(each, str) else type(each).__name__ for each in recipes]
     contenders = [(text, each, samples) for text, each in zip(texts, made, strict=True)]
-    if len(contenders) == 1:
-        return evaluate_recipe(made[0], texts[0], samples, settings, progress)[0]
-    return side_by_side(contenders, settings, progress)
+    return _evaluated(contenders, settings, progress)

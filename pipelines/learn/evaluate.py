@@ -2,97 +2,44 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from sklearn.base import clone
 
-from pipelines.learn.parallel import parallel
-from pipelines.learn.protocols import Fold, Samples
-from pipelines.report import Progress, format_value, interval, silent
-from terrain.classify.confidence import confidence_figures
-from terrain.classify.conformal import conformal_sets, conformal_threshold, held_out_scores
-from terrain.classify.conformal_figures import ConformalFigures, conformal_figures
-from terrain.classify.metrics import (
-    class_figures,
-    macro_run_accuracy,
-    per_run_figures,
-    run_bootstrap,
-    runs_by_terrain,
-    vote,
-    vote_sizes,
-)
-from terrain.errors import DataError
+from features.extractor import FeatureExtractor
+from features.motion import NO_MOTION, Motion, fastest_wheel, wheel_stream, window_motion
+from pipelines.learn.evaluation import CrossvalResult
+from pipelines.learn.parallel import counted, parallel
+from pipelines.learn.protocols import N_FOLDS, PROTOCOLS, Samples, folds_of, slow_and_fast
+from pipelines.learn.recipes import WindowPipeline, feature_matrix, recipe_of
+from pipelines.learn.sequences import following
+from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings
+from pipelines.report import Progress, format_counts, format_value, interval, silent
+from terrain.classify.breakaway import breakaways
+from terrain.classify.folds import Fold, single_run_classes
+from terrain.classify.held_out import Examples, HeldOut, fit_fold, held_out_figures, itself, set_figures
+from terrain.classify.learning_curve import drawn_folds, learning_curve
+from terrain.classify.next_drives import coverage_of
+from terrain.classify.sequence_figures import sequence_figures
+from terrain.classify.slow_fast import Applicability, run_speeds
+from terrain.classify.stiffness_figures import stiffness_figures
+from terrain.classify.svm import GroupedSVC
+from terrain.classify.unknown_figures import left_out_folds, score_fold, unknown_figures
 from terrain.records import Array
+from terrain.terramechanics.stiffness import known_levels
+
+CHECKED_WITH = FEATURE_RECIPE
+"""The recipe of the checks beside the figures: they are of the data, and have many fits."""
 
 WIDE_INTERVAL = 0.2
 """Accuracies that differ by half of this cannot be distinguished where the 95 % interval is wider."""
 
-
-class Examples(NamedTuple):
-    """What a classifier learns from.
-
-    Parameters
-    ----------
-    features : (n, f)
-    terrain : (n,) class of each row
-    group : (n,) what must not be split, the run of each row
-    """
-
-    features: Array
-    terrain: Array
-    group: Array
-
-
-class FoldResult(NamedTuple):
-    """Held-out class probabilities of one fold, and what else was asked of its classifier.
-
-    ``conformal`` is the threshold of its sets of classes; NaN where its training part does not give one.
-    """
-
-    fold: Fold
-    probability: Array
-    chosen: Mapping[str, Any]
-    found: Any = None
-    conformal: float = math.nan
-
-
-class HeldOut(NamedTuple):
-    """Held-out probabilities of every repeat, and the folds that they come from.
-
-    Parameters
-    ----------
-    classes : (k,) sorted
-    probability : (repeats, n, k); NaN of a window that was not held out
-    fold_number : (repeats, n); -1 of such a window
-    truth : (n,) class of each window
-    results : fold by fold; empty of a model that was fitted before
-    fitted : on all windows, where that was asked for
-    """
-
-    classes: Array
-    probability: Array
-    fold_number: Array
-    truth: Array
-    results: list[FoldResult]
-    fitted: Any = None
-
-    @property
-    def tested(self) -> Array:
-        """Whether each window (n,) was held out in every repeat."""
-        return np.asarray(np.isfinite(self.probability).all(axis=(0, 2)))
-
-    @property
-    def accuracies(self) -> list[float]:
-        """Part of the held-out windows that are classified correctly, repeat by repeat."""
-        found = []
-        for probability in self.probability:
-            rows = np.flatnonzero(np.isfinite(probability).all(axis=1))
-            predicted = self.classes[probability[rows].argmax(axis=1)]
-            found.append(float((predicted == self.truth[rows]).mean()))
-        return found
+NO_EXTRAS = (
+    "from cached features: speed alone, slow against fast, the learning curve and terrain over time need the "
+    "runs themselves"
+)
 
 
 def evaluate(
@@ -119,164 +66,204 @@ def evaluate(
 
     Examples
     --------
-    >>> from terrain.classify.svm import GroupedSVC
     >>> rng, runs = np.random.default_rng(0), np.repeat(np.arange(8), 10)
     >>> y = np.where(runs % 2, "ice", "mud")
     >>> examples = Examples(rng.normal(size=(80, 3)) + 9.0 * (y == "ice")[:, None], y, runs)
     >>> evaluate(GroupedSVC(), examples, [Fold(0, 0, np.flatnonzero(runs > 1), np.flatnonzero(runs < 2))]).accuracies
     [1.0]
     """
-    classes, n = np.unique(examples.terrain), len(examples.terrain)
-    n_repeats = 1 + max(fold.repeat for fold in folds)
-    probability = np.full((n_repeats, n, len(classes)), np.nan)
-    number = np.full((n_repeats, n), -1)
-    results: list[FoldResult] = []
+    shared, n = (classifier, examples, np.unique(examples.terrain)), len(examples.terrain)
     each = [*zip(folds, [None] * len(folds) if asks is None else asks, strict=True)]
-    fitted = None
     if on_all:  # first, as it takes longest
-        each.insert(0, (Fold(0, 0, np.arange(n), np.zeros(0, dtype=int)), _itself))
-    progress(task, 0, len(each))
-    done = 0
-    for result in parallel(_fit_fold, (classifier, examples, classes), each, min(n_jobs, len(each))):
-        done += 1
-        progress(task, done, len(each))
-        if not len(result.fold.test):
-            fitted = result.found
-            continue
-        probability[result.fold.repeat, result.fold.test] = result.probability
-        number[result.fold.repeat, result.fold.test] = result.fold.number
-        results.append(result)
-    return HeldOut(classes, probability, number, examples.terrain, results, fitted)
+        each.insert(0, (Fold(0, 0, np.arange(n), np.zeros(0, dtype=int)), itself))
+    results = parallel(fit_fold, shared, each, min(n_jobs, len(each)))
+    return HeldOut.of_folds([*counted(results, len(each), task, progress)], examples.terrain)
 
 
-def _itself(fitted: Any) -> Any:
-    return fitted
-
-
-def fit_on(classifier: Any, examples: Examples, rows: Array) -> Any:
-    """Return a clone of the classifier, fitted on some rows."""
-    features, terrain, group = examples
-    return clone(classifier).fit(features[rows], terrain[rows], groups=group[rows])
-
-
-def _fit_fold(
-    classifier: Any,
-    examples: Examples,
-    classes: Array,
-    fold: Fold,
-    ask: Callable[[Any], Any] | None = None,
-) -> FoldResult:
-    fitted = fit_on(classifier, examples, fold.train)
-    probability = np.zeros((len(fold.test), len(classes)))
-    columns = np.searchsorted(classes, fitted.classes_)
-    if len(fold.test):
-        probability[:, columns] = fitted.predict_proba(examples.features[fold.test])
-    best = getattr(fitted, "best_", None)
-    chosen = dict(best._asdict()) if best is not None else {}
-    threshold = math.nan
-    if hasattr(fitted, "inner_probability_"):
-        try:
-            scores = held_out_scores(fitted, examples.terrain[fold.train])
-            threshold = conformal_threshold(scores, np.asarray(examples.group)[fold.train].astype(str))
-        except DataError:
-            pass
-    return FoldResult(fold, probability, chosen, None if ask is None else ask(fitted), threshold)
-
-
-class FoldFigures(NamedTuple):
-    """One fold: how many windows train and test, its accuracy, and what the inner folds chose."""
-
-    repeat: int
-    fold: int
-    n_train: int
-    n_test: int
-    accuracy: float
-    chosen: Mapping[str, Any]
-
-
-def figures_of(held_out: HeldOut, samples: Samples, seed: int) -> dict[str, Any]:
-    """Return the figures of merit of held-out windows, by the fields of ``pipelines.learn.crossval.Figures``.
+def evaluate_recipe(
+    recipe: WindowPipeline,
+    name: str,
+    samples: Samples,
+    settings: EvaluationSettings,
+    progress: Progress = silent,
+    cached: tuple[Array, Motion | None] | None = None,
+    ask: Callable[[Examples, Fold], Callable[[Any], Any] | None] | None = None,
+) -> tuple[CrossvalResult, HeldOut]:
+    """Evaluate a recipe on windows by the protocol of the settings; also return its held-out probabilities.
 
     Parameters
     ----------
-    held_out : probabilities of the windows
-    samples : the windows
-    seed : of the bootstrap over runs
+    recipe, name : unfitted, and as it is named
+    samples : labelled windows with their groups
+    settings : protocol, repeats, seed, processes and extras; these are computed under ``grouped`` only
+    progress : called as the work goes on
+    cached : features (n, f) and motion of the windows, where they are there already
+    ask : gives for each fold what is called with its fitted classifier, which is then fitted on all windows, too;
+        not together with extras
+
+    Raises
+    ------
+    DataError
+        if there is one class only, or there are too few runs.
     """
-    rows, classes = np.flatnonzero(held_out.tested), held_out.classes
-    windows, group, terrain = samples.windows, samples.group.astype(str)[rows], samples.terrain[rows]
-    start_s, run_id = windows.start_s[rows], runs_by_terrain(samples.run_id[rows], terrain)
-    probability, fold_number = held_out.probability[:, rows], held_out.fold_number[:, rows]
-    predicted = classes[probability.argmax(axis=2)]
-    correct = predicted == terrain
-    # a vote is taken among windows of one group that one fold tested
-    group_of = np.unique(group, return_inverse=True)[1]
-    segments = group_of * (fold_number.max() + 1) + fold_number
-    voted = np.stack(
-        [
-            classes[vote(p, segment, start_s, windows.length_s)] == terrain
-            for p, segment in zip(probability, segments, strict=True)
-        ]
+    protocol, seed, windows = settings.protocol, settings.seed, samples.windows
+    folds = folds_of(samples, protocol, settings.repeats or PROTOCOLS[protocol].repeats, seed)
+    progress("features", 0, 1)
+    features, motion = cached or (feature_matrix(recipe, windows), window_motion(windows))
+    progress("features", 1, 1)
+    examples = Examples(features, samples.terrain, samples.group)
+    beside, published = settings.extras and protocol == "grouped", protocol == "published"
+    asks: list[Any] | None = None
+    if beside and samples.runs:
+        asks = [*following(recipe, samples, settings.rule, folds, seed)]
+    elif ask is not None:
+        asks = [ask(examples, fold) for fold in folds]
+    held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, ask is not None)
+    found: dict[str, Any] = {}
+    notes = []
+    if beside and cached is None:
+        found |= _extras(recipe, features, samples, held_out, settings, progress)
+    elif beside:
+        notes.append(NO_EXTRAS)
+    if protocol == "leave-terrain-out":
+        found |= _leave_terrain_out(recipe, features, samples, settings, progress)
+    if not published:
+        found["conformal"] = set_figures(held_out, windows, seed)
+        if motion is None:
+            notes.append(f"support: {NO_MOTION}")
+        else:
+            found |= coverage_of(held_out, samples.run_id, motion, windows.length_s, seed)._asdict()
+    result = evaluation_of(
+        held_out,
+        samples,
+        seed,
+        protocol=protocol,
+        recipe=name,
+        stride_s=None if published else settings.rule.step_s,
+        steady=settings.rule.steady is not None and not published,
+        signal_sets=tuple(getattr(recipe[0], "signal_sets", settings.signal_sets)),
+        n_features=features.shape[1],
+        **found,
     )
-    repeats = [class_figures(terrain, each, classes) for each in predicted]
-    pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
-    accuracies = np.array([repeat.accuracy for repeat in repeats])
-    stated = confidence_figures(
-        probability.max(axis=2), correct, run_id, terrain, np.random.default_rng(seed)
+    return replace(result, notes=(*_notes(samples, recipe, settings), *result.notes, *notes)), held_out
+
+
+def evaluation_of(held_out: HeldOut, samples: Samples, seed: int, **fields: Any) -> CrossvalResult:
+    """Return the result of an evaluation; ``fields`` are those that held-out windows do not give."""
+    result = CrossvalResult(
+        **held_out_figures(held_out, samples.windows, samples.group, seed),
+        window_s=samples.windows.length_s,
+        seed=seed,
+        dropped=dict(samples.dropped),
+        repaired=dict(samples.repaired),
+        notes=(),
+        **fields,
     )
-    per_run = per_run_figures(correct, predicted[0], voted, run_id, terrain)
-    accuracy_of = np.full(held_out.fold_number.shape, np.nan)
-    accuracy_of[:, rows] = correct
-    return {
-        "classes": tuple(str(name) for name in classes),
-        "n_windows": len(terrain),
-        "n_runs": len(np.unique(windows.run_id[rows])),
-        "repeats": len(repeats),
-        "accuracy": float(accuracies.mean()),
-        "accuracy_spread": float(accuracies.std(ddof=1)) if len(repeats) > 1 else None,
-        "accuracy_per_repeat": tuple(accuracies.tolist()),
-        "accuracy_ci": run_bootstrap(correct.mean(axis=0), run_id, terrain, np.random.default_rng(seed)),
-        "balanced_accuracy": float(np.mean([repeat.balanced_accuracy for repeat in repeats])),
-        "macro_f1": float(np.mean([repeat.macro_f1 for repeat in repeats])),
-        "macro_run_accuracy": macro_run_accuracy(per_run),
-        "per_class": pooled.per_class,
-        "confusion": pooled.confusion,
-        "vote_accuracy": float(np.mean(voted)),
-        "vote_windows": float(np.mean([vote_sizes(each, start_s, windows.length_s) for each in segments])),
-        "ece": stated.ece,
-        "ece_ci": stated.ece_ci,
-        "confidence_auc": stated.auc,
-        "confidence_auc_ci": stated.auc_ci,
-        "accuracy_at_coverage": stated.at_coverage,
-        "reliability": stated.reliability,
-        "per_run": per_run,
-        "folds": tuple(
-            FoldFigures(
-                fold.repeat,
-                fold.number,
-                len(fold.train),
-                len(fold.test),
-                float(np.nanmean(accuracy_of[fold.repeat, fold.test])),
-                chosen,
-            )
-            for fold, _, chosen, *_ in held_out.results
-        ),
+    return replace(result, notes=weaknesses(result.accuracy_ci, result.chance))
+
+
+def _of_svm(
+    recipe: WindowPipeline, features: Array, samples: Samples, settings: EvaluationSettings
+) -> tuple[Any, Array]:
+    """Return the classifier and the features of the checks: those of a recipe by the SVM, else the SVM's own."""
+    if not isinstance(recipe[-1], GroupedSVC):
+        recipe = recipe_of(settings, CHECKED_WITH)
+        features = feature_matrix(recipe, samples.windows)
+    return recipe[-1], features
+
+
+def _extras(
+    recipe: WindowPipeline,
+    features: Array,
+    samples: Samples,
+    held_out: HeldOut,
+    settings: EvaluationSettings,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Return the checks beside the figures, by field."""
+    classifier, features = _of_svm(recipe, features, samples, settings)
+    windows, terrain, run_id, seed = samples.windows, samples.terrain, samples.run_id, settings.seed
+    first = [result.fold for result in held_out.results if result.fold.repeat == 0]
+
+    def accuracies(features: Array, folds: Sequence[Fold], task: str) -> list[float]:
+        examples = Examples(features, terrain, samples.group)
+        return evaluate(classifier, examples, folds, settings.jobs, task, progress).accuracies
+
+    own = classifier is recipe[-1]
+    full = held_out.accuracies[0] if own else accuracies(features, first, CHECKED_WITH)[0]
+    speed_only = None
+    if wheel_stream(windows.channels) is not None:
+        wheels = FeatureExtractor(("wheels",), ("wheels",)).fit_transform(windows)
+        speed_only = accuracies(wheels, first, "speed only")[0]
+    side, slow_fast = slow_and_fast(samples)
+    if slow_fast.status is Applicability.APPLICABLE:
+        slow, fast = np.flatnonzero(side == "slow"), np.flatnonzero(side == "fast")
+        both = accuracies(features, [Fold(0, 0, slow, fast), Fold(1, 0, fast, slow)], "slow to fast")
+        slow_fast = slow_fast._replace(slow_to_fast=both[0], fast_to_slow=both[1])
+    drawn, runs_per_class = drawn_folds(terrain, samples.group.astype(str), first, seed)
+    curve = accuracies(features, drawn, "learning curve") if drawn else []
+    speeds = run_speeds(fastest_wheel(windows), run_id)
+    tracks = [track for result in held_out.results for track in result.found or ()]
+    spliced = sequence_figures([track for track in tracks if track.spliced], seed)
+    found = {
+        "speed_only_accuracy": speed_only,
+        "slow_fast": slow_fast,
+        "learning_curve": learning_curve(runs_per_class, curve, full),
+        "stiffness": stiffness_figures(held_out, run_id, known_levels(), features, speeds, seed),
+        "courses": spliced,
+        "recorded_courses": sequence_figures([track for track in tracks if not track.spliced], seed),
+        "breakaways": breakaways(held_out, windows),
     }
+    if spliced is not None:
+        for name in ("filtered_accuracy", "filtered_accuracy_ci", "filter_delay_s"):
+            found[name] = getattr(spliced, name)
+    return found
 
 
-def sets_of(held_out: HeldOut, samples: Samples, seed: int) -> ConformalFigures | None:
-    """Return the figures of the sets of classes; None where a fold has no threshold."""
-    if not held_out.results or any(math.isnan(result.conformal) for result in held_out.results):
-        return None
-    member = np.zeros(held_out.probability.shape, dtype=bool)
-    for result in held_out.results:
-        repeat, test = result.fold.repeat, result.fold.test
-        member[repeat, test] = conformal_sets(result.probability, result.conformal)
-    rows = np.flatnonzero(held_out.tested)
-    terrain = samples.terrain[rows]
-    run_id = runs_by_terrain(samples.run_id[rows], terrain)
-    truth = np.searchsorted(held_out.classes, terrain)
-    return conformal_figures(member[:, rows], truth, run_id, terrain, np.random.default_rng(seed))
+def _leave_terrain_out(
+    recipe: WindowPipeline,
+    features: Array,
+    samples: Samples,
+    settings: EvaluationSettings,
+    progress: Progress,
+) -> dict[str, Any]:
+    """Return how well a terrain that was left out of training is found to be unknown, by field."""
+    _, features = _of_svm(recipe, features, samples, settings)
+    terrain, run_id, seed, gap = samples.terrain, samples.group.astype(str), settings.seed, samples.gap
+    folds = left_out_folds(terrain, run_id, N_FOLDS, gap, seed)
+    shared = features, terrain, run_id, gap, seed
+    scored = parallel(score_fold, shared, folds, min(settings.jobs, len(folds)))
+    scores = [*counted(scored, len(folds), settings.protocol, progress)]
+    return unknown_figures(scores, terrain, run_id, samples.windows.start_s, seed)._asdict()
+
+
+def _notes(samples: Samples, recipe: WindowPipeline, settings: EvaluationSettings) -> Iterator[str]:
+    """Yield in sentences what a reader of the figures must know."""
+    protocol, classifier = settings.protocol, recipe[-1]
+    for group in samples.merged:
+        yield (
+            f"runs {', '.join(group)} hold the same measurements: they are one run, in which each stretch "
+            "counts once"
+        )
+    alone = single_run_classes(samples.terrain, samples.run_id)
+    if alone and protocol != "published":
+        yield (
+            f"{', '.join(alone)}: one run only, cut into {N_FOLDS} contiguous blocks with a gap; "
+            "its figures are optimistic, the same run trains and tests"
+        )
+    if PROTOCOLS[protocol].note:
+        yield PROTOCOLS[protocol].note
+    if not isinstance(classifier, GroupedSVC) and settings.extras and protocol == "grouped":
+        yield f"speed alone, slow against fast and the learning curve are of recipe {CHECKED_WITH!r}"
+    outputs = getattr(classifier, "outputs", "predict_proba")  # of a classifier of one's own
+    if outputs == "decision_function":
+        yield "the classifier gives no probabilities: its decisions were calibrated on inner held-out runs"
+    if outputs == "predict":
+        yield "the classifier gives no probabilities: each prediction counts as certain"
+    if samples.dropped:
+        yield f"windows left out: {format_counts(samples.dropped)}"
+    if samples.repaired:
+        yield f"changed or left out in reading the logs: {format_counts(samples.repaired)}"
 
 
 def weaknesses(accuracy_ci: tuple[float, float], chance: float) -> tuple[str, ...]:

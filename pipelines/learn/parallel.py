@@ -30,6 +30,7 @@ from typing import Any, Self
 
 from pydantic import model_validator
 
+from pipelines.report import Progress
 from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError, TerrainError
 
@@ -257,6 +258,14 @@ def parallel(
             "a process ended in the middle of its task, killed or out of memory: "
             "use fewer at once with --jobs, or give them more memory"
         ) from error
+
+
+def counted(results: Iterable[Any], number: int, task: str, progress: Progress) -> Iterator[Any]:
+    """Yield results as they come, and report the progress of a task to their number."""
+    progress(task, 0, number)
+    for done, result in enumerate(results, start=1):
+        yield result
+        progress(task, done, number)
 
 
 def end_with_parent(parent: int) -> None:

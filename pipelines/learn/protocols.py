@@ -1,4 +1,4 @@
-"""Protocols of evaluation: which windows train and which test, as one table of groups and splitters.
+"""Protocols of evaluation: which windows train and which test, as one table of groups and deals.
 
 A group is what is never divided between training and test: a run, a session, a regime of driving.  A class
 that has one group only is cut into contiguous blocks, and training windows beside a test block are left out.
@@ -8,16 +8,15 @@ has its own run in training; it serves to compare with papers only.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
-from sklearn.model_selection import LeaveOneGroupOut, PredefinedSplit, StratifiedKFold
+from sklearn.model_selection import StratifiedKFold
 
-from features.motion import wheel_stream
+from features.motion import fastest_wheel
 from features.windows import (
     TIME_TOLERANCE_S,
     WindowCut,
@@ -27,11 +26,18 @@ from features.windows import (
     layout_of,
     regular_starts,
     span_of,
-    wheel_speeds,
 )
 from pipelines.learn.settings import WindowSettings
 from pipelines.report import format_counts
-from terrain.classify.folds import block_groups, fold_numbers, single_run_classes
+from terrain.classify.folds import Fold, block_groups, fold_numbers, numbered_folds, single_run_classes
+from terrain.classify.slow_fast import (
+    MIN_CLASSES,
+    MIN_RUNS_A_SIDE,
+    MIN_TIME_A_SIDE_S,
+    Applicability,
+    SlowFast,
+    slow_fast_split,
+)
 from terrain.errors import ConfigError, DataError
 from terrain.logs.merge import distinct_runs
 from terrain.logs.regimes import driven_at, regime_of
@@ -41,22 +47,6 @@ from terrain.records import Array, RunLog, Windows
 N_FOLDS = 5
 PARTITION_S = 5.0
 PUBLISHED_STRIDE_S = 0.1
-
-MIN_RUNS_A_SIDE, MIN_TIME_A_SIDE_S = 2, 60.0
-"""Slow and fast runs of a class that are compared: at least so many, of so much time."""
-MIN_CLASSES = 3
-"""Slow and fast runs are compared where at least so many classes have enough of both."""
-MOVING_MPS = 0.03
-"""The faster wheel moves above this; it is the steady-motion rule's own threshold."""
-
-
-class Fold(NamedTuple):
-    """Rows that train and rows that test; ``repeat`` numbers the fold assignment."""
-
-    repeat: int
-    number: int
-    train: Array
-    test: Array
 
 
 class Samples(NamedTuple):
@@ -96,10 +86,6 @@ class Samples(NamedTuple):
         return self._replace(windows=self.windows[rows], group=self.group[rows])
 
 
-Splitter: TypeAlias = Any
-"""A scikit-learn splitter: ``split(X, y, groups)`` gives training and test rows."""
-
-
 class Protocol(NamedTuple):
     """What is held out, and how.
 
@@ -107,24 +93,31 @@ class Protocol(NamedTuple):
     ----------
     held_out : in words
     units : (n,) what is held out together; empty of a window that neither trains nor tests
-    splitter : what divides them, by class, unit and random numbers of the repeat
+    deal : from class, unit and random numbers of the repeat, the fold (n,) that tests each window, -1 for none
     repeats : fold assignments by default; 1 where there is one only
+    note : what a reader of the figures must know of it
     whole_runs : whether a run is on one side of a split, but for the blocks of a class with one unit
     """
 
     held_out: str
     units: Callable[[Samples], Array]
-    splitter: Callable[[Array, Array, np.random.Generator], Splitter]
+    deal: Callable[[Array, Array, np.random.Generator], Array]
     repeats: int = 1
+    note: str = ""
     whole_runs: bool = True
 
 
-def deal_groups(y: Array, group: Array, rng: np.random.Generator) -> Splitter:
+def deal_groups(y: Array, group: Array, rng: np.random.Generator) -> Array:
     """Deal whole groups into folds, evenly within classes (not scikit-learn's: see terrain.classify.folds)."""
-    return PredefinedSplit(fold_numbers(y, group, N_FOLDS, rng))
+    return fold_numbers(y, group, N_FOLDS, rng)
 
 
-def deal_partitions(y: Array, group: Array, rng: np.random.Generator) -> Splitter:
+def leave_one_out(y: Array, group: Array, rng: np.random.Generator) -> Array:
+    """Return the number of each group: it is a fold of its own."""
+    return np.asarray(np.unique(group, return_inverse=True)[1])
+
+
+def deal_partitions(y: Array, group: Array, rng: np.random.Generator) -> Array:
     """Deal partitions of runs into folds at random, stratified by class.
 
     Raises
@@ -132,18 +125,16 @@ def deal_partitions(y: Array, group: Array, rng: np.random.Generator) -> Splitte
     DataError
         if a class has fewer partitions than there are folds.
     """
-    names, first, group_of = np.unique(group.astype(str), return_index=True, return_inverse=True)
+    names, first, group_of = np.unique(group, return_index=True, return_inverse=True)
     labels = y[first]
-    short = [
-        f"{name} ({n})" for name, n in zip(*np.unique(labels, return_counts=True), strict=True) if n < N_FOLDS
-    ]
+    short = [f"{name} ({n})" for name, n in sorted(Counter(labels.tolist()).items()) if n < N_FOLDS]
     if short:
         raise DataError(f"fewer than {N_FOLDS} partitions of {PARTITION_S:g} s: {', '.join(short)}")
     number = np.empty(len(names), dtype=int)
     deal = StratifiedKFold(N_FOLDS, shuffle=True, random_state=int(rng.integers(2**31)))
     for fold, (_, test) in enumerate(deal.split(names, labels)):
         number[test] = fold
-    return PredefinedSplit(number[group_of])
+    return number[group_of]
 
 
 def sessions(samples: Samples) -> Array:
@@ -168,6 +159,12 @@ def regimes(samples: Samples) -> Array:
     return np.array([regime[name] for name in samples.windows.run_id], dtype=object)
 
 
+def slow_and_fast(samples: Samples) -> tuple[Array, SlowFast]:
+    """Return on which side of its class's median speed each window's run lies (n,), and how classes divide."""
+    windows, run_id = samples.windows, samples.run_id
+    return slow_fast_split(fastest_wheel(windows), run_id, samples.terrain, windows.start_s, windows.length_s)
+
+
 def sides(samples: Samples) -> Array:
     """Return ``slow`` or ``fast`` (n,), on which side of its class's median speed a window's run lies.
 
@@ -176,20 +173,24 @@ def sides(samples: Samples) -> Array:
     DataError
         if too few classes have enough slow and fast runs.
     """
-    split = slow_fast_split(samples)
-    if len(split.classes) < MIN_CLASSES:
+    side, split = slow_and_fast(samples)
+    if split.status is Applicability.NOT_APPLICABLE:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in split.left_out.items())
         raise DataError(
             f"slow and fast runs are compared on {MIN_CLASSES} terrains with at least {MIN_RUNS_A_SIDE} runs "
-            f"and {MIN_TIME_A_SIDE_S:g} s of each; there are {len(split.classes)} ({split.reasons})"
+            f"and {MIN_TIME_A_SIDE_S:g} s of each; there are {len(split.classes)} ({reasons})"
         )
-    return split.side
+    return side
 
 
 def _from_to(trained: str, tested: str) -> Protocol:
-    def splitter(y: Array, group: Array, rng: np.random.Generator) -> Splitter:
-        return PredefinedSplit(np.where(group == tested, 0, -1))
+    held_out = f"{tested} runs held out, {trained} ones trained on"
+    note = f"{held_out}, on either side of the median speed of each terrain"
 
-    return Protocol(f"{tested} runs held out, {trained} ones trained on", sides, splitter, whole_runs=False)
+    def deal(_: Array, side: Array, __: np.random.Generator) -> Array:
+        return np.where(side == tested, 0, -1)
+
+    return Protocol(held_out, sides, deal, note=note, whole_runs=False)
 
 
 def _groups(samples: Samples) -> Array:
@@ -197,14 +198,24 @@ def _groups(samples: Samples) -> Array:
 
 
 PROTOCOLS: dict[str, Protocol] = {
-    "grouped": Protocol("whole runs held out", _groups, deal_groups, repeats=5),
-    "leave-one-run-out": Protocol("one run held out at a time", _groups, lambda *_: LeaveOneGroupOut()),
-    "leave-sessions-out": Protocol("one session held out at a time", sessions, lambda *_: LeaveOneGroupOut()),
-    "leave-regimes-out": Protocol(
-        "speeds and directions of driving held out", regimes, deal_groups, repeats=5
+    "grouped": Protocol("whole runs held out", _groups, deal_groups, 5),
+    "leave-one-run-out": Protocol("one run held out at a time", _groups, leave_one_out),
+    "leave-sessions-out": Protocol("one session held out at a time", sessions, leave_one_out),
+    "leave-regimes-out": Protocol("speeds and directions of driving held out", regimes, deal_groups, 5),
+    "leave-terrain-out": Protocol(
+        "whole runs held out",
+        _groups,
+        deal_groups,
+        note="accuracy and the table of classes are of folds in which all terrains are known",
     ),
-    "leave-terrain-out": Protocol("whole runs held out", _groups, deal_groups),
-    "published": Protocol("parts of the same runs held out", _groups, deal_partitions, 5, whole_runs=False),
+    "published": Protocol(
+        "parts of the same runs held out",
+        _groups,
+        deal_partitions,
+        5,
+        "published protocol: parts of one run lie on both sides of the split; for comparison with papers only",
+        whole_runs=False,
+    ),
     "slow-fast": _from_to("slow", "fast"),
     "fast-slow": _from_to("fast", "slow"),
 }
@@ -226,34 +237,20 @@ def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed
     if len(np.unique(y)) < 2:
         raise DataError(f"all windows are {str(y[0])!r}: a classifier needs at least two classes")
     n_runs = len(np.unique(samples.run_id))
-    if scheme.whole_runs and scheme.splitter is deal_groups and n_runs < N_FOLDS:
+    if scheme.whole_runs and scheme.deal is deal_groups and n_runs < N_FOLDS:
         raise DataError(f"{n_runs} runs are fewer than {N_FOLDS} folds")
-    alone = single_run_classes(y, unit.astype(str)) if scheme.whole_runs else []
-    cut = block_groups(y, unit, N_FOLDS).astype(str) if scheme.whole_runs else unit.astype(str)
-    folds = []
-    drawn = scheme.splitter in (deal_groups, deal_partitions)
-    for repeat in range(repeats if drawn else 1):
-        splitter = scheme.splitter(y, cut, np.random.default_rng((seed, repeat)))
-        groups = None if isinstance(splitter, PredefinedSplit) else cut
-        for number, (train, test) in enumerate(splitter.split(y, y, groups)):
-            for terrain in alone:
-                train = without_neighbours(train, test, np.flatnonzero(y == terrain), samples.gap)
-            folds.append(Fold(repeat, number, used[train], used[test]))
-    return folds
-
-
-def without_neighbours(train: Array, test: Array, rows: Array, gap: int) -> Array:
-    """Return the training rows without those of one run, ``rows`` in order, that lie beside a test row.
-
-    Examples
-    --------
-    >>> without_neighbours(np.array([0, 1, 4, 5]), np.array([2, 3]), np.arange(6), gap=1)
-    array([0, 5])
-    """
-    tested = np.flatnonzero(np.isin(rows, test))
-    near = (tested[:, None] + np.arange(-gap, gap + 1)).ravel()
-    beside = rows[near[(near >= 0) & (near < len(rows))]]
-    return np.asarray(train[~np.isin(train, beside)])
+    cut, alone = unit.astype(str), []
+    if scheme.whole_runs:
+        alone = [np.flatnonzero(y == name) for name in single_run_classes(y, cut)]
+        cut = block_groups(y, unit, N_FOLDS).astype(str)
+    drawn = scheme.deal in (deal_groups, deal_partitions)
+    return [
+        Fold(repeat, number, used[train], used[test])
+        for repeat in range(repeats if drawn else 1)
+        for number, (train, test) in enumerate(
+            numbered_folds(scheme.deal(y, cut, np.random.default_rng((seed, repeat))), alone, samples.gap)
+        )
+    ]
 
 
 def samples_of(
@@ -363,94 +360,6 @@ def published_samples(
     return Samples(cut.windows, cut.dropped, np.array(group, dtype=object), 0, runs=runs)
 
 
-def run_speeds(windows: Windows) -> dict[str, float]:
-    """Return the median speed (m/s) of each run's faster wheel where it moves; NaN if it never does."""
-    names = windows.run_id.astype(str)
-    if wheel_stream(windows.channels) is None:
-        return dict.fromkeys(np.unique(names), math.nan)
-    fastest = np.abs(wheel_speeds(windows.values, windows.channels)).max(axis=1)
-    speeds = {}
-    for run_id in np.unique(names):
-        moving = fastest[names == run_id].ravel()
-        moving = moving[moving > MOVING_MPS]
-        speeds[run_id] = float(np.median(moving)) if len(moving) else math.nan
-    return speeds
-
-
-class ClassSpeeds(NamedTuple):
-    """Median speeds of the slow and of the fast runs of a class."""
-
-    slow_mps: float
-    fast_mps: float
-
-
-class SlowFastSplit(NamedTuple):
-    """Runs of each class on both sides of its median speed.
-
-    Parameters
-    ----------
-    side : (n,) ``slow`` or ``fast``; empty of a class that is left out, and of a run that is slow on one
-        class and fast on another
-    classes : speeds of the classes that are kept
-    left_out : the reason for each of the others
-    """
-
-    side: Array
-    classes: dict[str, ClassSpeeds]
-    left_out: dict[str, str]
-
-    @property
-    def reasons(self) -> str:
-        """Why classes are left out, in words."""
-        return "; ".join(f"{name}: {reason}" for name, reason in self.left_out.items())
-
-
-def slow_fast_split(samples: Samples) -> SlowFastSplit:
-    """Split the runs of each class at their median speed, taken over the run's time on that class."""
-    windows, run_id, y = samples.windows, samples.run_id, samples.terrain
-    side = np.full(len(y), "", dtype=object)
-    kept: dict[str, ClassSpeeds] = {}
-    left_out: dict[str, str] = {}
-    for terrain in np.unique(y).tolist():
-        speeds = run_speeds(windows[y == terrain])
-        known = {run: speed for run, speed in speeds.items() if math.isfinite(speed)}
-        median = np.median(list(known.values())) if known else math.nan
-        parts = {
-            "slow": [run for run, speed in known.items() if speed <= median],
-            "fast": [run for run, speed in known.items() if speed > median],
-        }
-        reason = None
-        for name, runs in parts.items():
-            starts = (windows.start_s[(run_id == run) & (y == terrain)] for run in runs)
-            time_s = sum(covered_s(start_s, windows.length_s) for start_s in starts)
-            if len(runs) < MIN_RUNS_A_SIDE:
-                reason = reason or f"{name} runs: {len(runs)}"
-            elif time_s < MIN_TIME_A_SIDE_S:
-                reason = reason or f"{name} runs: {time_s:.0f} s"
-        if reason:
-            left_out[terrain] = reason
-            continue
-        kept[terrain] = ClassSpeeds(
-            *(float(np.median([known[run] for run in runs])) for runs in parts.values())
-        )
-        for name, runs in parts.items():
-            side[(y == terrain) & np.isin(run_id, runs)] = name
-    both = set(run_id[side == "slow"]) & set(run_id[side == "fast"])
-    side[np.isin(run_id, list(both))] = ""
-    return SlowFastSplit(side, kept, left_out)
-
-
-def covered_s(start_s: Array, length_s: float) -> float:
-    """Return the time that windows of one run cover; where they overlap it counts once.
-
-    Examples
-    --------
-    >>> covered_s(np.array([0.0, 1.0, 5.0]), 2.0)
-    5.0
-    """
-    return float(np.minimum(np.diff(np.sort(start_s)), length_s).sum() + length_s)
-
-
 def _logs(samples: Samples) -> Sequence[RunLog]:
     """Return the runs of samples; windows from a cache, or cut by a user, do not have them."""
     if not samples.runs:
@@ -458,24 +367,3 @@ def _logs(samples: Samples) -> Sequence[RunLog]:
             "sessions and regimes are those of run logs, which are not at hand beside the windows"
         )
     return samples.runs
-
-
-def merged_notes(merged: Sequence[Sequence[str]]) -> list[str]:
-    """Return in a sentence each what groups of runs were taken for one run."""
-    ending = "hold the same measurements: they are one run, in which each stretch counts once"
-    return [f"runs {', '.join(group)} {ending}" for group in merged]
-
-
-def notes_of(samples: Samples, protocol: str) -> Iterator[str]:
-    """Yield in sentences what a reader of figures must know of the runs and the windows."""
-    yield from merged_notes(samples.merged)
-    alone = single_run_classes(samples.terrain, samples.run_id)
-    if alone and protocol != "published":
-        yield (
-            f"{', '.join(alone)}: one run only, cut into {N_FOLDS} contiguous blocks with a gap; "
-            "its figures are optimistic, the same run trains and tests"
-        )
-    if protocol == "published":
-        yield (
-            "published protocol: parts of one run lie on both sides of the split; for comparison with papers only"
-        )

@@ -22,9 +22,9 @@ from terrain.files.atomic import atomic_write
 from terrain.files.names import printable
 
 if TYPE_CHECKING:
-    from pipelines.learn.evaluate import Examples
     from pipelines.learn.training_data import TrainingData
     from pipelines.report import Progress
+    from terrain.classify.held_out import Examples
     from terrain.classify.paired import Difference
     from terrain.records import Array
 
@@ -91,10 +91,10 @@ def search(
     """
     import numpy as np
 
-    from pipelines.learn.evaluate import Examples
     from pipelines.learn.parallel import parallel
     from pipelines.learn.protocols import folds_of
     from pipelines.report.json_file import as_json
+    from terrain.classify.held_out import Examples
 
     optuna = _optuna()
     samples = data.samples

@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
     from pipelines.learn.card import TrainingRecord
     from pipelines.learn.champion import Bench
-    from pipelines.learn.evaluate import Examples
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.model_file import ModelInfo
-    from pipelines.learn.protocols import Fold
     from pipelines.learn.search import SearchResult
     from pipelines.learn.tracking import Registered
     from pipelines.learn.training_data import TrainingData
+    from terrain.classify.folds import Fold
+    from terrain.classify.held_out import Examples
     from terrain.classify.importance import ChannelImportance
     from terrain.records import RunLog
 
@@ -369,7 +369,7 @@ def _evaluated(
 
     One set of fits gives all three: channels are judged by those of the first repeat.
     """
-    from pipelines.learn.evaluation import evaluate_recipe
+    from pipelines.learn.evaluate import evaluate_recipe
     from pipelines.learn.settings import EvaluationSettings
     from terrain.classify.importance import ChannelDrops, channel_importance, channel_of
 

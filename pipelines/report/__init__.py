@@ -19,6 +19,7 @@ from pipelines.report.tree import Card as Card
 from pipelines.report.tree import Cards as Cards
 from pipelines.report.tree import Column as Column
 from pipelines.report.tree import Figure as Figure
+from pipelines.report.tree import Later as Later
 from pipelines.report.tree import Line as Line
 from pipelines.report.tree import Mark as Mark
 from pipelines.report.tree import Pairs as Pairs

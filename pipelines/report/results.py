@@ -77,6 +77,17 @@ class Result:
             if "description" in each.metadata
         }
 
+    def pairs(self, *names: str) -> list[tuple[Any, ...]]:
+        """Return rows of :class:`~pipelines.report.tree.Pairs`: what fields are, their values and forms."""
+        about = {each.name: each.metadata for each in fields(self)}  # type: ignore[arg-type]
+        rows = []
+        for name in names:
+            value, unit = getattr(self, name), about[name]["unit"]
+            if isinstance(value, tuple) and all(isinstance(each, str) for each in value):
+                value = ", ".join(value)
+            rows.append((about[name]["description"], value, about[name]["form"], "" if unit == "1" else unit))
+        return rows
+
     def to_pandas(self) -> pd.DataFrame:
         """Return the fields that are numbers, texts or intervals as a table of one row."""
         import pandas as pd

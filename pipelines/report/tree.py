@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
@@ -199,6 +200,19 @@ class Figure:
     caption: str = ""
     alt: str = ""
     x_label: str = ""
+
+
+class Later(Sequence[Any]):
+    """Parts of a section that are made when a writer comes to them: a screen without details needs none."""
+
+    def __init__(self, make: Callable[..., Sequence[Part]], *arguments: Any) -> None:
+        self._made = cache(lambda: make(*arguments))
+
+    def __getitem__(self, place: Any) -> Any:
+        return self._made()[place]
+
+    def __len__(self) -> int:
+        return len(self._made())
 
 
 @dataclass(frozen=True)

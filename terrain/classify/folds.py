@@ -9,13 +9,22 @@ cut into contiguous blocks, and training windows beside a test block are left ou
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.errors import DataError
 from terrain.records import Array
+
+
+class Fold(NamedTuple):
+    """Rows that train and rows that test; ``repeat`` numbers the fold assignment."""
+
+    repeat: int
+    number: int
+    train: Array
+    test: Array
 
 
 def single_run_classes(y: Array, groups: Array) -> list[Any]:
@@ -101,14 +110,31 @@ def split_runs(
     [2 3 8 9] [0 1 4 5 6]
     [0 1 4 5] [2 3 7 8 9]
     """
-    fold = fold_numbers(y, block_groups(y, groups, n_folds), n_folds, rng)
-    cut_runs = [np.flatnonzero(y == terrain) for terrain in single_run_classes(y, groups)]
-    for number in range(n_folds):
-        testing = fold == number
+    number = fold_numbers(y, block_groups(y, groups, n_folds), n_folds, rng)
+    return numbered_folds(number, [np.flatnonzero(y == name) for name in single_run_classes(y, groups)], gap)
+
+
+def numbered_folds(
+    number: Array, cut_runs: Sequence[Array] = (), gap: int = 0
+) -> Iterator[tuple[Array, Array]]:
+    """Yield training and test rows of each fold.
+
+    Parameters
+    ----------
+    number : (n,) the fold that tests each window; -1 of one that no fold tests
+    cut_runs : rows, in order of time, of each run that lies in several folds
+    gap : windows of such a run beside a test window that do not train
+
+    Examples
+    --------
+    >>> number = np.array([0, 0, 1, 1, 1, 2])
+    >>> [train.tolist() for train, _ in numbered_folds(number, [np.arange(6)], gap=1)]
+    [[3, 4, 5], [0], [0, 1, 2, 3]]
+    """
+    for each in range(int(number.max()) + 1):
+        testing = number == each
         training = ~testing
         for rows in cut_runs:
-            beside = np.flatnonzero(testing[rows])
-            for shift in range(-gap, gap + 1):
-                neighbours = beside + shift
-                training[rows[neighbours[(neighbours >= 0) & (neighbours < len(rows))]]] = False
+            near = np.flatnonzero(testing[rows])[:, None] + np.arange(-gap, gap + 1)
+            training[rows[near[(near >= 0) & (near < len(rows))]]] = False
         yield np.flatnonzero(training), np.flatnonzero(testing)

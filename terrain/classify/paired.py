@@ -7,14 +7,17 @@ common part out of the interval of the difference.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from terrain.bootstrap import percentile_interval
 from terrain.classify.confidence import Interval, confidence_auc
+from terrain.classify.held_out import HeldOut
+from terrain.classify.support import SupportLevel
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -46,6 +49,18 @@ class Outcome(NamedTuple):
     correct: Array
     confidence: Array
 
+    @classmethod
+    def of(cls, held_out: HeldOut, run_id: Array) -> Self:
+        """Return what was made of the windows that were held out."""
+        rows = np.flatnonzero(held_out.tested)
+        confidence = held_out.probability.max(axis=2)
+        return cls(run_id[rows], held_out.truth[rows], held_out.correct[:, rows], confidence[:, rows])
+
+    def at(self, rows: Array) -> Outcome:
+        """Return some of the windows."""
+        run_id, terrain, correct, confidence = self
+        return Outcome(run_id[rows], terrain[rows], correct[:, rows], confidence[:, rows])
+
 
 class Difference(NamedTuple):
     """A figure of two classifiers; ``difference`` is b minus a, with its ``interval`` of 95 % over runs.
@@ -71,13 +86,44 @@ class RunDifference(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Differences between two classifiers; those of each class are of accuracy."""
+    """Differences between two classifiers, b minus a.
+
+    Those of each class are of accuracy, as are those ``by_support``: by how many training runs drove the true
+    terrain with the motion of a window, where that is known.
+    """
 
     accuracy: Difference
     macro_run_accuracy: Difference
     confidence_auc: Difference
     by_class: dict[str, Difference]
     by_run: tuple[RunDifference, ...]
+    by_support: Mapping[str, Difference] = MappingProxyType({})
+    a: str = ""
+    b: str = ""
+
+
+def compare_with_first(
+    names: Sequence[str], outcomes: Sequence[Outcome], seed: int, levels: Array | None = None
+) -> tuple[Comparison, ...]:
+    """Return how each of the other classifiers differs from the first.
+
+    Parameters
+    ----------
+    names, outcomes : of the classifiers
+    seed : of each bootstrap
+    levels : (n,) :class:`~terrain.classify.support.SupportLevel` of each window, the same of all outcomes
+    """
+    first, found = outcomes[0], []
+    for name, other in zip(names[1:], outcomes[1:], strict=True):
+        by_support = {}
+        for level in SupportLevel if levels is not None else ():
+            rows = np.flatnonzero(levels == level.value)
+            if len(rows):
+                parts = compare_outcomes(first.at(rows), other.at(rows), np.random.default_rng(seed))
+                by_support[level.value] = parts.accuracy
+        compared = compare_outcomes(first, other, np.random.default_rng(seed))
+        found.append(compared._replace(by_support=by_support, a=names[0], b=name))
+    return tuple(found)
 
 
 def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Comparison:

@@ -11,7 +11,9 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
-from terrain.records import Array
+from terrain.classify.metrics import TIME_TOLERANCE_S
+from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
+from terrain.records import Array, Label
 
 STRIDE_S = 0.25
 """A window comes so often: four times as often as terrain has to be known at 1 Hz, an eighth of a window."""
@@ -101,6 +103,46 @@ class Track(NamedTuple):
     run: tuple[str, ...]
     begin_s: Array
     spliced: bool
+
+
+def track_of(
+    labels: Sequence[Label],
+    runs: tuple[str, ...],
+    starts_s: Array,
+    length_s: float,
+    probability: Array,
+    classes: Array,
+    prior: Array,
+    spliced: bool,
+) -> Track:
+    """Return what the last window and the filter over time report along a sequence.
+
+    Parameters
+    ----------
+    labels, runs : terrain and run of each stretch of the sequence
+    starts_s, length_s : (n,) starts of windows on a regular grid, and their length
+    probability : (n, k) of each window; NaN of one that was refused
+    classes, prior : (k,) sorted, and what the filter expects of each
+    spliced : whether the sequence was spliced
+    """
+    time_s = starts_s + length_s
+    settings = check_filter(TerrainFilter(tuple(prior.tolist())))
+    begin_s = np.array([label.start_s for label in labels])
+    ground = np.full(len(time_s), -1)
+    for i, label in enumerate(labels):
+        inside = (time_s > label.start_s + TIME_TOLERANCE_S) & (time_s <= label.end_s + TIME_TOLERANCE_S)
+        ground[inside] = i
+    return Track(
+        time_s,
+        ground,
+        (ground >= 0) & (starts_s >= begin_s[ground] - TIME_TOLERANCE_S),
+        reported(filter_run(probability, time_s, settings), settings.threshold),
+        last_class(probability),
+        np.searchsorted(classes, [label.terrain for label in labels]),
+        runs,
+        begin_s,
+        spliced,
+    )
 
 
 def last_class(probability: Array) -> Array:

@@ -1,7 +1,7 @@
 """Accuracy by support: by the true terrain, and by the mark that needs no label.
 
-Figures are ratios of sums over windows, their intervals those of a bootstrap that draws whole runs within
-their classes.
+Each held-out window is judged by a table of the training windows of its own fold.  Figures are ratios of sums
+over windows, their intervals those of a bootstrap that draws whole runs within their classes.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ import numpy as np
 
 from terrain.bootstrap import percentile_interval
 from terrain.classify.confidence import Interval, confidence_auc
+from terrain.classify.held_out import HeldOut
 from terrain.classify.metrics import N_BOOTSTRAP
-from terrain.classify.support import SupportLevel, support_levels
+from terrain.classify.regimes import Motion
+from terrain.classify.support import SupportLevel, learn_support, support_levels, support_of
 from terrain.records import Array
 
 
@@ -34,6 +36,30 @@ class HeldOutSupport(NamedTuple):
     predicted_runs: Array
     probability: Array
     supported: Array
+
+
+def held_out_support(held_out: HeldOut, run_id: Array, motion: Motion) -> HeldOutSupport:
+    """Return the support of each window (repeats, n) by the training windows of the fold that held it out.
+
+    Parameters
+    ----------
+    held_out : probabilities of the windows
+    run_id, motion : run of each window, and how the robot moved in it
+    """
+    shape, terrain = held_out.probability.shape[:2], held_out.truth
+    true_runs, predicted_runs = np.zeros((2, *shape), dtype=int)
+    probability, supported = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+    classes = [str(name) for name in held_out.classes]
+    true = np.searchsorted(held_out.classes, terrain)
+    for (repeat, _, train, test), stated, *_ in held_out.results:
+        driven, there = motion.of(train), motion.of(test)
+        table = learn_support(driven.speed_mps, driven.yaw_rate_radps, terrain[train], run_id[train], classes)
+        near = table.near_runs(there.speed_mps, there.yaw_rate_radps)
+        true_runs[repeat, test] = near[np.arange(len(test)), true[test]]
+        predicted_runs[repeat, test], probability[repeat, test], supported[repeat, test] = support_of(
+            stated, near
+        )
+    return HeldOutSupport(held_out.correct, true_runs, predicted_runs, probability, supported)
 
 
 class PartFigures(NamedTuple):

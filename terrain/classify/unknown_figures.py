@@ -1,4 +1,8 @@
-"""How well a terrain that was never learned is found to be unknown, by scores of windows that were held out."""
+"""How well a terrain that was never learned is found to be unknown.
+
+Each terrain is left out in turn: a novelty score is fitted on training runs of the others, and compares their
+held-out runs with all runs of the terrain that was left out.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,18 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
+from terrain.classify.folds import block_groups, split_runs
 from terrain.classify.metrics import N_BOOTSTRAP
-from terrain.classify.novelty import KNOWN_KEPT
+from terrain.classify.novelty import KNOWN_KEPT, NoveltyScore
+from terrain.errors import DataError
 from terrain.records import Array
 
 MEAN_SPAN_S = 10.0
 """Novelty scores are averaged over so long: a robot crosses a terrain for longer."""
+
+
+MIN_TERRAINS = 3
+"""Two are needed to train without the third."""
 
 
 class LeftOutTerrain(NamedTuple):
@@ -65,18 +75,61 @@ class Compared(NamedTuple):
     pairs: Array
 
 
+def left_out_folds(
+    terrain: Array, run_id: Array, n_folds: int, gap: int, seed: int
+) -> list[tuple[Array, Array, Array]]:
+    """Return training rows, held-out rows and rows of the terrain that is left out, terrain by terrain.
+
+    Parameters
+    ----------
+    terrain, run_id : (n,) class and run of each window
+    n_folds, gap, seed : as :func:`~terrain.classify.folds.split_runs`
+
+    Raises
+    ------
+    DataError
+        if there are fewer than three terrains, or too few runs.
+    """
+    y, terrains = terrain, np.unique(terrain)
+    if len(terrains) < MIN_TERRAINS:
+        raise DataError(
+            f"the runs are of {len(terrains)} terrains ({', '.join(terrains)}): "
+            f"at least {MIN_TERRAINS} are needed to leave one out"
+        )
+    folds = []
+    for name in terrains:
+        rows, unknown = np.flatnonzero(y != name), np.flatnonzero(y == name)
+        n_groups = len(np.unique(block_groups(y[rows], run_id[rows], n_folds).astype(str)))
+        if n_groups < n_folds:
+            raise DataError(f"{n_groups} runs without {name} are fewer than {n_folds} folds")
+        rng = np.random.default_rng((seed, 0))
+        for train, test in split_runs(y[rows], run_id[rows], n_folds, rng, gap):
+            if len(test):
+                folds.append((rows[train], rows[test], unknown))
+    return folds
+
+
+def score_fold(
+    X: Array, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array, unknown: Array
+) -> Scored:
+    """Return the novelty of held-out and of unknown rows, by a score that is fitted on training rows."""
+    fitted = NoveltyScore(gap=gap, seed=seed).fit(X[train], y[train], group[train])
+    return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.numbers_.threshold)
+
+
 def unknown_figures(
-    of_terrain: Mapping[str, Sequence[Scored]], terrain: Array, run_id: Array, start_s: Array, seed: int
+    scored: Sequence[Scored], terrain: Array, run_id: Array, start_s: Array, seed: int
 ) -> UnknownTerrain:
     """Return the figures of terrains that were left out in turn.
 
     Parameters
     ----------
-    of_terrain : scores of each fold, by the terrain that was left out
+    scored : of each fold
     terrain, run_id, start_s : (n,) class, run and start of each window
     seed : draws runs for the intervals
     """
     y, group, terrains = terrain, run_id, np.unique(terrain)
+    of_terrain = {str(name): [each for each in scored if y[each.unknown[0]] == name] for name in terrains}
     names, run_of = np.unique(np.char.add(np.char.add(group, " "), y), return_inverse=True)
     weights = np.zeros((N_BOOTSTRAP, len(names)))
     for number, terrain in enumerate(terrains):  # how often each run is drawn, terrain by terrain

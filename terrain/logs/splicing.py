@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.records import Array, Label, RunLog, Stream
+from terrain.records import Array, Label, RunLog, Stream, Windows
 
 TIME_TOLERANCE_S = 1e-6
 """Stamps are compared to this, far below any sample period."""
@@ -74,6 +74,59 @@ def order_stretches(stretches: Sequence[Part], rng: np.random.Generator) -> list
         weights = np.array([counts[name] for name in names], dtype=float)
         chosen = most if 2 * n_most > n_left else names[rng.choice(len(names), p=weights / weights.sum())]
         found.append(waiting[chosen].pop())
+
+
+def parts_under(runs: Mapping[str, RunLog], windows: Windows) -> list[Part]:
+    """Return the parts of runs that windows lie in, one a label.
+
+    A run of which some windows are there gives what they span.
+
+    Parameters
+    ----------
+    runs : by id
+    windows : of these runs
+    """
+    run_id, terrain = windows.run_id.astype(str), windows.terrain.astype(str)
+    parts = []
+    for name in np.unique(run_id):
+        for label in runs[name].labels:
+            begins_s = windows.start_s[(run_id == name) & (terrain == label.terrain)]
+            inside = (begins_s >= label.start_s - TIME_TOLERANCE_S) & (begins_s < label.end_s)
+            if inside.any():
+                begins_s = begins_s[inside]
+                end_s = float(begins_s.max()) + windows.length_s
+                parts.append(Part(runs[name], float(begins_s.min()), end_s, label.terrain))
+    return parts
+
+
+class SplicedRun(NamedTuple):
+    """A log over several grounds; the run behind each of its labels, and whether it was spliced."""
+
+    log: RunLog
+    runs: tuple[str, ...]
+    spliced: bool
+
+
+def sequences_of(
+    parts: Sequence[Part], channels: Mapping[str, Sequence[str]], run_id: str, rng: np.random.Generator
+) -> tuple[SplicedRun, ...]:
+    """Return a spliced sequence through all parts, each second at most once, and the runs over several grounds.
+
+    None is spliced where the terrain never changes.
+
+    Parameters
+    ----------
+    parts, channels, run_id : as :func:`splice_runs`
+    rng : of the lengths and the order of stretches
+    """
+    found = []
+    ordered = order_stretches([s for part in parts for s in stretches_of(part, rng)], rng)
+    if len(ordered) >= 2:
+        log = splice_runs(ordered, channels, run_id)
+        found.append(SplicedRun(log, tuple(part.run.run_id for part in ordered), True))
+    counts = Counter(part.run.run_id for part in parts)
+    logs = {part.run.run_id: part.run for part in parts if counts[part.run.run_id] > 1}
+    return *found, *(SplicedRun(log, (name,) * len(log.labels), False) for name, log in logs.items())
 
 
 def splice_runs(parts: Sequence[Part], channels: Mapping[str, Sequence[str]], run_id: str) -> RunLog:

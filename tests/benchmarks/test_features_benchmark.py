@@ -19,10 +19,10 @@ from features.motion import window_motion
 from features.stream import WindowStream
 from features.windows import WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import load_runs
-from pipelines.learn.coverage import table_of
 from pipelines.learn.recipes import make_recipe
 from pipelines.live.model import assess
 from terrain.classify.novelty import NoveltyScore
+from terrain.classify.support import learn_support
 from terrain.records import RunLog, Stream
 
 N_COMPARED = 8
@@ -148,7 +148,8 @@ def champion(windows):
     terrain = windows.terrain.astype(str)
     recipe = make_recipe(candidates=[(10.0, 1.0, 80.0)]).fit(windows, terrain)
     features, motion = recipe.matrix.of(windows), window_motion(windows)
-    support = table_of(motion, terrain, windows.run_id.astype(str), np.unique(terrain).tolist())
+    moved = motion.speed_mps, motion.yaw_rate_radps
+    support = learn_support(*moved, terrain, windows.run_id.astype(str), np.unique(terrain).tolist())
     return SimpleNamespace(
         recipe=recipe, novelty=NoveltyScore().fit(features, terrain, windows.run_id).numbers_, support=support
     )

@@ -17,14 +17,15 @@ from sklearn.base import clone
 
 from features.motion import Motion, window_motion
 from pipelines.data.datasets import load_runs
-from pipelines.learn.evaluate import Examples
 from pipelines.learn.parallel import parallel
-from pipelines.learn.protocols import Fold, folds_of, samples_of
+from pipelines.learn.protocols import folds_of, samples_of
 from pipelines.learn.recipes import feature_matrix, recipe_of
 from pipelines.learn.settings import LearnSettings
 from pipelines.report import Column, Progress, Report, Result, Table, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from terrain.classify.folds import Fold
+from terrain.classify.held_out import Examples
 from terrain.classify.paired import Difference, Outcome, compare_outcomes
 from terrain.classify.proposals import ACCEPTED, Proposal, questions
 from terrain.classify.support import learn_support, support_of

@@ -14,7 +14,8 @@ from pipelines.data.datasets import joint_digest, load_runs, run_loaders
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn import cache
 from pipelines.learn.cache import cached_features
-from pipelines.learn.crossval import EvaluationSettings, evaluate_recipe
+from pipelines.learn.crossval import EvaluationSettings
+from pipelines.learn.evaluate import evaluate_recipe
 from pipelines.learn.protocols import samples_of
 from pipelines.learn.recipes import feature_matrix, recipe_of
 from pipelines.learn.settings import RecipeSettings

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import data_digest
-from pipelines.learn.crossval import EvaluationSettings, compare_models, compare_recipes, crossval
+from pipelines.learn.comparison import compare_models
+from pipelines.learn.crossval import crossval
 from pipelines.learn.model_file import TerrainModel, read_model
 from pipelines.report.json_file import as_json
 from terrain.classify.paired import Verdict
 from terrain.classify.support import SupportLevel
-from terrain.errors import ConfigError, DataError
+from terrain.errors import DataError
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +23,17 @@ def noisy_runs(drive_all):
 
 @pytest.mark.slow
 def test_signal_sets_that_hold_the_terrain_are_better_than_those_that_do_not(noisy_runs, settings):
-    report = compare_recipes(noisy_runs, settings(recipe="svm@currents,svm@imu", repeats=2))
-    (found,) = report.differences
+    report = crossval(noisy_runs, settings(recipe="svm@currents,svm@imu", repeats=2))
+    (found,), n_all = report.differences, report.contenders[0].n_runs
     assert found.accuracy.verdict is Verdict.BETTER
     assert found.accuracy.a < 0.55 < found.accuracy.b
     assert (report.contenders[0].n_runs, report.contenders[0].repeats, report.kind) == (15, 2, "recipes")
     assert set(found.by_class) == {"ASPHALT", "GRASS", "GRAVEL"}
+    assert set(found.by_support) <= {level.value for level in SupportLevel}
+    n_runs = [row.n_runs for row in found.by_support.values()]
+    assert max(n_runs) <= n_all <= sum(n_runs)
+    differences = [row.difference for row in found.by_support.values()]
+    assert min(differences) <= found.accuracy.difference <= max(differences)
     document = as_json(report)
     assert json.loads(json.dumps(document, allow_nan=False)) == document
     assert document["differences"][0]["accuracy"]["verdict"] == "better"
@@ -39,21 +45,9 @@ def test_signal_sets_that_hold_the_terrain_are_better_than_those_that_do_not(noi
 
 
 def test_a_recipe_has_the_figures_of_its_cross_validation_and_does_not_differ_from_itself(runs, settings):
-    (found,) = compare_recipes(runs, settings(recipe="svm,svm")).differences
+    (found,) = crossval(runs, settings(recipe="svm,svm")).differences
     assert found.accuracy.a == found.accuracy.b == crossval(runs, settings()).accuracy
     assert found.accuracy.verdict is Verdict.NOT_DISTINGUISHED
-
-
-def test_differences_by_support_are_of_the_windows_of_a_level(runs, settings):
-    result = compare_recipes(runs, settings(recipe="svm@currents,svm@imu"))
-    (report,), n_all = result.differences, result.contenders[0].n_runs
-    assert set(report.by_support) <= {level.value for level in SupportLevel}
-    assert report.by_support
-    n_runs = [row.n_runs for row in report.by_support.values()]
-    assert max(n_runs) <= n_all <= sum(n_runs)
-    of_all = report.accuracy.difference
-    differences = [row.difference for row in report.by_support.values()]
-    assert min(differences) <= of_all <= max(differences)
 
 
 class Constant:
@@ -95,10 +89,3 @@ def test_models_without_a_common_class_are_refused(model, drive_all, settings):
     new = drive_all(n_runs=1, seed=92, label="LAVA")
     with pytest.raises(DataError, match="no window of these runs is labelled as a class of all models"):
         compare_models(new, (model, model), settings(model=("old", "new")))
-
-
-def test_a_recipe_is_not_compared_with_a_model():
-    with pytest.raises(ConfigError, match="--model and --recipe do not go together"):
-        EvaluationSettings(recipe=("svm",), model=("models:/field/1",))
-    with pytest.raises(ConfigError, match="unknown signal set 'radar'"):
-        EvaluationSettings(recipe=("svm@radar", "svm"))

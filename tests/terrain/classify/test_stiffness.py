@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from sklearn.metrics import adjusted_rand_score
 
+from terrain.classify.held_out import HeldOut
 from terrain.classify.stiffness import (
     MIN_RUNS,
     StiffnessLevel,
@@ -12,6 +13,7 @@ from terrain.classify.stiffness import (
     cost_matrix,
     least_cost_class,
 )
+from terrain.classify.stiffness_figures import stiffness_figures
 from terrain.errors import DataError
 
 SOFT, FIRM, HARD = StiffnessLevel
@@ -101,3 +103,45 @@ def test_what_cannot_be_clustered_is_refused():
         cluster_runs(np.zeros((10, 3)), np.ones(10), 0)
     with pytest.raises(DataError, match="no feature differs"):
         cluster_runs(np.full((10, 3), np.nan), np.ones(10), 0)
+
+
+KNOWN = {"asphalt": HARD, "concrete": HARD, "snow": SOFT}
+
+
+def figures_of(terrain, predicted, certainty=1.0, known=KNOWN):
+    """Return the figures of windows of runs of ten, of which ``certainty`` is put on the predicted class."""
+    classes = np.unique(terrain)
+    probability = np.full((len(terrain), len(classes)), (1 - certainty) / (len(classes) - 1))
+    probability[np.arange(len(terrain)), np.searchsorted(classes, predicted)] = certainty
+    run_id, rng = np.repeat(np.arange(len(terrain) // 10), 10).astype(str), np.random.default_rng(0)
+    speeds = dict.fromkeys(run_id, 0.5)
+    held_out = HeldOut.of_model(classes, probability, terrain)
+    return stiffness_figures(held_out, run_id, known, rng.normal(size=(len(terrain), 6)), speeds, 0)
+
+
+TERRAIN = np.repeat(["asphalt", "concrete", "snow"], [50, 40, 30])
+
+
+def test_a_wrong_class_of_the_right_level_costs_little():
+    right = figures_of(TERRAIN, TERRAIN)
+    assert (right.accuracy, right.cost, right.soft_hard_ratio) == (1.0, 0.0, 0.0)
+    within = figures_of(TERRAIN, np.where(TERRAIN == "asphalt", "concrete", TERRAIN))
+    assert (within.accuracy, within.cost) == (1.0, pytest.approx(0.25 * 50 / 120))
+    apart = figures_of(TERRAIN, np.where(TERRAIN == "asphalt", "snow", TERRAIN))
+    assert apart.cost == apart.soft_hard_ratio == pytest.approx(50 / 120)
+    assert apart.accuracy == pytest.approx(70 / 120)
+    assert apart.cost_ci[0] <= apart.cost <= apart.cost_ci[1]
+    assert -1.0 <= apart.clusters.interval[0] <= apart.clusters.interval[1] <= 1.0
+    assert apart.levels == {"asphalt": "HARD", "concrete": "HARD", "snow": "SOFT"}
+
+
+def test_two_hard_classes_together_outweigh_a_more_probable_soft_one():
+    doubtful = figures_of(TERRAIN, np.full(120, "snow"), 0.4)
+    assert doubtful.cost == pytest.approx(90 / 120)
+    assert doubtful.least_cost < doubtful.cost
+    assert doubtful.gain == pytest.approx(doubtful.cost - doubtful.least_cost)
+
+
+def test_without_two_known_levels_there_are_no_figures():
+    assert figures_of(TERRAIN, TERRAIN, known={"asphalt": HARD, "concrete": HARD}) is None
+    assert figures_of(TERRAIN, TERRAIN, known=dict.fromkeys(KNOWN, HARD)) is None

@@ -1,8 +1,11 @@
+from collections import Counter
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from terrain.errors import DataError
-from terrain.logs.splicing import Part, splice_runs
+from terrain.logs.splicing import Part, order_stretches, splice_runs, stretches_of
 from terrain.records import RunLog, Stream
 
 CHANNELS = {"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)}
@@ -60,3 +63,30 @@ def test_nothing_to_splice_is_refused():
         splice_runs([], CHANNELS, "course")
     with pytest.raises(DataError, match="run a: no sample of stream 'imu' from 50 to 60 s"):
         splice_runs([Part(run_of("a", 1.0), 50.0, 60.0, "grass")], CHANNELS, "course")
+
+
+def test_stretches_of_a_run_are_cut_without_remainder_or_overlap():
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        part = Part(None, 3.0, 3.0 + rng.uniform(5.0, 120.0), "grass")
+        found = stretches_of(part, rng)
+        lengths_s = [each.end_s - each.start_s for each in found]
+        if part.end_s - part.start_s < 10.0:
+            assert found == []
+            continue
+        assert min(lengths_s) >= 10.0 - 1e-9
+        assert max(lengths_s) <= 30.0 + 1e-9
+        assert found[0].start_s == 3.0
+        assert found[-1].end_s == pytest.approx(part.end_s)
+        assert all(a.end_s == b.start_s for a, b in pairwise(found))
+
+
+def test_grounds_of_a_sequence_alternate_and_as_few_as_possible_are_left_out():
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        terrains = rng.choice(["ice", "snow", "grass"], rng.integers(2, 20), p=[0.5, 0.3, 0.2])
+        found = order_stretches([Part(None, 0.0, 1.0, str(name)) for name in terrains], rng)
+        names = [each.terrain for each in found]
+        assert all(a != b for a, b in pairwise(names))
+        most = max(Counter(terrains.tolist()).values())
+        assert len(names) >= min(len(terrains), 2 * (len(terrains) - most) + 1)
