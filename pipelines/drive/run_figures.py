@@ -59,12 +59,8 @@ def _run_figure(
     if not drive.is_open_loop:
         slip += _control_marks(drive)
     panels = [Panel(moves, "speed [m/s]", y_range=speeds_mps), Panel(slip, "slip ratio", y_range=slips)]
-    names = dict.fromkeys(span[2] for strip in drive.terrains.values() for span in strip)
-    same_colours = [
-        (0.0, 0.0, each) for each in names
-    ]  # in both panels a name has the place of its first use
     for kind, strip in drive.terrains.items():
-        panels.append(Panel([Strip([*same_colours, *strip])], f"{kind} terrain", y_range=(0.0, 1.0)))
+        panels.append(Panel([Strip(strip)], f"{kind} terrain"))
     return Figure(name, panels, x_label="time [s]")
 
 

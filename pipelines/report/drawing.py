@@ -23,6 +23,7 @@ from pipelines.report.tree import Band, Bars, Figure, Line, Panel, Points, Strip
 
 PNG_DPI = 160
 WIDTH_IN, PANEL_HEIGHT_IN, BAR_HEIGHT_IN, HEAD_IN = 8.4, 2.3, 0.26, 0.9
+STRIP_HEIGHT_IN = 0.7
 TITLE_LETTERS_AN_INCH = 11
 LONGEST_NAME = 40
 """Letters of a category; of a longer name the middle is left out."""
@@ -95,7 +96,7 @@ def draw(figure: Figure) -> Drawn:
     grid = drawn.add_gridspec(len(heights), 1, height_ratios=heights)
     for i, panel in enumerate(figure.panels):
         axes = drawn.add_subplot(grid[i])
-        _draw_panel(axes, panel)
+        _draw_panel(axes, panel, strip_names(figure))
         if i == len(heights) - 1 and figure.x_label and not panel.x_label:
             axes.set_xlabel(figure.x_label)
     title = textwrap.fill(plain_line(figure.title), int(TITLE_LETTERS_AN_INCH * WIDTH_IN))
@@ -109,14 +110,25 @@ def _height_in(panel: Panel) -> float:
     bars = [mark for mark in panel.marks if isinstance(mark, Bars)]
     if bars:
         return 0.6 + BAR_HEIGHT_IN * len(bars[0].categories) * max(1.0, 0.7 * len(bars))
+    if all(isinstance(mark, Strip) for mark in panel.marks):
+        return STRIP_HEIGHT_IN
     return 4.5 if panel.equal else PANEL_HEIGHT_IN
 
 
-def _draw_panel(axes: Axes, panel: Panel) -> None:
+def strip_names(figure: Figure) -> list[str]:
+    """Return the names of all intervals of a figure, each of which has one colour in all panels."""
+    marks = [mark for panel in figure.panels for mark in panel.marks if isinstance(mark, Strip)]
+    return list(dict.fromkeys(name for mark in marks for _, _, name in mark.spans))
+
+
+def _draw_panel(axes: Axes, panel: Panel, names: list[str]) -> None:
     bars = [mark for mark in panel.marks if isinstance(mark, Bars)]
     others = [mark for mark in panel.marks if not isinstance(mark, Bars)]
     for number, mark in enumerate(others):
-        _draw_mark(axes, mark, number)
+        if isinstance(mark, Strip):
+            _draw_strip(axes, mark, names, thin=len(panel.marks) == 1)
+        else:
+            _draw_mark(axes, mark, number)
     for number, bar in enumerate(bars):
         _draw_bars(axes, bar, number, len(bars))
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
@@ -146,16 +158,20 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         )
 
 
-def _draw_mark(axes: Axes, mark: Line | Band | Points | Strip, number: int) -> None:
-    if isinstance(mark, Strip):
-        names = list(dict.fromkeys(name for _, _, name in mark.spans))
-        for start, end, name in mark.spans:
-            axes.axvspan(start, end, color=COLOURS[names.index(name) % len(COLOURS)], alpha=0.18, lw=0)
-        for i, name in enumerate(names):
-            axes.fill_between(
-                [], [], color=COLOURS[i % len(COLOURS)], alpha=0.18, lw=0, label=plain_line(name)
-            )
-        return
+def _draw_strip(axes: Axes, mark: Strip, names: list[str], thin: bool) -> None:
+    """Draw intervals in the colours of their names; where nothing else is drawn, without a vertical axis."""
+    alpha = 0.75 if thin else 0.18
+    present = [name for _, _, name in mark.spans]
+    for start, end, name in mark.spans:
+        axes.axvspan(start, end, color=COLOURS[names.index(name) % len(COLOURS)], alpha=alpha, lw=0)
+    for name in dict.fromkeys(present):
+        colour = COLOURS[names.index(name) % len(COLOURS)]
+        axes.fill_between([], [], color=colour, alpha=alpha, lw=0, label=plain_line(name))
+    if thin:
+        axes.set_yticks([])
+
+
+def _draw_mark(axes: Axes, mark: Line | Band | Points, number: int) -> None:
     colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
     label = plain_line(mark.label) or "_nolegend_"
     x = np.asarray(mark.x, float)

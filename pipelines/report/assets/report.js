@@ -9,15 +9,23 @@
   const rises = (x) => x.every((value, i) => i === 0 || (value !== null && x[i - 1] !== null && value > x[i - 1]));
   const written = (value) => value == null ? "–" : String(+value.toPrecision(4)).replace("-", "−");
 
-  // what is drawn of one panel: series that uPlot draws itself, and marks that are drawn over its axes
-  function taken(panel) {
+  const isStrip = (mark) => mark.kind === "strip";
+  const isThin = (panel) => panel.marks.every(isStrip);
+  const namesOf = (panels) => [...new Set(panels.flatMap((panel) => panel.marks.filter(isStrip)
+    .flatMap((mark) => mark.spans.map((span) => span[2]))))];
+
+  // what is drawn of one panel: series that uPlot draws itself, and marks that are drawn over its axes; a name of
+  // intervals has one colour in a figure, and panels of nothing else all have the same names: one legend serves them
+  function taken(panel, figure, thin) {
+    const names = namesOf(figure.panels), shared = thin ? namesOf(figure.panels.filter(isThin)) : [];
     const own = [], drawn = [];
     let number = 0;
     for (const mark of panel.marks) {
-      if (mark.kind === "strip") {
-        const names = [...new Set(mark.spans.map((span) => span[2]))];
-        names.forEach((name, i) => drawn.push({ kind: "strip", label: name, colour: i, number: i,
-          spans: mark.spans.filter((span) => span[2] === name) }));
+      if (isStrip(mark)) {
+        names.forEach((name, i) => {
+          const spans = mark.spans.filter((span) => span[2] === name);
+          if (spans.length || shared.includes(name)) drawn.push({ kind: "strip", label: name, colour: i, number: i, spans, thin });
+        });
         continue;
       }
       const entry = { ...mark, number: number++ };
@@ -42,8 +50,8 @@
     if (categories)
       return { x: panel.x_range || extent([[0], ...flat.flatMap((m) => [m.values, m.low, m.high])], 0.03),
         y: [-0.6, categories.length - 0.4] };
-    const x = flat.flatMap((m) => m.kind === "strip" ? [m.spans.flatMap((s) => [s[0], s[1]])] : [m.x]);
-    const y = flat.flatMap((m) => m.kind === "strip" ? [] : [m.y, m.low, m.high]);
+    const x = flat.flatMap((m) => isStrip(m) ? [m.spans.flatMap((s) => [s[0], s[1]])] : [m.x]);
+    const y = flat.flatMap((m) => isStrip(m) ? [] : [m.y, m.low, m.high]);
     return { x: panel.x_range || extent(x, panel.equal ? 0.04 : 0), y: panel.y_range || extent(y, 0.05) };
   }
 
@@ -51,8 +59,8 @@
     const { ctx } = u, colour = colourOf(mark, mark.number), dpr = devicePixelRatio || 1;
     const px = (value) => u.valToPos(value, "x", true), py = (value) => u.valToPos(value, "y", true);
     ctx.strokeStyle = colour; ctx.lineWidth = 1.3 * dpr; ctx.setLineDash([]);
-    if (mark.kind === "strip") {
-      ctx.fillStyle = faded(colour, 0.18);
+    if (isStrip(mark)) {
+      ctx.fillStyle = faded(colour, mark.thin ? 0.75 : 0.18);
       for (const [start, end] of mark.spans) ctx.fillRect(px(start), u.bbox.top, px(end) - px(start), u.bbox.height);
     } else if (mark.kind === "band") {
       ctx.fillStyle = faded(colour, 0.22);
@@ -103,11 +111,11 @@
   }
 
   function plot(holder, figure, panel, group, last) {
-    const { own, drawn } = taken(panel), bars = drawn.filter((mark) => mark.kind === "bars");
+    const thin = isThin(panel), { own, drawn } = taken(panel, figure, thin), bars = drawn.filter((mark) => mark.kind === "bars");
     const categories = bars.length ? bars[0].categories : null, width = holder.clientWidth;
     const vertical = { count: bars.length, order: new Map(bars.map((mark, i) => [mark, i])) };
     const height = categories ? 46 + Math.max(1, 0.7 * bars.length) * 24 * categories.length
-      : panel.equal ? Math.min(460, width) : 230;
+      : panel.equal ? Math.min(460, width) : thin ? 58 + (panel.x_label || (last && figure.x_label) ? 18 : 0) : 230;
     const full = ranges(panel, categories), zoom = group.zoom, zoomY = { y: null };
     if (panel.equal) {
       const per = Math.max((full.x[1] - full.x[0]) / (width - 70), (full.y[1] - full.y[0]) / (height - 50));
@@ -135,12 +143,13 @@
         size: categories ? Math.min(width * 0.42, 22 + longest) : 54, label: panel.y_label || undefined,
         values: (u, splits) => categories ? splits.map((i) => shortened(categories[i] ?? "", width * 0.42)) : splits.map(written) },
     ];
+    axes[1].show = !thin;
     if (categories) axes[1].splits = () => categories.map((_, i) => i);
     if (panel.log_x) Object.assign(axes[0], { splits: (u, axis, low, high) => decades(low, high),
       values: (u, splits) => splits.map(written), filter: (u, splits) => splits });
     const u = new uPlot({
-      width, height, series, axes, title: panel.title || undefined,
-      legend: { show: series.length > 2 || !panel.y_label, live: !categories },
+      width, height, series, axes, title: panel.title || (thin && panel.y_label) || undefined,
+      legend: { show: thin ? last : series.length > 2 || !panel.y_label, live: !categories && !thin },
       cursor: { sync: { key: group.key }, drag: { x: true, y: !categories, uni: 40, setScale: false },
         bind: { dblclick: () => () => { zoom.x = null; zoomY.y = null; group.redraw(); return null; } } },
       scales: {
@@ -158,6 +167,10 @@
           u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
           group.redraw();
         }],
+        setSeries: [(u, i, { show }) => {
+          if (thin && show !== undefined) for (const other of group.plots)
+            if (other.thin && other !== u && other.series[i].show !== show) other.setSeries(i, { show });
+        }],
         draw: [(u) => {
           u.ctx.save();
           u.ctx.beginPath(); u.ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height); u.ctx.clip();
@@ -166,6 +179,7 @@
         }],
       },
     }, data, holder);
+    u.thin = thin;
     u.reset = () => { zoomY.x = null; };
     u.rescale = () => { u.setScale("x", { min: full.x[0], max: full.x[1] }); u.setScale("y", { min: full.y[0], max: full.y[1] }); };
     return u;
