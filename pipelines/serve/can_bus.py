@@ -1,8 +1,14 @@
-"""``terrain serve --can BUS``: a pilot on a CAN bus, sensors in, corrections of the wheels' speeds out."""
+"""``terrain serve --can BUS``: a pilot on a CAN bus, sensors in, corrections of the wheels' speeds out.
+
+Corrections are the controller's only while the desired twist and the wheels' rates are fresh on both clocks, that
+of the bus and that of this computer, and the steering is where it was computed
+(:mod:`terrain.control.wheel_corrections`).  Nothing that is sent is older than the step that sends it.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import threading
 import time
 from collections import Counter, deque
@@ -12,13 +18,35 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.data.can_codec import MISSING_PACKAGE, OPTIONAL, SIGNALS, Frame, frame_of, load_layout
+from pipelines.data.can_codec import (
+    MISSING_PACKAGE,
+    OPTIONAL,
+    RECEIVED,
+    SIGNALS,
+    Frame,
+    Layout,
+    channels_of,
+    encode,
+    frame_of,
+    load_layout,
+)
+from pipelines.data.can_logs import Receiver
+from pipelines.live.chain import Chain, CommandStatus
+from pipelines.live.classifying import ClassifierThread
+from pipelines.live.over_time import filtered
+from pipelines.live.pilot import LivePilot
+from pipelines.live.terrain_source import Classifier
 from pipelines.report import Column, Pairs, Report, Result, Section, Table, described, format_value, interval
 from pipelines.report.stopping import stopping
-from pipelines.serve.can_bridge import KEPT, BridgeCore, MakeStep, Step
 from pipelines.serve.settings import Settings
+from terrain.control.pilot_settings import PilotSettings
+from terrain.control.slip_table import load_slip_table
+from terrain.control.wheel_controllers import step_or_period
+from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics, corrections, last_samples
 from terrain.errors import ConfigError
-from terrain.records import Array
+from terrain.estimation.live.clocks import SessionClock
+from terrain.records import Array, Sample
+from terrain.robots import SwerveRobot, as_drive, load_robot
 
 REQUIRED = tuple(name for name, channels in SIGNALS.items() if not set(channels) <= OPTIONAL)
 """Streams without which a pilot makes no correction."""
@@ -34,6 +62,18 @@ QUEUE = 20_000
 
 MAX_READ = 2000
 """Frames that are taken between two control steps: a flooded bus delays none."""
+
+
+KEPT = 100_000
+"""Latencies that are kept: half an hour at 50 Hz."""
+
+_STATUS = channels_of("status")
+_NOT_DECIDED = {
+    CommandStatus.NO_SAMPLES: BridgeState.STEERING,
+    CommandStatus.NOT_FINITE: BridgeState.NOT_FINITE,
+    CommandStatus.FAILED: BridgeState.STEP_FAILED,
+}
+"""States of commands that no controller has decided on."""
 
 
 def open_bus(interface: str, channel: str, bitrate: int | None = None) -> Any:
@@ -154,78 +194,152 @@ class Link:
 
 
 class Bridge:
-    """A core on a bus: frames in as they come, a control step at each tick of its own clock.
+    """Samples out of frames, a step of the live chain, corrections into frames, at each tick of its own clock.
 
     Parameters
     ----------
-    core : from frames to frames
-    link : the bus
-    rate_hz : of the control steps
-    clock : time of this computer in s
-    wait : waits so many s, or until it is stopped
+    layout : of the DBC
+    robot : a swerve robot
+    chain : gives the commands; begins where the steering is measured first
 
     Attributes
     ----------
+    receiver : of the frames; it counts those that are used, and what was not used by kind, steps that failed too
+    n_in : frames received
+    samples, states : samples by stream; control steps by :class:`BridgeState`
+    clipped : values sent as the end of their range, by signal
+    latencies_s : from the stamp of the wheels' newest sample to the correction sent
+    steps_s : time of each control step
     ticks_missed : control steps left out as one before took too long
     duration_s : from the start to the stop
-    steps_s : time of each control step
     """
 
-    def __init__(
-        self,
-        core: BridgeCore,
-        link: Link,
-        rate_hz: float,
-        clock: Callable[[], float] = time.monotonic,
-        wait: Callable[[float], Any] | None = None,
-    ) -> None:
-        self._core, self._link, self._period_s, self._clock = core, link, 1.0 / rate_hz, clock
+    def __init__(self, layout: Layout, robot: SwerveRobot, chain: Chain) -> None:
+        self._layout, self._chain = layout, chain
+        self.receiver = Receiver(layout, RECEIVED)
+        self._robot, self._zeros_rad = robot, robot.steering_zeros_rad
+        self._kinematics: LowLevelKinematics | None = None
+        self._clock, self._last = SessionClock(), last_samples()
+        self._before_s, self._counter, self._new_wheels = math.nan, 0, False
         self._stopped = threading.Event()
-        self._wait = wait or self._stopped.wait
-        self.ticks_missed = 0
+        self.n_in = self.ticks_missed = 0
         self.duration_s = 0.0
+        self.samples: Counter[str] = Counter()
+        self.states: Counter[str] = Counter()
+        self.clipped: Counter[str] = Counter()
+        self.latencies_s: deque[float] = deque(maxlen=KEPT)
         self.steps_s: deque[float] = deque(maxlen=KEPT)
 
     def stop(self) -> None:
         """End :meth:`run` at once; a signal handler may call it."""
         self._stopped.set()
 
-    def run(self, duration_s: float | None = None) -> None:
-        """Run until stopped, or for a time; then send corrections of zero and shut the bus down."""
-        start_s = due_s = self._clock()
-        end_s = np.inf if duration_s is None else start_s + duration_s
+    def run(
+        self,
+        link: Link,
+        rate_hz: float,
+        duration_s: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+        wait: Callable[[float], Any] | None = None,
+    ) -> None:
+        """Run until stopped, or for a time; then send corrections of zero and shut the bus down.
+
+        Parameters
+        ----------
+        link : the bus
+        rate_hz : of the control steps
+        duration_s : None for no end
+        clock : time of this computer in s
+        wait : waits so many s, or until it is stopped
+        """
+        period_s, wait = 1.0 / rate_hz, wait or self._stopped.wait
+        start_s = due_s = clock()
+        end_s = math.inf if duration_s is None else start_s + duration_s
         try:
-            while not self._stopped.is_set() and (now_s := self._clock()) < end_s:
+            while not self._stopped.is_set() and (now_s := clock()) < end_s:
                 if now_s < due_s:
-                    self._wait(min(due_s, end_s) - now_s)
+                    wait(min(due_s, end_s) - now_s)
                     continue
-                self._control()
-                due_s += self._period_s
-                late = int((self._clock() - due_s) / self._period_s)
-                if late > 0:
-                    self.ticks_missed += late
-                    due_s += late * self._period_s
+                for frame, read_s in link.frames():
+                    self.receive(frame, read_s)
+                began_s = clock()
+                frames = self.tick(began_s)
+                self.steps_s.append(clock() - began_s)
+                if link.send(frames):
+                    self.sent(clock())
+                due_s += period_s
+                late = max(int((clock() - due_s) / period_s), 0)
+                self.ticks_missed += late
+                due_s += late * period_s
         finally:
-            self.duration_s = self._clock() - start_s
-            self._link.send(self._core.stop(self._clock()))
-            self._link.close()
+            self.duration_s = clock() - start_s
+            link.send(self._frames(np.zeros(3), {}, BridgeState.STOPPED, self._clock.at(clock())))
+            link.close()
 
-    def _control(self) -> None:
-        for frame, read_s in self._link.frames():
-            self._core.receive(frame, read_s)
-        began_s = self._clock()
-        frames = self._core.tick(began_s)
-        self.steps_s.append(self._clock() - began_s)
-        if self._link.send(frames):
-            self._core.sent(self._clock())
+    def receive(self, frame: Frame, read_s: float) -> None:
+        """Take a frame that was read at a time of this computer."""
+        self.n_in += 1
+        if self.receiver.take(frame) is not None:
+            self._clock.received(frame.time_s, read_s)
+
+    def tick(self, read_s: float) -> list[Frame]:
+        """Return the frames of a control step at a time of this computer."""
+        now_s = self._clock.at(read_s)
+        readings = self.receiver.readings(now_s)
+        self.samples.update({name: len(reading.time_s) for name, reading in readings.items()})
+        new = {name: last.take(readings.get(name), read_s) for name, last in self._last.items()}
+        self._new_wheels = new["wheels"]
+        readings.pop("twist", None)
+        added, status, state = self._control(Sample(now_s, np.zeros(3), readings), read_s)
+        self._before_s = now_s
+        self.states[state.name] += 1
+        return self._frames(added, status, state, now_s)
+
+    def sent(self, read_s: float) -> None:
+        """Note when the frames of the last step were sent."""
+        if self._new_wheels:
+            self.latencies_s.append(self._clock.at(read_s) - self._last["wheels"].stamp_s)
+
+    def _control(self, sample: Sample, read_s: float) -> tuple[Array, Mapping[str, float], BridgeState]:
+        """Return corrections, the controller's status, and the state."""
+        states = {name: last.state(sample.time_s, read_s) for name, last in self._last.items()}
+        state = next((each for each in states.values() if each != BridgeState.ACTIVE), BridgeState.ACTIVE)
+        measured_rad = self._last["steering"].values - self._zeros_rad
+        if np.isnan(measured_rad).any():  # it never came
+            return np.zeros(3), {}, state
+        if self._kinematics is None:
+            self._kinematics = LowLevelKinematics(self._robot, measured_rad)
+        if states["twist"] == BridgeState.ACTIVE:
+            sample = sample._replace(twist=self._last["twist"].values)
+        wheel_radps = self._kinematics.step(sample.twist, step_or_period(sample.time_s - self._before_s))
+        done = self._chain.take(sample)
+        assert done.command is not None  # of a chain that drives
+        added, found = corrections(done.command, wheel_radps, self._kinematics.steer_rad, measured_rad)
+        if done.failure:
+            self.receiver.dropped[done.failure[:160]] += 1
+        found = _NOT_DECIDED.get(done.status, found)
+        if state == BridgeState.ACTIVE or found == BridgeState.STEP_FAILED:
+            state = found
+        return (added if state == BridgeState.ACTIVE else np.zeros(3)), done.command.status, state
+
+    def _frames(
+        self, added: Array, status: Mapping[str, float], state: BridgeState, now_s: float
+    ) -> list[Frame]:
+        figures = {**status, "bridge_code": float(state)}
+        values = [figures.get(name, math.nan) for name in _STATUS]
+        # a code below zero stands for none
+        coded = [
+            math.nan if n.endswith("_code") and v < 0.0 else v for n, v in zip(_STATUS, values, strict=True)
+        ]
+        counter, self._counter = self._counter, self._counter + 1
+        return [
+            *encode(self._layout, "corrections", added.tolist(), counter, now_s, self.clipped),
+            *encode(self._layout, "status", coded, counter, now_s, self.clipped),
+        ]
 
 
-@dataclass(frozen=True)
-class Latency:
-    """Times in ms: None where there was none."""
-
-    median_ms: float | None
-    p99_ms: float | None
+Latency = Mapping[str, float | None]
+"""Median and 99th percentile in ms: None where there was no step."""
 
 
 def latency_of(times_s: Sequence[float]) -> Latency:
@@ -234,14 +348,15 @@ def latency_of(times_s: Sequence[float]) -> Latency:
     Examples
     --------
     >>> latency_of([0.001, 0.002, 0.003])
-    Latency(median_ms=2.0, p99_ms=2.98)
+    {'median_ms': 2.0, 'p99_ms': 2.98}
     >>> latency_of([])
-    Latency(median_ms=None, p99_ms=None)
+    {'median_ms': None, 'p99_ms': None}
     """
-    if not times_s:
-        return Latency(None, None)
-    median, p99 = np.percentile(np.asarray(times_s), [50.0, 99.0])
-    return Latency(round(1e3 * float(median), 4), round(1e3 * float(p99), 4))
+    found = np.percentile(np.asarray(times_s), [50.0, 99.0]).tolist() if times_s else [None, None]
+    return {
+        name: None if each is None else round(1e3 * each, 4)
+        for name, each in zip(("median_ms", "p99_ms"), found, strict=True)
+    }
 
 
 @dataclass(frozen=True, repr=False)
@@ -276,8 +391,6 @@ def run(settings: Settings) -> BridgeResult:
     TerrainError
         if robot, table, model or DBC are not accepted, or the bus cannot be opened.
     """
-    from terrain.robots import SwerveRobot, as_drive, load_robot
-
     interface, channel = bus_of(settings.can or "")
     layout = load_layout(settings.dbc, REQUIRED)
     robot = as_drive(
@@ -285,27 +398,37 @@ def run(settings: Settings) -> BridgeResult:
         load_robot(settings.robot or "agrimaro"),
         "robot {name}: drive {drive!r} has no pilot, only 'swerve' has",
     )
-    core = BridgeCore(layout, robot, _pilot(settings, robot))
-    link = Link(lambda: open_bus(interface, channel, settings.bitrate))
-    bridge = Bridge(core, link, settings.rate_hz)
+    table, model = load_slip_table(settings.table), None
+    if settings.model is not None:
+        from pipelines.learn.load import load_model
+
+        model = filtered(load_model(settings.model), settings.filter_stride_s)
+    source, chosen = (
+        Classifier(model, robot, ClassifierThread()),
+        PilotSettings(controller=settings.controller),
+    )
+    chain = LivePilot(
+        robot, table, source, chosen, channels={name: channels_of(name) for name in RECEIVED[:-1]}
+    )
+    bridge, link = Bridge(layout, robot, chain), Link(lambda: open_bus(interface, channel, settings.bitrate))
     with stopping(bridge.stop):
-        bridge.run(settings.duration_s)
+        bridge.run(link, settings.rate_hz, settings.duration_s)
     return BridgeResult(
         interface=interface,
         channel=channel,
         dbc=layout.name,
         robot=robot.name,
         duration_s=round(bridge.duration_s, 3),
-        frames_in=core.n_in,
-        frames_used=core.receiver.n_used,
+        frames_in=bridge.n_in,
+        frames_used=bridge.receiver.n_used,
         frames_out=link.n_out,
-        samples=dict(sorted(core.samples.items())),
-        dropped=dict(sorted((core.receiver.dropped + core.failed).items())),
+        samples=dict(sorted(bridge.samples.items())),
+        dropped=dict(sorted(bridge.receiver.dropped.items())),
         bus_errors=dict(sorted(link.errors.items())),
-        clipped=dict(sorted(core.clipped.items())),
-        states=dict(sorted(core.states.items())),
+        clipped=dict(sorted(bridge.clipped.items())),
+        states=dict(sorted(bridge.states.items())),
         ticks_missed=bridge.ticks_missed,
-        wheels_to_correction=latency_of(core.latencies_s),
+        wheels_to_correction=latency_of(bridge.latencies_s),
         step=latency_of(bridge.steps_s),
     )
 
@@ -320,30 +443,6 @@ def bus_of(text: str) -> tuple[str, str]:
     """
     interface, colon, channel = text.partition(":")
     return (interface, channel) if colon else ("socketcan", text)
-
-
-def _pilot(settings: Settings, robot: Any) -> MakeStep:
-    """Return what makes the step of the pilot that the settings describe; what is not accepted is refused."""
-    from pipelines.live.pilot import LivePilot
-    from terrain.control.pilot_settings import PilotSettings
-    from terrain.control.slip_table import load_slip_table
-
-    table, source = load_slip_table(settings.table), None
-    if settings.model is not None:
-        from pipelines.learn.load import load_model
-        from pipelines.live.classifying import ClassifierThread
-        from pipelines.live.over_time import filtered
-        from pipelines.live.terrain_source import Classifier
-
-        model = filtered(load_model(settings.model), settings.filter_stride_s)
-        source = Classifier(model, robot, ClassifierThread())
-    pilot_settings = PilotSettings(controller=settings.controller)
-
-    def make(steer_rad: Array) -> Step:
-        return LivePilot(robot, table, source, pilot_settings, steer_rad=steer_rad).step
-
-    make(np.zeros(3))  # before the bus is opened
-    return make
 
 
 def report(result: BridgeResult) -> Report:
@@ -365,8 +464,14 @@ def report(result: BridgeResult) -> Report:
     pairs = (
         ("frames in, used, out", f"{result.frames_in}, {result.frames_used}, {result.frames_out}"),
         ("control steps left out", result.ticks_missed),
-        ("wheels to correction, median to p99", interval(latency.median_ms, latency.p99_ms, ".2f", "ms")),
-        ("control step, median to p99", interval(result.step.median_ms, result.step.p99_ms, ".2f", "ms")),
+        (
+            "wheels to correction, median to p99",
+            interval(latency["median_ms"], latency["p99_ms"], ".2f", "ms"),
+        ),
+        (
+            "control step, median to p99",
+            interval(result.step["median_ms"], result.step["p99_ms"], ".2f", "ms"),
+        ),
     )
     columns = (Column("kind"), Column("name", long=True), Column("number"))
     return Report(

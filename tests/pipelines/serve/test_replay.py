@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+from threading import Event
 from time import perf_counter
 
 import numpy as np
@@ -39,16 +40,15 @@ def grass():
 
 def replayed(run, model, stop_at_s=np.inf, **settings):
     """The replayed run, and when each second of it was passed."""
-    moments = []
-    result = replay_run(
-        run,
-        chain_of(run, model, TABLE),
-        Settings(replay="a log", **settings),
-        () if model is None else model.info.classes,
-        lambda task, done, total: moments.append((perf_counter(), done)),
-        stopped=lambda: bool(moments) and moments[-1][1] >= stop_at_s,
-    )
-    return result, moments
+    moments, stop = [], Event()
+
+    def progress(task, done, total):
+        moments.append((perf_counter(), done))
+        if done >= stop_at_s:
+            stop.set()
+
+    chain, classes = chain_of(run, model, TABLE), () if model is None else model.info.classes
+    return replay_run(run, chain, Settings(replay="a log", **settings), classes, progress, stop), moments
 
 
 def test_an_observer_gives_what_predict_gives(runs, husky_model):

@@ -1,0 +1,548 @@
+"""Corrections are the controller's or zero: never stale, never not finite, whatever is received or fails."""
+
+import math
+import os
+import signal
+import threading
+import time
+import uuid
+from collections import Counter
+from dataclasses import replace
+
+import can
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipelines.data.can_codec import (
+    QUATERNION,
+    RECEIVED,
+    Frame,
+    channels_of,
+    decode,
+    encode,
+    frame_of,
+    load_layout,
+)
+from pipelines.live.chain import CommandStatus, Step
+from pipelines.live.pilot import LivePilot
+from pipelines.serve.can_bus import Bridge, Link, open_bus
+from pipelines.serve.serve import Settings, run
+from terrain.control.drive_metrics import drive_history, slip_peak
+from terrain.control.pilot_settings import PilotSettings
+from terrain.control.situations import SituationOptions, make_situation
+from terrain.control.slip_table import load_slip_table
+from terrain.control.wheel_controllers import PERIOD_S
+from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics
+from terrain.errors import ConfigError
+from terrain.records import Command, Sample, Stream
+from terrain.robots import load_robot
+from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.run import simulate_run
+
+from .strangers import until
+
+LAYOUT, ROBOT, TABLE = load_layout(), load_robot("agrimaro"), load_slip_table()
+ACTIVE, RESOLUTION_RADPS = BridgeState.ACTIVE, 0.0005
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    return simulate_run(ROBOT, "grass", "arc", 7, duration_s=14.0)
+
+
+@pytest.fixture(scope="module")
+def frames(recorded, run_frames):
+    return [frame for frame in run_frames(LAYOUT, recorded) if frame.time_s <= 12.0]
+
+
+def pilot(controller, steer_rad=None):
+    channels = {name: channels_of(name) for name in RECEIVED[:-1]}
+    chosen = PilotSettings(controller=controller)
+    return LivePilot(ROBOT, TABLE, settings=chosen, steer_rad=steer_rad, channels=channels)
+
+
+class Slower:
+    """A chain that commands each wheel 1 rad/s less than the kinematics: corrections are -1, or zero.
+
+    Parameters
+    ----------
+    changed : is given each step and its number, and returns another
+    """
+
+    def __init__(self, changed=lambda step, n: step):
+        self._kinematics, self._before_s, self._changed, self._n = None, math.nan, changed, 0
+
+    def take(self, sample):
+        if self._kinematics is None:
+            steer_rad = sample.readings["steering"].values[-1] - ROBOT.steering_zeros_rad
+            self._kinematics = LowLevelKinematics(ROBOT, steer_rad)
+        dt_s = sample.time_s - self._before_s
+        radps = self._kinematics.step(sample.twist, dt_s if 0 < dt_s < 0.5 else PERIOD_S)
+        self._before_s, self._n = sample.time_s, self._n + 1
+        command = Command(radps - 1.0, self._kinematics.steer_rad, sample.twist, {"status_code": 0.0})
+        return self._changed(Step((), command), self._n)
+
+
+def bridged(chain=None):
+    return Bridge(LAYOUT, ROBOT, chain or Slower())
+
+
+def ticks(bridge, frames, until_s, read_at=lambda frame: frame.time_s):
+    """Give frames as their time comes; return time, corrections and state of each control step."""
+    frames, place, rows = sorted(frames, key=read_at), 0, []
+    for k in range(round(until_s / PERIOD_S)):
+        tick_s = (k + 1) * PERIOD_S + 1e-6
+        while place < len(frames) and read_at(frames[place]) <= tick_s:
+            bridge.receive(frames[place], read_at(frames[place]))
+            place += 1
+        sent = [decode(LAYOUT, frame) for frame in bridge.tick(tick_s)]
+        bridge.sent(tick_s)
+        added, state = np.array(sent[0].values), BridgeState(int(sent[1].values[4]))
+        assert np.isfinite(added).all()
+        assert sent[0].counter == sent[1].counter == k % 256
+        assert state == ACTIVE or not added.any(), "a correction without what it is built on"
+        rows.append((tick_s, added, state))
+    return rows
+
+
+def of(stream):
+    keys = {plan.message.frame_id for plan in LAYOUT.by_stream[stream]}
+    return lambda frame: frame.arbitration_id in keys
+
+
+def states(rows, start_s, end_s):
+    return {state for tick_s, _, state in rows if start_s < tick_s < end_s}
+
+
+def test_corrections_are_those_of_the_pilot_stepped_directly(frames):
+    """On the same samples, rounded by hand, to half a resolution: the bridge adds nothing."""
+    bridge = bridged(pilot("thesis"))
+    rows = ticks(bridge, frames, 12.0)
+    streams = {name: rounded_samples(frames, name) for name in RECEIVED}
+    direct, plain = (pilot(controller, streams["steering"][1][0]) for controller in ("thesis", "plain"))
+    largest, before_s = 0.0, -1.0
+    for tick_s, added, state in rows:
+        assert state == ACTIVE
+        readings = {}
+        for name, (time_s, values) in streams.items():
+            here = (time_s > before_s) & (time_s <= tick_s)
+            if here.any():
+                readings[name] = (time_s[here], values[here])
+        twists = streams["twist"]
+        twist = twists[1][np.searchsorted(twists[0], tick_s, side="right") - 1]
+        readings.pop("twist", None)
+        expected = direct.step(Sample(tick_s, twist, readings)).wheel_radps
+        expected = expected - plain.step(Sample(tick_s, twist, {})).wheel_radps
+        np.testing.assert_allclose(added, expected, atol=0.5 * RESOLUTION_RADPS * (1 + 1e-6))
+        largest, before_s = max(largest, np.abs(expected).max()), tick_s
+    assert largest > 0.2
+    assert bridge.receiver.dropped.total() == bridge.clipped.total() == 0
+
+
+def rounded_samples(frames, name):
+    """Times and values of a stream, put together without the assembler."""
+    samples = {}
+    for frame in filter(of(name), frames):
+        part = decode(LAYOUT, frame)
+        row = samples.setdefault(frame.time_s, np.full(len(channels_of(name)), np.nan))
+        row[list(part.columns)] = part.values
+        if name == "odometry":
+            row[QUATERNION[3]] = math.sqrt(max(0.0, 1.0 - sum(row[list(QUATERNION[:3])] ** 2)))
+    return np.array(list(samples)), np.array(list(samples.values()))
+
+
+STALE_S = {"twist": 0.2, "wheels": 0.1, "steering": 0.2}
+STALE = {
+    "twist": BridgeState.STALE_TWIST,
+    "wheels": BridgeState.STALE_WHEELS,
+    "steering": BridgeState.STEERING,
+}
+NEVER = STALE | {"twist": BridgeState.NO_TWIST, "wheels": BridgeState.NO_WHEELS}
+
+
+@pytest.mark.parametrize(
+    ("stream", "how", "kind"),
+    [
+        ("twist", "lost", ""),
+        ("twist", "damaged", "wrong checksum"),
+        ("wheels", "not measured", ""),
+        ("wheels", "damaged", "wrong length"),
+        ("steering", "hung", "steering: repeated or late"),
+        ("steering", "not measured", ""),
+    ],
+)
+def test_a_stream_that_ends_stops_corrections_in_time_and_one_that_returns_starts_them(
+    frames, stream, how, kind
+):
+    """Also one whose sender repeats its last frame, measures nothing, or sends what its CRC does not fit."""
+    ids, last, n_ended = [plan.message.frame_id for plan in LAYOUT.by_stream[stream]], {}, Counter()
+
+    def ended(frame):
+        if not of(stream)(frame) or not 3.0 < frame.time_s < 4.0:
+            last[frame.arbitration_id] = frame
+            return [frame]
+        if how == "hung":
+            return [last[frame.arbitration_id]._replace(time_s=frame.time_s)]
+        if how == "not measured":
+            n_ended[frame.arbitration_id] += 1
+            values = [math.nan] * len(channels_of(stream))
+            sent = encode(LAYOUT, stream, values, 90 + n_ended[frame.arbitration_id], frame.time_s)
+            return [sent[ids.index(frame.arbitration_id)]]
+        if how == "damaged":  # the twist has a CRC
+            flipped = bytes([frame.data[0] ^ 0x40, *frame.data[1:]])
+            return [frame._replace(data=flipped if stream == "twist" else frame.data[:5])]
+        return []
+
+    bridge = bridged()
+    rows = ticks(bridge, [sent for frame in frames for sent in ended(frame)], 5.0)
+    assert states(rows, 1.0, 3.0) == {ACTIVE}
+    assert states(rows, 3.0 + STALE_S[stream] + PERIOD_S, 4.0) == {STALE[stream]}
+    assert states(rows, 4.0 + 2 * PERIOD_S, 5.0) == {ACTIVE}
+    active = np.array([added for _, added, each in rows if each == ACTIVE])
+    np.testing.assert_allclose(active, -1.0, atol=0.001)
+    dropped = bridge.receiver.dropped
+    assert dropped[kind] > 40 if kind else not dropped
+
+
+def test_a_stream_that_never_came_is_named(frames):
+    for stream, state in NEVER.items():
+        rows = ticks(bridged(), [frame for frame in frames if not of(stream)(frame)], 1.0)
+        assert states(rows, 0.05, 1.0) == {state}
+
+
+def test_frames_that_were_read_too_late_are_stale(frames):
+    """A computer that does not come to read for 0.4 s: what it then reads was measured long ago."""
+
+    def read_at(frame):
+        return frame.time_s if frame.time_s < 3.0 else frame.time_s + min(0.4, 4 * (frame.time_s - 3.0))
+
+    rows = ticks(bridged(), frames, 3.45, read_at=read_at)
+    assert states(rows, 3.3, 3.45) & {BridgeState.STALE_WHEELS, BridgeState.STALE_TWIST}
+    assert ACTIVE not in states(rows, 3.35, 3.45)
+
+
+@pytest.mark.parametrize("offset_s", [1.7e9, -50.0])
+def test_the_clock_of_the_bus_may_be_any_and_one_that_is_set_is_followed(frames, offset_s):
+    """An hour ahead and back, as a computer's is by the network: corrections are zero, then go on."""
+
+    def stamped(frame):
+        return frame._replace(time_s=frame.time_s + offset_s + 3600.0 * (3.0 < frame.time_s < 6.0))
+
+    changed = [stamped(frame) for frame in frames]
+    read = {id(new): frame.time_s for new, frame in zip(changed, frames, strict=True)}
+    bridge = bridged()
+    rows = ticks(bridge, changed, 10.0, read_at=lambda frame: read[id(frame)])
+    for start_s, end_s in ((0.05, 3.0), (4.2, 6.0), (7.2, 10.0)):
+        assert states(rows, start_s, end_s) == {ACTIVE}
+    assert np.percentile(bridge.latencies_s, 95) < 0.021
+
+
+def test_steering_elsewhere_than_computed_gets_no_correction(recorded, run_frames):
+    """At 0.6 rad from the command the low-level kinematics commands other rates; half a turn is the same."""
+    for turn_rad, state in ((0.0, ACTIVE), (0.6, BridgeState.STEERING), (math.pi, ACTIVE)):
+        steering = recorded.streams["steering"]
+        values = steering.values.copy()
+        values[steering.time_s > 2.0, 1] += turn_rad
+        streams = dict(recorded.streams) | {"steering": Stream(steering.time_s, values, steering.channels)}
+        turned = [f for f in run_frames(LAYOUT, replace(recorded, streams=streams)) if f.time_s < 3.0]
+        rows = ticks(bridged(), turned, 3.0)
+        assert states(rows, 2.1, 3.0) == {state}
+        if state == ACTIVE:
+            sign = np.array([-1.0, 1.0 if turn_rad else -1.0, -1.0])
+            np.testing.assert_allclose(rows[-1][1], sign, atol=0.001)
+
+
+@pytest.mark.parametrize(
+    ("radps", "status", "state"),
+    [
+        (math.nan, CommandStatus.OK, BridgeState.NOT_FINITE),
+        (math.inf, CommandStatus.OK, BridgeState.NOT_FINITE),
+        (0.0, CommandStatus.NOT_FINITE, BridgeState.NOT_FINITE),
+        (0.0, CommandStatus.FAILED, BridgeState.STEP_FAILED),
+    ],
+)
+def test_a_chain_that_fails_leaves_corrections_of_zero(frames, radps, status, state):
+    """From its 100th step on."""
+
+    def changed(step, n):
+        if n < 100:
+            return step
+        command = step.command._replace(wheel_radps=np.array([0.0, radps, 0.0]))
+        failure = "a step failed" if status is CommandStatus.FAILED else ""
+        return step._replace(command=command, status=status, failure=failure)
+
+    bridge = bridged(Slower(changed))
+    rows = ticks(bridge, frames, 3.0)
+    assert states(rows, 0.05, 1.9) == {ACTIVE}
+    assert states(rows, 2.1, 3.0) == {state}
+    assert bool(bridge.receiver.dropped) == (state == BridgeState.STEP_FAILED)
+
+
+ANY_FRAME = st.builds(
+    Frame,
+    st.one_of(st.floats(0.0, 3.0), st.floats()),
+    st.sampled_from([*sorted(plan.message.frame_id for plan in LAYOUT.by_key.values()), 0x7FF]),
+    st.binary(min_size=0, max_size=9),
+    st.booleans(),
+    st.integers(0, 20).map(lambda n: n == 0),
+    st.integers(0, 20).map(lambda n: n == 0),
+)
+
+
+@settings(max_examples=40)
+@given(st.lists(ANY_FRAME, max_size=60), st.integers(0, 200))
+def test_no_frame_breaks_the_rule(frames, extra, every):
+    """Random frames between those of a drive: finite corrections, and zero where the state says so."""
+    mixed = [frame for frame in frames if frame.time_s < 0.6]
+    read = {id(frame): frame.time_s for frame in mixed}
+    for k, frame in enumerate(extra):
+        read[id(frame)] = (k * 0.01 + every * 0.003) % 0.6
+    bridge = bridged()
+    assert len(ticks(bridge, [*mixed, *extra], 0.6, read_at=lambda frame: read[id(frame)])) == 30
+    assert bridge.n_in >= bridge.receiver.n_used
+
+
+class Time:
+    """A clock that a test moves."""
+
+    now_s = 100.0
+
+    def __call__(self):
+        return self.now_s
+
+    def wait(self, s):
+        self.now_s += s
+
+
+class ScriptedLink:
+    """A link in a test's time: gives frames that are due, and sends none while its buffer is full."""
+
+    def __init__(self, clock, full_s=(np.inf, np.inf)):
+        self._clock, self._full_s, self.sent, self.n_closed = clock, full_s, [], 0
+        rows = {"wheels": [25.0] * 3 + [1.0] * 3, "steering": [0.0] * 3, "twist": [0.5, 0.0, 0.0]}
+        self._due = [
+            frame
+            for number, time_s in enumerate(np.arange(100.0, 104.0, 0.02).tolist())
+            for name, row in rows.items()
+            for frame in encode(LAYOUT, name, row, number, time_s)
+        ]
+
+    def frames(self):
+        n = sum(frame.time_s <= self._clock() for frame in self._due)
+        taken, self._due = self._due[:n], self._due[n:]
+        return [(frame, frame.time_s) for frame in taken]
+
+    def send(self, frames):
+        if self._full_s[0] <= self._clock() < self._full_s[1]:
+            return False
+        self.sent += [(self._clock(), frame) for frame in frames]
+        return True
+
+    def close(self):
+        self.n_closed += 1
+
+
+def message(frame, time_s=0.0):
+    return can.Message(
+        arbitration_id=frame.arbitration_id, data=frame.data, is_extended_id=False, timestamp=time_s
+    )
+
+
+def last_state(frame):
+    return BridgeState(int(decode(LAYOUT, frame).values[4]))
+
+
+@pytest.mark.parametrize("rate_hz", [20.0, 100.0])
+def test_corrections_are_sent_at_the_rate_and_zero_in_the_end(rate_hz):
+    clock, bridge = Time(), bridged()
+    link = ScriptedLink(clock)
+    bridge.run(link, rate_hz, 3.0, clock, clock.wait)
+    times = [time_s for time_s, sent in link.sent if sent.arbitration_id == 0x101]
+    np.testing.assert_allclose(np.diff(times[:-1]), 1.0 / rate_hz, atol=1e-9)
+    assert len(times) - 1 == pytest.approx(3.0 * rate_hz, abs=1)
+    states = [last_state(sent) for _, sent in link.sent if sent.arbitration_id == 0x102]
+    assert set(states[5:-1]) == {ACTIVE}
+    assert states[-1] == BridgeState.STOPPED
+    assert decode(LAYOUT, link.sent[-2][1]).values == (0.0, 0.0, 0.0)
+    assert (link.n_closed, bridge.ticks_missed) == (1, 0)
+
+
+def test_what_could_not_be_sent_is_not_sent_later_and_late_steps_are_left_out_and_counted():
+    clock = Time()
+    link = ScriptedLink(clock, full_s=(101.0, 102.0))
+    bridged().run(link, 50.0, 3.0, clock, clock.wait)
+    counters = [sent.data[6] for _, sent in link.sent if sent.arbitration_id == 0x101]
+    assert max(np.diff(counters)) == 51, "the receiver sees how many are missing"
+    clock = Time()
+    slow = bridged(Slower(lambda step, n: clock.wait(0.07) or step))
+    slow.run(ScriptedLink(clock), 50.0, 2.0, clock, clock.wait)
+    assert slow.ticks_missed > 50
+    assert slow.states.total() + slow.ticks_missed == pytest.approx(100, abs=3)
+
+
+class FailingBus(can.BusABC):
+    """A bus that gives messages as fast as they are read, until it fails."""
+
+    def __init__(self, given):
+        self._given, self.n_shut = list(given), 0
+        super().__init__(channel="failing")
+
+    def _recv_internal(self, timeout):
+        if not self._given:
+            raise can.CanOperationError("Network is down")
+        return self._given.pop(0), True
+
+    def send(self, message, timeout=None):
+        assert timeout == 0, "a command that waits is stale"
+        raise can.CanOperationError("Transmit buffer full")
+
+    def shutdown(self):
+        self.n_shut += 1
+        super().shutdown()
+
+
+def test_a_bus_that_fails_is_opened_again_and_what_it_refuses_is_counted(monkeypatch):
+    monkeypatch.setattr("pipelines.serve.can_bus.REOPEN_S", 0.1)
+    odd = [
+        can.Message(is_error_frame=True, arbitration_id=0x40),
+        can.Message(is_error_frame=True, arbitration_id=0x4),
+        can.Message(is_remote_frame=True, arbitration_id=0x120, is_extended_id=False),
+        can.Message(arbitration_id=0x120, data=bytes(3), is_extended_id=False),
+        can.Message(arbitration_id=0x101, data=bytes(8), is_extended_id=False),
+    ]
+    opened, gone = [], [True]
+
+    def make_bus():
+        if opened and gone[0]:
+            raise OSError("No such device")
+        opened.append(FailingBus(odd if not opened else []))
+        return opened[-1]
+
+    link, bridge = Link(make_bus), bridged()
+    assert not link.send([Frame(0.0, 0x101, bytes(8))])
+    until(lambda: link.errors["receive: Network is down"])
+    found = link.frames()
+    assert not link.send([]), "a bus that is closed sends nothing"
+    for frame, read_s in found:
+        bridge.receive(frame, read_s)
+    kinds = ("bus off", "error frame", "remote frame", "wrong length", "wrong checksum")
+    assert bridge.receiver.dropped == dict.fromkeys(kinds, 1)
+    until(lambda: link.frames() == [] and link.errors["open: No such device"])
+    gone[0] = False
+    until(lambda: link.frames() == [] and len(opened) == 2)
+    link.close()
+    assert [bus.n_shut for bus in opened] == [1, 1]
+    assert link.errors["send: Transmit buffer full"] == 1
+    assert link.n_out == 0
+
+
+def test_on_a_real_virtual_bus_a_wheels_frame_is_answered_within_a_period_beside_a_flood():
+    channel, bridge = f"real-{uuid.uuid4()}", bridged()
+    link = Link(lambda: open_bus("virtual", channel))
+    with can.Bus(interface="virtual", channel=channel) as robot:
+        thread = threading.Thread(target=bridge.run, args=(link, 50.0, 0.6))
+        thread.start()
+        rows = {"wheels": [25.0] * 3 + [1.0] * 3, "steering": [0.0] * 3, "twist": [0.5, 0, 0]}
+        for number in range(25):
+            for name, row in rows.items():
+                for frame in encode(LAYOUT, name, row, number):
+                    robot.send(message(frame))
+            for _ in range(50):
+                robot.send(can.Message(arbitration_id=0x7FF, data=bytes(8), is_extended_id=False))
+            time.sleep(0.02)
+        thread.join()
+        received = list(iter(lambda: robot.recv(0), None))
+    assert bridge.states["ACTIVE"] >= 15
+    assert len(received) == link.n_out == 2 * (bridge.states.total() + 1)
+    assert np.median(bridge.latencies_s) < 0.03
+    assert bridge.receiver.dropped == {"unknown id": 25 * 50}
+
+
+def test_a_signal_ends_it_in_order():
+    """SIGTERM, as a service manager sends it: zero corrections, the bus shut down, the report."""
+    channel = f"term-{uuid.uuid4()}"
+    with can.Bus(interface="virtual", channel=channel) as robot:
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGTERM)).start()
+        result = run(Settings(can=f"virtual:{channel}", duration_s=20.0))
+        received = list(iter(lambda: robot.recv(0), None))
+    assert result.duration_s < 5.0
+    assert result.frames_out == len(received)
+    assert last_state(frame_of(received[-1])) == BridgeState.STOPPED
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    n_steps = sum(result.states.values())
+    assert f"the controller's in 0 of {n_steps} control steps" in result.report.answer
+    assert result.as_json()["states"] == {"NO_TWIST": n_steps}
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"can": "nothing:no0"}, "python-can knows"),
+        ({"can": "no0"}, "the bus socketcan 'no0' cannot be opened"),
+        ({"can": "virtual:x", "robot": "husky"}, "robot husky: drive 'skid_steer' has no pilot"),
+        ({"can": "virtual:x", "dbc": "none.dbc"}, "none.dbc"),
+    ],
+)
+def test_what_cannot_be_driven_is_one_sentence(options, sentence):
+    with pytest.raises(ConfigError, match=sentence) as raised:
+        run(Settings(**options, duration_s=0.1))
+    assert "\n" not in str(raised.value)
+
+
+class RobotSide:
+    """The Teensy: sends samples and the desired twist, adds corrections to its own kinematics."""
+
+    def __init__(self, as_sent):
+        self._as_sent, channel = as_sent, f"loop-{uuid.uuid4()}"
+        self.bus = can.Bus(interface="virtual", channel=channel, preserve_timestamps=True)
+        self.other = can.Bus(interface="virtual", channel=channel)
+        self.bridge, self._kinematics = bridged(pilot("traction")), pilot("plain")
+        self._counters = Counter()
+        self.added = []
+
+    def _send(self, name, row, time_s):
+        for frame in encode(LAYOUT, name, self._as_sent(name, row), self._counters[name]):
+            self.bus.send(message(frame, float(time_s)))
+        self._counters[name] += 1
+
+    def step(self, sample):
+        for name, reading in sample.readings.items():
+            for time_s, row in zip(reading.time_s, reading.values, strict=True):
+                self._send(name, row, time_s)
+        self._send("twist", sample.twist, sample.time_s)
+        while (received := self.other.recv(0)) is not None:
+            self.bridge.receive(frame_of(received), sample.time_s)
+        for frame in self.bridge.tick(sample.time_s):
+            self.other.send(message(frame))
+        theory = self._kinematics.step(sample)
+        added, _ = (decode(LAYOUT, frame_of(self.bus.recv(0))).values for _ in range(2))
+        self.added.append(added)
+        return Command(theory.wheel_radps + np.array(added), theory.steer_rad, theory.twist, {})
+
+
+def driven(controller):
+    """A start that is commanded as a step, on grass."""
+    where = make_situation("straight", ROBOT, "grass", 3, SituationOptions(accel_mps2=np.inf, duration_s=8.0))
+    given, options = (ROBOT, where.scenario, where.soils, where.seed), {"conditions": where.conditions}
+    found = simulate(*given, **options, controller=controller, command_delay_s=0.04)
+    return found, slip_peak(drive_history(found, ROBOT, where.conditions.radius_factors))
+
+
+def test_the_loop_over_can_drives_as_the_one_without(as_sent):
+    """Slip of a start is limited as without CAN, and the commands differ by little more than roundings."""
+    direct, direct_peak = driven(pilot("traction").step)
+    _, plain_peak = driven(pilot("plain").step)
+    side = RobotSide(as_sent)
+    with side.bus, side.other:
+        over_can, peak = driven(side.step)
+    assert peak == pytest.approx(direct_peak, abs=0.002)
+    assert peak < 0.5 * plain_peak
+    for wheel in (f"wheel_{i}_radps" for i in (1, 2, 3)):
+        apart = over_can.streams["commands"].channel(wheel) - direct.streams["commands"].channel(wheel)
+        assert np.abs(apart).max() < 10 * RESOLUTION_RADPS
+        assert np.sqrt(np.mean(apart**2)) < 2 * RESOLUTION_RADPS
+    assert np.abs(side.added).max() > 0.5
+    assert set(side.bridge.states) == {"ACTIVE"}
+    assert not side.bridge.receiver.dropped
