@@ -408,7 +408,11 @@ def run(settings: Settings) -> BridgeResult:
         PilotSettings(controller=settings.controller),
     )
     chain = LivePilot(
-        robot, table, source, chosen, channels={name: channels_of(name) for name in RECEIVED[:-1]}
+        robot,
+        table,
+        source,
+        chosen,
+        channels={name: channels_of(name) for name in RECEIVED if name != "twist"},
     )
     bridge, link = Bridge(layout, robot, chain), Link(lambda: open_bus(interface, channel, settings.bitrate))
     with stopping(bridge.stop):

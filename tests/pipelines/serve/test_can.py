@@ -58,7 +58,7 @@ def frames(recorded, run_frames):
 
 
 def pilot(controller, steer_rad=None):
-    channels = {name: channels_of(name) for name in RECEIVED[:-1]}
+    channels = {name: channels_of(name) for name in RECEIVED if name != "twist"}
     chosen = PilotSettings(controller=controller)
     return LivePilot(ROBOT, TABLE, settings=chosen, steer_rad=steer_rad, channels=channels)
 
