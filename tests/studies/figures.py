@@ -1,9 +1,10 @@
-"""The tables of measured figures: docs/measured.md, and the short one of README, from docs/measured/*.json.
+"""The tables of measured figures, from docs/measured/*.json: docs/measured.md, those of other pages, and README's.
 
 Each file holds a table: a title, texts before and after, and one record a row with what was measured, by
 which command, when, and at which commit.  A record with ``readme`` is a row of README too, under those words
 (and with ``readme_command`` where its command refers to another row); the table there stands between
-``<!-- measured -->`` and ``<!-- end of measured -->``.
+``<!-- measured -->`` and ``<!-- end of measured -->``.  A table with ``page`` stands in that page of docs, after
+``<!-- measured: TITLE -->``.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from terrain.files.atomic import atomic_write
 
 EXAMPLE = "python tests/studies figures"
 ROOT = Path(__file__).resolve().parents[2]
-BEGIN, END = "<!-- measured -->", "<!-- end of measured -->"
+END = "<!-- end of measured -->"
 KEYS = {"figure", "measured", "command", "date", "commit"}
 HEAD = (
     "# Measured\n\nMade by `python tests/studies figures` from the records in docs/measured; do not edit. The date "
@@ -68,20 +69,21 @@ def read_tables(folder: Path) -> list[dict[str, Any]]:
 
 def page_text(tables: Sequence[Mapping[str, Any]]) -> str:
     """Return docs/measured.md."""
-    return HEAD + "".join(_section(table) for table in tables)
+    return HEAD + "".join(
+        "\n" + "\n\n".join([f"## {table['title']}", *table["before"], _table(table), *table["after"]]) + "\n"
+        for table in tables
+        if "page" not in table
+    )
 
 
-def _section(table: Mapping[str, Any]) -> str:
-    commands = ["command"] if table["shows_command"] else []
-    head = [table["heading"], *table["columns"], *commands, "date"]
+def _table(table: Mapping[str, Any]) -> str:
+    beside = [*(["command"] if table["shows_command"] else []), *([] if "page" in table else ["date"])]
     rows = [
         [record["figure"], *(record["measured"][name] for name in table["columns"])]
-        + [record["command"]] * len(commands)
-        + [record["date"]]
+        + [record[name] for name in beside]
         for record in table["records"]
     ]
-    parts = [f"## {table['title']}", *table["before"], _markdown(head, rows), *table["after"]]
-    return "\n" + "\n\n".join(parts) + "\n"
+    return _markdown([table["heading"], *table["columns"], *beside], rows)
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -106,20 +108,44 @@ def readme_table(tables: Sequence[Mapping[str, Any]]) -> str:
     return _markdown(["figure", "measured", "command"], rows)
 
 
-def with_table(readme: str, table: str) -> str:
-    """Return README with its table between the marks; as it is without marks."""
-    before, begin, rest = readme.partition(BEGIN)
+def with_table(page: str, table: str, title: str = "") -> str:
+    """Return a page with a table between its marks.
+
+    Raises
+    ------
+    DataError
+        if the marks are not there.
+    """
+    mark = f"<!-- measured: {title} -->" if title else "<!-- measured -->"
+    before, begin, rest = page.partition(mark)
     _, end, after = rest.partition(END)
-    return f"{before}{begin}\n{table}\n{end}{after}" if begin and end else readme
+    if not (begin and end):
+        raise DataError(f"a page lacks {mark} with {END} after it")
+    return f"{before}{begin}\n{table}\n{end}{after}"
+
+
+def pages(settings: Settings, tables: Sequence[Mapping[str, Any]]) -> dict[Path, str]:
+    """Return every page with tables of measured figures, as it has to be."""
+    docs, readme = settings.root / "docs", settings.root / "README.md"
+    texts = {
+        docs / "measured.md": page_text(tables),
+        readme: with_table(readme.read_text(encoding="utf-8"), readme_table(tables)),
+    }
+    for table in tables:
+        if "page" in table:
+            page = docs / table["page"]
+            text = texts.get(page) or page.read_text(encoding="utf-8")
+            texts[page] = with_table(text, _table(table), table["title"])
+    return texts
 
 
 def run(settings: Settings, progress: Progress = silent) -> Figures:
-    """Write docs/measured.md, and the table of README."""
+    """Write docs/measured.md, and the tables of the other pages and of README."""
     tables = read_tables(settings.records)
-    page, readme = settings.root / "docs" / "measured.md", settings.root / "README.md"
-    atomic_write(page, page_text(tables))
-    atomic_write(readme, with_table(readme.read_text(encoding="utf-8"), readme_table(tables)))
-    return Figures((page, readme), {table["title"]: len(table["records"]) for table in tables})
+    texts = pages(settings, tables)
+    for page, text in texts.items():
+        atomic_write(page, text)
+    return Figures(tuple(texts), {table["title"]: len(table["records"]) for table in tables})
 
 
 def report(result: Figures) -> Report:

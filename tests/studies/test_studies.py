@@ -54,11 +54,10 @@ def test_nothing_of_the_packages_imports_studies_or_examples():
 # -- measured figures --------------------------------------------------------------------------------------
 
 
-def test_the_page_of_measured_figures_is_what_its_records_give():
+def test_the_pages_of_measured_figures_are_what_their_records_give():
     tables = figures.read_tables(ROOT / "docs" / "measured")
-    assert (ROOT / "docs" / "measured.md").read_text(encoding="utf-8") == figures.page_text(tables)
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert readme == figures.with_table(readme, figures.readme_table(tables))
+    for page, text in figures.pages(figures.Settings(), tables).items():
+        assert page.read_text(encoding="utf-8") == text, page
     records = [record for table in tables for record in table["records"]]
     assert len(records) >= 100
     assert all(re.fullmatch(r"\d{4}-\d\d-\d\d", record["date"]) for record in records)
@@ -73,10 +72,11 @@ def test_a_record_without_its_command_is_refused(tmp_path):
         figures.read_tables(tmp_path)
 
 
-def test_the_table_of_readme_stands_between_its_marks():
-    text = f"before\n{figures.BEGIN}\nold\n{figures.END}\nafter"
-    assert figures.with_table(text, "new") == f"before\n{figures.BEGIN}\nnew\n{figures.END}\nafter"
-    assert figures.with_table("no marks", "new") == "no marks"
+def test_a_table_stands_between_its_marks():
+    text = f"before\n<!-- measured: depth -->\nold\n{figures.END}\nafter"
+    assert figures.with_table(text, "new", "depth") == text.replace("old", "new")
+    with pytest.raises(DataError, match="lacks <!-- measured: width -->"):
+        figures.with_table(text, "new", "width")
 
 
 # -- mutants -----------------------------------------------------------------------------------------------
