@@ -242,8 +242,8 @@ def _measured(folder: Path) -> dict[str, float | None]:
     """Return the time that one window takes the model in a folder, and its network by ONNX."""
     import numpy as np
 
-    from pipelines.learn.network_onnx import time_of_onnx
     from pipelines.live.model import assess
+    from terrain.classify.network_onnx import time_of_onnx
 
     model = read_model(folder)
     window = drawn_window(model.layout, model.info.window_s)

@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from features.samples import is_centred
 from features.windows import Layout, SteadyMotion, WindowRule
-from pipelines.learn.network_onnx import network_onnx, numbers_of_onnx
 from terrain import __version__
 from terrain.classify.network_numbers import check_network
+from terrain.classify.network_onnx import network_onnx, numbers_of_onnx
 from terrain.classify.novelty_numbers import NoveltyNumbers, check_novelty
 from terrain.classify.support import SupportTable
 from terrain.classify.terrain_filter import TerrainFilter
@@ -211,7 +212,15 @@ def write_model(folder: Path, model: TerrainModel) -> None:
     atomic_write(folder / MODEL_FILE, content)
     if network is not None:
         classes = [str(name) for name in model.info.classes]
-        atomic_write(folder / ONNX_FILE, network_onnx(network.numbers_, recipe[0].matrix, classes))
+        centred = {
+            each.stream: [
+                is_centred(each.stream, name, recipe[0].matrix.level_sets) for name in each.channels
+            ]
+            for each in network.numbers_.columns
+        }
+        atomic_write(
+            folder / ONNX_FILE, network_onnx(network.numbers_, classes, model.info.window_s, centred)
+        )
     seal(folder, model.info)
 
 

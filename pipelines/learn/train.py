@@ -207,8 +207,8 @@ def train(
         if the data do not suffice or the tracking folder cannot be written.
     """
     from pipelines.data.tracking import ensure_tracking
-    from pipelines.learn.network_onnx import require_onnx
     from pipelines.learn.training_data import data_of_runs
+    from terrain.classify.network_onnx import require_onnx
 
     if settings.recipe.partition("@")[0] in NETWORKS:
         require_onnx()

@@ -7,19 +7,16 @@ import pickle
 import zipfile
 
 import numpy as np
-import pandas as pd
 import pytest
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from skops import io as skops_io
 
 from features.windows import SteadyMotion, WindowRule, cut_windows
-from pipelines.learn.load import load_model
 from pipelines.learn.model_file import (
     MANIFEST_FILE,
     MODEL_FILE,
     TRUSTED_TYPES,
-    WindowProbabilities,
     read_files,
     read_model,
     seal,
@@ -240,24 +237,3 @@ def test_an_estimator_of_ones_own_is_refused_before_it_is_stored(model_dir, tmp_
 
 class Foreign(LogisticRegression):
     """Of no library."""
-
-
-def test_the_table_of_a_pyfunc_gives_the_probabilities_of_the_windows(model_dir, runs):
-    model = load_model(str(model_dir))
-    windows = cut_windows(runs, model.rule).windows[:5]
-    table = pd.DataFrame(
-        {
-            f"{stream}.{name}": list(samples[:, place])
-            for stream, samples in dict(windows.values).items()
-            for place, name in enumerate(windows.channels[stream])
-        }
-    )
-    found = WindowProbabilities(model).predict(table)
-    assert found.columns.tolist() == list(model.info.classes)
-    assert np.array_equal(found.to_numpy(), model.recipe.predict_proba(windows))
-
-
-@pytest.mark.parametrize("uri", ["nothing", "s3:/x", "a" * 5000])
-def test_what_is_no_model_is_one_sentence(uri):
-    with pytest.raises(ModelError, match=r"neither a folder nor a model URI|cannot be opened"):
-        load_model(uri)

@@ -12,8 +12,8 @@ from skops import io
 
 from features.windows import WindowRule, cut_windows
 from pipelines.learn.model_file import MODEL_FILE, ONNX_FILE, TRUSTED_TYPES, read_model, seal, write_model
-from pipelines.learn.network_onnx import network_onnx, time_of_onnx
 from pipelines.learn.recipes import feature_matrix, inform, make_recipe
+from terrain.classify.network_onnx import network_onnx, time_of_onnx
 from terrain.errors import ConfigError, ModelError
 
 
@@ -136,7 +136,7 @@ def test_without_onnx_there_is_one_sentence(windows, monkeypatch):
     recipe = quick("cnn").fit(windows, windows.terrain.astype(str))
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ConfigError, match="pip install"):
-        network_onnx(recipe[-1].numbers_, recipe[0].matrix, ["a"])
+        network_onnx(recipe[-1].numbers_, ["a"], 2.0, {})
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert time_of_onnx(b"", windows[0], 1) is None
 

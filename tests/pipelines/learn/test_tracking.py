@@ -83,6 +83,10 @@ def test_a_training_run_holds_what_is_needed_to_judge_and_repeat_it(in_tracked, 
     assert json.loads(logged)["accuracy"] == report.accuracy
     version = client.get_model_version("drawn", model.version)
     assert version.run_id == model.run_id
+    assert (version.tags["robots"], version.tags["classes"]) == ("husky", "ASPHALT, GRASS, GRAVEL")
+    low, _, high = version.tags["accuracy_interval"].partition(" to ")
+    assert (float(low), float(high)) == pytest.approx(report.accuracy_ci, abs=1e-4)
+    assert {"macro_f1", "data_digest", "channels", "windows", "chance"} <= version.tags.keys()
     signature = mlflow.models.get_model_info(model.model_uri).signature
     names = [spec.name for spec in signature.inputs]
     assert names[0] == "imu.gyro_x_radps"
@@ -130,14 +134,13 @@ def champion_of(name):
     return [str(version) for (version,) in rows]
 
 
-def test_the_champion_moves_by_the_rule(in_tracked, log):
+def test_the_alias_is_at_the_champion_whatever_is_registered(in_tracked, log, mlflow):
     reasons = []
     for macro_f1, digest, champion in (
         (0.80, "aa", "1"),  # the first
-        (0.80, "aa", "1"),  # no better
-        (0.85, "aa", "3"),  # better on the same data
-        (0.84, "aa", "3"),  # worse than the champion, though better than the first
-        (0.20, "bb", "5"),  # other data: not worse on the same runs, each held out
+        (0.85, "aa", "2"),  # better on the same data
+        (0.84, "aa", "2"),  # worse than the champion, though better than the first
+        (0.20, "bb", "4"),  # other data: not worse on the same runs, each held out
     ):
         registered = log("by_rule", macro_f1, digest)
         reasons.append(registered.alias_reason)
@@ -145,56 +148,23 @@ def test_the_champion_moves_by_the_rule(in_tracked, log):
         assert champion_of("by_rule") == [champion]
     assert reasons == [
         "first version",
-        "macro F1 0.8000 is not better than 0.8000 of version 1 on the same data",
         "macro F1 0.8500 is better than 0.8000 of version 1 on the same data",
-        "macro F1 0.8400 is not better than 0.8500 of version 3 on the same data",
-        "new data: on 12 runs, each held out, accuracy 75.0% against 75.0% of version 3 "
+        "macro F1 0.8400 is not better than 0.8500 of version 2 on the same data",
+        "new data: on 12 runs, each held out, accuracy 75.0% against 75.0% of version 2 "
         "(difference 95 % over runs: +0.0 to +0.0 points)",
     ]
-    assert load_model("models:/by_rule@champion").info.data_digest == "bb"
+    model = load_model("models:/by_rule@champion")
+    assert model.info.data_digest == "bb"
     assert in_tracked.alias_reason.startswith("first version")
-
-
-@pytest.mark.slow
-def test_the_champion_of_a_robot_stays_whatever_is_trained_under_its_name(in_tracked, log):
-    assert log("guarded", 0.80).alias_moved
-    for changed, reason in (
-        ({"robots": ("warthog",)}, "its robots are warthog, those of version 1 husky: choose another --name"),
-        ({"classes": ("ASPHALT", "MUD")}, "its classes are ASPHALT, MUD, those of version 1 ASPHALT, GRASS"),
-        ({"rate_hz": {"imu": 100.0, "wheels": 10.0}}, "its streams, channels or rates are not those of"),
-        ({"window_s": 3.0}, "its windows are 3 s every 3 s, steady motion, those of version 1 2 s every 2 s"),
-    ):
-        other = log("guarded", 0.99, "bb", **changed)
-        assert not other.alias_moved
-        assert other.alias_reason.startswith(reason)
-    chance = log("guarded", 0.99, "bb", accuracy_ci=(0.30, 0.60))
-    assert not chance.alias_moved
-    assert "30.0 to 60.0\xa0%) is not above chance, 33.3\xa0%" in chance.alias_reason
-    assert champion_of("guarded") == ["1"]
+    folder = Path(mlflow.artifacts.download_artifacts("models:/by_rule/4"))
+    (folder / "model.skops").write_bytes(b"")
+    assert log("by_rule", 0.5, "cc")[3:] == (True, "version 4 cannot be loaded")
 
 
 def test_a_first_version_at_chance_is_registered_and_no_champion(in_tracked, log):
     found = log("useless", 0.3, accuracy_ci=(0.25, 0.45))
     assert (found.version, found.alias_moved) == ("1", False)
     assert champion_of("useless") == []
-    wide = log("useless", 0.6, accuracy_ci=(0.40, 0.80))
-    assert wide.alias_moved
-    assert wide.alias_reason.startswith("first version; the interval of the accuracy is 40 points wide")
-
-
-def test_a_champion_that_cannot_be_loaded_is_replaced(in_tracked, log, mlflow):
-    first = log("broken", 0.99)
-    (Path(mlflow.artifacts.download_artifacts(first.model_uri)) / "model.skops").write_bytes(b"")
-    second = log("broken", 0.5, "bb")
-    assert (second.alias_moved, second.alias_reason) == (True, "version 1 cannot be loaded")
-
-
-def test_a_version_bears_what_it_is_compared_by(in_tracked, mlflow):
-    tags = mlflow.MlflowClient().get_model_version("drawn", "1").tags
-    assert (tags["robots"], tags["classes"]) == ("husky", "ASPHALT, GRASS, GRAVEL")
-    low, _, high = tags["accuracy_interval"].partition(" to ")
-    assert (float(low), float(high)) == pytest.approx(in_tracked.crossval.accuracy_ci, abs=1e-4)
-    assert {"macro_f1", "data_digest", "channels", "windows", "chance"} <= tags.keys()
 
 
 TWO_AT_ONCE = """
@@ -254,26 +224,18 @@ def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path
 
 
 @pytest.mark.parametrize(
-    "uri",
+    ("uri", "sentence"),
     [
-        "models:/missing@champion",
-        "models:/drawn/99",
-        "models:/drawn@missing",
-        "models:/",
-        "runs:/0123/model",
+        *((uri, f"{uri}.*cannot be loaded") for uri in ("models:/missing@champion", "models:/drawn/99")),
+        *((uri, f"{uri}.*cannot be loaded") for uri in ("models:/", "runs:/0123/model")),
+        *((uri, "is neither a folder nor a model URI") for uri in ("sftp:/x", "s3:/bucket/model", "nowhere")),
+        ("a" * 5000, "cannot be opened"),
     ],
 )
-def test_a_model_that_is_not_there_is_one_sentence(in_tracked, uri):
-    with pytest.raises(ModelError, match="cannot be loaded") as error:
+def test_a_model_that_is_not_there_is_one_sentence(in_tracked, uri, sentence):
+    with pytest.raises(ModelError, match=sentence) as error:
         load_model(uri)
-    assert str(error.value).startswith(uri)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("uri", ["sftp:/x", "http://x", "s3:/bucket/model", "nowhere"])
-def test_a_model_from_elsewhere_is_not_fetched(uri):
-    with pytest.raises(ModelError, match="is neither a folder nor a model URI"):
-        load_model(uri)
 
 
 def test_a_server_that_does_not_answer_is_named_before_the_work(monkeypatch):
@@ -288,8 +250,6 @@ def test_looking_for_a_model_makes_nothing(tmp_path, monkeypatch):
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     with pytest.raises(ModelError, match=r"mlflow\.db does not exist: train a model here first"):
         load_model("models:/drawn@champion")
-    with pytest.raises(ModelError, match="nowhere: is neither a folder nor a model URI"):
-        load_model("nowhere")
     assert list(tmp_path.iterdir()) == []
 
 

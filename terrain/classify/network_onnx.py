@@ -10,13 +10,11 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from features.matrix import FeatureMatrix
-from features.samples import is_centred
 from terrain.classify.network_numbers import (
     CLIP_STD,
     BranchNumbers,
@@ -69,14 +67,17 @@ class _Graph:
         return self.step("Reshape", values, self.constant(np.array(shape, dtype=np.int64)))
 
 
-def network_onnx(numbers: NetworkNumbers, matrix: FeatureMatrix, classes: Sequence[str]) -> bytes:
+def network_onnx(
+    numbers: NetworkNumbers, classes: Sequence[str], length_s: float, centred: Mapping[str, Sequence[bool]]
+) -> bytes:
     """Return the content of an ONNX file.
 
     Parameters
     ----------
     numbers : of the fitted network
-    matrix : of its recipe: the channels of each stream, and which of them lose their mean
     classes : (k,) names in the order of the output
+    length_s : of a window
+    centred : of each stream, which of its channels lose their mean over the window
 
     Raises
     ------
@@ -92,8 +93,8 @@ def network_onnx(numbers: NetworkNumbers, matrix: FeatureMatrix, classes: Sequen
         inputs.append(helper.make_tensor_value_info(columns.stream, onnx.TensorProto.FLOAT, shape))
         fill = numbers.fill[place : place + columns.width].reshape(len(columns.channels), -1)
         place += columns.width
-        centred = [is_centred(columns.stream, name, matrix.level_sets) for name in columns.channels]
-        pooled += _branch(graph, columns, branch, _filled(graph, columns.stream, centred, fill))
+        filled = _filled(graph, columns.stream, centred[columns.stream], fill)
+        pooled += _branch(graph, columns, branch, filled)
     joined = graph.step("Concat", *pooled, axis=2)
     column = graph.step("Unsqueeze", joined, graph.constant(np.array([3])))
     product = graph.step("MatMul", graph.constant(numbers.head_weight, "head_weight"), column)
@@ -109,25 +110,20 @@ def network_onnx(numbers: NetworkNumbers, matrix: FeatureMatrix, classes: Sequen
         ir_version=IR_VERSION,
         producer_name="terrain-slip",
     )
-    helper.set_model_props(model, _metadata(numbers, matrix, classes, n_members))
-    onnx.checker.check_model(model)
-    return bytes(model.SerializeToString())
-
-
-def _metadata(
-    numbers: NetworkNumbers, matrix: FeatureMatrix, classes: Sequence[str], n_members: int
-) -> dict[str, str]:
     streams = {
         each.stream: {"channels": each.channels, "rate_hz": each.rate_hz, "n_samples": each.n_samples}
         for each in numbers.columns
     }
-    return {
+    metadata = {
         "classes": json.dumps([str(name) for name in classes]),
         "streams": json.dumps(streams),
-        "length_s": json.dumps(matrix.length_s),
+        "length_s": json.dumps(length_s),
         "members": json.dumps(n_members),
         "temperature": repr(float(numbers.temperature)),
     }
+    helper.set_model_props(model, metadata)
+    onnx.checker.check_model(model)
+    return bytes(model.SerializeToString())
 
 
 def _filled(graph: _Graph, stream: str, centred: Sequence[bool], fill: Array) -> str:
