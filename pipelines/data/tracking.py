@@ -142,39 +142,22 @@ def log_learning(
     params: Mapping[str, Any],
     metrics: Mapping[str, float],
     tags: Mapping[str, str],
-    texts: Mapping[str, str],
     documents: Mapping[str, Any],
-    figures: Mapping[str, Any],
+    pictures: Mapping[str, bytes],
 ) -> str:
     """Log a run in which something other than a model was learned; return its id.
 
-    Parameters
-    ----------
-    name : of the run
-    params, metrics, tags : as MLflow holds them
-    texts, documents : text files and JSON documents by file name
-    figures : by name, logged as PNG: figures of matplotlib, or the content of image files
+    Parameters are those of :func:`log_run`.
 
     Raises
     ------
     TrackingError
         if the tracking folder cannot be written or the server cannot be reached.
     """
-    pictures = {f"figures/{key}.png": _png(figure) for key, figure in figures.items()}
     with mlflow_store(create=True) as mlflow:
-        run_id = log_run(mlflow, name, params, metrics, tags, {**documents, **texts}, pictures)
+        run_id = log_run(mlflow, name, params, metrics, tags, documents, pictures)
         mlflow.MlflowClient().set_terminated(run_id)
         return run_id
-
-
-def _png(figure: Any) -> bytes:
-    if isinstance(figure, bytes):
-        return figure
-    from io import BytesIO
-
-    stream = BytesIO()
-    figure.savefig(stream, format="png")
-    return stream.getvalue()
 
 
 def log_run(

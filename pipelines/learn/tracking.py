@@ -56,7 +56,7 @@ def log_training(
         another process holds the database for too long.
     """
     from pipelines.learn.card import read_training
-    from pipelines.learn.champion import Champion, judge, standing_of, standing_tags
+    from pipelines.learn.champion import Champion, judge, tags_of
 
     info, record = read_training(folder)
     if record is None:
@@ -72,19 +72,18 @@ def log_training(
     documents = {"crossval.json": record.evaluation, "importance.json": {"channels": record.importance}}
     chosen = {f"chosen_{key}": value for key, value in record.chosen.items()}
     tags = {key: str(getattr(info, key)) for key in ("data_digest", "commit", "seed")}
-    standing = standing_of(info, evaluated)
     with mlflow_store(create=True) as mlflow:
         client = mlflow.MlflowClient()
         run_id = log_run(mlflow, name, {**record.params, **chosen}, metrics, tags, documents, pictures or {})
         _log_data(mlflow, run_id, record, info)
         number = str(_log_model(mlflow, name, folder, info, run_id).registered_model_version)
-        for key, text in standing_tags(standing).items():
+        for key, text in tags_of(info, evaluated).items():
             client.set_model_version_tag(name, number, key, text)
         champion = None
         if (current := client.get_registered_model(name).aliases.get(CHAMPION)) is not None:
             found = client.get_model_version(name, current)
             champion = Champion(str(current), found.tags, _model_or_none(mlflow, f"models:/{name}/{current}"))
-        moved, reason = judge(champion, standing._replace(version=number), bench)
+        moved, reason = judge(champion, info, evaluated, bench)
         if moved:
             client.set_registered_model_alias(name, CHAMPION, number)
         client.set_terminated(run_id)

@@ -296,9 +296,11 @@ def log_curves(result: LearnSlipResult) -> str:
             "seed": str(result.seed),
             "kind": "slip table",
         },
-        {result.table.name: result.table.read_text(encoding="utf-8")},
-        {"learn_slip.json": {"terrains": as_json(result.terrains)}},
-        {name: figure_png(figure) for name, figure in result.pictures.items()},
+        {
+            result.table.name: result.table.read_text(encoding="utf-8"),
+            "learn_slip.json": {"terrains": as_json(result.terrains)},
+        },
+        {f"figures/{name}.png": figure_png(figure) for name, figure in result.pictures.items()},
     )
 
 

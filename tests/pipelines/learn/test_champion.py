@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.learn.card import read_training
-from pipelines.learn.champion import Bench, Champion, compare, held_out_runs, judge, standing_of
+from pipelines.learn.champion import Bench, Champion, compare, held_out_runs, judge
 from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.model_file import TerrainModel, read_model
 from pipelines.learn.settings import RecipeSettings
@@ -25,7 +25,7 @@ def judged(model, runs):
     data, report = data_of_runs(runs, TRAINING), crossval(runs, EVALUATION)
     info = replace(model.info, data_digest=data.digest)
     bench = Bench(data, held_out_runs(data.samples, report), 0)
-    return *judge(Champion("1", {"macro_f1": "0.9"}, model), standing_of(info, report), bench), data, report
+    return *judge(Champion("1", {"macro_f1": "0.9"}, model), info, report, bench), data, report
 
 
 @pytest.mark.parametrize(
@@ -53,14 +53,14 @@ def test_the_champion_moves_to_what_is_comparable_and_better(tracked, model, cha
     info, record = read_training(tracked[0] / "model")
     figures = {name: changed.pop(name) for name in ("macro_f1", "accuracy_ci") if name in changed}
     evaluated = record.evaluated.model_copy(update={"macro_f1": 0.99, "accuracy_ci": (0.9, 0.95)} | figures)
-    candidate = standing_of(replace(info, **changed), evaluated)
-    found = judge(Champion("1", {"macro_f1": "0.8"}, model), candidate)
+    candidate = replace(info, **changed), evaluated
+    found = judge(Champion("1", {"macro_f1": "0.8"}, model), *candidate)
     assert (found[0], found[1][: len(reason)]) == (moved, reason)
     if "accuracy_ci" not in figures:
-        assert judge(None, candidate) == (True, "first version")
-        assert judge(Champion("1", {}, None), candidate) == (True, "version 1 cannot be loaded")
+        assert judge(None, *candidate) == (True, "first version")
+        assert judge(Champion("1", {}, None), *candidate) == (True, "version 1 cannot be loaded")
     else:
-        assert not judge(None, candidate)[0]  # at chance, not even the first
+        assert not judge(None, *candidate)[0]  # at chance, not even the first
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, runs):
     assert set(skops_io.get_untrusted_types(file=model_dir / MODEL_FILE)) <= set(TRUSTED_TYPES)
 
 
-@pytest.mark.parametrize("place", [0.0, 0.1, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("place", [0.0, 0.5, 0.999])
 def test_one_flipped_bit_anywhere_is_seen(model_dir, place):
     content = bytearray((model_dir / MODEL_FILE).read_bytes())
     content[int(place * len(content))] ^= 1
@@ -58,20 +58,31 @@ def test_one_flipped_bit_anywhere_is_seen(model_dir, place):
 
 
 def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir, put):
+    """Of the archive, and of what lies in it, which its own checksums then do not cover."""
     whole = (model_dir / MODEL_FILE).read_bytes()
-    rng = np.random.default_rng(0)
-    refusals = []
-    for _ in range(60):
-        content = bytearray(whole[: rng.integers(len(whole))] if rng.random() < 0.3 else whole)
-        for place in rng.integers(max(len(content) - 4000, 0), max(len(content), 1), 3 if content else 0):
-            content[place] = rng.integers(256)
+    with zipfile.ZipFile(model_dir / MODEL_FILE) as source:
+        members = {name: source.read(name) for name in source.namelist()}
+    small = sorted(members, key=lambda name: len(members[name]))[:40]
+    rng, refusals = np.random.default_rng(3), []
+    for number in range(40):
+        inside = number % 2 == 1
+        hit = small[rng.integers(len(small))]
+        content = bytearray(members[hit] if inside else whole[: rng.integers(len(whole))])
+        for place in rng.integers(min(len(content), 128) if inside else max(len(content), 1), size=3):
+            content[place : place + 1] = bytes([rng.integers(256)])
+        if inside:
+            packed = io.BytesIO()
+            with zipfile.ZipFile(packed, "w") as target:
+                for name, member in members.items():
+                    target.writestr(name, bytes(content) if name == hit else member)
+            content = packed.getvalue()
         put(bytes(content))
         try:
             read_model(model_dir)
         except ModelError as error:
             refusals.append(str(error))
-    assert len(refusals) > 50  # bytes that carry nothing may change unseen; nothing else is ever raised
-    assert not [sentence for sentence in refusals if "\n" in sentence]
+    assert len(refusals) > 25  # bytes that carry nothing may change unseen; nothing else is ever raised
+    assert all(sentence.isprintable() for sentence in refusals)
 
 
 def test_a_model_of_another_package_is_foreign(model_dir, put, tmp_path):
@@ -201,30 +212,6 @@ def test_an_archive_that_unpacks_to_gigabytes_or_nests_deep_is_refused(model_dir
         put(packed.getvalue())
         with pytest.raises(ModelError, match=fault):
             read_model(model_dir)
-
-
-def test_damaged_members_of_an_archive_end_in_one_sentence(model_dir, put):
-    """The bytes inside of the archive, which its own checksums then do not cover."""
-    with zipfile.ZipFile(model_dir / MODEL_FILE) as source:
-        members = {name: source.read(name) for name in source.namelist()}
-    names = sorted(members, key=lambda name: len(members[name]))[:40]
-    rng, refusals = np.random.default_rng(3), []
-    for _ in range(25):
-        hit = names[rng.integers(len(names))]
-        content = bytearray(members[hit])
-        for place in rng.integers(min(len(content), 128), size=3):
-            content[place] = rng.integers(256)
-        packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w") as target:
-            for name, whole in members.items():
-                target.writestr(name, bytes(content) if name == hit else whole)
-        put(packed.getvalue())
-        try:
-            read_model(model_dir)
-        except ModelError as error:
-            refusals.append(str(error))
-    assert len(refusals) > 10
-    assert all(sentence.isprintable() for sentence in refusals)
 
 
 def test_an_estimator_of_ones_own_is_refused_before_it_is_stored(model_dir, tmp_path):

@@ -175,7 +175,7 @@ Path(f"ready_{sys.argv[1]}").touch()
 while len(list(Path().glob("ready_*"))) < 3:
     time.sleep(0.01)
 ensure_tracking()
-print(log_learning("together", {}, {"figure": 1.0}, {}, {}, {}, {}))
+print(log_learning("together", {}, {"figure": 1.0}, {}, {}, {}))
 """
 
 

@@ -42,32 +42,25 @@ def test_training_is_evaluated_on_held_out_runs_and_names_the_model(tracked):
     assert result.ui in str(result.report)
 
 
-@pytest.mark.parametrize("name", ["", "a/b", "a:b", "a@b", "a b", "a.b"])
-def test_a_name_no_registry_takes_is_refused(name):
-    with pytest.raises(ConfigError, match=f"model name '{name}'"):
-        TrainingSettings(name=name)
-
-
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
+        *(({"name": name}, f"model name '{name}'") for name in ("", "a/b", "a:b", "a@b", "a b", "a.b")),
         ({"protocol": "published"}, "there is no setting 'protocol'"),
         ({"cache": "c", "recipe": "cnn"}, "--cache is for recipe 'svm'"),
         ({"search": 4, "feature": ("a:b",)}, "--search is for recipe 'svm' .* with --feature"),
+        ({"search": 4, "recipe": "cnn"}, "--search is for recipe 'svm'"),
         ({"search": 4, "params": "best.json"}, "--search and --params do not go together"),
+        ({"recipe": "cnn", "params": "best.json"}, "--params has hyper-parameters of the SVM"),
         ({"cache": "c", "merge_duplicates": True}, "--cache keeps each run by itself"),
+        ({"data": None}, "--data is missing"),
+        ({"kept": "model"}, "--register trains nothing"),
     ],
 )
 def test_settings_that_do_not_go_together_are_refused(options, sentence):
     with pytest.raises(ConfigError, match=sentence):
-        TrainingSettings(name="m", **options)
-
-
-def test_data_are_needed_where_nothing_is_registered():
-    with pytest.raises(ConfigError, match="--data is missing"):
-        Settings(name="m")
-    with pytest.raises(ConfigError, match="--register trains nothing"):
-        Settings(name="m", data="runs", kept="model")
+        given = {"name": "m", "data": "runs"} | options
+        Settings(**{name: value for name, value in given.items() if value is not None})
 
 
 def test_a_tracking_folder_that_cannot_be_written_is_reported_before_any_work(tmp_path, monkeypatch):
