@@ -58,8 +58,8 @@ def test_training_is_evaluated_on_held_out_runs_and_names_the_model(tracked):
     ],
 )
 def test_settings_that_do_not_go_together_are_refused(options, sentence):
+    given = {"name": "m", "data": "runs"} | options
     with pytest.raises(ConfigError, match=sentence):
-        given = {"name": "m", "data": "runs"} | options
         Settings(**{name: value for name, value in given.items() if value is not None})
 
 
