@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,7 +14,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.drive.controllers import DriveInputs, drive_once, train_classifier
-from pipelines.drive.metrics import metric_label, signed_difference
 from pipelines.drive.run_figures import run_figures
 from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
@@ -41,6 +41,7 @@ from pipelines.report import (
     sections,
     silent,
 )
+from pipelines.report.numbers import MINUS, NBSP
 from pipelines.report.versions import versions
 from terrain.control.comparison import Difference, MeanInterval
 from terrain.control.controllers import (
@@ -53,6 +54,7 @@ from terrain.control.controllers import (
     pairs_to_compare,
 )
 from terrain.control.drive_comparison import (
+    ABSOLUTE,
     Comparison,
     Drive,
     Metrics,
@@ -62,28 +64,17 @@ from terrain.control.drive_comparison import (
     steepest_grade,
 )
 from terrain.control.drive_curves import DriveCurves
+from terrain.control.drive_evaluation import metric_label
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS
-from terrain.control.situations import COURSE, SLOPE, Situation, SituationOptions, make_situation
+from terrain.control.situations import COURSE, SITUATIONS, SLOPE, Situation, SituationOptions, make_situation
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError
-from terrain.records import Array
 from terrain.robots import load_robot
-from terrain.slip_learning.laws import LAW_PARAMETERS, traction_ratio
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from pipelines.drive.drive import Settings
-
-SCENARIOS = {
-    "starts": "Stand, start, hold the speed, stop: three times. Metrics of a start are means of the second "
-    "and third, when the slip of steady motion is known; those of the first are listed beside them in the "
-    "table.",
-    "brake": "Drive, and stop as fast as possible.",
-    "slope": "Uphill; the steepest grade is searched for at each seed.",
-    "course": "All terrains one after the other.",
-    "mixed": "Terrains in any order, and no camera for three seconds.",
-}
 
 PICTURED = 3
 """Metrics of the first picture."""
@@ -402,9 +393,26 @@ def _difference_text(found: Difference | None, key: str) -> str:
     return f"{mean} ({signed_difference(found.low, key)} to {signed_difference(found.high, key)}){star}"
 
 
+def signed_difference(difference: float, key: str) -> str:
+    r"""Return a difference with its sign: as a percentage, or in the metric's unit.
+
+    Examples
+    --------
+    >>> signed_difference(-0.0804, "slip_peak"), signed_difference(1.25, "steepest_deg")
+    ('−8.0\xa0%', '+1.25°')
+    """
+    if key in ABSOLUTE:
+        text = format_value(abs(difference), unit=metric_label(key).unit).replace(f"{NBSP}°", "°")
+    else:
+        text = format_value(abs(difference), ".1%")
+    if not re.search("[1-9]", text):
+        return text
+    return ("+" if difference > 0.0 else MINUS) + text
+
+
 def _metric_parts(result: DriveResult) -> Iterator[Part]:
     """Yield all metrics, those that are compared first, and the names of those that no controller has."""
-    if text := SCENARIOS.get(result.scenario):
+    if text := SITUATIONS.get(result.scenario):
         yield Text(text)
     compared = result.compared
     rows, undefined = [], []
@@ -452,20 +460,15 @@ def _curve_parts(table: SlipTable | None) -> Iterator[Part]:
         return
     panels = []
     for terrain, curve in table.curves.items():
-        parameters = [curve.parameters[name] for name in LAW_PARAMETERS[curve.law]]
-
-        def thrust(slips: Array, law: str = curve.law, given: Sequence[float] = parameters) -> Array:
-            return traction_ratio(law, given, np.atleast_1d(slips))
-
         measured = np.linspace(*curve.slip_range_ratio, 60)
         beyond = np.linspace(curve.slip_range_ratio[1], 1.0, 30)
         targets = np.array([table.targets[terrain][state].slip_ratio for state in ("traction", "steady")])
         marks: list[Mark] = [
             Strip([(*curve.peak_interval_ratio, "peak slip, 90 %")]),
-            Line("law, in the slips measured", measured, thrust(measured), 0),
-            Line("beyond", beyond, thrust(beyond), 0, dashed=True),
+            Line("law, in the slips measured", measured, curve.thrust_ratio(measured), 0),
+            Line("beyond", beyond, curve.thrust_ratio(beyond), 0, dashed=True),
             Line("resistance", [0.0, 1.0], [curve.resistance_ratio] * 2, 6, dashed=True),
-            Points("targets of traction and steady motion", targets, thrust(targets), colour=2),
+            Points("targets of traction and steady motion", targets, curve.thrust_ratio(targets), colour=2),
         ]
         panels.append(Panel(marks, "thrust over load", f"{terrain}: {curve.law}, {curve.n_runs} runs"))
     caption = (

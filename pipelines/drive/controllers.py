@@ -68,23 +68,20 @@ def _terrain_source(controller: Controller, model: TerrainModel | None, robot: R
     return Classifier(model, robot)
 
 
-def train_classifier(
-    robot: Robot, seed: int, progress: Progress = silent, runs_a_terrain: int | None = None
-) -> TerrainModel:
-    """Return a classifier that was trained on simulated labelled runs of a robot.
+def train_classifier(robot: Robot, seed: int, progress: Progress = silent) -> TerrainModel:
+    """Return a classifier that was trained on simulated labelled runs of a robot, as many as of quickstart.
 
     Parameters
     ----------
     robot : swerve robot
     seed : of the runs; they differ from the drives of ``terrain drive`` at any seed
     progress : of the runs and the training
-    runs_a_terrain : number of runs; that of ``terrain quickstart`` by default
     """
     from pipelines.learn.settings import RecipeSettings
     from pipelines.learn.training_data import fitted_model
     from terrain.estimation.labelled import RUNS_A_TERRAIN, labelled_runs
 
-    runs, _, _ = labelled_runs(seed, runs_a_terrain or RUNS_A_TERRAIN, progress, robot)
+    runs, _, _ = labelled_runs(seed, RUNS_A_TERRAIN, progress, robot)
     progress("train", 0, 1)
     model = fitted_model(runs, RecipeSettings(seed=seed), "simulated")
     progress("train", 1, 1)

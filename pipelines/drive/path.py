@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,8 +60,11 @@ SHOWN_M = 1.5
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PathResult(Result):
-    """A path that was followed."""
+    """A path that was followed, with the drive."""
 
+    offset_m: float
+    drive: FollowedDrive
+    reference: ReferencePath
     robot: str = described("name")
     path: Path = described("file of the path")
     observer: str = described("that gave the sideslip")
@@ -91,15 +93,12 @@ class PathResult(Result):
     warnings: tuple[str, ...] = described("a sentence for each")
     page: Path | None = described("page that was written")
     files: tuple[Path, ...] = described("all that was written")
-    offset_m: float = field(default=0.0)
-    drive: FollowedDrive | None = None
-    reference: ReferencePath | None = None
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the drive, a row a tick."""
         import pandas as pd
 
-        return pd.DataFrame(columns_of(self.drive) if self.drive is not None else {})
+        return pd.DataFrame(columns_of(self.drive))
 
 
 def run(settings: Settings, progress: Progress) -> PathResult:
@@ -140,12 +139,7 @@ def run(settings: Settings, progress: Progress) -> PathResult:
     drive, ticks = drive_along(robot, path, plan, settings.first_seed)
     progress("drive", 1, 1)
     files = () if settings.out is None else (settings.out / PAGE_FILE, settings.out / "drive.csv")
-    if files:
-        columns, text = columns_of(drive), io.StringIO()
-        table, head = np.column_stack(list(columns.values())), ",".join(columns)
-        np.savetxt(text, table, "%.6g", ",", header=head, comments="")
-        atomic_write(files[1], text.getvalue())
-    return PathResult(
+    result = PathResult(
         robot=robot.name,
         path=settings.path,
         observer=settings.observer,
@@ -153,7 +147,7 @@ def run(settings: Settings, progress: Progress) -> PathResult:
         length_m=path.length_m,
         n_points_merged=path.n_merged,
         speed_mps=speed_mps,
-        **path_figures(drive, plan)._asdict(),
+        **path_figures(drive, plan),
         statuses=tick_statuses(ticks),
         warnings=(*path_warnings(path, robot), *drive_warnings(drive, ticks, plan)),
         page=files[0] if files else None,
@@ -162,6 +156,10 @@ def run(settings: Settings, progress: Progress) -> PathResult:
         drive=drive,
         reference=path,
     )
+    if files:
+        table = result.to_pandas().to_csv(index=False, float_format="%.6g", na_rep="nan")
+        atomic_write(files[1], table)
+    return result
 
 
 def report(result: PathResult) -> Report:
@@ -185,7 +183,7 @@ def report(result: PathResult) -> Report:
         title=f"{result.robot} along {result.path.name}",
         answer=verdict(result),
         lead=f"{result.speed_mps:g} m/s · sideslip by: {result.observer} · seed {result.seed}",
-        picture=None if result.drive is None else _lateral_figure(result, result.drive),
+        picture=_lateral_figure(result),
         parts=[*(Text(text, "warning") for text in result.warnings), Pairs(figures)],
         details=[
             Section("Path and robot", list(_map(result))),
@@ -207,7 +205,8 @@ def verdict(result: PathResult) -> str:
     )
 
 
-def _lateral_figure(result: PathResult, drive: FollowedDrive) -> Figure:
+def _lateral_figure(result: PathResult) -> Figure:
+    drive = result.drive
     error, ends = drive.lateral_m - result.offset_m, drive.distance_m[[0, -1]]
     most = 1.1 * min(max(result.limit_m, float(np.abs(error).max())), SHOWN_M)
     marks: list[Mark] = [
@@ -223,8 +222,6 @@ def _lateral_figure(result: PathResult, drive: FollowedDrive) -> Figure:
 
 
 def _map(result: PathResult) -> Iterator[Part]:
-    if result.drive is None or result.reference is None:
-        return
     rows, drive = result.reference.rows, result.drive
     marks = [
         Line("path", rows[:, X], rows[:, Y], 6, dashed=True),
@@ -246,8 +243,6 @@ def _map(result: PathResult) -> Iterator[Part]:
 def _observed(result: PathResult) -> Iterator[Part]:
     """Yield slip angles and cornering stiffness of both axles, estimate beside truth."""
     drive = result.drive
-    if drive is None:
-        return
     panels = []
     for j, wheel in enumerate(WHEELS):
         estimate, std = np.degrees(drive.slip_rad[:, j]), np.degrees(drive.slip_std_rad[:, j])

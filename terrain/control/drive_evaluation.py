@@ -45,23 +45,64 @@ START_TIME_S, START_WINDOW_S = 5.0, 7.0
 TARGET_CHANGE = 0.02
 """Targets that differ by less count as one."""
 
-METRICS = (
-    "energy_j_per_m",
-    "distance_m",
-    "mean_speed_mps",
-    "final_speed_mps",
-    "slip_peak",
-    "lock_s",
-    "scrub_j",
-    "immobilised",
-    "adapt_s",
-)
-"""Metrics that every drive has; others belong to some scenarios."""
+METRICS = {
+    "energy_j_per_m": ("energy per metre", "J/m"),
+    "distance_m": ("distance travelled", "m"),
+    "mean_speed_mps": ("mean speed", "m/s"),
+    "final_speed_mps": ("final speed", "m/s"),
+    "slip_peak": ("largest slip", ""),
+    "lock_s": ("longest lock of a wheel", "s"),
+    "scrub_j": ("energy dissipated in the contacts", "J"),
+    "scrub_along_j": ("of it along the wheels", "J"),
+    "immobilised": ("times stuck", ""),
+    "adapt_s": ("time to the new terrain's target", "s"),
+    "adapted_ratio": ("ratio of terrain changes followed", ""),
+    "believed_ratio": ("ratio of driving time with a known terrain", ""),
+    "n_accepted": ("outputs of the classifier accepted", ""),
+    "n_below_threshold": ("outputs below the threshold", ""),
+    "n_refused": ("windows the classifier refused", ""),
+    "slip_error_ratio": ("slip error while the speed was limited", ""),
+    "sinkage_m": ("sinkage of the deepest wheel", "m"),
+    "command_mps2": ("change of the wheels' commands, rms", "m/s²"),
+    "yaw_drift_rad": ("change of heading over the drive", "rad"),
+}
+"""Metrics that every drive has, with what they are called and their unit."""
 
+LABELS = METRICS | {
+    "stop_m": ("stopping distance", "m"),
+    "steepest_deg": ("steepest grade climbed", "°"),
+    f"distance_{START_TIME_S:g}s_m": (f"distance within {START_TIME_S:g} s of a start", "m"),
+    f"energy_{START_DISTANCE_M:g}m_j": (f"energy of the first {START_DISTANCE_M:g} m", "J"),
+}
+"""The same with those of some scenarios."""
 
 BELIEF = ("believed_ratio", "n_accepted", "n_below_threshold", "n_refused")
 """Metrics of a controller that uses the terrain: ratio of the driving time with a known terrain, and outputs
 of its source by :class:`terrain.control.switching.OutputStatus`."""
+
+
+class Label(NamedTuple):
+    """Name of a metric, and its unit or nothing."""
+
+    text: str
+    unit: str
+
+    @property
+    def with_unit(self) -> str:
+        """The name with its unit in brackets."""
+        return f"{self.text} [{self.unit}]" if self.unit else self.text
+
+
+def metric_label(key: str) -> Label:
+    """Return the label of a metric.
+
+    Examples
+    --------
+    >>> tuple(metric_label("first_distance_5s_m")), metric_label("energy_4m_j").with_unit
+    (('distance within 5 s of a start, first start', 'm'), 'energy of the first 4 m [J]')
+    """
+    text, unit = LABELS[key.removeprefix("first_")]
+    return Label(f"{text}, first start" if key.startswith("first_") else text, unit)
 
 
 class EnergyCurve(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,38 +50,6 @@ class PathPlan(NamedTuple):
     stops_m: tuple[float, ...]
 
 
-class PathFigures(NamedTuple):
-    """Figures of a drive along a path, by its truth; NaN where one is not defined.
-
-    Parameters
-    ----------
-    reached_end : whether the robot came to the end
-    duration_s, slowest_mps : of the drive; the slowest speed, start and standing excepted
-    lateral_max_m, lateral_rms_m : error of the true position, to the desired offset
-    lateral_max_at_m : distance along the path of the largest error
-    limit_m : a tenth of the speed, the bound of Deremetz et al.
-    within_limit : whether the largest error is below it and the end was reached
-    slip_max_rad, slip_error_rad : largest true slip angle, and root mean square of the estimate's error,
-        above :data:`SLOW_MPS`; NaN without an observer
-    stiffness_error_ratio : median error of the cornering stiffness over the secant
-    grip_ratio, grip_std : as known at the end; NaN without the preview
-    """
-
-    reached_end: bool
-    duration_s: float
-    slowest_mps: float
-    lateral_max_m: float
-    lateral_rms_m: float
-    lateral_max_at_m: float
-    limit_m: float
-    within_limit: bool
-    slip_max_rad: float
-    slip_error_rad: float
-    stiffness_error_ratio: float
-    grip_ratio: float
-    grip_std: float
-
-
 def drive_along(
     robot: BicycleRobot, path: ReferencePath, plan: PathPlan, seed: int
 ) -> tuple[FollowedDrive, tuple[FollowedTick, ...]]:
@@ -107,8 +75,11 @@ def drive_along(
     return followed_drive(log, path, follower.ticks), tuple(follower.ticks)
 
 
-def path_figures(drive: FollowedDrive, plan: PathPlan) -> PathFigures:
-    """Return the figures of a drive."""
+def path_figures(drive: FollowedDrive, plan: PathPlan) -> dict[str, Any]:
+    """Return the figures of a drive by its truth, by the fields of ``pipelines.drive.path.PathResult``.
+
+    NaN where one is not defined; those of slip angles are above :data:`SLOW_MPS`.
+    """
     error = drive.lateral_m - plan.offset_m
     moves = drive.speed_mps > SLOW_MPS
     cruises = moves & drive.between(START_M + plan.speed_mps**2 / 3.0, np.inf)
@@ -118,21 +89,21 @@ def path_figures(drive: FollowedDrive, plan: PathPlan) -> PathFigures:
     errors = errors[np.isfinite(errors)]
     observed = plan.source != SlipSource.NONE and errors.size
     worst, limit = float(np.abs(error).max()), plan.speed_mps / 10.0
-    return PathFigures(
-        reached_end=drive.reached_end,
-        duration_s=float(drive.time_s[-1]),
-        slowest_mps=float(drive.speed_mps[cruises].min()) if cruises.any() else math.nan,
-        lateral_max_m=worst,
-        lateral_rms_m=float(np.sqrt(np.mean(error**2))),
-        lateral_max_at_m=float(drive.distance_m[np.abs(error).argmax()]),
-        limit_m=limit,
-        within_limit=bool(drive.reached_end and worst <= limit),
-        slip_max_rad=float(np.nanmax(slips)) if np.isfinite(slips).any() else math.nan,
-        slip_error_rad=float(np.sqrt(np.mean(errors**2))) if observed else math.nan,
-        stiffness_error_ratio=float(np.median(stiffness)) if stiffness.size else math.nan,
-        grip_ratio=float(drive.grip_ratio[-1]),
-        grip_std=float(drive.grip_std[-1]),
-    )
+    return {
+        "reached_end": drive.reached_end,
+        "duration_s": float(drive.time_s[-1]),
+        "slowest_mps": float(drive.speed_mps[cruises].min()) if cruises.any() else math.nan,
+        "lateral_max_m": worst,
+        "lateral_rms_m": float(np.sqrt(np.mean(error**2))),
+        "lateral_max_at_m": float(drive.distance_m[np.abs(error).argmax()]),
+        "limit_m": limit,
+        "within_limit": bool(drive.reached_end and worst <= limit),
+        "slip_max_rad": float(np.nanmax(slips)) if np.isfinite(slips).any() else math.nan,
+        "slip_error_rad": float(np.sqrt(np.mean(errors**2))) if observed else math.nan,
+        "stiffness_error_ratio": float(np.median(stiffness)) if stiffness.size else math.nan,
+        "grip_ratio": float(drive.grip_ratio[-1]),
+        "grip_std": float(drive.grip_std[-1]),
+    }
 
 
 def tick_statuses(ticks: Sequence[FollowedTick]) -> dict[str, dict[str, int]]:

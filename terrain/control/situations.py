@@ -31,8 +31,20 @@ STARTS_HOLD_S, STARTS_REST_S, N_STARTS = 6.0, 1.5, 3
 MIXED_S, CAMERA_LOST_S = 90.0, (28.0, 31.0)
 """Default length of ``mixed``, and the interval in it without the camera."""
 
-SITUATIONS = (STARTS, "straight", COURSE, SLOPE, BRAKE, "circle", "crab", MIXED)
-"""Scenarios made for comparisons; those of ``terrain simulate`` are accepted, too."""
+SITUATIONS = {
+    STARTS: "Stand, start, hold the speed, stop: three times. Metrics of a start are means of the second "
+    "and third, when the slip of steady motion is known; those of the first are listed beside them in the "
+    "table.",
+    "straight": "",
+    COURSE: "All terrains one after the other.",
+    SLOPE: "Uphill; the steepest grade is searched for at each seed.",
+    BRAKE: "Drive, and stop as fast as possible.",
+    "circle": "",
+    "crab": "",
+    MIXED: "Terrains in any order, and no camera for three seconds.",
+}
+"""Scenarios made for comparisons, and what there is to say of them; those of ``terrain simulate`` are accepted,
+too."""
 
 
 class Situation(NamedTuple):

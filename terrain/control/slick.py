@@ -13,7 +13,6 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.slip_table import CurveEntry
-from terrain.slip_learning.laws import LAW_PARAMETERS, traction_ratio
 
 SLICK_RATIO = 0.5
 """Thrust over load at the peak, up to which terrain counts as slick: with more, a robot stops from 1 m/s in
@@ -45,7 +44,7 @@ def braking_by_slip(curve: CurveEntry | None) -> Braking | None:
     if curve is None:
         return None
     slip = np.linspace(0.0, 1.0, 501)
-    thrust = traction_ratio(curve.law, [curve.parameters[name] for name in LAW_PARAMETERS[curve.law]], slip)
+    thrust = curve.thrust_ratio(slip)
     peak = int(thrust.argmax())
     if peak == len(slip) - 1 or thrust[peak] > SLICK_RATIO or thrust[-1] > LOCKED_RATIO * thrust[peak]:
         return None

@@ -22,8 +22,8 @@ from terrain.files.atomic import atomic_write
 from terrain.files.descriptions import check_keys
 from terrain.files.documents import read_yaml
 from terrain.files.resources import data_folder
-from terrain.records import SlipTarget, TargetStatus
-from terrain.slip_learning.laws import LAW_BOUNDS, LAW_PARAMETERS
+from terrain.records import Array, SlipTarget, TargetStatus
+from terrain.slip_learning.laws import LAW_BOUNDS, LAW_PARAMETERS, traction_ratio
 from terrain.slip_learning.peak import PeakStatus
 
 DRIVE_STATES = ("traction", "braking", "steady")
@@ -78,6 +78,12 @@ class CurveEntry:
     braking_energy_jpm: float
     steady_energy_jpm: float
     n_runs: int
+
+    def thrust_ratio(self, slip_ratio: Array) -> Array:
+        """Return the thrust over load (n,) at each slip (n,)."""
+        return traction_ratio(
+            self.law, [self.parameters[name] for name in LAW_PARAMETERS[self.law]], slip_ratio
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
