@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 
 from pipelines.cli.table import Command
 from pipelines.report.results import Result
-from pipelines.report.settings import Settings, option_name, option_text
+from pipelines.report.settings import Settings, option_name, option_of
 
 PATH = click.Path(path_type=Path)
 WIDTH = 110
@@ -54,15 +54,14 @@ class OneFile(click.Command):
     def _execute(
         self, json_file: Path | None, report_file: Path | None, details: bool, **given: Any
     ) -> Result:
-        from pipelines.report.json_file import checked_json, write_json
+        from pipelines.report.json_file import write_json
         from pipelines.report.terminal import output_console, print_report, progress_bar
-        from pipelines.report.writing import check_ending
-        from terrain.files.atomic import ensure_writable
+        from pipelines.report.writing import ENDINGS, check_file
 
-        checked_json(json_file)
+        if json_file is not None:
+            check_file(json_file, "--json")
         if report_file is not None:
-            check_ending(report_file)
-            ensure_writable(report_file.parent)
+            check_file(report_file, "--report", ENDINGS)
         settings = self.module.Settings(
             **{name: value for name, value in given.items() if value not in (None, ())}
         )
@@ -70,7 +69,8 @@ class OneFile(click.Command):
             result: Result = self.module.run(settings, progress)
         report = result.report
         print_report(report, output_console(), details=details)
-        write_json(json_file, result)
+        if json_file is not None:
+            write_json(json_file, result)
         if report_file is not None:
             report.save(report_file)
         return result
@@ -101,10 +101,10 @@ class OneFile(click.Command):
 
 def _parameters(model: type[Settings], name: str) -> list[click.Parameter]:
     """Return the parameter of a field; the model reads all values, so that they are texts here."""
-    field, written = model.model_fields[name], option_text(model, name)
-    if written.option == "":
+    field, (option_given, several) = model.model_fields[name], option_of(model, name)
+    if option_given == "":
         return []
-    shown, several = option_name(model, name), field.annotation == tuple[str, ...] and not written.separated
+    shown = option_name(model, name)
     if not shown.startswith("-"):
         argument = click.Argument([name], required=False, nargs=-1 if several else 1, metavar=shown)
         argument.text = field.description  # type: ignore[attr-defined]

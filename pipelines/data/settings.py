@@ -50,8 +50,8 @@ class AlignedRunsSettings(RunsSettings):
     """The runs of a command that can choose among them, and bring their two loggers onto one clock."""
 
     robot: str | None = setting(None, ROBOT_TEXT)
-    only: tuple[str, ...] = setting((), "Ids of the runs to use, by commas; all by default.", separated=True)
-    without: tuple[str, ...] = setting((), "Ids of runs to leave out, by commas.", separated=True)
+    only: tuple[str, ...] = setting((), "Ids of the runs to use, by commas; all by default.")
+    without: tuple[str, ...] = setting((), "Ids of runs to leave out, by commas.")
     align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")
 
 

@@ -36,10 +36,12 @@ class Settings(BaseSettings):
         0.0, "Slope along the start's heading in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0
     )
     payload_kg: float = setting(0.0, "Load in kg.", option="--payload", ge=0.0)
-    camera_lost: tuple[str, ...] = setting((), "START:END in s without the camera; may be given again.")
+    camera_lost: tuple[str, ...] = setting(
+        (), "START:END in s without the camera; may be given again.", repeated=True
+    )
     gnss: bool = setting(False, "With an RTK receiver on board.")
     effect: tuple[str, ...] = setting(
-        (), "NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again."
+        (), "NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again.", repeated=True
     )
 
     @property

@@ -72,7 +72,6 @@ class ComparisonSettings(BaseSettings):
         "By commas: plain, ramp, thesis; the traction controller on the target of fallback, classified, "
         "true_terrain, known:NAME (of that terrain) or target:SLIP; the thesis' PID on the targets of "
         "thesis:classified or thesis:true_terrain; NAME+track with path tracking.",
-        separated=True,
     )
     model: str | None = setting(
         None,
@@ -92,7 +91,6 @@ class ComparisonSettings(BaseSettings):
         None,
         "True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default.",
         option="--radius",
-        separated=True,
     )
     leg_backlash_rad: float = setting(0.0, "Backlash of the third leg in rad.", option="--leg-backlash")
     plant: str | None = setting(None, "Robot as it really is, where it differs from --robot.")
@@ -140,22 +138,17 @@ class FaultSettings(BaseSettings):
     """Sensor faults in the closed loop (--faults)."""
 
     faults: tuple[str, ...] = setting(
-        (), "Drive through these faults: names or kinds of them, by commas, or 'all'.", separated=True
+        (), "Drive through these faults: names or kinds of them, by commas, or 'all'."
     )
-    situations: tuple[str, ...] = setting(SITUATIONS, f"By commas: {', '.join(SITUATIONS)}.", separated=True)
+    situations: tuple[str, ...] = setting(SITUATIONS, f"By commas: {', '.join(SITUATIONS)}.")
     stop_terrains: tuple[str, ...] = setting(
-        ("wet_floor",), "Soils of stop, by commas.", option="--stop-terrain", separated=True
+        ("wet_floor",), "Soils of stop, by commas.", option="--stop-terrain"
     )
     durations_s: tuple[float, ...] = setting(
-        (3.0, math.inf),
-        "For how long a fault acts in s, by commas; inf for good.",
-        option="--durations",
-        separated=True,
+        (3.0, math.inf), "For how long a fault acts in s, by commas; inf for good.", option="--durations"
     )
     draw: tuple[str, ...] = setting(
-        (),
-        "Faults whose drives are drawn, by commas; by default, with --out, the worst of each kind.",
-        separated=True,
+        (), "Faults whose drives are drawn, by commas; by default, with --out, the worst of each kind."
     )
 
     @field_validator("situations", "stop_terrains", "durations_s")
@@ -194,9 +187,7 @@ class PathSettings(BaseSettings):
     )
     grip: float = setting(0.7, "Largest side force over load.", gt=0.0, le=1.5)
     offset: float = setting(0.0, "Desired distance to the left of the path in m.", ge=-100.0, le=100.0)
-    stop: tuple[float, ...] = setting(
-        (), "Distances in m at which to stop for 3 s, by commas.", separated=True
-    )
+    stop: tuple[float, ...] = setting((), "Distances in m at which to stop for 3 s, by commas.")
     point_std: float = setting(
         0.0, "Standard deviation of the points in m: 0.02 for points of an RTK receiver.", ge=0.0, le=10.0
     )

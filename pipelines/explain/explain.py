@@ -31,9 +31,7 @@ class Settings(AlignedRunsSettings):
     robot: str = setting(..., "Robot whose simulation is tested: name or YAML file.")
     out: Path = setting(..., "Folder of the page and of the extended robot.")
     model: str | None = setting(None, "Extended description of that robot, tested in its place.")
-    effects: tuple[str, ...] | None = setting(
-        None, "Effects that may be named, by commas; all by default.", separated=True
-    )
+    effects: tuple[str, ...] | None = setting(None, "Effects that may be named, by commas; all by default.")
     terrain: str | None = setting(None, "Use only runs of this label.")
     hold_out: int | None = setting(
         None, "Runs held out to measure the gain; a quarter of six or more by default.", ge=0

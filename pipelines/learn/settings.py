@@ -94,7 +94,6 @@ class WindowSettings(Settings):
         SIGNAL_SETS,
         "Signal sets to use, by commas; leave one out to see what it is worth.",
         option="--signals",
-        separated=True,
     )
     merge_duplicates: bool = setting(
         False, "Treat runs that hold the same measurements as one run instead of refusing them."
@@ -126,7 +125,9 @@ class LearnSettings(WindowSettings):
     seed: int = setting(0, "Deals runs into folds.", ge=0)
     n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
     feature: tuple[str, ...] = setting(
-        (), "MODULE:NAME of a function of a window of your own, beside the features; may be given again."
+        (),
+        "MODULE:NAME of a function of a window of your own, beside the features; may be given again.",
+        repeated=True,
     )
     params: Path | None = setting(None, "Result of a search, in place of the SVM's own choice.")
 
@@ -163,8 +164,12 @@ def check_params(params: Path | None, recipes: tuple[str, ...]) -> None:
 class EvaluationSettings(LearnSettings):
     """Evaluation: what is compared, and which windows are held out."""
 
-    recipe: tuple[str, ...] = setting((), f"Recipes to evaluate (svm), by commas or repeated: {RECIPE_TEXT}")
-    model: tuple[str, ...] = setting((), "Model folder or URI in place of recipes; may be given again.")
+    recipe: tuple[str, ...] = setting(
+        (), f"Recipes to evaluate (svm), by commas or repeated: {RECIPE_TEXT}", repeated=True
+    )
+    model: tuple[str, ...] = setting(
+        (), "Model folder or URI in place of recipes; may be given again.", repeated=True
+    )
     protocol: ProtocolName = setting("grouped", "Which windows train and which test.")
     extras: bool = setting(True, "Speed alone, slow against fast, learning curve, terrain over time.")
     speed: str | None = setting(

@@ -18,7 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Drawn
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from pipelines.report.numbers import plain_line, shorten
+from pipelines.report.numbers import plain_line
 from pipelines.report.tree import Band, Bars, Figure, Line, Panel, Points, Strip
 
 PNG_DPI = 160
@@ -145,17 +145,9 @@ def _draw_panel(axes: Axes, panel: Panel, names: list[str]) -> None:
     axes.grid(axis="x" if bars else "both")
     handles, labels = axes.get_legend_handles_labels()
     if len(labels) > 1 or (labels and not panel.y_label):
-        place = "lower left", (0.0, 1.0 if not panel.title else 1.1)
-        axes.legend(
-            handles,
-            labels,
-            ncols=4,
-            fontsize=8,
-            frameon=False,
-            loc=place[0],
-            bbox_to_anchor=place[1],
-            borderpad=0,
-        )
+        style = {"ncols": 4, "fontsize": 8, "frameon": False, "borderpad": 0}
+        above = (0.0, 1.1 if panel.title else 1.0)
+        axes.legend(handles, labels, loc="lower left", bbox_to_anchor=above, **style)
 
 
 def _draw_strip(axes: Axes, mark: Strip, names: list[str], thin: bool) -> None:
@@ -202,3 +194,17 @@ def _draw_bars(axes: Axes, mark: Bars, number: int, n_bars: int) -> None:
     names = [shorten(plain_line(name), LONGEST_NAME) for name in mark.categories]
     axes.set_yticks(np.arange(len(names)), names)
     axes.set_ylim(len(mark.categories) - 0.4, -0.6)
+
+
+def shorten(text: str, width: int) -> str:
+    """Cut the middle out of a text that is too long; both ends of an id carry information.
+
+    Examples
+    --------
+    >>> shorten("2024-05-01_field_north_run_17", 16)
+    '2024-05…h_run_17'
+    """
+    if len(text) <= width:
+        return text
+    tail = width // 2
+    return f"{text[: width - tail - 1]}…{text[-tail:]}"

@@ -16,21 +16,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from pipelines.report.numbers import format_value
-from pipelines.report.terminal import heading, is_numeric
-from pipelines.report.tree import (
-    Band,
-    Bars,
-    Figure,
-    Line,
-    Part,
-    Points,
-    Report,
-    Section,
-    Strip,
-    Table,
-    figures_of,
-)
+from pipelines.report.json_file import as_json
+from pipelines.report.tree import Figure, Part, Report, Section, figures_of
 
 ASSETS = Path(__file__).parent / "assets"
 DIGITS = 6
@@ -52,9 +39,6 @@ def _environment() -> Environment:
     environment.globals |= {
         "sections": _sections,
         "kind_of": lambda part: type(part).__name__,
-        "written": format_value,
-        "heading": heading,
-        "numeric": _numeric,
         "shade": _shade,
     }
     return environment
@@ -110,44 +94,32 @@ def figure_data(figure: Figure) -> dict[str, Any]:
 
     Examples
     --------
-    >>> from pipelines.report import Panel
+    >>> from pipelines.report import Line, Panel
     >>> figure = Figure("Speed", [Panel([Line("measured", [0, 1], [0.5, math.nan])], "m/s")])
     >>> figure_data(figure)["panels"][0]["marks"][0]["y"]
     [0.5, None]
     """
     panels = [
         {
-            "marks": [_mark_data(mark) for mark in panel.marks],
-            "title": panel.title,
-            "x_label": panel.x_label,
-            "y_label": panel.y_label,
-            "x_range": panel.x_range and [float(end) for end in panel.x_range],
-            "y_range": panel.y_range and [float(end) for end in panel.y_range],
-            "equal": panel.equal,
-            "log_x": panel.log_x,
+            **_shortened(as_json(panel)),
+            "marks": [
+                {"kind": type(mark).__name__.lower(), **_shortened(as_json(mark))} for mark in panel.marks
+            ],
         }
         for panel in figure.panels
     ]
     return {"title": figure.title, "x_label": figure.x_label, "panels": panels}
 
 
-def _mark_data(mark: Line | Band | Points | Bars | Strip) -> dict[str, Any]:
-    found: dict[str, Any] = {"kind": type(mark).__name__.lower()}
-    for name, value in mark._asdict().items():
-        if name in ("x", "y", "low", "high", "values") and value is not None:
-            value = [_plain(each) for each in value]
-        elif name == "spans":
-            value = [[_plain(start), _plain(end), str(text)] for start, end, text in value]
-        elif name == "categories":
-            value = [str(each) for each in value]
-        found[name] = value
-    return found
-
-
-def _plain(value: Any) -> float | None:
-    if value is None or not math.isfinite(value):
-        return None
-    return float(f"{float(value):.{DIGITS}g}")
+def _shortened(value: Any) -> Any:
+    """Return what JSON holds of a figure, its numbers with no more digits than can be seen."""
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}")
+    if isinstance(value, list):
+        return [_shortened(each) for each in value]
+    if isinstance(value, dict):
+        return {key: _shortened(each) for key, each in value.items()}
+    return value
 
 
 @cache
@@ -166,10 +138,6 @@ def _sections(parts: Sequence[Part]) -> list[Section]:
         else:
             found.append(Section("", [part]))
     return found
-
-
-def _numeric(table: Table, place: int) -> bool:
-    return is_numeric(table.heads[place], [row[place] for row in table.rows])
 
 
 def _shade(value: Any) -> str:

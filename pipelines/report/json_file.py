@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from terrain.errors import ConfigError
-from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.files.atomic import atomic_write
 
 
 def as_json(value: Any) -> Any:
@@ -54,23 +53,6 @@ def as_json(value: Any) -> Any:
     return [as_json(each) for each in value]
 
 
-def write_json(path: Path | None, result: Any) -> None:
-    """Write a result to a file, whole or not at all; nothing without a path."""
-    if path is not None:
-        document = as_json(result)
-        atomic_write(path, json.dumps(document, indent=2, allow_nan=False) + "\n")
-
-
-def checked_json(path: Path | None) -> Path | None:
-    """Refuse a place that cannot be written before the work is done, not after.
-
-    Raises
-    ------
-    ConfigError
-        if it is a folder, or nothing can be written there.
-    """
-    if path is not None:
-        if path.is_dir():
-            raise ConfigError(f"{path}: is a folder; --json names a file")
-        ensure_writable(path.parent)
-    return path
+def write_json(path: Path, result: Any) -> None:
+    """Write a result to a file, whole or not at all."""
+    atomic_write(path, json.dumps(as_json(result), indent=2, allow_nan=False) + "\n")

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from pipelines.report.numbers import format_value, plain_line
-from pipelines.report.terminal import heading, is_numeric
+from pipelines.report.numbers import plain_line
 from pipelines.report.tree import Cards, Figure, Pairs, Part, Report, Section, Table, Text
 
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~&!])")
@@ -62,12 +61,11 @@ def _blocks(parts: Sequence[Part], level: int) -> Iterator[str]:
         elif isinstance(part, Pairs):
             yield from [f"**{escape_markdown(part.title)}**"] if part.title else []
             yield "\n".join(
-                f"- {escape_markdown(str(name))}: {escape_markdown(format_value(*value))}"
-                for name, *value in part.rows
+                f"- {escape_markdown(name)}: {escape_markdown(value)}" for name, value in part.cells
             )
         elif isinstance(part, Cards):
             yield "\n".join(
-                f"- {escape_markdown(card.title)}: **{escape_markdown(format_value(*card[1:2], *card[3:]))}**"
+                f"- {escape_markdown(card.title)}: **{escape_markdown(card.written)}**"
                 + (f", {escape_markdown(card.text)}" if card.text else "")
                 for card in part.cards
             )
@@ -88,13 +86,6 @@ def markdown_table(table: Table) -> str:
     |---|---:|
     | a\|b | 3 |
     """
-    heads = table.heads
-    right = [is_numeric(head, [row[i] for row in table.rows]) for i, head in enumerate(heads)]
-    lines = [
-        f"| {' | '.join(escape_markdown(heading(head)) for head in heads)} |",
-        f"|{'|'.join('---:' if each else '---' for each in right)}|",
-    ]
-    for row in table.rows:
-        cells = (escape_markdown(format_value(v, head.form)) for v, head in zip(row, heads, strict=True))
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+    rows = [tuple(head.heading for head in table.heads), *table.cells]
+    head, *body = (f"| {' | '.join(map(escape_markdown, row))} |" for row in rows)
+    return "\n".join([head, f"|{'|'.join('---:' if each else '---' for each in table.numeric)}|", *body])

@@ -57,13 +57,14 @@ def format_value(value: Any, form: str = "", unit: str = "") -> str:
     >>> format_value((0.7236, 0.9079), ".1%"), format_value(0.12648, unit="m/s")
     ('72.4 to 90.8\xa0%', '0.126\xa0m/s')
     """
+    values: tuple[Any, ...] = (value,)
     if isinstance(value, tuple) and len(value) == 2 and not any(isinstance(end, str) for end in value):
-        return interval(value[0], value[1], form, unit)
-    text = _bare(value, form)
-    if text == NOT_KNOWN:
-        return text
+        values = tuple(0.0 if isinstance(end, float) and abs(end) < TINY else end for end in value)
+    texts = [_bare(each, form) for each in values]
+    if NOT_KNOWN in texts:
+        return NOT_KNOWN
     ending = "%" if form.endswith("%") else unit
-    return f"{text}{NBSP}{ending}" if ending else text
+    return " to ".join(texts) + (f"{NBSP}{ending}" if ending else "")
 
 
 def interval(low: float | None, high: float | None, form: str = "", unit: str = "") -> str:
@@ -74,14 +75,7 @@ def interval(low: float | None, high: float | None, form: str = "", unit: str = 
     >>> interval(0.1, 0.25, ".2f", "m"), interval(float("nan"), 1.0)
     ('0.10 to 0.25\xa0m', '–')
     """
-    if low is None or high is None:
-        return NOT_KNOWN
-    low, high = (0.0 if isinstance(end, float) and abs(end) < TINY else end for end in (low, high))
-    ends = _bare(low, form), _bare(high, form)
-    if NOT_KNOWN in ends:
-        return NOT_KNOWN
-    ending = "%" if form.endswith("%") else unit
-    return f"{ends[0]} to {ends[1]}{NBSP}{ending}" if ending else f"{ends[0]} to {ends[1]}"
+    return format_value((low, high), form, unit)
 
 
 def _bare(value: Any, form: str) -> str:
@@ -98,13 +92,9 @@ def _bare(value: Any, form: str) -> str:
         value = value.item()
     if isinstance(value, float) and not math.isfinite(value):
         return NOT_KNOWN if math.isnan(value) else ("∞" if value > 0 else f"{MINUS}∞")
-    if form.endswith("%"):
-        text = f"{100.0 * value:{form[:-1]}f}" if not form.endswith("f%") else f"{100.0 * value:{form[:-1]}}"
-    elif form:
-        text = f"{value:{form}}"
-    else:
-        return format_number(value) if isinstance(value, float) else str(value).replace("-", MINUS)
-    return text.replace("-", MINUS)
+    if form:
+        return f"{value:{form}}".removesuffix("%").replace("-", MINUS)
+    return format_number(value) if isinstance(value, float) else str(value).replace("-", MINUS)
 
 
 def plain_line(text: str) -> str:
@@ -118,35 +108,25 @@ def plain_line(text: str) -> str:
     return NBSP.join(printable(part) for part in text.split(NBSP))
 
 
-def format_number(number: float) -> str:
-    """Return a number with three significant digits.
+def format_number(number: float, digits: int = 3) -> str:
+    """Return a number with three significant digits, or so many.
 
     Examples
     --------
-    >>> format_number(0.12648), format_number(3.81e-4), format_number(7e-6)
-    ('0.126', '3.81·10⁻⁴', '7·10⁻⁶')
+    >>> format_number(0.12648), format_number(3.81e-4), format_number(7e-6), format_number(0.0127, 2)
+    ('0.126', '3.81·10⁻⁴', '7·10⁻⁶', '0.013')
     >>> format_number(-2.0), format_number(4096.0)
     ('−2', '4096')
     """
+    number = float(f"{number:.{digits}g}") if digits < 3 else number
     if number == 0:
         return "0"
     if not 1e-3 <= abs(number) < 1e5:
-        digits, _, power = f"{number:.2e}".partition("e")
-        text = f"{float(digits):g}·10{str(int(power)).translate(_SUPERSCRIPT)}"
+        mantissa, _, power = f"{number:.2e}".partition("e")
+        text = f"{float(mantissa):g}·10{str(int(power)).translate(_SUPERSCRIPT)}"
     else:
         text = f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
     return text.replace("-", MINUS)
-
-
-def two_digits(value: float) -> str:
-    """Return a number with two significant digits.
-
-    Examples
-    --------
-    >>> two_digits(0.0127)
-    '0.013'
-    """
-    return format_number(float(f"{value:.2g}"))
 
 
 def unit_of(parameter: str) -> str:
@@ -176,11 +156,11 @@ def quantity(parameter: str, value: float) -> str:
     if not math.isfinite(value):
         return NOT_KNOWN
     if parameter in PARAMETER and PARAMETER[parameter].as_percent:
-        return f"{two_digits(100.0 * value)}{NBSP}%"
+        return f"{format_number(100.0 * value, 2)}{NBSP}%"
     unit = parameter.rpartition("_")[2]
     if unit in SMALL and abs(value) < 0.0995:
-        return f"{two_digits(1000.0 * value)}{NBSP}{SMALL[unit]}"
-    return f"{two_digits(value)}{NBSP}{unit_of(parameter)}".strip(NBSP)
+        return f"{format_number(1000.0 * value, 2)}{NBSP}{SMALL[unit]}"
+    return f"{format_number(value, 2)}{NBSP}{unit_of(parameter)}".strip(NBSP)
 
 
 def format_counts(counts: Mapping[str, int]) -> str:
@@ -214,20 +194,6 @@ def enumerated(names: Sequence[str], last: str = "and") -> str:
     ('a, b and c', 'a', '')
     """
     return f"{', '.join(names[:-1])} {last} {names[-1]}" if len(names) > 1 else "".join(names)
-
-
-def shorten(text: str, width: int) -> str:
-    """Cut the middle out of a text that is too long; both ends of an id carry information.
-
-    Examples
-    --------
-    >>> shorten("2024-05-01_field_north_run_17", 16)
-    '2024-05…h_run_17'
-    """
-    if len(text) <= width:
-        return text
-    tail = width // 2
-    return f"{text[: width - tail - 1]}…{text[-tail:]}"
 
 
 def sentence(text: str) -> str:

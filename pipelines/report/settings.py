@@ -7,44 +7,29 @@ Nothing heavy is imported here, nor by a module of settings: ``--help`` reads th
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Self
+import typing
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from terrain.errors import ConfigError
 
 
-class OptionText(NamedTuple):
-    """How a field is written on the command line.
-
-    Parameters
-    ----------
-    option : its option, as ``--window``; ``--name-of-the-field`` by default; without dashes an argument that
-        is given by its place, as ``FOLDER``; empty for a field without one
-    separated : whether several values are given in one text, by commas
-    """
-
-    option: str | None = None
-    separated: bool = False
-
-
-def setting(
-    default: Any,
-    text: str,
-    option: str | None = None,
-    separated: bool = False,
-    **bounds: Any,
-) -> Any:
+def setting(default: Any, text: str, option: str | None = None, repeated: bool = False, **bounds: Any) -> Any:
     """Return a field of a settings model.
 
     Parameters
     ----------
     default : its only default; ``...`` where it has to be given
     text : its help
-    option, separated : as :class:`OptionText`
+    option : how it is given on the command line, as ``--window``; ``--name-of-the-field`` by default; without
+        dashes an argument that is given by its place, as ``FOLDER``; empty for a field without one
+    repeated : of a tuple: each value has an option of its own; otherwise they are one text, by commas
     bounds : of a number, as pydantic names them: ``ge``, ``gt``, ``le``, ``lt``
     """
-    return Field(default, description=text, json_schema_extra={"option": [option, separated]}, **bounds)
+    return Field(
+        default, description=text, json_schema_extra={"option": option, "repeated": repeated}, **bounds
+    )
 
 
 class Settings(BaseModel):
@@ -54,7 +39,7 @@ class Settings(BaseModel):
     --------
     >>> class Shown(Settings):
     ...     seed: int = setting(0, "Of all that is drawn.", ge=0)
-    ...     names: tuple[str, ...] = setting(("a",), "By commas.", separated=True)
+    ...     names: tuple[str, ...] = setting(("a",), "By commas.")
     >>> Shown(names="b, c").names
     ('b', 'c')
     >>> Shown(seed=-1)
@@ -73,52 +58,55 @@ class Settings(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _separate(cls, values: dict[str, Any]) -> dict[str, Any]:
-        values = dict(values)
-        for name in cls.model_fields:
-            if option_text(cls, name).separated and isinstance(values.get(name), str):
-                values[name] = tuple(part.strip() for part in values[name].split(",") if part.strip())
-        return values
+        separated = {
+            name: tuple(part.strip() for part in value.split(",") if part.strip())
+            for name, value in values.items()
+            if isinstance(value, str) and name in cls.model_fields and is_separated(cls, name)
+        }
+        return values | separated
 
     def with_(self, **changed: Any) -> Self:
         """Return the same settings with some changed, checked anew."""
         return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changed)
 
 
-def option_text(model: type[Settings], name: str) -> OptionText:
-    """Return how a field of a model is written on the command line."""
-    extra = model.model_fields[name].json_schema_extra
-    if not isinstance(extra, dict):
-        return OptionText()
-    option, separated = extra["option"]  # type: ignore[misc, str-unpack]
-    return OptionText(option, bool(separated))  # type: ignore[arg-type]
+def option_of(model: type[Settings], name: str) -> tuple[str | None, bool]:
+    """Return the option that a field is given, or None, and whether it is repeated for several values."""
+    extra: Any = model.model_fields[name].json_schema_extra or {"option": None, "repeated": False}
+    return extra["option"], extra["repeated"]
+
+
+def is_separated(model: type[Settings], name: str) -> bool:
+    """Return whether several values of a field are given in one text, by commas."""
+    kind = model.model_fields[name].annotation
+    is_tuple = any(typing.get_origin(each) is tuple for each in (kind, *typing.get_args(kind)))
+    return is_tuple and not option_of(model, name)[1]
 
 
 def option_name(model: type[Settings], name: str) -> str:
     """Return the option of a field, as ``--window``."""
-    return option_text(model, name).option or f"--{name.replace('_', '-')}"
+    return option_of(model, name)[0] or f"--{name.replace('_', '-')}"
 
 
 def _one_sentence(model: type[Settings], error: ValidationError) -> str:
     """Return the first thing that is not accepted."""
     first = error.errors()[0]
-    message = str(first["msg"])
-    message = message.removeprefix("Value error, ")
+    message = str(first["msg"]).removeprefix("Value error, ")
     if not first["loc"] or first["type"] == "value_error":
         return message
-    name = str(first["loc"][0])
+    name, given = str(first["loc"][0]), first["input"]
     if first["type"] == "extra_forbidden":
         return f"there is no setting {name!r}"
     option = option_name(model, name)
     if first["type"] == "missing":
         return f"{option} is missing"
-    given = first["input"]
-    shown = given if isinstance(given, str) and _is_number(given) else repr(given)
-    return f"{option} is {shown}: {message[:1].lower()}{message[1:]}"
+    return f"{option} is {_shown(given)}: {message[:1].lower()}{message[1:]}"
 
 
-def _is_number(text: str) -> bool:
+def _shown(given: Any) -> str:
+    """Return what was given: numbers, also those of the command line, as they are, and texts in quotes."""
     try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+        float(given)
+    except (TypeError, ValueError):
+        return repr(given)
+    return str(given)

@@ -9,14 +9,13 @@ from contextlib import contextmanager
 
 from rich.box import SIMPLE
 from rich.console import Console, RenderableType
-from rich.padding import Padding
 from rich.table import Column as RichColumn
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from pipelines.report.numbers import NOT_KNOWN, format_value, plain_line
+from pipelines.report.numbers import plain_line
 from pipelines.report.results import Progress
-from pipelines.report.tree import Cards, Column, Pairs, Part, Report, Section, Table, Text
+from pipelines.report.tree import Cards, Pairs, Part, Report, Section, Table, Text
 
 WIDTH_OF_A_FILE = 110
 """Characters of a line where the output is no terminal, which has a width of its own."""
@@ -63,9 +62,8 @@ def terminal_text(report: Report, *, details: bool = False, width: int = WIDTH_O
 
     Examples
     --------
-    >>> table = Table(("terrain", Column("recall", ".1%")), [("grass", 0.5)])
-    >>> terminal_text(Report("Runs", "Half of them are right.", parts=[table])).split()[-3:]
-    ['grass', '50.0', '%']
+    >>> terminal_text(Report("Runs", "Half of them are right.", parts=[Pairs([("runs", 3)])])).split()[-2:]
+    ['runs', '3']
     """
     console = Console(file=io.StringIO(), width=width, markup=False, soft_wrap=True, color_system=None)
     print_report(report, console, details=details)
@@ -100,12 +98,9 @@ def _parts(parts: Sequence[Part]) -> Iterator[RenderableType]:
             if part.note:
                 yield RichText(part.note, style="dim")
         elif isinstance(part, Pairs):
-            yield _pairs(part)
+            yield _grid(part.cells, part.title)
         elif isinstance(part, Cards):
-            rows = [
-                (card.title, format_value(card.value, card.form, card.unit), card.text) for card in part.cards
-            ]
-            yield _grid(rows)
+            yield _grid([(card.title, card.written, card.text) for card in part.cards])
         elif isinstance(part, Section):
             if part.title:
                 yield RichText(f"\n{part.title}", style="bold")
@@ -114,58 +109,28 @@ def _parts(parts: Sequence[Part]) -> Iterator[RenderableType]:
 
 
 def _table(table: Table) -> RenderableType:
-    numeric = [is_numeric(head, [row[i] for row in table.rows]) for i, head in enumerate(table.heads)]
     columns = [
         RichColumn(
-            RichText(heading(head)),
+            RichText(head.heading),
             justify="right" if right else "left",
             overflow="fold",
             min_width=24 if head.long else None,
         )
-        for head, right in zip(table.heads, numeric, strict=True)
+        for head, right in zip(table.heads, table.numeric, strict=True)
     ]
     drawn = RichTable(
         *columns, title=table.title or None, box=SIMPLE, padding=(0, 1, 0, 0), title_justify="left"
     )
-    for row in table.rows:
-        drawn.add_row(*(RichText(format_value(v, h.form)) for v, h in zip(row, table.heads, strict=True)))
+    for row in table.cells:
+        drawn.add_row(*map(RichText, row))
     return drawn
 
 
-def _pairs(pairs: Pairs) -> RenderableType:
-    rows = [(str(row[0]), format_value(*row[1:])) for row in pairs.rows]
-    grid = _grid(rows)
-    return grid if not pairs.title else Padding(_titled(pairs.title, grid), 0)
-
-
-def _titled(title: str, grid: RichTable) -> RichTable:
-    grid.title, grid.title_justify = title, "left"
-    return grid
-
-
-def _grid(rows: Sequence[Sequence[str]]) -> RichTable:
+def _grid(rows: Sequence[Sequence[str]], title: str = "") -> RichTable:
     grid = RichTable.grid(padding=(0, 2, 0, 0))
+    grid.title, grid.title_justify = title or None, "left"
     for _ in rows[0] if rows else ():
         grid.add_column(overflow="fold")
     for row in rows:
         grid.add_row(*map(RichText, row))
     return grid
-
-
-def heading(column: Column) -> str:
-    """Return the heading of a column, with its unit.
-
-    Examples
-    --------
-    >>> heading(Column("speed", unit="m/s"))
-    'speed [m/s]'
-    """
-    return f"{column.title} [{column.unit}]" if column.unit else column.title
-
-
-def is_numeric(column: Column, values: Sequence[object]) -> bool:
-    """Return whether values are aligned on the right."""
-    known = [value for value in values if value is not None]
-    return bool(column.form) or (
-        bool(known) and all(not isinstance(value, str) and value != NOT_KNOWN for value in known)
-    )

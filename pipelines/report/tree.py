@@ -7,6 +7,7 @@ written, so that screen and page show one number in one form.  A figure describe
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -14,6 +15,8 @@ from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
+
+from pipelines.report.numbers import format_value
 
 
 class Text(NamedTuple):
@@ -41,10 +44,22 @@ class Column(NamedTuple):
     shade: bool = False
     long: bool = False
 
+    @property
+    def heading(self) -> str:
+        """The title with its unit."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of values under headings; a heading alone may stand for a :class:`Column`."""
+    """Rows of values under headings; a heading alone may stand for a :class:`Column`.
+
+    Examples
+    --------
+    >>> recalls = Table(("terrain", Column("speed", ".1f", "m/s")), [("grass", 0.5), ("ice", None)])
+    >>> recalls.heads[1].heading, recalls.numeric, recalls.cells
+    ('speed [m/s]', (False, True), [('grass', '0.5'), ('ice', '–')])
+    """
 
     columns: Sequence[Column | str]
     rows: Sequence[Sequence[Any]]
@@ -55,6 +70,25 @@ class Table:
     def heads(self) -> tuple[Column, ...]:
         """The columns, all of them with their format."""
         return tuple(each if isinstance(each, Column) else Column(each) for each in self.columns)
+
+    @property
+    def cells(self) -> list[tuple[str, ...]]:
+        """The rows as they are written."""
+        heads = self.heads
+        return [
+            tuple(format_value(value, head.form) for value, head in zip(row, heads, strict=True))
+            for row in self.rows
+        ]
+
+    @property
+    def numeric(self) -> tuple[bool, ...]:
+        """Whether each column is aligned on the right: it has a format, or holds no text."""
+        found = []
+        for place, head in enumerate(self.heads):
+            known = [row[place] for row in self.rows if row[place] is not None]
+            texts = any(isinstance(value, str) for value in known)
+            found.append(bool(head.form) or (bool(known) and not texts))
+        return tuple(found)
 
 
 class Shown(NamedTuple):
@@ -99,6 +133,11 @@ class Pairs:
     rows: Sequence[tuple[Any, ...]]
     title: str = ""
 
+    @property
+    def cells(self) -> list[tuple[str, str]]:
+        """The names, and the values as they are written."""
+        return [(str(row[0]), format_value(*row[1:])) for row in self.rows]
+
 
 class Card(NamedTuple):
     """A figure that is written large, its name above and a line on it below."""
@@ -108,6 +147,11 @@ class Card(NamedTuple):
     text: str = ""
     form: str = ""
     unit: str = ""
+
+    @property
+    def written(self) -> str:
+        """The value as it is written."""
+        return format_value(self.value, self.form, self.unit)
 
 
 @dataclass(frozen=True)
@@ -279,15 +323,11 @@ def _writer(name: str) -> Any:
 
 def figures_of(report: Report) -> list[Figure]:
     """Return all figures of a report, in their order."""
-
-    def inside(parts: Sequence[Part]) -> list[Figure]:
-        found: list[Figure] = []
-        for part in parts:
-            if isinstance(part, Figure):
-                found.append(part)
-            elif isinstance(part, Section):
-                found += inside(part.parts)
-        return found
-
-    picture = [] if report.picture is None else [report.picture]
-    return [*picture, *inside(report.parts), *inside(report.details)]
+    found, waiting = [], deque([report.picture, *report.parts, *report.details])
+    while waiting:
+        part = waiting.popleft()
+        if isinstance(part, Figure):
+            found.append(part)
+        elif isinstance(part, Section):
+            waiting.extendleft(reversed(part.parts))
+    return found

@@ -1,4 +1,4 @@
-"""Reports as files, by the ending of their name, whole or not at all."""
+"""Reports as files, by the ending of their name, whole or not at all; and checks of files that are to be written."""
 
 from __future__ import annotations
 
@@ -6,26 +6,26 @@ from pathlib import Path
 
 from pipelines.report.tree import Report
 from terrain.errors import ConfigError
-from terrain.files.atomic import atomic_write
+from terrain.files.atomic import atomic_write, ensure_writable
 
 ENDINGS = (".html", ".md")
 
 
-def check_ending(path: Path, endings: tuple[str, ...] = ENDINGS, option: str = "--report") -> Path:
-    """Return a path whose ending is one of those that can be written.
+def check_file(path: Path, option: str, endings: tuple[str, ...] = ()) -> None:
+    """Refuse a file that cannot be written before the work is done, not after.
 
     Raises
     ------
     ConfigError
-        if it is another one, or the path is a folder.
+        if it is a folder, has none of the endings, or nothing can be written there.
     """
     if path.is_dir():
         raise ConfigError(f"{path}: is a folder; {option} names a file")
-    if path.suffix.lower() not in endings:
+    if endings and path.suffix.lower() not in endings:
         raise ConfigError(
             f"{option} is {str(path)!r}; a name that ends in {' or '.join(endings)} is required"
         )
-    return path
+    ensure_writable(path.parent)
 
 
 def save_report(report: Report, path: Path) -> Path:
@@ -34,9 +34,9 @@ def save_report(report: Report, path: Path) -> Path:
     Raises
     ------
     ConfigError
-        if the path has another ending.
+        if the path has another ending, or cannot be written.
     """
-    check_ending(path)
+    check_file(path, "--report", ENDINGS)
     if path.suffix.lower() == ".md":
         from pipelines.report.markdown import markdown_text
 

@@ -46,7 +46,7 @@ class NoiseSettings(BaseSettings):
 
     tuning: Tuning | None = setting(None, "Noise; the thesis' own for vio12, else physical.")
     tune_on: tuple[str, ...] | None = setting(
-        None, "Runs, by commas, for the tuning 'likelihood'; the first three.", separated=True
+        None, "Runs, by commas, for the tuning 'likelihood'; the first three."
     )
 
 
@@ -70,9 +70,7 @@ class PoseSettings(BaseSettings):
     )
     predict: bool = setting(False, "Predict slip from currents and wheel speeds, on held-out runs.")
     hold_out: tuple[str, ...] = setting(
-        (),
-        "Sessions that predictions never train on, by commas; runs without a label never are.",
-        separated=True,
+        (), "Sessions that predictions never train on, by commas; runs without a label never are."
     )
     rollers: bool = setting(False, "Of omni robots: rollers' friction by surface, load of the wheels.")
     seed: int = setting(0, "Deals and draws runs.", ge=0)
@@ -112,9 +110,7 @@ class RobotSettings(BaseSettings):
     """The ground of a robot's runs (--what robot)."""
 
     hard: tuple[str, ...] | None = setting(
-        None,
-        "Labels of hard ground, by commas; those that slip next to nothing by default.",
-        separated=True,
+        None, "Labels of hard ground, by commas; those that slip next to nothing by default."
     )
 
 
@@ -122,9 +118,7 @@ class OdometrySettings(BaseSettings):
     """Odometry of a tracked robot (--what odometry)."""
 
     lengths: tuple[float, ...] = setting(
-        (2.0, 6.0),
-        "Seconds after which poses are compared, by commas; windows of DRIVE have their own.",
-        separated=True,
+        (2.0, 6.0), "Seconds after which poses are compared, by commas; windows of DRIVE have their own."
     )
     folds: int = setting(5, "Folds of whole runs.", ge=2)
 
@@ -133,7 +127,7 @@ class SoilSettings(BaseSettings):
     """Soil of a wheel testbed (--what soil)."""
 
     laws: tuple[str, ...] = setting(
-        LAW_NAMES, "Laws to compare, by commas; the last one is reported in full.", separated=True
+        LAW_NAMES, "Laws to compare, by commas; the last one is reported in full."
     )
     check: Path | None = setting(
         None, "Folder of further trials, which the last law predicts and no fit has."

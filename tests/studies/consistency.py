@@ -132,8 +132,8 @@ class Settings(BaseSettings):
     seed: int = setting(0, "Of all runs.", ge=0)
     robot: str = setting("agrimaro", "Swerve robot.")
     filter_name: str = setting(FILTER, "Filter.", "--filter")
-    scenarios: tuple[str, ...] = setting(SCENARIOS, "By commas.", separated=True)
-    terrains: tuple[str, ...] = setting(tuple(soil_names()), "By commas.", separated=True)
+    scenarios: tuple[str, ...] = setting(SCENARIOS, "By commas.")
+    terrains: tuple[str, ...] = setting(tuple(soil_names()), "By commas.")
     camera_lost_s: float = setting(
         0.0, "Time in s without a camera, from the middle of each run.", "--camera-lost", ge=0.0
     )

@@ -52,7 +52,7 @@ class Mutant(NamedTuple):
 class Settings(BaseSettings):
     """Which mutants are put into which tree."""
 
-    only: tuple[str, ...] = setting((), "These mutants alone, by commas.", separated=True)
+    only: tuple[str, ...] = setting((), "These mutants alone, by commas.")
     file: Path = setting(FILE, "List of mutants.")
     tree: Path = setting(REPOSITORY, "Working tree that is copied.")
 

@@ -48,7 +48,7 @@ class Settings(BaseSettings):
     """How many runs are generated, and how many processes compute their features."""
 
     runs: int = setting(10_000, "Runs of the largest size; 10 % and 30 % of them are measured too.", ge=10)
-    workers: tuple[int, ...] = setting((1, 2), "Processes at once, by commas.", separated=True)
+    workers: tuple[int, ...] = setting((1, 2), "Processes at once, by commas.")
     seed: int = setting(0, "Of the runs.", ge=0)
     scratch: Path | None = setting(
         None, "Existing folder for the generated runs, 70 kB each; that of temporary files by default."

@@ -36,9 +36,7 @@ class Settings(BaseSettings):
         ge=1,
     )
     seed: int = setting(0, "Of all that is drawn.", ge=0)
-    rows: tuple[str, ...] = setting(
-        tuple(row.value for row in Row), "Kinds of trials, by commas.", separated=True
-    )
+    rows: tuple[str, ...] = setting(tuple(row.value for row in Row), "Kinds of trials, by commas.")
     runs: int = setting(8, "Runs of each trial; 80 of 6 s in rows short and known.")
     n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
 

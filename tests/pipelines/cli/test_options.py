@@ -31,10 +31,8 @@ class Settings(Folding):
     protocol: Literal["grouped", "published"] = setting("grouped", "Which.")
     window_s: float | None = setting(None, "Length.", option="--window", gt=0)
     figures: bool = setting(True, "Draw.")
-    signal_sets: tuple[str, ...] = setting(
-        ("imu", "currents"), "By commas.", option="--signals", separated=True
-    )
-    effect: tuple[str, ...] = setting((), "May be given again.")
+    signal_sets: tuple[str, ...] = setting(("imu", "currents"), "By commas.", option="--signals")
+    effect: tuple[str, ...] = setting((), "May be given again.", repeated=True)
     inner: int = setting(3, "Not on the command line.", option="")
 
 
