@@ -15,7 +15,7 @@ from typing import Any
 
 import click
 
-from pipelines.cli.options import COMMON, Option, click_command
+from pipelines.cli.options import COMMON, OneFile, Option
 from pipelines.cli.table import COMMANDS
 from pipelines.report import Column, Table
 from pipelines.report.markdown import markdown_table
@@ -42,7 +42,7 @@ def commands_page() -> str:
             f"### terrain {command.name}",
             text,
             f"```\n{module.EXAMPLE}\n```",
-            _options(click_command(command)),
+            _options(OneFile(command)),
         ]
         blocks += [_fields(kind) for kind in _results(module)]
     return "\n\n".join(blocks) + "\n"

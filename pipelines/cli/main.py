@@ -38,9 +38,9 @@ class Terrain(click.Group):
         """
         for each in COMMANDS:
             if each.name == name:
-                from pipelines.cli.options import click_command
+                from pipelines.cli.options import OneFile
 
-                return click_command(each)
+                return OneFile(each)
         if name in FORMER:
             raise click.UsageError(f"there is no command {name!r} any more: {FORMER[name]}")
         near = get_close_matches(name, [*(each.name for each in COMMANDS), *FORMER], 1)

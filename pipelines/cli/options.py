@@ -29,27 +29,18 @@ class Option(click.Option):
     heading: str = COMMON
 
 
-def click_command(command: Command) -> click.Command:
-    """Return a command of the table as click runs it."""
-    module = import_module(command.module)
-    parameters: list[click.Parameter] = []
-    for name in module.Settings.model_fields:
-        parameters += _parameters(module.Settings, name)
-    parameters += _common()
-    return OneFile(command, module, parameters)
-
-
 class OneFile(click.Command):
-    """A command whose settings, run and report are in one module."""
+    """A command of the table, whose settings, run and report are in one module."""
 
-    def __init__(self, command: Command, module: types.ModuleType, parameters: list[click.Parameter]) -> None:
+    def __init__(self, command: Command) -> None:
+        self.module, self.command = import_module(command.module), command
+        model = self.module.Settings
         super().__init__(
             command.name,
-            params=parameters,
+            params=[*(one for name in model.model_fields for one in _parameters(model, name)), *_common()],
             callback=self._execute,
             context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDTH},
         )
-        self.module, self.command = module, command
 
     def _execute(
         self, json_file: Path | None, report_file: Path | None, details: bool, **given: Any
@@ -157,16 +148,11 @@ def _headline(kind: type) -> str:
 
 def _common() -> list[click.Parameter]:
     return [
-        Option(
-            ["--json", "json_file"],
-            metavar="FILE",
-            type=click.Path(path_type=Path),
-            help="Write the result as JSON.",
-        ),
+        Option(["--json", "json_file"], metavar="FILE", type=PATH, help="Write the result as JSON."),
         Option(
             ["--report", "report_file"],
             metavar="FILE",
-            type=click.Path(path_type=Path),
+            type=PATH,
             help="Write the report as a page (.html) or as Markdown (.md).",
         ),
         Option(["--details"], is_flag=True, help="Print the details, too."),

@@ -9,11 +9,11 @@ from __future__ import annotations
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from pipelines.report import (
     Column,
@@ -34,7 +34,6 @@ from pipelines.report.settings import setting
 from terrain.errors import DataError
 
 if TYPE_CHECKING:
-    from pipelines.data.convert import ImportResult
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.predict import Predictions
     from pipelines.learn.train import TrainResult
@@ -45,14 +44,6 @@ EXAMPLE = "terrain quickstart --data logs/"
 REPORT_FILE = "report.html"
 SIMULATED = "simulated AgriMaRo"
 REPEATS = 1
-
-ENOUGH_RUNS = 6
-"""A terrain with so many runs gives one of them away: five are left, one for each fold."""
-
-FEWEST_RUNS = 3
-"""Where no terrain has enough, the one with the most runs gives one away if two are left."""
-
-N_FOLDS = 5
 
 
 class Settings(BaseSettings):
@@ -69,22 +60,6 @@ class Settings(BaseSettings):
     runs_a_terrain: int = setting(6, "Simulated runs of each terrain.", ge=2, option="--runs")
 
 
-class KeptRuns(NamedTuple):
-    """Where the runs lie, and whether they were there from an earlier call; what reading them found."""
-
-    out: Path
-    n_runs: int
-    reused: bool
-    imported: ImportResult | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        """Return all fields, those of the import among them."""
-        found = {"out": self.out, "n_runs": self.n_runs, "reused": self.reused}
-        if self.imported is None:
-            return found
-        return {each.name: getattr(self.imported, each.name) for each in fields(self.imported)} | found
-
-
 @dataclass(frozen=True, repr=False)
 class QuickstartResult(Result):
     """Evaluation, model and predictions, and where they come from."""
@@ -96,28 +71,20 @@ class QuickstartResult(Result):
     crossval: CrossvalResult = described("evaluation on held-out runs")
     train: TrainResult = described("the registered model")
     predict: Predictions = described("of the runs that were held out")
-    imported: KeptRuns = described("where the runs lie")
+    imported: Mapping[str, Any] = described("where the runs lie, and what reading them found")
     slip: tuple[TerrainSlip, ...] | None = described(
         "estimated and true slip by terrain; None of your own runs"
     )
     commands: tuple[str, ...] = described("what to type for the same, step by step")
     report_file: Path = described("the page")
     held_out: tuple[str, ...] = described("runs that the model was neither evaluated nor trained on")
-    figures: tuple[Figure, ...] = described("of a simulated run; not in JSON", default=())
+    figures: tuple[Figure, ...] = ()
 
     def as_json(self) -> Any:
-        """Return all fields; the evaluation is given once, beside the training."""
-        found = Result.as_json(self)
-        del found["figures"], found["train"]["crossval"]
+        """Return the described fields; the evaluation is given once, beside the training."""
+        found = super().as_json()
+        del found["train"]["crossval"]
         return found
-
-
-class _Source(NamedTuple):
-    """The runs, and what is known of them because they were simulated."""
-
-    runs: list[RunLog]
-    slip: tuple[TerrainSlip, ...] | None
-    figures: tuple[Figure, ...]
 
 
 def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
@@ -158,16 +125,17 @@ def _run(settings: Settings, progress: Progress) -> QuickstartResult:
     from pipelines.learn.load import load_model
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
+    from terrain.classify.folds import hold_out_runs
     from terrain.control.slip_table import load_slip_table
     from terrain.logs.merge import distinct_runs
 
     data, out = settings.data, settings.out
-    source = _simulated(settings, progress) if data is None else _Source(load_runs(data), None, ())
-    _refuse_other_runs(source.runs, data, out / "runs")
-    runs = distinct_runs(source.runs, merge=settings.merge_duplicates).runs
+    given, slip, figures = _simulated(settings, progress) if data is None else (load_runs(data), None, ())
+    _refuse_other_runs(given, data, out / "runs")
+    runs = distinct_runs(given, merge=settings.merge_duplicates).runs
     dataset = SIMULATED if data is None else data.resolve().name
-    training, held_out = divide(runs)
-    kept = _keep(source.runs, data, out / "runs", progress)
+    training, held_out = hold_out_runs(runs)
+    kept = _keep(given, data, out / "runs", progress)
     asked = TrainingSettings(name=settings.name, seed=settings.seed, n_jobs=settings.n_jobs, repeats=REPEATS)
     # without an evaluation given, that of the training shares its fits with the worth of the channels
     trained = train(training, asked, dataset, progress)
@@ -181,49 +149,25 @@ def _run(settings: Settings, progress: Progress) -> QuickstartResult:
         train=trained,
         predict=predicted,
         imported=kept,
-        slip=source.slip,
+        slip=slip,
         commands=_commands(settings, trained.model_uri, held_out),
         report_file=out / REPORT_FILE,
         held_out=tuple(each.run_id for each in held_out),
-        figures=source.figures,
+        figures=figures,
     )
     result.report.save(result.report_file)
     return result
 
 
-def divide(runs: Sequence[RunLog]) -> tuple[list[RunLog], list[RunLog]]:
-    """Return runs to evaluate and train on, and the last one of each terrain that has enough runs, held out.
-
-    The choice depends on names and numbers alone.  Nothing is held out where too little would be left, and no
-    run with several terrains is.
-
-    Examples
-    --------
-    >>> from terrain.records import RunLog
-    >>> def run(terrain, number):
-    ...     return RunLog(f"{terrain}_{number}", "husky", {}, ((0.0, 9.0, terrain),))
-    >>> runs = [run("ice", i) for i in range(6)] + [run("mud", i) for i in range(2)]
-    >>> [each.run_id for each in divide(runs)[1]]
-    ['ice_5']
-    """
-    by_terrain: dict[str, list[RunLog]] = {}
-    for run in sorted(runs, key=lambda each: each.run_id):
-        if len(run.terrains) == 1:
-            by_terrain.setdefault(run.terrains[0], []).append(run)
-    chosen = {of_one[-1].run_id for of_one in by_terrain.values() if len(of_one) >= ENOUGH_RUNS}
-    if not chosen and by_terrain:
-        most = max(by_terrain.values(), key=len)
-        if len(most) >= FEWEST_RUNS and len(runs) > N_FOLDS:
-            chosen = {most[-1].run_id}
-    return [run for run in runs if run.run_id not in chosen], [run for run in runs if run.run_id in chosen]
-
-
-def _simulated(settings: Settings, progress: Progress) -> _Source:
+def _simulated(
+    settings: Settings, progress: Progress
+) -> tuple[list[RunLog], tuple[TerrainSlip, ...], tuple[Figure, ...]]:
+    """Return the runs, and what is known of them because they were simulated."""
     from pipelines.slip.filtered import slip_figure, swerve_motion
     from terrain.estimation.labelled import labelled_runs
 
     runs, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
-    return _Source(runs, slip, (slip_figure(example), swerve_motion(example)))
+    return runs, slip, (slip_figure(example), swerve_motion(example))
 
 
 def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) -> tuple[str, ...]:
@@ -255,25 +199,24 @@ def _refuse_other_runs(runs: list[RunLog], data: Path | None, folder: Path) -> N
         raise DataError(f"{folder}: holds other runs than {data or 'this simulation'}; choose another --out")
 
 
-def _keep(runs: list[RunLog], data: Path | None, folder: Path, progress: Progress) -> KeptRuns:
+def _keep(runs: list[RunLog], data: Path | None, folder: Path, progress: Progress) -> dict[str, Any]:
     """Write run folders into ``folder``; earlier ones of the same data are used as they are."""
     from terrain.files.atomic import atomic_folder
     from terrain.logs.write import write_run
 
-    if folder.exists():
+    kept = {"out": folder, "n_runs": len(runs), "reused": folder.exists()}
+    if kept["reused"]:
         progress("write runs", len(runs), len(runs))
-        return KeptRuns(folder, len(runs), reused=True)
-    if data is not None:
+    elif data is not None:
         from pipelines.data import convert
 
-        imported = convert.run(convert.Settings(data=data, out=folder), progress)
-        assert isinstance(imported, convert.ImportResult)
-        return KeptRuns(folder, len(runs), reused=False, imported=imported)
-    with atomic_folder(folder) as unfinished:
-        for number, each in enumerate(runs, 1):
-            write_run(each, unfinished)
-            progress("write runs", number, len(runs))
-    return KeptRuns(folder, len(runs), reused=False)
+        return vars(convert.run(convert.Settings(data=data, out=folder), progress)) | kept
+    else:
+        with atomic_folder(folder) as unfinished:
+            for number, each in enumerate(runs, 1):
+                write_run(each, unfinished)
+                progress("write runs", number, len(runs))
+    return kept
 
 
 def report(result: QuickstartResult) -> Report:
@@ -313,12 +256,8 @@ def _held_out_sentence(result: QuickstartResult) -> str:
 
 def _slip(rows: Sequence[TerrainSlip]) -> Section:
     columns = (
-        "terrain",
-        "runs",
-        Column("slip", "+.3f"),
-        Column("true slip", "+.3f"),
-        Column("RMSE", ".4f"),
-        Column("NEES", ".2f"),
+        *("terrain", "runs", Column("slip", "+.3f"), Column("true slip", "+.3f")),
+        *(Column("RMSE", ".4f"), Column("NEES", ".2f")),
     )
     table = Table(columns, [tuple(row) for row in rows], title="steady slip of the simulated runs")
     worst = max((row.slip_rmse or 0.0) for row in rows)

@@ -11,7 +11,7 @@ sys.path[:0] = [str(TESTS), str(TESTS.parent)]
 
 import click  # noqa: E402
 
-from pipelines.cli.options import click_command  # noqa: E402
+from pipelines.cli.options import OneFile  # noqa: E402
 from pipelines.cli.table import Command  # noqa: E402
 from terrain.errors import TerrainError  # noqa: E402
 
@@ -49,7 +49,7 @@ def main(words: list[str]) -> int:
     try:
         if words[0] not in STUDIES:
             raise click.UsageError(f"there is no study {words[0]!r}; there are {', '.join(STUDIES)}")
-        command = click_command(Command("", words[0], *STUDIES[words[0]]))
+        command = OneFile(Command("", words[0], *STUDIES[words[0]]))
         prog_name = f"python tests/studies {words[0]}"
         result: Any = command.main(words[1:], prog_name=prog_name, standalone_mode=False)
     except click.exceptions.Exit as stop:

@@ -6,12 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.cli.quickstart import Settings, divide, run
+from pipelines.cli.quickstart import Settings, run
 from pipelines.data.datasets import data_digest
 from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.learn.load import load_model
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
+from terrain.classify.folds import hold_out_runs
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.labelled import labelled_runs
 from terrain.logs.read import read_run
@@ -111,7 +112,7 @@ def test_every_terrain_is_driven_and_its_slip_is_near_the_truth():
 )
 def test_enough_is_left_of_every_terrain(make_run, counts, held_out):
     runs = [make_run(f"{name}_{i}", name, i, 1.0) for name, n in counts.items() for i in range(n)]
-    training, out = divide(runs)
+    training, out = hold_out_runs(runs)
     assert [each.run_id for each in out] == held_out
     assert sorted(each.run_id for each in (*training, *out)) == sorted(each.run_id for each in runs)
 
