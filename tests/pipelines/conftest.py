@@ -3,11 +3,13 @@
 import math
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipelines.cli import main as cli
 from pipelines.data.can_codec import QUATERNION, RECEIVED, SIGNALS, encode
 from pipelines.learn.training_data import fitted_model
 from terrain.angles import wrapped
@@ -88,6 +90,56 @@ def driven_runs(terrains=("ASPHALT", "GRASS", "GRAVEL"), n_runs=4, seed=0, **opt
         for terrain in terrains
         for number in range(1, n_runs + 1)
     ]
+
+
+@pytest.fixture
+def terrain(monkeypatch, capfd):
+    """Return a function that runs the command in this process: exit code, stdout and stderr."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["terrain", *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        output = capfd.readouterr()
+        return stop.value.code or 0, output.out, output.err
+
+    return run
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """An empty folder to work in, with no tracking server named."""
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    (tmp_path / "place").mkdir()
+    monkeypatch.chdir(tmp_path / "place")
+    return tmp_path / "place"
+
+
+@pytest.fixture
+def refused(terrain, place):
+    """Return a function that asserts that a command is refused in one clear sentence and touches nothing."""
+
+    def check(sentence, *words):
+        before = files_of(place)
+        code, out, err = terrain(*words)
+        assert (code, out) == (2, "")
+        assert err.startswith("error: "), err
+        assert err.count("\n") == 1, err
+        assert err[:-1].isprintable()
+        assert len(err) < 1100
+        assert sentence in err
+        after = files_of(place)
+        assert {path: after.get(path) for path in before} == before
+        new = {path for path in after if path not in before}
+        assert {path.name for path in new} <= {"mlruns"}  # an empty folder, to see that it can be written
+        assert all(after[path] is None for path in new)
+
+    return check
+
+
+def files_of(folder):
+    """Return what lies under a folder, with the content of files."""
+    return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
 
 
 @pytest.fixture(scope="session")

@@ -8,7 +8,6 @@ from typing import Literal
 import pytest
 
 from pipelines.cli import main as cli
-from pipelines.cli import table
 from pipelines.cli.table import COMMANDS, FORMER, Command
 from pipelines.report import Report, Result, Section, Text, described
 from pipelines.report.settings import Settings as BaseSettings
@@ -62,29 +61,20 @@ def report(result):
 
 
 @pytest.fixture
-def terrain(monkeypatch, capsys):
-    """Run ``terrain draw`` with words: exit code, output, errors, settings that were taken."""
+def draw(monkeypatch, terrain):
+    """Run ``terrain draw`` with words: exit code, output, errors; the settings go to ``TAKEN``."""
     monkeypatch.setitem(sys.modules, "drawing_command", sys.modules[__name__])
-    drawing = Command("Data", "draw", "drawing_command", "draws")
-    for place in (cli, table):
-        monkeypatch.setattr(place, "COMMANDS", (*COMMANDS, drawing))
-
-    def run(*words):
-        TAKEN.clear()
-        monkeypatch.setattr(sys, "argv", ["terrain", *words])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        output = capsys.readouterr()
-        return stop.value.code, output.out, output.err, TAKEN[0] if TAKEN else None
-
-    return run
+    monkeypatch.setattr(cli, "COMMANDS", (*COMMANDS, Command("Data", "draw", "drawing_command", "draws")))
+    TAKEN.clear()
+    return lambda *words: terrain("draw", *words)
 
 
-def test_every_option_reaches_the_model_and_defaults_are_those_of_the_model(terrain):
-    assert terrain("draw", "--folder", "a")[3] == Settings(folder="a")
+def test_every_option_reaches_the_model_and_defaults_are_those_of_the_model(draw):
+    draw("--folder", "a")
+    assert TAKEN.pop() == Settings(folder="a")
     words = ["--folder", "a", "--protocol", "published", "--window", "1.5", "--seed", "4", "--no-figures"]
-    taken = terrain("draw", *words, "--signals", "imu, gnss", "--effect", "a=1", "--effect", "b=2")[3]
-    assert taken == Settings(
+    draw(*words, "--signals", "imu, gnss", "--effect", "a=1", "--effect", "b=2")
+    assert TAKEN.pop() == Settings(
         folder="a",
         protocol="published",
         window_s=1.5,
@@ -113,48 +103,38 @@ def test_every_option_reaches_the_model_and_defaults_are_those_of_the_model(terr
         ),
     ],
 )
-def test_a_mistake_is_one_sentence_and_code_2(terrain, words, sentence):
-    code, out, err, taken = terrain("draw", *words)
-    assert (code, out, taken) == (2, "", None)
+def test_a_mistake_is_one_sentence_and_code_2(draw, words, sentence):
+    code, out, err = draw(*words)
+    assert (code, out, TAKEN) == (2, "", [])
     assert err.startswith(f"error: {sentence}")
     assert err.count("\n") == 1
 
 
-def test_help_begins_with_an_example_and_groups_options(terrain):
-    code, out, _, _ = terrain("draw", "-h")
+def test_help_begins_with_an_example_and_groups_options(draw):
+    code, out, _ = draw("-h")
     assert code == 0
     assert out.startswith(EXAMPLE)
     options = out[len(EXAMPLE) :]
-    words = (
-        "Required:",
-        "--folder",
-        "What is drawn:",
-        "--window",
-        "How it is folded:",
-        "--seed",
-        "Output:",
-        "--json",
-    )
-    places = [options.index(word) for word in words]
+    order = "Required:, --folder, What is drawn:, --window, How it is folded:, --seed, Output:, --json"
+    places = [options.index(word) for word in order.split(", ")]
     assert places == sorted(places)
     assert "[default: imu,currents]" in out
     assert "inner" not in out
 
 
-def test_json_and_page_are_written_and_details_are_asked_for(terrain, tmp_path):
+def test_json_and_page_are_written_and_details_are_asked_for(draw, tmp_path):
     files = ["--json", str(tmp_path / "new" / "a.json"), "--report", str(tmp_path / "a.html")]
-    code, out, _, _ = terrain("draw", "--folder", "a", *files)
+    code, out, _ = draw("--folder", "a", *files)
     assert (code, out) == (0, "It is drawn.\n--details adds: More\nnext: terrain b\n")
     assert json.loads((tmp_path / "new" / "a.json").read_text()) == {"ratio": None, "folder": "a"}
     assert "<summary>More</summary>" in (tmp_path / "a.html").read_text()
-    assert "all of it" in terrain("draw", "--folder", "a", "--details")[1]
+    assert "all of it" in draw("--folder", "a", "--details")[1]
 
 
-def test_a_former_command_names_its_successor(terrain, monkeypatch):
-    monkeypatch.setitem(FORMER, "sketch", "use terrain draw")
-    code, _, err, _ = terrain("sketch", "--folder", "a")
-    assert (code, err) == (2, "error: there is no command 'sketch' any more: use terrain draw\n")
-    assert terrain("drow")[2] == "error: there is no command 'drow'; the nearest is 'draw'\n"
+def test_a_former_command_names_its_successor(terrain):
+    code, _, err = terrain("compare", "--folder", "a")
+    assert (code, err) == (2, f"error: there is no command 'compare' any more: {FORMER['compare']}\n")
+    assert terrain("explian")[2] == "error: there is no command 'explian'; the nearest is 'explain'\n"
 
 
 def test_unknown_settings_are_refused_and_settings_do_not_change():

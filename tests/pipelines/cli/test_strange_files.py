@@ -3,12 +3,10 @@
 import json
 import os
 import shutil
-import sys
 
 import pytest
 from pyarrow import parquet
 
-from pipelines.cli import main as cli
 from terrain.files.resources import data_folder
 from terrain.logs.write import write_run
 
@@ -19,31 +17,10 @@ LAUGHS = b"0: &a0 [x, x]\n" + b"".join(
 
 
 @pytest.fixture
-def place(tmp_path, monkeypatch, drive):
-    """A folder with a run in ``data``, to work in."""
-    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
-    monkeypatch.chdir(tmp_path)
-    write_run(drive("r", "GRASS", 0, duration_s=4.0), tmp_path / "data")
-    return tmp_path
-
-
-@pytest.fixture
-def refused(place, monkeypatch, capfd):
-    """Return a function that asserts that a command is refused in one clear line."""
-
-    def check(sentence, *words):
-        monkeypatch.setattr(sys, "argv", ["terrain", *map(str, words)])
-        with pytest.raises(SystemExit) as stop:
-            cli.main()
-        output = capfd.readouterr()
-        assert (stop.value.code, output.out) == (2, "")
-        assert sentence in output.err
-        assert output.err.startswith("error: ")
-        assert output.err.count("\n") == 1
-        assert output.err[:-1].isprintable()
-        assert len(output.err) < 1100
-
-    return check
+def place(place, drive):
+    """The folder to work in, with a run in ``data``."""
+    write_run(drive("r", "GRASS", 0, duration_s=4.0), place / "data")
+    return place
 
 
 def edit(place, **changed):
@@ -62,16 +39,13 @@ def test_a_log_never_makes_a_command_read_a_file(refused, place):
     refused("robot 'evil.yaml' is unknown", "crossval", "--data", "data", "--align")
 
 
-def test_a_robot_that_the_user_gives_may_be_a_file(place, monkeypatch, capsys):
+def test_a_robot_that_the_user_gives_may_be_a_file(place, terrain):
     text = (data_folder("robots") / "husky.yaml").read_text().replace("name: husky", "name: mule")
     (place / "mule.yaml").write_text(text)
     edit(place, robot="mule")
-    words = ["terrain", "estimate", "--data", "data", "--filter", "skid", "--robot", "mule.yaml"]
-    monkeypatch.setattr(sys, "argv", words)
-    with pytest.raises(SystemExit) as stop:
-        cli.main()
-    assert not stop.value.code
-    assert "skid" in capsys.readouterr().out
+    code, out, _ = terrain("estimate", "--data", "data", "--filter", "skid", "--robot", "mule.yaml")
+    assert code == 0
+    assert "skid" in out
 
 
 def test_names_of_a_log_do_not_reach_the_terminal_as_they_are(refused, place):

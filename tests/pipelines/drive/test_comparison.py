@@ -19,12 +19,10 @@ from pipelines.drive.run_figures import run_figures
 from pipelines.learn.model_file import TerrainModel
 from pipelines.live.terrain_source import TerrainEstimate
 from pipelines.report import NOT_KNOWN
-from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
-from terrain.control.comparison import mean_interval
 from terrain.control.controllers import CONTROLLERS, make_controller
-from terrain.control.drive_comparison import steepest_grade
-from terrain.control.drive_curves import drive_curves
+from terrain.control.drive_comparison import Comparison, steepest_grade
+from terrain.control.drive_curves import DriveCurves
 from terrain.control.drive_evaluation import (
     METRICS,
     evaluate_drive,
@@ -34,8 +32,6 @@ from terrain.control.pilot_settings import PilotStatus
 from terrain.control.power_state import DriveState
 from terrain.control.situations import SituationOptions, make_situation
 from terrain.control.slip_table import CurveEntry, SlipTable, load_slip_table
-from terrain.errors import ConfigError
-from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 
 SHORT = Settings(
@@ -52,13 +48,7 @@ INPUTS = DriveInputs(ROBOT, TABLE)
 
 
 @pytest.mark.slow
-def test_the_result_does_not_depend_on_the_number_of_processes():
-    one, two = (compare(ALL.with_(duration_s=3.0, jobs=n), INPUTS) for n in (1, 2))
-    assert json.dumps(as_json(one), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)
-
-
-@pytest.mark.slow
-def test_every_controller_has_every_metric():
+def test_every_controller_has_every_metric_on_any_number_of_processes():
     result = compare(ALL, INPUTS)
     assert tuple(result.controllers) == ALL.controllers
     for metrics in result.controllers.values():
@@ -68,6 +58,8 @@ def test_every_controller_has_every_metric():
         assert low < metrics["distance_m"].mean < high
     ramp, track = (result.controllers[name]["distance_m"].mean for name in ("ramp", "true_terrain+track"))
     assert ramp == pytest.approx(track, rel=0.01)  # the ramp travels as far
+    two = compare(ALL.with_(jobs=2), INPUTS)
+    assert json.dumps(result.as_json(), allow_nan=False) == json.dumps(two.as_json(), allow_nan=False)
 
 
 def test_one_controller_alone_is_driven():
@@ -156,18 +148,16 @@ def test_the_thesis_takes_the_targets_of_the_classified_terrain(monkeypatch):
     assert belief_notes(result.compared) == ()
 
 
-@pytest.mark.parametrize("suffix", ["", "+track"])
-def test_the_thesis_with_the_true_terrain_drives_on_its_targets(suffix):
+def test_the_thesis_with_the_true_terrain_drives_on_its_targets():
     """The same as the thesis with a table whose fallback has the targets of that terrain."""
     entry = dict(TABLE.targets["grass"])
     grass = replace(TABLE, targets={**TABLE.targets, TABLE.fallback: entry})
     settings = SHORT.with_(seeds=1)
-    name = f"thesis:true_terrain{suffix}"
-    adapting = compare(settings.with_(controllers=(name,)), INPUTS)
-    fixed = compare(settings.with_(controllers=(f"thesis{suffix}",)), DriveInputs(ROBOT, grass))
-    key = "energy_j_per_m"
-    assert adapting.controllers[name][key] == fixed.controllers[f"thesis{suffix}"][key]
-    assert adapting.controllers[name]["believed_ratio"].mean == 1.0
+    adapting = compare(settings.with_(controllers=("thesis:true_terrain+track",)), INPUTS)
+    fixed = compare(settings.with_(controllers=("thesis+track",)), DriveInputs(ROBOT, grass))
+    (found,), (expected,) = adapting.controllers.values(), fixed.controllers.values()
+    assert found["energy_j_per_m"] == expected["energy_j_per_m"]
+    assert found["believed_ratio"].mean == 1.0
 
 
 @pytest.mark.slow
@@ -202,52 +192,9 @@ def a_result(names=("plain", "ramp", "true_terrain"), values=None, n_seeds=4, **
         metrics |= (values or {}).get(name, {})
         seeds = zip(*metrics.values(), strict=True)
         rows[name] = tuple(dict(zip(metrics, row, strict=True)) for row in seeds)[:n_seeds]
-    result = DriveResult(
-        scenario="starts",
-        terrain="grass",
-        robot="agrimaro",
-        table="default",
-        seeds=tuple(range(n_seeds)),
-        delay_s=0.05,
-        grade_deg=0.0,
-        ramp_mps2=0.6582,
-        controllers={
-            name: {key: mean_interval([row[key] for row in found]) for key in found[0]}
-            for name, found in rows.items()
-        },
-        rows=rows,
-    )
-    return replace(result, **more)
-
-
-def a_run(name="true_terrain", open_loop=False, terrains=("grass",), wheel_radps=7.0, slip=0.2):
-    """2 s at 0.8 m/s: limited in the first, one refusal at its end, braking in the last half second."""
-    time_s = np.arange(200) / 100
-    columns = {"speed_x_mps": 0.8, "speed_y_mps": 0.0}
-    columns |= {f"wheel_{i}_radps": wheel_radps for i in (1, 2, 3)} | {
-        f"slip_{i}_ratio": slip for i in (1, 2, 3)
-    }
-    truth = Stream(time_s, np.tile(list(columns.values()), (200, 1)), tuple(columns))
-    status = dict.fromkeys(PilotStatus._fields, np.full(100, math.nan)) | {"driven_mps": np.full(100, 0.9)}
-    status |= {"desired_mps": np.ones(100), "status_code": np.zeros(100), "terrain_code": np.full(100, -1.0)}
-    status["drive_state_code"] = np.full(100, float(DriveState.STEADY))
-    if not open_loop:
-        status |= {
-            key: np.full(100, 0.2) for key in ("target_ratio", "aimed_ratio", "balance_ratio", "slip_ratio")
-        }
-        status["drive_state_code"] = np.repeat(
-            [float(DriveState.TRACTION), float(DriveState.STEADY), float(DriveState.BRAKING)], [50, 25, 25]
-        )
-        status["status_code"] = np.where(np.arange(100) == 50, 2.0, 0.0)
-        status["terrain_code"] = np.repeat([-1.0, list(TABLE.targets).index("clay")], 50)
-    control = Stream(time_s[::2], np.column_stack(list(status.values())), tuple(status))
-    edges = np.linspace(0, 2, len(terrains) + 1)
-    labels = tuple(zip(edges[:-1], edges[1:], terrains, strict=True))
-    return RunLog(name, "agrimaro", {"truth": truth, "control": control}, labels)
-
-
-def curves_of(**options):
-    return drive_curves(a_run(**options), TABLE)
+    about = {"scenario": "starts", "terrain": "grass", "robot": "agrimaro", "table": "default"} | more
+    about |= {"delay_s": 0.05, "grade_deg": 0.0, "ramp_mps2": 0.6582, "seeds": tuple(range(n_seeds))}
+    return DriveResult(**about, controllers=Comparison(about["scenario"], rows).means, rows=rows)
 
 
 def text_of(result):
@@ -315,17 +262,22 @@ def test_only_controllers_that_use_the_terrain_adapt_to_it():
 
 
 def test_a_drive_shows_states_refusals_and_terrains():
-    own, plain = curves_of(terrains=("grass", "clay")), curves_of(open_loop=True, terrains=("grass", "clay"))
-    assert [name for *_, name in own.terrains["true"]] == ["grass", "clay"]
-    assert own.terrains["classified"] == [(1.0, 1.98, "clay")]
-    assert set(plain.terrains) == {"true"}
-    assert curves_of().terrains == {}
-    one, other = run_figures({"true_terrain": own, "plain": plain})
+    """2 s at 0.8 m/s: limited in the first, one refusal at its end, braking in the last half second."""
+    time_s = np.arange(100) / 50
+    true = dict.fromkeys(("true_mps", "slip", "slip_least", "slip_largest"), np.full(100, 0.8))
+    status = dict.fromkeys(PilotStatus._fields, np.full(100, 0.2)) | {"desired_mps": np.ones(100)}
+    states = [float(DriveState.TRACTION), float(DriveState.STEADY), float(DriveState.BRAKING)]
+    status["drive_state_code"] = np.repeat(states, [50, 25, 25])
+    status["status_code"] = np.where(np.arange(100) == 50, 2.0, 0.0)
+    strips = {"true": [(0.0, 1.0, "grass"), (1.0, 2.0, "clay")], "classified": [(1.0, 2.0, "clay")]}
+    own = DriveCurves(time_s, **true, control_s=time_s, control=status, aimed=np.full(100, 0.2),
+                      is_open_loop=False, terrains=strips)  # fmt: skip
+    one, other = run_figures({"true_terrain": own, "plain": own._replace(is_open_loop=True, terrains={})})
     assert one.panels[0].marks[0].spans == [(0.0, 1.0, "traction: speed rises"), (1.5, 1.98, "braking")]
     assert one.panels[1].marks[2].spans == [(1.0, 1.02, "no correction: stale")]
     labels = [{getattr(mark, "label", "") for mark in figure.panels[1].marks} for figure in (one, other)]
-    assert {"target", "target with its floor"} <= labels[0]
-    assert not labels[1] & {"target", "target with its floor"}
+    assert labels[0] - labels[1] >= {"target", "target with its floor"}
+    assert (len(one.panels), len(other.panels)) == (4, 2)
     assert one.panels[1].y_range == other.panels[1].y_range
 
 
@@ -334,43 +286,6 @@ def test_curves_are_drawn_where_the_table_has_any():
     numbers |= {"law": "janosi", "parameters": {"limit_ratio": 0.5, "shear_ratio": 0.2}}
     numbers |= {"peak_status": "peak", "peak_interval_ratio": (0.5, 0.6), "slip_range_ratio": (0.0, 0.7)}
     table = SlipTable("t", "unknown", TABLE.targets, curves={"clay": CurveEntry(**numbers | {"n_runs": 5})})
-    titles = [
-        {section.title for section in a_result(slip_table=each).report.details} for each in (table, TABLE)
-    ]
+    results = [replace(a_result(), slip_table=each) for each in (table, TABLE)]
+    titles = [{section.title for section in result.report.details} for result in results]
     assert titles[0] - titles[1] == {"The curves behind the targets"}
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"controllers": ()}, "no controller"),
-        ({"controllers": ("plain", "plain")}, "twice"),
-        ({"controllers": ("oracle",)}, "'oracle' is unknown"),
-        ({"controllers": ("best",)}, f"'best' is unknown: use {', '.join(CONTROLLERS)}"),
-        ({"controllers": ("known:mars",)}, "no entry 'mars'"),
-        ({"controllers": ("target:1.5",)}, "0 to below 1"),
-        ({"controllers": ("plain+track",)}, "estimates no pose"),
-        ({"seeds": 0}, "seeds is 0"),
-        ({"delay_s": -0.1}, "--delay is -0.1: "),
-        ({"delay_s": math.nan}, "--delay is nan: "),
-        ({"scenario": "slope", "grade_deg": 5.0}, "leave the grade out"),
-        ({"grade_deg": 40.0}, "--grade is 40.0: "),
-        ({"radius_factors": "1,2"}, "three ratios"),
-        ({"model": "models:/m"}, "not among the controllers"),
-        ({"observer": "none"}, "--observer is accepted with --path FILE"),
-        ({"situations": "stop"}, "--situations is accepted with --faults NAME"),
-        ({"faults": "all"}, "--scenario is accepted without --faults"),
-        ({"faults": "all", "path": "a.csv"}, "give one of them"),
-        ({"terrain": "course"}, "does not go with"),
-        ({"speed_mps": 99.0}, "speed"),
-        ({"controllers": ("ramp",), "ramp_mps2": 0.0}, "above zero"),
-        ({"controllers": ("classified",)}, "needs a classifier"),
-        ({"controllers": ("classified+track",)}, "needs a classifier"),
-        ({"controllers": ("thesis:classified",)}, "'thesis:classified' needs a classifier"),
-        ({"controllers": ("thesis:fallback",)}, "'thesis:fallback' is unknown"),
-    ],
-)
-def test_invalid_settings_are_refused_in_one_sentence(changes, message):
-    with pytest.raises(ConfigError, match=message) as refusal:
-        compare(SHORT.with_(**changes), INPUTS)
-    assert "\n" not in str(refusal.value)

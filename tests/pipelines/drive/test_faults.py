@@ -2,17 +2,14 @@
 
 import json
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipelines.cli import main as cli
 from pipelines.drive.drive import Settings
 from pipelines.drive.faults import (
     bars_text,
-    checked_robot,
     drive_faults,
     fault_figure,
     fault_loop,
@@ -31,10 +28,9 @@ from terrain.control.fault_drives import (
 from terrain.control.fault_evaluation import BARS, RATIO_ABOVE_MPS, fault_drive, fault_figures
 from terrain.control.fault_situations import FAULT_SITUATIONS, make_fault_situation
 from terrain.control.pilot_settings import PilotSettings
+from terrain.control.situations import simulate_situation
 from terrain.control.slip_table import load_slip_table
-from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.simulate import simulate
 
 ROBOT = load_robot("agrimaro")
 SLIPS = load_slip_table()
@@ -45,41 +41,13 @@ FEW = Settings(
 )
 
 
-@pytest.fixture
-def terrain(monkeypatch, capsys, tmp_path):
-    """Return a function that runs the command in an empty folder: exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["terrain", "drive", *map(str, words)])
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        output = capsys.readouterr()
-        return code, output.out, output.err
-
-    return run
-
-
 @pytest.mark.parametrize("name", FAULT_SITUATIONS)
 def test_a_drive_by_plain_commands_is_evaluated_from_its_log(name):
-    robot = ROBOT
-    situation, start_s = make_fault_situation(name, robot, "grass", 400)
-    pilot = LivePilot(robot, settings=PilotSettings(controller="plain"))
-    run = simulate(
-        robot,
-        situation.scenario,
-        situation.soils,
-        situation.seed,
-        conditions=situation.conditions,
-        faults=situation.faults,
-        controller=pilot.step,
-        command_delay_s=0.05,
-    )
-    history = drive_history(run, robot, situation.conditions.radius_factors)
-    drive = fault_drive(run, history, robot, situation.scenario)
+    situation, start_s = make_fault_situation(name, ROBOT, "grass", 400)
+    pilot = LivePilot(ROBOT, settings=PilotSettings(controller="plain"))
+    run = simulate_situation(ROBOT, situation, pilot.step, 0.05)
+    history = drive_history(run, ROBOT, situation.conditions.radius_factors)
+    drive = fault_drive(run, history, ROBOT, situation.scenario)
     assert drive.desired_mps == pytest.approx(run.streams["control"].channel("desired_mps"))
     assert drive.commanded_mps == pytest.approx(drive.desired_mps)
     at = int(np.searchsorted(drive.time_s, start_s))
@@ -179,15 +147,15 @@ def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_command_writes_table_json_and_page(terrain):
+def test_the_command_writes_table_json_and_page(terrain, place):
     code, out, err = terrain(
-        *("--faults", "loss_wheels,late_30ms_imu", "--situations", "stop,start", "--durations", "3"),
+        *("drive", "--faults", "loss_wheels,late_30ms_imu", "--situations", "stop,start", "--durations", "3"),
         *("--seed", 403, "--seeds", 2, "--table", TABLE, "--jobs", 1, "--json", "faults.json"),
         *("--out", "page", "--draw", "loss_wheels"),
     )
     assert code == 0, err
     assert "drives with a sensor fault meet all bars" in out
-    document = json.loads(Path("faults.json").read_text())
+    document = json.loads((place / "faults.json").read_text())
     assert document["n_rows"] == len(document["rows"]) == 8
     row = document["rows"][0]
     assert (row["fault"], row["situation"], row["terrain"]) == ("loss_wheels", "stop", "wet_floor")
@@ -195,60 +163,17 @@ def test_the_command_writes_table_json_and_page(terrain):
     assert document["n_met"] == sum(row["is_met"] for row in document["rows"])
     assert row["stop_ratio"] > 1.0
     assert document["seeds"] == [403, 404]
-    page = Path("page/report.html").read_text()
+    page = (place / "page" / "report.html").read_text()
     assert page.count("<figure") == 2
     assert "no sample arrives" in page
 
 
 @pytest.mark.slow
-def test_without_a_table_targets_are_learned(terrain):
-    code, _, err = terrain(
-        *(
-            "--faults",
-            "nan_imu",
-            "--situations",
-            "stop",
-            "--durations",
-            "inf",
-            "--jobs",
-            1,
-            "--json",
-            "found.json",
-        )
-    )
+def test_without_a_table_targets_are_learned(terrain, place):
+    words = ("--faults", "nan_imu", "--situations", "stop", "--durations", "inf", "--jobs", 1)
+    code, _, err = terrain("drive", *words, "--json", "found.json")
     assert code == 0, err
-    document = json.loads(Path("found.json").read_text())
+    document = json.loads((place / "found.json").read_text())
     assert document["table"] == "learned"
     assert document["rows"][0]["duration_s"] is None
     assert document["clean"][0]["stop_m"] < document["clean"][0]["plain_stop_m"]  # by slip control
-
-
-@pytest.mark.parametrize(
-    ("sentence", "words"),
-    [
-        ("fault 'lost' is unknown: use a kind (loss, freeze", ("--faults", "lost")),
-        ("fault 'x' is unknown", ("--faults", "all", "--draw", "x")),
-        ("--draw has 'loss_imu', which is not among", ("--faults", "step", "--draw", "loss_imu")),
-        ("situation 'go' is unknown: use start, stop, steady", ("--faults", "all", "--situations", "go")),
-        ("soil 'moon' is unknown", ("--faults", "all", "--terrain", "moon")),
-        ("soil 'moon' is unknown", ("--faults", "all", "--stop-terrain", "moon")),
-        ("--durations has 0; times above 0 s", ("--faults", "all", "--durations", "0")),
-        ("--durations is 'long'", ("--faults", "all", "--durations", "long")),
-        ("one of each at least is required", ("--faults", "all", "--situations", ",")),
-        ("start, start: one is named twice", ("--faults", "all", "--situations", "start,start")),
-        ("--seeds is 0", ("--faults", "all", "--seeds", 0)),
-        ("only 'swerve' has", ("--faults", "all", "--robot", "husky")),
-    ],
-)
-def test_what_cannot_be_driven_is_refused_in_a_sentence(terrain, sentence, words):
-    code, out, err = terrain(*words)
-    assert (code, out) == (2, "")
-    assert err.startswith("error: ")
-    assert err.count("\n") == 1
-    assert sentence in err
-
-
-def test_a_wrong_name_lists_the_kinds():
-    kinds = r"^fault 'lost' is unknown: use a kind \(loss, .*clock\) or one .* as loss_wheels$"
-    with pytest.raises(ConfigError, match=kinds):
-        checked_robot(Settings(faults="lost"))

@@ -12,7 +12,6 @@ from pipelines.drive.drive import Settings, SlipSourceName, run
 from pipelines.report import silent
 from pipelines.report.json_file import as_json
 from terrain.control.car_following import SlipSource
-from terrain.errors import ConfigError
 
 
 def follow(**settings):
@@ -68,21 +67,3 @@ def test_a_path_too_tight_is_driven_and_named(tmp_path):
     result = follow(path=file, speed_mps=1.0)
     assert "curvature is 0.6" in result.warnings[0]
     assert any("limit" in warning for warning in result.warnings)
-
-
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"robot": "husky"}, "only 'bicycle' can"),
-        ({"speed_mps": 30.0}, "at most 8 m/s"),
-        ({"speed_mps": 0.0}, "--speed"),
-        ({"observer": "x"}, "--observer is 'x'"),
-        ({"slope_deg": 60.0}, "--slope is 60"),
-        ({"stop": (5.0, 3.0)}, "--stop"),
-        ({"terrain": "snow"}, "--terrain is accepted without --path"),
-    ],
-)
-def test_settings_that_cannot_be_are_one_sentence(path_csv, tmp_path, changed, message):
-    values = {"robot": "adap2e", "path": path_csv, "out": tmp_path / "out"} | changed
-    with pytest.raises(ConfigError, match=message):
-        run(Settings(**values), silent)
