@@ -18,48 +18,36 @@ class Command(NamedTuple):
     text: str
 
 
-COMMANDS: tuple[Command, ...] = (
-    Command(
-        "Data", "convert", "pipelines.data.convert", "logs of any layout <-> run folders, MCAP, ROS bags, CSV"
-    ),
-    Command(
-        "Data",
-        "inspect",
-        "pipelines.cli.inspect",
-        "rates, gaps, clocks, units, signs; the card of a model",
-    ),
-    Command("Data", "simulate", "pipelines.data.simulate", "runs of a described robot"),
-    Command("Data", "label", "pipelines.learn.label", "set, propose, answer"),
-    Command(
-        "State",
-        "estimate",
-        "pipelines.slip.estimate",
-        "motion and slip, by a filter, an observer or a pose from outside",
-    ),
-    Command("State", "calibrate", "pipelines.slip.calibrate", "a robot, an odometry or a soil from logs"),
-    Command(
-        "Terrain",
-        "crossval",
-        "pipelines.learn.crossval",
-        "recipes or models on runs and sessions held out, side by side",
-    ),
-    Command("Terrain", "train", "pipelines.learn.train", "evaluate, fit, track, register"),
-    Command("Terrain", "predict", "pipelines.learn.predict", "terrain or unknown, target slip"),
-    Command("Slip", "learn-slip", "pipelines.slip.learn_slip", "slip curves and target slips"),
-    Command(
-        "Reality",
-        "explain",
-        "pipelines.explain.explain",
-        "what the simulation gets wrong, and the extended robot",
-    ),
-    Command(
-        "Control",
-        "drive",
-        "pipelines.drive.drive",
-        "controllers in closed loop, side by side; --faults, --path",
-    ),
-    Command("Live", "serve", "pipelines.serve.serve", "WebSocket, --can BUS, --replay LOG"),
-    Command("Live", "quickstart", "pipelines.cli.quickstart", "all of it, on your runs or simulated ones"),
+_GROUPS = {
+    "Data": {
+        "data.convert": "logs of any layout <-> run folders, MCAP, ROS bags, CSV",
+        "cli.inspect": "rates, gaps, clocks, units, signs; the card of a model",
+        "data.simulate": "runs of a described robot",
+        "learn.label": "set, propose, answer",
+    },
+    "State": {
+        "slip.estimate": "motion and slip, by a filter, an observer or a pose from outside",
+        "slip.calibrate": "a robot, an odometry or a soil from logs",
+    },
+    "Terrain": {
+        "learn.crossval": "recipes or models on runs and sessions held out, side by side",
+        "learn.train": "evaluate, fit, track, register",
+        "learn.predict": "terrain or unknown, target slip",
+    },
+    "Slip": {"slip.learn_slip": "slip curves and target slips"},
+    "Reality": {"explain.explain": "what the simulation gets wrong, and the extended robot"},
+    "Control": {"drive.drive": "controllers in closed loop, side by side; --faults, --path"},
+    "Live": {
+        "serve.serve": "WebSocket, --can BUS, --replay LOG",
+        "cli.quickstart": "all of it, on your runs or simulated ones",
+    },
+}
+"""By group and module, the line of help; a command has the name of its module."""
+
+COMMANDS = tuple(
+    Command(group, module.rpartition(".")[2].replace("_", "-"), f"pipelines.{module}", text)
+    for group, commands in _GROUPS.items()
+    for module, text in commands.items()
 )
 
 FORMER: dict[str, str] = {

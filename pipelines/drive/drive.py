@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import option_name, setting
@@ -28,6 +29,8 @@ SlipSourceName = Literal["none", "dynamic", "kinematic", "multi", "multi-grip"]
 
 ALL = "all"
 """``--faults`` that names every fault."""
+
+Ratio = Annotated[float, Field(ge=0.5, le=2.0)]
 
 
 class DrivenSettings(BaseSettings):
@@ -87,7 +90,7 @@ class ComparisonSettings(BaseSettings):
     duration_s: float | None = setting(None, "Length of a drive in s.", option="--duration")
     accel_mps2: float = setting(1.0, "Rise of the desired speed in m/s^2; inf for a step.", option="--accel")
     grade_deg: float = setting(0.0, "Slope in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0)
-    radius_factors: tuple[float, float, float] | None = setting(
+    radius_factors: tuple[Ratio, Ratio, Ratio] | None = setting(
         None,
         "True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default.",
         option="--radius",
@@ -105,19 +108,16 @@ class ComparisonSettings(BaseSettings):
             raise ValueError(f"controllers name {min(repeated)!r} twice")
         return names
 
-    @field_validator("radius_factors", mode="before")
+    @field_validator("radius_factors", mode="wrap")
     @classmethod
-    def _three_ratios(cls, given: object) -> tuple[float, ...] | None:
-        if given is None:
-            return None
+    def _three_ratios(cls, given: object, check: Callable[[object], object]) -> object:
         try:
-            ratios = tuple(float(part) for part in given)  # type: ignore[attr-defined]
-        except (TypeError, ValueError):
-            ratios = ()
-        if len(ratios) != 3 or not all(0.5 <= ratio <= 2.0 for ratio in ratios):
+            return check(given)
+        except ValidationError:
             text = ",".join(map(str, given)) if isinstance(given, tuple) else given
-            raise ValueError(f"--radius is {text!r}; three ratios from 0.5 to 2 are required, as in 1,1.02,1")
-        return ratios
+            raise ValueError(
+                f"--radius is {text!r}; three ratios from 0.5 to 2 are required, as in 1,1.02,1"
+            ) from None
 
     @model_validator(mode="after")
     def _consistent(self) -> ComparisonSettings:
@@ -221,8 +221,8 @@ class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
             self._refuse(PathSettings.model_fields, "with --path FILE")
         return self
 
-    def _refuse(self, names: object, accepted: str) -> None:
-        for name in names:  # type: ignore[attr-defined]
+    def _refuse(self, names: Iterable[str], accepted: str) -> None:
+        for name in names:
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(f"{option_name(type(self), name)} is accepted {accepted}")
 

@@ -37,8 +37,8 @@ COMPARISON = [
     ("speed", "--controllers plain --speed 99"),
 ]
 FAULTS = [
-    ("fault 'lost' is unknown: use a kind (loss, freeze", "--faults lost"),
-    ("clock) or one of them, as loss_wheels", "--faults lost"),
+    ("fault 'lost' is unknown: use a kind (loss, freeze, step", "--faults lost"),
+    ("clock) or one fault of a kind, as loss_wheels", "--faults lost"),
     ("fault 'x' is unknown", "--faults all --draw x"),
     ("--draw has 'loss_imu', which is not among", "--faults step --draw loss_imu"),
     ("situation 'go' is unknown: use start, stop, steady", "--faults all --situations go"),
