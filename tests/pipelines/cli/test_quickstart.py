@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from pipelines.cli.quickstart import Settings, run
@@ -12,12 +11,9 @@ from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.learn.load import load_model
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
-from terrain.classify.folds import hold_out_runs
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.labelled import labelled_runs
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
-from terrain.terramechanics.soil import soil_names
 
 
 @pytest.fixture
@@ -86,35 +82,6 @@ def test_quickstart_needs_no_data(in_tracked, tmp_path):
     assert (tmp_path / "out" / "report.html").read_text().count('class="plot"') >= 3
     assert len(terminal_text(result.report).splitlines()) <= 25
     assert read_run(tmp_path / "out" / "runs" / "grass_survey_01").robot == "agrimaro"
-
-
-@pytest.mark.slow
-def test_every_terrain_is_driven_and_its_slip_is_near_the_truth():
-    runs, rows, example = labelled_runs(seed=3, runs_a_terrain=3)
-    assert [each.terrains for each in runs] == [(name,) for name in soil_names() for _ in range(3)]
-    assert [row.terrain for row in rows] == list(soil_names())
-    assert all({"slip", "estimator", "imu", "wheels", "truth"} <= set(each.streams) for each in runs)
-    assert all(row.slip_rmse < 0.01 for row in rows)
-    assert example.run.terrains == ("grass",)
-    driven = {each.run_id: np.abs(each.streams["truth"].channel("speed_x_mps")).max() for each in runs}
-    assert np.ptp(list(driven.values())) > 0.1
-
-
-@pytest.mark.parametrize(
-    ("counts", "held_out"),
-    [
-        ({"ice": 6, "mud": 7, "sand": 2}, ["ice_5", "mud_6"]),
-        ({"ice": 5, "mud": 4}, ["ice_4"]),
-        ({"ice": 3, "mud": 2}, []),  # five runs are needed for five folds
-        ({"ice": 2, "mud": 2, "sand": 2}, []),
-        ({}, []),
-    ],
-)
-def test_enough_is_left_of_every_terrain(make_run, counts, held_out):
-    runs = [make_run(f"{name}_{i}", name, i, 1.0) for name, n in counts.items() for i in range(n)]
-    training, out = hold_out_runs(runs)
-    assert [each.run_id for each in out] == held_out
-    assert sorted(each.run_id for each in (*training, *out)) == sorted(each.run_id for each in runs)
 
 
 def test_runs_are_chosen_by_id(make_run, tmp_path):

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrain.classify.folds import block_groups, fold_numbers, single_run_classes, split_runs
+from terrain.classify.folds import block_groups, fold_numbers, hold_out_runs, single_run_classes, split_runs
 from terrain.errors import DataError
 
 
@@ -98,3 +98,20 @@ def test_too_few_classes_or_runs_for_folds_are_refused():
     y, groups = np.repeat(["ice", "ice", "snow", "snow"], 3), np.repeat(list("abcd"), 3)
     with pytest.raises(DataError, match="4 runs are fewer than 5 folds"):
         next(split_runs(y, groups, 5, rng))
+
+
+@pytest.mark.parametrize(
+    ("counts", "held_out"),
+    [
+        ({"ice": 6, "mud": 7, "sand": 2}, ["ice_5", "mud_6"]),
+        ({"ice": 5, "mud": 4}, ["ice_4"]),
+        ({"ice": 3, "mud": 2}, []),  # five runs are needed for five folds
+        ({"ice": 2, "mud": 2, "sand": 2}, []),
+        ({}, []),
+    ],
+)
+def test_enough_is_left_of_every_terrain(make_run, counts, held_out):
+    runs = [make_run(f"{name}_{i}", name, i, 1.0) for name, n in counts.items() for i in range(n)]
+    training, out = hold_out_runs(runs)
+    assert [each.run_id for each in out] == held_out
+    assert sorted(each.run_id for each in (*training, *out)) == sorted(each.run_id for each in runs)
