@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -17,10 +17,11 @@ from pydantic import BaseModel, ConfigDict, Field
 from pipelines import report
 from pipelines.learn.model_file import TerrainModel
 from pipelines.report.json_file import as_json
-from pipelines.serve.connection import Connection, Watcher
+from pipelines.serve.connection import Connection
 from pipelines.serve.guard import Guard
 from pipelines.serve.hub import Hub
 from pipelines.serve.messages import served_content
+from pipelines.serve.wire import encode
 from terrain import __version__
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, TerrainError
@@ -79,7 +80,6 @@ def make_app(
         max_body_size=LARGEST_BODY,
     )
     guard = Guard(app, token, OPEN, hub.metrics, loopback=loopback)
-    replacing = asyncio.Lock()
 
     for place, folder in FOLDERS.items():
         app.mount(place, StaticFiles(directory=folder))
@@ -91,10 +91,6 @@ def make_app(
     @app.websocket("/robots")
     async def robots(socket: WebSocket) -> None:
         await Connection(socket, hub, token, guard.wrong_token).serve()
-
-    @app.websocket("/watch")
-    async def watchers(socket: WebSocket) -> None:
-        await Watcher(socket, hub, token, guard.wrong_token).serve()
 
     @app.get("/health")
     async def health() -> dict[str, str]:
@@ -122,32 +118,35 @@ def make_app(
             "card": {} if served.model is None else as_json(served.model.info),
         }
 
+    @app.get("/state")
+    async def state(session: str = "") -> Response:
+        """Return what the page shows of a robot, of the first one where it is not connected."""
+        return Response(encode(hub.content(session)), media_type="application/json")
+
     @app.get("/sessions")
     async def sessions() -> list[dict[str, Any]]:
         """Return the robots that are connected."""
         return [opened.content() for opened in hub.sessions.values()]
 
-    @asynccontextmanager
-    async def one_at_a_time() -> AsyncIterator[None]:
-        async with replacing:
-            try:
-                yield
-            except TerrainError as error:
-                raise HTTPException(409, str(error)) from None
+    async def replaced(
+        read: Callable[[str], Any], text: str, changed: Callable[[Any], Any]
+    ) -> dict[str, Any]:
+        try:
+            found = await asyncio.to_thread(read, text)
+            async with hub.changing:
+                return served_content(hub.swap(*changed(found)))
+        except TerrainError as error:
+            raise HTTPException(409, str(error)) from None
 
     @app.put("/model")
     async def replace_model(choice: ModelChoice) -> dict[str, Any]:
         """Serve another model: all robots at once, or none; no sample is lost."""
-        async with one_at_a_time():
-            found = await asyncio.to_thread(load, choice.uri)
-            return served_content(hub.swap(found, choice.uri, hub.served.table))
+        return await replaced(load, choice.uri, lambda model: (model, choice.uri, hub.served.table))
 
     @app.put("/table")
     async def replace_table(text: Annotated[str, Body(media_type="application/yaml")]) -> dict[str, Any]:
         """Serve another table of target slips, given as its YAML: all robots at once, or none."""
-        async with one_at_a_time():
-            table = await asyncio.to_thread(_table_of, text)
-            return served_content(hub.swap(hub.served.model, hub.served.model_name, table))
+        return await replaced(_table_of, text, lambda table: (hub.served.model, hub.served.model_name, table))
 
     return guard
 

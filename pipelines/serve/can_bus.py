@@ -36,9 +36,21 @@ from pipelines.live.classifying import ClassifierThread
 from pipelines.live.over_time import filtered
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
-from pipelines.report import Column, Pairs, Report, Result, Section, Table, described, format_value, interval
+from pipelines.report import (
+    Column,
+    Pairs,
+    Progress,
+    Report,
+    Result,
+    Section,
+    Table,
+    described,
+    format_value,
+    interval,
+    silent,
+)
 from pipelines.report.stopping import stopping
-from pipelines.serve.settings import Settings
+from pipelines.serve.serve import Settings
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import step_or_period
@@ -383,7 +395,7 @@ class BridgeResult(Result):
     step: Latency = described("time of a control step")
 
 
-def run(settings: Settings) -> BridgeResult:
+def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
     """Run a pilot on a bus until it is interrupted, or for the time of the settings.
 
     Raises

@@ -1,4 +1,4 @@
-"""What speaks WebSocket to the service: robots, messages in and steps out; and pages that watch them.
+"""A robot's WebSocket: messages in and steps out.
 
 Where a token is required, nothing is decoded before it has fitted: it comes in the header of the handshake, or
 as the first frame by itself.  Before its hello a robot is given one answer at a time, and what it
@@ -27,7 +27,6 @@ from pipelines.serve.messages import (
     Hello,
     error_content,
     read_hello,
-    served_content,
     step_content,
     welcome,
 )
@@ -45,9 +44,6 @@ LARGE = 32_768
 
 PAUSE_S = 0.5
 """Before the next message of a robot is read whose hello was not accepted."""
-
-WATCH_S, MAX_WATCHERS = 0.1, 16
-"""Between two states that a page is sent; and pages at once."""
 
 TRY_AGAIN_LATER, POLICY = 1013, 1008
 """Codes of closed WebSockets (RFC 6455)."""
@@ -84,8 +80,8 @@ class Budgets:
         return max(self._paid_s[name] - now_s, 0.0), f"{self._per_s[name]:g} {name}"
 
 
-class Line:
-    """A WebSocket from its handshake to its end.
+class Connection:
+    """One robot's connection, from its handshake to its end: messages in, steps out, each at its own time.
 
     Parameters
     ----------
@@ -95,7 +91,8 @@ class Line:
     wrong_token : counts a wrong token, and waits
     """
 
-    _has_header = True
+    _hello: Hello
+    _opened: OpenSession
 
     def __init__(
         self, socket: WebSocket, hub: Hub, token: str, wrong_token: Callable[[], Awaitable[None]]
@@ -103,6 +100,11 @@ class Line:
         self._socket, self._hub, self._token, self._wrong_token = socket, hub, token, wrong_token
         self._packed = False
         self._end: tuple[int, str] = (1000, "")
+        self._budgets = Budgets(hub.limits.per_s)
+        self._notes: deque[dict[str, Any]] = deque(maxlen=MAX_NOTES)
+        self._step: StepOutput | None = None
+        self._changed = asyncio.Event()
+        self._dropped: Counter[str] = Counter()
 
     async def serve(self) -> None:
         """Talk until the other end leaves or has to; nothing is raised."""
@@ -118,12 +120,9 @@ class Line:
                     async with asyncio.timeout(1.0):
                         await self._socket.close(*self._end)
 
-    async def _talk(self) -> None:
-        raise NotImplementedError
-
     async def _admitted(self) -> bool:
         """Say whether the token is the required one: that of the header, or the first frame, undecoded."""
-        if self._has_header and token_fits(self._token, bearer(self._socket.headers)):
+        if token_fits(self._token, bearer(self._socket.headers)):
             return True
         first: str | bytes = ""
         with suppress(TimeoutError):
@@ -158,23 +157,6 @@ class Line:
     def _error(self, code: str, sentence: str, *, fatal: bool = False) -> dict[str, Any]:
         self._hub.metrics.errors.labels(code).inc()
         return error_content(code, sentence, fatal=fatal)
-
-
-class Connection(Line):
-    """One robot's connection: messages in, steps out, each at its own time."""
-
-    _hello: Hello
-    _opened: OpenSession
-
-    def __init__(
-        self, socket: WebSocket, hub: Hub, token: str, wrong_token: Callable[[], Awaitable[None]]
-    ) -> None:
-        super().__init__(socket, hub, token, wrong_token)
-        self._budgets = Budgets(hub.limits.per_s)
-        self._notes: deque[dict[str, Any]] = deque(maxlen=MAX_NOTES)
-        self._step: StepOutput | None = None
-        self._changed = asyncio.Event()
-        self._dropped: Counter[str] = Counter()
 
     async def _talk(self) -> None:
         if not await self._greeted():
@@ -346,40 +328,3 @@ class Connection(Line):
     def _note(self, code: str, sentence: str, *, fatal: bool = False) -> None:
         self._notes.append(self._error(code, sentence, fatal=fatal))
         self._changed.set()
-
-
-class Watcher(Line):
-    """A page: it is sent the newest step of the session that its address names, ten times a second."""
-
-    _has_header = False  # a browser sets none: a token is its first frame, which is empty where it knows none
-
-    async def _talk(self) -> None:
-        if self._hub.watchers >= MAX_WATCHERS:
-            self._end = (TRY_AGAIN_LATER, f"{MAX_WATCHERS} pages are open, no more are accepted")
-            return
-        self._hub.watchers += 1
-        try:
-            while True:
-                await self._write(shown(self._hub, self._socket.query_params.get("session", "")))
-                await asyncio.sleep(WATCH_S)
-        finally:
-            self._hub.watchers -= 1
-
-
-def shown(hub: Hub, session: str) -> dict[str, Any]:
-    """Return what a page shows of a session, of the first one where it is not there."""
-    opened = hub.sessions.get(session) or next(iter(hub.sessions.values()), None)
-    content: dict[str, Any] = {
-        "type": "state",
-        "sessions": list(hub.sessions),
-        "served": served_content(hub.served),
-        "trouble": list(hub.trouble.values()),
-        "session": None,
-    }
-    if opened is not None:
-        robot = hub.robot(opened.chain.request.robot)
-        content["session"] = opened.content() | {
-            "wheels": [] if robot is None else list(robot.wheels),
-            "step": None if opened.last is None else step_content(opened.last),
-        }
-    return content

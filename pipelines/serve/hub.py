@@ -16,7 +16,7 @@ from pipelines.live.model import LiveModel
 from pipelines.live.recording import RecordingThread, SessionRecorder
 from pipelines.live.session import RobotSession, Served, StepOutput
 from pipelines.live.state import LiveState, Restorable, load_state, save_state
-from pipelines.serve.messages import Hello
+from pipelines.serve.messages import Hello, served_content, step_content
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
 from terrain.control.slip_table import SlipTable
@@ -96,6 +96,11 @@ class Hub:
     limits : of sessions and messages
     states : folder of the states that outlive the service; None for memory only
     recordings : folder of the files of sessions that ask to be recorded; None for no recording
+
+    Attributes
+    ----------
+    changing : held while a session begins, and while model or table are replaced
+    trouble : what is not as it should be, by what it is of
     """
 
     def __init__(
@@ -109,14 +114,13 @@ class Hub:
         self.served, self.limits, self.metrics = served, limits, Metrics()
         self.metrics.served.set(served.number)
         self.sessions: dict[str, OpenSession] = {}
+        self.changing = asyncio.Lock()
         self.closing = False
-        self.watchers = 0
         self.trouble: dict[str, str] = {}
         self._given, self._folder = given, states
         self._thread = ClassifierThread()
         self._recording = None if recordings is None else (recordings, RecordingThread())
         self._left: OrderedDict[str, LiveState] = OrderedDict()
-        self._opening: set[str] = set()
 
     def robot(self, name: str) -> Robot | None:
         """Return the description of a robot by its name, never by a path; None where it has none."""
@@ -140,48 +144,30 @@ class Hub:
         WireError
             if the session cannot be served, or there is one of that name already.
         """
-        if self.closing:
-            raise WireError("closing", "the service ends")
-        before = self.sessions.get(hello.session)
-        if before is not None and monotonic() - before.received_s > SILENT_S:
-            before.leave("name-taken", "another connection took the session, as this one was silent")
-            self.close(before)
-        elif before is not None or hello.session in self._opening:
-            raise WireError("name-taken", f"a session {hello.session!r} is open already")
-        if len(self.sessions) + len(self._opening) >= self.limits.sessions:
-            raise WireError("too-many", f"{self.limits.sessions} sessions are open, no more are accepted")
-        self._opening.add(hello.session)
-        beginning = asyncio.ensure_future(asyncio.to_thread(self._begin, hello))
-        try:
-            chain, restored = await asyncio.shield(beginning)
-        except (ConfigError, DataError, LogError) as error:
-            raise WireError("refused", str(error)) from None
-        except asyncio.CancelledError:
-            beginning.add_done_callback(_end_unused)
-            raise
-        finally:
-            self._opening.discard(hello.session)
-        if chain.served.number != self.served.number:  # replaced meanwhile
+        async with self.changing:
+            if self.closing:
+                raise WireError("closing", "the service ends")
+            before = self.sessions.get(hello.session)
+            if before is not None and monotonic() - before.received_s > SILENT_S:
+                before.leave("name-taken", "another connection took the session, as this one was silent")
+                self.close(before)
+            elif before is not None:
+                raise WireError("name-taken", f"a session {hello.session!r} is open already")
+            if len(self.sessions) >= self.limits.sessions:
+                raise WireError("too-many", f"{self.limits.sessions} sessions are open, no more are accepted")
             try:
-                chain.swap(self.served)
-            except (ConfigError, DataError) as error:
-                chain.end()
+                chain, restored = await asyncio.to_thread(self._begin, hello)
+                if hello.record and self._recording is not None:
+                    chain.record(self._recorder(hello, *self._recording))
+            except (ConfigError, DataError, LogError) as error:
                 raise WireError("refused", str(error)) from None
-        opened = OpenSession(hello.session, chain, restored, leave)
-        self.sessions[hello.session] = opened
+            opened = self.sessions[hello.session] = OpenSession(hello.session, chain, restored, leave)
         self.metrics.opened.inc()
         self.metrics.sessions.set(len(self.sessions))
         return opened
 
     def _begin(self, hello: Hello) -> tuple[RobotSession, Restorable | None]:
-        robot = self.robot(hello.robot)
-        chain = RobotSession(hello.request, self.served, robot, self._thread)
-        if hello.record and self._recording is not None:
-            folder, writer = self._recording
-            wheels = robot.wheels if robot is not None and hello.control else ()
-            name = f"{hello.session}_{datetime.now(UTC):%Y%m%d_%H%M%S}"
-            channels = hello.request.channels
-            chain.record(SessionRecorder(folder, name, hello.robot, channels, wheels, writer=writer))
+        chain = RobotSession(hello.request, self.served, self.robot(hello.robot), self._thread)
         state = self._left.get(hello.session)
         if state is None and self._folder is not None:
             try:
@@ -189,6 +175,11 @@ class Hub:
             except DataError as error:  # a damaged state is none
                 self.trouble[f"state of {hello.session}"] = str(error)
         return chain, None if state is None else chain.restore(state)
+
+    def _recorder(self, hello: Hello, folder: Path, writer: RecordingThread) -> SessionRecorder:
+        robot, name = self.robot(hello.robot), f"{hello.session}_{datetime.now(UTC):%Y%m%d_%H%M%S}"
+        wheels = robot.wheels if robot is not None and hello.control else ()
+        return SessionRecorder(folder, name, hello.robot, hello.request.channels, wheels, writer=writer)
 
     def close(self, opened: OpenSession) -> None:
         """End a session; its state is kept for the robot's return."""
@@ -202,8 +193,25 @@ class Hub:
         while len(self._left) > REMEMBERED:
             self._left.popitem(last=False)
 
+    def content(self, session: str) -> dict[str, Any]:
+        """Return what a page shows of a session, of the first one where it is not there."""
+        opened = self.sessions.get(session) or next(iter(self.sessions.values()), None)
+        shown = None
+        if opened is not None:
+            robot = self.robot(opened.chain.request.robot)
+            shown = opened.content() | {
+                "wheels": () if robot is None else robot.wheels,
+                "step": None if opened.last is None else step_content(opened.last),
+            }
+        return {
+            "sessions": list(self.sessions),
+            "served": served_content(self.served),
+            "trouble": list(self.trouble.values()),
+            "session": shown,
+        }
+
     def swap(self, model: LiveModel | None, model_name: str, table: SlipTable) -> Served:
-        """Serve another model and table: all sessions at once, or none.
+        """Serve another model and table: all sessions at once, or none; called with ``changing`` held.
 
         Raises
         ------
@@ -243,9 +251,3 @@ class Hub:
         self._thread.stop()
         if self._recording is not None:
             self._recording[1].stop()
-
-
-def _end_unused(beginning: asyncio.Future[tuple[RobotSession, Restorable | None]]) -> None:
-    """End a session whose connection did not wait for it."""
-    if not beginning.cancelled() and beginning.exception() is None:
-        beginning.result()[0].end()

@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from threading import Event
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -41,7 +40,7 @@ from pipelines.report import (
     silent,
 )
 from pipelines.report.stopping import stopping
-from pipelines.serve.settings import Settings
+from pipelines.serve.serve import Settings
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError
@@ -161,7 +160,7 @@ class ReplayResult(Replayed, Result):
         return pd.DataFrame(rows, columns=["run_id", *ObservedWindow._fields])
 
 
-def run(settings: Settings, log: Path, progress: Progress = silent) -> ReplayResult:
+def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     """Replay all runs of a log, one after the other; Ctrl-C and SIGTERM end it with what was found until then.
 
     A line is printed for each window at which the classified or the believed terrain changes.
@@ -171,6 +170,7 @@ def run(settings: Settings, log: Path, progress: Progress = silent) -> ReplayRes
     ConfigError, DataError, LogError, ModelError
         if the log, the model or the table cannot be read, or do not fit each other.
     """
+    assert settings.replay is not None
     table, model = load_slip_table(settings.table), None
     if settings.model is not None:
         from pipelines.learn.load import load_model
@@ -178,7 +178,7 @@ def run(settings: Settings, log: Path, progress: Progress = silent) -> ReplayRes
         model = filtered(load_model(settings.model), settings.filter_stride_s)
     classes = () if model is None else model.info.classes
     read = {name: getattr(settings, name) for name in ("robot", *ReadSettings.model_fields)}
-    logs, skipped = load(InspectSettings(data=log, **read))
+    logs, skipped = load(InspectSettings(data=settings.replay, **read))
     robot = None if settings.robot is None else load_robot(settings.robot)
     runs: list[ReplayedRun] = []
     stop = Event()

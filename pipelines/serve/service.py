@@ -27,7 +27,7 @@ from pipelines.live.terrain_source import Classifier
 from pipelines.serve.app import make_app
 from pipelines.serve.guard import Watched, is_loopback, required_token
 from pipelines.serve.hub import Hub, Limits
-from pipelines.serve.settings import Settings
+from pipelines.serve.serve import Settings
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.estimation.live.estimator import CHANNELS

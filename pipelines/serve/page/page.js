@@ -1,11 +1,11 @@
 "use strict";
 // The newest step of one robot, ten times a second; all that is drawn is kept here and nowhere else.
 (() => {
-  const HISTORY_S = 300, PLOT_S = 60, STALE_MS = 1500, INTERVAL = 1.96;
+  const HISTORY_S = 300, PLOT_S = 60, STALE_MS = 1500, PERIOD_MS = 100, INTERVAL = 1.96;
   const COLOURS = ["#2f7ed8", "#e07a1f", "#2c9c5a", "#b5489c", "#8a6d3b", "#5ab4c9", "#d0433f", "#7a7f2a", "#6b63c4", "#c98f00", "#3f8f8a", "#9a5a44"];
   const BAD = ["lost", "frozen", "stepped", "disagrees", "gated"], DOUBTFUL = ["late", "reopened", "not finite"];
   const byId = (id) => document.getElementById(id);
-  const state = { socket: null, session: "", token: sessionStorage.getItem("token") || "", wheels: null, name: null, heard: 0, stepped: 0, retry: 500, terrains: [], number: -1 };
+  const state = { session: "", token: sessionStorage.getItem("token") || "", wheels: null, name: null, heard: 0, stepped: 0, retry: 500, terrains: [], number: -1 };
   const history = { t: [], terrain: [], probability: [] };
   let plots = { slip: [], current: null }, series = null;
 
@@ -21,34 +21,36 @@
   const variable = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
   // --- connection -------------------------------------------------------------------------------------
-  function connect() {
-    const place = location.host + "/watch?session=" + encodeURIComponent(state.session);
-    const socket = new WebSocket((location.protocol === "https:" ? "wss://" : "ws://") + place);
-    state.socket = socket;
-    socket.onopen = () => socket.send(state.token);  // empty where none is known
-    socket.onmessage = (event) => { if (state.socket === socket) take(JSON.parse(event.data)); };
-    socket.onclose = () => {
-      if (byId("token-form").hidden && state.socket === socket) {
-        document.body.classList.add("stale");
-        setConnection("lost", "not connected, trying again");
-        setTimeout(connect, state.retry);
-        state.retry = Math.min(state.retry * 2, 5000);
-      }
-    };
+  async function ask() {
+    const headers = state.token ? { Authorization: "Bearer " + state.token } : {};
+    let message;
+    try {
+      const answer = await fetch("state?session=" + encodeURIComponent(state.session), { headers, signal: AbortSignal.timeout(5000) });
+      if (answer.status === 401) { askToken(); return; }
+      if (!answer.ok) throw new Error(answer.status);
+      message = await answer.json();
+    } catch {
+      document.body.classList.add("stale");
+      setConnection("lost", "not connected, trying again");
+      setTimeout(ask, state.retry);
+      state.retry = Math.min(state.retry * 2, 5000);
+      return;
+    }
+    setTimeout(ask, PERIOD_MS);
+    take(message);
   }
   function setConnection(kind, words) {
     byId("connection").dataset.state = kind;
     text("connection", words);
   }
+  function askToken() {
+    sessionStorage.removeItem("token");
+    text("token-error", state.token ? "That is not the token." : "");
+    byId("token-form").hidden = false;
+    byId("token").focus();
+    setConnection("waiting", "a token is required");
+  }
   function take(message) {
-    if (message.type === "error") {
-      sessionStorage.removeItem("token");
-      text("token-error", state.token ? "That is not the token." : "");
-      byId("token-form").hidden = false;
-      byId("token").focus();
-      setConnection("waiting", "a token is required");
-      return;
-    }
     byId("token-form").hidden = true;
     state.retry = 500;
     state.heard = performance.now();
@@ -290,13 +292,13 @@
   }
 
   // --- controls ---------------------------------------------------------------------------------------
-  byId("session").addEventListener("change", (event) => { state.session = event.target.value; state.socket.close(); connect(); });
+  byId("session").addEventListener("change", (event) => { state.session = event.target.value; });
   byId("token-form").addEventListener("submit", (event) => {
     event.preventDefault();
     state.token = byId("token").value;
     sessionStorage.setItem("token", state.token);
     byId("token-form").hidden = true;
-    connect();
+    ask();
   });
   const dark = () => (document.documentElement.dataset.theme || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light")) === "dark";
   const showTheme = () => { byId("theme").setAttribute("aria-pressed", String(dark())); };
@@ -312,6 +314,6 @@
   byId("more").addEventListener("toggle", () => { if (state.wheels) makePlots(); state.drawn = -1; });  // what is folded has no width
   let width = innerWidth;
   addEventListener("resize", () => { if (Math.abs(innerWidth - width) > 20 && state.wheels) { width = innerWidth; makePlots(); state.drawn = -1; } });
-  connect();
+  ask();
   requestAnimationFrame(draw);
 })();

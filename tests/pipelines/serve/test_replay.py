@@ -14,8 +14,8 @@ import pytest
 from pipelines.learn.predict import predict
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.replay import chain_of, replay_run
+from pipelines.serve.serve import Settings
 from pipelines.serve.serve import run as serve
-from pipelines.serve.settings import Settings
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError

@@ -188,14 +188,13 @@ def test_what_is_over_a_budget_is_named_and_the_rest_is_taken(
         assert len(decoded) < 95, "what is dropped is not decoded"
 
 
-@pytest.mark.parametrize("place", ["/robots", "/watch"])
 def test_before_its_token_nothing_of_a_client_is_decoded_and_wrong_tokens_wait_and_are_counted(
-    guarded, hello, decoded, place
+    guarded, hello, decoded
 ):
     wrong = '{"type": "samples", "streams": {"imu": [' + "0.123," * 40_000
     for first in (wrong, json.dumps(hello("x")), "", TOKEN[:-1], TOKEN + TOKEN, TOKEN.encode()):
         begun_s = time.monotonic()
-        with guarded.socket(place) as stranger:
+        with guarded.socket() as stranger:
             answer = ask(stranger, first)
             assert (answer["code"], answer["fatal"]) == ("token", True)
             assert time.monotonic() - begun_s > 0.19
@@ -203,9 +202,11 @@ def test_before_its_token_nothing_of_a_client_is_decoded_and_wrong_tokens_wait_a
                 stranger.recv(10)
     another = {"Authorization": "Bearer another"}
     with pytest.raises(InvalidStatus, match="401"):
-        guarded.socket(place, additional_headers=another)
-    for headers, method in ((BEARER, "GET"), ({}, "GET"), (another, "GET"), (another, "PUT")):
-        status, text = guarded.get("/model", method, b"{}" if method == "PUT" else None, headers)
+        guarded.socket(additional_headers=another)
+    for headers, place, method in (
+        (BEARER, "/state", "GET"), ({}, "/state", "GET"), (another, "/model", "GET"), (another, "/model", "PUT"),
+    ):  # fmt: skip
+        status, text = guarded.get(place, method, b"{}" if method == "PUT" else None, headers)
         assert (status == 401) == ("a token is required" in text) == (headers is not BEARER)
     assert decoded == []
     assert "terrain_wrong_tokens_total 10.0" in guarded.get("/metrics", headers=BEARER)[1]
