@@ -204,7 +204,7 @@ def propose_labels(settings: Settings, model: TerrainModel) -> ProposalsResult:
     from pipelines.learn.predict import model_windows
     from pipelines.learn.proposals import write_proposals
     from pipelines.live.model import assess
-    from pipelines.live.over_time import filter_of
+    from pipelines.live.windows import filter_of
     from terrain.classify.proposals import propose, questions
 
     runs = load_runs(settings.data)

@@ -209,7 +209,7 @@ def run(settings: Settings, progress: Progress = silent) -> Predictions | Change
         needs.
     """
     from pipelines.learn.load import load_model
-    from pipelines.live.over_time import filtered
+    from pipelines.live.windows import filtered
     from terrain.control.slip_table import load_slip_table
     from terrain.files.atomic import ensure_writable
     from terrain.robots import load_robot
@@ -382,7 +382,7 @@ def filtered_terrains(windows: Windows, assessed: Assessed, model: TerrainModel)
     """
     import numpy as np
 
-    from pipelines.live.over_time import filter_of
+    from pipelines.live.windows import filter_of
     from terrain.classify.terrain_filter import filter_run, novelty_evidence, reported
 
     classes = np.asarray(model.recipe.classes_, dtype=str)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.model import LiveModel
-from pipelines.live.state import Bias, LiveState, Restorable, restorable
+from pipelines.live.state import Bias, LiveState, restorable
 from pipelines.live.terrain_source import TerrainSource
 from terrain.control.pilot_settings import check_table
 from terrain.control.slip_table import SlipTable
@@ -90,10 +90,6 @@ class Chain:
         self.robot_name, self.switching, self._clocks = robot_name, switching, clocks
         self.belief: TerrainBelief = NO_BELIEF
         self.estimate: Estimate | None = None
-        self._target_ratio = math.nan
-        self._take_table(table)
-
-    def _take_table(self, table: SlipTable) -> None:
         self._check_table(table)
         self.table = table
 
@@ -141,7 +137,7 @@ class Chain:
         """
         self.check(model, table)
         self.source.swap(model)
-        self._take_table(table)
+        self.table = table
 
     def _believe(self, sample: Sample, estimates: Sequence[Estimate]) -> OutputStatus:
         """Update the belief by what the source finds in a sample; return what its last output was."""
@@ -162,10 +158,9 @@ class Chain:
             for state, (mean, std) in known.items()
             if math.isfinite(mean + std) and std > 0.0
         }
-        believed = self.belief.terrain, self.belief.probability
-        return LiveState(self.robot_name, name, now_s, biases, *believed, self._target_ratio)
+        return LiveState(self.robot_name, name, now_s, biases, self.belief.terrain, self.belief.probability)
 
-    def restore(self, state: LiveState, now_s: float) -> Restorable:
+    def restore(self, state: LiveState, now_s: float) -> LiveState:
         """Start from a saved state, before the first sample; return what of it is used.
 
         Raises
@@ -176,8 +171,8 @@ class Chain:
         resident, name = self._kept_filter
         fresh = restorable(state, self.robot_name, name, now_s)
         if resident is not None:
-            resident.begin_from(fresh.biases, fresh.age_s)
-        self.belief, self._target_ratio = fresh.belief, fresh.target_ratio
+            resident.begin_from(fresh.biases, max(now_s - state.saved_s, 0.0))
+        self.belief = TerrainBelief(fresh.terrain, fresh.probability)
         return fresh
 
     @property

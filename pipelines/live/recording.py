@@ -17,8 +17,9 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from io import BytesIO
+from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
@@ -52,25 +53,13 @@ MAX_WAITING_BYTES = 4 << 20
 _OVERHEAD_BYTES = 200
 """What an array takes beside its numbers."""
 
-RECORDING = "recording"
-FINISHED = "finished"
-NOTHING_KEPT = "finished: nothing to keep"
+RECORDING, FINISHED, NOTHING_KEPT = "recording", "finished", "finished: nothing to keep"
 
 WINDOW = "a window"
 """Takes the place of a stream's name for outputs of the model."""
 
 _DECIDED = ("commands", "control")
 """Streams that a controller writes."""
-
-
-class _Part(NamedTuple):
-    """A file that is being written."""
-
-    path: Path
-    file: BinaryIO
-    run: RunRecorder
-    streams: set[str]
-    """That are registered."""
 
 
 class SessionRecorder:
@@ -84,7 +73,6 @@ class SessionRecorder:
     robot : name
     channels : of each stream that is recorded, in the order of the columns of its readings
     wheels : names of the wheels that are commanded
-    source : of the run, as text
     writer : thread that writes; shared by all recordings
     part_bytes : size above which a file is followed by another
 
@@ -112,7 +100,6 @@ class SessionRecorder:
         robot: str,
         channels: Mapping[str, Sequence[str]],
         wheels: Sequence[str] = (),
-        source: str = "recorded live",
         *,
         writer: RecordingThread,
         part_bytes: int = PART_BYTES,
@@ -124,12 +111,14 @@ class SessionRecorder:
         self._channels["commands"] = commanded
         self._n_wheels = len(wheels)
         self._folder, self._part_bytes, self._writer = Path(folder), part_bytes, writer
-        self._head = Head(run_id, robot, run_id, source=source, live=True)
+        self._head = Head(run_id, robot, run_id, source="recorded live", live=True)
         self._lock = threading.Lock()
         self._waiting: list[tuple[str, Array | WindowOutput]] = []
         self._dropped: Counter[str] = Counter()
         self._n_waiting = 0
-        self._part: _Part | None = None
+        self._file: BinaryIO | None = None  # that is written, its run, and the streams it has
+        self._run: RunRecorder
+        self._registered: set[str] = set()
         self._origin_s = np.nan
         self._ended = ""  # why no more is taken; empty while it is
         self.settled = threading.Event()
@@ -192,13 +181,14 @@ class SessionRecorder:
 
     def work(self) -> bool:
         """Write what waits; say whether there is more to come.  Called by the thread, and by nothing else."""
-        if self.settled.is_set():
-            return False
         ended = bool(self._ended)  # seen before the samples are taken, so that all of them are
         try:
             self._flush()
-            if self._part is not None and (ended or self._part.file.tell() > self._part_bytes):
-                self._finish(self._part)
+            if self._file is not None and (ended or self._file.tell() > self._part_bytes):
+                self._run.finish(dropped=+self._dropped)
+                os.fsync(self._file.fileno())
+                self._file.close()
+                self._file, self._dropped = None, Counter()
             if ended and not self.files and self._ended == FINISHED:
                 self._ended = NOTHING_KEPT
         except OSError as error:
@@ -206,15 +196,12 @@ class SessionRecorder:
         except Exception as error:  # of this recording: the thread serves the others
             ended, self._ended = True, f"stopped: {type(error).__name__}: {error}"
         if ended:
-            self._settle()
+            if self._file is not None:
+                with suppress(OSError):  # a full disk: what was written before stays readable
+                    self._file.close()
+            self._waiting = []
+            self.settled.set()
         return not ended
-
-    def _settle(self) -> None:
-        if self._part is not None:
-            with suppress(OSError):  # a full disk: what was written before stays readable
-                self._part.file.close()
-        self._waiting = []
-        self.settled.set()
 
     def _flush(self) -> None:
         """Write what waits to the file, and wait until it is on the disk."""
@@ -225,22 +212,22 @@ class SessionRecorder:
             by_stream.setdefault(name, []).append(content)
         windows = by_stream.pop(WINDOW, [])
         blocks = {name: self._stampable(np.concatenate(rows)) for name, rows in by_stream.items()}
-        if not any(map(len, blocks.values())) and (self._part is None or not windows):
+        if not any(map(len, blocks.values())) and (self._file is None or not windows):
             return
-        part = self._part or self._begin()
+        file = self._file or self._begin()
         for name, rows in blocks.items():
             if len(rows):
-                if name not in part.streams:
-                    part.run.register(name, self._channels[name])
-                    part.streams.add(name)
-                part.run.append(name, rows[:, 0], rows[:, 1:])
+                if name not in self._registered:
+                    self._run.register(name, self._channels[name])
+                    self._registered.add(name)
+                self._run.append(name, rows[:, 0], rows[:, 1:])
         for output in windows:
             if 0.0 <= output.end_s - self._origin_s < LATEST_S:
-                part.run.append_text(WINDOW_TOPIC, output.end_s, recorded(output).model_dump_json())
-        part.run.flush()
-        os.fsync(part.file.fileno())
-        if not os.fstat(part.file.fileno()).st_nlink:
-            raise FileNotFoundError(f"{part.path} was removed")
+                self._run.append_text(WINDOW_TOPIC, output.end_s, recorded(output).model_dump_json())
+        self._run.flush()
+        os.fsync(file.fileno())
+        if not os.fstat(file.fileno()).st_nlink:
+            raise FileNotFoundError(f"{self.files[-1]} was removed")
         if shutil.disk_usage(self._folder).free < FREE_BYTES:
             self._end(f"stopped: less than {FREE_BYTES >> 20} MiB are free on the disk")
 
@@ -255,32 +242,20 @@ class SessionRecorder:
         self._dropped[BAD_TIME] += int((~held).sum())
         return rows[held]
 
-    def _begin(self) -> _Part:
+    def _begin(self) -> BinaryIO:
         """Begin a file that no other recording has."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        name = base = (
-            self._head.run_id if not self.files else f"{self.files[0].stem}_part{len(self.files) + 1}"
-        )
-        count = 1
-        while True:
+        first = self.files[0].stem if self.files else ""
+        base = f"{first}_part{len(self.files) + 1}" if first else self._head.run_id
+        for name in chain([base], (f"{base}_{number}" for number in count(2))):
             path = self._folder / f"{name}.mcap"
-            try:
-                file = path.open("xb")
+            with suppress(FileExistsError):
+                file = self._file = path.open("xb")
                 break
-            except FileExistsError:
-                count += 1
-                name = f"{base}_{count}"
-        head = self._head._replace(run_id=name, session=self.files[0].stem if self.files else name)
-        self._part = _Part(path, file, RunRecorder(file, head, self._origin_s), set())
+        head = self._head._replace(run_id=name, session=first or name)
+        self._run, self._registered = RunRecorder(file, head, self._origin_s), set()
         self.files.append(path)
-        return self._part
-
-    def _finish(self, part: _Part) -> None:
-        """Write the end of the file; what comes next begins another."""
-        part.run.finish(dropped=+self._dropped)
-        os.fsync(part.file.fileno())
-        part.file.close()
-        self._part, self._dropped = None, Counter()
+        return file
 
 
 def recorded(output: WindowOutput) -> RecordedWindow:
@@ -336,13 +311,11 @@ class RecordingThread:
     """
 
     def __init__(self, flush_s: float = FLUSH_S) -> None:
-        RunRecorder(
-            BytesIO(), Head("none", "")
-        )  # imports what it needs; later that would hold up the sessions
+        RunRecorder(BytesIO(), Head("none", ""))  # imports now what would hold up the sessions later
         self._flush_s, self._stopped = flush_s, False
         self._recordings: list[SessionRecorder] = []
         self._woken = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._thread = threading.Thread(target=self._write, name="recording", daemon=True)
         self._thread.start()
 
     def add(self, recording: SessionRecorder) -> None:
@@ -360,7 +333,7 @@ class RecordingThread:
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
-    def _run(self) -> None:
+    def _write(self) -> None:
         while not self._stopped or self._recordings:
             self._woken.wait(self._flush_s)
             self._woken.clear()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -25,7 +25,7 @@ from pydantic import (
 )
 from pydantic.dataclasses import dataclass
 
-from terrain.control.switching import NO_BELIEF, UNKNOWN, TerrainBelief
+from terrain.control.switching import UNKNOWN
 from terrain.errors import DataError
 from terrain.files.atomic import atomic_write
 
@@ -78,25 +78,8 @@ class LiveState:
     target_ratio: Number = math.nan
 
 
-class Restorable(NamedTuple):
-    """What of a state is fresh enough to be used.
-
-    Parameters
-    ----------
-    biases : none where they are too old, or another robot's or filter's
-    belief : unknown where it is too old
-    target_ratio : NaN where the terrain is too old
-    age_s : since it was saved
-    """
-
-    biases: Mapping[str, Bias]
-    belief: TerrainBelief
-    target_ratio: float
-    age_s: float
-
-
-def restorable(state: LiveState, robot: str, filter_name: str, now_s: float) -> Restorable:
-    """Return what of a state may be used now.
+def restorable(state: LiveState, robot: str, filter_name: str, now_s: float) -> LiveState:
+    """Return a state without what may not be used now: what is too old, or another robot's or filter's.
 
     Parameters
     ----------
@@ -108,23 +91,20 @@ def restorable(state: LiveState, robot: str, filter_name: str, now_s: float) -> 
     --------
     >>> biases = {"gyro_bias_radps": Bias(0.01, 0.001)}
     >>> state = LiveState("agrimaro", "vio15", 1000.0, biases, "grass", 0.9, 0.1)
-    >>> restorable(state, "agrimaro", "vio15", 1005.0).belief.terrain
+    >>> restorable(state, "agrimaro", "vio15", 1005.0).terrain
     'grass'
     >>> later = restorable(state, "agrimaro", "vio15", 1060.0)
-    >>> later.belief.terrain, later.biases["gyro_bias_radps"].mean
+    >>> later.terrain, later.biases["gyro_bias_radps"].mean
     ('', 0.01)
     """
     age_s = now_s - state.saved_s
     suits = state.robot == robot and age_s >= -CLOCK_SLACK_S  # False for NaN
     fresh_biases = suits and state.filter == filter_name and age_s <= BIASES_FRESH_S
     fresh_belief = suits and age_s <= BELIEF_FRESH_S and state.terrain != UNKNOWN
-    belief = TerrainBelief(state.terrain, state.probability) if fresh_belief else NO_BELIEF
-    return Restorable(
-        state.biases if fresh_biases else {},
-        belief,
-        state.target_ratio if fresh_belief else math.nan,
-        max(age_s, 0.0),
-    )
+    biases = state.biases if fresh_biases else {}
+    if fresh_belief:
+        return replace(state, biases=biases)
+    return LiveState(state.robot, state.filter, state.saved_s, biases)
 
 
 class _Document(BaseModel):

@@ -1,10 +1,11 @@
-"""The windows of a model on a robot: by which filter live, and of logs that lack its estimates."""
+"""The windows of a model on a robot: by which filter live, of logs that lack its estimates, and filtered over time."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -19,7 +20,8 @@ from features.windows import (
     label_windows,
     span_of,
 )
-from pipelines.live.model import WindowsInfo
+from pipelines.live.model import LiveModel, WindowsInfo
+from terrain.classify.terrain_filter import TerrainFilter, check_filter
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.choice import (
     ESTIMATED,
@@ -32,6 +34,11 @@ from terrain.extension import correct_live
 from terrain.logs.replay import SENSORS, replay
 from terrain.records import RunLog
 from terrain.robots import Robot
+
+Model = TypeVar("Model", bound=LiveModel)
+
+STRIDE_S = 0.25
+"""From window to window of a model whose outputs are filtered over time, in place of a dwell."""
 
 
 def needs_filter(info: WindowsInfo, channels: Mapping[str, Sequence[str]]) -> bool:
@@ -157,3 +164,29 @@ def windows_of_log(run: RunLog, info: WindowsInfo, robot: Robot, *, skip_short: 
         kind.removeprefix("window: "): n for kind, n in feed.dropped.items() if kind.startswith("window: ")
     }
     return WindowCut(labelled, Counter(reasons))
+
+
+def filter_of(info: WindowsInfo) -> TerrainFilter:
+    """Return the filter of a model: shares of its classes in training, equal ones where it has none."""
+    prior = tuple(float(info.class_ratio.get(name, 1.0 / len(info.classes))) for name in info.classes)
+    return check_filter(TerrainFilter(prior))
+
+
+def filtered(model: Model, stride_s: float | None = STRIDE_S) -> Model:
+    """Return a model whose windows begin every ``stride_s`` and are filtered; the model itself for None.
+
+    Raises
+    ------
+    ConfigError
+        if the stride is not above zero, or longer than a window.
+    """
+    if stride_s is None:
+        return model
+    if not 0.0 < stride_s <= model.info.window_s:
+        raise ConfigError(
+            f"filter stride is {stride_s:g} s: above zero and at most a window, {model.info.window_s:g} s, "
+            "is required"
+        )
+    changed: Any = model
+    info = replace(changed.info, stride_s=stride_s)
+    return cast(Model, changed._replace(info=info, over_time=filter_of(model.info)))

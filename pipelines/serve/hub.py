@@ -15,7 +15,7 @@ from pipelines.live.classifying import ClassifierThread
 from pipelines.live.model import LiveModel
 from pipelines.live.recording import RecordingThread, SessionRecorder
 from pipelines.live.session import RobotSession, Served, StepOutput
-from pipelines.live.state import LiveState, Restorable, load_state, save_state
+from pipelines.live.state import LiveState, load_state, save_state
 from pipelines.serve.messages import Hello, served_content, step_content
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
@@ -68,7 +68,7 @@ class OpenSession:
 
     name: str
     chain: RobotSession
-    restored: Restorable | None
+    restored: LiveState | None
     leave: Callable[[str, str], None]
     received_s: float = field(default_factory=monotonic)
     last: StepOutput | None = None
@@ -166,7 +166,7 @@ class Hub:
         self.metrics.sessions.set(len(self.sessions))
         return opened
 
-    def _begin(self, hello: Hello) -> tuple[RobotSession, Restorable | None]:
+    def _begin(self, hello: Hello) -> tuple[RobotSession, LiveState | None]:
         chain = RobotSession(hello.request, self.served, self.robot(hello.robot), self._thread)
         state = self._left.get(hello.session)
         if state is None and self._folder is not None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from time import time
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.session import COMMAND_VALID_S, RobotSession, Served, SessionRequest, StepOutput
-from pipelines.live.state import Restorable
+from pipelines.live.state import LiveState
 from pipelines.serve.wire import WireError
 from terrain.control.traction import TractionStatus
 
@@ -89,13 +90,13 @@ def read_hello(content: dict[str, Any]) -> Hello:
 
 
 def welcome(
-    hello: Hello, chain: RobotSession, restored: Restorable | None, limits: dict[str, float]
+    hello: Hello, chain: RobotSession, restored: LiveState | None, limits: dict[str, float]
 ) -> dict[str, Any]:
     """Return the answer to a hello."""
     known = restored and {
-        "age_s": restored.age_s,
+        "age_s": max(time() - restored.saved_s, 0.0),
         "biases": sorted(restored.biases),
-        "terrain": restored.belief.terrain or None,
+        "terrain": restored.terrain or None,
     }
     return {
         "type": "welcome",

@@ -18,10 +18,9 @@ from pipelines.data.settings import ReadSettings, load
 from pipelines.live.chain import Chain
 from pipelines.live.model import LiveModel
 from pipelines.live.observer import Observer
-from pipelines.live.over_time import filtered
 from pipelines.live.pilot import LivePilot
 from pipelines.live.terrain_source import Classifier
-from pipelines.live.windows import needs_filter
+from pipelines.live.windows import filtered, needs_filter
 from pipelines.report import (
     Column,
     Figure,

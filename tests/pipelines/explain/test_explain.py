@@ -252,7 +252,7 @@ def test_an_extended_description_passes_through_the_commands(tmp_path):
         (row,) = estimate_runs([run], robot, "vio15", tuning=tuning).result.runs
         assert row.speed_rmse_mps < 0.006
     assert np.isfinite(terrain_runs(run, robot)[0].balance.mass_kg)
-    assert LivePilot(robot)._radius_m == pytest.approx(0.208)
+    assert LivePilot(robot).control._radius_m == pytest.approx(0.208)
     with pytest.raises(ConfigError, match="is extended by effects"):
         calibrate.run(calibrate.Settings(data=tmp_path, robot=str(out)), silent)
     assert yaml.safe_load(out.read_text())["effects"]["schema"] == 1

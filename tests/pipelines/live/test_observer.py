@@ -18,18 +18,18 @@ from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.observers.estimate import observe_run, with_estimates
 from terrain.logs.replay import replay
-from terrain.logs.replay import replay as named_replay
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.run import simulate_run
 
-AGRIMARO, HUSKY = load_robot("agrimaro"), load_robot("husky")
+AGRIMARO, HUSKY, TABLE = load_robot("agrimaro"), load_robot("husky"), load_slip_table()
 DATA = Path(os.environ.get("TERRAIN_DATA", "/nowhere"))
 
 
-def simulated(terrain, number, duration_s=25.0):
-    return simulate_run(AGRIMARO, terrain, "survey", 5, number, duration_s=duration_s)
+@pytest.fixture(scope="module")
+def grass():
+    return simulate_run(AGRIMARO, "grass", "survey", 5, 7, duration_s=25.0)
 
 
 def observed(observer, run, rate_hz=50.0):
@@ -44,40 +44,26 @@ def assert_same(found, rows):
     assert [(one.start_s, one.terrain) for one in found] == [(row.start_s, row.terrain) for row in rows]
     assert [one.probability for one in found] == pytest.approx([row.probability for row in rows], abs=1e-12)
     for one, row in zip(found, rows, strict=True):
-        target = load_slip_table().lookup(one.terrain)
+        target = TABLE.lookup(one.terrain)
         assert {state: each.slip_ratio for state, each in target.items()} == row.target_slip
 
 
-def test_a_raw_log_is_filtered_by_predict_and_live_alike(swerve_model):
-    run = simulated("grass", 7)
-    result = predict([run], swerve_model, load_slip_table())
-    assert result.filtered == (run.run_id,)
-    assert result.n_windows > 5
-    assert result.n_judged == result.n_windows
-    found = observed(Observer(swerve_model, robot=AGRIMARO, channels=channels_of(run)), run)
-    assert_same(found, result.windows)
-
-
-def test_a_filtered_log_and_a_raw_one_give_the_same_terrain_but_for_what_a_log_sees_ahead(swerve_model):
+def test_a_raw_log_is_filtered_by_predict_and_live_alike(swerve_model, grass):
     """The filter of a log takes latencies off, which a live one cannot: nearly all windows agree."""
-    run = simulated("grass", 7)
-    raw = predict([run], swerve_model, load_slip_table())
-    whole = predict([enriched(estimate_run(run, AGRIMARO, "vio15"))], swerve_model, load_slip_table())
+    raw = predict([grass], swerve_model, TABLE)
+    assert raw.filtered == (grass.run_id,)
+    assert raw.n_judged == raw.n_windows > 5
+    observer = Observer(swerve_model, robot=AGRIMARO, channels=channels_of(grass))
+    assert observer.belief.terrain == ""
+    assert_same(observed(observer, grass), raw.windows)
+    whole = predict([enriched(estimate_run(grass, AGRIMARO, "vio15"))], swerve_model, TABLE)
     assert whole.filtered == ()
     assert [row.start_s for row in raw.windows] == [row.start_s for row in whole.windows]
-    same = [a.terrain == b.terrain for a, b in zip(raw.windows, whole.windows, strict=True)]
-    assert np.mean(same) >= 0.9
-
-
-def test_the_belief_follows_windows_that_agree_and_ends_with_driving_on_in_silence(swerve_model):
-    run = simulated("grass", 8)
-    observer = Observer(swerve_model, robot=AGRIMARO, channels=channels_of(run))
-    assert observer.belief.terrain == ""
-    observed(observer, run)
+    assert np.mean([a.terrain == b.terrain for a, b in zip(raw.windows, whole.windows, strict=True)]) >= 0.9
     assert observer.belief.terrain == "grass"
-    wheels, end_s = run.streams["wheels"], run.streams["wheels"].time_s[-1]
-    for k in range(1, 12 * 50):
-        observer.update({"wheels": Reading(np.array([end_s + k / 50]), wheels.values[-200:-199])})
+    wheels = grass.streams["wheels"]
+    for k in range(1, 12 * 50):  # it drives on in silence
+        observer.update({"wheels": Reading(wheels.time_s[-1:] + k / 50, wheels.values[-200:-199])})
     assert observer.belief.terrain == ""
 
 
@@ -87,7 +73,7 @@ def test_live_equals_the_log_on_all_measured_runs(set_name, trained):
         pytest.skip(f"TERRAIN_DATA has no {set_name}")
     runs = load_runs(DATA / set_name)
     model = trained(runs[:: max(len(runs) // 9, 1)])
-    result = predict(runs, model, load_slip_table(), skip_short=True)
+    result = predict(runs, model, TABLE, skip_short=True)
     by_run = {run.run_id: [] for run in runs}
     for row in result.windows:
         by_run[row.run_id].append(row)
@@ -102,9 +88,8 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
         pytest.skip("TERRAIN_DATA has no vulpi")
     runs = load_runs(DATA / "vulpi")
     model = trained([enriched(estimate_run(run, HUSKY, "skid")) for run in runs[::2]])
-    assert model.info.filter == "skid"
-    assert model.info.robots == ("husky",)
-    rows = predict(runs[5:6], model, load_slip_table()).windows
+    assert (model.info.filter, model.info.robots) == ("skid", ("husky",))
+    rows = predict(runs[5:6], model, TABLE).windows
     assert len(rows) > 5
     observer = Observer(model, robot=HUSKY, channels=channels_of(runs[5]))
     assert_same(observed(observer, runs[5]), rows)
@@ -112,25 +97,31 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
 
 
 def test_slip_by_an_observer_of_tracked_robots_is_a_feature_in_the_log_and_live(trained):
-    """What the observer adds is in the windows, and live the same as in the log."""
-    robot = load_robot("orchard_ugv")
+    robot, sloped = load_robot("orchard_ugv"), Conditions(grade_ratio=(0.15, 0))
     runs = [
-        simulate_run(
-            robot, terrain, "survey", 5, k, duration_s=30.0, conditions=Conditions(grade_ratio=(0.15, 0))
-        )
+        simulate_run(robot, terrain, "survey", 5, k, duration_s=30.0, conditions=sloped)
         for terrain in ("clay", "dry_sand")
         for k in (1, 2, 3)
     ]
-    model = trained(
-        [with_estimates(observe_run(run, robot, "tracked")) for run in runs if run.run_id[-1] != "3"]
-    )
+    unseen = runs.pop(2)
+    model = trained([with_estimates(observe_run(run, robot, "tracked")) for run in runs[:4]])
     assert model.info.filter == "tracked"
     assert set(model.info.channels["slip"]) == {"slip_left_ratio", "slip_right_ratio"}
-    rows = predict([runs[2]], model, load_slip_table()).windows
+    rows = predict([unseen], model, TABLE).windows
     assert len(rows) > 5
-    observer = Observer(model, robot=robot, channels=channels_of(runs[2]))
-    assert_same(observed(observer, runs[2]), rows)
+    observer = Observer(model, robot=robot, channels=channels_of(unseen))
+    assert_same(observed(observer, unseen), rows)
     assert observer.estimate.status.label == "standing"  # at the end of the drive
+
+
+def test_a_robot_without_a_description_is_observed_by_its_channels(mower_model, two_drives):
+    """A terrain that nothing confirms becomes unknown, also where no wheels are measured."""
+    run, observer = two_drives[4], Observer(mower_model)
+    assert_same(observed(observer, run), predict([run], mower_model, TABLE).windows)
+    assert observer.belief.terrain == "b"
+    for k in range(1, 150):
+        observer.update({"imu": Reading(np.array([run.end_s + 0.1 * k]), np.full((1, 1), math.nan))})
+    assert observer.belief.terrain == ""
 
 
 @pytest.mark.parametrize("far_s", [-600.0, 4000.0])
@@ -145,24 +136,6 @@ def test_after_a_clock_was_set_windows_begin_anew(mower_model, two_drives, far_s
     assert sum(stamp_s > 1000.0 for stamp_s in stamps) == 0
     assert min(stamps) < -500.0 if far_s < 0 else max(stamps) > 8.5
     assert observer.belief.terrain == "b"
-
-
-def test_a_terrain_that_nothing_confirms_becomes_unknown_where_no_wheels_are_measured(
-    mower_model, two_drives
-):
-    observer = Observer(mower_model)
-    for sample in replay(two_drives[4]):
-        observer.update(sample.readings)
-    assert observer.belief.terrain == "b"
-    end_s = two_drives[4].end_s
-    for k in range(1, 150):
-        observer.update({"imu": Reading(np.array([end_s + 0.1 * k]), np.full((1, 1), math.nan))})
-    assert observer.belief.terrain == ""
-
-
-def test_a_robot_without_a_description_is_observed_by_its_channels(mower_model, two_drives):
-    run = two_drives[4]
-    assert_same(observed(Observer(mower_model), run), predict([run], mower_model, load_slip_table()).windows)
 
 
 BROKEN = [
@@ -199,13 +172,11 @@ def test_samples_that_name_their_columns_need_no_channels(mower_model, two_drive
         name: Stream(s.time_s, np.hstack([np.full((len(s), 1), np.nan), s.values]), named[name])
         for name, s in run.streams.items()
     }
-    observer, found = Observer(mower_model), []
-    for sample in named_replay(RunLog("m", "mower", streams)):
-        found += observer.update(sample.readings)
+    found = observed(Observer(mower_model), RunLog("m", "mower", streams))
     assert [one[:4] for one in found] == [one[:4] for one in observed(Observer(mower_model), run)]
     del streams["imu"]
     with pytest.raises(DataError, match="of the stream 'imu'"):
-        Observer(mower_model).update(next(named_replay(RunLog("m", "mower", streams))).readings)
+        observed(Observer(mower_model), RunLog("m", "mower", streams))
 
 
 def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives):
@@ -217,36 +188,29 @@ def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives):
 
     observer = Observer(mower_model._replace(recipe=Refusing()))
     found = observed(observer, two_drives[0])
-    assert {one.refused for one in found} == {"Input X contains NaN."}
-    assert {one.terrain for one in found} == {""}
+    assert {(one.refused, one.terrain) for one in found} == {("Input X contains NaN.", "")}
     assert np.isnan([one.probability for one in found]).all()
-    assert observer.source.failed == {"Input X contains NaN.": len(found)}
+    assert observer.dropped == {"window: refused, Input X contains NaN.": len(found)}
     assert observer.belief.terrain == ""
 
 
-def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model):
+def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model, grass):
     with pytest.raises(DataError, match="requires 'accel_z_mps2' of the stream 'imu'"):
         Observer(mower_model, channels={"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
+    measured = {name: swerve_model.info.channels[name] for name in ("imu", "wheels")}
     with pytest.raises(DataError, match=r"requires .* of the stream 'estimator', which is neither"):
-        Observer(
-            swerve_model,
-            channels={
-                "imu": swerve_model.info.channels["imu"],
-                "wheels": swerve_model.info.channels["wheels"],
-            },
-        )
-    table = replace(load_slip_table(), robot="warthog")
+        Observer(swerve_model, channels=measured)
+    table = replace(TABLE, robot="warthog")
     with pytest.raises(ConfigError, match="is of the robot 'warthog', not of 'agrimaro'"):
-        Observer(swerve_model, table, AGRIMARO, channels_of(simulated("grass", 1, 9.0)))
+        Observer(swerve_model, table, AGRIMARO, channels_of(grass))
     other = swerve_model._replace(info=replace(swerve_model.info, filter="skid"))
     with pytest.raises(DataError, match="filter 'skid', which robot agrimaro does not run live"):
-        Observer(other, robot=AGRIMARO, channels=channels_of(simulated("grass", 1, 9.0)))
-
-
-def test_runs_of_several_filters_do_not_train_one_model():
-    runs = [
-        enriched(estimate_run(simulated("grass", number), AGRIMARO, name))
-        for number, name in enumerate(("vio15", "slip14"), 1)
-    ]
+        Observer(other, robot=AGRIMARO, channels=channels_of(grass))
+    another = simulate_run(AGRIMARO, "grass", "survey", 5, 8, duration_s=25.0)
     with pytest.raises(DataError, match="estimates of slip14 and vio15"):
-        fitted_model([replace(run, run_id=f"r{k}") for k, run in enumerate(runs)])
+        fitted_model(
+            [
+                enriched(estimate_run(*each))
+                for each in ((grass, AGRIMARO, "vio15"), (another, AGRIMARO, "slip14"))
+            ]
+        )
