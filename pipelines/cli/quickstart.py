@@ -193,7 +193,8 @@ def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) ->
 
 
 def _refuse_other_runs(runs: list[RunLog], data: Path | None, folder: Path) -> None:
-    from pipelines.data.datasets import data_digest, load_runs
+    from pipelines.data.datasets import load_runs
+    from terrain.logs.digest import data_digest
 
     if folder.exists() and data_digest(load_runs(folder)) != data_digest(runs):
         raise DataError(f"{folder}: holds other runs than {data or 'this simulation'}; choose another --out")

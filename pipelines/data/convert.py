@@ -98,10 +98,12 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
     TerrainError
         if ``out`` cannot be written.
     """
-    from pipelines.data.datasets import data_digest, verdict
-    from pipelines.data.run_writers import csv_mapping, target_place, write
+    from pipelines.data.datasets import verdict
+    from pipelines.data.run_writers import target_place, write
     from terrain.files.atomic import atomic_write
+    from terrain.logs.digest import data_digest
     from terrain.logs.duplicates import shared_stretches
+    from terrain.logs.mapping import csv_mapping
     from terrain.logs.plausibility import counted, doubts_of, refuse_implausible_runs
     from terrain.robots import load_robot
 

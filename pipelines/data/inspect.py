@@ -125,7 +125,7 @@ def run(settings: Settings, progress: Progress = silent) -> Inspection:
     LogError
         if a run cannot be read.
     """
-    from pipelines.data.datasets import data_digest
+    from terrain.logs.digest import data_digest
     from terrain.logs.duplicates import shared_stretches
     from terrain.robots import load_robot
 

@@ -8,33 +8,18 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
-
-import numpy as np
 
 from terrain.errors import ConfigError, LogError, one_line
 from terrain.files.names import shown
 from terrain.files.regular import MEBIBYTE
 from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
 from terrain.logs.log_files import short_name
-from terrain.logs.run_topics import (
-    RUN_TOPIC,
-    STRING,
-    STRING_TEXT,
-    Head,
-    Messages,
-    StreamTopic,
-    run_document,
-    stream_messages,
-    stream_topic,
-    string_message,
-    text_messages,
-)
-from terrain.records import Array, Label
+from terrain.logs.run_topics import Head, Messages
 
 if TYPE_CHECKING:
     from mcap.records import Chunk
@@ -77,7 +62,7 @@ class McapWriter:
     Parameters
     ----------
     file : opened for writing
-    metadata : shown by tools that list a file's metadata
+    head : of the run; tools that list a file's metadata show it
 
     Raises
     ------
@@ -85,14 +70,15 @@ class McapWriter:
         if mcap is not installed.
     """
 
-    def __init__(self, file: BinaryIO, metadata: Mapping[str, str]) -> None:
+    def __init__(self, file: BinaryIO, head: Head) -> None:
         library("mcap.writer")
         from mcap.writer import CompressionType, Writer
 
         self._file = file
         self._writer = Writer(file, compression=CompressionType.ZSTD)
         self._writer.start(profile="ros2", library=LIBRARY)
-        self._writer.add_metadata("terrain_run", dict(metadata))
+        texts = {name: value for name, value in head._asdict().items() if isinstance(value, str)}
+        self._writer.add_metadata("terrain_run", texts)
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}
 
@@ -110,82 +96,7 @@ class McapWriter:
         self._writer.flush()
 
     def finish(self) -> None:
-        """Write the end of the file, which stays open."""
-        self._writer.finish()
-
-
-class RunRecorder:
-    """A run that is written as it comes: topics as those of a run that was exported.
-
-    After :meth:`flush` all that was appended is in the file; if the process is killed then, readers find it.
-
-    Parameters
-    ----------
-    file : opened for writing
-    head : of the run
-    origin_s : time on the clock of the run that is stamped 0; stamps reach 68 years from there
-
-    Examples
-    --------
-    >>> from io import BytesIO
-    >>> recorder = RunRecorder(BytesIO(), Head("drive_1", "husky", live=True))
-    >>> recorder.register("imu", ("gyro_z_radps",))
-    >>> recorder.append("imu", [0.0, 0.01], [[0.1], [0.2]])
-    >>> recorder.finish(dropped={"late": 1})
-    """
-
-    def __init__(self, file: BinaryIO, head: Head, origin_s: float = 0.0) -> None:
-        metadata = {name: value for name, value in head._asdict().items() if isinstance(value, str)}
-        self._writer = McapWriter(file, metadata)
-        self._file, self._head, self._origin_s = file, head, origin_s
-        self._topics: dict[str, StreamTopic] = {}
-        self._is_described, self._last_ns = False, 0
-
-    def register(self, stream: str, channels: Sequence[str]) -> None:
-        """Announce a stream; streams may come later than samples of others."""
-        taken = [each.topic for each in self._topics.values()]
-        self._topics[stream] = stream_topic(stream, channels, taken)
-        self._is_described = False
-
-    def append(
-        self, stream: str, time_s: Array | Sequence[float], values: Array | Sequence[Sequence[float]]
-    ) -> None:
-        """Append samples (n,) and (n, c) of a stream that is registered."""
-        messages = stream_messages(self._topics[stream], time_s, values, self._origin_s)
-        if not self._is_described and len(messages.log_ns):
-            self._describe(int(messages.log_ns[0]))
-        self._write(messages)
-
-    def append_text(self, topic: str, time_s: float, text: str) -> None:
-        """Append a text, as of :data:`~terrain.logs.run_topics.WINDOW_TOPIC`."""
-        self._write(text_messages(topic, [time_s], [text], self._origin_s))
-
-    def _describe(
-        self, log_ns: int, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None
-    ) -> None:
-        text = run_document(self._head, self._topics, labels, dropped)
-        stamps_ns, contents = np.array([log_ns]), [string_message(text)]
-        self._write(Messages(RUN_TOPIC, STRING, STRING_TEXT, stamps_ns, contents))
-        self._is_described = True
-
-    def _write(self, messages: Messages) -> None:
-        for log_ns, content in zip(messages.log_ns.tolist(), messages.contents, strict=True):
-            self._writer.write(messages, log_ns, content)
-            self._last_ns = max(self._last_ns, log_ns)
-
-    def flush(self) -> None:
-        """Give all that was appended to the system."""
-        self._writer.flush()
-
-    def finish(self, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None) -> None:
-        """Write the end of the file, which stays open.
-
-        Parameters
-        ----------
-        labels : of the run
-        dropped : counts by kind of what was not recorded
-        """
-        self._describe(self._last_ns, labels, dropped)
+        """Write the end of the file, which stays open, and give all to the system."""
         self._writer.finish()
         self._file.flush()
 

@@ -10,21 +10,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 
 from pipelines.data.mcap_file import McapWriter, library
 from pipelines.data.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.kinematics.standard_messages import StandardTopic, standard_topic
-from terrain.logs.run_topics import Messages, origin_of, run_messages, stamps_ns
-from terrain.logs.schema import UNIT_SCALES, unit_of
+from terrain.logs.run_topics import Messages, head_of, origin_of, run_messages, stamps_ns
 from terrain.logs.topic_mapping import DISTRO
-from terrain.logs.write import run_folder, write_run
+from terrain.logs.write import run_folder, write_csv, write_run
 from terrain.records import Array, RunLog
 
 Target = Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"]
-
-LABELS_FILE = "labels.csv"
 
 
 def messages_of_run(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iterator[Messages]:
@@ -133,9 +129,8 @@ def write(place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: T
         return write_csv(place, run)
     topics = list(messages_of_run(run, windows))
     if target == "mcap":
-        head = {"run_id": run.run_id, "robot": run.robot, "session": run.session, "filter": run.filter}
         with atomic_file(place) as file:
-            writer = McapWriter(file, head)
+            writer = McapWriter(file, head_of(run))
             for log_ns, number, message in _in_order(topics):
                 writer.write(topics[number], log_ns, message)
             writer.finish()
@@ -180,45 +175,3 @@ def _in_order(topics: Sequence[Messages]) -> Iterator[tuple[int, int, bytes]]:
             yield log_ns, number, message
 
     return heapq.merge(*(numbered(number) for number in range(len(topics))), key=lambda found: found[0])
-
-
-def write_csv(place: Path, run: RunLog) -> dict[str, int]:
-    """Write a run as a folder with a CSV file a stream, and its labels; return the number of rows of each.
-
-    Numbers are written with as many digits as give them back.
-    """
-    import pandas as pd
-
-    with atomic_folder(place) as folder:
-        for name, stream in run.streams.items():
-            table = pd.DataFrame(stream.values, columns=list(stream.channels))
-            table.insert(0, "time_s", stream.time_s, allow_duplicates=True)
-            table.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
-        if run.labels:
-            labels = pd.DataFrame(run.labels, columns=["start_s", "end_s", "terrain"])
-            labels.to_csv(folder / LABELS_FILE, index=False, lineterminator="\n")
-    rows = {f"{name}.csv": len(stream) for name, stream in run.streams.items()}
-    return rows | ({LABELS_FILE: len(run.labels)} if run.labels else {})
-
-
-def csv_mapping(runs: Sequence[RunLog]) -> str | None:
-    """Return the mapping that reads the CSV files of runs; None where they differ in robot or channels.
-
-    Labels are no part of it, and neither are codes, which have no unit.
-    """
-    first = runs[0]
-    for run in runs:
-        if run.robot != first.robot or {n: s.channels for n, s in run.streams.items()} != {
-            n: s.channels for n, s in first.streams.items()
-        }:
-            return None
-    unit_name = {word: name for name, (word, factor) in reversed(UNIT_SCALES.items()) if factor == 1.0}
-    streams: dict[str, Any] = {}
-    for name, stream in first.streams.items():
-        units = {channel: unit_name.get(unit_of(channel)) for channel in stream.channels}
-        channels = {channel: {"column": channel, "unit": unit} for channel, unit in units.items() if unit}
-        if channels:
-            time = {"column": "time_s", "unit": "s"}
-            streams[name] = {"file": f"{{run}}/{name}.csv", "time": time, "channels": channels}
-    document = {"robot": first.robot, "run_id": "{run}", "streams": streams}
-    return str(yaml.safe_dump(document, sort_keys=False, allow_unicode=True))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,6 +95,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     """
     import math
 
+    from terrain.effects import read_effects_of
     from terrain.errors import LogError
     from terrain.files.atomic import ensure_writable
     from terrain.logs.write import run_folder, write_run
@@ -106,7 +107,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
 
     scenario, out = settings.scenario, settings.out
     robot = load_robot(settings.robot)
-    effects = _effects(settings.effect, robot.drive)
+    effects = read_effects_of(settings.effect, robot.drive)
     ensure_writable(out)
     terrains = soil_names() if settings.terrain == EVERY else (settings.terrain,)
     jobs = [(name, number) for name in terrains for number in range(1, settings.runs + 1)]
@@ -138,20 +139,6 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     return SimulatedRuns(
         out, robot.name, scenario, settings.seed, effects, len(run_ids), tuple(run_ids), total_s
     )
-
-
-def _effects(given: Sequence[str], drive: str) -> dict[str, float]:
-    """Return the parameters that all ``NAME=VALUE`` set together."""
-    from terrain.effects import read_effect
-    from terrain.errors import ConfigError
-
-    acting: dict[str, float] = {}
-    for text in given:
-        for name, value in read_effect(text, drive).items():
-            if name in acting:
-                raise ConfigError(f"effect {text.partition('=')[0]!r} is given twice")
-            acting[name] = value
-    return acting
 
 
 def report(result: SimulatedRuns) -> Report:

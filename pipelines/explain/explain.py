@@ -155,7 +155,6 @@ def explain_runs(
     """
     from dataclasses import replace
 
-    from pipelines.data.datasets import data_digest
     from pipelines.explain.explanation import ExplainResult
     from pipelines.report import silent
     from terrain.discrepancy.diagnosed_runs import diagnose_runs, held_out_gain
@@ -166,6 +165,7 @@ def explain_runs(
     from terrain.discrepancy.statements import statements_of, terrains_apart
     from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain
     from terrain.extension import region_of
+    from terrain.logs.digest import data_digest
     from terrain.robots import load_robot
 
     progress = progress or silent

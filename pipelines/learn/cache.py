@@ -22,7 +22,7 @@ import numpy as np
 from features.extractor import FeatureExtractor
 from features.motion import Motion, wheel_stream, window_motion
 from features.windows import Layout, WindowRule, cut_windows, layout_of
-from pipelines.data.datasets import RunLoader, data_digest, joint_digest, run_loaders
+from pipelines.data.datasets import RunLoader, run_loaders
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.learn.parallel import parallel
 from pipelines.learn.protocols import Samples
@@ -30,6 +30,7 @@ from pipelines.report import Progress, format_counts, silent
 from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
+from terrain.logs.digest import data_digest, joint_digest
 from terrain.logs.duplicates import PrintFiles, shared_stretches
 from terrain.logs.fingerprints import RunPrint, run_print
 from terrain.logs.merge import sentences

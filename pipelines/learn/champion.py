@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipelines.data.datasets import joint_digest
 from pipelines.learn.evaluate import weaknesses
 from pipelines.learn.model_file import ModelInfo, TerrainModel, window_words
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.metrics import runs_by_terrain
+from terrain.logs.digest import joint_digest
 from terrain.records import Array
 
 if TYPE_CHECKING:

@@ -114,11 +114,11 @@ def compare_models(
     import numpy as np
 
     from features.windows import cut_windows
-    from pipelines.data.datasets import data_digest
     from pipelines.learn.evaluate import evaluation_of
     from pipelines.learn.protocols import Samples
     from terrain.classify.held_out import HeldOut
     from terrain.classify.paired import Outcome, compare_with_first
+    from terrain.logs.digest import data_digest
 
     trained = {digest for model in models for digest in model.info.run_digests}
     excluded = tuple(each.run_id for each in runs if data_digest([each]) in trained)

@@ -67,7 +67,7 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
     with computing(settings.compute):
         if settings.cache is not None:
             return _of_cache(settings, settings.cache, progress)
-        from pipelines.data.datasets import data_digest
+        from terrain.logs.digest import data_digest
 
         runs, skipped = load(settings)
         asked = settings.with_(skip_short=settings.repair)

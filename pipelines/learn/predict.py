@@ -281,9 +281,9 @@ def predict(
     import numpy as np
 
     from features.windows import cut_windows, join_windows
-    from pipelines.data.datasets import data_digest
     from pipelines.live.model import assess
     from pipelines.live.windows import lacking_estimates
+    from terrain.logs.digest import data_digest
 
     other = next((each for each in runs if table.robot and each.robot != table.robot), None)
     if other is not None:

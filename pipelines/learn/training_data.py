@@ -12,7 +12,6 @@ from features.extractor import FeatureExtractor
 from features.matrix import FeatureMatrix
 from features.motion import Motion, window_motion
 from features.windows import Layout, cut_windows
-from pipelines.data.datasets import data_digest
 from pipelines.learn.cache import CachedFeatures
 from pipelines.learn.model_file import ModelInfo, TerrainModel, model_info
 from pipelines.learn.protocols import Samples, samples_of
@@ -20,6 +19,7 @@ from pipelines.learn.recipes import WindowPipeline, feature_matrix, recipe_of
 from pipelines.learn.settings import RecipeSettings
 from terrain.errors import DataError
 from terrain.estimation.live.choice import ESTIMATED
+from terrain.logs.digest import data_digest
 from terrain.records import Array, RunLog
 
 SAME_RATE = 1e-6

@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from pipelines.data.mcap_file import RunRecorder
+from pipelines.data.mcap_file import McapWriter
 from pipelines.data.recorded_windows import RecordedWindow
 from terrain.control.switching import SWITCHING
 from terrain.errors import LogError
 from terrain.files.names import plain_name
 from terrain.logs.replay import TWIST
-from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, Head
+from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, Head, RunRecorder
 from terrain.logs.samples import BAD_TIME
 from terrain.logs.schema import unit_of
 from terrain.logs.write import run_folder
@@ -253,7 +253,7 @@ class SessionRecorder:
                 file = self._file = path.open("xb")
                 break
         head = self._head._replace(run_id=name, session=first or name)
-        self._run, self._registered = RunRecorder(file, head, self._origin_s), set()
+        self._run, self._registered = RunRecorder(McapWriter(file, head), head, self._origin_s), set()
         self.files.append(path)
         return file
 
@@ -311,7 +311,7 @@ class RecordingThread:
     """
 
     def __init__(self, flush_s: float = FLUSH_S) -> None:
-        RunRecorder(BytesIO(), Head("none", ""))  # imports now what would hold up the sessions later
+        McapWriter(BytesIO(), Head("", ""))  # imports now what would hold up the sessions later
         self._flush_s, self._stopped = flush_s, False
         self._recordings: list[SessionRecorder] = []
         self._woken = threading.Event()

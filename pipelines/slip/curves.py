@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from pipelines.data.datasets import data_digest
 from pipelines.report import (
     Band,
     Figure,
@@ -39,6 +38,7 @@ from pipelines.slip.shown import file_name, first_rows
 from terrain.control.learned_table import DIGITS, FALLBACK, learned_table
 from terrain.control.slip_table import DRIVE_STATES, CurveEntry, SlipTable
 from terrain.errors import DataError
+from terrain.logs.digest import data_digest
 from terrain.records import RunLog, SlipTarget, TargetStatus
 from terrain.robots import Robot
 from terrain.slip_learning.curve import N_BOOTSTRAP

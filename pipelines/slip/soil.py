@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.datasets import load_runs
 from pipelines.data.settings import load
 from pipelines.report import (
     Figure,
@@ -37,6 +37,7 @@ from pipelines.report import (
 from pipelines.slip.shown import write_figures
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.logs.digest import data_digest
 from terrain.records import RunLog
 from terrain.soil_identification.comparison import BAR_RATIO, WheelResult, compare_laws, n_fits
 from terrain.soil_identification.held_out import HELD_OUT, Misfit

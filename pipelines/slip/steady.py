@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipelines.data.datasets import data_digest
 from pipelines.report import (
     Figure,
     Line,
@@ -36,6 +35,7 @@ from terrain.control.measured_table import MIN_RUNS, measured_table, reason_of
 from terrain.control.slip_table import DRIVE_STATES, SlipTable
 from terrain.control.transfer import Transfer, transfers
 from terrain.errors import DataError
+from terrain.logs.digest import data_digest
 from terrain.measured_slip.measure import Measured, measure
 from terrain.measured_slip.operating import OperatingPoints, operating_points
 from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip

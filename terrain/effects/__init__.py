@@ -25,7 +25,7 @@ from terrain.effects.catalogue import (
     library_of,
     nuisances_of,
     parameters_of,
-    read_effect,
+    read_effects_of,
     showing,
 )
 from terrain.effects.described import SCHEMA, checked_covariance, checked_effects, read_effects
@@ -103,8 +103,8 @@ __all__ = [
     "library_of",
     "nuisances_of",
     "parameters_of",
-    "read_effect",
     "read_effects",
+    "read_effects_of",
     "showing",
     "vector_of",
 ]

@@ -13,7 +13,7 @@ To add an effect, write its entry into the module of its kind, and its formula i
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from terrain.effects.car import CAR
 from terrain.effects.ground import SIDEWAYS, SLIP_AND_RESISTANCE
@@ -145,35 +145,40 @@ def in_plant(*parts: PlantPart) -> tuple[str, ...]:
     return tuple(p.name for effect in LIBRARY if effect.plant in parts for p in effect.parameters)
 
 
-def read_effect(text: str, drive: str) -> dict[str, float]:
-    """Return the parameters that ``NAME=VALUE`` sets; several values are separated by commas.
+def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:
+    """Return the parameters that all ``NAME=VALUE`` set together; several values are separated by commas.
 
     Raises
     ------
     ConfigError
-        for an unknown name, an effect that does not apply to the robot, a value that is no number, too few or
-        too many of them, or one out of bounds.
+        for an unknown name, an effect that does not apply to the robot or is given twice, a value that is no
+        number, too few or too many of them, or one out of bounds.
 
     Examples
     --------
-    >>> read_effect("wheel_radius=0.03", "swerve"), read_effect("lever_arm=0.1,-0.05", "skid_steer")
-    ({'wheel_radius_ratio': 0.03}, {'lever_x_m': 0.1, 'lever_y_m': -0.05})
+    >>> read_effects_of(["wheel_radius=0.03", "lever_arm=0.1,-0.05"], "skid_steer")
+    {'wheel_radius_ratio': 0.03, 'lever_x_m': 0.1, 'lever_y_m': -0.05}
     """
-    name, _, given = text.partition("=")
-    effect = effect_named(name.strip())
-    if drive not in effect.drives:
-        raise ConfigError(f"effect {effect.name} does not apply to a robot with the drive {drive!r}")
-    try:
-        values = [float(part) for part in given.split(",")]
-    except ValueError:
-        values = []
-    required = ",".join(p.name for p in effect.parameters)
-    if len(values) != len(effect.parameters):
-        raise ConfigError(f"--effect is {text!r}; {effect.name}=VALUE with {required} is required")
-    for parameter, value in zip(effect.parameters, values, strict=True):
-        if not parameter.low <= value <= parameter.high:
-            raise ConfigError(
-                f"effect {effect.name}: {parameter.name} is {value:g}, "
-                f"{parameter.low:g} to {parameter.high:g} is accepted"
-            )
-    return {p.name: value for p, value in zip(effect.parameters, values, strict=True)}
+    acting: dict[str, float] = {}
+    for text in texts:
+        name, _, given = text.partition("=")
+        effect = effect_named(name.strip())
+        if drive not in effect.drives:
+            raise ConfigError(f"effect {effect.name} does not apply to a robot with the drive {drive!r}")
+        try:
+            values = [float(part) for part in given.split(",")]
+        except ValueError:
+            values = []
+        required = ",".join(p.name for p in effect.parameters)
+        if len(values) != len(effect.parameters):
+            raise ConfigError(f"--effect is {text!r}; {effect.name}=VALUE with {required} is required")
+        for parameter, value in zip(effect.parameters, values, strict=True):
+            if not parameter.low <= value <= parameter.high:
+                raise ConfigError(
+                    f"effect {effect.name}: {parameter.name} is {value:g}, "
+                    f"{parameter.low:g} to {parameter.high:g} is accepted"
+                )
+            if parameter.name in acting:
+                raise ConfigError(f"effect {name!r} is given twice")
+            acting[parameter.name] = value
+    return acting

@@ -46,13 +46,14 @@ from __future__ import annotations
 import glob
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from collections.abc import Mapping as Map
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from terrain.errors import ConfigError, LogError
@@ -442,3 +443,26 @@ def first_fault(error: ValidationError) -> str:
     if fault["type"] == "missing":
         return f"key {place!r} is missing"
     return f"{place} is {shown(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
+
+
+def csv_mapping(runs: Sequence[RunLog]) -> str | None:
+    """Return the mapping that reads the CSV files of runs; None where they differ in robot or channels.
+
+    Labels are no part of it, and neither are codes, which have no unit.
+    """
+    first = runs[0]
+    for run in runs:
+        if run.robot != first.robot or {n: s.channels for n, s in run.streams.items()} != {
+            n: s.channels for n, s in first.streams.items()
+        }:
+            return None
+    unit_name = {word: name for name, (word, factor) in reversed(UNIT_SCALES.items()) if factor == 1.0}
+    streams: dict[str, Any] = {}
+    for name, stream in first.streams.items():
+        units = {channel: unit_name.get(unit_of(channel)) for channel in stream.channels}
+        channels = {channel: {"column": channel, "unit": unit} for channel, unit in units.items() if unit}
+        if channels:
+            time = {"column": "time_s", "unit": "s"}
+            streams[name] = {"file": f"{{run}}/{name}.csv", "time": time, "channels": channels}
+    document = {"robot": first.robot, "run_id": "{run}", "streams": streams}
+    return str(yaml.safe_dump(document, sort_keys=False, allow_unicode=True))

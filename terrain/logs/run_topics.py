@@ -14,7 +14,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -245,6 +245,11 @@ def stream_messages(
     return Messages(topic.topic, topic.kind, topic.definition, log_ns, contents)
 
 
+def head_of(run: RunLog) -> Head:
+    """Return what a run states of itself."""
+    return Head(run.run_id, run.robot, run.session, run.filter, run.source)
+
+
 def origin_of(run: RunLog) -> float:
     """Return the time of a run that is stamped 0: 0, where stamps allow it.
 
@@ -280,8 +285,7 @@ def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iter
     topics: dict[str, StreamTopic] = {}
     for name, stream in run.streams.items():
         topics[name] = stream_topic(name, stream.channels, [each.topic for each in topics.values()])
-    head = Head(run.run_id, run.robot, run.session, run.filter, run.source)
-    document = run_document(head, topics, run.labels, run.dropped)
+    document = run_document(head_of(run), topics, run.labels, run.dropped)
     yield text_messages(RUN_TOPIC, [start_s], [document], origin_s)
     changes = _label_changes(run)
     for topic, texts in ((LABEL_TOPIC, changes), (WINDOW_TOPIC, windows)):
@@ -313,6 +317,93 @@ def stream_samples(place: str, topic: StreamTopic, messages: Sequence[bytes], fa
         faults.found(place, DAMAGED_MESSAGE, text, damaged)
     numbers: Array = np.frombuffer(b"".join(whole), dtype=record)["numbers"]
     return numbers
+
+
+class Writer(Protocol):
+    """Writes messages to a file, each with its log time."""
+
+    def write(self, of: Messages, log_ns: int, content: bytes) -> None: ...  # noqa: D102
+    def flush(self) -> None: ...  # noqa: D102
+    def finish(self) -> None: ...  # noqa: D102
+
+
+class RunRecorder:
+    """A run that is written as it comes: topics as those of a run that was exported.
+
+    After :meth:`flush` all that was appended is in the file; if the process is killed then, readers find it.
+
+    Parameters
+    ----------
+    writer : of a file
+    head : of the run
+    origin_s : time on the clock of the run that is stamped 0; stamps reach 68 years from there
+
+    Examples
+    --------
+    >>> class Shown:
+    ...     def write(self, of: Messages, log_ns: int, content: bytes) -> None:
+    ...         print(of.topic, log_ns, len(content))
+    ...     def flush(self) -> None: ...
+    ...     def finish(self) -> None: ...
+    >>> recorder = RunRecorder(Shown(), Head("drive_1", "husky", live=True))
+    >>> recorder.register("imu", ("gyro_z_radps",))
+    >>> recorder.append("imu", [0.0, 0.01], [[0.1], [0.2]])
+    /terrain/run 0 280
+    /terrain/imu 0 36
+    /terrain/imu 10000000 36
+    """
+
+    def __init__(self, writer: Writer, head: Head, origin_s: float = 0.0) -> None:
+        self._writer, self._head, self._origin_s = writer, head, origin_s
+        self._topics: dict[str, StreamTopic] = {}
+        self._is_described, self._last_ns = False, 0
+
+    def register(self, stream: str, channels: Sequence[str]) -> None:
+        """Announce a stream; streams may come later than samples of others."""
+        taken = [each.topic for each in self._topics.values()]
+        self._topics[stream] = stream_topic(stream, channels, taken)
+        self._is_described = False
+
+    def append(
+        self, stream: str, time_s: Array | Sequence[float], values: Array | Sequence[Sequence[float]]
+    ) -> None:
+        """Append samples (n,) and (n, c) of a stream that is registered."""
+        messages = stream_messages(self._topics[stream], time_s, values, self._origin_s)
+        if not self._is_described and len(messages.log_ns):
+            self._describe(int(messages.log_ns[0]))
+        self._write(messages)
+
+    def append_text(self, topic: str, time_s: float, text: str) -> None:
+        """Append a text, as of :data:`WINDOW_TOPIC`."""
+        self._write(text_messages(topic, [time_s], [text], self._origin_s))
+
+    def _describe(
+        self, log_ns: int, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None
+    ) -> None:
+        text = run_document(self._head, self._topics, labels, dropped)
+        stamps_ns, contents = np.array([log_ns]), [string_message(text)]
+        self._write(Messages(RUN_TOPIC, STRING, STRING_TEXT, stamps_ns, contents))
+        self._is_described = True
+
+    def _write(self, messages: Messages) -> None:
+        for log_ns, content in zip(messages.log_ns.tolist(), messages.contents, strict=True):
+            self._writer.write(messages, log_ns, content)
+            self._last_ns = max(self._last_ns, log_ns)
+
+    def flush(self) -> None:
+        """Give all that was appended to the system."""
+        self._writer.flush()
+
+    def finish(self, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None) -> None:
+        """Write the end of the file, which stays open.
+
+        Parameters
+        ----------
+        labels : of the run
+        dropped : counts by kind of what was not recorded
+        """
+        self._describe(self._last_ns, labels, dropped)
+        self._writer.finish()
 
 
 class RunDocument:

@@ -1,4 +1,4 @@
-"""Writer of run folders (``terrain.logs.read`` documents the format)."""
+"""Writers of run folders (``terrain.logs.read`` documents the format) and of CSV files."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from terrain.files.names import plain_name, shown
 from terrain.logs.log_files import checked_names
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
 from terrain.records import RunLog, Stream
+
+LABELS_FILE = "labels.csv"
 
 
 def run_folder(run_id: str, folder: str | Path) -> Path:
@@ -105,3 +107,22 @@ def _write_parquet(stream: Stream, path: Path) -> None:
     columns = {"time_s": stream.time_s}
     columns |= {channel: stream.channel(channel) for channel in stream.channels}
     parquet.write_table(pyarrow.table(columns), path, compression="zstd")
+
+
+def write_csv(place: Path, run: RunLog) -> dict[str, int]:
+    """Write a run as a folder with a CSV file a stream, and its labels; return the number of rows of each.
+
+    Numbers are written with as many digits as give them back.
+    """
+    import pandas as pd
+
+    with atomic_folder(place) as folder:
+        for name, stream in run.streams.items():
+            table = pd.DataFrame(stream.values, columns=list(stream.channels))
+            table.insert(0, "time_s", stream.time_s, allow_duplicates=True)
+            table.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+        if run.labels:
+            labels = pd.DataFrame(run.labels, columns=["start_s", "end_s", "terrain"])
+            labels.to_csv(folder / LABELS_FILE, index=False, lineterminator="\n")
+    rows = {f"{name}.csv": len(stream) for name, stream in run.streams.items()}
+    return rows | ({LABELS_FILE: len(run.labels)} if run.labels else {})

@@ -6,12 +6,12 @@ from dataclasses import replace
 import pytest
 
 from pipelines.cli.quickstart import Settings, run
-from pipelines.data.datasets import data_digest
 from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.learn.load import load_model
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.errors import ConfigError, DataError
+from terrain.logs.digest import data_digest
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 

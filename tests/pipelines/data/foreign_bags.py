@@ -100,8 +100,8 @@ def write_mcap(path, rows, compression=CompressionType.ZSTD, chunk_size=20_000, 
 def write_ros1(path, rows, compression=None):
     """Write ``(topic, log time in ns, message)`` as a bag of ROS 1."""
     from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_typestore
 
+    path.parent.mkdir(parents=True, exist_ok=True)
     store = get_typestore(Stores.ROS1_NOETIC)
     writer = Writer(path)
     if compression is not None:

@@ -3,8 +3,9 @@ import shutil
 import numpy as np
 import pytest
 
-from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
+from terrain.logs.digest import data_digest
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
 

@@ -5,12 +5,13 @@ import pytest
 
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
-from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.datasets import load_runs
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.errors import LogError, TerrainError
+from terrain.logs.digest import data_digest
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 

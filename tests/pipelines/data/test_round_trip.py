@@ -17,15 +17,16 @@ from scipy.spatial.transform import Rotation
 from pipelines.data.bag_runs import find_runs
 from pipelines.data.convert import Settings
 from pipelines.data.convert import run as convert
-from pipelines.data.datasets import data_digest, load_runs
-from pipelines.data.mcap_file import McapWriter, RunRecorder
+from pipelines.data.datasets import load_runs
+from pipelines.data.mcap_file import McapWriter
 from pipelines.data.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from pipelines.data.run_writers import messages_of_run, write
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
+from terrain.logs.digest import data_digest
 from terrain.logs.read import read_run
-from terrain.logs.run_topics import Head, string_message
+from terrain.logs.run_topics import Head, RunRecorder, string_message
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
@@ -50,27 +51,22 @@ def exported(source, out, target="mcap", **options):
 
 
 @pytest.mark.parametrize("target", TARGETS)
-def test_an_export_is_imported_as_the_same_runs(raw, tmp_path, target):
-    before = load_runs(raw)
-    result = exported(raw, tmp_path, target)
-    after = load_runs(tmp_path)
-    assert data_digest(after) == data_digest(before) == result.digest
-    for one, other in zip(before, after, strict=True):
-        for name in ("run_id", "robot", "labels", "session", "filter", "source", "dropped"):
-            assert getattr(one, name) == getattr(other, name)
-        for name, stream in one.streams.items():
-            assert stream.channels == other.streams[name].channels
-            assert stream.values.tobytes() == other.streams[name].values.tobytes()
-    assert any("estimator" in run.streams for run in after)
-
-
-def test_a_measured_run_survives(datasets_dir, tmp_path):
-    source = next(path for path in sorted((datasets_dir / "borealtc").iterdir()) if path.is_dir()).parent
-    runs = load_runs(source)[:3]
-    for run in runs:
-        write_run(run, tmp_path / "raw")
-    exported(tmp_path / "raw", tmp_path / "out")
-    assert data_digest(load_runs(tmp_path / "out")) == data_digest(runs)
+def test_an_export_is_imported_as_the_same_runs(raw, datasets_dir, tmp_path, target):
+    """Simulated and measured runs, one with its estimates."""
+    measured = tmp_path / "measured"
+    for run in load_runs(datasets_dir / "vulpi")[:1]:
+        write_run(run, measured)
+    for source in (raw, measured):
+        before = load_runs(source)
+        result = exported(source, tmp_path / "out" / source.name, target)
+        after = load_runs(tmp_path / "out" / source.name, layout="bag")
+        assert data_digest(after) == data_digest(before) == result.digest
+        for one, other in zip(before, after, strict=True):
+            for name in ("run_id", "robot", "labels", "session", "filter", "source", "dropped"):
+                assert getattr(one, name) == getattr(other, name)
+            for name, stream in one.streams.items():
+                assert stream.channels == other.streams[name].channels
+                assert stream.values.tobytes() == other.streams[name].values.tobytes()
 
 
 def test_other_libraries_read_the_same_numbers(raw, tmp_path):
@@ -226,7 +222,7 @@ def test_a_run_that_is_too_long_for_stamps_is_refused(tmp_path):
 def test_an_export_whose_document_is_changed_is_refused(raw, tmp_path, old, new):
     run = load_runs(raw)[0]
     with (tmp_path / "changed.mcap").open("wb") as file:
-        writer = McapWriter(file, {})
+        writer = McapWriter(file, Head("", ""))
         for topic in messages_of_run(run):
             for stamp_ns, message in zip(topic.log_ns.tolist(), topic.contents, strict=True):
                 if topic.topic == "/terrain/run":
@@ -239,27 +235,25 @@ def test_an_export_whose_document_is_changed_is_refused(raw, tmp_path, old, new)
     assert "\n" not in str(raised.value)
 
 
-ENTRIES = [
-    {"start_s": 1.0, "end_s": 3.0, "terrain": "ICE", "probability": 0.75, "probabilities": {"ICE": 0.75},
-     "doubtful": False, "refused": ""},
-    {"start_s": 2.0, "end_s": 4.5, "terrain": "", "probability": None, "probabilities": {},
-     "doubtful": True, "refused": "not finite"},
-]  # fmt: skip
-
-
 @pytest.mark.parametrize("target", TARGETS)
 def test_recorded_windows_go_with_their_run_out_and_in(raw, tmp_path, target):
     run = load_runs(raw)[0]
-    place = write_run(
-        run,
-        tmp_path / "raw",
-        beside={WINDOWS_FILE: windows_text(RecordedWindow(**entry) for entry in ENTRIES)},
-    )
+    given = {
+        "start_s": 1.0,
+        "end_s": 3.0,
+        "terrain": "ICE",
+        "probabilities": {"ICE": 0.75},
+        "doubtful": False,
+    }
+    windows = [
+        RecordedWindow(**given, probability=p, refused=why) for p, why in ((0.75, ""), (None, "not finite"))
+    ]
+    place = write_run(run, tmp_path / "raw", beside={WINDOWS_FILE: windows_text(windows)})
     result = exported(tmp_path / "raw", tmp_path / "out", target)
     assert result.topics["/terrain/window"] == 2
     convert(Settings(data=tmp_path / "out", out=tmp_path / "again"))
     assert (tmp_path / "again" / run.run_id / WINDOWS_FILE).read_text() == (place / WINDOWS_FILE).read_text()
-    for damage in ('{"version": 1}', '{"windows": [3]}', '{"windows": [{"end_s": "x"}]}'):
+    for damage in ('{"version": 1}', '{"windows": [3]}', '{"version": 1, "windows": [{"end_s": "x"}]}'):
         (place / WINDOWS_FILE).write_text(damage)
         with pytest.raises(LogError, match="is damaged"):
             exported(tmp_path / "raw", tmp_path / "other", target)
@@ -300,7 +294,8 @@ def test_csv_files_are_read_back_by_the_mapping_beside_them(raw, tmp_path):
 def test_of_a_recording_that_ends_anywhere_all_that_was_flushed_is_read(tmp_path_factory, data):
     """A recording is cut off where a process was killed: the samples before the last flush are there."""
     file = BytesIO()
-    recorder = RunRecorder(file, Head("drive", "husky", live=True))
+    head = Head("drive", "husky", live=True)
+    recorder = RunRecorder(McapWriter(file, head), head)
     recorder.register("imu", ("gyro_z_radps",))
     flushed = [0]
     for part in range(6):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from features.motion import Motion, window_motion
-from pipelines.data.datasets import joint_digest, load_runs, run_loaders
+from pipelines.data.datasets import load_runs, run_loaders
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn import cache
 from pipelines.learn.cache import cached_features
@@ -22,6 +22,7 @@ from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_cache, data_of_runs, same_features
 from pipelines.report.json_file import as_json
 from terrain.errors import ConfigError, DataError, LogError
+from terrain.logs.digest import joint_digest
 from terrain.logs.write import write_run
 from terrain.records import Label, Stream
 

@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.data.datasets import data_digest
 from pipelines.learn.comparison import compare_models
 from pipelines.learn.crossval import crossval
 from pipelines.learn.model_file import TerrainModel, read_model
@@ -13,6 +12,7 @@ from pipelines.report.json_file import as_json
 from terrain.classify.paired import Verdict
 from terrain.classify.support import SupportLevel
 from terrain.errors import DataError
+from terrain.logs.digest import data_digest
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,6 @@ import pandas as pd
 import pytest
 
 from features.windows import cut_windows
-from pipelines.data.datasets import data_digest
 from pipelines.data.tracking import ensure_tracking
 from pipelines.learn.champion import Bench, held_out_runs
 from pipelines.learn.load import load_model
@@ -25,6 +24,7 @@ from pipelines.learn.tracking import log_training
 from pipelines.learn.training_data import data_of_runs
 from terrain.errors import ModelError, TerrainError
 from terrain.files.lock import file_lock
+from terrain.logs.digest import data_digest
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ from terrain.effects import (
     PlantPart,
     effect_named,
     library_of,
-    read_effect,
+    read_effects_of,
     vector_of,
 )
 from terrain.errors import ConfigError
@@ -147,7 +147,7 @@ def test_names_are_unique_and_the_neutral_value_lies_within_the_bounds():
 
 @pytest.mark.parametrize("name", ["steering_play=0.01", "steering_backlash=0.01"])
 def test_a_former_name_is_accepted_on_the_command_line(name):
-    assert read_effect(name, "swerve") == {"steering_backlash_rad": 0.01}
+    assert read_effects_of([name], "swerve") == {"steering_backlash_rad": 0.01}
 
 
 def test_homes_are_numbers_of_a_description():
@@ -206,7 +206,7 @@ for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_O
               information.PRIOR_STD, effects.nuisances_of("swerve")):
     assert name in table
 assert name not in effects.nuisances_of("skid_steer")
-assert effects.read_effect("worn=0.05", "swerve") == {name: 0.05}
+assert effects.read_effects_of(["worn=0.05"], "swerve") == {name: 0.05}
 assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[-1].name == "gear_wear"
 entry = {"value": 0.05, "unit": "ratio", "source": "test"}
 assert effects.read_effects("here", {"schema": 1, "worn_ratio": entry}, "swerve")[0] == {name: 0.05}
@@ -283,7 +283,7 @@ def test_an_alias_is_the_effect():
     for effect in LIBRARY:
         for name in (effect.name, *effect.aliases):
             assert effect_named(name) is effect
-    assert read_effect("encoder_scale=0.02", "swerve") == {"wheel_radius_ratio": 0.02}
+    assert read_effects_of(["encoder_scale=0.02"], "swerve") == {"wheel_radius_ratio": 0.02}
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_an_alias_is_the_effect():
 )
 def test_an_effect_that_cannot_be_is_refused_in_one_sentence(text, drive, message):
     with pytest.raises(ConfigError) as error:
-        read_effect(text, drive)
+        read_effects_of([text], drive)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 

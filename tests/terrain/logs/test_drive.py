@@ -6,8 +6,9 @@ import pytest
 
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
-from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
+from terrain.logs.digest import data_digest
 from terrain.logs.drive import FILE_NAME, STREAMS, DriveRobot, find_runs
 from terrain.logs.held import between_updates
 from terrain.logs.imu_axes import GYRO_TURNED

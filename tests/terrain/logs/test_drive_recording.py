@@ -9,9 +9,10 @@ import pytest
 
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
-from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.current_signs import NO_SIGN, POWER_SIGN, current_sign
+from terrain.logs.digest import data_digest
 from terrain.logs.drive_recording import LOST, NOT_RECORDED, STILL
 from terrain.logs.imu_axes import GYRO_IN_DEGREES, GYRO_TURNED, TURNED
 from terrain.logs.samples import BAD_CELL, BAD_TIME

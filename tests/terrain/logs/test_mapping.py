@@ -6,8 +6,9 @@ import yaml
 
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
-from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
+from terrain.logs.digest import data_digest
 from terrain.logs.mapping import find_runs, load_mapping
 from terrain.logs.spelling import RESPELT
 

@@ -7,10 +7,11 @@ import pytest
 
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
-from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import LogError
 from terrain.kinematics import omni
 from terrain.logs import robotino
+from terrain.logs.digest import data_digest
 from terrain.logs.robotino import HELD, NO_SIGN, SCALED
 from terrain.robots import load_robot
 

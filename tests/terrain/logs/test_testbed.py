@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from pipelines.data.datasets import data_digest, load_runs
+from pipelines.data.datasets import load_runs
 from terrain.errors import LogError
 from terrain.logs import testbed
+from terrain.logs.digest import data_digest
 from terrain.logs.write import write_run
 
 HEADER = (
