@@ -18,7 +18,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -26,7 +26,8 @@ from itertools import islice
 from pathlib import Path
 from socket import create_connection
 from time import monotonic
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
+from urllib.parse import urlsplit
 
 from pydantic import model_validator
 
@@ -101,11 +102,11 @@ class ComputeSettings(Settings):
         return self
 
 
-class _Cluster:
+class _Cluster(NamedTuple):
     """A client of a scheduler, and the scheduler's address."""
 
-    def __init__(self, client: Any, address: str) -> None:
-        self.client, self.address = client, address
+    client: Any
+    address: str
 
     def results(
         self, function: Callable[..., Any], shared: Sequence[Any], each: Iterable[Sequence[Any]]
@@ -113,23 +114,19 @@ class _Cluster:
         """Yield the result of each task in order.
 
         ``shared`` travels as the result of a task of its own, so that it is sent to a worker once and, where
-        all workers that have it are lost, made again from what the scheduler holds.
+        all workers that have it are lost, made again from what the scheduler holds.  Arguments are bound to
+        the functions: dask would look into tuples for tasks, and make lists of some.
         """
-        client, tasks = self.client, iter(each)
         waiting: deque[Any] = deque()
         with _failures(self.address):
-            given = client.submit(_unpacked, _packed((function, tuple(shared))), pure=False)
-
-            def add(number: int) -> None:
-                for one in islice(tasks, number):
-                    waiting.append(client.submit(_compute, given, _packed(tuple(one)), pure=False))
-
+            given = self.client.submit(partial(_bound, function, *shared), pure=False)
+            tasks = (self.client.submit(partial(_call, *one), given, pure=False) for one in each)
             try:
-                add(TASKS_A_THREAD * max(self._n_threads(), 1))
+                waiting.extend(islice(tasks, TASKS_A_THREAD * max(self._n_threads(), 1)))
                 while waiting:
                     yield self._wait(waiting[0])
                     waiting.popleft()
-                    add(1)
+                    waiting.extend(islice(tasks, 1))
             finally:
                 for future in waiting:
                     future.release()
@@ -156,27 +153,22 @@ class _Cluster:
         found = self.client.sync(self.client.scheduler.identity, callback_timeout=ANSWER_S)
         return sum(int(worker["nthreads"]) for worker in found["workers"].values())
 
-    def check_software(self) -> None:
-        """Raise ``TerrainError`` where a worker computes with other software than this process."""
-        here = software()
-        for worker, there in sorted(self.client.run(software, on_error="return").items()):
-            if not isinstance(there, Mapping):
-                raise TerrainError(
-                    f"worker {worker} of {self.address} cannot import this package "
-                    f"({' '.join(str(there).split())[:120]}): install the same version on it"
-                )
-            if (found := difference(here, dict(there))) is not None:
-                raise TerrainError(
-                    f"worker {worker} of {self.address} has {found}: install the same version on it"
-                )
+
+def _bound(function: Callable[..., Any], *shared: Any) -> Callable[..., Any]:
+    return partial(function, *shared)
+
+
+def _call(*one_and_function: Any) -> Any:
+    *one, function = one_and_function
+    return function(*one)
 
 
 _cluster: ContextVar[_Cluster | None] = ContextVar("cluster", default=None)
 
 
 @contextmanager
-def computing(compute: str) -> Iterator[None]:
-    """State where the tasks of a block are computed.
+def computing(compute: str) -> Iterator[str]:
+    """State where the tasks of a block are computed: ``local`` or the address of a scheduler is given.
 
     Parameters
     ----------
@@ -190,25 +182,15 @@ def computing(compute: str) -> Iterator[None]:
         if the scheduler cannot be reached, has no worker, or a worker has other software.
     """
     address = scheduler_address(compute)
-    with _local() if address is None else _connected(address) as cluster:
-        token = _cluster.set(cluster)
+    if address is None:
+        yield LOCAL
+        return
+    with _connected(address) as client:
+        token = _cluster.set(_Cluster(client, address))
         try:
-            yield
+            yield address
         finally:
             _cluster.reset(token)
-
-
-def place() -> str:
-    """Return where tasks are computed now: ``local`` or the address of the scheduler."""
-    cluster = _cluster.get()
-    return LOCAL if cluster is None else cluster.address
-
-
-def end_processes() -> None:
-    """End the processes that local tasks left behind to be used again, with the memory they hold."""
-    from joblib.externals.loky import get_reusable_executor
-
-    get_reusable_executor().shutdown(wait=True)
 
 
 def parallel(
@@ -327,47 +309,56 @@ def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str | None:
 
 
 @contextmanager
-def _local() -> Iterator[None]:
-    yield
+def _connected(address: str) -> Iterator[Any]:
+    """Give a client of a scheduler whose workers have the software of this process.
 
-
-@contextmanager
-def _connected(address: str) -> Iterator[_Cluster]:
-    """Give the workers of a scheduler, all of which have the software of this process."""
+    What dask and tornado log and warn of stays off the screen: what matters becomes an error here.  The port is
+    tried first, as a client without a scheduler leaves its thread behind.
+    """
     if find_spec("distributed") is None:
         raise ConfigError("--compute dask:... needs the package distributed: install terrain-slip[cluster]")
-    with _quiet():
-        client = _client(address)
-        try:
-            try:
-                client.wait_for_workers(1, timeout=FIRST_WORKER_S)
-            except TimeoutError as error:
-                raise TerrainError(
-                    f"the Dask scheduler at {address} has no worker: start one with 'dask worker {address}'"
-                ) from error
-            cluster = _Cluster(client, address)
-            with _failures(address):
-                cluster.check_software()
-            yield cluster
-        finally:
-            client.close(timeout=PARENT_POLL_S)
-
-
-def _client(address: str) -> Any:
-    """Return a client; a port is tried first, as a client without a scheduler leaves its thread behind."""
-    from urllib.parse import urlsplit
-
     from distributed import Client
 
-    where = urlsplit(address)
+    where, logged = urlsplit(address), logging.root.manager.disable
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logging.disable(logging.CRITICAL)
+        try:
+            create_connection((str(where.hostname), int(where.port or 0)), timeout=CONNECT_S).close()
+            client = Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            logging.disable(logged)
+            raise TerrainError(
+                f"no Dask scheduler answers at {address}: start one there with 'dask scheduler', "
+                "and workers with 'dask worker'"
+            ) from error
+        try:
+            _check_workers(client, address)
+            yield client
+        finally:
+            client.close(timeout=PARENT_POLL_S)
+            logging.disable(logged)
+
+
+def _check_workers(client: Any, address: str) -> None:
+    """Raise ``TerrainError`` where no worker comes, or one computes with other software than this process."""
     try:
-        create_connection((str(where.hostname), int(where.port or 0)), timeout=CONNECT_S).close()
-        return Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
+        client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+    except TimeoutError as error:
         raise TerrainError(
-            f"no Dask scheduler answers at {address}: start one there with 'dask scheduler', "
-            "and workers with 'dask worker'"
+            f"the Dask scheduler at {address} has no worker: start one with 'dask worker {address}'"
         ) from error
+    with _failures(address):
+        answers = client.run(software, on_error="return")
+    for worker, there in sorted(answers.items()):
+        if not isinstance(there, Mapping):
+            reason = " ".join(str(there).split())[:120]
+            found = f"cannot import this package ({reason})"
+        elif (different := difference(software(), dict(there))) is not None:
+            found = f"has {different}"
+        else:
+            continue
+        raise TerrainError(f"worker {worker} of {address} {found}: install the same version on it")
 
 
 @contextmanager
@@ -391,46 +382,3 @@ def _failures(address: str) -> Iterator[None]:
         ) from error
     except MemoryError as error:
         raise TerrainError(f"a worker of {address} has too little memory for its task") from error
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep what dask and tornado log and warn of off the screen: what matters becomes an error here."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        import distributed.client  # noqa: F401 - its loggers get levels of their own when they are made
-
-        begins = ("distributed", "tornado", "asyncio")
-        loggers = [
-            logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith(begins)
-        ]
-        levels = [logger.level for logger in loggers]
-        for logger in loggers:
-            logger.setLevel(logging.CRITICAL + 1)
-        try:
-            yield
-        finally:
-            for logger, level in zip(loggers, levels, strict=True):
-                logger.setLevel(level)
-
-
-def _packed(value: Any) -> bytes:
-    """Return the bytes of a value; dask would look into its tuples for tasks, and make lists of some.
-
-    As on this machine's cores, read-only mappings and local functions are packed as well.
-    """
-    import cloudpickle
-
-    packed: bytes = cloudpickle.dumps(value)
-    return packed
-
-
-def _unpacked(packed: bytes) -> Any:
-    import pickle
-
-    return pickle.loads(packed)
-
-
-def _compute(given: tuple[Callable[..., Any], tuple[Any, ...]], packed: bytes) -> Any:
-    function, shared = given
-    return function(*shared, *_unpacked(packed))

@@ -215,7 +215,9 @@ def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
     TerrainError
         if the folder cannot be written.
     """
-    from pipelines.learn.parallel import end_processes, parallel
+    from joblib.externals.loky import get_reusable_executor
+
+    from pipelines.learn.parallel import parallel
 
     sizes = sorted({max(round(fraction * settings.runs), 1) for fraction in FRACTIONS})
     begun_s = perf_counter()
@@ -232,7 +234,9 @@ def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
         write_s = perf_counter() - begun_s
         points: list[Point] = []
         for n_workers in settings.workers:
-            end_processes()
+            get_reusable_executor().shutdown(
+                wait=True
+            )  # processes of the last size, with the memory they hold
             _measure(runs, min(WARM_RUNS, sizes[-1]), n_workers)
             for n_runs in sizes:
                 progress("measure", len(points), len(sizes) * len(settings.workers))

@@ -19,7 +19,6 @@ from pipelines.learn.parallel import (
     computing,
     difference,
     parallel,
-    place,
     scheduler_address,
     software,
 )
@@ -67,12 +66,6 @@ def test_local_results_come_in_order_while_tasks_are_still_made():
     assert next(results) == 1
     assert len(made) < 40
     assert list(results) == [2**k for k in range(1, 40)]
-
-
-def test_the_place_is_that_of_the_block():
-    with computing("local"):
-        assert place() == "local"
-    assert place() == "local"
 
 
 def test_no_scheduler_is_one_sentence():
@@ -153,8 +146,8 @@ def test_a_cluster_gives_the_bytes_of_this_machine(threads_cluster):
     rng = np.random.default_rng(0)
     table = rng.normal(size=(500, 20))
     each = [(float(k),) for k in rng.normal(size=30)]
-    with computing(threads_cluster):
-        assert place() == threads_cluster.removeprefix("dask:")
+    with computing(threads_cluster) as place:
+        assert place == threads_cluster.removeprefix("dask:")
         there = list(parallel(np.multiply, (table,), each, 1))
     here = list(parallel(np.multiply, (table,), each, 1))
     assert [a.tobytes() for a in here] == [b.tobytes() for b in there]
