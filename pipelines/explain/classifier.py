@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from features.labelled import labelled
 from features.windows import Layout, cut_windows, layout_of
-from pipelines.learn.protocols import labelled
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
 from pipelines.report import Progress, silent

@@ -9,26 +9,16 @@ has its own run in training; it serves to compare with papers only.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from sklearn.model_selection import StratifiedKFold
 
+from features.labelled import PARTITION_S, cut_labelled, cut_partitions
 from features.motion import fastest_wheel
-from features.windows import (
-    TIME_TOLERANCE_S,
-    WindowCut,
-    WindowRule,
-    cut_windows,
-    label_windows,
-    layout_of,
-    regular_starts,
-    span_of,
-)
 from pipelines.learn.settings import WindowSettings
-from pipelines.report import format_counts
 from terrain.classify.folds import Fold, block_groups, fold_numbers, numbered_folds, single_run_classes
 from terrain.classify.slow_fast import (
     MIN_CLASSES,
@@ -38,15 +28,12 @@ from terrain.classify.slow_fast import (
     SlowFast,
     slow_fast_split,
 )
-from terrain.errors import ConfigError, DataError
+from terrain.errors import DataError
 from terrain.logs.merge import distinct_runs
 from terrain.logs.regimes import driven_at, regime_of
-from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 
 N_FOLDS = 5
-PARTITION_S = 5.0
-PUBLISHED_STRIDE_S = 0.1
 
 
 class Samples(NamedTuple):
@@ -279,85 +266,18 @@ def samples_of(
         if not runs:
             raise DataError(f"no run is driven at a speed of {speed_mps[0]:g} to {speed_mps[1]:g} m/s")
     distinct = distinct_runs(runs, merge=settings.merge_duplicates)
+    cut_of = distinct.runs, settings.rule, settings.signal_sets
     if protocol == "published":
-        samples = published_samples(distinct.runs, settings.rule, settings.signal_sets)
+        cut, group = cut_partitions(*cut_of)
+        gap = 0
     else:
-        samples = grouped_samples(
-            distinct.runs, settings.rule, settings.signal_sets, skip_short=settings.skip_short
-        )
-    values = samples.windows.values
+        cut = cut_labelled(*cut_of, skip_short=settings.skip_short)
+        group, gap = cut.windows.run_id, settings.rule.overlap
+    values = cut.windows.values
     if not any((each != each[:1, :, :1]).any() for each in values.values()):
         streams = " and ".join(repr(name) for name in values)
         raise DataError(f"no channel of the streams {streams} ever varies: nothing can be learned from them")
-    return samples._replace(merged=distinct.merged, runs=distinct.runs, repaired=repaired)
-
-
-def grouped_samples(
-    runs: Sequence[RunLog],
-    rule: WindowRule,
-    signal_sets: Iterable[str] = SIGNAL_SETS,
-    *,
-    skip_short: bool = False,
-) -> Samples:
-    """Cut windows by the rule, labelled ones only; what is held out is a run."""
-    layout = layout_of(runs, signal_sets, speeds=rule.steady is not None)
-    cut = labelled(cut_windows(runs, rule, layout=layout, skip_short=skip_short))
-    return Samples(cut.windows, cut.dropped, cut.windows.run_id, rule.overlap, runs=runs)
-
-
-def labelled(cut: WindowCut) -> WindowCut:
-    """Keep the windows that lie under one label; the others are counted as ``no single label``.
-
-    Raises
-    ------
-    DataError
-        if there is no window, or none with a label.
-    """
-    known = cut.windows.terrain != ""
-    if not len(known):
-        raise DataError(f"not one window is left: {format_counts(cut.dropped) or 'no run is long enough'}")
-    if not known.any():
-        raise DataError("no window has a terrain label: nothing can be trained or tested")
-    if known.all():
-        return cut
-    return WindowCut(cut.windows[known], {**cut.dropped, "no single label": int((~known).sum())})
-
-
-def published_samples(
-    runs: Sequence[RunLog], rule: WindowRule, signal_sets: Iterable[str] = SIGNAL_SETS
-) -> Samples:
-    """Cut windows as the papers do: slid inside 5 s partitions, classes balanced by stride.
-
-    The class with the fewest partitions is cut every 0.1 s, the others in proportion to their number.
-    No rule of steady motion is applied.  What is held out is a partition.
-    """
-    if rule.length_s > PARTITION_S:
-        raise ConfigError(
-            f"a window of {rule.length_s:g} s does not fit into a partition of {PARTITION_S:g} s"
-        )
-    layout = layout_of(runs, signal_sets, speeds=False)
-    begin_s = {run.run_id: span_of(run, layout)[0] for run in runs}
-    places = []
-    for run in runs:
-        starts = regular_starts(*span_of(run, layout), PARTITION_S, PARTITION_S)
-        labels = label_windows(run, starts, PARTITION_S)
-        places += [(run.run_id, name, start) for start, name in zip(starts, labels, strict=True) if name]
-    if not places:
-        raise DataError(f"no partition of {PARTITION_S:g} s lies under one label")
-    names, counts = np.unique(np.array([place[1] for place in places]), return_counts=True)
-    stride_s = dict(zip(names, PUBLISHED_STRIDE_S * counts / counts.min(), strict=True))
-    starts_s: dict[str, list[float]] = {}
-    for run_id, name, start in places:
-        inside = regular_starts(start, start + PARTITION_S, rule.length_s, stride_s[name])
-        starts_s.setdefault(run_id, []).extend(inside)
-    plain = WindowRule(rule.length_s, rule.stride_s, None, rule.max_gap_periods)
-    at = {run_id: np.array(each) for run_id, each in starts_s.items()}
-    cut = labelled(cut_windows(runs, plain, layout=layout, starts_s=at, skip_short=True))
-    group = [
-        f"{run_id} part {int((start - begin_s[run_id] + TIME_TOLERANCE_S) // PARTITION_S)}"
-        for start, run_id in zip(cut.windows.start_s, cut.windows.run_id, strict=True)
-    ]
-    return Samples(cut.windows, cut.dropped, np.array(group, dtype=object), 0, runs=runs)
+    return Samples(cut.windows, cut.dropped, group, gap, distinct.merged, distinct.runs, repaired)
 
 
 def _logs(samples: Samples) -> Sequence[RunLog]:

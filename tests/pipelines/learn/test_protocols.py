@@ -1,22 +1,16 @@
 import numpy as np
 import pytest
 
-from features.windows import WindowRule
-from pipelines.learn.protocols import (
-    N_FOLDS,
-    PARTITION_S,
-    PUBLISHED_STRIDE_S,
-    folds_of,
-    grouped_samples,
-    published_samples,
-    samples_of,
-)
-from pipelines.learn.settings import PUBLISHED_WINDOW_S, EvaluationSettings
+from features.labelled import PARTITION_S, PUBLISHED_STRIDE_S
+from pipelines.learn.protocols import N_FOLDS, folds_of, samples_of
+from pipelines.learn.settings import EvaluationSettings
 from terrain.errors import DataError
 from terrain.logs.regimes import driven_at
 from terrain.records import Label, RunLog, Stream
 
-PUBLISHED_RULE = WindowRule(PUBLISHED_WINDOW_S)
+
+def samples_under(protocol, runs, **options):
+    return samples_of(runs, EvaluationSettings(protocol=protocol, **options), protocol)
 
 
 @pytest.fixture
@@ -43,7 +37,7 @@ def nearest_other_side_s(windows, fold, terrain):
 
 @pytest.mark.parametrize("stride_s", [None, 0.5])
 def test_grouped_keeps_runs_whole_and_tests_every_window_once_a_repeat(uneven_runs, stride_s):
-    samples = grouped_samples(uneven_runs, WindowRule(2.0, stride_s))
+    samples = samples_under("grouped", uneven_runs, stride_s=stride_s)
     windows = samples.windows
     folds = folds_of(samples, "grouped", 3, seed=5)
     assert [(fold.repeat, fold.number) for fold in folds] == [
@@ -67,7 +61,7 @@ def test_grouped_keeps_runs_whole_and_tests_every_window_once_a_repeat(uneven_ru
 
 
 def test_folds_repeat_with_their_seed_and_earlier_repeats_stay(uneven_runs):
-    samples = grouped_samples(uneven_runs, WindowRule())
+    samples = samples_under("grouped", uneven_runs)
     one, three = folds_of(samples, "grouped", 1, 5), folds_of(samples, "grouped", 3, 5)
     other = folds_of(samples, "grouped", 1, 6)
     for fold, same in zip(one, three[:N_FOLDS], strict=True):
@@ -78,7 +72,7 @@ def test_folds_repeat_with_their_seed_and_earlier_repeats_stay(uneven_runs):
 
 @pytest.mark.parametrize("stride_s", [None, 0.5])
 def test_leave_one_run_out_holds_out_each_run_and_cuts_a_single_one_into_blocks(uneven_runs, stride_s):
-    samples = grouped_samples(uneven_runs, WindowRule(2.0, stride_s))
+    samples = samples_under("grouped", uneven_runs, stride_s=stride_s)
     windows = samples.windows
     folds = folds_of(samples, "leave-one-run-out", 7, seed=0)
     assert_each_tested_once(folds, len(windows), 1)
@@ -99,11 +93,11 @@ def test_leave_one_run_out_holds_out_each_run_and_cuts_a_single_one_into_blocks(
 def test_published_windows_lie_inside_partitions_and_classes_are_balanced_by_stride(drive):
     plan = {"ASPHALT": (42.0, 31.0, 24.9), "GRASS": (29.0, 30.0), "GRAVEL": (26.0,)}
     runs = [
-        drive(f"{terrain}_{i}", terrain, i, duration_s=duration_s, start_s=7.3 * i)
+        drive(f"{terrain}_{i}", terrain, 10 * i + len(terrain), duration_s=duration_s, start_s=7.3 * i)
         for terrain, durations in plan.items()
         for i, duration_s in enumerate(durations)
     ]
-    samples = published_samples(runs, PUBLISHED_RULE)
+    samples = samples_under("published", runs)
     windows, group = samples.windows, samples.group
     begin_s = {run.run_id: run.start_s for run in runs}
     n_parts = {t: sum(int(d // PARTITION_S) for d in durations) for t, durations in plan.items()}
@@ -132,12 +126,18 @@ def test_published_windows_lie_inside_partitions_and_classes_are_balanced_by_str
 
 
 def test_published_has_no_rule_of_steady_motion_and_grouped_has(drive):
-    still = [drive(f"{t}_{i}", t, i, speed_mps=0.0) for t in ("ASPHALT", "GRASS") for i in range(3)]
-    driven = [drive(f"{t}_d{i}", t, i) for t in ("ASPHALT", "GRASS") for i in range(3)]
-    assert set(published_samples(still + driven, PUBLISHED_RULE).windows.run_id) == {
+    still, driven = (
+        [
+            drive(f"{t}_{name}{i}", t, 10 * i + len(t) + len(name), speed_mps=speed)
+            for t in ("ASPHALT", "GRASS")
+            for i in range(3)
+        ]
+        for name, speed in (("still", 0.0), ("moved_", 0.6))
+    )
+    assert set(samples_under("published", still + driven).windows.run_id) == {
         run.run_id for run in still + driven
     }
-    samples = grouped_samples(still + driven, WindowRule())
+    samples = samples_under("grouped", still + driven)
     assert set(samples.windows.run_id) == {run.run_id for run in driven}
     assert samples.dropped == {"not moving": 72}
 
@@ -145,7 +145,7 @@ def test_published_has_no_rule_of_steady_motion_and_grouped_has(drive):
 def test_windows_without_one_label_are_left_out_and_counted(drive):
     run = drive("r", "GRASS", 0)
     halves = RunLog("r", "husky", run.streams, (Label(0.0, 11.0, "GRASS"), Label(11.0, 20.0, "GRAVEL")))
-    samples = grouped_samples([halves], WindowRule())
+    samples = samples_under("grouped", [halves])
     # Of twelve windows of 2 s the one from 10 s lies under both, those from 20 and 22 s under none.
     assert samples.windows.terrain.tolist() == ["GRASS"] * 5 + ["GRAVEL"] * 4
     assert samples.dropped == {"no single label": 3}
@@ -170,12 +170,12 @@ def test_what_cannot_be_split_is_refused(drive, drive_all):
         ("slow-fast", unnamed, r"^slow and fast runs are compared on 3 terrains .*GRASS: slow"),
     ):
         with pytest.raises(DataError, match=sentence):
-            folds_of(samples_of(runs, EvaluationSettings(protocol=protocol), protocol), protocol, 1, 0)
+            folds_of(samples_under(protocol, runs), protocol, 1, 0)
 
 
 def commanded(run_id, terrain, speed_mps, number=0, session="", length_s=9.0):
     """Return a run at one commanded speed, with wheels that follow it."""
-    rng = np.random.default_rng(number)
+    rng = np.random.default_rng((number, len(terrain)))
     time_s = np.arange(0.0, length_s, 0.1)
     speeds = speed_mps + 0.01 * rng.normal(size=(time_s.size, 2))
     streams = {
@@ -192,7 +192,7 @@ def test_regimes_are_on_one_side_whatever_the_terrain():
         for terrain in ("ICE", "SAND")
         for i, speed in enumerate(speeds)
     ]
-    samples = grouped_samples(runs, WindowRule())
+    samples = samples_under("grouped", runs)
     regime = np.array([name.split("_")[1] for name in samples.windows.run_id])
     folds = folds_of(samples, "leave-regimes-out", 2, 0)
     assert len(folds) == 2 * N_FOLDS
@@ -204,7 +204,7 @@ def test_regimes_are_on_one_side_whatever_the_terrain():
 def test_sessions_are_held_out_whole_and_the_only_one_of_a_terrain_by_blocks_of_runs():
     runs = [commanded(f"a_{i}", "ICE", 0.5, i, session=f"monday_{i % 3}") for i in range(9)]
     runs += [commanded(f"b_{i}", "SAND", 0.5, i, session="only") for i in range(10)]
-    samples = grouped_samples(runs, WindowRule())
+    samples = samples_under("grouped", runs)
     windows = samples.windows
     session = {run.run_id: run.session for run in runs}
     folds = folds_of(samples, "leave-sessions-out", 1, 0)
