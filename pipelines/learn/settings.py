@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import field_validator, model_validator
+from pydantic import AfterValidator, model_validator
 
 from pipelines.report.settings import Settings, setting
 from terrain.errors import ConfigError
@@ -84,13 +84,38 @@ def check_recipe(text: str) -> str:
     return text
 
 
+def checked_recipes(texts: tuple[str, ...]) -> tuple[str, ...]:
+    """Return recipes one a text; raise ``ConfigError`` where one is not known."""
+    return tuple(check_recipe(text) for text in split_recipes(texts))
+
+
+def check_params(params: Path | None, recipes: tuple[str, ...]) -> None:
+    """Raise ``ConfigError`` where hyper-parameters of the SVM are given to a recipe without one."""
+    for text in recipes:
+        name = text.partition("@")[0]
+        if params is not None and (name in WITHOUT_SVM or ":" in name):
+            raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
+
+
+def speeds_of(text: str) -> tuple[float, float]:
+    """Read ``LOW:HIGH``; raise ``ConfigError`` where these are no speeds."""
+    low, _, high = text.partition(":")
+    try:
+        low_mps, high_mps = float(low), float(high)
+    except ValueError:
+        low_mps = high_mps = 0.0
+    if not 0.0 <= low_mps < high_mps < math.inf:
+        raise ConfigError(f"--speed is {text!r}; LOW:HIGH in m/s is required, as in 0:0.15")
+    return low_mps, high_mps
+
+
 class WindowSettings(Settings):
     """Windows: how runs are cut, and which signals are used."""
 
     window_s: float | None = setting(None, "Window length in s (2; 1.7 under 'published').", "--window")
     stride_s: float | None = setting(None, "From window to window in s; one length by default.", "--stride")
     steady: bool = setting(True, "Keep windows of steady motion only.")
-    signal_sets: tuple[str, ...] = setting(
+    signal_sets: Annotated[tuple[str, ...], AfterValidator(check_signal_sets)] = setting(
         SIGNAL_SETS,
         "Signal sets to use, by commas; leave one out to see what it is worth.",
         option="--signals",
@@ -100,21 +125,17 @@ class WindowSettings(Settings):
     )
     skip_short: bool = setting(False, "Leave out and count runs shorter than a window.", option="")
 
-    @field_validator("signal_sets")
-    @classmethod
-    def _check_signal_sets(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        return check_signal_sets(names)
+    @property
+    def default_window_s(self) -> float:
+        """Length of a window where none is asked for."""
+        return WINDOW_S
 
     @property
     def rule(self) -> WindowRule:
         """How windows are cut."""
-        return self.rule_of(WINDOW_S)
-
-    def rule_of(self, default_s: float) -> WindowRule:
-        """Return how windows are cut, of a length by default."""
         from features.windows import WindowRule
 
-        length_s = default_s if self.window_s is None else self.window_s
+        length_s = self.default_window_s if self.window_s is None else self.window_s
         return WindowRule(length_s, self.stride_s, WindowRule().steady if self.steady else None)
 
 
@@ -144,27 +165,18 @@ class LearnSettings(WindowSettings):
 class RecipeSettings(LearnSettings):
     """One recipe."""
 
-    recipe: str = setting(FEATURE_RECIPE, RECIPE_TEXT)
+    recipe: Annotated[str, AfterValidator(check_recipe)] = setting(FEATURE_RECIPE, RECIPE_TEXT)
 
     @model_validator(mode="after")
-    def _check_recipe(self) -> Self:
-        check_recipe(self.recipe)
+    def _check_params(self) -> Self:
         check_params(self.params, (self.recipe,))
         return self
-
-
-def check_params(params: Path | None, recipes: tuple[str, ...]) -> None:
-    """Raise ``ConfigError`` where hyper-parameters of the SVM are given to a recipe without one."""
-    for text in recipes:
-        name = text.partition("@")[0]
-        if params is not None and (name in WITHOUT_SVM or ":" in name):
-            raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
 
 
 class EvaluationSettings(LearnSettings):
     """Evaluation: what is compared, and which windows are held out."""
 
-    recipe: tuple[str, ...] = setting(
+    recipe: Annotated[tuple[str, ...], AfterValidator(checked_recipes)] = setting(
         (), f"Recipes to evaluate (svm), by commas or repeated: {RECIPE_TEXT}", repeated=True
     )
     model: tuple[str, ...] = setting(
@@ -176,23 +188,12 @@ class EvaluationSettings(LearnSettings):
         None, "LOW:HIGH in m/s: runs commanded at such a speed alone (or, without commands, driven at)."
     )
 
-    @field_validator("speed")
-    @classmethod
-    def _check_speed(cls, text: str | None) -> str | None:
-        if text is not None:
-            _speeds(text)
-        return text
-
-    @field_validator("recipe")
-    @classmethod
-    def _check_recipes(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(check_recipe(text) for text in split_recipes(texts))
-
     @model_validator(mode="after")
     def _check_protocol(self) -> Self:
         if self.model and self.recipe:
             raise ConfigError("--model and --recipe do not go together: compare models, or recipes")
         check_params(self.params, self.recipe)
+        _ = self.speed_mps
         if self.protocol == "published" and (self.stride_s is not None or not self.steady):
             raise ConfigError(
                 "'published' sets its own strides and keeps all motion: stride and steady do not apply"
@@ -207,23 +208,11 @@ class EvaluationSettings(LearnSettings):
         return self.recipe or (FEATURE_RECIPE,)
 
     @property
-    def rule(self) -> WindowRule:
-        """How windows are cut."""
-        return self.rule_of(PUBLISHED_WINDOW_S if self.protocol == "published" else WINDOW_S)
+    def default_window_s(self) -> float:
+        """Length of a window where none is asked for."""
+        return PUBLISHED_WINDOW_S if self.protocol == "published" else WINDOW_S
 
     @property
     def speed_mps(self) -> tuple[float, float] | None:
         """Speeds of the runs that are used; None for all."""
-        return None if self.speed is None else _speeds(self.speed)
-
-
-def _speeds(text: str) -> tuple[float, float]:
-    """Read ``LOW:HIGH``."""
-    low, _, high = text.partition(":")
-    try:
-        low_mps, high_mps = float(low), float(high)
-    except ValueError:
-        low_mps = high_mps = 0.0
-    if not 0.0 <= low_mps < high_mps < math.inf:
-        raise ConfigError(f"--speed is {text!r}; LOW:HIGH in m/s is required, as in 0:0.15")
-    return low_mps, high_mps
+        return None if self.speed is None else speeds_of(self.speed)
