@@ -238,13 +238,16 @@ class Hub:
         """Write states to the folder, if there is one; one that cannot be written is named in ``trouble``."""
         if self._folder is None:
             return
-        failed = {}
+        failed = ""
         for name, state in states.items():
             try:
                 save_state(self._folder / f"{name}.json", state)
             except TerrainError as error:
-                failed = {"states": str(error)}
-        self.trouble = {name: why for name, why in self.trouble.items() if name != "states"} | failed
+                failed = str(error)
+        if failed:
+            self.trouble["states"] = failed
+        else:
+            self.trouble.pop("states", None)
 
     def stop(self) -> None:
         """End the threads; recordings are written."""

@@ -135,29 +135,6 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
                 assert json.loads(robot.recv(10))["restored"]["terrain"] == "ab"[k % 2]
 
 
-def test_models_are_replaced_and_damaged_ones_refused_while_robots_stream(
-    running, model_folder, hello, messages, two_drives, tmp_path
-):
-    for file in model_folder.iterdir():
-        (tmp_path / file.name).write_bytes(file.read_bytes()[:-100])
-    with running(model=str(model_folder)) as service:  # noqa: SIM117 - the robots end first
-        with robots(service.ws, hello, messages, two_drives) as ended:
-            until(lambda: know_their_terrain(ended), 20.0)
-            for k in range(5):
-                assert service.put("/model", {"uri": str(tmp_path)})[0] == 409
-                assert service.put("/model", {"uri": "x" * 900})[0] == 409
-                assert json.loads(service.put("/model", {"uri": str(model_folder)})[1])["number"] == k + 2
-            until(
-                lambda: all(
-                    one["last"].get("observation", {}).get("served") == 6 for one in list(ended.values())
-                )
-            )
-            assert know_their_terrain(ended)
-            assert service.hub.trouble == {}
-            for opened in list(service.hub.sessions.values()):
-                opened.leave("closing", "the test ends")
-
-
 def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, hello, tmp_path, monkeypatch):
     def full(self, *arguments, **named):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

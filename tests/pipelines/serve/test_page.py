@@ -4,7 +4,6 @@ import shutil
 import threading
 import time
 from contextlib import contextmanager
-from pathlib import Path
 
 import pytest
 
@@ -120,13 +119,6 @@ def shows(page, place, text, timeout_s=8.0):
     playwright.expect(page.locator(place)).to_contain_text(text, timeout=timeout_s * 1000)
 
 
-def shot(page, name):
-    """Keep a picture where somebody wants to look at it."""
-    folder = Path("/tmp/shots")
-    if folder.is_dir():
-        page.screenshot(path=folder / f"{name}.png", full_page=True)
-
-
 @pytest.fixture(scope="module")
 def driving(running, model_folder):
     """A service for robots of any channels, without a model."""
@@ -150,7 +142,6 @@ def test_a_robot_is_shown_with_terrain_target_and_model(service, opened):
         page.wait_for_timeout(300)
         assert page.eval_on_selector("#band", INK) > 3
         assert page.evaluate(CONTRAST)[0] >= 4.5, page.evaluate(CONTRAST)
-        shot(page, "light")
         page.reload()
         shows(page, "#probability", "%")
         assert page.inner_text("#terrain") in ("a", "b")
@@ -168,13 +159,11 @@ def test_a_driven_robot_is_shown_with_command_and_plots_in_light_and_dark(drivin
             assert canvas.evaluate(INK) > 3 or not canvas.is_visible()
         dark = page.eval_on_selector("body", "(body) => getComputedStyle(body).backgroundColor")
         assert page.evaluate(CONTRAST)[0] >= 4.5, page.evaluate(CONTRAST)
-        shot(page, "dark")
         page.click("#theme")
         assert page.eval_on_selector("body", "(body) => getComputedStyle(body).backgroundColor") != dark
         assert page.get_attribute("#theme", "aria-pressed") == "false"
         assert page.evaluate(CONTRAST)[0] >= 4.5, page.evaluate(CONTRAST)
         page.wait_for_timeout(400)
-        shot(page, "light-driven")
         page.reload()
         assert page.get_attribute("html", "data-theme") == "light"
 
@@ -186,10 +175,8 @@ def test_a_phone_shows_it_without_scrolling_aside(driving, opened):
         page.wait_for_timeout(500)
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         assert page.locator("#slip-heading").bounding_box()["y"] > 780, "one message on the first screen"
-        shot(page, "phone")
         page.click("#more summary")
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
-        shot(page, "phone-more")
 
 
 def test_robots_come_and_go_and_are_chosen_by_the_keyboard(driving, opened):
@@ -229,7 +216,6 @@ def test_the_page_says_that_the_service_has_gone_and_goes_on_when_it_is_back(run
     assert page.evaluate("document.body.classList.contains('stale')")
     page.wait_for_timeout(600)
     assert page.evaluate(CONTRAST)[0] >= 4.5
-    shot(page, "stale")
     with running(port=port, model=str(model_folder)) as service, robot(service):
         shows(page, "#connection", "live", 8.0)
         assert not page.evaluate("document.body.classList.contains('stale')")
@@ -245,7 +231,6 @@ def test_a_token_is_asked_for(running, model_folder, opened, monkeypatch):
         page.keyboard.press("Enter")
         shows(page, "#token-error", "That is not the token.")
         assert page.evaluate(CONTRAST)[0] >= 4.5
-        shot(page, "token")
         page.fill("#token", TOKEN)
         page.keyboard.press("Enter")
         shows(page, "#connection", "live")

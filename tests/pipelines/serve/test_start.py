@@ -1,10 +1,7 @@
 """What is wrong at the start is one sentence, and no robot ever waits for a service that cannot serve."""
 
 import json
-import os
 import socket
-import subprocess
-import sys
 import threading
 from dataclasses import replace
 
@@ -15,7 +12,6 @@ from pipelines.serve.service import Service
 from terrain.control.slip_table import load_slip_table, write_slip_table
 from terrain.errors import ConfigError, TerrainError
 
-CLI = "from pipelines.cli.main import main; main()"
 TOKEN = "t" * 20
 
 
@@ -149,20 +145,3 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
 def test_options_of_another_mode_are_refused(options, sentence):
     with pytest.raises(ConfigError, match=sentence):
         Settings(**options)
-
-
-@pytest.mark.parametrize(
-    ("options", "fault"), [(["--port", "70000"], "65535"), (["--max-sessions", "nan"], "--max-sessions")]
-)
-def test_the_command_ends_with_one_sentence(model_folder, options, fault):
-    done = subprocess.run(
-        [sys.executable, "-c", CLI, "serve", "--model", str(model_folder), *options],
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-        env={name: value for name, value in os.environ.items() if name != "TERRAIN_TOKEN"},
-    )
-    assert done.returncode == 2, done.stderr
-    assert fault in done.stderr
-    assert "Traceback" not in done.stderr + done.stdout

@@ -1,13 +1,13 @@
 """What strangers and faulty robots send: the service keeps its limits, commands stay fresh, others go on."""
 
-import asyncio
 import json
 import math
 import re
 import socket
 import struct
+import threading
 import time
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -15,7 +15,6 @@ import msgpack
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from pipelines.serve import connection, guard
@@ -62,10 +61,15 @@ def guarded(running, model_folder, monkeypatch):
 
 @pytest.fixture
 def decoded(monkeypatch):
-    """Sizes of the messages that were decoded."""
-    sizes, decode = [], connection.decode
-    monkeypatch.setattr(connection, "decode", lambda message: sizes.append(len(message)) or decode(message))
-    return sizes
+    """Size of each message that was decoded, and whether that was in a thread beside the event loop's."""
+    found, decode = [], connection.decode
+
+    def noted(message):
+        found.append((len(message), "Pool" in threading.current_thread().name))
+        return decode(message)
+
+    monkeypatch.setattr(connection, "decode", noted)
+    return found
 
 
 def samples(stamp_s, speed=20.0, **more):
@@ -86,8 +90,15 @@ def assert_finite(step):
     assert all(isinstance(one, float) and math.isfinite(one) for one in numbers)
 
 
-@pytest.mark.parametrize("reset", [False, True], ids=["closed", "reset"])
-@pytest.mark.parametrize("when", ["in a frame", "between frames", "between fragments", "with the welcome"])
+@pytest.mark.parametrize(
+    ("when", "reset"),
+    [
+        ("in a frame", False),
+        ("between frames", True),
+        ("between fragments", True),
+        ("with the welcome", False),
+    ],
+)
 def test_a_robot_that_is_gone_without_a_message_leaves_nothing_behind(service, hello, reset, when):
     for k in range(5):
         name = f"gone-{reset}-{when.replace(' ', '')}-{k}"
@@ -149,9 +160,14 @@ def test_each_message_is_answered_or_taken(service, hello, given_messages, rate_
     assert service.hub.trouble == {}
 
 
-def test_too_large_messages_are_refused_and_larger_ones_close_the_connection(service, hello):
+def test_large_messages_are_decoded_in_a_thread_too_large_ones_refused_and_larger_ones_close_the_connection(
+    service, hello, decoded
+):
     with service.socket() as robot:
         assert ask(robot, hello("large"))["type"] == "welcome"
+        for size in (1_000, 100_000):
+            assert ask(robot, {"type": "x" * size})["code"] == "unknown-type"
+        assert [in_thread for _, in_thread in decoded] == [False, False, True]
         for filling in ("x" * LIMITS.message_bytes, "x" * 1_000_000):
             answer = ask(robot, {"type": filling})
             assert (answer["code"], answer["fatal"]) == ("too-large", False)
@@ -236,30 +252,24 @@ def test_before_its_hello_a_client_is_answered_once_at_a_time_and_large_messages
         assert ask(stranger, hello("greeted"))["type"] == "welcome"
 
 
-def test_a_thousand_robots_at_once(service, hello):
-    async def come(k):
-        socket_ = await connect(service.ws + "/robots", compression=None, open_timeout=60)
-        await socket_.send(json.dumps(hello(f"many-{k}")))
-        return socket_, json.loads(await socket_.recv())
-
-    async def all_come():
-        found = await asyncio.gather(*(come(k) for k in range(MANY)))
-        answers = [answer["type"] if "code" not in answer else answer["code"] for _, answer in found]
-        refused = next(one for one, answer in found if answer.get("code") == "too-many")
-        for one, answer in found:
-            if answer["type"] == "welcome":
-                await one.close()
+def test_more_robots_than_are_accepted_wait_until_one_has_left(running, model_folder, hello):
+    with running(LIMITS._replace(sessions=1), model=str(model_folder)) as service, service.socket() as late:
+        with service.socket() as robot:
+            assert ask(robot, hello("first"))["type"] == "welcome"
+            assert ask(late, hello("late"))["code"] == "too-many"
         until(lambda: not service.hub.sessions)
-        await refused.send(json.dumps(hello("many-later")))
-        later = json.loads(await refused.recv())
-        await asyncio.gather(*(one.close() for one, _ in found))
-        return answers, later
+        assert ask(late, hello("late"))["type"] == "welcome"
 
-    answers, later = asyncio.run(all_come())
-    assert {kind: answers.count(kind) for kind in set(answers)} == {"welcome": 64, "too-many": MANY - 64}
-    assert later["type"] == "welcome"
-    until(lambda: not service.hub.sessions)
-    assert service.hub.trouble == {}
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
+def test_a_robot_is_served_for_longer_than_its_request_may_take(
+    running, model_folder, hello, monkeypatch, host
+):
+    monkeypatch.setattr(guard, "REQUEST_S", 0.2)
+    with running(model=str(model_folder), host=host) as service, service.socket() as robot:
+        assert ask(robot, hello("long"))["type"] == "welcome"
+        time.sleep(0.5)
+        assert ask(robot, {"type": "samples", "streams": {}, "step": True})["type"] == "step"
 
 
 @pytest.mark.parametrize(
@@ -344,29 +354,18 @@ def test_a_slow_receiver_that_goes_on_gets_fresh_commands(driving, monkeypatch):
     assert max(ages[n_old:]) <= 0.25
 
 
-@pytest.mark.parametrize("rate_hz", [0, pytest.param(100, marks=pytest.mark.slow)])
-def test_clocks_that_are_set_and_stamps_that_are_none(driving, rate_hz):
+def test_clocks_that_are_set_and_stamps_that_are_none(driving):
     """After each the session goes on, with commands that are finite and as new as the robot's last stamp."""
     strange = [None, 1e308, -1e308, 1e15, -1e15, 1e9, 5.0, 5.0, 4.99, 2**62, 0.0, -7200.0, 7200.0]
-    n_sent, begun_s = 0, time.monotonic() - 100.0
+    begun_s = time.monotonic() - 100.0
     with driving.socket() as robot:
-        hello = {**DRIVEN, "session": f"clocks-{rate_hz}", "rate_hz": rate_hz}
-        assert ask(robot, hello)["type"] == "welcome"
-
-        def step_of(content):
-            answer = ask(robot, {**content, "step": rate_hz == 0})
-            while rate_hz and answer["type"] != "error" and answer["message"] < n_sent:
-                answer = json.loads(robot.recv(10))
-            assert_finite(answer)
-            return answer
-
+        assert ask(robot, {**DRIVEN, "session": "clocks", "rate_hz": 0})["type"] == "welcome"
         for stamp in strange:
-            n_sent += 1
-            step_of(samples(stamp))
+            assert_finite(ask(robot, samples(stamp, step=True)))
             for _ in range(12):
                 base_s = time.monotonic() - begun_s
-                n_sent += 1
-                step = step_of(samples(base_s, time_s=base_s) if rate_hz == 0 else samples(base_s))
+                step = ask(robot, samples(base_s, step=True, time_s=base_s))
+                assert_finite(step)
                 time.sleep(0.01)
             assert step["command"]["status"] == "ok", stamp
             assert abs(step["time_s"] - base_s) < 0.5, stamp
@@ -377,31 +376,23 @@ REFUSED_TWISTS = ([math.nan] * 3, [0.5, None, 0.0], [0.5, 0.0], [1e999, 0, 0], "
 
 
 def test_a_desired_motion_that_is_none_is_refused_and_the_last_one_ends(driving):
-    with ExitStack() as stack:
-        robots = [stack.enter_context(driving.socket()) for _ in REFUSED_TWISTS]
-        for k, robot in enumerate(robots):
-            assert ask(robot, {**DRIVEN, "session": f"twist-{k}", "rate_hz": 0})["type"] == "welcome"
-        begun_s, statuses = time.monotonic(), []
-        while time.monotonic() - begun_s < 0.7:
-            now_s = time.monotonic() - begun_s
-            content, first = samples(now_s, step=True, time_s=now_s), not statuses
-            for robot, twist in zip(robots, REFUSED_TWISTS, strict=True):
-                robot.send(json.dumps(content if first else {**content, "twist": twist}))
-                answers = [json.loads(robot.recv(3)) for _ in range(1 if first else 2)]
-                step = next(one for one in answers if one["type"] == "step")
-                if not first:
-                    refusal = next(one["message"] for one in answers if one["type"] == "error")
-                    assert "twist that is not three numbers" in refusal
-                assert_finite(step)
-                statuses.append((now_s, step["command"]["status"]))
-            time.sleep(0.02)
-    assert {status for now_s, status in statuses if now_s < 0.45} == {"ok"}
-    stopped = {status for now_s, status in statuses if now_s > 0.55}
-    assert stopped == {"stopped: the desired motion is too old"}
     with driving.socket() as robot:
-        assert ask(robot, {**DRIVEN, "session": "huge", "rate_hz": 0})["type"] == "welcome"
+        assert ask(robot, {**DRIVEN, "session": "twist", "rate_hz": 0})["type"] == "welcome"
+        step = ask(robot, samples(0.0, step=True, time_s=0.0))
+        assert (step["command"]["status"], min(step["command"]["wheel_radps"]) > 0.0) == ("ok", True)
+        begun_s, early, late = time.monotonic(), set(), set()
+        while (now_s := time.monotonic() - begun_s) < 0.7:
+            for twist in REFUSED_TWISTS:
+                sent_s = time.monotonic() - begun_s
+                robot.send(json.dumps({**samples(now_s, step=True, time_s=now_s), "twist": twist}))
+                answers = {answer["type"]: answer for answer in (json.loads(robot.recv(3)) for _ in range(2))}
+                assert "twist that is not three numbers" in answers["error"]["message"]
+                assert_finite(answers["step"])
+                seen = early if time.monotonic() - begun_s < 0.4 else late if sent_s > 0.6 else set()
+                seen.add(answers["step"]["command"]["status"])
+            time.sleep(0.02)
+        assert (early, late) == ({"ok"}, {"stopped: the desired motion is too old"})
         for k, size in enumerate((1e3, 1e150, 1e308, -1e308, 1e-308, 0.5)):
             for speed in (20.0, 1e308, None, -1e308):
-                now_s = 1.0 + 0.1 * k
-                content = samples(now_s, speed, step=True, time_s=now_s) | {"twist": [size] * 3}
-                assert_finite(ask(robot, content))
+                content = samples(2.0 + 0.1 * k, speed, step=True, time_s=2.0 + 0.1 * k)
+                assert_finite(ask(robot, content | {"twist": [size] * 3}))
