@@ -10,11 +10,11 @@ import numpy as np
 
 from features.extractor import FeatureExtractor
 from features.motion import NO_MOTION, Motion, fastest_wheel, wheel_stream, window_motion
+from features.sequences import following
 from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import counted, parallel
 from pipelines.learn.protocols import N_FOLDS, PROTOCOLS, Samples, folds_of, slow_and_fast
 from pipelines.learn.recipes import WindowPipeline, feature_matrix, recipe_of
-from pipelines.learn.sequences import following
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings
 from pipelines.report import Progress, format_counts, format_value, interval, silent
 from terrain.classify.breakaway import breakaways
@@ -115,7 +115,7 @@ def evaluate_recipe(
     beside, published = settings.extras and protocol == "grouped", protocol == "published"
     asks: list[Any] | None = None
     if beside and samples.runs:
-        asks = [*following(recipe, samples, settings.rule, folds, seed)]
+        asks = [*following(recipe[:-1], windows, samples.runs, settings.rule, folds, seed)]
     elif ask is not None:
         asks = [ask(examples, fold) for fold in folds]
     held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, ask is not None)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from pipelines.report import (
@@ -47,13 +48,16 @@ if TYPE_CHECKING:
 MAX_ROWS = 10
 PERCENT = ".1%"
 
+optional = partial(described, default=None)
+"""Field of a result that is None where it was not asked for, or is not known."""
+
 
 @dataclass(frozen=True, repr=False)
 class CrossvalResult(Result):
     """An evaluation on held-out windows: its figures, how they were obtained, and what to know of them.
 
     Figures are means over the repeats, intervals of 95 % over runs within classes.  What was not asked for,
-    or is not known, is None and left out of JSON.
+    or is not known, is None and left out of JSON, as is ``data``: where the data lie, for the next step.
     """
 
     classes: tuple[str, ...] = described("terrains")
@@ -84,63 +88,49 @@ class CrossvalResult(Result):
     protocol: str = described("which windows were held out")
     recipe: str = described("recipe or model")
     window_s: float = described("length of a window", "s")
-    stride_s: float | None = described("from window to window; None where a protocol sets it", "s")
-    steady: bool = described("whether windows of steady motion alone were kept")
+    stride_s: float | None = described("stride; none where a protocol sets it", "s")
+    steady: bool = described("windows of steady motion alone")
     signal_sets: tuple[str, ...] = described("signals that were used")
-    seed: int = described("deals runs into folds, and draws runs for intervals")
+    seed: int = described("seed of the folds and of the intervals")
     n_features: int = described("features of a window; 0 of a model")
     dropped: Mapping[str, int] = described("windows left out, by reason")
     repaired: Mapping[str, int] = described("what a repairing reader changed, by kind")
     notes: tuple[str, ...] = described("what a reader has to know")
-    speed_only_accuracy: float | None = described(
-        "accuracy from wheel speed alone", "1", default=None, form=PERCENT
+    speed_only_accuracy: float | None = optional("accuracy from wheel speed alone", "1", form=PERCENT)
+    slow_fast: SlowFast | None = optional("slow runs train and fast ones test, and the reverse")
+    learning_curve: LearningCurve | None = optional("accuracy by number of training runs")
+    stiffness: StiffnessFigures | None = optional("accuracy by level of stiffness")
+    filtered_accuracy: float | None = optional("accuracy of the filter over time", "1")
+    filtered_accuracy_ci: tuple[float, float] | None = optional("interval of it", "1")
+    filter_delay_s: DelayFigures | None = optional("from a change of terrain to its report", "s")
+    courses: SequenceFigures | None = optional("sequences spliced from held-out runs")
+    recorded_courses: SequenceFigures | None = optional("runs over several terrains")
+    breakaways: tuple[Breakaway, ...] | None = optional("stretches that look unlike their run")
+    auroc_unknown: float | None = optional(
+        "area of the novelty score of a terrain never learned", "1", form=".3f"
     )
-    slow_fast: SlowFast | None = described(
-        "slow runs train and fast ones test, and the reverse", default=None
+    auroc_unknown_ci: tuple[float, float] | None = optional("interval of it", "1", form=".3f")
+    auroc_unknown_10s: float | None = optional("the same of means over 10 s", "1", form=".3f")
+    auroc_unknown_10s_ci: tuple[float, float] | None = optional("interval of it", "1", form=".3f")
+    unknown_accepted: float | None = optional("unknown windows taken for known", "1", form=PERCENT)
+    known_kept: float | None = optional("known windows not called unknown", "1", form=PERCENT)
+    known_kept_target: float | None = optional(
+        "known windows that the threshold is to keep", "1", form=PERCENT
     )
-    learning_curve: LearningCurve | None = described("accuracy by number of training runs", default=None)
-    stiffness: StiffnessFigures | None = described("accuracy by level of stiffness", default=None)
-    filtered_accuracy: float | None = described("accuracy of the filter over time", "1", default=None)
-    filtered_accuracy_ci: tuple[float, float] | None = described("interval of it", "1", default=None)
-    filter_delay_s: DelayFigures | None = described(
-        "from a change of terrain to its report", "s", default=None
+    unknown_by_terrain: Mapping[str, LeftOutTerrain] | None = optional("by terrain left out")
+    support: tuple[SupportRow, ...] | None = optional("windows and accuracy by terrain and driving")
+    accuracy_by_support: tuple[Mapping[str, Any], ...] | None = optional(
+        "accuracy by training runs of the true terrain near the motion of a window"
     )
-    courses: SequenceFigures | None = described("sequences spliced from held-out runs", default=None)
-    recorded_courses: SequenceFigures | None = described("runs over several terrains", default=None)
-    breakaways: tuple[Breakaway, ...] | None = described("stretches that look unlike their run", default=None)
-    auroc_unknown: float | None = described(
-        "area of the novelty score of a terrain never learned", "1", default=None, form=".3f"
-    )
-    auroc_unknown_ci: tuple[float, float] | None = described("interval of it", "1", default=None, form=".3f")
-    auroc_unknown_10s: float | None = described("the same of means over 10 s", "1", default=None, form=".3f")
-    auroc_unknown_10s_ci: tuple[float, float] | None = described(
-        "interval of it", "1", default=None, form=".3f"
-    )
-    unknown_accepted: float | None = described(
-        "unknown windows taken for known", "1", default=None, form=PERCENT
-    )
-    known_kept: float | None = described("known windows not called unknown", "1", default=None, form=PERCENT)
-    known_kept_target: float | None = described(
-        "known windows that the threshold is to keep", "1", default=None, form=PERCENT
-    )
-    unknown_by_terrain: Mapping[str, LeftOutTerrain] | None = described("by terrain left out", default=None)
-    support: tuple[SupportRow, ...] | None = described(
-        "windows and accuracy by terrain and driving", default=None
-    )
-    accuracy_by_support: tuple[Mapping[str, Any], ...] | None = described(
-        "accuracy by training runs of the true terrain near the motion of a window", default=None
-    )
-    unsupported: PartFigures | None = described("predictions without training runs near them", default=None)
-    supported: PartFigures | None = described("the other predictions", default=None)
-    supported_auc: float | None = described(
-        "area from supported probability to correctness", "1", default=None
-    )
-    next_drives: tuple[NextDrive, ...] | None = described("what to record next, best first", default=None)
-    conformal: ConformalFigures | None = described("sets of terrains that hold the true one", default=None)
-    dataset: str | None = described("name of the data", default=None)
-    data_digest: str | None = described("digest of the runs", default=None)
-    skipped: tuple[str, ...] | None = described("runs that a repairing reader had to skip", default=None)
-    data: str = described("where the data lie, for the next step; not in JSON", default="")
+    unsupported: PartFigures | None = optional("predictions without training runs near them")
+    supported: PartFigures | None = optional("the other predictions")
+    supported_auc: float | None = optional("area from supported probability to correctness", "1")
+    next_drives: tuple[NextDrive, ...] | None = optional("what to record next, best first")
+    conformal: ConformalFigures | None = optional("sets of terrains that hold the true one")
+    dataset: str | None = optional("name of the data")
+    data_digest: str | None = optional("digest of the runs")
+    skipped: tuple[str, ...] | None = optional("runs that a repairing reader had to skip")
+    data: str = ""
 
     @property
     def chance(self) -> float:
@@ -155,12 +145,8 @@ class CrossvalResult(Result):
             always |= {"speed_only_accuracy", "stiffness", "courses", "recorded_courses"}
         if self.support is not None:
             always |= {"supported_auc"}
-        left_out = {
-            each.name
-            for each in fields(self)
-            if each.name == "data" or (getattr(self, each.name) is None and each.name not in always)
-        }
-        return {name: value for name, value in super().as_json().items() if name not in left_out}
+        written = super().as_json().items()
+        return {name: value for name, value in written if name in always or getattr(self, name) is not None}
 
     def to_pandas(self) -> pd.DataFrame:
         """Return precision, recall, F1 and windows of each terrain."""
@@ -317,7 +303,7 @@ def _coverage(result: CrossvalResult) -> list[Part]:
     regimes = list(dict.fromkeys(row.regime for row in support))
     driven = [(name, *(cells.get((name, regime)) for regime in regimes)) for name in result.classes]
     shaded = [Column(name, ".0%", shade=True) for name in regimes]
-    of_drive = ("record next", "driving", "runs", Column("of", "g", "s"), Column("gain", ".2%"))
+    of_drive = ("record next", "driving", "runs", Column("each of", "g", "s"), Column("gain", ".2%"))
     so_far = (Column("runs near it", ".1f"), "windows", ACCURACY)
     note = "The drive that is expected to gain most first; the order alone is to be relied on."
     return [

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import platform
 import re
 import warnings
 from collections import deque
@@ -20,7 +19,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, partial
 from importlib import import_module
-from importlib.metadata import version
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
@@ -33,6 +31,7 @@ from pydantic import model_validator
 
 from pipelines.report import Progress
 from pipelines.report.settings import Settings, setting
+from pipelines.report.versions import COMPUTING, installed
 from terrain.errors import ConfigError, TerrainError
 
 LOCAL = "local"
@@ -59,7 +58,6 @@ NO_WORKER_S = 60.0
 TASKS_A_THREAD = 3
 """In progress at once for each thread of a worker: one is computed, the next are there when it ends."""
 
-LIBRARIES = ("numpy", "scipy", "scikit-learn", "numba", "pyarrow")
 PACKAGES = ("terrain", "features", "pipelines")
 
 
@@ -267,19 +265,8 @@ def end_with_parent(parent: int) -> None:
 
 
 def software() -> dict[str, str]:
-    """Return the versions that the bytes of a result depend on, by name, and a digest of this package's code.
-
-    Examples
-    --------
-    >>> list(software())[:3]
-    ['terrain-slip', 'its code', 'python']
-    """
-    return {
-        "terrain-slip": import_module("terrain").__version__,
-        "its code": code_digest(),
-        "python": platform.python_version(),
-        **{name: version(name) for name in LIBRARIES},
-    }
+    """Return the versions that the bytes of a result depend on, by name, and a digest of this package's code."""
+    return {**installed(COMPUTING), "its code": code_digest()}
 
 
 @cache

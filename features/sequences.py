@@ -9,12 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from features.windows import Layout, WindowRule, cut_windows, regular_starts, span_of
-from pipelines.learn.protocols import Samples
-from pipelines.learn.recipes import WindowPipeline, feature_matrix
 from terrain.classify.folds import Fold
 from terrain.classify.sequence_figures import STRIDE_S, Track, track_of
 from terrain.logs.splicing import SplicedRun, parts_under, sequences_of
-from terrain.records import Array
+from terrain.records import Array, RunLog, Windows
 
 
 class Following(NamedTuple):
@@ -22,13 +20,13 @@ class Following(NamedTuple):
 
     Parameters
     ----------
-    recipe : whose features are computed
+    features : scikit-learn transformer of windows
     sequences : to be followed
     rule, layout : of the classifier's windows
     classes, prior : (k,) names in the order of the columns, and the part of each among the training windows
     """
 
-    recipe: WindowPipeline
+    features: Any
     sequences: tuple[SplicedRun, ...]
     rule: WindowRule
     layout: Layout
@@ -48,7 +46,7 @@ class Following(NamedTuple):
                 rows = np.rint((windows.start_s - begin_s) / STRIDE_S).astype(int)
                 columns = np.searchsorted(self.classes, classifier.classes_)
                 probability[rows] = 0.0
-                features = feature_matrix(self.recipe, windows)
+                features = np.asarray(self.features.fit_transform(windows))
                 probability[np.ix_(rows, columns)] = classifier.predict_proba(features)
             at = starts_s, rule.length_s, probability, self.classes, self.prior
             tracks.append(track_of(log.labels, runs, *at, spliced))
@@ -56,24 +54,28 @@ class Following(NamedTuple):
 
 
 def following(
-    recipe: WindowPipeline, samples: Samples, rule: WindowRule, folds: Sequence[Fold], seed: int
+    features: Any,
+    windows: Windows,
+    runs: Sequence[RunLog],
+    rule: WindowRule,
+    folds: Sequence[Fold],
+    seed: int,
 ) -> Iterator[Following]:
     """Yield what follows, for each fold, the sequences through its held-out runs.
 
     Parameters
     ----------
-    recipe : whose features are computed
-    samples : windows with their runs, as the folds number them
+    features : scikit-learn transformer of windows, which learns nothing but their channels and rates
+    windows, runs : labelled windows as the folds number them, and the runs that they are of
     rule : of the windows
     folds : training and test rows
     seed : of what is drawn
     """
-    by_id = {run.run_id: run for run in samples.runs}
-    layout = Layout(samples.windows.channels, samples.windows.rate_hz)
-    classes, class_of = np.unique(samples.terrain, return_inverse=True)
+    by_id, layout = {run.run_id: run for run in runs}, Layout(windows.channels, windows.rate_hz)
+    classes, class_of = np.unique(windows.terrain.astype(str), return_inverse=True)
     for repeat, number, train, test in folds:
         rng = np.random.default_rng((seed, repeat, number))
-        parts = parts_under(by_id, samples.windows[test])
+        parts = parts_under(by_id, windows[test])
         sequences = sequences_of(parts, layout.channels, f"course {repeat} {number}", rng)
         counts = np.bincount(class_of[train], minlength=len(classes)) + 1.0
-        yield Following(recipe, sequences, rule, layout, classes, counts / counts.sum())
+        yield Following(features, sequences, rule, layout, classes, counts / counts.sum())
