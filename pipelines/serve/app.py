@@ -12,7 +12,6 @@ from typing import Annotated, Any
 from fastapi import Body, FastAPI, HTTPException, Response, WebSocket
 from fastapi.responses import FileResponse, PlainTextResponse
 from fastapi.staticfiles import StaticFiles
-from pydantic import BaseModel, ConfigDict, Field
 
 from pipelines import report
 from pipelines.learn.model_file import TerrainModel
@@ -41,15 +40,10 @@ OPEN = frozenset(
 )
 """Paths that need no token: they tell nothing of robots."""
 
-
-class ModelChoice(BaseModel):
-    """A model to serve."""
-
-    model_config = ConfigDict(extra="forbid")
-
-    uri: Annotated[
-        str, Field(min_length=1, max_length=1000, description="models:/NAME@champion or a model folder")
-    ]
+ModelUri = Annotated[
+    str,
+    Body(embed=True, min_length=1, max_length=1000, description="models:/NAME@champion or a model folder"),
+]
 
 
 def make_app(
@@ -139,9 +133,9 @@ def make_app(
             raise HTTPException(409, str(error)) from None
 
     @app.put("/model")
-    async def replace_model(choice: ModelChoice) -> dict[str, Any]:
+    async def replace_model(uri: ModelUri) -> dict[str, Any]:
         """Serve another model: all robots at once, or none; no sample is lost."""
-        return await replaced(load, choice.uri, lambda model: (model, choice.uri, hub.served.table))
+        return await replaced(load, uri, lambda model: (model, uri, hub.served.table))
 
     @app.put("/table")
     async def replace_table(text: Annotated[str, Body(media_type="application/yaml")]) -> dict[str, Any]:

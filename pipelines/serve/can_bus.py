@@ -119,7 +119,6 @@ class Link:
     Parameters
     ----------
     make_bus : opens the bus; called at once, and again after an error of it
-    clock : time of this computer in s
 
     Attributes
     ----------
@@ -132,19 +131,24 @@ class Link:
         if the bus cannot be opened at first.
     """
 
-    def __init__(self, make_bus: Callable[[], Any], clock: Callable[[], float] = time.monotonic) -> None:
-        self._make_bus, self._clock = make_bus, clock
+    def __init__(self, make_bus: Callable[[], Any]) -> None:
+        self._make_bus = make_bus
         self._read: deque[tuple[Frame, float]] = deque(maxlen=QUEUE)
         self.errors: Counter[str] = Counter()
         self.n_out = 0
         self._failed, self._retry_s = threading.Event(), 0.0
-        self._bus: Any = None
         self._notifier: Any = None
         self._open()
 
+    def _open(self) -> None:
+        bus = self._make_bus()
+        import can
+
+        self._notifier = can.Notifier(bus, [self], timeout=RECEIVE_S)
+
     def __call__(self, message: Any) -> None:
         """Take a message, in the thread of the notifier."""
-        self._read.append((frame_of(message), self._clock()))
+        self._read.append((frame_of(message), time.monotonic()))
 
     def on_error(self, error: Exception) -> None:
         """Note that the bus failed, in the thread of the notifier; it is closed by the next :meth:`frames`."""
@@ -155,21 +159,22 @@ class Link:
 
     def frames(self) -> list[tuple[Frame, float]]:
         """Return frames that have come, each with the time at which it was read."""
+        now_s = time.monotonic()
         if self._failed.is_set():
             self.close()
             self._failed.clear()
-            self._retry_s = self._clock() + REOPEN_S
-        if self._bus is None and self._clock() >= self._retry_s:
+            self._retry_s = now_s + REOPEN_S
+        if self._notifier is None and now_s >= self._retry_s:
             try:
                 self._open()
             except Exception as error:  # each interface has errors of its own
                 self._count("open", error)
-                self._retry_s = self._clock() + REOPEN_S
+                self._retry_s = now_s + REOPEN_S
         return [self._read.popleft() for _ in range(min(len(self._read), MAX_READ))]
 
     def send(self, frames: Sequence[Frame]) -> bool:
         """Send frames; those that cannot be sent at once are not sent later. Say whether all were."""
-        if self._bus is None:
+        if self._notifier is None:
             return False
         import can
 
@@ -178,7 +183,7 @@ class Link:
                 arbitration_id=frame.arbitration_id, data=frame.data, is_extended_id=frame.is_extended
             )
             try:
-                self._bus.send(message, timeout=0)
+                self._notifier.bus.send(message, timeout=0)
             except Exception as error:
                 self._count("send", error)
                 return False
@@ -187,18 +192,11 @@ class Link:
 
     def close(self) -> None:
         """Shut the bus down."""
-        bus, notifier, self._bus, self._notifier = self._bus, self._notifier, None, None
+        notifier, self._notifier = self._notifier, None
         if notifier is not None:
             notifier.stop()
-        if bus is not None:
             with contextlib.suppress(Exception):  # a bus that failed may refuse
-                bus.shutdown()
-
-    def _open(self) -> None:
-        self._bus = self._make_bus()
-        import can
-
-        self._notifier = can.Notifier(self._bus, [self], timeout=RECEIVE_S)
+                notifier.bus.shutdown()
 
     def _count(self, what: str, error: Exception) -> None:
         text = " ".join(str(error).split()) or type(error).__name__

@@ -11,7 +11,6 @@ import threading
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager, suppress
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -79,10 +78,8 @@ class Service:
                 folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as undone:
             self._socket = undone.enter_context(_listen(settings.host, settings.port))
-            load = partial(_load, filter_stride_s=settings.filter_stride_s)
-            model = load(settings.model)
-            if robot is not None:
-                check_fit(model, robot)
+            self._stride_s = settings.filter_stride_s
+            model = self._load(settings.model)
             served, limits = Served(1, model, settings.model, table), Limits(sessions=settings.max_sessions)
             self.hub = Hub(served, robot, limits, settings.state, settings.record)
             undone.callback(self.hub.stop)
@@ -95,7 +92,7 @@ class Service:
         self._announce: Callable[[str], None] = lambda url: None
         self._server = uvicorn.Server(
             uvicorn.Config(
-                make_app(self.hub, token, load, self._lifespan, loopback=is_loopback(host)),
+                make_app(self.hub, token, self._load, self._lifespan, loopback=is_loopback(host)),
                 log_level="critical",
                 access_log=False,
                 loop="asyncio",
@@ -110,6 +107,9 @@ class Service:
                 server_header=False,
             )
         )
+
+    def _load(self, name: str) -> TerrainModel:
+        return filtered(load_model(name), self._stride_s)
 
     def close(self) -> None:
         """Give the port back, and end the threads."""
@@ -176,10 +176,6 @@ class Service:
         self._server.should_exit = True
 
 
-def _load(name: str, filter_stride_s: float | None) -> TerrainModel:
-    return filtered(load_model(name), filter_stride_s)
-
-
 def _listen(host: str, port: int) -> socket.socket:
     """Return a socket that listens; ``TerrainError`` where the address is taken or none of this machine."""
     try:
@@ -194,24 +190,20 @@ def _listen(host: str, port: int) -> socket.socket:
         raise TerrainError(f"port {port} of {host} cannot be listened on ({reason})") from None
 
 
-def check_fit(model: TerrainModel, robot: Robot) -> None:
-    """Refuse a model that cannot classify a robot's windows.
+def warm_up(model: TerrainModel, robot: Robot | None) -> None:
+    """Run all code once, so that the first robot does not wait for it.
 
     Raises
     ------
     DataError
-        if it needs channels that neither the robot's sensors nor its filter give.
+        if the model cannot classify the robot's windows: it needs channels that neither the robot's sensors nor
+        its filter give, or was trained on other robots.
     """
-    if robot.drive == "swerve":
-        Classifier(model, robot)
-    elif model.info.robots and robot.name not in model.info.robots:
+    source = Classifier(model, robot) if robot is not None and robot.drive == "swerve" else None
+    if source is None and robot is not None and model.info.robots and robot.name not in model.info.robots:
         raise DataError(
             f"the model was trained on runs of {', '.join(model.info.robots)}, not of {robot.name}"
         )
-
-
-def warm_up(model: TerrainModel, robot: Robot | None) -> None:
-    """Run all code once, so that the first robot does not wait for it."""
     rng = np.random.default_rng(0)
     layout, rule = model.layout, model.rule
     values = {
@@ -221,15 +213,13 @@ def warm_up(model: TerrainModel, robot: Robot | None) -> None:
     nothing = np.array([""], dtype=object)
     window = Windows(values, layout.channels, layout.rate_hz, rule.length_s, np.zeros(1), nothing, nothing)
     classify_window(model, window)
-    if robot is None or robot.drive != "swerve":
+    if robot is None or source is None:
         return
-    try:
-        pilot = LivePilot(robot, source=Classifier(model, robot))
-    except (ConfigError, DataError):
-        return
-    for k in range(WARM_STEPS):
-        time_s = np.array([0.02 * k])
-        readings = {
-            stream: Reading(time_s, rng.normal(size=(1, len(names)))) for stream, names in CHANNELS.items()
-        }
-        pilot.step(Sample(0.02 * k, np.array([0.5, 0.0, 0.0]), readings))
+    with suppress(ConfigError, DataError):  # it has no pilot
+        pilot = LivePilot(robot, source=source)
+        for time_s in 0.02 * np.arange(WARM_STEPS):
+            readings = {
+                stream: Reading(np.array([time_s]), rng.normal(size=(1, len(names))))
+                for stream, names in CHANNELS.items()
+            }
+            pilot.step(Sample(time_s, np.array([0.5, 0.0, 0.0]), readings))
