@@ -18,10 +18,8 @@ import numpy as np
 from terrain.errors import ConfigError, DataError
 from terrain.logs.plausible import refuse_implausible, usable_rows
 from terrain.logs.schema import SIGNAL_SETS, signal_set_of
+from terrain.logs.schema import TIME_TOLERANCE_S as TIME_TOLERANCE_S
 from terrain.records import Array, RunLog, Stream, Windows
-
-TIME_TOLERANCE_S = 1e-6
-"""Stamps are compared to this; it covers the rounding of decimal stamps, far below any sample period."""
 
 MAX_RATE_DEVIATION = 0.05
 """Runs whose rates differ by more than this cannot share windows of one length.  The clocks of real loggers

@@ -8,13 +8,13 @@ from functools import partial
 from pathlib import Path
 
 from pipelines.data.bag_files import Bag, decoder_of, find_bags, messages_of, open_bag, topics_of
-from pipelines.data.recorded_windows import RecordedWindow, window_of_text
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
 from terrain.logs.borealtc import whole_run_label
 from terrain.logs.faults import Faults, Topic
 from terrain.logs.log_files import checked_names, short_name
 from terrain.logs.parquet_file import MAX_VALUES
+from terrain.logs.recorded_windows import RecordedWindow, window_of_text
 from terrain.logs.run_topics import RUN_TOPIC, STRING, WINDOW_TOPIC, RunDocument, string_of
 from terrain.logs.samples import refuse_apart
 from terrain.logs.topic_mapping import Mapping as TopicMapping

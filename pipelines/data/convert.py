@@ -27,9 +27,9 @@ from pipelines.report.settings import setting
 from terrain.errors import LogError, TerrainError
 
 if TYPE_CHECKING:
-    from pipelines.data.recorded_windows import RecordedWindow
     from terrain.logs.duplicates import SharedStretch
     from terrain.logs.plausibility import Doubt
+    from terrain.logs.recorded_windows import RecordedWindow
 
 EXAMPLE = "terrain convert logs/ --mapping mapping.yaml --out runs/"
 
@@ -161,8 +161,8 @@ def _recorded_windows(place: Path) -> dict[str, list[RecordedWindow]]:
     """Return the windows that lie beside the streams of run folders, or in recordings, by run."""
     from pipelines.data.bag_files import find_bags
     from pipelines.data.bag_runs import recorded_windows
-    from pipelines.data.recorded_windows import read_windows
     from terrain.logs.read import read_run_head, run_folders
+    from terrain.logs.recorded_windows import read_windows
 
     folders = run_folders(place) if place.is_dir() else []
     found = {read_run_head(folder).run_id: read_windows(folder) or [] for folder in folders}

@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 
 from pipelines.data.mcap_file import McapWriter, library
-from pipelines.data.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.kinematics.standard_messages import StandardTopic, standard_topic
+from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from terrain.logs.run_topics import Messages, head_of, origin_of, run_messages, stamps_ns
 from terrain.logs.topic_mapping import DISTRO
 from terrain.logs.write import run_folder, write_csv, write_run

@@ -31,10 +31,10 @@ from terrain.errors import ConfigError, DataError
 from terrain.files.names import plain_name
 
 if TYPE_CHECKING:
-    from pipelines.data.labels import DoubtfulWindow, RunWindows
     from pipelines.learn.model_file import TerrainModel
     from pipelines.learn.proposals import Answered
     from terrain.classify.proposals import Proposal
+    from terrain.logs.recorded_windows import DoubtfulWindow, RunWindows
     from terrain.records import Label, RunLog
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
@@ -176,7 +176,8 @@ def run(
     TerrainError
         if a file cannot be written.
     """
-    from pipelines.data.labels import doubtful_windows, set_label
+    from terrain.logs.labels import set_label
+    from terrain.logs.recorded_windows import doubtful_windows
 
     if settings.model is not None:
         from pipelines.learn.load import load_model
@@ -296,7 +297,7 @@ def _label_of(row: Answered, accept: float) -> LabelSource | None:
 
 def _with(labels: Sequence[LabelSource], added: LabelSource) -> list[LabelSource]:
     """Return labels with one more: a person's replaces what it covers, the model's only fills gaps."""
-    from pipelines.data.labels import relabelled
+    from terrain.logs.labels import relabelled
     from terrain.records import Label
 
     if added.source == "model":

@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from pipelines.data.mcap_file import McapWriter
-from pipelines.data.recorded_windows import RecordedWindow
 from terrain.control.switching import SWITCHING
 from terrain.errors import LogError
 from terrain.files.names import plain_name
+from terrain.logs.recorded_windows import RecordedWindow
 from terrain.logs.replay import TWIST
 from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, Head, RunRecorder
 from terrain.logs.samples import BAD_TIME

@@ -22,6 +22,7 @@ from terrain.errors import DataError, LogError
 from terrain.files.documents import parse_json
 from terrain.files.names import shown
 from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
+from terrain.logs.labels import label_changes
 from terrain.logs.log_files import checked_names
 from terrain.logs.read import MAX_STREAMS, MAY_BE_UNKNOWN, read_labels
 from terrain.logs.samples import DEAD_CHANNEL, checked_stream, refuse_apart
@@ -287,7 +288,7 @@ def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iter
         topics[name] = stream_topic(name, stream.channels, [each.topic for each in topics.values()])
     document = run_document(head_of(run), topics, run.labels, run.dropped)
     yield text_messages(RUN_TOPIC, [start_s], [document], origin_s)
-    changes = _label_changes(run)
+    changes = label_changes(run.labels)
     for topic, texts in ((LABEL_TOPIC, changes), (WINDOW_TOPIC, windows)):
         if texts:
             times_s, contents = zip(*texts, strict=True)
@@ -295,16 +296,6 @@ def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iter
     for name, stream in run.streams.items():
         values = np.column_stack([stream.channel(channel) for channel in topics[name].fields.values()])
         yield stream_messages(topics[name], stream.time_s, values, origin_s)
-
-
-def _label_changes(run: RunLog) -> list[tuple[float, str]]:
-    """Return the terrains as they change; an empty one where no label holds."""
-    found: list[tuple[float, str]] = []
-    for label in sorted(run.labels):
-        if found and found[-1] == (label.start_s, ""):
-            found.pop()
-        found += [(label.start_s, label.terrain), (label.end_s, "")]
-    return found
 
 
 def stream_samples(place: str, topic: StreamTopic, messages: Sequence[bytes], faults: Faults) -> Array:

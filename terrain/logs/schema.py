@@ -12,6 +12,9 @@ from terrain.errors import LogError
 
 SCHEMA_VERSION = 1
 
+TIME_TOLERANCE_S = 1e-6
+"""Stamps are compared to this; it covers the rounding of decimal stamps, far below any sample period."""
+
 UNIT_SYMBOLS: dict[str, str] = {
     "s": "s",
     "m": "m",

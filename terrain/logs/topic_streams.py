@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -12,8 +11,8 @@ import numpy as np
 
 from terrain.errors import ConfigError, LogError
 from terrain.files.names import shown
-from terrain.logs.borealtc import whole_run_label
 from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
+from terrain.logs.labels import label_intervals
 from terrain.logs.message_numbers import Number, number_at, stamp_at
 from terrain.logs.parquet_file import MAX_VALUES
 from terrain.logs.samples import checked_stream, longest_rise
@@ -346,33 +345,3 @@ def start_of(stamps: list[Array], repairs: Counter[str] | None) -> int:
     if repairs is None:
         return min(int(each.min()) for each in stamps)
     return min(int(each[longest_rise(each)[0]]) for each in stamps)
-
-
-def label_intervals(
-    texts: Sequence[tuple[int, str]], start_ns: int, streams: Mapping[str, Stream]
-) -> tuple[Label, ...]:
-    """Return the terrain intervals of a run from the terrains as they change.
-
-    Parameters
-    ----------
-    texts : log time in ns and terrain, in order; an empty text ends a terrain
-    start_ns : of the run
-    streams : of the run; the last terrain lasts until their end
-
-    Examples
-    --------
-    >>> imu = Stream([0.0, 1.0, 2.0], [[0.0]] * 3, ("gyro_z_radps",))
-    >>> label_intervals([(10**9, "ICE"), (10**9 + 5 * 10**8, "ICE"), (2 * 10**9, "")], 0, {"imu": imu})
-    (Label(start_s=1.0, end_s=2.0, terrain='ICE'),)
-    """
-    end_s = whole_run_label(dict(streams), "all").end_s
-    changes = [((log_ns - start_ns) / 1e9, terrain.strip()) for log_ns, terrain in texts]
-    labels: list[Label] = []
-    for (begin_s, terrain), (stop_s, _) in pairwise([*changes, (end_s, "")]):
-        stop_s = min(stop_s, end_s)
-        if not terrain or stop_s <= begin_s:
-            continue
-        if labels and labels[-1].terrain == terrain and labels[-1].end_s == begin_s:
-            begin_s = labels.pop().start_s
-        labels.append(Label(begin_s, stop_s, terrain))
-    return tuple(labels)

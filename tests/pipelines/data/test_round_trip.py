@@ -19,13 +19,13 @@ from pipelines.data.convert import Settings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from pipelines.data.mcap_file import McapWriter
-from pipelines.data.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from pipelines.data.run_writers import messages_of_run, write
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
 from terrain.logs.digest import data_digest
 from terrain.logs.read import read_run
+from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from terrain.logs.run_topics import Head, RunRecorder, string_message
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream

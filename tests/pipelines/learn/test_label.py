@@ -10,15 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipelines.cli import main as cli
-from pipelines.data.labels import relabelled
-from pipelines.data.recorded_windows import WINDOWS_FILE, windows_text
 from pipelines.learn.label import Settings, time_text
 from pipelines.learn.label import run as label
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.recording import recorded
 from terrain.errors import ConfigError, LogError
 from terrain.files import atomic
+from terrain.logs.labels import relabelled
 from terrain.logs.read import read_run
+from terrain.logs.recorded_windows import WINDOWS_FILE, windows_text
 from terrain.logs.write import write_run
 from terrain.records import Label
 

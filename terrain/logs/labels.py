@@ -1,50 +1,22 @@
-"""Labels of run folders: intervals that are set, windows that the model was in doubt about."""
+"""Labels of runs: intervals as the terrains change, those that are set, and those of run folders."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from features.windows import TIME_TOLERANCE_S
-from pipelines.data.recorded_windows import read_windows
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
+from terrain.logs.borealtc import whole_run_label
 from terrain.logs.read import read_run, read_run_head, run_folders
-from terrain.records import Label
+from terrain.logs.schema import TIME_TOLERANCE_S
+from terrain.records import Label, Stream
 
 SLACK_S = 0.01
 """An interval may be that far outside of a run: times are typed with two digits."""
-
-
-class DoubtfulWindow(NamedTuple):
-    """A window whose output does not count.
-
-    Parameters
-    ----------
-    run_id, start_s, end_s : which one
-    terrain, probability : output of the model; empty and NaN where it refused the window
-    refused : why it did
-    label : of the run, where one covers the whole window
-    """
-
-    run_id: str
-    start_s: float
-    end_s: float
-    terrain: str
-    probability: float
-    refused: str
-    label: str | None
-
-
-class RunWindows(NamedTuple):
-    """Windows of a run: how many there are, are doubtful, and of those lack a label; None: none recorded."""
-
-    run_id: str
-    n_windows: int | None
-    n_doubtful: int
-    n_without_label: int
 
 
 class ChangedLabels(NamedTuple):
@@ -56,44 +28,44 @@ class ChangedLabels(NamedTuple):
     labels: tuple[Label, ...]
 
 
-def doubtful_windows(
-    data: Path, run_id: str | None = None
-) -> tuple[tuple[RunWindows, ...], tuple[DoubtfulWindow, ...]]:
-    """Return the windows whose outputs do not count, of all runs or of one, and how many each run has.
+def label_intervals(
+    texts: Sequence[tuple[int, str]], start_ns: int, streams: Mapping[str, Stream]
+) -> tuple[Label, ...]:
+    """Return the terrain intervals of a run from the terrains as they change.
 
-    Raises
-    ------
-    LogError
-        if there is no run, or a file of a run is damaged.
-    ConfigError
-        if there is no run of the id.
+    Parameters
+    ----------
+    texts : log time in ns and terrain, in order; an empty text ends a terrain
+    start_ns : of the run
+    streams : of the run; the last terrain lasts until their end
+
+    Examples
+    --------
+    >>> imu = Stream([0.0, 1.0, 2.0], [[0.0]] * 3, ("gyro_z_radps",))
+    >>> label_intervals([(10**9, "ICE"), (10**9 + 5 * 10**8, "ICE"), (2 * 10**9, "")], 0, {"imu": imu})
+    (Label(start_s=1.0, end_s=2.0, terrain='ICE'),)
     """
-    folders = _folders(data)
-    if run_id is not None:
-        folders = [_folder_of(run_id, folders, data)]
-    runs: list[RunWindows] = []
-    found: list[DoubtfulWindow] = []
-    for folder in folders:
-        head, windows = read_run_head(folder), read_windows(folder)
-        if windows is None:
-            runs.append(RunWindows(head.run_id, None, 0, 0))
+    end_s = whole_run_label(dict(streams), "all").end_s
+    changes = [((log_ns - start_ns) / 1e9, terrain.strip()) for log_ns, terrain in texts]
+    labels: list[Label] = []
+    for (begin_s, terrain), (stop_s, _) in pairwise([*changes, (end_s, "")]):
+        stop_s = min(stop_s, end_s)
+        if not terrain or stop_s <= begin_s:
             continue
-        rows = [
-            DoubtfulWindow(
-                head.run_id,
-                window.start_s,
-                window.end_s,
-                window.terrain,
-                window.probability,
-                window.refused,
-                label_over(head.labels, window.start_s, window.end_s),
-            )
-            for window in windows
-            if window.doubtful
-        ]
-        runs.append(RunWindows(head.run_id, len(windows), len(rows), sum(row.label is None for row in rows)))
-        found += rows
-    return tuple(runs), tuple(found)
+        if labels and labels[-1].terrain == terrain and labels[-1].end_s == begin_s:
+            begin_s = labels.pop().start_s
+        labels.append(Label(begin_s, stop_s, terrain))
+    return tuple(labels)
+
+
+def label_changes(labels: Iterable[Label]) -> list[tuple[float, str]]:
+    """Return the terrains as they change, the inverse of :func:`label_intervals`; an empty one where none holds."""
+    found: list[tuple[float, str]] = []
+    for label in sorted(labels):
+        if found and found[-1] == (label.start_s, ""):
+            found.pop()
+        found += [(label.start_s, label.terrain), (label.end_s, "")]
+    return found
 
 
 def set_label(
@@ -117,7 +89,7 @@ def set_label(
     TerrainError
         if the file cannot be written; it is as it was then.
     """
-    folder = _folder_of(run_id, _folders(data), data)
+    folder = folder_of(run_id, labelled_folders(data), data)
     head = read_run_head(folder)
     streams = read_run(folder, repair=True).streams.values()
     first_s = min(float(stream.time_s[0]) for stream in streams)
@@ -171,7 +143,8 @@ def label_over(labels: Sequence[Label], start_s: float, end_s: float) -> str | N
     return None
 
 
-def _folders(data: Path) -> list[Path]:
+def labelled_folders(data: Path) -> list[Path]:
+    """Return the run folders under a folder, which are the ones that labels can be set of; none is refused."""
     if not data.is_dir():
         raise LogError(f"{data}: {'is no folder' if data.exists() else 'does not exist'}")
     found = run_folders(data)
@@ -180,7 +153,8 @@ def _folders(data: Path) -> list[Path]:
     return found
 
 
-def _folder_of(run_id: str, folders: Sequence[Path], data: Path) -> Path:
+def folder_of(run_id: str, folders: Sequence[Path], data: Path) -> Path:
+    """Return the one folder of a run; none and several are refused."""
     found = [folder for folder in folders if read_run_head(folder).run_id == run_id]
     if len(found) > 1:
         raise LogError(f"{data}: {len(found)} runs have the id {run_id!r}")

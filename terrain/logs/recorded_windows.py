@@ -8,15 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
-from terrain.control.switching import SWITCHING
 from terrain.errors import LogError
 from terrain.files.regular import MEBIBYTE, read_regular
+from terrain.logs.labels import folder_of, label_over, labelled_folders
 from terrain.logs.log_files import short_name
 from terrain.logs.mapping import first_fault
+from terrain.logs.read import read_run_head
 
 WINDOWS_FILE = "windows.json"
 
@@ -54,7 +55,6 @@ class _File(BaseModel):
     """Content of ``windows.json``."""
 
     version: Literal[1]
-    probability_least: float = SWITCHING.probability_least
     windows: list[RecordedWindow]
 
 
@@ -93,3 +93,72 @@ def window_of_text(place: str, text: str) -> RecordedWindow:
         return RecordedWindow.model_validate_json(text)
     except ValidationError as error:
         raise LogError(f"{place}: a recorded window is damaged ({first_fault(error)})") from error
+
+
+class DoubtfulWindow(NamedTuple):
+    """A window whose output does not count.
+
+    Parameters
+    ----------
+    run_id, start_s, end_s : which one
+    terrain, probability : output of the model; empty and NaN where it refused the window
+    refused : why it did
+    label : of the run, where one covers the whole window
+    """
+
+    run_id: str
+    start_s: float
+    end_s: float
+    terrain: str
+    probability: float
+    refused: str
+    label: str | None
+
+
+class RunWindows(NamedTuple):
+    """Windows of a run: how many there are, are doubtful, and of those lack a label; None: none recorded."""
+
+    run_id: str
+    n_windows: int | None
+    n_doubtful: int
+    n_without_label: int
+
+
+def doubtful_windows(
+    data: Path, run_id: str | None = None
+) -> tuple[tuple[RunWindows, ...], tuple[DoubtfulWindow, ...]]:
+    """Return the windows whose outputs do not count, of all runs or of one, and how many each run has.
+
+    Raises
+    ------
+    LogError
+        if there is no run, or a file of a run is damaged.
+    ConfigError
+        if there is no run of the id.
+    """
+    folders = labelled_folders(data)
+    if run_id is not None:
+        folders = [folder_of(run_id, folders, data)]
+    runs: list[RunWindows] = []
+    found: list[DoubtfulWindow] = []
+    for folder in folders:
+        head, windows = read_run_head(folder), read_windows(folder)
+        if windows is None:
+            runs.append(RunWindows(head.run_id, None, 0, 0))
+            continue
+        rows = [
+            DoubtfulWindow(
+                head.run_id,
+                window.start_s,
+                window.end_s,
+                window.terrain,
+                window.probability,
+                window.refused,
+                label_over(head.labels, window.start_s, window.end_s),
+            )
+            for window in windows
+            if window.doubtful
+        ]
+        runs.append(RunWindows(head.run_id, len(windows), len(rows), sum(row.label is None for row in rows)))
+        found += rows
+    return tuple(runs), tuple(found)
