@@ -67,7 +67,7 @@ def read_run(
     topics = topics_of(bag)
     exported = topics.get(RUN_TOPIC)
     if mapping is None and exported is not None and exported.kind == STRING:
-        return _exported_run(bag, place, topics, faults, repair=repair)
+        return _exported_run(bag, place, topics, repair=repair)
     if not topics:
         raise LogError(f"{place}: has no topic")
     mapping = standard_mapping(place, list(topics.values())) if mapping is None else mapping
@@ -130,9 +130,7 @@ def _mapped(
     return found
 
 
-def _exported_run(
-    bag: Bag, place: str, topics: Mapping[str, Topic], faults: Faults, *, repair: bool
-) -> RunLog:
+def _exported_run(bag: Bag, place: str, topics: Mapping[str, Topic], *, repair: bool) -> RunLog:
     """Return the run that was exported or recorded; a recording that ends early is read as far as it goes."""
     prefix = RUN_TOPIC.rpartition("/")[0]
     names = frozenset(name for name in topics if name.startswith(prefix))
@@ -148,12 +146,10 @@ def _exported_run(
         raise LogError(f"{place}: {RUN_TOPIC} has no message")
     document = RunDocument(place, string_of(place, messages[RUN_TOPIC][-1]))
     document.check(topics)
-    if document.head.live or repair:
-        return document.run(messages, counted)
-    if counted.repairs:  # a strict read finds the fault again, and says where it is
-        for _ in messages_of(bag, names, faults):
-            pass
-    return document.run(messages, faults)
+    tolerant = document.head.live or repair
+    if counted.first and not tolerant:
+        raise LogError(counted.first)
+    return document.run(messages, counted if tolerant else Faults(None))
 
 
 def recorded_windows(path: Path) -> tuple[str, list[RecordedWindow]] | None:

@@ -31,13 +31,18 @@ class Faults:
     Parameters
     ----------
     repairs : counts by kind; None refuses
+
+    Attributes
+    ----------
+    first : what a strict read would refuse first; empty without a fault
     """
 
     def __init__(self, repairs: Counter[str] | None) -> None:
-        self.repairs = repairs
+        self.repairs, self.first = repairs, ""
 
     def found(self, place: str, kind: str, text: str, n: int = 1) -> None:
         """Raise :class:`LogError`, or count."""
+        self.first = self.first or f"{place}: {text}; read it with --repair to leave that out"
         if self.repairs is None:
-            raise LogError(f"{place}: {text}; read it with --repair to leave that out")
+            raise LogError(self.first)
         self.repairs[kind] += n

@@ -361,67 +361,58 @@ OF_SPEEDS = """streams:
 """
 
 
-@pytest.mark.parametrize("encoding", ["json", "protobuf"])
-def test_messages_of_foxglove_are_read_by_their_fields_and_stamps(tmp_path, encoding):
-    kind, definition = protobuf_speeds()
-    contents = []
-    for number in range(5):
-        stamp_s, nanos = divmod(START_NS - 10**9 + 2 * 10**7 * number, 10**9)
-        speeds = [3.6 * number, 1.0]
-        if encoding == "json":
-            stamp = {"sec": stamp_s, "nsec": nanos}
-            contents.append(
-                json.dumps({"timestamp": stamp, "speed": speeds, "place": {"x": -number}}).encode()
-            )
-        else:
-            message = kind(speed=speeds, place={"x": -number}, timestamp={"seconds": stamp_s, "nanos": nanos})
-            contents.append(message.SerializeToString())
-    schema = ("jsonschema", b"{}") if encoding == "json" else ("protobuf", definition)
-    path = write_messages(tmp_path / "a.mcap", (encoding, schema[0]), schema[1], contents)
+RULE = "=" * 80 + "\n"
+IDL = f"""{RULE}IDL: own/msg/Speeds
+module own {{ module msg {{ struct Speeds {{ sequence<float> speed; own::msg::Place place; }}; }}; }};
+{RULE}IDL: own/msg/Place
+module own {{ module msg {{ struct Place {{ double x; }}; }}; }};
+"""
+MSG = f"float32[] speed\nPlace place\n{RULE}MSG: own/Place\nfloat64 x\n"
+
+
+def as_protobuf(number, seconds, nanos):
+    kind, _ = protobuf_speeds()
+    stamp = {"seconds": seconds, "nanos": nanos}
+    return kind(speed=[3.6 * number, 1.0], place={"x": -number}, timestamp=stamp).SerializeToString()
+
+
+def as_json_text(number, seconds, nanos):
+    stamp = {"sec": seconds, "nsec": nanos}
+    return json.dumps({"timestamp": stamp, "speed": [3.6 * number, 1.0], "place": {"x": -number}}).encode()
+
+
+@pytest.mark.parametrize(
+    ("encodings", "definition", "content", "step_s"),
+    [
+        (("protobuf", "protobuf"), protobuf_speeds()[1], as_protobuf, 0.02),
+        (("json", "jsonschema"), b"{}", as_json_text, 0.02),
+        (
+            ("cdr", "ros2idl"),
+            IDL.encode(),
+            lambda i, *_: b"\0\1\0\0" + struct.pack("<I2f4xd", 2, 3.6 * i, 1, -i),
+            0.01,
+        ),
+        (("ros1", "ros1msg"), MSG.encode(), lambda i, *_: struct.pack("<I2fd", 2, 3.6 * i, 1, -i), 0.01),
+    ],
+)
+def test_messages_of_any_encoding_are_read_by_their_fields_and_stamps(
+    tmp_path, encodings, definition, content, step_s
+):
+    """Without a header the log times are the stamps; a message that is damaged is refused or left out."""
+    stamps = [divmod(START_NS - 10**9 + 2 * 10**7 * number, 10**9) for number in range(5)]
+    contents = [content(number, *stamp) for number, stamp in enumerate(stamps)]
+    kind = "own.Speeds" if encodings[0] in ("json", "protobuf") else "own/msg/Speeds"
+    path = write_messages(tmp_path / "a.mcap", encodings, definition, contents, kind)
     (run,) = load_runs(path, mapping=mapping_of(tmp_path, OF_SPEEDS))
     stream = run.streams["w"]
-    np.testing.assert_allclose(stream.time_s, 0.02 * np.arange(5), atol=1e-9)
-    np.testing.assert_allclose(stream.channel("speed_left_mps"), np.arange(5), atol=1e-6)
-    np.testing.assert_array_equal(stream.channel("position_x_m"), -np.arange(5.0))
+    np.testing.assert_allclose(stream.time_s, step_s * np.arange(5), atol=1e-9)
+    np.testing.assert_allclose(stream.values, [[i, -i] for i in range(5)], atol=1e-6)
     changed = [*contents[:2], b"{broken", *contents[3:]]
-    path = write_messages(tmp_path / "a.mcap", (encoding, schema[0]), schema[1], changed)
+    path = write_messages(tmp_path / "a.mcap", encodings, definition, changed, kind)
     with pytest.raises(LogError, match="not as defined"):
         load_runs(path, mapping=mapping_of(tmp_path, OF_SPEEDS))
     (run,) = load_runs(path, mapping=mapping_of(tmp_path, OF_SPEEDS), repair=True)
     assert (len(run.streams["w"]), run.dropped["damaged messages"]) == (4, 1)
-
-
-IDL = """IDL: own_msgs/msg/Speeds
-module own_msgs { module msg { struct Speeds { sequence<float> speed; own_msgs::msg::Place place; }; }; };
-"""
-PLACE_IDL = (
-    "=" * 80
-    + """
-IDL: own_msgs/msg/Place
-module own_msgs { module msg { struct Place { double x; }; }; };
-"""
-)
-
-
-@pytest.mark.parametrize(
-    ("encodings", "definition"),
-    [
-        (("cdr", "ros2idl"), "=" * 80 + "\n" + IDL + PLACE_IDL),
-        (
-            ("ros1", "ros1msg"),
-            "float32[] speed\nPlace place\n" + "=" * 80 + "\nMSG: own_msgs/Place\nfloat64 x\n",
-        ),
-    ],
-)
-def test_definitions_in_idl_and_messages_of_ros_1_in_mcap_are_read(tmp_path, encodings, definition):
-    cdr = [b"\0\1\0\0" + struct.pack("<I2f4xd", 2, 3.6 * i, 1.0, -i) for i in range(5)]
-    ros1 = [struct.pack("<I2fd", 2, 3.6 * i, 1.0, -i) for i in range(5)]
-    contents = cdr if encodings[0] == "cdr" else ros1
-    path = write_messages(
-        tmp_path / "a.mcap", encodings, definition.encode(), contents, "own_msgs/msg/Speeds"
-    )
-    (run,) = load_runs(path, mapping=mapping_of(tmp_path, OF_SPEEDS))
-    np.testing.assert_allclose(run.streams["w"].values, [[i, -i] for i in range(5)], atol=1e-6)
 
 
 CDR = ("cdr", "ros2msg")

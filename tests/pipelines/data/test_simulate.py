@@ -11,12 +11,12 @@ from terrain.errors import ConfigError, LogError
 from terrain.files.resources import data_folder
 from terrain.logs.read import find_runs, read_run
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions, Faults
+from terrain.simulation.conditions import Conditions
 from terrain.simulation.run import simulate_run
-from terrain.simulation.sensors.gnss import Gnss
 from terrain.terramechanics.soil import soil_names
 
 ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
+RUNS = ("tiles_survey_01", "tiles_straight_01", "tiles_straight_01")
 
 
 def simulate_runs(robot, terrain, scenario, out, progress=silent, **options):
@@ -57,30 +57,43 @@ def test_a_run_is_the_same_whatever_is_simulated_beside_it(tmp_path):
     assert values_of(read_run(tmp_path / "b" / name)) != values_of(read_run(tmp_path / "alone" / name))
 
 
-def test_runs_differ_by_number_seed_and_terrain_and_more_so_where_they_vary():
-    def slip(number=1, seed=0, terrain="grass", vary=False):
-        truth = simulate_run(ROBOT, terrain, "straight", seed, number, duration_s=6.0, vary=vary).streams[
-            "truth"
+def test_runs_differ_by_number_and_terrain_and_more_so_where_they_vary(tmp_path):
+    slips = {}
+    for terrain, vary in (("grass", False), ("clay", False), ("grass", True)):
+        out = tmp_path / f"{terrain}_{vary}"
+        simulate_runs("agrimaro", terrain, "straight", out, runs=6, duration_s=6.0, vary=vary)
+        truths = [read().streams["truth"] for read in find_runs(out)]
+        slips[terrain, vary] = [
+            np.mean([truth.channel(f"slip_{i}_ratio")[truth.time_s > 3.0] for i in (1, 2, 3)])
+            for truth in truths
         ]
-        slips = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
-        return slips[truth.time_s > 3.0].mean()
-
-    nominal = [slip(number) for number in range(1, 7)]
-    varied = [slip(number, vary=True) for number in range(1, 7)]
-    assert len({*nominal, slip(seed=1), slip(terrain="clay")}) == 8
-    assert np.std(varied) > 5 * np.std(nominal)
+    assert len({*slips["grass", False], *slips["clay", False]}) == 12
+    assert np.std(slips["grass", True]) > 5 * np.std(slips["grass", False])
 
 
-def test_options_reach_the_run():
-    given = {"duration_s": 10.0, "conditions": Conditions(grade_ratio=(0.1, 0.0)), "gnss": Gnss()}
-    run = simulate_run(ROBOT, "tiles", "survey", 3, faults=Faults(camera_lost_s=((2.0, 4.0),)), **given)
-    odometry = run.streams["odometry"]
-    assert run.streams["truth"].time_s[-1] == pytest.approx(10.01)
-    assert not ((odometry.time_s >= 2.0) & (odometry.time_s < 4.0)).any()
-    assert "gnss" in run.streams
-    assert run.streams["imu"].channel("accel_x_mps2")[:50].mean() == pytest.approx(0.976, abs=0.1)
-    drawn = simulate_run(ROBOT, "tiles", "survey", 3, vary=True, **given)
-    assert drawn.streams["imu"].channel("accel_x_mps2")[:50].mean() == pytest.approx(0.976, abs=0.8)
+def test_options_reach_the_run(tmp_path):
+    """A slope of 0.1 pitches the robot and pulls at it, a load adds to that, and the camera is lost for 2 s."""
+    steps = []
+    slope = {"grade_deg": float(np.degrees(np.arctan(0.1))), "duration_s": 10.0, "camera_lost": ("2:4",)}
+    for robot, scenario, options in (
+        ("agrimaro", "survey", slope | {"gnss": True}),
+        ("husky", "straight", slope | {"payload_kg": 25.0}),
+        ("husky", "straight", {"duration_s": 10.0}),
+    ):
+        out = tmp_path / str(len(steps))
+        simulate_runs(robot, "tiles", scenario, out, lambda *step: steps.append(step), seed=3, **options)
+    assert steps == [("simulate", 1, 1)] * 3
+    swerve, loaded, bare = (read_run(tmp_path / n / name) for n, name in zip("012", RUNS, strict=True))
+    for run in (swerve, loaded):
+        time_s = run.streams["odometry"].time_s
+        assert not ((time_s >= 2.0) & (time_s < 4.0)).any()
+    assert "gnss" in swerve.streams
+    assert swerve.streams["imu"].channel("accel_x_mps2")[:50].mean() == pytest.approx(0.976, abs=0.1)
+    assert loaded.streams["imu"].channel("pitch_rad").mean() == pytest.approx(-0.1, abs=0.01)
+    current, level = (log.streams["wheels"].values[250:, 2:].sum(axis=1).mean() for log in (loaded, bare))
+    amps_per_n = HUSKY.wheel_radius_m / (0.044 * 78.71 * 0.7)
+    slope_n = 75.0 * 9.80665 * np.sin(np.arctan(0.1))
+    assert (current - level) / amps_per_n == pytest.approx(slope_n, rel=0.1)
 
 
 def test_a_course_goes_over_all_grounds(tmp_path):
@@ -104,24 +117,6 @@ def test_a_skid_steered_robot_makes_runs_too(tmp_path):
     asked = (speeds[:, 1] - speeds[:, 0]) / HUSKY.track_m
     turned = run.streams["imu"].channel("gyro_z_radps")[::2]
     assert np.polyfit(asked, turned, 1)[0] == pytest.approx(1 / 1.6, abs=0.04)
-
-
-def test_load_slope_and_a_lost_camera_reach_a_skid_steered_run():
-    given = {"conditions": Conditions(payload_kg=25.0, grade_ratio=(0.1, 0.0)), "duration_s": 10.0}
-    lost = Faults(camera_lost_s=((2.0, 4.0),))
-    run, bare = (
-        simulate_run(HUSKY, "tiles", "straight", 3, **options)
-        for options in (given | {"faults": lost}, {"duration_s": 10.0})
-    )
-    time_s = run.streams["odometry"].time_s
-    assert not ((time_s >= 2.0) & (time_s < 4.0)).any()
-    assert run.streams["imu"].channel("pitch_rad").mean() == pytest.approx(-0.1, abs=0.01)
-    current, level = (log.streams["wheels"].values[250:, 2:].sum(axis=1).mean() for log in (run, bare))
-    amps_per_n = HUSKY.wheel_radius_m / (0.044 * 78.71 * 0.7)
-    slope_n = 75.0 * 9.80665 * np.sin(np.arctan(0.1))
-    assert (current - level) / amps_per_n == pytest.approx(slope_n, rel=0.1)
-    blind = simulate_run(HUSKY, "tiles", "straight", 3, duration_s=5.0, faults=Faults(((0.0, 9.0),)))
-    assert "odometry" not in blind.streams
 
 
 @pytest.mark.parametrize(
@@ -175,20 +170,6 @@ def test_a_soil_of_ones_own_goes_by_its_name(tmp_path):
     assert read_run(tmp_path / "runs" / "orchard_straight_01").terrains == ("orchard",)
     with pytest.raises(LogError, match="orchard_straight_01: is there already"):
         simulate_runs("agrimaro", str(own), "straight", tmp_path / "runs", duration_s=4.0)
-
-
-def test_progress_counts_the_runs(tmp_path):
-    steps = []
-    simulate_runs(
-        "agrimaro",
-        "snow",
-        "stand",
-        tmp_path,
-        runs=2,
-        duration_s=1.0,
-        progress=lambda *args: steps.append(args),
-    )
-    assert steps == [("simulate", 1, 2), ("simulate", 2, 2)]
 
 
 def test_an_imu_on_a_bench_is_simulated_for_calibration(tmp_path):
