@@ -60,15 +60,8 @@ def test_a_repairing_read_leaves_it_out_and_counts_it(runs, kind):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        lambda x: x * 1e10,
-        lambda x: x * 1e-310,
-        lambda x: x * 1e-160,
-        lambda x: 0.0 * x,
-        lambda x: 0.0 * x + 1e12,
-        lambda x: np.where(np.arange(len(x)) == 400, 1e12, x),
-    ],
-    ids=["large", "denormal", "squares are denormal", "zero", "constant", "impulse"],
+    [lambda x: x * 1e10, lambda x: x * 1e-160, lambda x: 0.0 * x + 1e12],
+    ids=["large", "squares are denormal", "constant"],
 )
 def test_strange_values_that_can_be_computed_with_are_computed_with(runs, settings, change):
     report = crossval([spoilt(run, change) for run in runs], settings())

@@ -6,6 +6,7 @@ import warnings
 from dataclasses import fields
 from typing import get_args
 
+import distributed
 import numpy as np
 import pytest
 from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict, cross_validate
@@ -347,7 +348,6 @@ def test_a_window_with_few_samples_of_a_slow_stream_is_classified_and_one_with_f
 
 @pytest.mark.slow
 def test_a_cluster_gives_the_report_of_this_machine(drive_all):
-    distributed = pytest.importorskip("distributed")
     runs = drive_all(("ASPHALT", "GRASS"), 4, duration_s=12.0)
     settings = EvaluationSettings(repeats=1, steady=False, n_jobs=2)
     here = crossval(runs, settings)

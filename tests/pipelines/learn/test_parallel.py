@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -9,8 +10,11 @@ import warnings
 from contextlib import suppress
 from pathlib import Path
 
+import distributed
 import numpy as np
+import psutil
 import pytest
+from distributed.utils import open_port
 
 from features.windows import WindowRule
 from pipelines.learn import parallel as cluster
@@ -24,30 +28,30 @@ from pipelines.learn.parallel import (
 )
 from terrain.errors import ConfigError, TerrainError
 
-HERE = Path(__file__).resolve().parent
+ROOT = Path(__file__).resolve().parents[3]
 
 
-@pytest.mark.parametrize(
-    ("compute", "address"),
-    [
+def test_an_address_is_read_and_another_text_refused_in_one_sentence():
+    for compute, address in (
         ("dask:127.0.0.1:8786", "tcp://127.0.0.1:8786"),
         ("dask:tcp://node-3.lab:1", "tcp://node-3.lab:1"),
         ("dask:tls://[::1]:8786", "tls://[::1]:8786"),
         ("local", None),
-    ],
-)
-def test_an_address_is_read(compute, address):
-    assert scheduler_address(compute) == address
-    assert ComputeSettings(compute=compute).compute == compute
-
-
-@pytest.mark.parametrize(
-    "compute",
-    ["", "dask", "dask:", "dask:host", "dask:host:0", "dask:host:65536", "dask:http://h:1", "ray:h:1"],
-)
-def test_another_text_is_refused_in_one_sentence(compute):
-    with pytest.raises(ConfigError, match="'local' or the address of a Dask scheduler"):
-        ComputeSettings(compute=compute)
+    ):
+        assert scheduler_address(compute) == address
+        assert ComputeSettings(compute=compute).compute == compute
+    for text in (
+        "",
+        "dask",
+        "dask:",
+        "dask:host",
+        "dask:host:0",
+        "dask:host:65536",
+        "dask:http://h:1",
+        "ray:h:1",
+    ):
+        with pytest.raises(ConfigError, match="'local' or the address of a Dask scheduler"):
+            ComputeSettings(compute=text)
 
 
 def test_results_of_two_processes_come_in_the_order_of_their_tasks():
@@ -69,7 +73,6 @@ def test_local_results_come_in_order_while_tasks_are_still_made():
 
 
 def test_no_scheduler_is_one_sentence():
-    pytest.importorskip("distributed")
     with pytest.raises(TerrainError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9:"):
         computing("dask:127.0.0.1:9").__enter__()
 
@@ -79,15 +82,10 @@ def test_a_process_that_ends_is_one_sentence():
         list(parallel(os._exit, (), [(3,), (3,)], 2))
 
 
-def children_of(process):
-    """Return the processes that a process started, directly or not."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        with suppress(OSError):
-            words = stat.read_text().rpartition(")")[2].split()
-            if int(words[1]) == process and words[0] != "Z":
-                found += [int(stat.parent.name), *children_of(int(stat.parent.name))]
-    return found
+def is_over(process):
+    with suppress(psutil.NoSuchProcess):
+        return process.status() == psutil.STATUS_ZOMBIE
+    return True
 
 
 @pytest.mark.parametrize("request_to_end", [signal.SIGTERM, signal.SIGKILL])
@@ -102,7 +100,10 @@ def test_no_process_is_left_where_the_command_is_ended(request_to_end):
     try:
         assert command.stdout.readline() == "begun\n"
         end_s = time.monotonic() + 60
-        while len(started := children_of(command.pid)) < 3 and time.monotonic() < end_s:
+        while (
+            len(started := psutil.Process(command.pid).children(recursive=True)) < 3
+            and time.monotonic() < end_s
+        ):
             time.sleep(0.1)
         assert len(started) >= 3  # two that compute, one that keeps count of files
         time.sleep(2.0)
@@ -110,17 +111,9 @@ def test_no_process_is_left_where_the_command_is_ended(request_to_end):
         command.send_signal(request_to_end)
         command.communicate()
     end_s = time.monotonic() + 20
-    while any(map(running, started)) and time.monotonic() < end_s:
+    while not all(map(is_over, started)) and time.monotonic() < end_s:
         time.sleep(0.1)
-    assert not any(map(running, started))
-
-
-def running(process):
-    """Return whether a process is there and is not one that ended already."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    assert all(map(is_over, started))
 
 
 def test_software_that_differs_is_named():
@@ -133,7 +126,6 @@ def test_software_that_differs_is_named():
 @pytest.fixture(scope="module")
 def threads_cluster():
     """A cluster in this process."""
-    distributed = pytest.importorskip("distributed")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with distributed.LocalCluster(
@@ -181,74 +173,90 @@ def test_a_cluster_without_workers_is_one_sentence(monkeypatch):
             computing("dask:" + empty.scheduler_address).__enter__()
 
 
-@pytest.fixture
-def cluster_processes(tmp_path, monkeypatch):
-    """A scheduler without workers; ``add_worker`` adds them."""
-    pytest.importorskip("distributed")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(HERE))
-    from dask_processes import processes
+class Processes:
+    """A scheduler and workers in processes of their own, on loopback."""
 
-    with processes() as running:
-        yield running
+    def __init__(self):
+        self.port, self.started = open_port(host="127.0.0.1"), []
+        self.compute = f"dask:127.0.0.1:{self.port}"
+        self.scheduler = self.start("dask_scheduler", f"--port {self.port}")
+        end_s = time.monotonic() + 60
+        while time.monotonic() < end_s:
+            with suppress(OSError):
+                socket.create_connection(("127.0.0.1", self.port), timeout=1).close()
+                return
+            time.sleep(0.1)
+        raise AssertionError("the scheduler did not start")
+
+    def start(self, module, options):
+        words = [sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", "--no-dashboard"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        self.started.append(subprocess.Popen([*words, *options.split()], env=environment, **quiet))
+        return self.started[-1]
+
+    def add_worker(self, nanny="--no-nanny"):
+        return self.start("dask_worker", f"tcp://127.0.0.1:{self.port} --nthreads 1 {nanny}")
+
+    def disturbed(self, disturb):
+        """Compute many tasks, and disturb the cluster when the first is done."""
+        with computing(self.compute):
+            for number, _ in enumerate(parallel(time.sleep, (), [(0.2,)] * 200, 1)):
+                if number == 0:
+                    disturb()
+
+
+@pytest.fixture
+def processes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    running = Processes()
+    yield running
+    for process in running.started:
+        process.kill()
+        process.wait()
 
 
 @pytest.mark.slow
-def test_a_killed_worker_costs_its_task_only(cluster_processes):
-    import tasks
-
-    first, _ = cluster_processes.add_worker("--no-nanny"), cluster_processes.add_worker("--no-nanny")
-    table = np.arange(1e5)
-    with computing(cluster_processes.compute):
-        found = []
-        for result in parallel(tasks.slowly, (table,), [(k,) for k in range(20)], 1):
+def test_a_killed_worker_costs_its_task_only(processes):
+    first, _ = processes.add_worker(), processes.add_worker()
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(300, 300)))[0]
+    powers = [2**12 + number for number in range(40)]
+    found = []
+    with computing(processes.compute):
+        for result in parallel(np.linalg.matrix_power, (turn,), [(power,) for power in powers], 1):
             found.append(result)
             if len(found) == 3:
                 first.kill()
-    assert found == [k + table.sum() for k in range(20)]
-
-
-def disturbed(running, disturb):
-    """Compute many tasks, and disturb the cluster when the first is done."""
-    import tasks
-
-    with computing(running.compute):
-        for number, _ in enumerate(parallel(tasks.slowly, (np.ones(3),), [(k,) for k in range(200)], 1)):
-            if number == 0:
-                disturb()
+    for power, result in zip(powers, found, strict=True):
+        np.testing.assert_allclose(result, np.linalg.matrix_power(turn, power), atol=1e-9)
 
 
 @pytest.mark.slow
-def test_a_dead_scheduler_is_one_sentence_soon(cluster_processes):
-    cluster_processes.add_worker("--no-nanny")
+def test_a_dead_scheduler_is_one_sentence_soon(processes):
+    processes.add_worker()
     with pytest.raises(TerrainError, match=r"does not answer any more"):
-        disturbed(cluster_processes, lambda: cluster_processes.scheduler.kill())
+        processes.disturbed(lambda: processes.scheduler.kill())
 
 
 @pytest.mark.slow
-def test_a_stopped_scheduler_is_one_sentence_in_a_bounded_time(cluster_processes, monkeypatch):
+def test_a_stopped_scheduler_is_one_sentence_in_a_bounded_time(processes, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
-    cluster_processes.add_worker("--no-nanny")
+    processes.add_worker()
     with pytest.raises(TerrainError, match=r"does not answer any more"):
-        disturbed(cluster_processes, lambda: cluster_processes.scheduler.send_signal(signal.SIGSTOP))
+        processes.disturbed(lambda: processes.scheduler.send_signal(signal.SIGSTOP))
 
 
 @pytest.mark.slow
-def test_tasks_that_end_their_worker_are_one_sentence(cluster_processes):
-    import tasks
-
-    cluster_processes.add_worker("--nanny")
-    with (
-        pytest.raises(TerrainError, match="were killed or ran out of memory"),
-        computing(cluster_processes.compute),
-    ):
-        list(parallel(tasks.end_process, (), [(0,)], 1))
+def test_tasks_that_end_their_worker_are_one_sentence(processes):
+    processes.add_worker("--nanny")
+    with computing(processes.compute), pytest.raises(TerrainError, match="were killed or ran out of memory"):
+        list(parallel(os._exit, (), [(3,)], 1))
 
 
 @pytest.mark.slow
-def test_no_worker_left_is_one_sentence(cluster_processes, monkeypatch):
+def test_no_worker_left_is_one_sentence(processes, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
     monkeypatch.setattr(cluster, "NO_WORKER_S", 2.0)
-    worker = cluster_processes.add_worker("--no-nanny")
+    worker = processes.add_worker()
     with pytest.raises(TerrainError, match=r"no worker of .* has taken a task"):
-        disturbed(cluster_processes, lambda: worker.kill())
+        processes.disturbed(worker.kill)
