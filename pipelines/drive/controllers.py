@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from pipelines.learn.model_file import TerrainModel
+from pipelines.live.classifying import Classifier
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import Classifier, KnownTerrain, TerrainSource
 from pipelines.report import Progress, silent
 from terrain.control.controllers import Controller, Source
 from terrain.control.situations import Situation, simulate_situation
 from terrain.control.slip_table import SlipTable
+from terrain.control.terrain_source import KnownTerrain, TerrainSource
 from terrain.errors import ConfigError
 from terrain.records import RunLog
 from terrain.robots import Robot

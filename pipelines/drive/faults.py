@@ -18,7 +18,6 @@ import numpy as np
 from pipelines.drive.drive import ALL
 from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import KnownTerrain
 from pipelines.report import (
     NOT_KNOWN,
     Column,
@@ -59,6 +58,7 @@ from terrain.control.fault_situations import STOP, make_fault_situation
 from terrain.control.learned_table import simulated_table
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
+from terrain.control.terrain_source import KnownTerrain
 from terrain.errors import ConfigError
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
 from terrain.simulation.faults.catalogue import fault_catalogue, select_faults

@@ -15,7 +15,6 @@ from typing import NamedTuple
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.model import LiveModel
 from pipelines.live.state import Bias, LiveState, restorable
-from pipelines.live.terrain_source import TerrainSource
 from terrain.control.pilot_settings import check_table
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import (
@@ -26,6 +25,7 @@ from terrain.control.switching import (
     output_status,
     update,
 )
+from terrain.control.terrain_source import TerrainSource
 from terrain.estimation.ekf.resident import BIASES, ResidentFilter
 from terrain.estimation.live.choice import Estimate, Filter
 from terrain.estimation.live.clocks import Clocks, ClockWatch

@@ -8,9 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from pipelines.live.chain import Chain, Step
-from pipelines.live.classifying import ClassifierThread, WindowOutput
+from pipelines.live.classifying import Classifier, ClassifierThread, WindowOutput
 from pipelines.live.model import LiveModel
-from pipelines.live.terrain_source import Classifier
 from pipelines.live.windows import live_estimator
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import SWITCHING, SwitchSettings, TerrainBelief, check_switching, drive_on

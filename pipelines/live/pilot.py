@@ -17,13 +17,14 @@ from dataclasses import replace
 import numpy as np
 
 from pipelines.live.chain import Chain, CommandStatus, Step
+from pipelines.live.classifying import PILOT_FILTER
 from pipelines.live.model import LiveModel
 from pipelines.live.state import LiveState
-from pipelines.live.terrain_source import PILOT_FILTER, TerrainSource
 from terrain.control.pilot_settings import DEFAULT_SETTINGS, OPEN_LOOP, PilotSettings, check_pilot
 from terrain.control.robot_control import RobotControl
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import OutputStatus
+from terrain.control.terrain_source import TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.control.wheel_controllers import PERIOD_S
 from terrain.estimation.live.clocks import Clocks, numbers
@@ -57,7 +58,8 @@ class LivePilot(Chain):
 
     Examples
     --------
-    >>> from terrain.control.traction import TractionStatus
+    >>> from terrain.control.terrain_source import TerrainSource
+    from terrain.control.traction import TractionStatus
     >>> from terrain.robots import load_robot
     >>> pilot = LivePilot(load_robot("agrimaro"), load_slip_table())
     >>> command = pilot.step(Sample(0.0, np.array([0.5, 0.0, 0.0]), {}))  # nothing is known yet

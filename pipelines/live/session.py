@@ -7,7 +7,6 @@ table, which are read only, and the thread that classifies.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import monotonic, time
@@ -16,21 +15,21 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipelines.live.chain import Chain, CommandStatus
-from pipelines.live.classifying import ClassifierThread, WindowOutput
+from pipelines.live.classifying import Classifier, ClassifierThread, WindowOutput
 from pipelines.live.model import LiveModel
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import SessionRecorder
 from pipelines.live.state import LiveState
-from pipelines.live.terrain_source import Classifier
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import TerrainBelief
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.live.clocks import SessionClock, StreamHealth, as_numbers
+from terrain.estimation.live.arrivals import Inbox, StreamHealth, as_numbers
+from terrain.estimation.live.clocks import SessionClock
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.skid_live import LiveSkidEstimate
-from terrain.records import Array, Command, Reading, Sample, SlipTarget
+from terrain.records import Array, Command, Sample, SlipTarget
 from terrain.robots import Robot
 
 TWIST_FRESH_S = 0.5
@@ -38,9 +37,6 @@ TWIST_FRESH_S = 0.5
 
 COMMAND_VALID_S = 0.25
 """What drives the wheels has to stop them when it has had no newer command for so long."""
-
-MAX_QUEUED = 20_000
-"""Rows of a stream that wait for a step: some seconds at a kilohertz; of more, the oldest are left out."""
 
 _NO_TWIST = np.zeros(3)
 
@@ -130,71 +126,6 @@ class StepOutput(NamedTuple):
     status: CommandStatus
     observation: Observation
     latency_s: float
-
-
-class Inbox:
-    """Queue rows of streams, in the order in which they come.
-
-    Parameters
-    ----------
-    channels : number of columns by stream
-
-    Attributes
-    ----------
-    received : rows taken, by stream
-    refused : rows or readings that were not taken, by reason
-
-    Examples
-    --------
-    >>> inbox = Inbox({"imu": 2})
-    >>> inbox.put("imu", [0.0, 0.01], [[1.0, 2.0], [3.0, None]])
-    0.01
-    >>> inbox.take()["imu"].values.tolist()
-    [[1.0, 2.0], [3.0, nan]]
-    >>> inbox.put("imu", [0.0], [[1.0]]), dict(inbox.refused)
-    (None, {'imu: not rows of 2 numbers': 1})
-    """
-
-    def __init__(self, channels: Mapping[str, int]) -> None:
-        self._n_columns = dict(channels)
-        self._queued: dict[str, list[Reading]] = {name: [] for name in channels}
-        self._n_queued = dict.fromkeys(channels, 0)
-        self.received: Counter[str] = Counter()
-        self.refused: Counter[str] = Counter()
-
-    def put(self, stream: str, time_s: Any, values: Any) -> float | None:
-        """Queue rows; return their newest stamp, or None where they were refused and counted."""
-        n_columns = self._n_columns.get(stream)
-        if n_columns is None:
-            self.refused["stream that was not announced"] += 1
-            return None
-        stamps, rows = as_numbers(time_s), as_numbers(values)
-        if stamps is None or rows is None or rows.shape != (stamps.size, n_columns) or stamps.ndim != 1:
-            self.refused[f"{stream}: not rows of {n_columns} numbers"] += 1
-            return None
-        if not stamps.size:
-            return None
-        queued = self._queued[stream]
-        queued.append(Reading(stamps, rows))
-        self.received[stream] += stamps.size
-        self._n_queued[stream] += stamps.size
-        while self._n_queued[stream] > MAX_QUEUED and len(queued) > 1:
-            n = queued.pop(0).time_s.size
-            self._n_queued[stream] -= n
-            self.refused[f"{stream}: too many wait"] += n
-        finite = stamps[np.isfinite(stamps)]
-        return float(finite.max()) if finite.size else None
-
-    def take(self) -> dict[str, Reading]:
-        """Return what is queued, as one reading a stream, and empty the queue."""
-        found = {}
-        for stream, queued in self._queued.items():
-            if queued:
-                found[stream] = (
-                    Reading(*map(np.concatenate, zip(*queued, strict=True))) if queued[1:] else queued[0]
-                )
-                self._queued[stream], self._n_queued[stream] = [], 0
-        return found
 
 
 class RobotSession:

@@ -32,9 +32,8 @@ from pipelines.data.can_codec import (
 )
 from pipelines.data.can_logs import Receiver
 from pipelines.live.chain import Chain, CommandStatus
-from pipelines.live.classifying import ClassifierThread
+from pipelines.live.classifying import Classifier, ClassifierThread
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import Classifier
 from pipelines.live.windows import filtered
 from pipelines.report import (
     Column,

@@ -16,10 +16,10 @@ from features.windows import label_windows
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.settings import ReadSettings, load
 from pipelines.live.chain import Chain
+from pipelines.live.classifying import Classifier
 from pipelines.live.model import LiveModel
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import Classifier
 from pipelines.live.windows import filtered, needs_filter
 from pipelines.report import (
     Column,

@@ -18,10 +18,9 @@ import uvicorn
 
 from pipelines.learn.load import load_model
 from pipelines.learn.model_file import TerrainModel
-from pipelines.live.classifying import classify_window
+from pipelines.live.classifying import Classifier, classify_window
 from pipelines.live.pilot import LivePilot
 from pipelines.live.session import Served
-from pipelines.live.terrain_source import Classifier
 from pipelines.live.windows import filtered
 from pipelines.serve.app import make_app
 from pipelines.serve.guard import Watched, is_loopback, required_token

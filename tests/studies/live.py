@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 
 from features.windows import cut_windows
 from pipelines.learn.load import load_model
-from pipelines.live.classifying import ClassifierThread, classify_window
+from pipelines.live.classifying import Classifier, ClassifierThread, classify_window
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import Classifier
 from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -42,9 +42,6 @@ set."""
 BEHIND_S, N_BEHIND = 1.0, 5
 """A reading that is so far behind the newest stamp of its stream is late, or its clock was set where so many
 follow each other: late ones are fewer."""
-
-LOST_AFTER_S, PERIODS = 0.5, 3.0
-"""A stream that gives nothing for so long is lost; of one that is slower, so many of its periods."""
 
 _FLOATS = np.dtype(np.float64)
 
@@ -80,31 +77,6 @@ def numbers(value: Any) -> Array | None:
         return array.astype(np.float64, copy=False)
     except Exception:
         return None
-
-
-def as_numbers(given: Any) -> Array | None:
-    """Return numbers as an array of floats, NaN for None; None where anything else is among them.
-
-    Examples
-    --------
-    >>> as_numbers([1, None]), as_numbers(["1"]), as_numbers([True])
-    (array([ 1., nan]), None, None)
-    """
-    if not isinstance(given, Sequence | np.ndarray) or isinstance(given, str | bytes):
-        return None
-    try:
-        array = np.asarray(given)
-        if array.dtype.kind in "fiu":
-            return array.astype(np.float64, copy=False)
-        if array.dtype.kind != "O" or not all(map(_is_number, array.ravel().tolist())):
-            return np.empty(array.shape) if array.size == 0 else None
-        return array.astype(np.float64)
-    except (TypeError, ValueError, OverflowError, RecursionError, MemoryError):
-        return None
-
-
-def _is_number(value: Any) -> bool:
-    return value is None or (type(value) is float) or (type(value) is int and abs(value) < 2**63)
 
 
 class _StreamClock:
@@ -341,52 +313,3 @@ def last_stamp_s(samples: Mapping[str, Reading], stream: str) -> float:
         return float(samples[stream][0][-1])
     except (TypeError, ValueError, LookupError, OverflowError):
         return math.nan
-
-
-class StreamHealth:
-    """Judge whether each stream comes, and keep its last values.
-
-    Parameters
-    ----------
-    channels : by stream
-
-    Examples
-    --------
-    >>> health = StreamHealth({"imu": ("gyro_z_radps",)})
-    >>> health.take({"imu": Reading(np.array([1.0]), np.array([[0.1]]))}, 1.0)
-    >>> health.health(1.2), health.health(2.0)
-    ({'imu': 'fresh'}, {'imu': 'lost'})
-    """
-
-    def __init__(self, channels: Mapping[str, Sequence[str]]) -> None:
-        self._channels = {stream: tuple(names) for stream, names in channels.items()}
-        self._last_s = dict.fromkeys(channels, math.nan)
-        self._period_s = dict.fromkeys(channels, 0.0)
-        self._values: dict[str, Array] = {}
-
-    def take(self, readings: Mapping[str, Reading], time_s: float) -> None:
-        """Note what came by a time of the robot's clock."""
-        for stream, reading in readings.items():
-            if not len(reading.values):
-                continue
-            step_s = (time_s - self._last_s[stream]) / len(reading.values)
-            if 0.0 < step_s < 10.0:
-                self._period_s[stream] = step_s
-            self._last_s[stream], self._values[stream] = time_s, reading.values[-1]
-
-    def health(self, time_s: float) -> dict[str, str]:
-        """Return ``fresh``, ``not finite`` or ``lost`` by stream."""
-        found = {}
-        for stream, last_s in self._last_s.items():
-            allowed_s = max(LOST_AFTER_S, PERIODS * self._period_s[stream])
-            if not abs(time_s - last_s) <= allowed_s:  # True for NaN, and a clock that was set back
-                found[stream] = "lost"
-            else:
-                found[stream] = "fresh" if np.isfinite(self._values[stream]).all() else "not finite"
-        return found
-
-    def last(self, stream: str, channels: Sequence[str]) -> Array:
-        """Return the last values of some channels; NaN where there is none."""
-        values = self._values.get(stream)
-        known = {} if values is None else dict(zip(self._channels[stream], values, strict=True))
-        return np.array([known.get(name, math.nan) for name in channels])

@@ -17,7 +17,6 @@ from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import run_figures
 from pipelines.learn.model_file import TerrainModel
-from pipelines.live.terrain_source import TerrainEstimate
 from pipelines.report import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.control.controllers import CONTROLLERS, make_controller
@@ -32,6 +31,7 @@ from terrain.control.pilot_settings import PilotStatus
 from terrain.control.power_state import DriveState
 from terrain.control.situations import SituationOptions, make_situation
 from terrain.control.slip_table import CurveEntry, SlipTable, load_slip_table
+from terrain.control.terrain_source import TerrainEstimate
 from terrain.robots import load_robot
 
 SHORT = Settings(

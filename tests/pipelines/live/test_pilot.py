@@ -9,13 +9,13 @@ import pytest
 
 from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import KnownTerrain
 from terrain.control.controllers import make_controller
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
 from terrain.control.pid import Gains
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.situations import SituationOptions, make_situation, start_times
 from terrain.control.slip_table import load_slip_table
+from terrain.control.terrain_source import KnownTerrain
 from terrain.control.traction import TractionStatus
 from terrain.control.traction_settings import SETTINGS
 from terrain.errors import ConfigError

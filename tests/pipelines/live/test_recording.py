@@ -21,11 +21,10 @@ from pipelines.data.inspect import run as inspect_runs
 from pipelines.learn.crossval import EvaluationSettings
 from pipelines.learn.predict import predict
 from pipelines.learn.protocols import samples_of
-from pipelines.live.classifying import WindowOutput
+from pipelines.live.classifying import Classifier, WindowOutput
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread, SessionRecorder
-from pipelines.live.terrain_source import Classifier
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import LogError
 from terrain.estimation.live.estimator import CHANNELS as OF_SWERVE

@@ -9,12 +9,12 @@ import pytest
 
 from pipelines.drive.faults import fault_loop
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import TerrainEstimate, TerrainSource
 from terrain.control.fault_drives import FaultCase, Place, drive_case, drive_references, evaluate_case
 from terrain.control.fault_evaluation import LIMITS
 from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.switching import OutputStatus
+from terrain.control.terrain_source import TerrainEstimate, TerrainSource
 from terrain.records import Sample
 from terrain.robots import load_robot
 from terrain.slip_learning.laws import LAW_PARAMETERS

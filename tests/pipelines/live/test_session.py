@@ -9,16 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.live.chain import CommandStatus
+from pipelines.live.classifying import Classifier
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.session import TWIST_FRESH_S, RobotSession, Served, SessionRequest
-from pipelines.live.terrain_source import Classifier
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.live.clocks import StreamHealth
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.logs.replay import replay
-from terrain.records import Reading
 from terrain.robots import load_robot
 
 ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
@@ -333,12 +331,3 @@ def test_what_is_kept_is_as_old_as_the_last_sample_over_any_number_of_restarts(
     assert again.restore(session.state()).terrain == "b"
     clock["now_s"] = 1016.0  # it sent nothing meanwhile
     assert third.restore(again.state()).terrain == ""
-
-
-def test_a_stream_that_ended_before_the_clock_was_set_back_is_lost():
-    health = StreamHealth({"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
-    reading = Reading(np.array([0.0]), np.array([[0.1]]))
-    health.take({"imu": reading, "wheels": reading}, 5000.0)
-    for k in range(20):
-        health.take({"imu": reading}, 1000.0 + 0.1 * k)
-    assert health.health(1002.0) == {"imu": "fresh", "wheels": "lost"}

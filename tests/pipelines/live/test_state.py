@@ -20,9 +20,9 @@ from pipelines.live.state import (
     save_state,
     to_text,
 )
-from pipelines.live.terrain_source import KnownTerrain
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
+from terrain.control.terrain_source import KnownTerrain
 from terrain.errors import DataError
 from terrain.logs.replay import replay
 from terrain.robots import load_robot

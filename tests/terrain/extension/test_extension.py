@@ -280,7 +280,7 @@ EDGES = {
     "pipelines/slip/filtered.py",
     "terrain/slip_learning/learn.py",
     "pipelines/live/windows.py",
-    "pipelines/live/terrain_source.py",
+    "pipelines/live/classifying.py",
     "pipelines/live/pilot.py",
 }
 """Where a run as measured meets the robot as described."""

@@ -10,10 +10,16 @@ import numpy as np
 import pytest
 
 from features.windows import cut_windows
-from pipelines.live.classifying import ClassifierThread, WindowOutput, classify_window
+from pipelines.live.classifying import (
+    AT_MOST,
+    MAX_WAITING,
+    Classifier,
+    ClassifierThread,
+    WindowOutput,
+    classify_window,
+)
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.terrain_source import AT_MOST, MAX_WAITING, Classifier, KnownTerrain, TerrainSource
 from terrain.control.pilot_settings import PilotSettings, PilotStatus
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import SWITCHING, OutputStatus
@@ -49,7 +55,7 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(swerve_model, 
         shown.append(window)
         return classify_window(model, window)
 
-    monkeypatch.setattr("pipelines.live.terrain_source.classify_window", classify)
+    monkeypatch.setattr("pipelines.live.classifying.classify_window", classify)
     classifier, estimator = Classifier(swerve_model, ROBOT), LiveEstimator(ROBOT)
     for sample in replay(survey):
         new = classifier.update(sample, estimator.step(sample.readings))
@@ -111,15 +117,6 @@ def test_a_model_that_requires_a_missing_channel_is_refused(swerve_model, stream
     )
 
 
-def test_a_known_terrain_is_given_once_a_change_and_no_terrain_never():
-    known = KnownTerrain(lambda terrain: {"clay": "grass"}.get(terrain, terrain))
-    terrains = ["", "clay", "clay", "", "clay", "snow", "snow", ""]
-    samples = [Sample(float(k), np.zeros(3), {}, terrain) for k, terrain in enumerate(terrains)]
-    found = [tuple(one) for sample in samples for one in known.update(sample, [])]
-    assert found == [(1.0, "grass", 1.0), (5.0, "snow", 1.0)]
-    assert not any(TerrainSource().update(sample, []) for sample in samples)
-
-
 # What a model says of a window, and the thread that asks it
 
 
@@ -176,7 +173,7 @@ def gate(monkeypatch):
             raise KeyError("unforeseen")
         return WindowOutput(window.start_s[0], 0.0, "a", 1.0, np.ones(1), ("a",), nearest=model.info.rule)
 
-    monkeypatch.setattr("pipelines.live.terrain_source.feed_of", feed_of)
+    monkeypatch.setattr("pipelines.live.classifying.feed_of", feed_of)
     event, thread = threading.Event(), ClassifierThread(classify)
     yield event, thread
     event.set()
