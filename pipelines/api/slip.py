@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from pipelines.slip.estimate import Estimates, estimate_runs
-from pipelines.slip.table import LearnedSlipTable, learn_slip_table
+from pipelines.slip.learn_slip import learn_slip_table
+from pipelines.slip.table import LearnedSlipTable
 from terrain.records import RunLog
 from terrain.robots import Robot
 
@@ -37,7 +38,7 @@ def learn_slip(tracks: Estimates | Iterable[RunLog], robot: Robot, **options: An
     ----------
     tracks : what :func:`estimate` returned, or runs
     robot : whose they are
-    options : as :func:`pipelines.slip.table.learn_slip_table`
+    options : as :func:`pipelines.slip.learn_slip.learn_slip_table`
     """
     runs = tracks.runs if isinstance(tracks, Estimates) else tracks
     return learn_slip_table(list(runs), robot, **options)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic import field_validator
 
 from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 
 if TYPE_CHECKING:
     from pipelines.explain.explanation import ExplainResult
     from pipelines.report import Progress
-    from terrain.effects import Effect
     from terrain.records import RunLog
     from terrain.robots import Robot
 
@@ -25,12 +25,9 @@ RESULTS = ("pipelines.explain.explanation",)
 PAGE_FILE, EXTENDED_FILE, NEXT_FILE = "report.html", "extended.yaml", "next_drive.yaml"
 
 
-class Settings(AlignedRunsSettings):
-    """Runs to explain, and the simulation under test."""
+class ExplainOptions(BaseSettings):
+    """What may be named, of which runs, and how the gain is measured."""
 
-    robot: str = setting(..., "Robot whose simulation is tested: name or YAML file.")
-    out: Path = setting(..., "Folder of the page and of the extended robot.")
-    model: str | None = setting(None, "Extended description of that robot, tested in its place.")
     effects: tuple[str, ...] | None = setting(None, "Effects that may be named, by commas; all by default.")
     terrain: str | None = setting(None, "Use only runs of this label.")
     hold_out: int | None = setting(
@@ -39,8 +36,23 @@ class Settings(AlignedRunsSettings):
     classifier: bool = setting(
         False, "Also train a classifier in simulation, before and after; takes a minute."
     )
-    pictures: str = setting("6", "Most runs that the page draws: a number, or 'all'.")
     seed: int = setting(0, "Of the choice of held-out runs, and of the bootstrap.", ge=0)
+
+    @field_validator("effects")
+    @classmethod
+    def _check_effects(cls, effects: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        if effects == ():
+            raise ValueError("--effects names none; leave it out for all of them")
+        return effects
+
+
+class Settings(ExplainOptions, AlignedRunsSettings):
+    """Runs to explain, and the simulation under test."""
+
+    robot: str = setting(..., "Robot whose simulation is tested: name or YAML file.")
+    out: Path = setting(..., "Folder of the page and of the extended robot.")
+    model: str | None = setting(None, "Extended description of that robot, tested in its place.")
+    pictures: str = setting("6", "Most runs that the page draws: a number, or 'all'.")
 
     @field_validator("pictures")
     @classmethod
@@ -64,52 +76,51 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     """
     from dataclasses import replace
 
+    import numpy as np
     import yaml
 
     from terrain.discrepancy.extend import extended_effects
     from terrain.errors import ConfigError
     from terrain.extension import extended_yaml
     from terrain.files.atomic import atomic_write, ensure_writable
+    from terrain.robots import load_robot
 
     runs, skipped = load(settings)
-    robot = tested_robot(settings.robot, settings.model)
-    extended_file = settings.out / EXTENDED_FILE
+    out, model = settings.out, settings.model
+    robot = tested = load_robot(settings.robot)
+    if model is not None:
+        tested = load_robot(model)
+        if tested.name != robot.name:
+            raise ConfigError(f"--model is of the robot {tested.name!r}, --robot is {robot.name!r}")
+        if tested.effects and not np.isfinite(tested.effects_cov).all():
+            raise ConfigError(f"{model}: its effects have no covariance, which a model that is tested needs")
+    extended_file = out / EXTENDED_FILE
     if extended_file.exists():
         raise ConfigError(f"{extended_file}: is there already and is not overwritten; choose another --out")
-    ensure_writable(settings.out)
-    description = settings.model or settings.robot
+    ensure_writable(out)
+    description = model or settings.robot
+    options = {name: getattr(settings, name) for name in ExplainOptions.model_fields}
     found = explain_runs(
-        runs,
-        robot,
-        effects=settings.effects,
-        terrain=settings.terrain,
-        hold_out=settings.hold_out,
-        classifier=settings.classifier,
-        seed=settings.seed,
-        data=settings.dataset,
-        description=description,
-        progress=progress,
+        runs, tested, data=settings.dataset, description=description, progress=progress, **options
     )
     result = replace(
         found,
-        model=settings.model,
+        model=model,
         skipped=tuple(skipped),
         n_pictures=None if settings.pictures == "all" else int(settings.pictures),
-        page=settings.out / PAGE_FILE,
+        page=out / PAGE_FILE,
         extended_file=None if found.extended is None else extended_file,
     )
     if result.extended is not None:
         source = f"terrain explain, {result.diagnosis.n_runs} runs of {settings.dataset or 'a data set'}"
-        effects = extended_effects(robot, result.diagnosis)
-        text = extended_yaml(description, *effects, source, result.extended.region)
-        atomic_write(extended_file, text)
-    next_drive = result.diagnosis.next_drive
-    if next_drive is None:
-        (settings.out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result
+        effects = extended_effects(tested, result.diagnosis)
+        atomic_write(extended_file, extended_yaml(description, *effects, source, result.extended.region))
+    if (drive := result.diagnosis.next_drive) is None:
+        (out / NEXT_FILE).unlink(missing_ok=True)  # of an earlier result
     else:
-        text = yaml.safe_dump(next_drive._asdict(), sort_keys=False, allow_unicode=True, width=10_000)
-        atomic_write(settings.out / NEXT_FILE, text)
-    result.report.save(settings.out / PAGE_FILE)
+        text = yaml.safe_dump(drive._asdict(), sort_keys=False, allow_unicode=True, width=10_000)
+        atomic_write(out / NEXT_FILE, text)
+    result.report.save(out / PAGE_FILE)
     return result
 
 
@@ -117,14 +128,10 @@ def explain_runs(
     runs: Sequence[RunLog],
     robot: Robot | str,
     *,
-    effects: Sequence[str] | None = None,
-    terrain: str | None = None,
-    hold_out: int | None = None,
-    classifier: bool = False,
-    seed: int = 0,
     data: str = "",
     description: str | None = None,
     progress: Progress | None = None,
+    **options: Any,
 ) -> ExplainResult:
     """Return what the simulation of a robot gets wrong about its runs, extend it, and measure the gain.
 
@@ -132,14 +139,10 @@ def explain_runs(
     ----------
     runs : of the robot, three or more
     robot : whose simulation is tested, with the effects that its description has; or its name
-    effects : names of those that may be named; all that apply to its drive by default
-    terrain : use only runs of this label
-    hold_out : runs held out to measure the gain; a quarter of six or more by default
-    classifier : also train a classifier in simulation, before and after
-    seed : of the choice of held-out runs, and of the bootstrap
     data : name of the data set, for the report
     description : of the robot, for the report and the suggested command; its name by default
     progress : called with steps that are done
+    options : fields of :class:`ExplainOptions`, as ``hold_out`` or ``terrain``
 
     Returns
     -------
@@ -164,23 +167,25 @@ def explain_runs(
     from terrain.discrepancy.robot_terms import in_robot_terms
     from terrain.discrepancy.statements import statements_of, terrains_apart
     from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain
+    from terrain.effects import chosen_effects, showing
     from terrain.extension import region_of
     from terrain.logs.digest import data_digest
     from terrain.robots import load_robot
 
-    progress = progress or silent
+    asked, progress = ExplainOptions(**options), progress or silent
     robot = load_robot(robot) if isinstance(robot, str) else robot
     description = description or robot.name
-    library = _library(robot, effects)
-    chosen = runs_of_terrain(runs, terrain)
+    names, seed = asked.effects, asked.seed
+    library = showing(robot.drive, robot.effects) if names is None else chosen_effects(robot.drive, names)
+    chosen = runs_of_terrain(runs, asked.terrain)
     check_robots(chosen, robot)
-    diagnosed = diagnose_runs(chosen, robot, library, hold_out, seed)
+    diagnosed = diagnose_runs(chosen, robot, library, asked.hold_out, seed)
     progress("diagnose", 1, 1)
     gained = held_out_gain(diagnosed, robot, seed)
     progress("gain", 1, 1)
     diagnosis, extended = diagnosed.diagnosis, None
     if diagnosed.extended is not None:
-        if classifier and diagnosed.held_out:
+        if asked.classifier and diagnosed.held_out:
             from pipelines.explain.classifier import classifier_gain
 
             before, after = diagnosed.simulation.effects, diagnosed.extended.effects
@@ -192,7 +197,7 @@ def explain_runs(
         data=data,
         data_digest=data_digest(runs),
         description=description,
-        terrain=terrain,
+        terrain=asked.terrain,
         effects=tuple(effect.name for effect in library),
         seed=seed,
         robot=robot,
@@ -205,46 +210,3 @@ def explain_runs(
         terrains_apart=terrains_apart(diagnosis, diagnosed.compared),
         powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
     )
-
-
-def tested_robot(robot_name: str, model: str | None) -> Robot:
-    """Return the robot whose simulation is tested: as it is described, or extended.
-
-    Raises
-    ------
-    ConfigError
-        if the model is of another robot, or its effects have no covariance.
-    """
-    import numpy as np
-
-    from terrain.errors import ConfigError
-    from terrain.robots import load_robot
-
-    robot = load_robot(robot_name)
-    if model is None:
-        return robot
-    extended = load_robot(model)
-    if extended.name != robot.name:
-        raise ConfigError(f"--model is of the robot {extended.name!r}, --robot is {robot.name!r}")
-    if extended.effects and not np.isfinite(extended.effects_cov).all():
-        raise ConfigError(f"{model}: its effects have no covariance, which a model that is tested needs")
-    return extended
-
-
-def _library(robot: Robot, names: Sequence[str] | None) -> tuple[Effect, ...]:
-    """Return the effects that may be named, in the order of the catalogue."""
-    from terrain.effects import effect_named, library_of, showing
-    from terrain.errors import ConfigError
-
-    applicable = library_of(robot.drive)
-    if names is None:
-        return showing(robot.drive, robot.effects)
-    chosen = [effect_named(name) for name in names]
-    if not chosen:
-        raise ConfigError("--effects names none; leave it out for all of them")
-    for effect in chosen:
-        if effect not in applicable:
-            raise ConfigError(
-                f"effect {effect.name} does not apply to a robot with the drive {robot.drive!r}"
-            )
-    return tuple(effect for effect in applicable if effect in chosen)

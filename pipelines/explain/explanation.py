@@ -7,26 +7,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.explain.figures import (
-    dependence_figure,
-    parts_figure,
-    run_figure,
-    spectra_figure,
-    strongest_figure,
-)
+from pipelines.explain import figures
 from pipelines.explain.sentences import (
     PERCENT,
-    caveat_text,
     channel_label,
     effect_label,
     gain_text,
     in_words_of,
     limit_text,
     quantity_interval,
-    terrain_notes,
-    terrain_text,
-    undetected_text,
-    unexplained_text,
     value_with_interval,
     varying_text,
     verdict_text,
@@ -46,22 +35,22 @@ from pipelines.report import (
     quantity,
     sentence,
 )
+from pipelines.report.json_file import as_json
 from pipelines.report.versions import versions
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
-from terrain.discrepancy.filter_gain import Comparison
 from terrain.discrepancy.powertrain_answer import PowertrainAnswer
 from terrain.discrepancy.response_slopes import Slope
 from terrain.discrepancy.statements import (
     SESSION_COLUMNS,
     Statement,
-    session_notes,
+    notes_of,
     session_rows,
     split_ruled_out,
 )
 from terrain.discrepancy.verdict import Diagnosis
-from terrain.effects import LIBRARY
+from terrain.effects import effect_named
 from terrain.robots import Robot
 
 if TYPE_CHECKING:
@@ -81,6 +70,8 @@ ERROR_LABELS = {
 
 Z = ".1f"
 """Format of evidence in standard deviations."""
+
+WHY, NEEDS = Column("why", long=True), Column("driving that shows it", long=True)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -130,15 +121,11 @@ class ExplainResult(Result):
     @property
     def notes(self) -> tuple[str, ...]:
         """What a reader has to know of the terrains and sessions, in sentences."""
-        return terrain_notes(self.diagnosed.terrains, self.terrains_apart) + session_notes(self.diagnosis)
+        return notes_of(self.diagnosis, self.diagnosed.terrains, self.terrains_apart)
 
     def as_json(self) -> dict[str, Any]:
         """Return the described fields, those of the diagnosis, and what the runs were used for."""
-        from pipelines.report.json_file import as_json
-
-        runs, extended = self.diagnosed, None
-        if self.extended is not None:
-            extended = {"file": self.extended_file, "effects": self.extended.effects}
+        runs, extended = self.diagnosed, self.extended
         beside = {
             **self.diagnosis.as_json(),
             "built_in": runs.simulation.effects,
@@ -146,7 +133,7 @@ class ExplainResult(Result):
             "notes": self.notes,
             "used": [run.run_id for run in runs.used],
             "held_out": [run.run_id for run in runs.held_out],
-            "extended": extended,
+            "extended": extended and {"file": self.extended_file, "effects": extended.effects},
         }
         return {**super().as_json(), **as_json(beside)}
 
@@ -170,20 +157,19 @@ def report(result: ExplainResult) -> Report:
     lead = [f"{diagnosis.n_runs} runs compared"]
     if runs.held_out:
         lead.append(f"{len(runs.held_out)} held out for the gain")
-    lead += [name for name in (result.data, result.terrain) if name]
     picture = None
     if shown := result.gain.judged or runs.compared:  # held-out runs where there are any
         stretch = example_stretch(shown, runs.noise)
         there = channels_of([stretch])
         stated = [each.channel for each in result.statements if each.channel in there and each.found]
-        picture = run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
+        picture = figures.run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
     written = Report(
         title=f"What the simulation of {diagnosis.robot} gets wrong",
         answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain, result.gain.reason)}",
         picture=picture,
         parts=list(_decisive_parts(result)),
-        details=[Section(title, parts) for title, parts in _details(result).items() if parts],
-        lead=" · ".join(lead),
+        details=[section for section in _details(result) if section.parts],
+        lead=" · ".join([*lead, *filter(None, (result.data, result.terrain))]),
     )
     worded: Report = in_words_of(result.robot.drive, written)
     return replace(worded, next_step=result.next_command or "")
@@ -207,8 +193,9 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         yield Text(varying_text(each))
     if result.gain.nameless is not None:
         yield Text(result.gain.nameless.sentence)
-    if undetected := undetected_text(diagnosis):
-        yield Text(undetected)
+    if n := len(diagnosis.not_excited):
+        of = len(diagnosis.limits)
+        yield Text(f"Of {of} parameters that may be wrong, {n} could not have been detected.")
     for note in result.notes:
         yield Text(note, "note")
     for skipped in result.skipped:
@@ -218,26 +205,21 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
 
 
 def _causes(result: ExplainResult) -> Table:
-    rows, notes = [], ["Values are added to what the description has already."]
+    rows: list[tuple[Any, ...]] = []
+    notes = ["Values are added to what the description has already."]
     varying = {each.name for each in result.diagnosis.varying}
     for cause in result.diagnosis.causes:
+        label, terms = effect_label(cause.name), result.terms.get(cause.name, "")
         for place, value in enumerate(cause.values):
-            first = place == 0
+            numbers = quantity(value.name, value.value), quantity_interval(value)
             rows.append(
-                (
-                    effect_label(cause.name) if first else "",
-                    quantity(value.name, value.value),
-                    quantity_interval(value),
-                    cause.gain if first else None,
-                    cause.z if first else None,
-                    result.terms.get(cause.name, "") if first else "",
-                )
+                ("", *numbers, None, None, "") if place else (label, *numbers, cause.gain, cause.z, terms)
             )
         if cause.aliases:
             aliases = enumerated([effect_label(alias) for alias in cause.aliases])
-            notes.append(f"No log distinguishes {effect_label(cause.name)} from {aliases}.")
+            notes.append(f"No log distinguishes {label} from {aliases}.")
         if cause.caveat and cause.name not in varying:
-            notes.append(f"{effect_label(cause.name)}: {caveat_text(cause.caveat)}.")
+            notes.append(f"{label}: {cause.caveat}.")
     columns = (
         *("cause", "value", "95 %", Column("held-out gain", PERCENT), Column("z", Z)),
         Column("the robot has", long=True),
@@ -246,36 +228,36 @@ def _causes(result: ExplainResult) -> Table:
 
 
 def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:
-    effects = {effect.name: effect for effect in LIBRARY}
     rows = []
     for name in names:
-        needs = [effects[name].needs]
+        effect = effect_named(name)
+        needs = [effect.needs]
         needs += [
             f"{channel_label(channel)} distinguishes it from {effect_label(other)}"
-            for other, channel in effects[name].twins
+            for other, channel in effect.twins
             if other in names
         ]
         values = ", ".join(map(value_with_interval, diagnosis.ambiguous_values.get(name, ())))
         rows.append((effect_label(name), values, "; ".join(needs)))
-    return Table(("one of", "its value, if it acts alone", Column("driving that shows it", long=True)), rows)
+    return Table(("one of", "its value, if it acts alone", NEEDS), rows)
 
 
 def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
+    """Yield by channel what an extension and a black-box reference gain, and what it is for a filter or classifier."""
     gain, learned = found.gain, {} if found.nameless is None else found.nameless.channels
-    rows: list[tuple[Any, ...]] = []
     if gain is None:
-        for name, each in learned.items():
-            rows.append((*CHANNEL_WORDS[name], each.rms_before, each.ratio))
-        columns = ("channel", "unit", "rms", Column("square less by a black-box reference", PERCENT))
-        if rows:
+        if learned:
+            columns = ("channel", "unit", "rms", Column("square less by a black-box reference", PERCENT))
+            rows = [(*CHANNEL_WORDS[name], each.rms_before, each.ratio) for name, each in learned.items()]
             yield Table(columns, rows)
         return
+    gains: list[tuple[Any, ...]] = []
     for name, own in gain.channels.items():
         ratio, low, high = own.reduction
         remark = "" if not own.reduction.refused else "worse" if high < 0.0 else "no gain to claim"
         nameless = learned[name].ratio if name in learned else None
         sizes = (own.rms_before, own.rms_after, ratio, (low, high))
-        rows.append((*CHANNEL_WORDS[name], *sizes, remark, nameless))
+        gains.append((*CHANNEL_WORDS[name], *sizes, remark, nameless))
     excluded = enumerated([run.run_id for run in gain.excluded])
     note = (
         f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "
@@ -288,37 +270,27 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
             *("channel", "unit", "rms before", "after", Column("square less by", PERCENT)),
             *(Column("95 %", PERCENT), "", Column("by a black-box reference", PERCENT)),
         ),
-        rows,
+        gains,
         note=f"{note} Excluded as unfit: {excluded}." if excluded else note,
     )
-    for kind, title in COMPARISON_TITLES.items():
+    for kind, words in COMPARISON_TITLES.items():
         compared = found.comparisons.get(kind)
-        if compared is not None and (compared.errors or compared.reason):
-            yield _comparison(title.format(name=compared.name), compared)
+        if compared is None:
+            continue
+        title = words.format(name=compared.name)
+        if compared.reason:
+            yield Text(f"{title}: not measured: {compared.reason}.")
+        elif compared.errors:
+            changes = [
+                (*ERROR_LABELS[key], each.before, each.after, each.change_ci)
+                for key, each in compared.errors.items()
+            ]
+            yield Table(("figure", "unit", "before", "after", "change, 95 %"), changes, title)
 
 
-def _comparison(title: str, compared: Comparison) -> Part:
-    if compared.reason:
-        return Text(f"{title}: not measured: {compared.reason}.")
-    rows = [
-        (*ERROR_LABELS[key], each.before, each.after, each.change_ci) for key, each in compared.errors.items()
-    ]
-    return Table(("figure", "unit", "before", "after", "change, 95 %"), rows, title)
-
-
-def _details(result: ExplainResult) -> dict[str, list[Part]]:
-    """Return the folded parts by their heading."""
-    diagnosis, runs = result.diagnosis, result.diagnosed
+def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
+    """Yield the effects that were withdrawn, what is left unexplained, and the effects that are ruled out."""
     withdrawn, ruled_out = split_ruled_out(diagnosis)
-    found: dict[str, list[Part]] = {
-        "Channel by channel": [Pairs([tuple(each.text.split(": ", 1)) for each in result.statements])],
-        "Gain on held-out runs, channel by channel": list(_gain_parts(result.gain)),
-    }
-    open_parts: list[Part] = []
-    limits: list[Part] = []
-    health: list[Part] = []
-    found["What was withdrawn, and what is unexplained"] = open_parts
-    why, z = Column("why", long=True), Column("z", Z)
     if withdrawn:
         rows = [
             (
@@ -330,77 +302,89 @@ def _details(result: ExplainResult) -> dict[str, list[Part]]:
             for each in withdrawn
         ]
         note = "These effects reduce the residual, and something speaks against each as its cause."
-        open_parts.append(Table(("withdrawn", "value it would have", why, z), rows, note=note))
+        yield Table(("withdrawn", "value it would have", WHY, Column("z", Z)), rows, note=note)
     if diagnosis.unexplained:
+        alike = {each.name: f"resembles {effect_label(each.name)}, which was withdrawn" for each in withdrawn}
         unexplained = [
-            (channel_label(left.channel), unexplained_text(left, diagnosis), left.z, left.ratio or None)
+            (
+                channel_label(left.channel),
+                alike.get(left.input, f"depends on {left.input}"),
+                left.z,
+                left.ratio or None,
+            )
             for left in diagnosis.unexplained
         ]
         note = (
             "Beside all causes the residual of the channel depends on the input, and no effect of the library "
             "explains it. The input is the clearest of some thirty that were tried."
         )
-        columns = ("unexplained", "its residual", z, Column("part of its squared residual", PERCENT))
-        open_parts.append(Table(columns, unexplained, note=note))
+        part = Column("part of its squared residual", PERCENT)
+        yield Table(("unexplained", "its residual", Column("z", Z), part), unexplained, note=note)
     if ruled_out:
         excluded = [(effect_label(each.name), sentence(each.reason), each.z) for each in ruled_out]
-        open_parts.append(Table(("ruled out: these runs would have shown it", why, z), excluded))
-    if result.powertrain is not None:
-        found["From commanded to measured wheel speeds"] = [
-            *map(Text, result.powertrain.sentences),
-            Text(
-                "The simulation is given the measured wheel speeds, so that this is no part of the residuals. "
-                "Intervals hold 95 % over runs.",
-                "note",
-            ),
-        ]
+        yield Table(("ruled out: these runs would have shown it", WHY, Column("z", Z)), excluded)
+
+
+def _details(result: ExplainResult) -> Iterator[Section]:
+    """Yield all that the answer rests on; sections may be empty."""
+    diagnosis, runs = result.diagnosis, result.diagnosed
+    statements = [tuple(each.text.split(": ", 1)) for each in result.statements]
+    yield Section("Channel by channel", [Pairs(statements)])
+    yield Section("Gain on held-out runs, channel by channel", list(_gain_parts(result.gain)))
+    yield Section("What was withdrawn, and what is unexplained", list(_open_parts(diagnosis)))
+    if (powertrain := result.powertrain) is not None:
+        given = (
+            "The simulation is given the measured wheel speeds, so that this is no part of the residuals. "
+            "Intervals hold 95 % over runs."
+        )
+        stated = [*map(Text, powertrain.sentences), Text(given, "note")]
+        yield Section("From commanded to measured wheel speeds", stated)
     if coming := diagnosis.next_drive:
         slope = f", on a slope of {coming.grade_deg:g}°" if coming.grade_deg else ""
-        found["What to drive next"] = [
-            Text(f"Scenario {coming.scenario}{slope}: {coming.reason}. In simulation first:"),
-            Text(result.next_command or "", "code"),
-        ]
-    found["What the residuals depend on"] = list(_dependence_parts(runs))
+        why = f"Scenario {coming.scenario}{slope}: {coming.reason}. In simulation first:"
+        yield Section("What to drive next", [Text(why), Text(result.next_command or "", "code")])
+    yield Section("What the residuals depend on", list(_dependence_parts(runs)))
     whole: Sequence[ComparedRun] = [*runs.compared, *result.gain.judged]
     if result.n_pictures is not None:
         whole = telling_runs(whole, runs.noise, result.n_pictures)
-    found["Whole runs"] = [run_figure(run, runs.noise, channels_of([run])) for run in whole]
-    found["What would not have been detected"] = limits
-    missed = {limit.name for limit in diagnosis.not_excited}
-    for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
-        listed = [limit for limit in diagnosis.limits if (limit.name in missed) is is_missed]
-        if listed:
-            texts = [(limit_text(limit, is_missed), limit.needs) for limit in listed]
-            limits.append(
-                Table((Column(title, long=True), Column("driving that shows it", long=True)), texts)
-            )
-    limits.append(
-        Text("Not detected does not mean absent: at its limit an effect is found nine times in ten.", "note")
-    )
-    found["Health of the logs"] = health
+    drawn = [figures.run_figure(run, runs.noise, channels_of([run])) for run in whole]
+    yield Section("Whole runs", drawn)
+    yield Section("What would not have been detected", list(_limit_parts(diagnosis)))
+    health: list[Part] = []
     if diagnosis.excluded_runs:
-        health.append(Table(("excluded run", why), diagnosis.excluded_runs))
+        health.append(Table(("excluded run", WHY), diagnosis.excluded_runs))
     if diagnosis.clocks:
+        behind = Column("IMU and camera behind the wheels", ".1f", "ms")
+        columns = ("clock of the run", behind, Column("standard deviation", ".1f", "ms"))
         clocks = [(each.run_id, 1e3 * each.offset_s, 1e3 * each.std_s) for each in diagnosis.clocks]
-        columns_of_clocks = (
-            *("clock of the run", Column("IMU and camera behind the wheels", ".1f", "ms")),
-            Column("standard deviation", ".1f", "ms"),
-        )
-        health.append(Table(columns_of_clocks, clocks))
+        health.append(Table(columns, clocks))
+    yield Section("Health of the logs", health)
     built_in = [f"{name} {format_value(value)}" for name, value in runs.simulation.effects.items()]
     provenance: list[tuple[Any, ...]] = [
         ("data", f"{result.data} ({result.data_digest[:12]})"),
         ("description", result.description),
         ("effects built in already", ", ".join(built_in) or "none"),
-        ("terrain", terrain_text(runs.terrains)),
+        ("terrain", "; ".join(match.text for match in runs.terrains)),
         ("effects that may be named", f"{len(result.effects)}: {enumerated(result.effects)}"),
         ("runs behind the diagnosis", enumerated([run.run_id for run in runs.used])),
         ("runs held out, drawn by the seed", enumerated([run.run_id for run in runs.held_out]) or "none"),
         ("seed", result.seed),
         ("versions", versions()),
     ]
-    found["Where these numbers come from"] = [Pairs(provenance)]
-    return found
+    yield Section("Where these numbers come from", [Pairs(provenance)])
+
+
+def _limit_parts(diagnosis: Diagnosis) -> Iterator[Part]:
+    """Yield what would not have been detected: first the effects that the driving did not excite."""
+    missed = {limit.name for limit in diagnosis.not_excited}
+    for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
+        listed = [limit for limit in diagnosis.limits if (limit.name in missed) is is_missed]
+        if listed:
+            texts = [(limit_text(limit, is_missed), limit.needs) for limit in listed]
+            yield Table((Column(title, long=True), NEEDS), texts)
+    yield Text(
+        "Not detected does not mean absent: at its limit an effect is found nine times in ten.", "note"
+    )
 
 
 def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
@@ -414,7 +398,7 @@ def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
         )
         yield Table(SESSION_COLUMNS, rows, "By session", note)
     if runs.parts:
-        yield parts_figure(runs.parts)
+        yield figures.parts_figure(runs.parts)
     rows_of_residuals = [
         (*CHANNEL_WORDS[name], before.rms, before.noise, before.systematic, after.rms, after.systematic)
         for name, before in diagnosis.residual_before.items()
@@ -431,6 +415,8 @@ def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
     )
     if compared:
         channels = channels_of(compared)
-        yield strongest_figure(compared, channels)
-        yield spectra_figure(compared, runs.noise, runs.low_pass.cutoff_hz, channels)
-        yield Section("Every input", [dependence_figure(compared, runs.noise, name) for name in channels])
+        yield figures.strongest_figure(compared, channels)
+        yield figures.spectra_figure(compared, runs.noise, runs.low_pass.cutoff_hz, channels)
+        yield Section(
+            "Every input", [figures.dependence_figure(compared, runs.noise, name) for name in channels]
+        )

@@ -60,10 +60,7 @@ def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figur
 
 def strongest_figure(runs: Sequence[ComparedRun], channels: Sequence[str]) -> Figure:
     """Return the mean residual of each channel over the input on which it depends most."""
-    panels = []
-    for name in channels:
-        key = strongest_input(runs, name)
-        panels.append(_panel(name, _means(runs, name, key), INPUT_LABELS[key]))
+    panels = [_means(runs, name, strongest_input(runs, name)) for name in channels]
     caption = (
         "Measured minus simulated: means over bins of the input on which the residual depends most, with 95 % "
         "intervals over runs. A residual that is noise depends on nothing: its means lie on zero."
@@ -73,15 +70,12 @@ def strongest_figure(runs: Sequence[ComparedRun], channels: Sequence[str]) -> Fi
 
 def dependence_figure(runs: Sequence[ComparedRun], noise: Noise, channel: str) -> Figure:
     """Return the mean residual of a channel over every input, time and run."""
-    inputs = [name for name in runs[0].inputs if spread_of(runs, name) > MIN_SPREAD]
-    panels = [_panel(channel, _means(runs, channel, key), INPUT_LABELS[key]) for key in inputs]
-    c = CHANNELS.index(channel)
+    panels = [_means(runs, channel, key) for key in runs[0].inputs if spread_of(runs, key) > MIN_SPREAD]
+    c, at = CHANNELS.index(channel), np.arange(1.0, len(runs) + 1)
+    sizes = [noise.size(run.pace_mps)[:, c] for run in runs]
     marks = []
-    for after, colour, kind in _kinds(runs):
-        residuals = [run.residual(after)[:, c] for run in runs]
-        sizes = [noise.size(run.pace_mps)[:, c] for run in runs]
-        means, halves = run_means(residuals, sizes, noise.filters[c])
-        marks.append(_points(kind, np.arange(1.0, len(runs) + 1), means, halves, colour))
+    for kind, colour, residuals in _residuals(runs, c):
+        marks.append(_points(kind, at, *run_means(residuals, sizes, noise.filters[c]), colour))
     panels.append(_panel(channel, marks, "run"))
     caption = (
         "Measured minus simulated. Intervals are over runs; those of single runs come from the noise, and do "
@@ -119,8 +113,8 @@ def spectra_figure(
     for name in channels:
         c, unit = CHANNELS.index(name), CHANNEL_WORDS[name][1]
         marks = []
-        for after, colour, kind in _kinds(runs):
-            frequency_hz, density = spectrum([run.residual(after)[:, c] for run in runs], rate_hz)
+        for kind, colour, residuals in _residuals(runs, c):
+            frequency_hz, density = spectrum(residuals, rate_hz)
             marks.append(Line(kind, frequency_hz, _decibels(density), colour))
         power = float(np.concatenate([noise.size(run.pace_mps)[:, c] ** 2 for run in runs]).mean())
         frequency_hz = np.geomspace(frequency_hz[0], rate_hz / 2, 100)
@@ -139,19 +133,18 @@ def _panel(channel: str, marks: Sequence[Mark], x_label: str = "") -> Panel:
     return Panel(marks, f"{words} [{unit}]", x_label=x_label)
 
 
-def _kinds(runs: Sequence[ComparedRun]) -> list[tuple[bool, int, str]]:
-    """Return before and, where anything was built in, after: with its colour and label."""
-    return [(False, VERMILION, BEFORE), *([(True, BLUE, AFTER)] if runs[0].after is not None else [])]
+def _residuals(runs: Sequence[ComparedRun], c: int) -> list[tuple[str, int, list[Array]]]:
+    """Return the residuals of a channel before and, where anything was built in, after: label, colour, by run."""
+    kinds = [(BEFORE, VERMILION, False), (AFTER, BLUE, True)][: 1 if runs[0].after is None else 2]
+    return [(kind, colour, [run.residual(after)[:, c] for run in runs]) for kind, colour, after in kinds]
 
 
-def _means(runs: Sequence[ComparedRun], channel: str, key: str) -> list[Points]:
+def _means(runs: Sequence[ComparedRun], channel: str, key: str) -> Panel:
     """Return the mean residual of a channel over an input, before and after."""
-    c, given = CHANNELS.index(channel), [run.inputs[key] for run in runs]
-    marks = []
-    for after, colour, kind in _kinds(runs):
-        at, means, halves = binned_means(given, [run.residual(after)[:, c] for run in runs])
-        marks.append(_points(kind, at, means, halves, colour))
-    return marks
+    given, marks = [run.inputs[key] for run in runs], []
+    for kind, colour, residuals in _residuals(runs, CHANNELS.index(channel)):
+        marks.append(_points(kind, *binned_means(given, residuals), colour))
+    return _panel(channel, marks, INPUT_LABELS[key])
 
 
 def _points(label: str, at: Array, values: Array, halves: Array, colour: int) -> Points:

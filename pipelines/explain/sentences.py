@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from pipelines.report import enumerated, format_value, interval, quantity
-from pipelines.report.numbers import NBSP, SI
+from pipelines.report import enumerated, format_value, interval, plural, quantity
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.gain import Gain
-from terrain.discrepancy.response_slopes import Slope
-from terrain.discrepancy.terrain_match import TerrainMatch
-from terrain.discrepancy.verdict import Diagnosis, Limit, Unexplained, Value, Varying
+from terrain.discrepancy.verdict import Diagnosis, Limit, Value, Varying
 from terrain.effects import PARAMETER, TRACKED
 
 SHOWN_RUNS = 5
@@ -23,8 +19,14 @@ SHOWN_RUNS = 5
 PERCENT = ".1%"
 """Format of ratios of squares, wherever one stands."""
 
-_WHEELS = re.compile(r"\bwheel radius\b|\b[Ww]heels?\b")
-_OF_TRACKS = {"wheel radius": "sprocket radius", "wheel": "track", "wheels": "tracks"}
+OF_TRACKS = {
+    "wheel radius": "sprocket radius",
+    "wheel": "track",
+    "wheels": "tracks",
+    "Wheel": "Track",
+    "Wheels": "Tracks",
+}
+"""Words for robots on wheels, and for those on tracks."""
 
 
 def effect_label(effect: str) -> str:
@@ -93,32 +95,15 @@ def gain_text(gain: Gain | None, reason: str | None) -> str:
     """Return what an extension gains on held-out runs, or why that was not measured."""
     if gain is None:
         return f"The gain on held-out runs was not measured: {reason}."
-    n = len(gain.run_ids)
+    n, (ratio, low, high) = len(gain.run_ids), gain.reduction
     runs = f"{n} held-out runs" if n != 1 else "one held-out run"
-    ratio, low, high = gain.reduction
-    square = (
-        f"{format_value(ratio, PERCENT)} ({interval(low, high, PERCENT)}) of the whitened squared residual"
+    removes = (
+        f"the extension removes {format_value(ratio, PERCENT)} ({interval(low, high, PERCENT)}) of the whitened "
+        "squared residual"
     )
-    if gain.refused:
-        return f"On {runs} no gain can be claimed: the extension removes {square}, which includes zero."
-    return f"On {runs} the extension removes {square}."
-
-
-def undetected_text(diagnosis: Diagnosis) -> str:
-    """Return of how many parameters these runs would show nothing; empty where there are none."""
-    n, of = len(diagnosis.not_excited), len(diagnosis.limits)
-    return f"Of {of} parameters that may be wrong, {n} could not have been detected." if n else ""
-
-
-def caveat_text(caveat: str) -> str:
-    r"""Return a caveat with units as they are written elsewhere.
-
-    Examples
-    --------
-    >>> caveat_text("it differs from run to run by 0.34 ratio")
-    'it differs from run to run by 0.34'
-    """
-    return re.sub(rf"(?<=\d) ({'|'.join(SI)})\b", lambda found: f"{NBSP}{SI[found[1]]}".rstrip(NBSP), caveat)
+    return (
+        f"On {runs} {f'no gain can be claimed: {removes}, which includes zero' if gain.refused else removes}."
+    )
 
 
 def varying_text(each: Varying) -> str:
@@ -128,27 +113,20 @@ def varying_text(each: Varying) -> str:
         f"The {effect_label(each.name)} differs from run to run: {mean} on average, with a standard "
         f"deviation of {scatter}."
     )
-    if each.groups:
-        parts = []
-        for group in each.groups:
-            n, shown = len(group.run_ids), ", ".join(group.run_ids[:SHOWN_RUNS])
-            more = ", ..." if n > SHOWN_RUNS else ""
-            parts.append(
-                f"{quantity(each.parameter, group.value)} in {n} run{'s' * (n != 1)} ({shown}{more})"
-            )
+    parts = []
+    for group in each.groups:
+        names = ", ".join(
+            (*group.run_ids[:SHOWN_RUNS], *(["..."] if len(group.run_ids) > SHOWN_RUNS else []))
+        )
+        parts.append(
+            f"{quantity(each.parameter, group.value)} in {plural(len(group.run_ids), 'run')} ({names})"
+        )
+    if parts:
         text += f" Two groups: {', and '.join(parts)}."
     if each.rivals:
         rivals = enumerated([effect_label(rival) for rival in each.rivals], "or")
         text += f" These runs do not distinguish that from {rivals}."
     return text
-
-
-def unexplained_text(left: Unexplained, diagnosis: Diagnosis) -> str:
-    """Return what a channel depends on: an input, or what resembles an effect that was withdrawn."""
-    withdrawn = {effect.name for effect in diagnosis.ruled_out if effect.values}
-    if left.input in withdrawn:
-        return f"resembles {effect_label(left.input)}, which was withdrawn"
-    return f"depends on {left.input}"
 
 
 def limit_text(limit: Limit, missed: bool) -> str:
@@ -179,45 +157,6 @@ def limit_text(limit: Limit, missed: bool) -> str:
     return f"{article} {name} {under} would not have been detected."
 
 
-def terrain_notes(matches: Sequence[TerrainMatch], apart: Mapping[str, Slope]) -> tuple[str, ...]:
-    """Return what a reader has to know of the terrains, in sentences.
-
-    Parameters
-    ----------
-    matches : on which the runs of each label were simulated
-    apart : measured over simulated by label, where labels clearly differ
-    """
-    notes = [
-        f"On {match.terrain} runs fit best if {100.0 * match.effective_ratio:.0f} % of the measured tilt "
-        "is a slope to drive up; the rest is attributed to a body that rides over bumps, which takes no "
-        "traction."
-        for match in matches
-        if match.effective_ratio is not None and match.effective_ratio < 1.0
-    ]
-    if apart:
-        each = enumerated([f"{slope.ratio:.2f} on {label}" for label, slope in apart.items()])
-        notes.append(
-            f"Terrains differ: measured over simulated is {each}. Explain each by itself with "
-            f"{enumerated([f'--terrain {label}' for label in apart], 'or')}."
-        )
-    return tuple(notes)
-
-
-def terrain_text(matches: Sequence[TerrainMatch]) -> str:
-    """Return on which terrain the runs of each label were simulated.
-
-    Examples
-    --------
-    >>> terrain_text([TerrainMatch("grass", "grass", 1.0), TerrainMatch("", None, None)])
-    'soil grass; runs without a label (or with several): default terrain'
-    """
-    texts = []
-    for match in matches:
-        name = f"label {match.terrain}" if match.terrain else "runs without a label (or with several)"
-        texts.append(f"soil {match.soil}" if match.soil else f"{name}: default terrain")
-    return "; ".join(texts)
-
-
 def in_words_of(drive: str, part: Any) -> Any:
     """Return a text, or a report with all its texts, in the words of robots of a drive.
 
@@ -231,7 +170,9 @@ def in_words_of(drive: str, part: Any) -> Any:
     if drive != TRACKED:
         return part
     if isinstance(part, str):
-        return _WHEELS.sub(_of_tracks, part)
+        for wheel, track in OF_TRACKS.items():
+            part = re.sub(rf"\b{wheel}\b", track, part)
+        return part
     if is_dataclass(part) and not isinstance(part, type):
         changed = {each.name: in_words_of(drive, getattr(part, each.name)) for each in fields(part)}
         return replace(part, **changed)
@@ -239,8 +180,3 @@ def in_words_of(drive: str, part: Any) -> Any:
         parts = [in_words_of(drive, each) for each in part]
         return type(part)(*parts) if hasattr(part, "_fields") else type(part)(parts)
     return part
-
-
-def _of_tracks(found: re.Match[str]) -> str:
-    word = _OF_TRACKS.get(found[0].lower(), found[0])
-    return word.capitalize() if found[0][0] == "W" else word

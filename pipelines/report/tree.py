@@ -8,11 +8,10 @@ written, so that screen and page show one number in one form.  A figure describe
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib import import_module
-from operator import attrgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
@@ -97,7 +96,7 @@ class Shown(NamedTuple):
     Parameters
     ----------
     title, form, unit, long : as :class:`Column`
-    of : attribute of a record, as ``case.seed``, or a function of it
+    of : attribute or key of a record, as ``case.seed``, or a function of it
     """
 
     title: str
@@ -114,16 +113,27 @@ def table(rows: Iterable[Any], columns: Sequence[Shown], title: str = "", note: 
     --------
     >>> table([1.5, 2.0], [Shown("speed", lambda row: row, ".1f", "m/s"), Shown("whole", "real")]).rows
     ((1.5, 1.5), (2.0, 2.0))
+    >>> table([{"speed": 1.5 + 2j}, {"speed": None}], [Shown("ahead", "speed.real", ".1f")]).rows
+    ((1.5,), (None,))
     """
     return Table(
         [Column(each.title, each.form, each.unit, long=each.long) for each in columns],
         tuple(
-            tuple(each.of(row) if callable(each.of) else attrgetter(each.of)(row) for each in columns)
+            tuple(each.of(row) if callable(each.of) else value_at(row, each.of) for each in columns)
             for row in rows
         ),
         title,
         note,
     )
+
+
+def value_at(record: Any, place: str) -> Any:
+    """Return what a record has at a place, as ``slip.interval``; None where a mapping has nothing there."""
+    for name in place.split("."):
+        if record is None:
+            return None
+        record = record.get(name) if isinstance(record, Mapping) else getattr(record, name)
+    return record
 
 
 @dataclass(frozen=True)

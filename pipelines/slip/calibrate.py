@@ -2,17 +2,92 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
-from pipelines.slip.modes import CalibrateSettings as Settings
-from pipelines.slip.modes import OdometrySettings, RobotSettings, SoilSettings, refuse_others
+from pydantic import field_validator
+
+from pipelines.data.settings import RunsSettings
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from pipelines.slip.modes import refuse_others
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipelines.report import Progress, Result
-    from pipelines.report.settings import Settings as BaseSettings
 
 EXAMPLE = "terrain calibrate --data raw/ --robot agrimaro --out mine.yaml"
+
+LAW_NAMES = (
+    "simulator",
+    *("bekker", "wong_reece", "ishigami", "ishigami_ding", "ishigami_travel"),
+    "inflow",
+)
+"""Laws of a wheel in sand; ``simulator`` is the one of ``terrain simulate``."""
+
+
+class RobotSettings(BaseSettings):
+    """The ground of a robot's runs (--what robot)."""
+
+    hard: tuple[str, ...] | None = setting(
+        None, "Labels of hard ground, by commas; those that slip next to nothing by default."
+    )
+
+
+class OdometrySettings(BaseSettings):
+    """Odometry of a tracked robot (--what odometry)."""
+
+    lengths: tuple[float, ...] = setting(
+        (2.0, 6.0), "Seconds after which poses are compared, by commas; windows of DRIVE have their own."
+    )
+    folds: int = setting(5, "Folds of whole runs.", ge=2)
+
+
+class SoilSettings(BaseSettings):
+    """Soil of a wheel testbed (--what soil)."""
+
+    laws: tuple[str, ...] = setting(
+        LAW_NAMES, "Laws to compare, by commas; the last one is reported in full."
+    )
+    check: Path | None = setting(
+        None, "Folder of further trials, which the last law predicts and no fit has."
+    )
+    draws: int = setting(60, "Bootstrap samples behind the intervals.", ge=2, le=10_000)
+
+    @field_validator("laws")
+    @classmethod
+    def _check_laws(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        unknown = [name for name in names if name not in LAW_NAMES]
+        if unknown or not names:
+            found = repr(unknown[0]) if unknown else "empty"
+            raise ValueError(f"--laws is {found}; choose among {', '.join(LAW_NAMES)}")
+        if names[-1] == "simulator":
+            raise ValueError("--laws ends in 'simulator'; the last one is a law of stresses, as 'inflow' is")
+        return tuple(dict.fromkeys(names))
+
+
+class Settings(SoilSettings, OdometrySettings, RobotSettings, RunsSettings):
+    """What is calibrated, and what is written."""
+
+    what: Literal["robot", "odometry", "soil"] = setting(
+        "robot",
+        "A robot's description; slip-compensated odometry of a tracked robot; the soil of a wheel testbed.",
+    )
+    robot: str | None = setting(None, "Robot by name, or its YAML file, to start from; of a soil none.")
+    out: Path | None = setting(
+        None, "New YAML file of the robot or of the slip model; of a soil a folder with a file a wheel."
+    )
+    figures: Path | None = setting(None, "Folder of pictures; of a soil.")
+    seed: int = setting(0, "Of folds and bootstrap; a robot's calibration draws nothing.", ge=0)
+
+
+GROUPS: dict[str, type[BaseSettings]] = {
+    "--what robot": RobotSettings,
+    "--what odometry": OdometrySettings,
+    "--what soil": SoilSettings,
+}
+"""Options of each mode, by what they are for."""
 
 
 def run(settings: Settings, progress: Progress) -> Result:
@@ -27,26 +102,12 @@ def run(settings: Settings, progress: Progress) -> Result:
     DataError
         if the runs do not show what is to be found.
     """
-    groups: dict[str, type[BaseSettings]] = {
-        "--what robot": RobotSettings,
-        "--what odometry": OdometrySettings,
-        "--what soil": SoilSettings,
-    }
-    refuse_others(settings, groups, f"--what {settings.what}", f"--what {settings.what}")
-    if settings.what == "soil":
-        from pipelines.slip.soil import calibrate_soil
-
-        if settings.robot is not None:
-            raise ConfigError("--robot: a soil is found from trials that name their wheels; leave it out")
-        return calibrate_soil(settings, progress)
-    if settings.robot is None:
+    refuse_others(settings, GROUPS, f"--what {settings.what}", f"--what {settings.what}")
+    if settings.what == "soil" and settings.robot is not None:
+        raise ConfigError("--robot: a soil is found from trials that name their wheels; leave it out")
+    if settings.what != "soil" and settings.robot is None:
         raise ConfigError(f"--robot is missing: --what {settings.what} starts from one")
-    if settings.figures is not None:
+    if settings.what != "soil" and settings.figures is not None:
         raise ConfigError(f"--figures is for --what soil, not for --what {settings.what}")
-    if settings.what == "odometry":
-        from pipelines.slip.odometry import calibrate_odometry
-
-        return calibrate_odometry(settings, settings.robot, progress)
-    from pipelines.slip.robot import calibrate_robot
-
-    return calibrate_robot(settings, settings.robot)
+    result: Result = import_module(f"pipelines.slip.{settings.what}").calibrate(settings, progress)
+    return result

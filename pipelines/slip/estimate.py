@@ -4,31 +4,107 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
+
+from pydantic import field_validator
 
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
-from pipelines.slip.modes import (
-    EstimateOptions,
-    Filter,
-    NoiseSettings,
-    PoseSettings,
-    SlipModelSettings,
-    refuse_existing,
-    refuse_others,
-)
+from pipelines.slip.modes import refuse_others
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.report import Figure, Progress, Report, Result
-    from pipelines.slip.filtered import EstimateResult, Keep
-    from pipelines.slip.measured import MeasuredSlipResult
-    from pipelines.slip.observed import ObservedResult
+    from pipelines.report import Figure, Progress, Report
+    from pipelines.slip.tracks import Keep, TracksResult
     from terrain.records import RunLog
     from terrain.robots import Robot
+
+EXAMPLE = "terrain estimate --data raw/ --filter vio15 --out runs/"
+
+Filter = Literal[
+    "encoder12",
+    "slip14",
+    "vio12",
+    "vio15",
+    "skid",
+    "tracked",
+    "slip-odometry",
+    "slip-learning",
+    "encoder-odometry",
+    "gyrodometry",
+    "endo",
+    "sideslip-kinematic",
+    "sideslip-dynamic",
+    "sideslip-multi",
+    "pose",
+]
+"""Filters, the numbers being those of their states; observers of slip of tracked robots, and of car-like
+ones; and ``pose``, slip against an outside measurement of motion."""
+
+Tuning = Literal["physical", "thesis", "likelihood"]
+"""Sources of a filter's noise."""
+
+
+class NoiseSettings(BaseSettings):
+    """Noise of filters."""
+
+    tuning: Tuning | None = setting(None, "Noise; the thesis' own for vio12, else physical.")
+    tune_on: tuple[str, ...] | None = setting(
+        None, "Runs, by commas, for the tuning 'likelihood'; the first three."
+    )
+
+
+class SlipModelSettings(BaseSettings):
+    """Slip model of observers."""
+
+    slip_model: Path | None = setting(
+        None,
+        "Slip model of a tracked robot on its ground, for slip-odometry and endo (terrain calibrate "
+        "--what odometry).",
+    )
+
+
+class PoseSettings(BaseSettings):
+    """Slip against a pose from outside (--filter pose)."""
+
+    window_s: float = setting(2.0, "Window length in s.", "--window", gt=0.0)
+    stride_s: float = setting(1.0, "From window to window in s.", "--stride", gt=0.0)
+    delay: str = setting(
+        "auto", "Delay of the outside measurement in s; 'auto' finds it, a session at a time."
+    )
+    predict: bool = setting(False, "Predict slip from currents and wheel speeds, on held-out runs.")
+    hold_out: tuple[str, ...] = setting(
+        (), "Sessions that predictions never train on, by commas; runs without a label never are."
+    )
+    rollers: bool = setting(False, "Of omni robots: rollers' friction by surface, load of the wheels.")
+    seed: int = setting(0, "Deals and draws runs.", ge=0)
+
+    @field_validator("delay")
+    @classmethod
+    def _check_delay(cls, text: str) -> str:
+        try:
+            within = text == "auto" or abs(float(text)) <= 5.0
+        except ValueError:
+            within = False
+        if not within:
+            raise ValueError(f"--delay is {text!r}; 'auto' or seconds from -5 to 5 are required")
+        return text
+
+    @property
+    def delay_s(self) -> float | None:
+        """The delay that is given; None where it is to be found."""
+        return None if self.delay == "auto" else float(self.delay)
+
+
+class EstimateOptions(PoseSettings, SlipModelSettings, NoiseSettings):
+    """How slip is found."""
+
+    filter: Filter = setting(..., "Filter or observer; 'pose' is slip against a pose from outside.")
+
 
 GROUPS: dict[str, type[BaseSettings]] = {
     "filters": NoiseSettings,
@@ -36,8 +112,6 @@ GROUPS: dict[str, type[BaseSettings]] = {
     "--filter pose": PoseSettings,
 }
 """Options of each mode, by what they are for."""
-
-EXAMPLE = "terrain estimate --data raw/ --filter vio15 --out runs/"
 
 
 class Settings(EstimateOptions, AlignedRunsSettings):
@@ -59,7 +133,7 @@ class Estimates:
     """
 
     runs: tuple[RunLog, ...]
-    result: Result
+    result: TracksResult
 
     @property
     def report(self) -> Report:
@@ -122,7 +196,7 @@ def estimate_runs(
     return Estimates(tuple(kept), result)
 
 
-def run(settings: Settings, progress: Progress) -> Result:
+def run(settings: Settings, progress: Progress) -> TracksResult:
     """Read runs, estimate, and write them with their tracks, and their pictures.
 
     Raises
@@ -131,31 +205,33 @@ def run(settings: Settings, progress: Progress) -> Result:
         if a run is in ``out`` already; nothing is written then.
     """
     from pipelines.data.settings import load
-    from pipelines.slip.measured import MeasuredSlipResult
     from pipelines.slip.shown import write_figures
+    from terrain.errors import LogError
     from terrain.files.atomic import ensure_writable
-    from terrain.logs.write import write_run
+    from terrain.logs.write import run_folder, write_run
     from terrain.robots import load_robot
 
     runs, skipped = load(settings)
-    if settings.out is not None:
-        refuse_existing(runs, settings.out)
-    if settings.figures is not None:
-        ensure_writable(settings.figures)
-    of_runs = None if settings.filter == "pose" else settings.figures  # pictures of a pose are of all runs
+    out, figures = settings.out, settings.figures
+    for folder in (out, figures):
+        if folder is not None:
+            ensure_writable(folder)
+    for each in runs:
+        if out is not None and (taken := run_folder(each.run_id, out)).exists():
+            raise LogError(f"{taken}: is there already, and is left as it is; choose another --out")
+    of_runs = None if settings.filter == "pose" else figures  # pictures of a pose are of all runs
 
-    def write(run: RunLog, figures: Callable[[], Mapping[str, Figure]]) -> None:
-        if settings.out is not None:
-            write_run(run, settings.out)
+    def write(run: RunLog, pictures: Callable[[], Mapping[str, Figure]]) -> None:
+        if out is not None:
+            write_run(run, out)
         if of_runs is not None:
-            write_figures(figures(), of_runs, svg=False)
+            write_figures(pictures(), of_runs, svg=False)
 
     robot = None if settings.robot is None else load_robot(settings.robot)
-    keep = None if settings.out is None and of_runs is None else write
-    result = _estimated(runs, robot, settings, progress, keep)
-    found: dict[str, Any] = {"out": settings.out, "skipped": tuple(skipped)}
-    if isinstance(result, MeasuredSlipResult) and settings.figures is not None:
-        found["figures"] = write_figures(result.pictures, settings.figures)
+    result = _estimated(runs, robot, settings, progress, write if out or of_runs else None)
+    found: dict[str, Any] = {"out": out, "skipped": tuple(skipped)}
+    if figures is not None and of_runs is None:
+        found["figures"] = write_figures(result.pictures, figures)
     return replace(result, **found)
 
 
@@ -165,21 +241,16 @@ def _estimated(
     options: EstimateOptions,
     progress: Progress,
     keep: Keep | None,
-) -> EstimateResult | ObservedResult | MeasuredSlipResult:
+) -> TracksResult:
     """Estimate by the mode that the filter names."""
     from terrain.estimation.observers.choice import OBSERVERS
 
-    observer, pose = options.filter in OBSERVERS, options.filter == "pose"
-    used = "observers" if observer else "--filter pose" if pose else "filters"
+    used, module = "filters", "filtered"
+    if options.filter == "pose":
+        used, module = "--filter pose", "measured"
+    elif options.filter in OBSERVERS:
+        used, module = "observers", "observed"
     refuse_others(options, GROUPS, used, f"--filter {options.filter}")
-    if pose:
-        from pipelines.slip.measured import measure_runs
-
-        return measure_runs(runs, robot, options, progress, keep)
-    if observer:
-        from pipelines.slip.observed import observe_runs
-
-        return observe_runs(runs, robot, options, progress, keep)
-    from pipelines.slip.filtered import filter_runs
-
-    return filter_runs(runs, robot, options, progress, keep)
+    mode = import_module(f"pipelines.slip.{module}")
+    result: TracksResult = mode.estimate_all(runs, robot, options, progress, keep)
+    return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,8 +12,9 @@ from pipelines.report.settings import setting
 
 if TYPE_CHECKING:
     from pipelines.report import Progress
-    from pipelines.slip.curves import LearnSlipResult
-    from pipelines.slip.steady import MeasuredTargets
+    from pipelines.slip.table import LearnedSlipTable
+    from terrain.records import RunLog
+    from terrain.robots import Robot
 
 EXAMPLE = "terrain learn-slip --data pull/ --robot agrimaro --out table.yaml"
 
@@ -26,7 +28,7 @@ class Settings(RunsSettings):
     seed: int = setting(0, "Of the bootstrap.", ge=0)
 
 
-def run(settings: Settings, progress: Progress) -> LearnSlipResult | MeasuredTargets:
+def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
     """Learn the table, write it and its pictures; what a swerve robot shows is logged with MLflow.
 
     Raises
@@ -37,9 +39,8 @@ def run(settings: Settings, progress: Progress) -> LearnSlipResult | MeasuredTar
         if a folder cannot be written.
     """
     from pipelines.data.settings import load
-    from pipelines.slip.curves import LearnSlipResult, log_curves
+    from pipelines.slip.curves import LearnedCurves, log_curves
     from pipelines.slip.shown import write_figures
-    from pipelines.slip.table import learn_slip_table
     from terrain.errors import ConfigError
     from terrain.files.atomic import ensure_writable
     from terrain.robots import SwerveRobot, load_robot
@@ -59,15 +60,53 @@ def run(settings: Settings, progress: Progress) -> LearnSlipResult | MeasuredTar
         runs, robot, seed=settings.seed, name=settings.out.stem, repair=settings.repair, progress=progress
     )
     table.save(settings.out)
-    result = table.result
-    files = () if settings.figures is None else write_figures(result.pictures, settings.figures)
+    files = () if settings.figures is None else write_figures(table.pictures, settings.figures)
     written = replace(
-        result,
+        table,
         table=settings.out,
         dataset=settings.dataset,
         figures=files,
-        skipped=(*skipped, *result.skipped),
+        skipped=(*skipped, *table.skipped),
     )
-    if isinstance(written, LearnSlipResult):
+    if isinstance(written, LearnedCurves):
         log_curves(written)
     return written
+
+
+def learn_slip_table(
+    runs: Sequence[RunLog],
+    robot: Robot,
+    *,
+    seed: int = 0,
+    name: str = "learned",
+    repair: bool = False,
+    progress: Progress | None = None,
+) -> LearnedSlipTable:
+    """Learn target slips; nothing is written.
+
+    Parameters
+    ----------
+    runs : labelled logs: of a swerve robot with motor currents, of others with an outside measurement of
+        motion
+    robot : whose they are
+    seed : of the bootstrap
+    name : of the table
+    repair : leave out runs that lack something, in place of refusing them
+    progress : gets the runs and terrains that are done
+
+    Raises
+    ------
+    ConfigError
+        if the robot lacks a section.
+    DataError
+        if no run has a label, one is another robot's or lacks currents or attitude, or none has a slip.
+    """
+    from pipelines.report import silent
+    from pipelines.slip.curves import learn_curves
+    from pipelines.slip.steady import learn_steady
+    from terrain.robots import SwerveRobot
+
+    progress = progress or silent
+    if isinstance(robot, SwerveRobot):
+        return learn_curves(runs, robot, seed, name, repair, progress)
+    return learn_steady(runs, robot, seed, name, progress)

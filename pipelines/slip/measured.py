@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -20,23 +19,19 @@ from pipelines.report import (
     Points,
     Progress,
     Report,
-    Result,
     Shown,
-    Table,
     Text,
     described,
     enumerated,
     format_value,
-    frame,
-    interval,
     sections,
-    silent,
+    sentence,
     table,
 )
-from pipelines.slip.filtered import Keep
+from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
 from terrain.logs.regimes import regime_of
-from terrain.measured_slip.delay import Delay, DelayStatus
+from terrain.measured_slip.delay import Delay
 from terrain.measured_slip.measure import (
     NO_ROLLERS,
     Measured,
@@ -50,16 +45,14 @@ from terrain.measured_slip.measure import (
 )
 from terrain.measured_slip.prediction_scores import Cases, PredictionFigures, predictions
 from terrain.measured_slip.rollers import RollerFindings
-from terrain.measured_slip.slips import MeasuredSlip, measured_slip
+from terrain.measured_slip.slips import measured_slip
 from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
 from terrain.measured_slip.wheel_distance import DistanceBound
-from terrain.records import Array, RunLog
+from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, as_drive
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from pipelines.slip.modes import PoseSettings
+    from pipelines.slip.estimate import EstimateOptions
 
 SHORT_S, SHORT_STRIDE_S = 0.5, 0.1
 """Windows of the stream ``slip`` that runs are written with."""
@@ -71,9 +64,11 @@ UNLABELLED = "(no label)"
 SLIP, FINE = ".3f", ".4f"
 
 
-@dataclass(frozen=True)
-class MeasuredSlipResult(Result):
+@dataclass(frozen=True, kw_only=True)
+class MeasuredSlipResult(TracksResult):
     """Slip measured from outside."""
+
+    rows: ClassVar[str] = "surfaces"
 
     robot: str = described("by name")
     window_s: float = described("length of windows", "s")
@@ -90,31 +85,19 @@ class MeasuredSlipResult(Result):
     )
     not_measured: tuple[str, ...] = described("a sentence for each run without a slip")
     n_runs: int = described("that were read")
-    out: Path | None = described("folder of the runs with their slip")
-    figures: tuple[str, ...] = described("files")
-    skipped: tuple[str, ...] = described("a sentence for each run that could not be read")
-    pictures: Mapping[str, Figure] = field(default_factory=dict)
-
-    def to_pandas(self) -> pd.DataFrame:
-        """Return a row a surface."""
-        return frame(self.surfaces)
+    figures: tuple[str, ...] = described("files", default=())
 
 
-def measure_runs(
+def estimate_all(
     runs: Sequence[RunLog],
     robot: Robot | None,
-    options: PoseSettings,
-    progress: Progress = silent,
-    keep: Keep | None = None,
+    options: EstimateOptions,
+    progress: Progress,
+    keep: Keep | None,
 ) -> MeasuredSlipResult:
-    """Measure the slip of runs, and on request predict it.
+    """Measure the slip of runs of one robot, as :func:`pipelines.slip.estimate.estimate_runs`.
 
-    Parameters
-    ----------
-    runs : of one robot
-    robot : whose they are; by default the one that they name
-    options : windows, delay, predictions
-    keep : gets each run with the stream ``slip``, over windows of :data:`SHORT_S`
+    ``keep`` gets each run with the stream ``slip``, over windows of :data:`SHORT_S`.
 
     Raises
     ------
@@ -124,52 +107,40 @@ def measure_runs(
         if the runs are of several robots, none has a slip, or predictions are asked for and there is nothing
         to predict from.
     """
-    robot = one_robot(runs, robot)
+    robot, seed = one_robot(runs, robot), options.seed
     if options.rollers:
         as_drive(OmniRobot, robot, NO_ROLLERS)
-    found = measure(
-        runs,
-        robot,
-        window_s=options.window_s,
-        stride_s=options.stride_s,
-        delay_s=options.delay_s,
-        seed=options.seed,
-        progress=progress,
-    )
+    asked: dict[str, Any] = {"window_s": options.window_s, "stride_s": options.stride_s, "seed": seed}
+    found = measure(runs, robot, **asked, delay_s=options.delay_s, progress=progress)
     if not found.slips:
         raise DataError(f"none of {len(runs)} runs has a slip; the first for this: {found.failed[0]}")
-    rng = np.random.default_rng(options.seed)
-    by_terrain: dict[str, list[MeasuredSlip]] = {}
-    for run, slip in zip(found.runs, found.slips, strict=True):
-        by_terrain.setdefault(single_terrain(run), []).append(slip)
-    names = sorted(by_terrain, key=lambda name: (name == "", name))
-    surfaces = tuple(surface_slip(name, by_terrain[name], rng) for name in names)
+    rng, by_terrain = np.random.default_rng(seed), found.by_terrain()
+    surfaces = tuple(surface_slip(name, own.slips, rng) for name, own in by_terrain.items())
     predicted = []
     if options.predict:
-        cases = cases_of(found.runs, found.slips, options.window_s)
-        predicted = predictions(cases, options.hold_out, options.seed, progress)
-    rollers = rollers_of(found, robot, options.seed) if options.rollers else None
-    result = MeasuredSlipResult(
+        cases = cases_of(found, options.window_s)
+        predicted = predictions(cases, options.hold_out, seed, progress)
+    rollers = rollers_of(found, robot, seed) if options.rollers else None
+    if keep is not None:
+        _hand_over(found, robot, keep, progress)
+    title = f"Slip of {robot.name}"
+    return MeasuredSlipResult(
         robot=robot.name,
-        window_s=options.window_s,
-        stride_s=options.stride_s,
-        seed=options.seed,
+        **asked,
         sources=dict(sorted(Counter(slip.source for slip in found.slips).items())),
         delays=found.delays,
         surfaces=surfaces,
         predictions=tuple(predicted),
         rollers=rollers,
         named=() if rollers is None else named_surfaces(found, robot, rollers),
-        distances=distances_of(found, robot, options.seed) if options.rollers else {},
+        distances=distances_of(found, robot, seed) if options.rollers else {},
         not_measured=tuple(found.failed),
         n_runs=len(runs),
-        out=None,
-        figures=(),
-        skipped=(),
+        pictures={
+            **_by_surface(title, options.window_s, surfaces, by_terrain),
+            "slip_by_motion": _by_motion(title, by_terrain),
+        },
     )
-    if keep is not None:
-        _hand_over(found, robot, keep, progress)
-    return replace(result, pictures=_figures(result, {name: by_terrain[name] for name in names}))
 
 
 def _hand_over(found: Measured, robot: Robot, keep: Keep, progress: Progress) -> None:
@@ -187,7 +158,7 @@ def _hand_over(found: Measured, robot: Robot, keep: Keep, progress: Progress) ->
         progress("write runs", done, len(found.runs))
 
 
-def cases_of(runs: Sequence[RunLog], measured: Sequence[MeasuredSlip], window_s: float) -> Cases:
+def cases_of(found: Measured, window_s: float) -> Cases:
     """Return the windows of runs whose slip was measured in steady motion.
 
     Raises
@@ -195,35 +166,34 @@ def cases_of(runs: Sequence[RunLog], measured: Sequence[MeasuredSlip], window_s:
     DataError
         if the runs have no currents, or no window has a slip.
     """
-    starts = {each.run_id: each.start_s[each.steady & np.isfinite(each.body_slip)] for each in measured}
-    chosen = [run for run in runs if starts.get(run.run_id, np.empty(0)).size]
-    if not chosen:
+    steady = {each.run_id: each for each in found.slips if each.known.size}
+    runs = [run for run in found.runs if run.run_id in steady]
+    if not runs:
         raise DataError(
             f"no window of {window_s:g} s has a measured slip in steady motion that could be predicted; a "
             "shorter --window may"
         )
-    rule = WindowRule(window_s, None, None)
-    layout = layout_of(chosen, ("wheels", "currents"), speeds=True)
-    windows = cut_windows(chosen, rule, layout=layout, starts_s=starts, skip_short=True).windows
-    extractor = ResponseExtractor(("wheels", "currents")).fit(windows)
-    slips = {
-        (each.run_id, round(float(start_s), 6)): slip
-        for each in measured
-        for start_s, slip in zip(each.start_s, each.body_slip, strict=True)
+    sets, rule = ("wheels", "currents"), WindowRule(window_s, None, None)
+    starts = {name: each.start_s[each.known] for name, each in steady.items()}
+    layout = layout_of(runs, sets, speeds=True)
+    windows = cut_windows(runs, rule, layout=layout, starts_s=starts, skip_short=True).windows
+    places = {
+        (name, round(float(each.start_s[k]), 6)): each.body_slip[k]
+        for name, each in steady.items()
+        for k in each.known
     }
-    slip = np.array(
-        [slips[run_id, round(float(s), 6)] for run_id, s in zip(windows.run_id, windows.start_s, strict=True)]
-    )
-    about = {run.run_id: (run.terrains, run.session, regime_of(run)) for run in chosen}
-    of_windows = [about[name] for name in windows.run_id]
+    slips = [
+        places[name, round(float(s), 6)] for name, s in zip(windows.run_id, windows.start_s, strict=True)
+    ]
+    about = {run.run_id: (single_terrain(run), run.session, regime_of(run)) for run in runs}
+    terrain, session, regime = zip(*(about[name] for name in windows.run_id), strict=True)
+    extractor = ResponseExtractor(sets).fit(windows)
     return Cases(
         extractor.transform(windows),
         extractor.columns_,
-        slip,
+        np.array(slips),
         windows.run_id.astype(str),
-        np.array([terrains[0] if len(terrains) == 1 else "" for terrains, _, _ in of_windows]),
-        np.array([session for _, session, _ in of_windows]),
-        np.array([regime for _, _, regime in of_windows]),
+        *(np.array(each) for each in (terrain, session, regime)),
     )
 
 
@@ -259,14 +229,16 @@ def report(result: MeasuredSlipResult) -> Report:
     """Return slip by surface, delays, predictions, and which runs have no slip and why."""
     title = f"median slip over {result.window_s:g} s, by surface"
     parts: list[Part] = [table(result.surfaces, SURFACES, title)]
-    parts += [Text(delay_sentence(*each)) for each in result.delays.items()]
+    parts += [
+        Text(f"Session {session}: {delay.sentence}" if session else sentence(delay.sentence))
+        for session, delay in result.delays.items()
+    ]
     if result.predictions:
         parts.append(
             table(result.predictions, PREDICTIONS, "slip predicted from currents and wheel speeds alone")
         )
     if result.rollers is not None:
-        parts.append(_roller_table(result.rollers))
-        parts += [Text(sentence) for sentence in _roller_sentences(result, result.rollers)]
+        parts += _roller_parts(result, result.rollers)
     spinning = [name for row in result.surfaces for name in row.spinning]
     if spinning:
         names = ", ".join(spinning[:8])
@@ -308,18 +280,8 @@ def _answer(result: MeasuredSlipResult) -> str:
     return f"No window of {result.window_s:g} s is covered by {sources}; a shorter --window may be."
 
 
-def delay_sentence(session: str, delay: Delay) -> str:
-    """Return in a sentence by how much the outside measurement is late."""
-    where = f"Session {session}: the" if session else "The"
-    if delay.status is DelayStatus.UNDETERMINED:
-        return f"{where} delay of the outside measurement was not found, and none is taken off."
-    return (
-        f"{where} outside measurement is {delay.delay_s:+.3f} s behind the wheels "
-        f"(± {1.96 * delay.std_s:.3f}), which is taken off."
-    )
-
-
-def _roller_table(found: RollerFindings) -> Table:
+def _roller_parts(result: MeasuredSlipResult, found: RollerFindings) -> list[Part]:
+    """Return what of the slip is the robot's own, which surfaces rollers name, and where the wheels are."""
     columns = (
         Shown("surface", str),
         Shown("roller friction", found.roller_ratio.get, SLIP),
@@ -330,109 +292,68 @@ def _roller_table(found: RollerFindings) -> Table:
     note = (
         "Friction of the rollers over the stiffness of traction, both in proportion to the load of a wheel."
     )
-    return table(found.roller_ratio, columns, "what makes it slip", note)
-
-
-def _roller_sentences(result: MeasuredSlipResult, found: RollerFindings) -> list[str]:
-    """Return what of the slip is the robot's own, which surfaces rollers name, and where the wheels are."""
-    loads = ", ".join(
-        f"{format_value(load, SLIP)} ({interval(*ends, SLIP)})"
-        for load, ends in zip(found.load_ratio, found.load_interval, strict=True)
-    )
-    sentences = [
-        f"Load of the wheels: {loads}.",
-        f"Slip alike in all directions on all surfaces: {format_value(found.scale_error, SLIP)} "
-        f"({interval(*found.scale_interval, SLIP)}); the wheels' radius or the scale of the outside "
-        "measurement, which these runs do not distinguish.",
-    ]
-    for name, other in found.other_loads.items():
-        before, after = (format_value(rms, FINE) for rms in found.other_rms[name])
-        text = ", ".join(format_value(load, SLIP) for load in other)
-        sentences.append(
-            f"{name}: the surface is {found.other_surface[name]}, the load of the wheels {text}, by which "
-            f"{before} of RMS falls to {after}."
-        )
+    sentences = list(found.sentences)
     for each in result.named:
-        if each.n_right is not None:
-            of = "fitted" if each.group in found.roller_ratio else "not fitted"
-            sentences.append(
-                f"{each.group}, {of}: {each.n_right} of {each.n_runs} runs are named by their slip."
-            )
-            continue
-        counts = ", ".join(f"{name} {n}" for name, n in sorted(each.windows.items(), key=lambda x: -x[1]))
-        sentences.append(f"{each.group or UNLABELLED}: windows of {each.n_runs} runs look like {counts}.")
-    for name, bound in result.distances.items():
-        sentences.append(
-            f"{name}: turns are those of wheels {format_value(bound.distance_m, FINE, 'm')} from the middle "
-            f"that turn without slip ({interval(*bound.interval_m, FINE)}, {bound.n_runs} runs)."
+        known = (
+            "" if each.n_right is None else ", fitted" if each.group in found.roller_ratio else ", not fitted"
         )
-    return sentences
+        sentences.append(f"{each.group or UNLABELLED}{known}: {each.text}.")
+    sentences += [f"{name}: {bound.sentence}" for name, bound in result.distances.items()]
+    return [table(found.roller_ratio, columns, "what makes it slip", note), *map(Text, sentences)]
 
 
-def _figures(
-    result: MeasuredSlipResult, by_terrain: Mapping[str, Sequence[MeasuredSlip]]
+def _by_surface(
+    title: str, window_s: float, surfaces: Sequence[SurfaceSlip], by_terrain: Mapping[str, Measured]
 ) -> dict[str, Figure]:
-    """Return slip by surface, a run a point, and by the direction of travel or the turn, a window a point."""
-    rows, rng = result.surfaces, np.random.default_rng(0)
-    names = tuple(row.terrain or UNLABELLED for row in rows)
-    low, high = np.array([row.interval for row in rows]).T
-    bars = Bars("median, 95 % over runs", names, np.array([row.slip_ratio for row in rows]), low, high)
-    points = []
-    for place, (name, row) in enumerate(zip(names, rows, strict=True)):
-        known = [
-            slip.body_slip[slip.steady & np.isfinite(slip.body_slip)] for slip in by_terrain[row.terrain]
-        ]
+    """Return slip by surface, and a run a point."""
+    names = [row.terrain or UNLABELLED for row in surfaces]
+    low, high = np.array([row.interval for row in surfaces]).T
+    bars = Bars("median, 95 % over runs", names, np.array([row.slip_ratio for row in surfaces]), low, high)
+    points, rng = [], np.random.default_rng(0)
+    for place, (name, own) in enumerate(zip(names, by_terrain.values(), strict=True)):
+        known = [each.body_slip[each.known] for each in own.slips]
         medians = np.array([np.median(each) for each in known if each.size])
         if medians.size:
             points.append(Points(name, medians, place + rng.uniform(-0.22, 0.22, medians.size)))
-    label = f"slip ratio of the body over {result.window_s:g} s"
+    label = f"slip ratio of the body over {window_s:g} s"
     figures = {
         "slip_by_surface": Figure(
-            f"Slip of {result.robot} by surface, measured from outside",
+            f"{title} by surface, measured from outside",
             (Panel((bars,)),),
             "The median over runs and its 95 % interval over runs.",
             x_label=label,
-        ),
+        )
     }
     if points:
         figures["slip_by_run"] = Figure(
-            f"Slip of {result.robot}, a run a point",
-            (Panel(tuple(points), "surface"),),
+            f"{title}, a run a point",
+            (Panel(points, "surface"),),
             "The median of each run; surfaces one above another.",
             x_label=label,
         )
-    return figures | {"slip_by_motion": _by_motion(result, by_terrain)}
+    return figures
 
 
-def _by_motion(result: MeasuredSlipResult, by_terrain: Mapping[str, Sequence[MeasuredSlip]]) -> Figure:
-    rolled = np.concatenate([slip.rolled_twist for slips in by_terrain.values() for slip in slips])
+def _by_motion(title: str, by_terrain: Mapping[str, Measured]) -> Figure:
+    """Return slip by the direction of travel or, of robots that only drive ahead, the turn; a window a point."""
+    rolled = np.concatenate([slip.rolled_twist for own in by_terrain.values() for slip in own.slips])
     with np.errstate(invalid="ignore"):
         sideways = np.nanmean(np.abs(rolled[:, 1]) > 0.1 * np.abs(rolled[:, 0])) > MIN_SIDEWAYS
     marks = []
-    for terrain, slips in by_terrain.items():
-        rows = [slip.steady & np.isfinite(slip.body_slip) for slip in slips]
-        twist = np.concatenate([slip.rolled_twist[row] for slip, row in zip(slips, rows, strict=True)])
-        ratio = np.concatenate([slip.body_slip[row] for slip, row in zip(slips, rows, strict=True)])
+    for terrain, own in by_terrain.items():
+        twist = np.concatenate([slip.rolled_twist[slip.known] for slip in own.slips])
+        ratio = np.concatenate([slip.body_slip[slip.known] for slip in own.slips])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            turn = twist[:, 2] / np.abs(twist[:, 0])
+        at = np.degrees(np.arctan2(twist[:, 1], twist[:, 0])) if sideways else turn
         if ratio.size:
-            marks.append(Points(terrain or UNLABELLED, _motion(twist, sideways), ratio))
-    return Figure(
-        f"Slip of {result.robot} by how it was driven, a window a point",
-        (
-            Panel(
-                tuple(marks),
-                "slip ratio of the body",
-                x_range=(-180.0, 180.0) if sideways else (-3.0, 3.0),
-            ),
-        ),
-        "A window of steady motion a point.",
-        x_label="direction of travel in the body's axes [degrees]"
-        if sideways
-        else "yaw rate of the wheels over their speed [rad/m]",
-    )
-
-
-def _motion(twist: Array, sideways: bool) -> Array:
+            marks.append(Points(terrain or UNLABELLED, at, ratio))
+    reach, label = 3.0, "yaw rate of the wheels over their speed [rad/m]"
     if sideways:
-        return np.degrees(np.arctan2(twist[:, 1], twist[:, 0]))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(twist[:, 2] / np.abs(twist[:, 0]))
+        reach, label = 180.0, "direction of travel in the body's axes [degrees]"
+    return Figure(
+        f"{title} by how it was driven, a window a point",
+        (Panel(marks, "slip ratio of the body", x_range=(-reach, reach)),),
+        "A window of steady motion a point.",
+        x_label=label,
+    )

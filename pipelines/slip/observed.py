@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from operator import itemgetter
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,71 +17,59 @@ from pipelines.report import (
     Points,
     Progress,
     Report,
-    Result,
     Shown,
-    Strip,
     described,
     enumerated,
     format_value,
-    frame,
     interval,
     plural,
     sections,
-    silent,
 )
-from pipelines.slip.filtered import Keep, next_step
-from pipelines.slip.shown import MAX_PICTURED, TRUTH_COLOUR, band, first_rows, line, spans
+from pipelines.slip.shown import first_rows
+from pipelines.slip.tracks import (
+    SLIP,
+    TRUTH_COLOUR,
+    Keep,
+    TracksResult,
+    estimate_each,
+    estimated,
+    line,
+    next_step,
+    spans,
+)
 from terrain.errors import ConfigError
 from terrain.estimation.observers.choice import BY_MODEL
 from terrain.estimation.observers.estimate import ObserverEstimate, observe_run, with_estimates
 from terrain.estimation.observers.family import ObserverStatus
 from terrain.estimation.observers.slip_model_file import read_slip_model
-from terrain.estimation.observers.summary import SETTLED, ObservedSlip, ObserverSummary, summarize_observer
+from terrain.estimation.observers.summary import SETTLED, ObserverSummary, summarize_observer
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, packaged_robot
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from pipelines.slip.modes import EstimateOptions
+    from pipelines.slip.estimate import EstimateOptions
 
 LATE_S = 2.0
 """Time from the start that does not set the limits of an axis: estimates begin where nothing is known."""
 
-SLIP = "+.4f"
 
-
-@dataclass(frozen=True)
-class ObservedResult(Result):
+@dataclass(frozen=True, kw_only=True)
+class ObserverResult(TracksResult):
     """Estimates of runs by an observer."""
 
     filter: str = described("which observer")
     slip_model: Path | None = described("file of the slip model that it has")
-    out: Path | None = described("folder that the runs were written to")
     runs: tuple[ObserverSummary, ...] = described("figures of each run; slip positive in traction")
-    skipped: tuple[str, ...] = described("a sentence for each run that a repairing read left out", default=())
-    pictures: Mapping[str, Figure] = field(default_factory=dict)
-
-    def to_pandas(self) -> pd.DataFrame:
-        """Return a row a run."""
-        return frame(self.runs)
 
 
-def observe_runs(
+def estimate_all(
     runs: Sequence[RunLog],
     robot: Robot | None,
     options: EstimateOptions,
-    progress: Progress = silent,
-    keep: Keep | None = None,
-) -> ObservedResult:
-    """Run an observer over runs.
-
-    Parameters
-    ----------
-    runs : logs
-    robot : whose they are; by default each that a run names
-    options : observer and slip model
-    keep : gets each run with its estimates
+    progress: Progress,
+    keep: Keep | None,
+) -> ObserverResult:
+    """Run an observer over runs, as :func:`pipelines.slip.estimate.estimate_runs`.
 
     Raises
     ------
@@ -92,46 +78,38 @@ def observe_runs(
     DataError
         if a log has no wheels.
     """
-    if options.slip_model is not None and options.filter not in (*BY_MODEL, "encoder-odometry"):
-        raise ConfigError(f"filter {options.filter!r} takes no slip model: leave --slip-model out")
-    rows: list[ObserverSummary] = []
-    pictures: dict[str, Figure] = {}
-    for done, run in enumerate(runs):
+    name, file = options.filter, options.slip_model
+    if file is not None and name not in (*BY_MODEL, "encoder-odometry"):
+        raise ConfigError(f"filter {name!r} takes no slip model: leave --slip-model out")
+
+    def observe(run: RunLog) -> ObserverEstimate:
         own = robot or packaged_robot(run.robot)
-        model = None if options.slip_model is None else read_slip_model(options.slip_model, own.name)
-        found = observe_run(run, own, options.filter, model)
-        rows.append(summarize_observer(found))
-        if keep is not None:
-            keep(with_estimates(found), partial(figures_of, found))
-        pictures |= figures_of(found) if done < MAX_PICTURED else {}
-        progress(f"estimate {options.filter}", done + 1, len(runs))
-    return ObservedResult(options.filter, options.slip_model, None, tuple(rows), (), pictures)
+        return observe_run(run, own, name, None if file is None else read_slip_model(file, own.name))
+
+    found = estimate_each(runs, name, observe, summarize_observer, with_estimates, figures_of, progress, keep)
+    return ObserverResult(**found, slip_model=file)
 
 
 SLIPS = (
-    *(
-        Shown("run", itemgetter(0), long=True),
-        Shown("slip", itemgetter(1)),
-        Shown("mean", itemgetter(2), SLIP),
-    ),
-    *(Shown("std", itemgetter(3), ".4f"), Shown("true", itemgetter(4), SLIP)),
-    *(Shown("RMSE", itemgetter(5), ".4f"), Shown("NEES", itemgetter(6), ".2f")),
-    Shown("position RMSE", itemgetter(7), ".3f", "m"),
+    Shown("run", "run_id", long=True),
+    Shown("slip", "name"),
+    Shown("mean", "slip.mean", SLIP),
+    Shown("std", "slip.std", ".4f"),
+    Shown("true", "slip.true_mean", SLIP),
+    Shown("RMSE", "slip.rmse", ".4f"),
+    Shown("NEES", "slip.nees", ".2f"),
+    Shown("position RMSE", "position_m", ".3f", "m"),
 )
 
-NOT_ESTIMATED = {"not estimated": ObservedSlip(*[math.nan] * 5)}
 
-
-def report(result: ObservedResult) -> Report:
+def report(result: ObserverResult) -> Report:
     """Return each slip of a run, its truth where it is known, and how long the observer had which status."""
-    rows = [
-        (
-            *("" if k else run.run_id, name, slip.mean, slip.std, slip.true_mean, slip.rmse, slip.nees),
-            None if k else run.position_rmse_m,
-        )
-        for run in result.runs
-        for k, (name, slip) in enumerate((run.slip or NOT_ESTIMATED).items())
-    ]
+    rows = []
+    for run in result.runs:
+        of_run = {"run_id": run.run_id, "position_m": run.position_rmse_m}
+        for name, slip in run.slip.items() or [("not estimated", None)]:
+            rows.append({"name": name, "slip": slip, **of_run})
+            of_run = {"run_id": ""}
     first, all_rows = first_rows(rows, SLIPS, f"observer {result.filter}")
     pictures = list(result.pictures.values())
     return Report(
@@ -149,7 +127,7 @@ def report(result: ObservedResult) -> Report:
     )
 
 
-def _answer(result: ObservedResult) -> str:
+def _answer(result: ObserverResult) -> str:
     n = plural(len(result.runs), "run")
     means: dict[str, list[float]] = {}
     for row in result.runs:
@@ -185,44 +163,38 @@ def figures_of(found: ObserverEstimate) -> dict[str, Figure]:
 def slip_figure(found: ObserverEstimate) -> Figure:
     """Show each slip over time with a band of one standard deviation, and its truth where there is one."""
     track, time_s = found.track, found.track.time_s
-    away = spans(
-        time_s, ~np.isin(track.status, (*SETTLED, ObserverStatus.STANDING)), "does not follow measurements"
-    )
+    settled = np.isin(track.status, (*SETTLED, ObserverStatus.STANDING))
+    away = spans(time_s, ~settled, "does not follow measurements")
     panels = []
     for k, name in enumerate(track.slips):
         scale, unit = (np.degrees(1.0), "degrees") if name.endswith("_rad") else (1.0, "ratio")
         slip, true = scale * track.slip[:, k], found.true(name)
-        marks: list[Mark] = [
-            band("± 1 std", time_s, slip, scale * track.slip_std[:, k], 0),
-            line(found.observer.name, time_s, slip, 0),
-        ]
-        if true is not None:
-            marks.append(line("true", time_s, scale * true, TRUTH_COLOUR, dashed=True))
-        if away:
-            marks.append(Strip(away))
+        marks = estimated(
+            found.observer.name,
+            time_s,
+            slip,
+            scale * track.slip_std[:, k],
+            1,
+            None if true is None else scale * true,
+        )
         label = f"{name.rpartition('_')[0].replace('_', ' ')} [{unit}]"
-        panels.append(Panel(tuple(marks), label, y_range=_range(time_s, slip)))
+        panels.append(Panel([*marks, *away], label, y_range=_range(time_s, slip)))
     title = f"Slip of {found.run.run_id} by the observer {found.observer.name}"
-    return Figure(title, tuple(panels), "With one standard deviation.", x_label="time [s]")
+    return Figure(title, panels, "With one standard deviation.", x_label="time [s]")
 
 
 def path_figure(found: ObserverEstimate) -> Figure:
     """Show the estimated path, the fixes, and the true one where it is known."""
-    track, rows = found.track, found.observer.rows
-    x, y = found.true("position_x_m"), found.true("position_y_m")
-    own = track.state("position_x_m") + 1j * track.state("position_y_m")
-    if "position_x_m" not in rows and x is not None and y is not None:
-        yaw = found.true("yaw_rad")
-        own = own * np.exp(1j * (0.0 if yaw is None else yaw[0])) + x[0] + 1j * y[0]
+    own, true = found.path()
     marks: list[Mark] = []
-    if "position_x_m" in rows and "gnss" in found.run.streams:
+    if "position_x_m" in found.observer.rows and "gnss" in found.run.streams:
         gnss = found.run.streams["gnss"]
         marks.append(Points("fixes", gnss.channel("position_x_m"), gnss.channel("position_y_m"), colour=4))
     marks.append(line(found.observer.name, own.real, own.imag, 0))
-    if x is not None and y is not None:
-        marks.append(line("true", x, y, TRUTH_COLOUR, dashed=True))
+    if true is not None:
+        marks.append(line("truth", true.real, true.imag, TRUTH_COLOUR, dashed=True))
     title = f"Path of {found.run.run_id} by the observer {found.observer.name}"
-    return Figure(title, (Panel(tuple(marks), "y [m]", equal=True),), x_label="x [m]")
+    return Figure(title, (Panel(marks, "y [m]", equal=True),), x_label="x [m]")
 
 
 def _range(time_s: Array, slip: Array) -> tuple[float, float] | None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pipelines.data.datasets import drive_robot
 from pipelines.data.settings import load
 from pipelines.report import (
+    Column,
     Progress,
     Report,
     Result,
@@ -22,7 +23,6 @@ from pipelines.report import (
     frame,
     interval,
     sections,
-    silent,
     table,
 )
 from terrain.calibration.odometry import ParameterFound, judge_odometry
@@ -36,7 +36,7 @@ from terrain.robots import TrackedRobot, as_drive, load_robot
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.slip.modes import CalibrateSettings as Settings
+    from pipelines.slip.calibrate import Settings
 
 SHORTEST_S, LONGEST_S = 0.2, 3600.0
 """Legs that are compared: the shortest has two poses of a lidar."""
@@ -72,13 +72,12 @@ class OdometryResult(Result):
         )
 
 
-def calibrate_odometry(settings: Settings, robot_name: str, progress: Progress = silent) -> OdometryResult:
+def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
     """Fit kinds of odometry to folds of runs and judge them on the others; write the slip model of all.
 
     Parameters
     ----------
-    settings : of ``terrain calibrate``: runs with poses, or commands of DRIVE; lengths, folds
-    robot_name : tracked robot by name, or its YAML file
+    settings : of ``terrain calibrate``: runs with poses, or commands of DRIVE; lengths, folds; a tracked robot
 
     Raises
     ------
@@ -87,9 +86,10 @@ def calibrate_odometry(settings: Settings, robot_name: str, progress: Progress =
     DataError
         if fewer runs than folds have poses.
     """
-    runs = load(settings, robot_name).runs
+    assert settings.robot is not None
+    runs = load(settings, settings.robot).runs
     refusal = "robot {name}: drive {drive!r} has no tracks; --what odometry is for 'tracked'"
-    robot = as_drive(TrackedRobot, load_robot(robot_name), refusal)
+    robot = as_drive(TrackedRobot, load_robot(settings.robot), refusal)
     if not all(SHORTEST_S <= length <= LONGEST_S for length in settings.lengths) or not settings.lengths:
         raise ConfigError(f"--lengths: {SHORTEST_S:g} to {LONGEST_S:g} seconds are accepted")
     if settings.out is not None:
@@ -104,22 +104,17 @@ def calibrate_odometry(settings: Settings, robot_name: str, progress: Progress =
         settings.seed,
         lambda done, total: progress("odometry", done, total),
     )
+    values = found._asdict()
+    model, flat = values.pop("model"), values.pop("flat")
     if settings.out is not None:
-        write_slip_model(settings.out, found.fitted.model, robot.name)
-    x_m, y_m, angle_rad = map(float, found.fitted.mount)
+        write_slip_model(settings.out, model, robot.name)
     return OdometryResult(
+        **values,
         robot=robot.name,
         seed=settings.seed,
         folds=settings.folds,
-        n_runs=found.n_runs,
-        scores=found.scores,
-        parameters=found.parameters,
-        observed_point_m=(x_m, y_m),
-        observed_angle_rad=angle_rad,
-        delay_s=found.delay_s,
-        adaptive=found.adaptive,
         written=settings.out,
-        notes=(FLAT,) if found.flat else (),
+        notes=(FLAT,) if flat else (),
     )
 
 
@@ -134,8 +129,10 @@ KINDS = (
     Shown("95 %", "rmse_ci_m", RMSE),
     Shown("median", "median_m", RMSE, "m"),
     Shown("heading", lambda row: math.degrees(row.yaw_rmse_rad), ".1f", "degrees"),
-    *(Shown("below encoder", _gain("gain_encoder"), ".0%"), Shown("95 %", _gain("gain_encoder_ci"), ".0%")),
-    *(Shown("below gyro", _gain("gain_gyro"), ".0%"), Shown("95 %", _gain("gain_gyro_ci"), ".0%")),
+    Shown("below encoder", _gain("gain_encoder"), ".0%"),
+    Shown("95 %", _gain("gain_encoder_ci"), ".0%"),
+    Shown("below gyro", _gain("gain_gyro"), ".0%"),
+    Shown("95 %", _gain("gain_gyro_ci"), ".0%"),
 )
 
 
@@ -146,11 +143,8 @@ def report(result: OdometryResult) -> Report:
     if result.adaptive is not None:
         title = f"last windows of {result.adaptive.n_legs} commands, by efficiencies of the windows before"
         tables.append(_table(result.adaptive, title))
-    parameters = (
-        Shown("parameter", str),
-        Shown("value", lambda name: result.parameters[name].value, ".4g"),
-        Shown("95 %", lambda name: (result.parameters[name].low, result.parameters[name].high), ".4g"),
-    )
+    columns = ("parameter", Column("value", ".4g"), Column("95 %", ".4g"))
+    parameters = [(name, each.value, (each.low, each.high)) for name, each in result.parameters.items()]
     mount = (
         f"The poses are of a point {100 * x_m:+.1f} cm ahead and {100 * y_m:+.1f} cm to the left, turned by "
         f"{math.degrees(result.observed_angle_rad):+.1f} degrees, {result.delay_s:.2f} s late."
@@ -162,9 +156,7 @@ def report(result: OdometryResult) -> Report:
         f"After {longest.length_s:.2g} s the position is off by {format_value(best.rmse_m, RMSE, 'm')} "
         f"({interval(*best.rmse_ci_m, RMSE)}) by {best.kind} odometry, on runs held out.",
         parts=[tables[len(result.scores) - 1], Text(mount), *(Text(note, "note") for note in result.notes)],
-        details=sections(
-            ("All lengths", tables), ("Slip model of all runs", [table(result.parameters, parameters)])
-        ),
+        details=sections(("All lengths", tables), ("Slip model of all runs", [Table(columns, parameters)])),
         next_step=f"terrain estimate --data DIR --filter slip-odometry --slip-model {result.written or 'FILE'}",
     )
 

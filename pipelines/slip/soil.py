@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,28 +30,26 @@ from pipelines.report import (
     format_value,
     frame,
     sections,
-    silent,
     table,
 )
+from pipelines.report.tree import value_at
 from pipelines.slip.shown import write_figures
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.logs.digest import data_digest
 from terrain.records import RunLog
-from terrain.soil_identification.comparison import BAR_RATIO, WheelResult, compare_laws, n_fits
-from terrain.soil_identification.held_out import HELD_OUT, Misfit
+from terrain.soil_identification.comparison import BAR_RATIO, WheelResult, compare_laws
+from terrain.soil_identification.held_out import GIVEN, HELD_OUT, Misfit
 from terrain.soil_identification.laws import Prediction
 from terrain.soil_identification.soil_file import soil_yaml
-from terrain.soil_identification.trials import WHEELS, Trials, Wheel, trials_of
+from terrain.soil_identification.trials import WHEELS, Trials, trials_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.slip.modes import CalibrateSettings as Settings
+    from pipelines.slip.calibrate import Settings
 
-SOIL_NAME = "testbed_sand_{wheel}"
 ERROR = ".1%"
-
 
 LEFT_OUT = {"slip": "slips left out", "angle": "slip angles left out"}
 
@@ -84,7 +81,7 @@ class SoilResult(Result):
         )
 
 
-def calibrate_soil(settings: Settings, progress: Progress = silent) -> SoilResult:
+def calibrate(settings: Settings, progress: Progress) -> SoilResult:
     """Compare laws on held-out slips and angles, wheel by wheel, and write soils and pictures.
 
     Parameters
@@ -104,33 +101,49 @@ def calibrate_soil(settings: Settings, progress: Progress = silent) -> SoilResul
         if a folder cannot be written.
     """
     runs, skipped = load(settings)
-    if settings.out is not None and settings.out.is_file():
-        raise ConfigError(f"{settings.out}: is a file; --out names a folder of soils")
-    for folder in (settings.out, settings.figures):
+    out = settings.out
+    if out is not None and out.is_file():
+        raise ConfigError(f"{out}: is a file; --out names a folder of soils")
+    for folder in (out, settings.figures):
         if folder is not None:
             ensure_writable(folder)
-    further = _further(settings)
-    by_wheel = {robot: [run for run in runs if run.robot == robot] for robot in WHEELS}
-    if not any(by_wheel.values()):
+    further: list[RunLog] = []
+    if (check := settings.check) is not None:
+        further = load_runs(check, layout=settings.layout, repair=settings.repair)
+        if not any(run.robot in WHEELS for run in further):
+            raise DataError(f"--check {check}: none of {len(further)} runs is a trial of a wheel testbed")
+    if not any(run.robot in WHEELS for run in runs):
         raise DataError(
             f"none of {len(runs)} runs is a trial of a wheel testbed (robots {', '.join(WHEELS)}): "
             "give a folder with smooth.csv or grouser.csv"
         )
     results: list[WheelResult] = []
-    files: list[str] = []
     pictures: dict[str, Figure] = {}
-    for robot, own in by_wheel.items():
-        if own:
-            others = [run for run in further if run.robot == robot]
-            result, figures = _one_wheel(WHEELS[robot], own, others, settings, progress)
-            results.append(result)
-            pictures |= figures
-            files += [] if result.soil.file is None else [str(result.soil.file)]
+    for robot, wheel in WHEELS.items():
+        own, others = ([run for run in each if run.robot == robot] for each in (runs, further))
+        if not own:
+            continue
+        result, shown, predictions = compare_laws(
+            trials_of(own, wheel),
+            trials_of(others, wheel) if others else None,
+            wheel,
+            settings.laws,
+            settings.draws,
+            settings.seed,
+            progress,
+        )
+        if out is not None:
+            result = _written(result, out, settings.dataset)
+        results.append(result)
+        for held, text in LEFT_OUT.items():
+            figure = held_out_figure(result, shown, predictions[held], held)
+            pictures[f"{wheel.name}, {text}"] = figure
+    files = [str(result.soil.file) for result in results if result.soil.file is not None]
     if settings.figures is not None:
         named = {name.replace(", ", "_"): figure for name, figure in pictures.items()}
         files += write_figures(named, settings.figures)
     return SoilResult(
-        out=settings.out,
+        out=out,
         dataset=settings.dataset,
         data_digest=data_digest(runs),
         seed=settings.seed,
@@ -143,42 +156,13 @@ def calibrate_soil(settings: Settings, progress: Progress = silent) -> SoilResul
     )
 
 
-def _one_wheel(
-    wheel: Wheel, own: Sequence[RunLog], others: Sequence[RunLog], settings: Settings, progress: Progress
-) -> tuple[WheelResult, dict[str, Figure]]:
-    """Compare laws on one wheel's trials, and write its soil; return its figures by name."""
-    trials, further = trials_of(own, wheel), trials_of(others, wheel) if others else None
-    fits = itertools.count(1)
-    total = n_fits(trials, settings.laws, settings.draws)
-    result, shown, predictions = compare_laws(
-        trials,
-        further,
-        wheel,
-        settings.laws,
-        settings.draws,
-        settings.seed,
-        lambda: progress(f"fit {wheel.name}", next(fits), total),
-    )
-    figures = {
-        f"{wheel.name}, {text}": held_out_figure(result, shown, predictions[held], held)
-        for held, text in LEFT_OUT.items()
-    }
-    if settings.out is None:
-        return result, figures
-    name = SOIL_NAME.format(wheel=wheel.name)
-    friction, file = result.parameters["tan_friction"], settings.out / f"{name}.yaml"
-    atomic_write(file, soil_yaml(name, wheel.name, settings.dataset, result.soil.fit, friction, result.law))
-    return replace(result, soil=result.soil._replace(file=file)), figures
-
-
-def _further(settings: Settings) -> list[RunLog]:
-    """Return the runs of ``--check``; none without it."""
-    if settings.check is None:
-        return []
-    runs = load_runs(settings.check, layout=settings.layout, repair=settings.repair)
-    if not any(run.robot in WHEELS for run in runs):
-        raise DataError(f"--check {settings.check}: none of {len(runs)} runs is a trial of a wheel testbed")
-    return runs
+def _written(result: WheelResult, out: Path, dataset: str) -> WheelResult:
+    """Write the soil of a wheel, and name the file in its result."""
+    name, soil = f"testbed_sand_{result.wheel}", result.soil
+    text = soil_yaml(name, result.wheel, dataset, soil.fit, result.parameters["tan_friction"], result.law)
+    file = out / f"{name}.yaml"
+    atomic_write(file, text)
+    return replace(result, soil=soil._replace(file=file))
 
 
 def report(result: SoilResult) -> Report:
@@ -192,27 +176,22 @@ def report(result: SoilResult) -> Report:
     answers = " and ".join(
         f"{_forces(each.laws[-1].slip.load)} ({each.wheel} wheel)" for each in result.wheels
     )
-    soils = [wheel.soil.file for wheel in result.wheels if wheel.soil.file is not None]
+    soil = next((wheel.soil.file for wheel in result.wheels if wheel.soil.file is not None), "FILE")
     return Report(
         f"Wheel in sand, {result.dataset}",
         f"On slips left out, {result.wheels[0].law} predicts traction and side force within {answers} of the load.",
         parts=parts,
         details=[*details, *sections(("Not read", result.skipped))],
-        next_step=f"terrain simulate --robot husky --terrain {soils[0] if soils else 'FILE'} --scenario straight "
-        "--out runs/",
+        next_step=f"terrain simulate --robot husky --terrain {soil} --scenario straight --out runs/",
     )
 
 
 def verdict(wheel: WheelResult) -> str:
     """Return whether the last law reaches what is aimed at, and where it stops."""
-    row = wheel.laws[-1]
     parts = []
-    for held, found in (("slips", row.slip), ("angles", row.angle)):
-        state = (
-            "reached"
-            if found.reached
-            else f"not reached ({_forces(found.below_axle_angle)} without the wheel dragged along its axle)"
-        )
+    for held, found in (("slips", wheel.laws[-1].slip), ("angles", wheel.laws[-1].angle)):
+        without = f"({_forces(found.below_axle_angle)} without the wheel dragged along its axle)"
+        state = "reached" if found.reached else f"not reached {without}"
         parts.append(
             f"{held} left out, traction and side force off by {_forces(found.load)} of the load: {state}"
         )
@@ -225,36 +204,47 @@ def _forces(errors: Misfit) -> str:
     return f"{format_value(errors.pull_ratio, ERROR)} and {format_value(errors.side_ratio, ERROR)}"
 
 
-def _errors(*titles: str, of: Callable[[Any], Misfit] = lambda row: row) -> list[Shown]:
-    """Return columns of traction, side force and sinkage."""
+def _errors(of: str, *titles: str) -> list[Shown]:
+    """Return columns of the errors of traction, side force and sinkage that a row has at a place."""
     return [
-        Shown(titles[0], lambda row: of(row).pull_ratio, ERROR),
-        Shown(titles[1], lambda row: of(row).side_ratio, ERROR),
-        Shown(titles[2], lambda row: 1e3 * of(row).sinkage_m, ".1f", "mm"),
+        Shown(titles[0], f"{of}.pull_ratio", ERROR),
+        Shown(titles[1], f"{of}.side_ratio", ERROR),
+        Shown(titles[2], lambda row: 1e3 * value_at(row, f"{of}.sinkage_m"), ".1f", "mm"),
     ]
 
 
 def _laws_table(wheel: WheelResult) -> Table:
     columns = (
-        *(Shown("law", lambda row: row[0]), Shown("parameters", lambda row: row[1])),
-        Shown("given", lambda row: row[2]),
-        *_errors("slip out: traction", "side", "sinkage", of=lambda row: row[3]),
-        *_errors("angle out: traction", "side", "sinkage", of=lambda row: row[4]),
+        Shown("law", "law"),
+        Shown("parameters", "n_parameters"),
+        Shown("given", "given"),
+        *_errors("slip", "slip out: traction", "side", "sinkage"),
+        *_errors("angle", "angle out: traction", "side", "sinkage"),
     )
-    rows: list[tuple[Any, ...]] = [
-        (row.name, row.n_parameters, given, getattr(row.slip, given), getattr(row.angle, given))
+    rows = [
+        {
+            "law": row.name,
+            "n_parameters": row.n_parameters,
+            "given": given,
+            "slip": getattr(row.slip, given),
+            "angle": getattr(row.angle, given),
+        }
         for row in wheel.laws
-        for given in ("load", "sinkage")
+        for given in GIVEN
         if math.isfinite(getattr(row.slip, given).pull_ratio)
     ]
-    rows.append(("(polynomial)", None, "load", wheel.surrogate_slip, wheel.surrogate_angle))
+    surrogate = {"slip": wheel.surrogate_slip, "angle": wheel.surrogate_angle}
+    rows.append({"law": "(polynomial)", "n_parameters": None, "given": "load", **surrogate})
     title = f"{wheel.wheel} wheel, {wheel.n_trials} trials: errors over the load"
     return table(rows, columns, title, "Root mean squares over the measured load, with slip and angle given.")
 
 
 PARAMETERS = (
-    *(Shown("parameter", "name"), Shown("value", "value"), Shown("95 %", "interval")),
-    *(Shown("of the prior", "informed_ratio", ".2f"), Shown("identified", "identified")),
+    Shown("parameter", "name"),
+    Shown("value", "value"),
+    Shown("95 %", "interval"),
+    Shown("of the prior", "informed_ratio", ".2f"),
+    Shown("identified", "identified"),
 )
 PRIOR = '"Of the prior": standard deviation with the trials over that without; below 0.5 one is identified.'
 
@@ -270,8 +260,9 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
         },
     }
     columns = (
-        *(Shown("", lambda named: named[0]), Shown("trials", lambda named: named[1].n_trials)),
-        *_errors("traction", "side force", "sinkage", of=lambda named: named[1]),
+        Shown("", "name"),
+        Shown("trials", "misfit.n_trials"),
+        *_errors("misfit", "traction", "side force", "sinkage"),
     )
     soil, (low_m, high_m) = wheel.soil.misfit, wheel.sinkage_range_m
     return [
@@ -281,7 +272,10 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
             f"{wheel.deeper_than_axle} trials deeper than the axle; {_coupling_text(wheel)}."
         ),
         table(wheel.parameters.values(), PARAMETERS, f"parameters of {wheel.law}", PRIOR),
-        *(table(rows.items(), columns, title) for title, rows in misfits.items()),
+        *(
+            table([{"name": name, "misfit": each} for name, each in rows.items()], columns, title)
+            for title, rows in misfits.items()
+        ),
         *(Text(sentence) for sentence in wheel.not_identified),
         Text(
             f"On trials that roll nearly straight the simulator's law is off by {_forces(soil)} (traction and side "

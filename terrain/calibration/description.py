@@ -18,6 +18,7 @@ from terrain.calibration.skid_steer import identify
 from terrain.calibration.standing import gyro_bias, standing
 from terrain.calibration.steady import steady_stretches, why_none
 from terrain.calibration.wheels import SLIP_RATIO, reduction_ratio, steering_zeros
+from terrain.errors import DataError
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, robot_from
 from terrain.terramechanics.soil import load_soil, soil_names
@@ -48,12 +49,39 @@ def hard_grounds() -> tuple[str, ...]:
 
 
 def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:
-    """Return what the runs of a robot show, by its drive."""
+    """Return what the runs of a robot show, by its drive, beside what its description has.
+
+    Raises
+    ------
+    DataError
+        if a run is another robot's, or those of a skid-steer robot have no lidar.
+    """
+    if robot.skids and not any("lidar" in run.streams for run in runs):
+        raise DataError(
+            f"robot {robot.name}: drive {robot.drive!r} is not calibrated from logs without the stream "
+            "'lidar', speeds over ground, which those of DRIVE have"
+        )
+    for run in runs:
+        if run.robot != robot.name:
+            raise DataError(
+                f"run {run.run_id} is one of robot {run.robot!r}, and {robot.name!r} is calibrated"
+            )
     if robot.skids:
-        return identify(runs, robot.wheel_radius_m, hard)
-    if isinstance(robot, OmniRobot):
-        return identify_omni(runs, robot)
-    return find(runs, description, robot, hard)
+        findings = identify(runs, robot.wheel_radius_m, hard)
+    elif isinstance(robot, OmniRobot):
+        findings = identify_omni(runs, robot)
+    else:
+        findings = find(runs, description, robot, hard)
+    return [_beside(finding, description) for finding in findings]
+
+
+def _beside(finding: Finding, description: Any) -> Finding:
+    """Return a finding with its unit, and the number that a description has of it."""
+    section, _, name = finding.parameter.partition(".")
+    entry = description.get(section, {}).get(name)
+    if entry:
+        return finding._replace(unit=entry["unit"], described=float(entry["value"]))
+    return finding._replace(unit=name.rpartition("_")[2] if section == IDENTIFIED else "s")
 
 
 def find(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:

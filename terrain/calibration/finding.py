@@ -25,6 +25,7 @@ class Finding(NamedTuple):
     n, counted : how many of what it rests on (12, ``"stretches"``)
     runs : ids of the runs used
     note : what is assumed; or why the value is undetermined
+    unit, described : of the number, and its value before; None where the description has no such number
     """
 
     parameter: str
@@ -35,6 +36,8 @@ class Finding(NamedTuple):
     counted: str
     runs: tuple[str, ...]
     note: str = ""
+    unit: str = ""
+    described: float | None = None
 
     @property
     def determined(self) -> bool:

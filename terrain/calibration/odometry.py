@@ -22,7 +22,7 @@ from terrain.calibration.odometry_fit import (
 from terrain.calibration.odometry_judge import LegScores, held_out_ends, score_legs
 from terrain.calibration.odometry_legs import Leg, legs_of_poses, legs_of_windows
 from terrain.errors import DataError
-from terrain.estimation.observers.slip_model import PARAMETERS
+from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel
 from terrain.logs.drive_poses import WindowPoses
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
@@ -49,8 +49,10 @@ class JudgedOdometry(NamedTuple):
     ----------
     n_runs : runs with poses
     scores : by length of the legs
-    fitted : slip-compensated odometry, to all runs
-    parameters : of its slip model
+    model : slip model of slip-compensated odometry, fitted to all runs
+    parameters : of that
+    observed_point_m, observed_angle_rad : where the point that poses show lies in the body, and by which the
+        sensor of the poses is turned
     adaptive : scores of the last windows of commands, by the adaptive observer and others; None without
     delay_s : of the poses behind the gyro
     flat : whether no slope was driven, or no tilt measured, so that what slopes do is not fitted
@@ -58,8 +60,10 @@ class JudgedOdometry(NamedTuple):
 
     n_runs: int
     scores: tuple[LegScores, ...]
-    fitted: FittedOdometry
+    model: SlipModel
     parameters: Mapping[str, ParameterFound]
+    observed_point_m: tuple[float, float]
+    observed_angle_rad: float
     adaptive: LegScores | None
     delay_s: float
     flat: bool
@@ -113,7 +117,9 @@ def judge_odometry(
     adaptive = None
     if windows:
         adaptive = _adaptive(runs, windows, groups, ends, robot, delay_s, fitted.mount, seed)
-    return JudgedOdometry(n_runs, scores, fitted, _parameters(fitted, n_runs), adaptive, delay_s, flat)
+    x_m, y_m, angle_rad = map(float, fitted.mount)
+    found = _parameters(fitted, n_runs)
+    return JudgedOdometry(n_runs, scores, fitted.model, found, (x_m, y_m), angle_rad, adaptive, delay_s, flat)
 
 
 def _window_groups(

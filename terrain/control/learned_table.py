@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from statistics import median_low
+from typing import Any
 
 from terrain.control.slip_table import DRIVE_STATES, SIGN, CurveEntry, SlipTable, load_slip_table
 from terrain.records import SlipTarget, TargetStatus
@@ -12,7 +13,7 @@ from terrain.robots import Robot
 from terrain.simulation.slip_sweep import learning_runs
 from terrain.slip_learning.curve import SlipCurve
 from terrain.slip_learning.laws import LAW_PARAMETERS
-from terrain.slip_learning.learn import LearnedTerrain, learn_terrain, terrain_runs
+from terrain.slip_learning.learn import LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
 from terrain.slip_learning.targets import Targets, energy_jpm, tractive_efficiency
 from terrain.terramechanics.soil import load_soil
 
@@ -128,6 +129,54 @@ def curve_entry(curve: SlipCurve, targets: Targets, robot: Robot) -> CurveEntry:
         steady_energy_jpm=energy["steady"],
         n_runs=curve.n_runs,
     )
+
+
+def run_row(run: TerrainRun) -> dict[str, Any]:
+    """Return how much one run shows on one terrain, and mass and resistance by its force balance."""
+    mass_kg, mass_std_kg, ratio, std = run.balance
+    slips = run.bins.slip_ratio
+    return {
+        "run_id": run.run_id,
+        "terrain": run.terrain,
+        "n_samples": run.n_samples,
+        "n_bins": len(slips),
+        "slip_range": _rounded((float(slips.min()), float(slips.max()))) if len(slips) else None,
+        "mass_kg": round(mass_kg, 1),
+        "mass_std_kg": round(mass_std_kg, 1),
+        "resistance_ratio": round(ratio, DIGITS),
+        "resistance_std": round(std, DIGITS),
+        "left_out": run.left_out,
+    }
+
+
+def terrain_row(learned: LearnedTerrain, slips: SlipTable) -> dict[str, Any]:
+    """Return whether and why the targets of a terrain are learned; what is of a curve only where one was."""
+    curve = slips.curves.get(learned.terrain)
+    row = {
+        "status": learned.status,
+        "reason": learned.reason or None,
+        "n_runs": len(learned.runs_with_bins),
+        "n_samples": sum(run.n_samples for run in learned.runs),
+        "slip_range": None if math.isnan(learned.slip_range[0]) else _rounded(learned.slip_range),
+        "peak_slip": curve and curve.peak_slip_ratio,
+        "peak_slip_ci": curve and curve.peak_interval_ratio,
+        "peak_status": curve and curve.peak_status,
+        "targets": slips.target_rows(learned.terrain),
+    }
+    if curve is None or learned.curve is None:
+        return row
+    return row | {
+        "law": curve.law,
+        "parameters": curve.parameters,
+        "resistance_ratio": curve.resistance_ratio,
+        "resistance_std": curve.resistance_std,
+        "balance_slip": curve.balance_slip_ratio,
+        "working_slip": curve.working_slip_ratio,
+        "peak_based_slip": curve.peak_based_slip_ratio,
+        "traction_efficiency": curve.traction_efficiency_ratio,
+        "energy_jpm": {state: getattr(curve, f"{state}_energy_jpm") for state in DRIVE_STATES},
+        "scores": {law: round(score, 3) for law, score in learned.curve.scores.items()},
+    }
 
 
 def _rounded(pair: tuple[float, float]) -> tuple[float, float]:

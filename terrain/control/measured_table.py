@@ -10,16 +10,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from terrain.control.learned_table import DIGITS, FALLBACK
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.measured_slip.surfaces import SurfaceSlip
-from terrain.records import SlipTarget, TargetStatus
+from terrain.control.transfer import MIN_RUNS, Transfer, transfers
+from terrain.measured_slip.measure import Measured
+from terrain.measured_slip.operating import OperatingPoints, operating_points
+from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
+from terrain.records import Array, SlipTarget, TargetStatus
 from terrain.robots import Robot
 from terrain.slip_learning.targets import MIN_ABOVE_BALANCE_SLIP
-
-MIN_RUNS = 3
-"""From fewer, how a median differs from run to run is not known."""
 
 NO_PEAK = (
     "steady motion alone is used: the slip where thrust balances resistance, which shows no peak of thrust"
@@ -91,3 +94,57 @@ def _copied(terrain: str, entry: Mapping[str, SlipTarget], default: SlipTable) -
         )
         for state, target in entry.items()
     }
+
+
+class LearnedSurfaces(NamedTuple):
+    """What was learned of surfaces.
+
+    Parameters
+    ----------
+    table : of target slips
+    surfaces : by name: the slip as measured, medians over runs of current and thrust over load with their
+        quartiles, targets, and why there are no more
+    points : operating points of the runs on each
+    transfers : of targets from session to session
+    """
+
+    table: SlipTable
+    surfaces: dict[str, dict[str, Any]]
+    points: dict[str, OperatingPoints]
+    transfers: tuple[Transfer, ...]
+
+
+def learn_surfaces(found: Measured, robot: Robot, name: str, seed: int) -> LearnedSurfaces:
+    """Return what runs on one terrain each show.
+
+    Parameters
+    ----------
+    found : runs with their slip
+    robot : that drove
+    name : of the table
+    seed : of the bootstrap
+    """
+    rng, by_terrain = np.random.default_rng(seed), found.by_terrain()
+    slips = {each: surface_slip(each, own.slips, rng) for each, own in by_terrain.items()}
+    table = measured_table(list(slips.values()), robot, name)
+    points = {each: operating_points(own.runs, own.slips, robot) for each, own in by_terrain.items()}
+    surfaces = {
+        each: {
+            "slip": slip,
+            "current_a": _quartiles(points[each].current_a),
+            "thrust_ratio": _quartiles(points[each].thrust_ratio),
+            "targets": table.target_rows(each),
+            "reason": reason_of(slip),
+        }
+        for each, slip in slips.items()
+    }
+    return LearnedSurfaces(table, surfaces, points, tuple(transfers(found.runs, found.slips, rng)))
+
+
+def _quartiles(values: Array) -> tuple[float, float, float]:
+    """Return the median, and the quartiles below and above it."""
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return math.nan, math.nan, math.nan
+    low, middle, high = np.quantile(known, [0.25, 0.5, 0.75])
+    return float(middle), float(low), float(high)

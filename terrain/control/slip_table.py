@@ -128,6 +128,14 @@ class SlipTable:
         entry = self._valid.get(terrain)
         return self.targets[self.fallback] if entry is None else entry
 
+    def target_rows(self, terrain: str) -> dict[str, dict[str, Any]]:
+        """Return the targets of an entry by drive state, as JSON has them."""
+        keys = ("slip_ratio", "slip_std", "status", "source")
+        return {
+            state: {key: getattr(target, key) for key in keys}
+            for state, target in self.targets[terrain].items()
+        }
+
 
 def _is_valid(entry: Mapping[str, SlipTarget]) -> bool:
     return not any(target.status is TargetStatus.INVALID for target in entry.values())

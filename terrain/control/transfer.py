@@ -8,9 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
-from terrain.control.measured_table import MIN_RUNS
 from terrain.measured_slip.slips import MeasuredSlip
 from terrain.records import Array, RunLog
+
+MIN_RUNS = 3
+"""From fewer, how a median differs from run to run is not known."""
 
 N_DRAWS = 1000
 
@@ -25,7 +27,7 @@ class Transfer(NamedTuple):
     n_learned, n_driven : runs with a slip in steady motion
     difference : of what was driven from what was learned
     interval : its 95 % interval, by draws of runs of both; NaN where a session has fewer than
-        :data:`terrain.control.measured_table.MIN_RUNS` runs
+        :data:`MIN_RUNS` runs
     """
 
     terrain: str

@@ -10,6 +10,7 @@ from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of
 from terrain.discrepancy.fitting import names_of
 from terrain.discrepancy.information import Information, partial_information
 from terrain.discrepancy.residuals import measured_channels
+from terrain.discrepancy.robot_terms import UNITS
 from terrain.discrepancy.search import Found
 from terrain.discrepancy.selection import Z_EFFECT, gain_interval
 from terrain.discrepancy.varying import run_scatter
@@ -62,7 +63,8 @@ def caveat_of(found: Found, effect: Effect) -> str:
     value = abs(float(found.change[found.names.index(names[0])]))
     scatter = run_scatter(found, names[0])
     if len(names) == 1 and scatter > CAVEAT_RATIO * value:
-        caveats.append(f"it differs from run to run by {scatter:.2g} {effect.parameters[0].unit}")
+        unit = effect.parameters[0].unit
+        caveats.append(f"it differs from run to run by {scatter:.2g} {UNITS.get(unit, unit)}".strip())
     return "; ".join(caveats)
 
 

@@ -16,6 +16,7 @@ from terrain.discrepancy.response_slopes import Slope, slopes_of
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.terrain_match import TerrainMatch
 from terrain.discrepancy.verdict import Diagnosis, RuledOut, finite
 from terrain.effects import CHANNELS, PARAMETER, effect_named
 from terrain.records import Array
@@ -289,14 +290,35 @@ def session_rows(diagnosis: Diagnosis) -> tuple[tuple[str, ...], ...]:
     return tuple(rows)
 
 
-def session_notes(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return a sentence for each value in which sessions of one terrain differ by more than their errors."""
-    notes = []
-    for each in diagnosis.by_session:
-        if not each.agree:
-            parameter = PARAMETER[each.parameter]
-            values = _listed([f"{own.text} in {own.session}" for own in each.sessions])
-            of = f" of {each.terrain}" if each.terrain else ""
+def notes_of(
+    diagnosis: Diagnosis, matches: Sequence[TerrainMatch], apart: Mapping[str, Slope]
+) -> tuple[str, ...]:
+    """Return what a reader has to know of terrains and sessions that differ, in sentences.
+
+    Parameters
+    ----------
+    diagnosis : of the runs
+    matches : on which the runs of each label were simulated
+    apart : measured over simulated by label, as of :func:`terrains_apart`
+    """
+    notes = [
+        f"On {match.terrain} runs fit best if {100.0 * match.effective_ratio:.0f} % of the measured tilt "
+        "is a slope to drive up; the rest is attributed to a body that rides over bumps, which takes no "
+        "traction."
+        for match in matches
+        if match.effective_ratio is not None and match.effective_ratio < 1.0
+    ]
+    if apart:
+        each = _listed([f"{slope.ratio:.2f} on {label}" for label, slope in apart.items()])
+        alone = _listed([f"--terrain {label}" for label in apart], "or")
+        notes.append(
+            f"Terrains differ: measured over simulated is {each}. Explain each by itself with {alone}."
+        )
+    for session in diagnosis.by_session:
+        if not session.agree:
+            parameter = PARAMETER[session.parameter]
+            values = _listed([f"{own.text} in {own.session}" for own in session.sessions])
+            of = f" of {session.terrain}" if session.terrain else ""
             notes.append(
                 f"Sessions{of} differ: the {parameter.label} is {values}, with the same causes in each; one "
                 "value for all of them is a mean."

@@ -34,6 +34,14 @@ class TerrainMatch(NamedTuple):
     soil: str | None
     effective_ratio: float | None
 
+    @property
+    def text(self) -> str:
+        """On which terrain the runs were simulated, in words."""
+        if self.soil:
+            return f"soil {self.soil}"
+        runs = f"label {self.terrain}" if self.terrain else "runs without a label (or with several)"
+        return f"{runs}: default terrain"
+
 
 def simulation_for(
     runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect]

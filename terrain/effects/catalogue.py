@@ -93,6 +93,21 @@ def library_of(drive: str) -> tuple[Effect, ...]:
     return tuple(effect for effect in LIBRARY if drive in effect.drives)
 
 
+def chosen_effects(drive: str, names: Collection[str]) -> tuple[Effect, ...]:
+    """Return effects by their names, in the order of the catalogue.
+
+    Raises
+    ------
+    ConfigError
+        if one is unknown, or does not apply to robots of a drive.
+    """
+    chosen = [effect_named(name) for name in names]
+    for effect in chosen:
+        if drive not in effect.drives:
+            raise ConfigError(f"effect {effect.name} does not apply to a robot with the drive {drive!r}")
+    return tuple(effect for effect in LIBRARY if effect in chosen)
+
+
 def showing(drive: str, known: Collection[str] = ()) -> tuple[Effect, ...]:
     """Return those effects of a drive that runs may show, with the parameters that are known already.
 

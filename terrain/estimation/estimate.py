@@ -119,6 +119,7 @@ def estimate_run(
     tuning: str | None = None,
     noise: Noise | None = None,
     initial_yaw_rad: float | None = None,
+    tuned: Noise | None = None,
 ) -> Estimate:
     """Correct one run for the effects of its robot, and filter it.
 
@@ -127,11 +128,12 @@ def estimate_run(
     run : log of the robot, as measured
     robot : its description
     name, tuning, noise, initial_yaw_rad : as :func:`filter_run` takes them
+    tuned : of other runs, which may have other sensors; only its process variance is taken
 
     Returns
     -------
     Estimate
-        of the corrected robot, beside the run as measured
+        of the corrected robot, beside the run as measured, less the GNSS that was left out
 
     Raises
     ------
@@ -140,14 +142,11 @@ def estimate_run(
     DataError
         if the log has no wheels.
     """
-    found = filter_run(
-        *correct(run, robot), name, tuning=tuning, noise=noise, initial_yaw_rad=initial_yaw_rad
-    )
-    return beside(run, found)
-
-
-def beside(run: RunLog, found: Estimate) -> Estimate:
-    """Return the estimate of a corrected run beside the run as measured, less the GNSS that was left out."""
+    log, robot = correct(run, robot)
+    if tuned is not None:
+        usual = model_and_noise(log, robot, name, tuning)[1]
+        noise = replace(usual, process_variance=tuned.process_variance)
+    found = filter_run(log, robot, name, tuning=tuning, noise=noise, initial_yaw_rad=initial_yaw_rad)
     left_out = "gnss" in run.streams and "gnss" not in found.run.streams
     return replace(found, run=_without_gnss(run) if left_out else run)
 

@@ -6,11 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from terrain.errors import DataError
-from terrain.estimation.ekf.model import FilterModel, Noise
+from terrain.estimation.ekf.model import Noise
+from terrain.estimation.estimate import model_and_noise
 from terrain.estimation.filters.tuning import NoiseGroup, TuningStatus, tune_noise
 from terrain.estimation.measurements.batch import measurement_table
+from terrain.extension import corrected, corrected_log
 from terrain.records import RunLog
-from terrain.robots import Robot
+from terrain.robots import Robot, packaged_robot
 
 MAX_RUNS = 3
 """Number of runs to tune on unless they are named: the likelihood of each is evaluated a hundred times."""
@@ -63,17 +65,26 @@ def tuning_runs(runs: Sequence[RunLog], names: Sequence[str] | None) -> list[Run
 
 
 def tuned_noise(
-    model: FilterModel, noise: Noise, runs: Sequence[RunLog], robot: Robot
+    runs: Sequence[RunLog], robot: Robot | None, name: str, names: Sequence[str] | None = None
 ) -> tuple[Noise, TunedNoise]:
     """Return noise under which the runs are most likely, and what became of each group.
 
     Parameters
     ----------
-    model : the filter
-    noise : where to start
-    runs : to tune on, without the effects of an extended robot
-    robot : whose runs they are, without its effects
+    runs : logs, as measured
+    robot : whose they are; by default the one that the first names
+    name : of the filter
+    names : of the runs to tune on; the first few by default
+
+    Raises
+    ------
+    DataError
+        if there is no run of a name.
     """
+    chosen = tuning_runs(runs, names)
+    robot = robot or packaged_robot(chosen[0].robot)
+    runs, robot = [corrected_log(run, robot) for run in chosen], corrected(robot)
+    model, noise = model_and_noise(runs[0], robot, name)
     tables = []
     for run in runs:
         table = measurement_table(run, robot)

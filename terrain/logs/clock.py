@@ -20,12 +20,14 @@ an offset and is part of it.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.optimize import least_squares
 
+from terrain.errors import DataError
 from terrain.logs.yaw_rates import YawRatePair, correlation_of, gyro_at, imu_time_s, low_passed_pair
 from terrain.records import Array, RunLog
 
@@ -61,6 +63,10 @@ SAME_PEAK_SIGMAS = 4.0
 
 MAX_SEARCH_SAMPLES = 1500
 """The coarse search looks at this many instants of a long run; least squares at all of them."""
+
+MAX_APART_S = 0.1
+"""Between the clocks of wheels and IMU: in more, a robot that begins to turn is seen to turn without wheels,
+and the effective track is wrong by as much as its turns are short."""
 
 STATUSES = ("estimated", "offset only", "not excited", "ambiguous", "at bound")
 
@@ -196,6 +202,26 @@ def estimate_clock(
     return ClockEstimate(
         offset_s, std_s, fit.rate, rate_std, fit.gain, fit.correlation, "estimated", reference_s
     )
+
+
+def offsets_apart_s(runs: Sequence[RunLog], track_m: Callable[[RunLog], float]) -> dict[str, float]:
+    """Return by run the offset of the clocks of wheels and IMU, of those runs where they clearly differ.
+
+    Parameters
+    ----------
+    runs : logs
+    track_m : of the robot of a run
+    """
+    offsets_s = {}
+    for run in runs:
+        try:
+            found = estimate_clock(run, track_m=track_m(run))
+        except DataError:  # no gyro, or no speeds of two sides
+            continue
+        known = found.status in ("estimated", "offset only")
+        if known and abs(found.offset_s) > max(MAX_APART_S, 3.0 * found.offset_std_s):
+            offsets_s[run.run_id] = found.offset_s
+    return offsets_s
 
 
 def _no_estimate(status: str, reference_s: float, correlation: float = np.nan) -> ClockEstimate:

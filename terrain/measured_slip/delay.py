@@ -65,6 +65,16 @@ class Delay(NamedTuple):
         """The delay where it was found, else 0."""
         return self.delay_s if self.status is DelayStatus.ESTIMATED else 0.0
 
+    @property
+    def sentence(self) -> str:
+        """By how much the outside measurement is late, in words."""
+        if self.status is DelayStatus.UNDETERMINED:
+            return "the delay of the outside measurement was not found, and none is taken off."
+        return (
+            f"the outside measurement is {self.delay_s:+.3f} s behind the wheels "
+            f"(± {1.96 * self.std_s:.3f}), which is taken off."
+        )
+
 
 def estimate_delay(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Delay:
     """Return by how much the outside measurement of runs lags behind their wheels.

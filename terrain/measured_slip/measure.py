@@ -16,6 +16,10 @@ from terrain.measured_slip.wheel_distance import DistanceBound, distance_bound
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, as_drive, robot_named
 
+WINDOWS_S = (2.0, 0.5)
+"""Windows of steady motion; short ones where the outside measurement does not cover longer ones, as a lidar's
+twist."""
+
 NO_ROLLERS = "robot {name}: drive {drive!r} has no rollers, only 'omni' has"
 
 
@@ -26,6 +30,15 @@ class Measured(NamedTuple):
     slips: list[MeasuredSlip]
     delays: dict[str, Delay]
     failed: list[str]
+
+    def by_terrain(self) -> dict[str, Measured]:
+        """Return the runs of each single terrain, sorted by its name, with those on several or none last."""
+        names = [single_terrain(run) for run in self.runs]
+        found = {}
+        for name in sorted(set(names), key=lambda name: (name == "", name)):
+            own = [i for i, each in enumerate(names) if each == name]
+            found[name] = self._replace(runs=[self.runs[i] for i in own], slips=[self.slips[i] for i in own])
+        return found
 
 
 class NamedSurface(NamedTuple):
@@ -43,6 +56,14 @@ class NamedSurface(NamedTuple):
     n_runs: int
     n_right: int | None
     windows: Mapping[str, int]
+
+    @property
+    def text(self) -> str:
+        """How many runs are named rightly or, without labels, what windows look like, in words."""
+        if self.n_right is not None:
+            return f"{self.n_right} of {self.n_runs} runs are named by their slip"
+        counts = ", ".join(f"{name} {n}" for name, n in sorted(self.windows.items(), key=lambda x: -x[1]))
+        return f"windows of {self.n_runs} runs look like {counts}"
 
 
 def one_robot(runs: Sequence[RunLog], given: Robot | None) -> Robot:
@@ -101,6 +122,28 @@ def measure(
             failed.append(str(error))
         progress("slip", done, len(runs))
     return Measured(kept, slips, delays, failed)
+
+
+def measure_steady(
+    runs: Sequence[RunLog],
+    robot: Robot,
+    seed: int,
+    progress: Callable[[str, int, int], None] = lambda task, done, total: None,
+) -> tuple[float, Measured]:
+    """Return slips over :data:`WINDOWS_S`, the first in which a robot drives steadily, and that length.
+
+    Raises
+    ------
+    DataError
+        if there is no slip in steady motion.
+    """
+    first = ""
+    for window_s in WINDOWS_S:
+        found = measure(runs, robot, window_s=window_s, stride_s=window_s / 2, seed=seed, progress=progress)
+        if any(slip.known.size for slip in found.slips):
+            return window_s, found
+        first = first or (found.failed[0] if found.failed else "no window is driven steadily")
+    raise DataError(f"none of {len(runs)} runs has a slip; the first for this: {first}")
 
 
 def rollers_of(found: Measured, robot: Robot, seed: int) -> RollerFindings:

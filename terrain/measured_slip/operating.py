@@ -43,7 +43,7 @@ def operating_points(runs: Sequence[RunLog], slips: Sequence[MeasuredSlip], robo
 
 
 def _point(run: RunLog, slip: MeasuredSlip, robot: Robot) -> tuple[float, float, float]:
-    rows = np.flatnonzero(slip.steady & np.isfinite(slip.body_slip))
+    rows = slip.known
     if not rows.size:
         return np.nan, np.nan, np.nan
     ratio = float(np.median(slip.body_slip[rows]))

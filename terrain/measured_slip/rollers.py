@@ -61,6 +61,27 @@ class RollerFindings:
     other_loads: Mapping[str, tuple[float, ...]]
     other_rms: Mapping[str, tuple[float, float]]
 
+    @property
+    def sentences(self) -> list[str]:
+        """What of the slip is the robot's own, and what groups that were not fitted look like, in words."""
+        loads = ", ".join(
+            f"{load:.3f} ({low:.3f} to {high:.3f})"
+            for load, (low, high) in zip(self.load_ratio, self.load_interval, strict=True)
+        )
+        low, high = self.scale_interval
+        found = [
+            f"Load of the wheels: {loads}.",
+            f"Slip alike in all directions on all surfaces: {self.scale_error:.3f} ({low:.3f} to {high:.3f}); "
+            "the wheels' radius or the scale of the outside measurement, which these runs do not distinguish.",
+        ]
+        for name, other in self.other_loads.items():
+            before, after = self.other_rms[name]
+            found.append(
+                f"{name}: the surface is {self.other_surface[name]}, the load of the wheels "
+                f"{', '.join(f'{load:.3f}' for load in other)}, by which {before:.4f} of RMS falls to {after:.4f}."
+            )
+        return found
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cases:

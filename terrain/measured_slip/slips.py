@@ -100,6 +100,11 @@ class MeasuredSlip:
         return (self.start_s + self.end_s) / 2
 
     @property
+    def known(self) -> Array:
+        """Places (j,) of the windows in steady motion that have a slip of the body."""
+        return np.flatnonzero(self.steady & np.isfinite(self.body_slip))
+
+    @property
     def track(self) -> SlipTrack:
         """The slips of the wheels, at the middle of each window."""
         return SlipTrack(self.time_s, self.slip_ratio, self.slip_std, self.wheels)

@@ -66,7 +66,7 @@ def surface_slip(terrain: str, runs: Sequence[MeasuredSlip], rng: np.random.Gene
     rng : draws runs
     """
     steady = [run.steady for run in runs]
-    slips = [run.body_slip[rows & np.isfinite(run.body_slip)] for run, rows in zip(runs, steady, strict=True)]
+    slips = [run.body_slip[run.known] for run in runs]
     known = [i for i, slip in enumerate(slips) if slip.size]
     all_slips = np.concatenate(slips)
     medians = np.array([np.median(slips[i]) for i in known])

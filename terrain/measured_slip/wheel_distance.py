@@ -33,6 +33,15 @@ class DistanceBound(NamedTuple):
     correlation: float
     n_runs: int
 
+    @property
+    def sentence(self) -> str:
+        """The distance, in words."""
+        low_m, high_m = self.interval_m
+        return (
+            f"turns are those of wheels {self.distance_m:.4f} m from the middle that turn without slip "
+            f"({low_m:.4f} to {high_m:.4f}, {self.n_runs} runs)."
+        )
+
 
 def distance_bound(
     runs: Sequence[MeasuredSlip], robot: OmniRobot, rng: np.random.Generator

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -155,7 +156,7 @@ def compare_laws(
     laws: Sequence[str],
     draws: int,
     seed: int,
-    count: Callable[[], None] = lambda: None,
+    progress: Callable[[str, int, int], None] = lambda task, done, total: None,
 ) -> tuple[WheelResult, Trials, dict[str, Prediction]]:
     """Compare laws on slips and on angles that their fits did not have, and report the last one in full.
 
@@ -166,7 +167,7 @@ def compare_laws(
     wheel : of the trials
     laws : names of :data:`~terrain.soil_identification.laws.LAWS`, and ``simulator``
     draws, seed : of the bootstrap over settings
-    count : called for each fit that is done, :func:`n_fits` times
+    progress : gets the task, how many fits are done, and how many there are
 
     Returns
     -------
@@ -181,6 +182,11 @@ def compare_laws(
     DataError
         if there are too few settings to fit.
     """
+    fits, total = itertools.count(1), n_fits(trials, laws, draws)
+
+    def count() -> None:
+        progress(f"fit {wheel.name}", next(fits), total)
+
     coupling = side_coupling(trials)
     raw, trials = trials, without_coupling(trials, coupling)
     if further is not None:

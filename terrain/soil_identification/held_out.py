@@ -39,6 +39,11 @@ class Misfit(NamedTuple):
     side_ratio: float
     sinkage_m: float
 
+    @property
+    def forces(self) -> str:
+        """The errors of traction and side force, in words."""
+        return f"{100.0 * self.pull_ratio:.1f} % and {100.0 * self.side_ratio:.1f} %"
+
 
 Predictor = Callable[[Trials, Trials], dict[str, Prediction]]
 """From training trials (means of settings) and tested trials to predictions by what is given."""

@@ -53,6 +53,19 @@ class ObserverEstimate:
             return np.asarray(wrapped(np.interp(self.track.time_s, truth.time_s, np.unwrap(values))))
         return np.interp(self.track.time_s, truth.time_s, values)
 
+    def path(self) -> tuple[Array, Array | None]:
+        """Return the estimated and the true position (n,), x + i y; the true one None where it is not known.
+
+        Of an observer that does not know where it begins, the path begins at the true pose.
+        """
+        own = self.track.state("position_x_m") + 1j * self.track.state("position_y_m")
+        x, y, yaw = (self.true(name) for name in ("position_x_m", "position_y_m", "yaw_rad"))
+        if x is None or y is None or yaw is None:
+            return own, None
+        if "position_x_m" not in self.observer.rows:
+            own = own * np.exp(1j * yaw[0]) + x[0] + 1j * y[0]
+        return own, x + 1j * y
+
 
 def observe_run(
     run: RunLog, robot: Robot, name: str, slip_model: SlipModel | None = None

@@ -100,15 +100,11 @@ def _slip(slip: Array, std: Array, true: Array | None, settled: Array) -> Observ
 
 def _position_error(found: ObserverEstimate) -> Array:
     """Return the distance (n,) from the true position; odometry begins at the true pose."""
-    track = found.track
-    x, y, yaw = (found.true(name) for name in ("position_x_m", "position_y_m", "yaw_rad"))
-    if x is None or y is None or yaw is None or "position_x_m" not in track.states:
-        return np.full(len(track.time_s), np.nan)
-    own = track.state("position_x_m") + 1j * track.state("position_y_m")
-    true = x + 1j * y
-    if "position_x_m" not in found.observer.rows:  # it does not know where it begins
-        own = own * np.exp(1j * yaw[0]) + true[0]
-    return np.abs(own - true)
+    if "position_x_m" in found.track.states:
+        own, true = found.path()
+        if true is not None:
+            return np.asarray(np.abs(own - true))
+    return np.full(len(found.track.time_s), np.nan)
 
 
 def _mean(values: Array) -> float:

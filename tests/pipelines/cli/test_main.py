@@ -249,7 +249,7 @@ def test_the_choices_of_the_command_line_are_those_that_there_are():
     """They are written twice, so that help need not load what offers them."""
     from typing import get_args
 
-    from pipelines.slip.modes import Filter, Tuning
+    from pipelines.slip.estimate import Filter, Tuning
     from terrain.estimation.estimate import FILTERS, TUNINGS
     from terrain.estimation.observers.choice import OBSERVERS
 

@@ -1,13 +1,14 @@
 """`terrain explain` from logs to the extended robot, and what it refuses."""
 
 import json
-import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
+from click.testing import CliRunner
 
-from pipelines.cli import main as cli
+from pipelines.cli.main import app
 from pipelines.explain.explain import EXTENDED_FILE, PAGE_FILE, explain_runs
 from pipelines.live.pilot import LivePilot
 from pipelines.report import silent
@@ -16,40 +17,21 @@ from pipelines.report.terminal import terminal_text
 from pipelines.slip import calibrate
 from pipelines.slip.estimate import estimate_runs
 from terrain.discrepancy.answers import INTERVAL_T
-from terrain.errors import ConfigError
+from terrain.errors import ConfigError, TerrainError
 from terrain.extension import write_extended
 from terrain.logs.write import write_run
-from terrain.records import RunLog
-from terrain.robots import load_robot
+from terrain.robots import description_file, load_robot
 from terrain.simulation.planar.drives import COMMANDS_HZ, DRIVE_S
-from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.planar.noise import load_noise
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.run import simulate_run
 from terrain.slip_learning.learn import terrain_runs
 
-HIDDEN = {"camera_yaw_rad": 0.04}
 HUSKY = load_robot("husky")
 
 
-def a_run(i, robot=HUSKY, effects=HIDDEN, terrain="field"):
-    time_s = np.arange(1250) / 50
-    ahead = 0.5 * np.sin(0.6 * time_s + i) + 0.2 * np.sin(1.9 * time_s)
-    twist = np.column_stack([ahead, np.zeros_like(ahead), 0.5 * np.sin(0.9 * time_s + 0.3 * i)])
-    twist[:50] *= np.linspace(0, 1, 50)[:, None]
-    return simulate_planar(
-        robot,
-        twist,
-        i,
-        effects=effects,
-        scatter=load_scatter(),
-        noise=load_noise(),
-        run_id=f"{robot.name}_{i}",
-        terrain=terrain,
-    )
-
-
 @pytest.fixture(scope="module")
-def data(tmp_path_factory):
+def data(a_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     for i in range(7):
         write_run(a_run(i), folder)
@@ -57,45 +39,25 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture
-def terrain(monkeypatch, capsys, tmp_path):
-    """Return a function that runs the command in this process: exit code, stdout and stderr."""
+def terrain(monkeypatch, tmp_path):
+    """Return a function that runs the command in an empty folder: what it raised, and its screen."""
     monkeypatch.chdir(tmp_path)
 
     def run(*words):
-        monkeypatch.setattr(sys, "argv", ["terrain", "explain", *map(str, words)])
-        try:
-            cli.main()
-            code = 0
-        except SystemExit as stop:
-            code = stop.code or 0
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
+        done = CliRunner().invoke(app, ["explain", *map(str, words)])
+        return done.exception, done.output
 
     return run
 
 
-@pytest.fixture
-def refused(terrain, tmp_path):
-    def check(sentence, *words):
-        before = sorted(tmp_path.rglob("*"))
-        code, out, err = terrain(*words)
-        assert (code, out) == (2, ""), err
-        assert err.startswith("error: "), err
-        assert err.count("\n") == 1, err
-        assert sentence in err
-        assert sorted(tmp_path.rglob("*")) == before
-
-    return check
-
-
 def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain, data, tmp_path):
-    code, out, err = terrain("--data", data, "--robot", "husky", "--out", "found", "--json", "found.json")
-    assert code == 0, err
+    error, out = terrain("--data", data, "--robot", "husky", "--out", "found", "--json", "found.json")
+    assert error is None, out
     found = json.loads((tmp_path / "found.json").read_text())
     assert [cause["name"] for cause in found["causes"]] == ["camera_yaw"]
     (value,) = found["causes"][0]["parameters"]
     std = (value["ci"][1] - value["ci"][0]) / (2 * INTERVAL_T)
-    assert abs(value["value"] - HIDDEN["camera_yaw_rad"]) < 4 * std
+    assert abs(value["value"] - 0.04) < 4 * std
     lines = out.splitlines()
     assert "camera yaw" in lines[0]
     assert "held-out runs the extension removes" in lines[0]
@@ -130,10 +92,8 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     extended = tmp_path / "found" / EXTENDED_FILE
     assert load_robot(extended).effects == pytest.approx({"camera_yaw_rad": value["value"]}, rel=1e-6)
     words = ("--data", data, "--robot", "husky", "--model", extended, "--json", "again.json", "--effects")
-    code, out, err = terrain(
-        *words, "camera_yaw,lever_arm,gyro_scale", "--out", "again", "--terrain", "field"
-    )
-    assert code == 0, err
+    error, out = terrain(*words, "camera_yaw,lever_arm,gyro_scale", "--out", "again", "--terrain", "field")
+    assert error is None, out
     again = json.loads((tmp_path / "again.json").read_text())
     assert (again["verdict"], again["causes"]) == ("none", [])
     assert again["effects"] == ["gyro_scale", "camera_yaw", "lever_arm"]
@@ -141,16 +101,10 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     assert "not measured: no cause was named" in out
 
 
-@pytest.fixture(scope="module")
-def few():
-    return explain_runs([a_run(i) for i in range(4)], "husky", effects=["camera_yaw"], hold_out=1, seed=3)
-
-
-def test_runs_are_explained_without_files_and_the_extended_robot_is_simulated(few, tmp_path):
+def test_runs_are_explained_without_files_and_the_extended_robot_is_simulated(a_run, few, tmp_path):
     assert few.extended.effects == few.diagnosis.values
     assert few.extended.region.terrains == ("field",)
-    again = a_run(9, few.extended, effects={})
-    assert again.robot == "husky"
+    assert a_run(9, few.extended, effects={}).robot == "husky"
     assert few.report.save(tmp_path / "explained.html").stat().st_size > 10_000
     assert few.report.picture.panels
     assert few.to_pandas()["name"].tolist() == ["camera_yaw_rad"]
@@ -159,7 +113,7 @@ def test_runs_are_explained_without_files_and_the_extended_robot_is_simulated(fe
     assert (document["page"], document["extended"]["file"]) == (None, None)
 
 
-def test_the_same_seed_gives_the_same_report_and_of_few_runs_none_is_held_out_by_default(few):
+def test_the_same_seed_gives_the_same_report_and_of_few_runs_none_is_held_out_by_default(a_run, few):
     runs = [a_run(i) for i in range(4)]
     same = explain_runs(runs, HUSKY, effects=["camera_yaw"], hold_out=1, seed=3)
     texts = [terminal_text(each.report, details=True) for each in (few, same)]
@@ -170,75 +124,75 @@ def test_the_same_seed_gives_the_same_report_and_of_few_runs_none_is_held_out_by
     assert "The gain on held-out runs was not measured: no run was held out" in bare.report.answer
 
 
-def test_a_users_mistake_is_one_sentence_and_nothing_is_written(refused, data, tmp_path):
-    here = ("--data", data, "--robot", "husky", "--out", "out")
-    refused("effect 'gravity' is unknown", *here, "--effects", "gravity")
-    refused("does not apply to a robot with the drive 'skid_steer'", *here, "--effects", "steering_backlash")
-    refused("--effects names none", *here, "--effects", ",")
-    refused("--pictures is 'few'; a number or 'all' is required", *here, "--pictures", "few")
-    refused("no run is labelled 'sand' throughout; labels are field", *here, "--terrain", "sand")
-    refused("--hold-out is 5 of 7 runs; the diagnosis requires at least 3", *here, "--hold-out", "5")
-    refused("7 of 7 runs are of the robot 'husky'", *here[:2], "--robot", "agrimaro", "--out", "out")
-    refused("--model is of the robot 'agrimaro', --robot is 'husky'", *here, "--model", "agrimaro")
-    refused("does not exist", "--data", tmp_path / "nowhere", *here[2:])
-    (tmp_path / "empty").mkdir()
-    refused("holds no run", "--data", tmp_path / "empty", *here[2:])
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("--effects gravity", "effect 'gravity' is unknown"),
+        ("--effects steering_backlash", "does not apply to a robot with the drive 'skid_steer'"),
+        ("--effects ,", "--effects names none"),
+        ("--pictures few", "--pictures is 'few'; a number or 'all' is required"),
+        ("--terrain sand", "no run is labelled 'sand' throughout; labels are field"),
+        ("--hold-out 5", "--hold-out is 5 of 7 runs; the diagnosis requires at least 3"),
+        ("--robot agrimaro", "7 of 7 runs are of the robot 'husky'"),
+        ("--model agrimaro", "--model is of the robot 'agrimaro', --robot is 'husky'"),
+        ("--data nowhere", "does not exist"),
+    ],
+)
+def test_a_users_mistake_is_one_sentence_and_nothing_is_written(terrain, data, tmp_path, words, sentence):
+    error, out = terrain("--data", data, "--robot", "husky", "--out", "out", *words.split())
+    assert isinstance(error, TerrainError)
+    assert sentence in str(error)
+    assert "\n" not in str(error)
+    assert (out, list(tmp_path.iterdir())) == ("", [])
 
 
-def test_a_model_without_covariance_is_refused_in_one_sentence(refused, data, tmp_path):
-    text = (load_husky_text()).rstrip() + "\neffects:\n"
+def test_runs_that_cannot_be_compared_are_refused(a_run):
+    runs = [a_run(i) for i in range(3)]
+    wheels = runs[0].streams["wheels"]
+    keep = ("speed_left_mps", "speed_right_mps")
+    only = type(wheels)(wheels.time_s, np.column_stack([wheels.channel(name) for name in keep]), keep)
+    standing = [
+        simulate_planar(
+            HUSKY, np.zeros((400, 3)), i, noise=load_noise(), run_id=f"stand_{i}", terrain="field"
+        )
+        for i in range(3)
+    ]
+    for refused, sentence in (
+        ([replace(run, streams={"wheels": only}) for run in runs], "none of its channels is simulated"),
+        (runs[:2], "there are 2, at least 3"),
+        (runs[:1], "there are 1, at least 3"),
+        ([], "there is no run to explain"),
+        (
+            [replace(run, robot="mower") for run in runs],
+            "3 of 3 runs are of the robot 'mower'; the simulation",
+        ),
+        (standing, "in all 3 the wheels are at rest; runs that drive are required"),
+    ):
+        with pytest.raises(TerrainError, match=sentence):
+            explain_runs(refused, HUSKY)
+
+
+def test_a_model_without_covariance_and_an_extended_description_that_is_there_are_refused(
+    terrain, data, tmp_path
+):
+    text = description_file("husky").read_text(encoding="utf-8").rstrip() + "\neffects:\n"
     model = tmp_path / "model.yaml"
-    model.write_text(text + "  schema: 99\n")
-    here = ("--data", data, "--robot", "husky", "--model", model, "--out", "out")
-    refused("schema 99 is newer", *here)
-    model.write_text(text + "  schema: 1\n  camera_yaw_rad: {value: 0.01, unit: rad, source: me}\n")
-    refused("its effects have no covariance", *here)
+    here = ("--data", data, "--robot", "husky", "--out", "out")
+    for effects, sentence in (
+        ("  schema: 99\n", "schema 99 is newer"),
+        (
+            "  schema: 1\n  camera_yaw_rad: {value: 0.01, unit: rad, source: me}\n",
+            "its effects have no covariance",
+        ),
+    ):
+        model.write_text(text + effects)
+        assert sentence in str(terrain(*here, "--model", model)[0])
 
 
-def load_husky_text():
-    from terrain.robots import description_file
-
-    return description_file("husky").read_text(encoding="utf-8")
-
-
-def test_runs_that_cannot_be_compared_are_one_sentence(refused, tmp_path):
-    bare = tmp_path / "bare"
-    for i in range(3):
-        run = a_run(i)
-        wheels = run.streams["wheels"]
-        keep = ["speed_left_mps", "speed_right_mps"]
-        columns = wheels.values[:, [wheels.channels.index(name) for name in keep]]
-        only = type(wheels)(wheels.time_s, columns, tuple(keep))
-        write_run(RunLog(run.run_id, run.robot, {"wheels": only}, run.labels), bare)
-    refused("none of its channels is simulated", "--data", bare, "--robot", "husky", "--out", "out")
-    two = tmp_path / "two"
-    for i in range(2):
-        write_run(a_run(i), two)
-    refused("there are 2, at least 3", "--data", two, "--robot", "husky", "--out", "out")
-
-
-def test_runs_of_another_robot_one_run_and_a_robot_at_rest_are_one_sentence(refused, tmp_path):
-    out = ("--out", "out")
-    for i in range(3):
-        write_run(a_run(i, load_robot("agrimaro"), {}), tmp_path / "agrimaro")
-    wrong = "3 of 3 runs are of the robot 'agrimaro'; the simulation is of 'husky'"
-    refused(wrong, "--data", tmp_path / "agrimaro", "--robot", "husky", *out)
-    write_run(a_run(0), tmp_path / "one")
-    refused("there are 1, at least 3", "--data", tmp_path / "one", "--robot", "husky", *out)
-    for i in range(3):
-        standing = np.zeros((400, 3))
-        run = simulate_planar(HUSKY, standing, i, noise=load_noise(), run_id=f"stand_{i}", terrain="field")
-        write_run(run, tmp_path / "rest")
-    refused(
-        "in all 3 the wheels are at rest; runs that drive are required",
-        *("--data", tmp_path / "rest", "--robot", "husky", *out),
-    )
-
-
-def test_an_extended_description_is_not_overwritten(refused, data, tmp_path):
+def test_an_extended_description_is_not_overwritten(terrain, data, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / EXTENDED_FILE).write_text("mine")
-    refused("is there already", "--data", data, "--robot", "husky", "--out", "out")
+    assert "is there already" in str(terrain("--data", data, "--robot", "husky", "--out", "out")[0])
     assert (tmp_path / "out" / EXTENDED_FILE).read_text() == "mine"
 
 

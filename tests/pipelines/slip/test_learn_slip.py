@@ -7,9 +7,8 @@ from click.testing import CliRunner
 from pipelines.cli.main import app
 from pipelines.report import silent
 from pipelines.slip.curves import curve_figures
-from pipelines.slip.learn_slip import Settings, run
+from pipelines.slip.learn_slip import Settings, learn_slip_table, run
 from pipelines.slip.shown import write_figures
-from pipelines.slip.table import learn_slip_table
 from terrain.control.learned_table import FALLBACK
 from terrain.control.slip_table import DRIVE_STATES, load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
@@ -147,8 +146,8 @@ def test_figures_of_terrains_with_and_without_a_curve(runs):
 
 def test_a_single_run_is_counted_but_no_curve_is_learned(runs):
     table = learn_slip_table(runs[:1], ROBOT)
-    row = table.result.terrains["snow"]
-    assert (row.status, row.n_runs) == ("unestimated", 1)
+    row = table.terrains["snow"]
+    assert (row["status"], row["n_runs"]) == ("unestimated", 1)
     assert (
         table.lookup("lava")["traction"].slip_ratio == load_slip_table().lookup("lava")["traction"].slip_ratio
     )
@@ -162,7 +161,7 @@ def test_a_terrain_in_no_table_keeps_its_own_name(runs, tmp_path):
     again = load_slip_table(table.save(tmp_path / "t.yaml"))
     assert "table default, unknown" in again.lookup("moon/dust")["traction"].source
     assert not [file for file in tmp_path.iterdir() if file.name.startswith(".t")]
-    files = write_figures(table.result.pictures, tmp_path / "f")
+    files = write_figures(table.pictures, tmp_path / "f")
     assert str(tmp_path / "f" / "moon_dust.svg") in files
     assert "moon/dust" in table.report.save(tmp_path / "page.html").read_text()
 
@@ -183,7 +182,7 @@ def test_runs_without_the_required_data_are_refused(runs, change, fault):
 
 def test_a_faulty_run_is_left_out_on_request(runs):
     bad = without(runs[1], "wheels", "current_1_a")
-    result = learn_slip_table([runs[0], bad], ROBOT, repair=True).result
+    result = learn_slip_table([runs[0], bad], ROBOT, repair=True)
     assert result.n_runs == 1
     (sentence,) = result.skipped
     assert "current_1_a" in sentence

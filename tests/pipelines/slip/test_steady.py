@@ -4,7 +4,7 @@ from click.testing import CliRunner
 
 from pipelines.cli.main import app
 from pipelines.data.datasets import load_runs
-from pipelines.slip.table import learn_slip_table
+from pipelines.slip.learn_slip import learn_slip_table
 from terrain.control.measured_table import FEW_RUNS, NO_PEAK
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import DataError
@@ -41,7 +41,7 @@ def runs(omni_run):
 
 def test_steady_slip_is_learned_and_what_was_not_driven_stays_assumed(tmp_path, runs):
     learned = learn_slip_table(runs, ROBOTINO)
-    table, result = load_slip_table(learned.save(tmp_path / "table.yaml"), robot="robotino"), learned.result
+    table, result = load_slip_table(learned.save(tmp_path / "table.yaml"), robot="robotino"), learned
     moss, cork = table.targets["moss"], table.targets["cork"]
     assert moss["steady"].status is TargetStatus.ESTIMATED
     assert moss["steady"].slip_ratio == pytest.approx(0.35, abs=0.02)
@@ -50,20 +50,20 @@ def test_steady_slip_is_learned_and_what_was_not_driven_stays_assumed(tmp_path, 
     assert moss["traction"].status is TargetStatus.UNESTIMATED
     assert moss["traction"].slip_ratio >= moss["steady"].slip_ratio + 0.03
     assert {target.status for target in cork.values()} == {TargetStatus.UNESTIMATED}
-    assert (result.surfaces["moss"].reason, result.surfaces["cork"].reason) == (NO_PEAK, FEW_RUNS)
+    assert (result.surfaces["moss"]["reason"], result.surfaces["cork"]["reason"]) == (NO_PEAK, FEW_RUNS)
 
 
 def test_the_thrust_of_a_point_is_that_of_its_current(runs):
     motors = ROBOTINO.motors
     torque = 0.6 * motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
     expected = (torque - motors.friction_nm) / ROBOTINO.wheel_radius_m / (ROBOTINO.mass_kg * 9.80665 / 3)
-    found = learn_slip_table(runs, ROBOTINO).result.surfaces["moss"]
-    assert found.current_a[0] == pytest.approx(0.6)
-    assert found.thrust_ratio[0] == pytest.approx(expected)
+    found = learn_slip_table(runs, ROBOTINO).surfaces["moss"]
+    assert found["current_a"][0] == pytest.approx(0.6)
+    assert found["thrust_ratio"][0] == pytest.approx(expected)
 
 
 def test_what_a_session_costs_another_is_the_difference_that_was_hidden(runs):
-    transfers = learn_slip_table(runs, ROBOTINO).result.transfers
+    transfers = learn_slip_table(runs, ROBOTINO).transfers
     assert [(each.learned, each.driven) for each in transfers] == [("friday", "monday"), ("monday", "friday")]
     low, high = transfers[1].interval
     assert low < 0.1 < high
@@ -76,7 +76,7 @@ def test_what_a_session_costs_another_is_the_difference_that_was_hidden(runs):
 @pytest.mark.parametrize("n_runs", [1, 2])
 def test_a_session_of_few_runs_has_a_difference_without_an_interval(runs, n_runs):
     monday, friday = runs[:12], runs[12 : 12 + n_runs]
-    for each in learn_slip_table([*monday, *friday], ROBOTINO).result.transfers:
+    for each in learn_slip_table([*monday, *friday], ROBOTINO).transfers:
         assert abs(each.difference) > 0.05
         assert np.isnan(each.interval).all()
 
@@ -89,18 +89,18 @@ def test_slip_of_a_simulated_skid_steer_robot_is_that_of_its_truth(soil, least):
     late = [truth.channel("slip_left_ratio")[truth.time_s > 6.0] for truth in truths]
     truth = float(np.median(np.concatenate(late)))
     table = learn_slip_table(driven, husky)
-    (row,) = table.result.surfaces.values()
+    (row,) = table.surfaces.values()
     assert truth > least
-    assert row.slip.slip_ratio == pytest.approx(truth, abs=3 * row.slip.std)
-    assert row.slip.std < 0.02
-    assert table.targets[soil]["steady"].slip_ratio == pytest.approx(row.slip.slip_ratio, abs=1e-4)
+    assert row["slip"].slip_ratio == pytest.approx(truth, abs=3 * row["slip"].std)
+    assert row["slip"].std < 0.02
+    assert table.targets[soil]["steady"].slip_ratio == pytest.approx(row["slip"].slip_ratio, abs=1e-4)
 
 
 def test_runs_that_are_not_used_are_named(runs):
     streams = dict(runs[0].streams)
     halves = (Label(0.0, 4.0, "moss"), Label(4.0, 8.0, "cork"))
     others = [RunLog("bare", "robotino", streams), RunLog("both", "robotino", streams, halves)]
-    result = learn_slip_table([*runs, *others], ROBOTINO).result
+    result = learn_slip_table([*runs, *others], ROBOTINO)
     assert result.skipped == ("run bare: has no label", "run both: is on 2 terrains: moss, cork")
     assert result.n_runs == len(runs)
 
@@ -115,9 +115,9 @@ def test_the_picture_shows_what_is_known_over_slip(runs, kept, label):
         runs = [simulate_run(robot, "clay", "straight", 3, i, duration_s=8.0) for i in range(3)]
     if kept == "slip alone":
         runs = [without_currents(run) for run in runs]
-    result = learn_slip_table(runs, robot).result
+    result = learn_slip_table(runs, robot)
     assert result.pictures["operating_points"].panels[0].y_label.startswith(label)
-    known = np.isfinite([row.current_a[0] for row in result.surfaces.values()])
+    known = np.isfinite([row["current_a"][0] for row in result.surfaces.values()])
     assert known.all() == (kept != "slip alone")
 
 
@@ -145,6 +145,6 @@ def test_the_command_writes_the_table_and_says_what_is_assumed(tmp_path, runs):
 @pytest.mark.slow
 def test_measured_medians_of_the_robotino(measured):
     loaded = load_runs(measured("robotino") / "one_surface")
-    result = learn_slip_table(loaded, ROBOTINO).result
-    slips = {name: row.slip.slip_ratio for name, row in result.surfaces.items()}
+    result = learn_slip_table(loaded, ROBOTINO)
+    slips = {name: row["slip"].slip_ratio for name, row in result.surfaces.items()}
     assert slips == pytest.approx({"table": 0.10, "brown": 0.14, "gray": 0.29, "green": 0.50}, abs=0.03)

@@ -5,7 +5,13 @@ import math
 import numpy as np
 import pytest
 
-from terrain.discrepancy.compared import ComparedRun, strongest_input, telling_runs, without_levels
+from terrain.discrepancy.compared import (
+    ComparedRun,
+    example_stretch,
+    strongest_input,
+    telling_runs,
+    without_levels,
+)
 from terrain.discrepancy.nameless import DRIVEN, nameless_gain
 from terrain.discrepancy.noise import Noise
 from terrain.effects import CHANNELS
@@ -111,3 +117,7 @@ def test_telling_runs_go_from_the_largest_residual_to_the_smallest():
     assert [run.run_id for run in telling_runs(runs, noise, 3)] == ["r1", "r2", "r4"]
     assert telling_runs(runs, noise, 0) == []
     assert len(telling_runs(runs, noise, 9)) == 5
+    example = example_stretch(runs, noise)
+    assert example.run_id == "r3"  # larger than most, not the largest
+    assert 19.0 < example.time_s[-1] - example.time_s[0] <= 20.0
+    assert len(example_stretch([runs[0].part(0.0, 7.0)], noise).time_s) == 44

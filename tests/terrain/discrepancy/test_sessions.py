@@ -7,7 +7,7 @@ import pytest
 
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.sessions import agreement
-from terrain.discrepancy.statements import SESSION_COLUMNS, session_notes, session_rows
+from terrain.discrepancy.statements import SESSION_COLUMNS, notes_of, session_rows
 from terrain.discrepancy.trials.drives import rich_drives
 from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.discrepancy.trials.trial import simulation_of
@@ -47,7 +47,7 @@ def test_sessions_that_are_alike_agree_and_each_holds_the_truth():
         assert each.high - each.low < 0.15
         assert each.text.startswith("0.9")  # 1.6 times 0.5708 m
         assert " m (" in each.text
-    assert session_notes(found) == ()
+    assert notes_of(found, (), {}) == ()
     rows = session_rows(found)
     assert {len(row) for row in rows} == {len(SESSION_COLUMNS)}
     assert (rows[0][-1], rows[1][-1]) == ("agree", "")
@@ -62,7 +62,7 @@ def test_sessions_that_differ_are_named_with_their_values():
     assert not table.agree
     assert table.between_std == pytest.approx(0.23, abs=0.05)
     assert [each.value for each in table.sessions] == pytest.approx([0.5, 0.5, 0.9], abs=0.05)
-    (note,) = (note for note in session_notes(found) if "effective track" in note)
+    (note,) = (note for note in notes_of(found, (), {}) if "effective track" in note)
     assert "differ" in note
     assert "in worn" in note
 

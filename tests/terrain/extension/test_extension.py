@@ -277,7 +277,7 @@ def test_motion_does_not_depend_on_the_mounting_of_the_camera():
 EDGES = {
     "terrain/estimation/estimate.py",
     "terrain/estimation/observers/estimate.py",
-    "pipelines/slip/filtered.py",
+    "terrain/estimation/tuned_noise.py",
     "terrain/slip_learning/learn.py",
     "pipelines/live/windows.py",
     "pipelines/live/classifying.py",

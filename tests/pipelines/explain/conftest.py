@@ -1,0 +1,34 @@
+import numpy as np
+import pytest
+
+from pipelines.explain.explain import explain_runs
+from terrain.robots import load_robot
+from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.planar.run import simulate_planar
+
+HIDDEN = {"camera_yaw_rad": 0.04}
+HUSKY = load_robot("husky")
+
+
+def simulated(i, robot=HUSKY, effects=HIDDEN, terrain="field"):
+    """Return a run that drives and turns, whose camera is turned by 0.04 rad unless other effects are given."""
+    time_s = np.arange(1250) / 50
+    ahead = 0.5 * np.sin(0.6 * time_s + i) + 0.2 * np.sin(1.9 * time_s)
+    twist = np.column_stack([ahead, np.zeros_like(ahead), 0.5 * np.sin(0.9 * time_s + 0.3 * i)])
+    twist[:50] *= np.linspace(0, 1, 50)[:, None]
+    about = {"run_id": f"{robot.name}_{i}", "terrain": terrain}
+    return simulate_planar(
+        robot, twist, i, effects=effects, scatter=load_scatter(), noise=load_noise(), **about
+    )
+
+
+@pytest.fixture(scope="session")
+def a_run():
+    """Return what simulates a run."""
+    return simulated
+
+
+@pytest.fixture(scope="session")
+def few():
+    """Four runs explained by one effect, one of them held out."""
+    return explain_runs([simulated(i) for i in range(4)], "husky", effects=["camera_yaw"], hold_out=1, seed=3)
