@@ -45,7 +45,7 @@ def terrain(monkeypatch, tmp_path):
 
     def run(*words):
         done = CliRunner().invoke(app, ["explain", *map(str, words)])
-        return done.exception, done.output
+        return done.exception, done.stdout
 
     return run
 
