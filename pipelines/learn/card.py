@@ -49,9 +49,9 @@ from pipelines.report import (
 )
 from terrain.classify.confidence import CoverageFigures
 from terrain.classify.metrics import ClassFigures
-from terrain.errors import LogError, ModelError
+from terrain.errors import ModelError
 from terrain.files.atomic import atomic_write
-from terrain.files.documents import parse_json
+from terrain.files.documents import parse_document
 from terrain.files.names import printable
 
 if TYPE_CHECKING:
@@ -220,9 +220,8 @@ def read_training(folder: Path) -> tuple[ModelInfo, TrainingRecord | None]:
     if TRAINING_FILE not in contents:
         return info, None
     try:
-        parse_json(contents[TRAINING_FILE])
-        return info, TrainingRecord.model_validate_json(contents[TRAINING_FILE])
-    except (LogError, ValueError) as error:
+        return info, parse_document(contents[TRAINING_FILE], TrainingRecord)
+    except ValueError as error:
         text = printable(" ".join(str(error).split()))[:160]
         raise ModelError(f"{folder / TRAINING_FILE}: is no record of a training ({text})") from None
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from features.samples import is_centred
 from features.windows import Layout, SteadyMotion, WindowRule
@@ -28,9 +28,9 @@ from terrain.classify.network_onnx import network_onnx, numbers_of_onnx
 from terrain.classify.novelty_numbers import NoveltyNumbers, check_novelty
 from terrain.classify.support import SupportTable
 from terrain.classify.terrain_filter import TerrainFilter
-from terrain.errors import ConfigError, DataError, LogError, ModelError
+from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
-from terrain.files.documents import MAX_JSON_BYTES, parse_json
+from terrain.files.documents import MAX_JSON_BYTES, parse_document, parse_json
 from terrain.files.names import MAX_NAME, printable, shown
 from terrain.files.regular import MEBIBYTE, check_inside, read_regular
 from terrain.records import Array, Windows
@@ -293,24 +293,16 @@ def read_files(folder: Path) -> tuple[ModelInfo, dict[str, bytes]]:
     check_inside(place, folder, str(place), ModelError)
     content = read_regular(place, str(place), ModelError, MAX_JSON_BYTES)
     try:
-        document = parse_json(content)
-        version = document["version"]
-    except (LogError, ValueError, TypeError, KeyError) as error:
-        raise _damaged(place, error) from error
-    if version != VERSION:
-        raise ModelError(f"{place}: has version {shown(version)}; version {VERSION} is read here")
-    try:
-        manifest = Manifest.model_validate_json(content)
+        version = parse_json(content)["version"]
+        if version != VERSION:
+            raise ModelError(f"{place}: has version {shown(version)}; version {VERSION} is read here")
+        manifest = parse_document(content, Manifest)
         info, listed = manifest.info, manifest.files
         for stream in info.layout.channels:
             info.layout.n_samples(stream, info.rule.length_s)
         if MODEL_FILE not in listed or not set(listed) <= set(FILES):
             raise DataError("its list of files is not that of a model")
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise _damaged(place, ValueError(f"{where}: {first['msg']}")) from None
-    except (ConfigError, DataError, ArithmeticError, LookupError, ValueError) as error:
+    except (ConfigError, DataError, ArithmeticError, LookupError, TypeError, ValueError) as error:
         raise _damaged(place, error) from error
     contents = {}
     for name, expected in listed.items():

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from terrain.errors import ConfigError, LogError
-from terrain.files.documents import MAX_JSON_BYTES, parse_json
+from terrain.errors import ConfigError
+from terrain.files.documents import MAX_JSON_BYTES, parse_document
 from terrain.files.names import printable
 from terrain.files.regular import read_regular
 
@@ -36,13 +36,8 @@ def read_params(file: Path) -> SvmParams:
     ConfigError
         if it is no such file, of another version, or has an unknown or impossible hyper-parameter.
     """
+    content = read_regular(file, str(file), ConfigError, MAX_JSON_BYTES)
     try:
-        content = read_regular(file, str(file), ConfigError, MAX_JSON_BYTES)
-        parse_json(content)
-        return _ParamsFile.model_validate_json(content).params
-    except (LogError, ValueError) as error:
-        text = str(error)
-        if isinstance(error, ValidationError):
-            first = error.errors()[0]
-            text = f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
-        raise ConfigError(f"{file}: is no result of a search ({printable(text)[:200]})") from None
+        return parse_document(content, _ParamsFile).params
+    except ValueError as error:
+        raise ConfigError(f"{file}: is no result of a search ({printable(str(error))[:200]})") from None

@@ -10,13 +10,18 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 
 from terrain.errors import ConfigError, TerrainError
 from terrain.files.names import shown
 from terrain.files.regular import MEBIBYTE, read_regular
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+Document = TypeVar("Document", bound="BaseModel")
 
 MAX_JSON_BYTES = 16 * MEBIBYTE
 """A run with a label each second of 24 hours has 7 MiB of them."""
@@ -94,6 +99,25 @@ def parse_json(content: bytes | str) -> Any:
         except UnicodeEncodeError as error:
             raise ValueError("holds half of a UTF-16 pair, which is no character") from error
     return found
+
+
+def parse_document(content: bytes | str, model: type[Document]) -> Document:
+    """Return what a pydantic model makes of a JSON text.
+
+    Raises
+    ------
+    ValueError
+        as :func:`parse_json`, or in one sentence where the model does not accept it, which names the place.
+    """
+    from pydantic import ValidationError
+
+    parse_json(content)
+    try:
+        return model.model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise ValueError(f"{place}: {first['msg']}") from None
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
