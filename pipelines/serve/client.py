@@ -188,6 +188,7 @@ class TerrainClient:
             raise self._closed or ServiceError("closed", f"the connection has ended ({error})") from None
 
     def _read(self) -> None:
+        reason = ""
         try:
             for message in self._socket:
                 content = decode(message)
@@ -200,9 +201,9 @@ class TerrainClient:
                         if content.get("fatal"):
                             self._closed = ServiceError(content["code"], content["message"])
                     self._came.notify_all()
-        except (ConnectionClosed, TerrainError, OSError):
-            pass
+        except (ConnectionClosed, TerrainError, OSError) as error:
+            reason = f" ({error})"
         finally:
             with self._came:
-                self._closed = self._closed or ServiceError("closed", "the connection has ended")
+                self._closed = self._closed or ServiceError("closed", f"the connection has ended{reason}")
                 self._came.notify_all()

@@ -220,12 +220,8 @@ class ServiceProcess:
 
     @property
     def rss_mb(self) -> float:
-        """Resident memory of the process in MB; NaN where the system does not tell."""
-        try:
-            pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
-        except (OSError, ValueError, IndexError):
-            return float("nan")
-        return pages * 4096 / 1e6
+        """Resident memory of the process in MB; 0 where the system does not tell."""
+        return self.figure("process_resident_memory_bytes") / 1e6
 
     def figure(self, name: str) -> float:
         """Return one of its Prometheus figures; 0 where there is none yet."""
