@@ -11,15 +11,19 @@ from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.live.pilot import LivePilot
 from terrain.control.controllers import make_controller
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
+from terrain.control.path_tracking import PoseEstimate, TrackStatus, initial_tracking, track_step
 from terrain.control.pid import Gains
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.situations import SituationOptions, make_situation, start_times
 from terrain.control.slip_table import load_slip_table
 from terrain.control.terrain_source import KnownTerrain
+from terrain.control.tracking_settings import SETTINGS as TRACKING
+from terrain.control.tracking_settings import check_tracking
 from terrain.control.traction import TractionStatus
 from terrain.control.traction_settings import SETTINGS
 from terrain.errors import ConfigError
 from terrain.estimation.live.health import SENSORS, Health
+from terrain.logs.replay import TWIST as TWIST_CHANNELS
 from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot
@@ -230,3 +234,44 @@ def test_backward_and_sideways_slip_is_estimated_and_limited_as_forward():
     assert (why == TractionStatus.UNSOUND).mean() < 0.01  # a dropout of the camera
     assert set(why) <= {TractionStatus.OK, TractionStatus.UNCERTAIN, TractionStatus.UNSOUND}
     assert slip_peak(truth) < slip_peak(history("plain", "complex", "grass", 202))
+
+
+def off_the_path(scenario, terrain, seed, duration_s):
+    """Return the distance from the path at each step with a good status, and how many steps have one.
+
+    The path is that of the tracking itself, fed with the true motion: it starts anew at each standstill, and
+    the robot is on it wherever along it slip has let it come.
+    """
+    run, situation = driven("fallback+track", scenario, terrain, seed, duration_s=duration_s)
+    truth, control = run.streams["truth"], run.streams["control"]
+    time_s = control.time_s
+
+    def at(source_s, columns):
+        return np.column_stack([np.interp(time_s, source_s, column) for column in columns])
+
+    pose = at(truth.time_s, [truth.channel(name) for name in ("position_x_m", "position_y_m", "yaw_rad")])
+    ground = at(truth.time_s, [truth.channel(name) for name in TWIST_CHANNELS])
+    desired = at(situation.scenario.time_s, situation.scenario.twist.T)
+    settings, state, off_m = check_tracking(ROBOT, TRACKING, DELAY_S), initial_tracking(), []
+    for place, twist, motion in zip(pose, desired, ground, strict=True):
+        seen = PoseEstimate(*map(float, place), yaw_std_rad=0.0, stale_s=0.0)
+        _, state, report = track_step(settings, state, twist.copy(), seen, motion.copy(), 0.02)
+        off_m.append(abs(report.cross_track_m))
+    tracked = np.isin(control.channel("track_status_code"), (TrackStatus.OK, TrackStatus.CLAMPED))
+    good = tracked & (control.channel("status_code") == TractionStatus.OK)
+    return np.array(off_m)[good], good
+
+
+def test_a_minute_on_the_path():
+    off_m, good = off_the_path("complex", "tiles", 63, 60.0)
+    assert np.nanmax(off_m) < 0.3
+    assert good.mean() > 0.5  # the others stand
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["straight", "complex"])
+@pytest.mark.parametrize("terrain", ["tiles", "grass", "dry_sand"])
+def test_ten_minutes_on_the_path(scenario, terrain):
+    off_m, good = off_the_path(scenario, terrain, 64, 600.0)
+    assert np.nanmax(off_m) < 0.3
+    assert good.mean() > 0.8

@@ -16,11 +16,7 @@ import pytest
 import pipelines.live.recording as recording
 from pipelines.data.bag_runs import recorded_windows
 from pipelines.data.datasets import load_runs
-from pipelines.data.inspect import Settings as InspectSettings
-from pipelines.data.inspect import run as inspect_runs
-from pipelines.learn.crossval import EvaluationSettings
 from pipelines.learn.predict import predict
-from pipelines.learn.protocols import samples_of
 from pipelines.live.classifying import Classifier, WindowOutput
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
@@ -31,7 +27,7 @@ from terrain.estimation.live.estimator import CHANNELS as OF_SWERVE
 from terrain.logs.replay import replay
 from terrain.logs.run_topics import APART, DEAD_STREAM, SHORT_STREAM
 from terrain.logs.samples import BAD_TIME, DEAD_CHANNEL
-from terrain.records import Command, Label, Reading, Stream
+from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import make_scenario
@@ -144,22 +140,6 @@ def test_a_recorded_pilot_is_predicted_as_it_was_live_and_desires_the_same_motio
     assert set(run.streams["control"].channels) == set(commands[0].status)
 
 
-def test_a_recorded_run_is_inspected_and_trained_on_once_it_is_labelled(writer, tmp_path, two_drives):
-    for run in two_drives:
-        channels = {name: stream.channels for name, stream in run.streams.items()}
-        recorder = SessionRecorder(tmp_path, run.run_id, "mower", channels, writer=writer)
-        for each in replay(run):
-            recorder.readings(each.readings)
-            recorder.command(each.time_s, each.twist, Command((), (), (), {"probability_ratio": 0.5}))
-        recorder.close(10.0)
-    assert inspect_runs(InspectSettings(data=tmp_path)).n_runs == len(two_drives)
-    labelled = [replace(run, labels=(Label(0.0, 12.0, run.run_id[0]),)) for run in load_runs(tmp_path)]
-    windows, plain = (samples_of(runs, EvaluationSettings()).windows for runs in (labelled, two_drives))
-    assert set(windows.values) == {"imu", "wheels"}
-    np.testing.assert_array_equal(windows.values["imu"], plain.values["imu"])
-    assert windows.terrain.tolist() == plain.terrain.tolist()
-
-
 @pytest.mark.parametrize("origin_s", [0.0, 1.7e9, -50.0, 5e9])
 def test_stamps_of_any_clock_come_back_as_they_were(recorder, origin_s):
     stamps = origin_s + np.arange(20) / 50
@@ -169,19 +149,13 @@ def test_stamps_of_any_clock_come_back_as_they_were(recorder, origin_s):
 
 def test_windows_of_any_class_are_in_the_file(recorder):
     recorded(recorder)
-    for start_s, terrain, probability, refused in (
-        (0.0, "grass", 0.9, ""),
-        (2.0, "grass", 0.4, ""),
-        (4.0, "", np.nan, "NaN in it"),
-    ):
-        probabilities = np.array([probability, 1.0 - probability])
-        found = WindowOutput(
-            start_s, start_s + 2.0, terrain, probability, probabilities, ("grass", "a/b: c"), refused
-        )
-        recorder.window(found)
+    given = (("a/b: c", 0.9, ""), ("a/b: c", 0.4, ""), ("", np.nan, "NaN"))
+    for k, (terrain, probability, why) in enumerate(given):
+        both, span_s = np.array([probability, 1.0 - probability]), (2.0 * k, 2.0 * k + 2.0)
+        recorder.window(WindowOutput(*span_s, terrain, probability, both, ("a/b: c", "d"), why))
     _, windows = recorded_windows(recorder.close(10.0)[0])
-    assert [(w.doubtful, w.refused) for w in windows] == [(False, ""), (True, ""), (True, "NaN in it")]
-    assert windows[0].probabilities == {"grass": 0.9, "a/b: c": pytest.approx(0.1)}
+    assert [(w.doubtful, w.refused) for w in windows] == [(False, ""), (True, ""), (True, "NaN")]
+    assert windows[0].probabilities == {"a/b: c": 0.9, "d": pytest.approx(0.1)}
 
 
 def test_what_a_run_cannot_hold_is_dropped_and_counted(writer, tmp_path):
