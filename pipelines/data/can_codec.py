@@ -341,17 +341,17 @@ def _factor(path: Path, signal: Any, channel: str) -> float:
     """Return the factor from a signal's unit to that of its channel."""
     given, required = signal.unit or "", unit_of(channel)
     if required == "code" or (required == "ratio" and given == ""):
-        known = ("", 1.0) if given in UNITLESS else None
-    else:
-        known = None if given in UNIT_OFFSETS else UNIT_SCALES.get(given)  # a DBC has offsets of its own
-        known = known if known is not None and known[0] == required else None
-    if known is None:
-        fitting = [repr(unit) for unit, (word, _) in UNIT_SCALES.items() if word == required] or ["none"]
-        raise ConfigError(
-            f"{path}: the signal {signal.name!r} has the unit {given!r}, which does not fit {channel}; "
-            f"accepted: {', '.join(fitting)}"
-        )
-    return known[1]
+        if given in UNITLESS:
+            return 1.0
+    elif (
+        given not in UNIT_OFFSETS and UNIT_SCALES.get(given, ("",))[0] == required
+    ):  # a DBC has its own offsets
+        return UNIT_SCALES[given][1]
+    fitting = [repr(unit) for unit, (word, _) in UNIT_SCALES.items() if word == required] or ["none"]
+    raise ConfigError(
+        f"{path}: the signal {signal.name!r} has the unit {given!r}, which does not fit {channel}; "
+        f"accepted: {', '.join(fitting)}"
+    )
 
 
 def _message_plan(message: Any, stream: str, signals: list[SignalPlan]) -> MessagePlan:
@@ -444,24 +444,21 @@ def encode(
     time_s : of the frames
     clipped : gets the number of values beyond their range, by signal
     """
-    return [_encode(plan, values, counter, time_s, clipped) for plan in layout.by_stream.get(stream, ())]
-
-
-def _encode(
-    plan: MessagePlan, values: Sequence[float], counter: int, time_s: float, clipped: Counter[str] | None
-) -> Frame:
-    sent: dict[str, Any] = dict(plan.others)
-    for signal in plan.signals:
-        value = float(values[signal.column]) / signal.factor
-        sent[signal.name] = signal.absent
-        if math.isfinite(value):
-            sent[signal.name] = min(max(value, signal.low), signal.high)
-            if abs(value - sent[signal.name]) > 0.5 * signal.scale and clipped is not None:
-                clipped[signal.name] += 1
-    if plan.counter_bits:
-        sent[COUNTER] = counter % 2**plan.counter_bits
-    data = bytes(plan.message.encode(sent, padding=False, strict=False))
-    if plan.crc_bits:
-        sent[CRC] = _crc_of(plan, data)
+    frames = []
+    for plan in layout.by_stream.get(stream, ()):
+        sent: dict[str, Any] = dict(plan.others)
+        for signal in plan.signals:
+            value = float(values[signal.column]) / signal.factor
+            sent[signal.name] = signal.absent
+            if math.isfinite(value):
+                sent[signal.name] = min(max(value, signal.low), signal.high)
+                if abs(value - sent[signal.name]) > 0.5 * signal.scale and clipped is not None:
+                    clipped[signal.name] += 1
+        if plan.counter_bits:
+            sent[COUNTER] = counter % 2**plan.counter_bits
         data = bytes(plan.message.encode(sent, padding=False, strict=False))
-    return Frame(time_s, plan.message.frame_id, data, plan.message.is_extended_frame)
+        if plan.crc_bits:
+            sent[CRC] = _crc_of(plan, data)
+            data = bytes(plan.message.encode(sent, padding=False, strict=False))
+        frames.append(Frame(time_s, plan.message.frame_id, data, plan.message.is_extended_frame))
+    return frames

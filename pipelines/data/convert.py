@@ -8,8 +8,9 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from pipelines.data.layouts import Target
 from pipelines.data.settings import MAPPING_TEXT, ROBOT_TEXT, RunsSettings, load
 from pipelines.report import (
     Progress,
@@ -41,7 +42,7 @@ class Settings(RunsSettings):
     robot: str | None = setting(None, ROBOT_TEXT)
     mapping: Path | None = setting(None, MAPPING_TEXT)
     out: Path = setting(..., "Folder of the new runs; what is there is left as it is.")
-    to: Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"] = setting(
+    to: Target = setting(
         "runs",
         "What is written: runs, folders that all commands read; mcap, a file a run; ros2 or ros2-mcap, a bag a "
         "run in SQLite or MCAP; csv, a folder of tables a run.",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,15 +65,8 @@ class InspectedRun:
 
     def as_json(self) -> dict[str, Any]:
         """Return all fields, the figures of channels by quantity."""
-        return {
-            "run_id": self.run_id,
-            "terrains": self.terrains,
-            "dropped": self.dropped,
-            "streams": {name: _stream_json(quality) for name, quality in self.streams.items()},
-            "clock": self.clock,
-            "odd_stretches": self.odd_stretches,
-            "plausibility": self.plausibility,
-        }
+        found = {each.name: getattr(self, each.name) for each in fields(self)}
+        return found | {"streams": {name: _stream_json(quality) for name, quality in self.streams.items()}}
 
 
 def _stream_json(quality: StreamQuality) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Layouts of logs: what a folder of them may be."""
+"""Layouts of logs: what a folder of them may be, and what is written."""
 
 from typing import Literal, get_args
 
@@ -21,3 +21,6 @@ ACCEPTED = (
     "any CSV with a mapping file"
 )
 """What a refusal lists."""
+
+Target = Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"]
+"""``runs``: run folders; ``mcap``: a file a run; ``ros2``, ``ros2-mcap``: a bag a run; ``csv``: tables a run."""

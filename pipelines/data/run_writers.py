@@ -6,11 +6,14 @@ import heapq
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import repeat
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from pipelines.data.layouts import Target
 from pipelines.data.mcap_file import McapWriter, library
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.kinematics.standard_messages import StandardTopic, standard_topic
@@ -19,8 +22,6 @@ from terrain.logs.run_topics import Messages, head_of, origin_of, run_messages, 
 from terrain.logs.topic_mapping import DISTRO
 from terrain.logs.write import run_folder, write_csv, write_run
 from terrain.records import Array, RunLog
-
-Target = Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"]
 
 
 def messages_of_run(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iterator[Messages]:
@@ -131,8 +132,8 @@ def write(place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: T
     if target == "mcap":
         with atomic_file(place) as file:
             writer = McapWriter(file, head_of(run))
-            for log_ns, number, message in _in_order(topics):
-                writer.write(topics[number], log_ns, message)
+            for log_ns, topic, content in _in_order(topics):
+                writer.write(topic, log_ns, content)
             writer.finish()
     else:
         with atomic_folder(place) as unfinished:
@@ -162,16 +163,11 @@ def _write_ros2(folder: Path, topics: Sequence[Messages], storage: str) -> None:
             if (each.topic, each.kind) not in connections:
                 connection = writer.add_connection(each.topic, each.kind, typestore=store)
                 connections[each.topic, each.kind] = connection
-        for log_ns, number, message in _in_order(topics):
-            writer.write(connections[topics[number].topic, topics[number].kind], log_ns, message)
+        for log_ns, each, content in _in_order(topics):
+            writer.write(connections[each.topic, each.kind], log_ns, content)
 
 
-def _in_order(topics: Sequence[Messages]) -> Iterator[tuple[int, int, bytes]]:
-    """Yield log time, number of the topic and message, of all topics in the order of log times."""
-
-    def numbered(number: int) -> Iterator[tuple[int, int, bytes]]:
-        topic = topics[number]
-        for log_ns, message in zip(topic.log_ns.tolist(), topic.contents, strict=True):
-            yield log_ns, number, message
-
-    return heapq.merge(*(numbered(number) for number in range(len(topics))), key=lambda found: found[0])
+def _in_order(topics: Sequence[Messages]) -> Iterator[tuple[int, Messages, bytes]]:
+    """Yield log time, topic and content of all messages in the order of log times."""
+    rows = (zip(each.log_ns.tolist(), repeat(each), each.contents, strict=False) for each in topics)
+    return heapq.merge(*rows, key=itemgetter(0))

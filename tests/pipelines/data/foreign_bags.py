@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from rosbags.interfaces import Nodetype
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
@@ -15,54 +16,61 @@ TYPES = STORE.types
 START_NS = 1_700_000_000_123_456_789
 
 
-def header(stamp_ns, frame="base_link"):
-    time = TYPES["builtin_interfaces/msg/Time"](stamp_ns // 10**9, stamp_ns % 10**9)
-    return TYPES["std_msgs/msg/Header"](time, frame)
+def message(kind, stamp_ns=None, **fields):
+    """Return a message whose fields are 0 or empty, but for some: a number, text or array, or x, y, z and w."""
+    values = {}
+    for name, (node, about) in STORE.fielddefs[kind][1]:
+        if node == Nodetype.NAME:
+            values[name] = message(about)
+        elif node == Nodetype.BASE:
+            values[name] = "" if about[0] == "string" else 0
+        else:
+            values[name] = np.zeros(about[1] if node == Nodetype.ARRAY else 0)
+    made = TYPES[kind](**values)
+    if stamp_ns is not None:
+        made.header.stamp.sec, made.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    for path, value in fields.items():
+        *parents, last = path.split("__")
+        owner = made
+        for name in parents:
+            owner = getattr(owner, name)
+        if isinstance(value, tuple):
+            for axis, number in zip("xyzw", value, strict=False):
+                setattr(getattr(owner, last), axis, number)
+        else:
+            setattr(owner, last, value)
+    return made
 
 
-def vector(x, y, z):
-    return TYPES["geometry_msgs/msg/Vector3"](x, y, z)
-
-
-def imu(stamp_ns, gyro, accel=(0.0, 0.0, 9.81), quaternion=(0.0, 0.0, 0.0, 1.0), unknown=False, frame="imu"):
-    covariance = np.zeros(9)
-    attitude = np.array([-1.0 if unknown else 0.0, *covariance[1:]])
-    return TYPES["sensor_msgs/msg/Imu"](
-        header(stamp_ns, frame),
-        TYPES["geometry_msgs/msg/Quaternion"](*quaternion),
-        attitude,
-        vector(*gyro),
-        covariance,
-        vector(*accel),
-        covariance,
+def imu(stamp_ns, gyro, accel=(0.0, 0.0, 9.81), quaternion=(0.0, 0.0, 0.0, 1.0), unknown=False):
+    return message(
+        "sensor_msgs/msg/Imu",
+        stamp_ns,
+        angular_velocity=tuple(gyro),
+        linear_acceleration=tuple(accel),
+        orientation=tuple(quaternion),
+        orientation_covariance=np.array([-1.0 if unknown else 0.0, *np.zeros(8)]),
     )
 
 
 def joints(stamp_ns, names, velocity, position=(), effort=()):
-    numbers = (np.array(each, dtype=np.float64) for each in (position, velocity, effort))
-    return TYPES["sensor_msgs/msg/JointState"](header(stamp_ns), list(names), *numbers)
+    numbers = {"velocity": velocity, "position": position, "effort": effort}
+    arrays = {field: np.array(each, dtype=np.float64) for field, each in numbers.items()}
+    return message("sensor_msgs/msg/JointState", stamp_ns, name=list(names), **arrays)
 
 
 def twist(x, y, yaw_rate):
-    return TYPES["geometry_msgs/msg/Twist"](vector(x, y, 0.0), vector(0.0, 0.0, yaw_rate))
+    return message("geometry_msgs/msg/Twist", linear=(x, y, 0.0), angular=(0.0, 0.0, yaw_rate))
 
 
 def odometry(stamp_ns, position, quaternion, linear, angular):
-    pose = TYPES["geometry_msgs/msg/Pose"](
-        TYPES["geometry_msgs/msg/Point"](*position), TYPES["geometry_msgs/msg/Quaternion"](*quaternion)
-    )
-    return TYPES["nav_msgs/msg/Odometry"](
-        header(stamp_ns, "odom"),
-        "base_link",
-        TYPES["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36)),
-        TYPES["geometry_msgs/msg/TwistWithCovariance"](
-            TYPES["geometry_msgs/msg/Twist"](vector(*linear), vector(*angular)), np.zeros(36)
-        ),
-    )
+    pose = {"pose__pose__position": tuple(position), "pose__pose__orientation": tuple(quaternion)}
+    rates = {"twist__twist__linear": tuple(linear), "twist__twist__angular": tuple(angular)}
+    return message("nav_msgs/msg/Odometry", stamp_ns, **pose, **rates)
 
 
 def text(content):
-    return TYPES["std_msgs/msg/String"](content)
+    return message("std_msgs/msg/String", data=content)
 
 
 def write_bag(folder, rows, storage="sqlite3"):
