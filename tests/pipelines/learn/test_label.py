@@ -1,7 +1,6 @@
 """Labels are set where a person says so, and nothing else of a run changes."""
 
 import json
-import sys
 from itertools import pairwise
 
 import numpy as np
@@ -9,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.cli import main as cli
 from pipelines.learn.label import Settings, time_text
 from pipelines.learn.label import run as label
 from pipelines.live.classifying import WindowOutput
@@ -20,7 +18,6 @@ from terrain.logs.labels import relabelled
 from terrain.logs.read import read_run
 from terrain.logs.recorded_windows import WINDOWS_FILE, windows_text
 from terrain.logs.write import write_run
-from terrain.records import Label
 
 WINDOWS = ((0.0, "SNOW", 0.9), (1.0, "SNOW", 0.4), (2.0, "ICE", 0.49), (3.0, "", np.nan))
 
@@ -124,6 +121,10 @@ def test_a_whole_run_is_labelled_to_the_end_of_its_last_sample(folder):
         ({"whole": True, "terrain": "../ICE"}, "use letters"),
         ({"whole": True, "terrain": "ICE", "remove": True}, "give one of the two"),
         ({"run": None, "whole": True, "terrain": "ICE"}, "needs --run"),
+        ({"model": "a", "answers": "b", "out": "c"}, "--model proposes labels"),
+        ({"model": "a", "terrain": "ICE", "whole": True}, "--model proposes labels"),
+        ({"answers": "b"}, "--answers FILE sets labels in the new folder --out DIR"),
+        ({"out": "c"}, "--answers FILE sets labels in the new folder --out DIR"),
     ],
 )
 def test_what_is_not_accepted_changes_nothing(folder, options, message):
@@ -180,33 +181,6 @@ def test_the_last_label_of_an_instant_holds(settings):
     assert joined == []
 
 
-def test_a_label_that_is_cut_keeps_its_terrain_on_both_sides():
-    assert relabelled([Label(0.0, 9.0, "a")], 8.0, 12.0, "b") == (Label(0.0, 8.0, "a"), Label(8.0, 12.0, "b"))
-
-
 def test_times_are_printed_as_they_can_be_given_back():
     for time_s in (0.0, 4.73, 1732345678.123456, 0.000001):
         assert float(time_text(time_s)) == pytest.approx(time_s, abs=1e-6)
-
-
-def test_the_command_lists_and_sets(folder, monkeypatch, capsys, tmp_path):
-    def terrain(*words):
-        monkeypatch.setattr(sys, "argv", ["terrain", "label", str(folder), *map(str, words)])
-        try:
-            cli.main()
-        except SystemExit as end:
-            return end.code or 0, capsys.readouterr()
-        raise AssertionError
-
-    code, printed = terrain("--json", tmp_path / "out.json")
-    assert code == 0
-    assert "3 of 4 recorded windows are of low confidence, 0 of them without a label" in printed.out
-    assert "refused: NaN" in printed.out
-    listed = json.loads((tmp_path / "out.json").read_text())
-    assert [row["start_s"] for row in listed["windows"]] == [1.0, 2.0, 3.0]
-    assert listed["windows"][2]["probability"] is None
-    code, printed = terrain("--run", "SNOW_01", "--from", 1, "--to", 2, "--terrain", "ICE")
-    assert (code, "SNOW_01: 1 to 2 s labelled ICE" in printed.out) == (0, True)
-    code, printed = terrain("--run", "SNOW_09", "--all", "--terrain", "ICE")
-    assert code == 2
-    assert printed.err == f"error: {folder}: there is no run 'SNOW_09'\n"

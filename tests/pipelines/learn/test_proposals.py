@@ -2,13 +2,11 @@
 
 import csv
 import json
-import sys
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from pipelines.cli.main import main
 from pipelines.data.datasets import load_runs
 from pipelines.learn.label import SOURCES_FILE, Settings
 from pipelines.learn.label import propose_labels as propose
@@ -22,11 +20,11 @@ from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.write import write_run
 
 
-def propose_labels(data, model, n_asked, file, accept):
-    return propose(Settings(data=data, ask=n_asked, proposals=file, accept=accept), model)
+def propose_labels(data, model, n_asked, file):
+    return propose(Settings(data=data, ask=n_asked, proposals=file, accept=0.9), model)
 
 
-def write_labels(data, answers, out, accept, *, new_class):
+def write_labels(data, answers, out, accept=1.01, *, new_class=False):
     return write(Settings(data=data, accept=accept, new_class=new_class), answers, out)
 
 
@@ -48,7 +46,7 @@ def recorded(tmp_path, drive):
 @pytest.fixture
 def table(recorded, model, tmp_path):
     file = tmp_path / "proposals.csv"
-    propose_labels(recorded, model, 2, file, 0.9)
+    propose_labels(recorded, model, 2, file)
     return file
 
 
@@ -57,11 +55,7 @@ def rows_of(file):
         return list(csv.DictReader(text))
 
 
-def answered(file, **answers):
-    """Write answers by run id into the table."""
-    rows = rows_of(file)
-    for row in rows:
-        row["answer"] = answers.get(row["run_id"], "")
+def put(file, rows):
     with file.open("w", newline="") as text:
         writer = csv.DictWriter(text, COLUMNS)
         writer.writeheader()
@@ -69,9 +63,16 @@ def answered(file, **answers):
     return file
 
 
+def answered(file, **answers):
+    """Write answers by run id into the table."""
+    return put(file, [row | {"answer": answers.get(row["run_id"], "")} for row in rows_of(file)])
+
+
 def test_proposals_cover_the_runs_and_questions_come_first(recorded, model, tmp_path):
-    found = propose_labels(recorded, model, 2, tmp_path / "p.csv", 0.9)
+    found = propose_labels(recorded, model, 2, tmp_path / "p.csv")
     assert (found.n_runs, found.n_asked) == (4, 2)
+    right = sum(p.n_windows for p in found.proposals if p.run_id == f"new_{p.terrain}")
+    assert right > 0.6 * sum(p.n_windows for p in found.proposals if p.run_id != "old")
     rows = rows_of(tmp_path / "p.csv")
     assert [row["ask"] for row in rows[:3]] == ["1", "2", ""]
     assert len({row["run_id"] for row in rows[:2]}) == 2  # not two of one run
@@ -86,7 +87,7 @@ def test_proposals_cover_the_runs_and_questions_come_first(recorded, model, tmp_
 
 def test_answers_stand_above_what_the_model_proposes_and_measured_labels_stay(recorded, table, tmp_path):
     answers = answered(table, new_ASPHALT="GRAVEL", new_GRASS="none", new_GRAVEL="yes")
-    found = write_labels(recorded, answers, tmp_path / "out", 1.01, new_class=False)
+    found = write_labels(recorded, answers, tmp_path / "out")
     runs = {run.run_id: run for run in load_runs(tmp_path / "out")}
     assert {label.terrain for label in runs["new_ASPHALT"].labels} == {"GRAVEL"}
     assert runs["new_GRASS"].labels == ()
@@ -102,21 +103,14 @@ def test_answers_stand_above_what_the_model_proposes_and_measured_labels_stay(re
 
 
 def test_what_the_model_is_certain_of_needs_no_answer(recorded, table, tmp_path):
-    found = write_labels(recorded, table, tmp_path / "out", 0.0, new_class=False)
+    found = write_labels(recorded, table, tmp_path / "out", 0.0)
     assert found.n_labels["model"] >= 1
     of_model = [each for labels in found.runs.values() for each in labels if each.source == "model"]
     assert all(0 < each.confidence <= 1 for each in of_model)
     assert not any(each.source == "model" for each in found.runs["old"])  # it is labelled already
     answers = answered(table, new_GRASS="yes")
-    stricter = write_labels(recorded, answers, tmp_path / "strict", 1.01, new_class=False)
+    stricter = write_labels(recorded, answers, tmp_path / "strict")
     assert set(stricter.n_labels) == {"measured", "person"}
-
-
-def test_proposals_name_the_ground_of_easy_runs(recorded, model, tmp_path):
-    found = propose_labels(recorded, model, 0, tmp_path / "p.csv", 0.9)
-    right = sum(p.n_windows for p in found.proposals if p.run_id in (f"new_{p.terrain}",))
-    of_new = sum(p.n_windows for p in found.proposals if p.run_id != "old")
-    assert right > 0.6 * of_new
 
 
 @pytest.mark.parametrize(
@@ -133,65 +127,30 @@ def test_proposals_name_the_ground_of_easy_runs(recorded, model, tmp_path):
 def test_a_table_that_does_not_fit_is_refused_in_one_sentence(
     recorded, table, tmp_path, change, error, sentence
 ):
-    rows = change(rows_of(table))
-    with table.open("w", newline="") as text:
-        writer = csv.DictWriter(text, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
+    put(table, change(rows_of(table)))
     with pytest.raises(error, match=sentence) as refusal:
-        write_labels(recorded, table, tmp_path / "out", 0.9, new_class=False)
+        write_labels(recorded, table, tmp_path / "out")
     assert len(str(refusal.value).splitlines()) == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_other_files_no_labels_and_folders_that_are_there_are_refused(recorded, table, tmp_path, model):
+def test_other_files_no_labels_and_folders_that_are_there_are_refused(
+    recorded, table, tmp_path, model, drive
+):
     (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
     with pytest.raises(LogError, match="no table of proposals"):
         read_answers(tmp_path / "notes.csv", {}, [], new_class=False)
     with pytest.raises(LogError, match="cannot be read"):
         read_answers(tmp_path / "nowhere.csv", {}, [], new_class=False)
     with pytest.raises(ConfigError, match="nothing is written"):
-        write_labels(recorded, table, tmp_path / "out", 1.01, new_class=False)
+        write_labels(recorded, table, tmp_path / "out")
     with pytest.raises(ConfigError, match="exists already"):
-        write_labels(recorded, table, recorded, 0.5, new_class=False)
-    new = write_labels(recorded, answered(table, new_GRASS="LAVA"), tmp_path / "out", 1.01, new_class=True)
-    assert {each.terrain for each in new.runs["new_GRASS"]} == {"LAVA"}
-
-
-def test_short_runs_give_no_proposal(tmp_path, drive, model):
-    write_run(drive("short", "GRASS", 3, duration_s=1.5), tmp_path / "data")
+        write_labels(recorded, table, recorded)
+    write_run(drive("short", "GRASS", 3, duration_s=1.5), tmp_path / "short")
     with pytest.raises(DataError, match="no run holds a window"):
-        propose_labels(tmp_path / "data", model, 2, tmp_path / "p.csv", 0.9)
-
-
-@pytest.mark.parametrize(
-    "given",
-    [
-        {"model": "a", "answers": "b", "out": "c"},
-        {"answers": "b"},
-        {"out": "c"},
-        {"model": "a", "terrain": "x"},
-    ],
-)
-def test_options_that_contradict_each_other_are_refused(given):
-    with pytest.raises((ConfigError, ValueError)):
-        Settings(data="runs", run="r", whole="terrain" in given, **given)
-
-
-def test_the_command_goes_from_proposals_to_labelled_runs(recorded, tracked, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    folder = str(tracked[0] / "model")
-
-    def terrain(*words):
-        monkeypatch.setattr(sys, "argv", ["terrain", "label", str(recorded), *words])
-        with pytest.raises(SystemExit) as done:
-            main()
-        assert not done.value.code
-        return " ".join(capsys.readouterr().out.split())
-
-    assert "proposals for 4 runs in proposals.csv" in terrain("--model", folder, "--ask", "1")
-    assert "by model" in terrain("--answers", "proposals.csv", "--out", "new", "--accept", "0")
-    assert len(load_runs("new")) == 4
+        propose_labels(tmp_path / "short", model, 2, tmp_path / "p.csv")
+    new = write_labels(recorded, answered(table, new_GRASS="LAVA"), tmp_path / "out", new_class=True)
+    assert {each.terrain for each in new.runs["new_GRASS"]} == {"LAVA"}
 
 
 def test_doubt_is_of_what_is_improbable_unsupported_or_unknown():
