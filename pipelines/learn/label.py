@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Self
+from typing import TYPE_CHECKING, Self
 
 from pydantic import model_validator
 
@@ -32,8 +31,7 @@ from terrain.files.names import plain_name
 
 if TYPE_CHECKING:
     from pipelines.learn.model_file import TerrainModel
-    from pipelines.learn.proposals import Answered
-    from terrain.classify.proposals import Proposal
+    from terrain.classify.proposals import LabelSource, Proposal
     from terrain.logs.recorded_windows import DoubtfulWindow, RunWindows
     from terrain.records import Label, RunLog
 
@@ -141,16 +139,6 @@ class ProposalsResult(Result):
     proposals: tuple[Proposal, ...] = described("stretches with the terrain that the model proposes")
 
 
-class LabelSource(NamedTuple):
-    """A label, and where it comes from: ``measured`` as the run had it, a ``person``, or the ``model``."""
-
-    start_s: float
-    end_s: float
-    terrain: str
-    source: str
-    confidence: float | None
-
-
 @dataclass(frozen=True)
 class AnswersResult(Result):
     """Runs that were written with their labels."""
@@ -243,6 +231,7 @@ def write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
     """
     from pipelines.data.datasets import load_runs
     from pipelines.learn.proposals import read_answers
+    from terrain.classify.proposals import LabelSource, label_of, with_label
     from terrain.files.atomic import atomic_folder
     from terrain.logs.write import write_run
     from terrain.records import Label
@@ -259,11 +248,11 @@ def write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
     for run in runs:
         labels = [LabelSource(*label, "measured", None) for label in run.labels]
         for row in (row for row in rows if row.proposal.run_id == run.run_id):
-            added = _label_of(row, settings.accept)
+            added = label_of(row.proposal, row.answer, settings.accept)
             if added is None:
                 left_open += not row.answer
             else:
-                labels = _with(labels, added)
+                labels = with_label(labels, added)
         written[run.run_id] = tuple(sorted(labels))
         labelled.append(replace(run, labels=tuple(Label(*each[:3]) for each in written[run.run_id])))
     if not any(each.source != "measured" for labels in written.values() for each in labels):
@@ -278,36 +267,6 @@ def write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
             write_run(run, folder, beside={SOURCES_FILE: text})
     counts = Counter(each.source for labels in written.values() for each in labels)
     return AnswersResult(out, len(runs), dict(sorted(counts.items())), left_open, written)
-
-
-def _label_of(row: Answered, accept: float) -> LabelSource | None:
-    """Return the label that a row sets; None where it sets none, an empty terrain where it removes."""
-    from pipelines.learn.proposals import NONE, YES
-
-    proposal = row.proposal
-    if row.answer == NONE:
-        return LabelSource(proposal.start_s, proposal.end_s, "", "person", None)
-    if row.answer:
-        terrain = proposal.terrain if row.answer == YES else row.answer
-        return LabelSource(proposal.start_s, proposal.end_s, terrain, "person", None)
-    if not proposal.taken_over(accept):
-        return None
-    return LabelSource(proposal.start_s, proposal.end_s, proposal.terrain, "model", proposal.confidence)
-
-
-def _with(labels: Sequence[LabelSource], added: LabelSource) -> list[LabelSource]:
-    """Return labels with one more: a person's replaces what it covers, the model's only fills gaps."""
-    from terrain.logs.labels import relabelled
-    from terrain.records import Label
-
-    if added.source == "model":
-        free = not any(each.start_s < added.end_s and added.start_s < each.end_s for each in labels)
-        return [*labels, added] if free else list(labels)
-    kept = []
-    for each in labels:
-        for part in relabelled([Label(*each[:3])], added.start_s, added.end_s, ""):
-            kept.append(each._replace(start_s=part.start_s, end_s=part.end_s))
-    return [*kept, added] if added.terrain else kept
 
 
 def _span_s(run: RunLog) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from terrain.classify.proposals import Proposal
+from terrain.classify.proposals import NONE, YES, Proposal
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
 from terrain.files.names import plain_name, shown
@@ -23,9 +23,6 @@ class Answered(NamedTuple):
 
 
 COLUMNS = (*Proposal._fields, "ask", "answer")
-YES, NONE = "yes", "none"
-"""Answers beside the name of a terrain: the proposal is right; the stretch is of no terrain."""
-
 NUMBERS = ("start_s", "end_s", "confidence", "supported_ratio", "unknown_ratio")
 MAX_FILE_BYTES = 1 << 26
 TOLERANCE_S = 0.5

@@ -18,6 +18,10 @@ ACCEPTED = 0.9
 """Least mean probability of a proposal that is taken over without a question."""
 
 
+YES, NONE = "yes", "none"
+"""Answers beside the name of a terrain: the proposal is right; the stretch is of no terrain."""
+
+
 class Proposal(NamedTuple):
     """A stretch of a run, and the terrain that a model proposes for it.
 
@@ -116,3 +120,43 @@ def questions(proposals: Sequence[Proposal], n: int) -> list[int]:
         runs[proposals[best].run_id] += 1
         terrains[proposals[best].terrain] += 1
     return chosen
+
+
+class LabelSource(NamedTuple):
+    """A label, and where it comes from: ``measured`` as the run had it, a ``person``, or the ``model``."""
+
+    start_s: float
+    end_s: float
+    terrain: str
+    source: str
+    confidence: float | None
+
+
+def label_of(proposal: Proposal, answer: str, accept: float) -> LabelSource | None:
+    """Return the label that an answer sets; None where it sets none, an empty terrain where it removes."""
+    span_s = proposal.start_s, proposal.end_s
+    if answer:
+        terrain = {NONE: "", YES: proposal.terrain}.get(answer, answer)
+        return LabelSource(*span_s, terrain, "person", None)
+    if not proposal.taken_over(accept):
+        return None
+    return LabelSource(*span_s, proposal.terrain, "model", proposal.confidence)
+
+
+def with_label(labels: Sequence[LabelSource], added: LabelSource) -> list[LabelSource]:
+    """Return labels with one more: a person's replaces what it covers, the model's only fills gaps.
+
+    Examples
+    --------
+    >>> person = LabelSource(2.0, 4.0, "mud", "person", None)
+    >>> [each[:3] for each in with_label([LabelSource(0.0, 9.0, "ice", "measured", None)], person)]
+    [(0.0, 2.0, 'ice'), (4.0, 9.0, 'ice'), (2.0, 4.0, 'mud')]
+    """
+    if added.source == "model":
+        free = not any(each.start_s < added.end_s and added.start_s < each.end_s for each in labels)
+        return [*labels, added] if free else list(labels)
+    kept = []
+    for each in labels:
+        parts = (each.start_s, min(each.end_s, added.start_s)), (max(each.start_s, added.end_s), each.end_s)
+        kept += [each._replace(start_s=start_s, end_s=end_s) for start_s, end_s in parts if start_s < end_s]
+    return [*kept, added] if added.terrain else kept

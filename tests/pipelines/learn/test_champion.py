@@ -31,6 +31,7 @@ def judged(model, runs):
 @pytest.mark.parametrize(
     ("changed", "moved", "reason"),
     [
+        ({"macro_f1": 0.7}, False, "macro F1 0.7000 is not better than 0.8000 of version 1 on the same data"),
         ({"macro_f1": 0.8}, False, "macro F1 0.8000 is not better than 0.8000 of version 1 on the same data"),
         ({"macro_f1": 0.85}, True, "macro F1 0.8500 is better than 0.8000 of version 1 on the same data"),
         ({"robots": ("warthog",)}, False, "its robots are warthog, those of version 1 husky: choose another"),
