@@ -12,8 +12,8 @@ from terrain.control.slip_table import load_slip_table
 from terrain.records import RunLog, Stream
 
 
-def curves_of(wheel_radps=7.0, slip=0.2):
-    """Those of 2 s at 0.8 m/s, by a pilot that estimates no slip."""
+def curves_of(wheel_radps=7.0, slip=0.2, terrains=("grass",), classified=None):
+    """Those of 2 s at 0.8 m/s, by a pilot that estimates no slip; it classifies the terrain in the second."""
     time_s = np.arange(200) / 100
     columns = {"speed_x_mps": 0.8, "speed_y_mps": 0.0}
     columns |= {f"wheel_{i}_radps": wheel_radps for i in (1, 2, 3)}
@@ -24,7 +24,21 @@ def curves_of(wheel_radps=7.0, slip=0.2):
         name: Stream(time_s, np.tile(list(each.values()), (200, 1)), tuple(each))
         for name, each in (("truth", columns), ("control", status))
     }
-    return drive_curves(RunLog("run", "agrimaro", streams, ((0.0, 2.0, "grass"),)), load_slip_table())
+    table, edges = load_slip_table(), np.linspace(0.0, 2.0, len(terrains) + 1)
+    if classified is not None:
+        values = streams["control"].values.copy()
+        values[100:, -1] = list(table.targets).index(classified)
+        streams["control"] = Stream(time_s, values, streams["control"].channels)
+    labels = tuple(zip(edges[:-1], edges[1:], terrains, strict=True))
+    return drive_curves(RunLog("run", "agrimaro", streams, labels), table)
+
+
+def test_terrains_are_shown_where_there_are_several():
+    both = curves_of(terrains=("grass", "clay"), classified="clay").terrains
+    assert [name for *_, name in both["true"]] == ["grass", "clay"]
+    assert both["classified"] == [(1.0, 1.99, "clay")]
+    assert set(curves_of(terrains=("grass", "clay")).terrains) == {"true"}
+    assert curves_of(classified="grass").terrains == {}
 
 
 def test_slip_is_signed_by_the_motion_and_filtered_as_its_estimate():
