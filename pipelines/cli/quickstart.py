@@ -98,48 +98,32 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     TerrainError
         if a run cannot be read, the data do not suffice, or something cannot be written.
     """
-    from pipelines.data.tracking import ensure_tracking
-    from terrain.files.atomic import ensure_writable
-
-    out = settings.out
-    ensure_writable(out)
-    ensure_tracking()
-    with _compiling_ahead():
-        return _run(settings, progress)
-
-
-@contextmanager
-def _compiling_ahead() -> Iterator[None]:
-    """Have a process of its own compile the kernels that prediction needs, where they are not compiled yet."""
-    words = [sys.executable, "-c", "import pipelines.live.windows"]
-    ahead = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        yield
-    finally:
-        ahead.kill()
-        ahead.wait()
-
-
-def _run(settings: Settings, progress: Progress) -> QuickstartResult:
     from pipelines.data.datasets import load_runs
+    from pipelines.data.tracking import ensure_tracking
     from pipelines.learn.load import load_model
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
     from terrain.classify.folds import hold_out_runs
     from terrain.control.slip_table import load_slip_table
+    from terrain.files.atomic import ensure_writable
     from terrain.logs.merge import distinct_runs
 
     data, out = settings.data, settings.out
-    given, slip, figures = _simulated(settings, progress) if data is None else (load_runs(data), None, ())
-    _refuse_other_runs(given, data, out / "runs")
-    runs = distinct_runs(given, merge=settings.merge_duplicates).runs
-    dataset = SIMULATED if data is None else data.resolve().name
-    training, held_out = hold_out_runs(runs)
-    kept = _keep(given, data, out / "runs", progress)
-    asked = TrainingSettings(name=settings.name, seed=settings.seed, n_jobs=settings.n_jobs, repeats=REPEATS)
-    # without an evaluation given, that of the training shares its fits with the worth of the channels
-    trained = train(training, asked, dataset, progress)
-    predicted = predict(held_out or runs, load_model(trained.model_uri), load_slip_table())
+    ensure_writable(out)
+    ensure_tracking()
+    with _compiling_ahead():
+        given, slip, figures = _simulated(settings, progress) if data is None else (load_runs(data), None, ())
+        _refuse_other_runs(given, data, out / "runs")
+        runs = distinct_runs(given, merge=settings.merge_duplicates).runs
+        dataset = SIMULATED if data is None else data.resolve().name
+        training, held_out = hold_out_runs(runs)
+        kept = _keep(given, data, out / "runs", progress)
+        asked = TrainingSettings(
+            name=settings.name, seed=settings.seed, n_jobs=settings.n_jobs, repeats=REPEATS
+        )
+        # without an evaluation given, that of the training shares its fits with the worth of the channels
+        trained = train(training, asked, dataset, progress)
+        predicted = predict(held_out or runs, load_model(trained.model_uri), load_slip_table())
     result = QuickstartResult(
         dataset=dataset,
         data_digest=trained.data_digest,
@@ -157,6 +141,18 @@ def _run(settings: Settings, progress: Progress) -> QuickstartResult:
     )
     result.report.save(result.report_file)
     return result
+
+
+@contextmanager
+def _compiling_ahead() -> Iterator[None]:
+    """Have a process of its own compile the kernels that prediction needs, where they are not compiled yet."""
+    words = [sys.executable, "-c", "import pipelines.live.windows"]
+    ahead = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield
+    finally:
+        ahead.kill()
+        ahead.wait()
 
 
 def _simulated(
