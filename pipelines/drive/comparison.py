@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ import numpy as np
 
 from pipelines.drive.controllers import DriveInputs, drive_once, train_classifier
 from pipelines.drive.run_figures import run_figures
-from pipelines.learn.parallel import parallel
+from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report import (
     NOT_KNOWN,
@@ -180,35 +179,32 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
         for each in controllers:
             if each.source is Source.CLASSIFIER:
                 raise ConfigError(f"controller {each.name!r} needs a classifier: give a model")
-    done, n_drives = count(1), len(settings.all_seeds) * len(names)
 
-    def drive_all(controllers: Sequence[Controller], counted: bool = True) -> dict[str, list[Drive]]:
+    def drive_all(
+        task: str, controllers: Sequence[Controller], progress: Progress = progress
+    ) -> dict[str, list[Drive]]:
         """Return the drives of each controller, one a seed, in as many processes as the settings say."""
-        found: dict[str, list[Drive]] = {each.name: [] for each in controllers}
-        jobs = [(inputs.of(each), each, seed) for seed in settings.all_seeds for each in controllers]
-        drives = parallel(_drive_one, (settings,), jobs, min(settings.n_jobs, len(jobs)))
-        for (_, controller, _), drive in zip(jobs, drives, strict=True):
-            found[controller.name].append(drive)
-            if counted:
-                progress("drive", next(done), n_drives)
-        return found
+        jobs = [(inputs.of(each), each, seed) for each in controllers for seed in settings.all_seeds]
+        found = parallel(_drive_one, (settings,), jobs, min(settings.n_jobs, len(jobs)))
+        drives, n = [*counted(found, len(jobs), task, progress)], len(settings.all_seeds)
+        return {each.name: drives[n * place : n * place + n] for place, each in enumerate(controllers)}
 
-    drives = drive_all([each for each in controllers if each.name != "ramp"])
+    def ramp(rise_mps2: float | None) -> Controller:
+        return make_controller("ramp", table, settings.delay_s, rise_mps2)
+
+    others = [each for each in controllers if each.name != "ramp"]
+    drives = drive_all("drive", others) if others else {}
     ramp_mps2 = None
     if "ramp" in names:
-
-        def ramp(rise_mps2: float | None) -> Controller:
-            return make_controller("ramp", table, settings.delay_s, rise_mps2)
-
         ramp_mps2 = settings.ramp_mps2
         if ramp_mps2 is None:
             ramp_mps2 = matching_ramp(
                 drives,
-                lambda rise_mps2: drive_all([ramp(rise_mps2)], counted=False)["ramp"],
+                lambda rise_mps2: drive_all("", [ramp(rise_mps2)], silent)["ramp"],
                 settings.scenario,
                 settings.accel_mps2,
             )
-        drives |= drive_all([ramp(ramp_mps2)])
+        drives |= drive_all("drive ramp", [ramp(ramp_mps2)])
         ramp_mps2 = ramp(ramp_mps2).pilot.ramp_mps2
     add_energies(drives)
     rows = {name: tuple(one.metrics for one in drives[name]) for name in names}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.drive.drive import ALL
-from pipelines.learn.parallel import parallel
+from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report import (
     NOT_KNOWN,
@@ -190,11 +190,8 @@ def drive_faults(
     chosen, places, loop = _chosen_faults(settings, robot), _places(settings), fault_loop(robot, slips)
 
     def computed(task: str, function: Callable[..., Any], tasks: Sequence[Sequence[Any]]) -> list[Any]:
-        found = []
-        for one in parallel(function, (loop,), tasks, min(settings.n_jobs, len(tasks))):
-            found.append(one)
-            progress(task, len(found), len(tasks))
-        return found
+        found = parallel(function, (loop,), tasks, min(settings.n_jobs, len(tasks)))
+        return [*counted(found, len(tasks), task, progress)]
 
     made = computed("drive without faults", drive_references, [(place,) for place in places])
     references: dict[Place, References] = dict(zip(places, made, strict=True))
@@ -206,11 +203,9 @@ def drive_faults(
     ]
     tasks = [(case, references[Place(*case[2:])]) for case in cases]
     rows: list[FaultRow] = computed("drive with faults", evaluate_case, tasks)
-    drawn: list[Figure] = []
     shown = drawn_cases(rows, settings.draw) if settings.out is not None or settings.draw else []
-    for case in shown:
-        drawn.append(fault_figure(case, drive_case(loop, case), references[Place(*case[2:])]))
-        progress("draw", len(drawn), len(shown))
+    figures = (fault_figure(case, drive_case(loop, case), references[Place(*case[2:])]) for case in shown)
+    drawn = tuple(counted(figures, len(shown), "draw", progress)) if shown else ()
     return FaultsResult(
         robot=robot.name,
         table=slips.name,
@@ -223,7 +218,7 @@ def drive_faults(
         bars=count_bars([row.bars for row in rows]),
         n_rows=len(rows),
         n_met=sum(not row.unmet for row in rows),
-        drawn=tuple(drawn),
+        drawn=drawn,
     )
 
 
