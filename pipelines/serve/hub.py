@@ -21,7 +21,7 @@ from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
-from terrain.robots import Robot, packaged_robot
+from terrain.robots import Robot, robot_named
 
 REMEMBERED = 1000
 """States of robots that have left, which are kept in memory for their return."""
@@ -124,10 +124,8 @@ class Hub:
 
     def robot(self, name: str) -> Robot | None:
         """Return the description of a robot by its name, never by a path; None where it has none."""
-        if self._given is not None and self._given.name == name:
-            return self._given
         try:
-            return packaged_robot(name)
+            return robot_named(name, self._given)
         except ConfigError:
             return None
 

@@ -10,11 +10,13 @@ import pytest
 from websockets.sync.client import connect
 
 from pipelines.learn.model_file import write_model
+from pipelines.serve.hub import LIMITS
 from pipelines.serve.serve import Settings
 from pipelines.serve.service import Service
+from terrain.control.slip_table import load_slip_table
 from terrain.logs.replay import replay
 
-CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
+from .strangers import CHANNELS
 
 
 @pytest.fixture(scope="session")
@@ -75,6 +77,15 @@ def running():
 def service(running, model_folder):
     """A service that several tests of a file use; each has sessions of its own name."""
     with running(model=str(model_folder)) as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def driving(running, model_folder):
+    """A service without a model, which gives commands to robots of any channels."""
+    limits = LIMITS._replace(hello_s=1.0, too_slow_s=0.6)
+    with running(limits, model=str(model_folder)) as found:
+        found.hub.swap(None, "", load_slip_table())
         yield found
 
 

@@ -1,4 +1,4 @@
-"""Connections that keep to no rule."""
+"""Messages to a service, and connections that keep to no rule."""
 
 import json
 import socket
@@ -6,6 +6,10 @@ import struct
 import time
 from contextlib import contextmanager
 from urllib.parse import urlsplit
+
+import msgpack
+
+CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
 
 HANDSHAKE = (
     "GET /robots HTTP/1.1\r\nHost: {}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -19,6 +23,14 @@ def until(fact, timeout_s=5.0):
     while not fact():
         assert time.monotonic() < end_s, "it did not become true"
         time.sleep(0.01)
+
+
+def ask(robot, content, *, packed=False):
+    """Send a message, whole or to be encoded, and return the answer."""
+    encode = msgpack.packb if packed else json.dumps
+    robot.send(content if isinstance(content, str | bytes) else encode(content))
+    answer = robot.recv(30)
+    return msgpack.unpackb(answer) if isinstance(answer, bytes) else json.loads(answer)
 
 
 def frame(payload, opcode=1, fin=True):

@@ -20,11 +20,10 @@ from pipelines.serve.hub import Hub
 from pipelines.serve.messages import read_hello
 from terrain.control.slip_table import load_slip_table
 
-from .strangers import until
+from .strangers import CHANNELS, ask, until
 
 SERVE = "from pipelines.cli.main import main; main()"
 N_ROBOTS = 8
-CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
 
 
 @contextmanager
@@ -112,13 +111,11 @@ def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, h
 
     monkeypatch.setattr("pipelines.serve.service.SAVE_EVERY_S", 0.05)
     with running(model=str(model_folder), state=tmp_path) as service, service.socket() as robot:
-        robot.send(json.dumps(hello("full")))
-        robot.recv(10)
+        ask(robot, hello("full"))
         with monkeypatch.context() as patch:
             patch.setattr("terrain.files.atomic.os.fsync", full)
             until(lambda: "No space left on device" in trouble(service).get("states", ""))
-            robot.send(json.dumps({"type": "samples", "streams": {}, "step": True}))
-            assert json.loads(robot.recv(10))["type"] == "step"
+            assert ask(robot, {"type": "samples", "streams": {}, "step": True})["type"] == "step"
             seen = [trouble(service).get("states", "") for _ in range(30)]
             assert all(seen), "the trouble is not gone while it is tried again"
         until(lambda: trouble(service) == {})

@@ -8,14 +8,14 @@ from contextlib import contextmanager
 import pytest
 
 from pipelines.serve.client import TerrainClient
-from terrain.control.slip_table import load_slip_table
+
+from .strangers import CHANNELS
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 
 DRIVEN = {"wheels": [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]}
-CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
 TOKEN = "a token of the page's test"
 MARKUP = "<img src=x onerror=document.title='run'>"
 
@@ -117,14 +117,6 @@ def robot(service, session="mower-1", token="", **options):
 def shows(page, place, text, timeout_s=8.0):
     """Wait until an element holds a text."""
     playwright.expect(page.locator(place)).to_contain_text(text, timeout=timeout_s * 1000)
-
-
-@pytest.fixture(scope="module")
-def driving(running, model_folder):
-    """A service for robots of any channels, without a model."""
-    with running(model=str(model_folder)) as service:
-        service.hub.swap(None, "", load_slip_table())
-        yield service
 
 
 def assert_readable(page):

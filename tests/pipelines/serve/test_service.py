@@ -3,8 +3,8 @@
 import json
 import math
 import time
+from functools import partial
 
-import msgpack
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from websockets.exceptions import ConnectionClosed
@@ -18,21 +18,9 @@ from terrain.control.slip_table import load_slip_table
 from terrain.files.resources import data_folder
 from terrain.logs.replay import replay
 
-from .strangers import until
+from .strangers import CHANNELS, ask, until
 
-CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
 TABLE = (data_folder("target_slip") / "default.yaml").read_text()
-
-
-def talk(socket, packed):
-    """Send a message and return the answer."""
-
-    def say(content):
-        socket.send(msgpack.packb(content) if packed else json.dumps(content))
-        answer = socket.recv(30)
-        return msgpack.unpackb(answer) if packed else json.loads(answer)
-
-    return say
 
 
 @pytest.mark.parametrize("packed", [False, True])
@@ -42,7 +30,7 @@ def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(
     run, observer = two_drives[4], Observer(mower_model)
     found, seen = [], []
     with service.socket() as socket:
-        say = talk(socket, packed)
+        say = partial(ask, socket, packed=packed)
         welcome = say(hello(f"alone-{packed}"))
         assert (welcome["type"], welcome["served"]["classes"]) == ("welcome", ["a", "b"])
         for message in messages(run):
@@ -91,7 +79,7 @@ def test_steps_come_at_the_rate_that_was_asked_for(service):
 )
 def test_a_step_is_at_the_robots_time_or_where_it_has_none_at_its_clocks(service, hello, given, time_s):
     with service.socket() as socket:
-        say = talk(socket, False)
+        say = partial(ask, socket, packed=False)
         assert say(hello(f"at-{str(given)[:4]}"))["type"] == "welcome"
         steps = []
         for _ in range(2):
@@ -137,7 +125,7 @@ def test_health_card_and_figures_in_the_form_of_prometheus(service, hello, messa
 
     before = figures()
     with service.socket() as socket:
-        say = talk(socket, True)
+        say = partial(ask, socket, packed=True)
         say(hello("counted"))
         for message in list(messages(two_drives[0]))[:100]:
             say(message)
@@ -162,7 +150,7 @@ def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(
     running, model_folder, hello, messages, two_drives
 ):
     with running(model=str(model_folder)) as service, service.socket() as socket:
-        say, starts, numbers = talk(socket, False), [], []
+        say, starts, numbers = partial(ask, socket, packed=False), [], []
         say(hello("swapped"))
         for k, message in enumerate(messages(two_drives[4])):
             if k in (150, 320):
@@ -212,10 +200,10 @@ def test_what_cannot_be_served_is_refused_and_the_old_goes_on(
 def test_a_session_that_is_silent_is_taken_by_its_robot_that_comes_back(service, hello, monkeypatch):
     monkeypatch.setattr("pipelines.serve.hub.SILENT_S", 0.3)
     with service.socket() as first, service.socket() as second:
-        assert talk(first, False)(hello("back"))["type"] == "welcome"
-        assert talk(second, False)(hello("back"))["code"] == "name-taken"
+        assert ask(first, hello("back"))["type"] == "welcome"
+        assert ask(second, hello("back"))["code"] == "name-taken"
         time.sleep(0.4)
-        assert talk(second, False)(hello("back"))["type"] == "welcome"
+        assert ask(second, hello("back"))["type"] == "welcome"
         last = json.loads(first.recv(10))
         assert (last["code"], last["fatal"]) == ("name-taken", True)
         with pytest.raises(ConnectionClosed):
@@ -225,7 +213,7 @@ def test_a_session_that_is_silent_is_taken_by_its_robot_that_comes_back(service,
 def test_a_robot_that_comes_back_knows_its_terrain(service, hello, messages, two_drives):
     for restored in (None, "b"):
         with service.socket() as socket:
-            say = talk(socket, True)
+            say = partial(ask, socket, packed=True)
             welcome = say(hello("returning"))
             assert (welcome["restored"] or {}).get("terrain") == restored
             if restored:
@@ -244,7 +232,7 @@ def test_a_session_that_asks_for_it_becomes_a_run_that_predicts_as_it_was_driven
     windows = {}
     with running(model=str(model_folder), record=tmp_path) as service:
         with service.socket() as socket:
-            say = talk(socket, True)
+            say = partial(ask, socket, packed=True)
             assert say(hello("kept", record=True))["recording"] == "recording"
             for message in messages(two_drives[4]):
                 window = say(message)["observation"]["window"]
@@ -252,7 +240,7 @@ def test_a_session_that_asks_for_it_becomes_a_run_that_predicts_as_it_was_driven
                     windows[window["start_s"]] = window
                 time.sleep(0.0005)
         with service.socket() as socket:
-            assert talk(socket, True)(hello("not kept"))["recording"] == "off"
+            assert ask(socket, hello("not kept"))["recording"] == "off"
     (run,) = load_runs(tmp_path)
     assert run.run_id.startswith("kept_")
     rows = predict([run], mower_model, load_slip_table()).windows

@@ -12,6 +12,8 @@ from pipelines.serve.service import Service
 from terrain.control.slip_table import load_slip_table, write_slip_table
 from terrain.errors import ConfigError, TerrainError
 
+from .strangers import ask
+
 TOKEN = "t" * 20
 
 
@@ -126,8 +128,7 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
     with running(model=str(model_folder), state=tmp_path) as service:
         for name in ("bytes", "half", "deep", "folder", "new"):
             with service.socket() as robot:
-                robot.send(json.dumps(hello(name)))
-                welcome = json.loads(robot.recv(10))
+                welcome = ask(robot, hello(name))
                 assert (welcome["type"], welcome["restored"]) == ("welcome", None)
         trouble = json.loads(service.get("/ready")[1])["trouble"]
         assert {"state of bytes", "state of half", "state of deep", "state of folder"} <= set(trouble)

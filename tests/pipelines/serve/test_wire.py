@@ -20,9 +20,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from pipelines.serve import connection, guard
 from pipelines.serve.client import ServiceError, TerrainClient
 from pipelines.serve.hub import LIMITS
-from terrain.control.slip_table import load_slip_table
 
-from .strangers import frame, raw, until
+from .strangers import CHANNELS, ask, frame, raw, until
 
 TOKEN = "a token of the tests"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -33,21 +32,11 @@ DRIVEN = {
     "control": True,
     "streams": {"wheels": [f"motor_{i}_radps" for i in (1, 2, 3)]},
 }
-CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
 MANY = 1000
 
 
 def resident_bytes():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
-
-
-@pytest.fixture(scope="module")
-def driving(running, model_folder):
-    """A service without a model, which gives commands to robots of any channels."""
-    limits = LIMITS._replace(hello_s=1.0, too_slow_s=0.6)
-    with running(limits, model=str(model_folder)) as service:
-        service.hub.swap(None, "", load_slip_table())
-        yield service
 
 
 @pytest.fixture
@@ -75,12 +64,6 @@ def decoded(monkeypatch):
 def samples(stamp_s, speed=20.0, **more):
     content = {"type": "samples", "streams": {"wheels": [[stamp_s], [[speed] * 3]]}, "twist": [0.5, 0.0, 0.0]}
     return {**content, **more}
-
-
-def ask(robot, content):
-    robot.send(content if isinstance(content, str | bytes) else json.dumps(content))
-    answer = robot.recv(10)
-    return msgpack.unpackb(answer) if isinstance(answer, bytes) else json.loads(answer)
 
 
 def assert_finite(step):
