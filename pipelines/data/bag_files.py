@@ -20,11 +20,10 @@ from pydantic import BaseModel, ValidationError
 
 from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, McapReader, library
 from terrain.errors import LogError, TerrainError, one_line
-from terrain.files.documents import read_yaml
+from terrain.files.documents import first_fault, read_yaml
 from terrain.files.names import shown
 from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
 from terrain.logs.log_files import check_log_file, short_name
-from terrain.logs.mapping import first_fault
 from terrain.logs.topic_mapping import DISTRO, short_type
 
 METADATA = "metadata.yaml"

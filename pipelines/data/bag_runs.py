@@ -15,7 +15,7 @@ from terrain.logs.faults import Faults, Topic
 from terrain.logs.log_files import checked_names, short_name
 from terrain.logs.parquet_file import MAX_VALUES
 from terrain.logs.recorded_windows import RecordedWindow, window_of_text
-from terrain.logs.run_topics import RUN_TOPIC, STRING, WINDOW_TOPIC, RunDocument, string_of
+from terrain.logs.run_topics import RUN_TOPIC, STRING, WINDOW_TOPIC, read_document, run_of, string_of
 from terrain.logs.samples import refuse_apart
 from terrain.logs.topic_mapping import Mapping as TopicMapping
 from terrain.logs.topic_mapping import check_stream, load_mapping, standard_mapping
@@ -144,12 +144,11 @@ def _exported_run(bag: Bag, place: str, topics: Mapping[str, Topic], *, repair: 
             raise LogError(f"{place}: has more than {MAX_VALUES} values")
     if not messages.get(RUN_TOPIC):
         raise LogError(f"{place}: {RUN_TOPIC} has no message")
-    document = RunDocument(place, string_of(place, messages[RUN_TOPIC][-1]))
-    document.check(topics)
-    tolerant = document.head.live or repair
+    document = read_document(place, string_of(place, messages[RUN_TOPIC][-1]), topics)
+    tolerant = document.live or repair
     if counted.first and not tolerant:
         raise LogError(counted.first)
-    return document.run(messages, counted if tolerant else Faults(None))
+    return run_of(place, document, messages, counted if tolerant else Faults(None))
 
 
 def recorded_windows(path: Path) -> tuple[str, list[RecordedWindow]] | None:
@@ -162,13 +161,14 @@ def recorded_windows(path: Path) -> tuple[str, list[RecordedWindow]] | None:
     """
     bag, place = open_bag(path), short_name(path)
     texts: dict[str, list[str]] = {WINDOW_TOPIC: [], RUN_TOPIC: []}
-    if not set(texts) <= set(topics_of(bag)):
+    topics = topics_of(bag)
+    if not set(texts) <= set(topics):
         return None
     for topic, _, content in messages_of(bag, frozenset(texts), Faults(Counter())):
         texts[topic].append(string_of(place, content))
     if not texts[RUN_TOPIC]:
         return None
-    run_id = RunDocument(place, texts[RUN_TOPIC][-1]).head.run_id
+    run_id = read_document(place, texts[RUN_TOPIC][-1], topics).run_id
     return run_id, [window_of_text(place, text) for text in texts[WINDOW_TOPIC]]
 
 

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 Document = TypeVar("Document", bound="BaseModel")
 
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+
 MAX_JSON_BYTES = 16 * MEBIBYTE
 """A run with a label each second of 24 hours has 7 MiB of them."""
 
@@ -195,6 +198,17 @@ def parse_yaml(content: bytes | str) -> Any:
         raise ValueError(str(error)) from error
     except (yaml.YAMLError, *_BAD_VALUES) as error:
         raise ValueError(f"is no YAML ({' '.join(str(error).split())})") from error
+
+
+def first_fault(error: ValidationError) -> str:
+    """Return the first thing in a document that is not accepted, in one sentence."""
+    fault: dict[str, Any] = dict(error.errors()[0])
+    place = ".".join(str(part) for part in fault["loc"]) or "the file"
+    if fault["type"] == "extra_forbidden":
+        return f"key {shown(place)} is unknown"
+    if fault["type"] == "missing":
+        return f"key {place!r} is missing"
+    return f"{place} is {shown(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
 
 
 class _TooMuchError(yaml.YAMLError):

@@ -57,7 +57,7 @@ import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from terrain.errors import ConfigError, LogError
-from terrain.files.documents import read_yaml
+from terrain.files.documents import first_fault, read_yaml
 from terrain.files.names import check_name, has_control_characters, normal_name, shown
 from terrain.logs.borealtc import whole_run_label
 from terrain.logs.csv_table import TextLayout
@@ -432,17 +432,6 @@ def _check_fields(file: str, mapping: Mapping) -> None:
         if strange or re.search(r"[{}]", _FIELD.sub("", rule)):
             known = ", ".join(f"{{{word}}}" for word in sorted(words[first])) or "none"
             raise ConfigError(f"{file}: {key} {rule!r} uses a word that the files lack (they have {known})")
-
-
-def first_fault(error: ValidationError) -> str:
-    """Return the first thing in a mapping that is not accepted, in one sentence."""
-    fault: dict[str, Any] = dict(error.errors()[0])
-    place = ".".join(str(part) for part in fault["loc"]) or "the file"
-    if fault["type"] == "extra_forbidden":
-        return f"key {shown(place)} is unknown"
-    if fault["type"] == "missing":
-        return f"key {place!r} is missing"
-    return f"{place} is {shown(fault['input'])}: {fault['msg'][0].lower()}{fault['msg'][1:]}"
 
 
 def csv_mapping(runs: Sequence[RunLog]) -> str | None:

@@ -13,10 +13,10 @@ from typing import Annotated, Literal, NamedTuple
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from terrain.errors import LogError
+from terrain.files.documents import first_fault
 from terrain.files.regular import MEBIBYTE, read_regular
 from terrain.logs.labels import folder_of, label_over, labelled_folders
 from terrain.logs.log_files import short_name
-from terrain.logs.mapping import first_fault
 from terrain.logs.read import read_run_head
 
 WINDOWS_FILE = "windows.json"

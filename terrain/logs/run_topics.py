@@ -14,12 +14,13 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from terrain.errors import DataError, LogError
-from terrain.files.documents import parse_json
+from terrain.files.documents import first_fault, parse_json
 from terrain.files.names import shown
 from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
 from terrain.logs.labels import label_changes
@@ -47,7 +48,6 @@ uint32 nanosec
 """
 
 TIME_FIELD = "time_s"
-VERSION = 1
 
 LATEST_S = 2**31 - 1
 """Latest stamp of a header in s: its seconds have 32 bits."""
@@ -60,12 +60,14 @@ DECIDED = ("commands", "control")
 """Streams that a controller writes; sensors have precedence over them."""
 
 
-class StreamTopic(NamedTuple):
+class StreamTopic(BaseModel):
     """A stream as a topic: its name and type, and the channel of each field."""
 
+    model_config = ConfigDict(frozen=True)
+
     topic: str
-    kind: str
-    fields: Mapping[str, str]
+    kind: str = Field(validation_alias=AliasChoices("type", "kind"), serialization_alias="type")
+    fields: Annotated[dict[str, str], Field(min_length=1)]
 
     @property
     def definition(self) -> str:
@@ -112,7 +114,9 @@ def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[str] = ()
     (name,) = _accepted_names([stream], f"stream_{len(others)}", [*RESERVED, *others])
     fields = _accepted_names(channels, "channel", (TIME_FIELD, "header"))
     kind = "".join(part.capitalize() for part in name.split("_"))
-    return StreamTopic(PREFIX + name, f"{PACKAGE}/msg/{kind}", dict(zip(fields, channels, strict=True)))
+    return StreamTopic(
+        topic=PREFIX + name, kind=f"{PACKAGE}/msg/{kind}", fields=dict(zip(fields, channels, strict=True))
+    )
 
 
 def _accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]) -> list[str]:
@@ -129,26 +133,35 @@ def _accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]
     return found
 
 
+class RunDocument(BaseModel):
+    """What a message of :data:`RUN_TOPIC` states: fields of a :class:`Head`, and of each stream its topic."""
+
+    version: Literal[1] = 1
+    run_id: str
+    robot: str
+    session: str
+    filter: str
+    source: str
+    live: bool = False
+    labels: list[dict[str, Any]]
+    streams: Annotated[dict[str, StreamTopic], Field(min_length=1, max_length=MAX_STREAMS)]
+    dropped: dict[str, int]
+
+
 def run_document(
     head: Head,
     topics: Mapping[str, StreamTopic],
     labels: Iterable[Label] = (),
     dropped: Mapping[str, int] | None = None,
 ) -> str:
-    """Return what a message of :data:`RUN_TOPIC` states."""
-    return json.dumps(
-        {
-            "version": VERSION,
-            **head._asdict(),
-            "labels": [label._asdict() for label in labels],
-            "streams": {
-                name: {"topic": each.topic, "type": each.kind, "fields": dict(each.fields)}
-                for name, each in topics.items()
-            },
-            "dropped": dict(sorted((dropped or {}).items())),
-        },
-        allow_nan=False,
+    """Return the text of a document."""
+    document = RunDocument(
+        **head._asdict(),
+        labels=[label._asdict() for label in labels],
+        streams=dict(topics),
+        dropped=dict(sorted((dropped or {}).items())),
     )
+    return json.dumps(document.model_dump(by_alias=True), allow_nan=False)
 
 
 def string_message(text: str) -> bytes:
@@ -339,7 +352,7 @@ class RunRecorder:
     >>> recorder = RunRecorder(Shown(), Head("drive_1", "husky", live=True))
     >>> recorder.register("imu", ("gyro_z_radps",))
     >>> recorder.append("imu", [0.0, 0.01], [[0.1], [0.2]])
-    /terrain/run 0 280
+    /terrain/run 0 271
     /terrain/imu 0 36
     /terrain/imu 10000000 36
     """
@@ -397,113 +410,98 @@ class RunRecorder:
         self._writer.finish()
 
 
-class RunDocument:
-    """The document of a run in a file of messages, and the run that its messages are.
+def read_document(place: str, text: str, topics: Mapping[str, Topic]) -> RunDocument:
+    """Return the document of a run in a file of messages.
 
     Parameters
     ----------
     place : of the file, as messages name it
     text : of the document
+    topics : of the file, by name
 
     Raises
     ------
     LogError
-        if the document is damaged.
+        if the document is damaged, or the file lacks a topic of a stream, or has one of another type or with
+        other fields.
     """
+    place = f"{place}: {RUN_TOPIC}"
+    try:
+        document = RunDocument.model_validate(parse_json(text))
+    except ValidationError as error:
+        raise LogError(f"{place}: is damaged ({first_fault(error)})") from error
+    except ValueError as error:
+        raise LogError(f"{place}: is damaged ({error})") from error
+    for name, each in document.streams.items():
+        there = topics.get(each.topic)
+        if there is None or there.kind != each.kind:
+            raise LogError(f"{place}: stream {shown(name)} has no topic {shown(each.topic)} of its type")
+        for channel in each.fields.values():
+            unit_of(channel)
+        own = re.findall(r"^float64 (\w+)", there.definition.partition("=" * 80)[0], re.MULTILINE)
+        differ = there.definition and own != [TIME_FIELD, *each.fields]
+        if there.encoding != "cdr" or differ or len(set(each.fields.values())) != len(each.fields):
+            raise LogError(f"{place}: topic {shown(each.topic)} has not the fields of its stream")
+    return document
 
-    def __init__(self, place: str, text: str) -> None:
-        self._place = f"{place}: {RUN_TOPIC}"
-        try:
-            document = parse_json(text)
-            if document["version"] != VERSION:
-                raise LogError(f"{self._place}: version {shown(document['version'])} is unknown")
-            self.topics = {
-                str(name): StreamTopic(str(each["topic"]), str(each["type"]), _fields(each["fields"]))
-                for name, each in document["streams"].items()
-            }
-            texts = {name: str(document[name]) for name in Head._fields if name != "live"}
-            self.head = Head(**texts, live=bool(document.get("live", False)))
-            self._dropped = {str(kind): int(n) for kind, n in document["dropped"].items()}
-            self._labels = read_labels(self._place, document["labels"])
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise LogError(f"{self._place}: is damaged ({type(error).__name__}: {error})") from error
-        if not 0 < len(self.topics) <= MAX_STREAMS:
-            raise LogError(f"{self._place}: lists {len(self.topics)} streams, 1 to {MAX_STREAMS} are read")
 
-    def check(self, topics: Mapping[str, Topic]) -> None:
-        """Refuse a file that lacks a topic of a stream, or has one of another type or with other fields."""
-        for name, each in self.topics.items():
-            there = topics.get(each.topic)
-            if there is None or there.kind != each.kind:
-                raise LogError(
-                    f"{self._place}: stream {shown(name)} has no topic {shown(each.topic)} of its type"
-                )
-            for channel in each.fields.values():
-                unit_of(channel)
-            own = re.findall(r"^float64 (\w+)", there.definition.partition("=" * 80)[0], re.MULTILINE)
-            if there.encoding != "cdr" or (there.definition and own != [TIME_FIELD, *each.fields]):
-                raise LogError(f"{self._place}: topic {shown(each.topic)} has not the fields of its stream")
+def run_of(
+    place: str, document: RunDocument, messages: Mapping[str, Sequence[bytes]], faults: Faults
+) -> RunLog:
+    """Return the run of a document.
 
-    def run(self, messages: Mapping[str, Sequence[bytes]], faults: Faults) -> RunLog:
-        """Return the run.
+    What was recorded as it came is read as a repairing reader does: rows that go back in time, channels
+    without a value, streams of fewer than two samples and streams that no instant has in common with the
+    others are dropped and counted.
 
-        What was recorded as it came is read as a repairing reader does: rows that go back in time, channels
-        without a value, streams of fewer than two samples and streams that no instant has in common with the
-        others are dropped and counted.
+    Parameters
+    ----------
+    place : of the file, as messages name it
+    document : of the run
+    messages : of each topic, in the order of the file
+    faults : counts what is dropped instead of refused, or refuses
 
-        Parameters
-        ----------
-        messages : of each topic, in the order of the file
-        faults : counts what is dropped instead of refused, or refuses
-
-        Raises
-        ------
-        LogError
-            if a stream is broken, or none is left.
-        """
-        dropped = Counter(self._dropped)
-        streams: dict[str, Stream] = {}
-        for name, topic in self.topics.items():
-            numbers = stream_samples(self._place, topic, messages.get(topic.topic, ()), faults)
-            channels = tuple(topic.fields.values())
-            if self.head.live:
-                recorded = _recorded_stream(name, channels, numbers, dropped)
-                streams |= {name: recorded} if recorded is not None else {}
-                continue
-            streams[name] = checked_stream(
-                f"{self._place}: stream {shown(name)}",
-                numbers[:, 0],
-                numbers[:, 1:],
-                channels,
-                row_of=lambda index: index + 1,
-                repairs=faults.repairs,
-                unknown_is_a_value=name in MAY_BE_UNKNOWN,
-            )
-        if self.head.live:
-            streams = _overlapping(streams, dropped)
-            if not streams:
-                raise LogError(f"{self._place}: holds no stream of two samples or more")
-        refuse_apart(self.head.run_id, streams)
-        dropped.update(faults.repairs or {})
-        head = self.head
-        run = RunLog(
-            head.run_id,
-            head.robot,
-            streams,
-            self._labels,
-            source=head.source,
-            dropped=dict(dropped),
-            session=head.session,
-            filter=head.filter,
+    Raises
+    ------
+    LogError
+        if a stream or a label is broken, or no stream is left.
+    """
+    place = f"{place}: {RUN_TOPIC}"
+    dropped = Counter(document.dropped)
+    streams: dict[str, Stream] = {}
+    for name, topic in document.streams.items():
+        numbers = stream_samples(place, topic, messages.get(topic.topic, ()), faults)
+        channels = tuple(topic.fields.values())
+        if document.live:
+            recorded = _recorded_stream(name, channels, numbers, dropped)
+            streams |= {name: recorded} if recorded is not None else {}
+            continue
+        streams[name] = checked_stream(
+            f"{place}: stream {shown(name)}",
+            numbers[:, 0],
+            numbers[:, 1:],
+            channels,
+            row_of=lambda index: index + 1,
+            repairs=faults.repairs,
+            unknown_is_a_value=name in MAY_BE_UNKNOWN,
         )
-        return checked_names(self._place, run)
-
-
-def _fields(fields: Mapping[str, Any]) -> dict[str, str]:
-    found = {str(field): str(channel) for field, channel in fields.items()}
-    if not found or len(set(found.values())) != len(found):
-        raise ValueError("the fields of a stream are no list of channels")
-    return found
+    if document.live:
+        streams = _overlapping(streams, dropped)
+        if not streams:
+            raise LogError(f"{place}: holds no stream of two samples or more")
+    refuse_apart(document.run_id, streams)
+    dropped.update(faults.repairs or {})
+    run = RunLog(
+        document.run_id,
+        document.robot,
+        streams,
+        read_labels(place, document.labels),
+        source=document.source,
+        dropped=dict(dropped),
+        session=document.session,
+        filter=document.filter,
+    )
+    return checked_names(place, run)
 
 
 def _recorded_stream(

@@ -34,11 +34,11 @@ from typing import Annotated, Literal
 from pydantic import Field, FiniteFloat, ValidationError
 
 from terrain.errors import ConfigError, LogError
-from terrain.files.documents import read_yaml
+from terrain.files.documents import first_fault, read_yaml
 from terrain.files.names import check_name, listed, plain_name
 from terrain.files.resources import data_folder
 from terrain.logs.faults import Topic
-from terrain.logs.mapping import Strict, Unit, Word, check_unit, first_fault
+from terrain.logs.mapping import Strict, Unit, Word, check_unit
 from terrain.logs.schema import unit_of
 
 Kind = Literal["fields", "gnss", "imu", "joints", "odometry", "pose", "twist"]
