@@ -21,14 +21,14 @@ FACE = {
     "Runs": "pipelines.api.runs",
     "load_robot": "terrain.robots",
     "simulate": "pipelines.api.runs",
-    "estimate": "pipelines.api.slip",
-    "learn_slip": "pipelines.api.slip",
+    "estimate": "pipelines.api.runs",
+    "learn_slip": "pipelines.api.runs",
     "cut_windows": "pipelines.api.learn",
-    "TerrainClassifier": "pipelines.api.learn",
+    "TerrainClassifier": "pipelines.learn.classifier",
     "cross_validate": "pipelines.api.learn",
-    "explain": "pipelines.api.explain",
-    "Observer": "pipelines.api.live",
-    "replay": "pipelines.api.live",
+    "explain": "pipelines.api.runs",
+    "Observer": "pipelines.live.observer",
+    "replay": "terrain.logs.replay",
 }
 """The names that ``import terrain`` offers, and the modules that have them."""
 

@@ -15,7 +15,7 @@ from pipelines.learn.recipes import make_recipe
 from terrain.errors import DataError
 from terrain.records import RunLog, Windows
 
-__all__ = ["TerrainClassifier", "cross_validate", "cut_windows"]
+__all__ = ["cross_validate", "cut_windows"]
 
 
 def cut_windows(

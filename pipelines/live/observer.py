@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ class Observer(Chain):
 
     Parameters
     ----------
-    model : that classifies
+    model : that classifies, or a fitted classifier, whose ``model_`` is one
     table : of target slips; the packaged one by default
     robot : its description; needed where the model uses what a filter estimates, or wheel speeds that are
         computed from motor rates
@@ -58,7 +59,7 @@ class Observer(Chain):
 
     def __init__(
         self,
-        model: LiveModel,
+        model: LiveModel | Any,
         table: SlipTable | None = None,
         robot: Robot | None = None,
         channels: Mapping[str, Sequence[str]] | None = None,
@@ -67,6 +68,7 @@ class Observer(Chain):
         switching: SwitchSettings = SWITCHING,
     ) -> None:
         check_switching(switching)
+        model = getattr(model, "model_", model)
         table = load_slip_table() if table is None else table
         super().__init__("" if robot is None else robot.name, table, switching, ClockWatch())
         self._robot, self._thread = robot, thread
