@@ -3,18 +3,18 @@
 import json
 import socket
 import threading
-from dataclasses import replace
 
 import pytest
 
 from pipelines.serve.serve import Settings, run
 from pipelines.serve.service import Service
-from terrain.control.slip_table import load_slip_table, write_slip_table
 from terrain.errors import ConfigError, TerrainError
+from terrain.files.resources import data_folder
 
 from .strangers import ask
 
 TOKEN = "t" * 20
+FOR_HUSKY = (data_folder("target_slip") / "default.yaml").read_bytes() + b"\nschema: 2\nrobot: husky\n"
 
 
 @pytest.fixture
@@ -30,16 +30,6 @@ def refusal(model_folder, monkeypatch):
         return sentence
 
     return of
-
-
-@pytest.fixture
-def copied(model_folder, tmp_path):
-    """A copy of the model that may be damaged."""
-    folder = tmp_path / "model"
-    folder.mkdir()
-    for file in model_folder.iterdir():
-        (folder / file.name).write_bytes(file.read_bytes())
-    return folder
 
 
 def written(path, content):
@@ -66,6 +56,7 @@ def written(path, content):
         ("", {"robot": "nowhere"}, "nowhere"),
         ("", {"table": "none.yaml"}, "none.yaml"),
         ("", {"table": b"[" * 100_000}, "nested deeper"),
+        ("", {"robot": "agrimaro", "table": FOR_HUSKY}, "is for robot 'husky', not for 'agrimaro'"),
         ("", {"state": "file/below"}, "cannot be written"),
         ("", {"record": "file"}, "cannot be written"),
     ],
@@ -79,23 +70,6 @@ def test_what_is_wrong_is_one_sentence(refusal, monkeypatch, tmp_path, token, op
         for name, value in options.items()
     }
     assert sentence in refusal(**given)
-
-
-def test_a_table_for_another_robot_is_refused(refusal, tmp_path):
-    write_slip_table(replace(load_slip_table(), robot="husky"), tmp_path / "table.yaml")
-    sentence = refusal(robot="agrimaro", table=tmp_path / "table.yaml")
-    assert "is for robot 'husky', not for 'agrimaro'" in sentence
-
-
-def test_a_damaged_model_is_named(refusal, copied):
-    for file in copied.iterdir():
-        content = file.read_bytes()
-        for damaged in (b"", content[: len(content) // 2], b"[" * 100_000, b"PK\x03\x04 nothing else"):
-            file.write_bytes(damaged)
-            assert str(copied) in refusal(model=str(copied))
-        file.unlink()
-        assert str(copied) in refusal(model=str(copied))
-        file.write_bytes(content)
 
 
 def test_after_a_refused_start_the_port_is_free_and_no_thread_is_left(
@@ -141,8 +115,12 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
         ({"can": "can0", "port": 1}, "--port is an option of the WebSocket service, not of --can"),
         ({"replay": "runs", "duration_s": 1.0}, "--duration is an option of --can, not of --replay"),
         ({"speed": "4"}, "--speed is an option of --replay, not of the WebSocket service"),
+        *(
+            ({"replay": "runs", "speed": speed}, "--speed is")
+            for speed in ("0", "-1", "inf", "nan", "fast", "")
+        ),
     ],
 )
-def test_options_of_another_mode_are_refused(options, sentence):
+def test_options_that_are_no_speed_or_of_another_mode_are_refused(options, sentence):
     with pytest.raises(ConfigError, match=sentence):
         Settings(**options)
