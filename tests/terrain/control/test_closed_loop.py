@@ -1,0 +1,165 @@
+"""A robot's control in the closed loop with its estimator and a simulated robot: what it gains, and that it stays."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from terrain.control.controllers import make_controller
+from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
+from terrain.control.path_tracking import PoseEstimate, TrackStatus, initial_tracking, track_step
+from terrain.control.pilot_settings import OPEN_LOOP
+from terrain.control.robot_control import RobotControl
+from terrain.control.situations import SituationOptions, make_situation, simulate_situation, start_times
+from terrain.control.slip_table import load_slip_table
+from terrain.control.switching import OutputStatus, TerrainBelief
+from terrain.control.tracking_settings import SETTINGS as TRACKING
+from terrain.control.tracking_settings import check_tracking
+from terrain.control.traction import TractionStatus
+from terrain.estimation.live.estimator import LiveEstimator
+from terrain.logs.replay import TWIST
+from terrain.robots import load_robot
+
+ROBOT, TABLE, DELAY_S = load_robot("agrimaro"), load_slip_table(), 0.05
+
+
+class Loop:
+    """A controller by name with its estimator, where it is told the terrain or none."""
+
+    def __init__(self, name):
+        controller = make_controller(name, TABLE, DELAY_S)
+        self.filter = None if controller.pilot.controller in OPEN_LOOP else LiveEstimator(ROBOT)
+        states = () if self.filter is None else self.filter.states
+        self.control = RobotControl(ROBOT, controller.table, controller.pilot, states)
+        self.belief, self.seen, self.time_s = TerrainBelief(controller.known_terrain, 1.0), None, math.nan
+
+    def step(self, sample):
+        time_s, dt_s, readings = sample.time_s, sample.time_s - self.time_s, dict(sample.readings)
+        self.time_s = time_s
+        if self.filter is not None:
+            self.control.measured(time_s, dt_s, readings, self.seen)
+            self.filter.step(readings, time_s)
+            self.seen = self.filter.at(time_s)
+        now = time_s, dt_s if math.isfinite(dt_s) else 0.02, sample.twist, self.seen
+        return self.control.step(*now, self.belief, OutputStatus.NONE, holds=True)[0]
+
+
+@cache
+def driven(name, scenario, terrain, seed, **options):
+    """A drive of that controller and its situation."""
+    where = make_situation(scenario, ROBOT, terrain, seed, SituationOptions(**options))
+    return simulate_situation(ROBOT, where, Loop(name).step, DELAY_S), where
+
+
+@cache
+def history(name, scenario, terrain, seed, **options):
+    run, where = driven(name, scenario, terrain, seed, **options)
+    return drive_history(run, ROBOT, where.conditions.radius_factors)
+
+
+def test_without_slip_it_drives_the_plain_command():
+    """On asphalt, sped up by no more than it can follow."""
+    run, _ = driven("known:asphalt", "straight", "asphalt", 200, duration_s=12.0, accel_mps2=0.5)
+    control = run.streams["control"]
+    short = control.channel("desired_mps") - control.channel("driven_mps")
+    assert (short >= 0).all()
+    assert short.max() < 0.15
+    assert short[control.time_s > 4.0].max() == 0.0
+    wheels = np.column_stack([run.streams["commands"].channel(f"wheel_{i}_radps") for i in (1, 2, 3)])
+    assert wheels[-1] == pytest.approx(np.full(3, 5.0), rel=0.02)
+
+
+def test_a_start_on_grass_slips_less_and_travels_nearly_as_far():
+    plain, limited = (history(name, "starts", "grass", 200) for name in ("plain", "known:grass"))
+    for start_s in start_times(make_situation("starts", ROBOT, "grass", 200).scenario)[1:]:
+        within = (plain.time_s >= start_s) & (plain.time_s < start_s + 7)
+        assert slip_peak(plain, within) > 1.5 * slip_peak(limited, within)
+        assert distance_within(limited, start_s, 5.0) > 0.85 * distance_within(plain, start_s, 5.0)
+
+
+def test_wheels_of_unequal_radius_do_not_work_against_each_other_in_a_circle_on_tiles():
+    factors = (1.02, 1.0, 1.0)
+    plain, limited = (
+        history(name, "circle", "tiles", 200, radius_factors=factors) for name in ("plain", "known:tiles")
+    )
+    after = np.searchsorted(plain.time_s, 6.0)
+    for what, most in (("scrub_along_j", 0.2), ("energy_j", 0.6)):
+        spent, spent_limited = (getattr(c, what)[-1] - getattr(c, what)[after] for c in (plain, limited))
+        assert spent_limited < most * spent
+    assert limited.distance_m[-1] == pytest.approx(plain.distance_m[-1], rel=0.02)
+
+
+@pytest.mark.parametrize("target", [0.02, 0.6])
+def test_a_wrong_target_costs_no_speed_on_dry_sand(target):
+    options = {"scenario": "straight", "terrain": "dry_sand", "seed": 200, "duration_s": 40.0}
+    plain, limited = (final_speed(history(name, **options)) for name in ("plain", f"target:{target}"))
+    assert limited == pytest.approx(plain, rel=0.005)
+
+
+@pytest.mark.slow
+def test_the_thesis_slows_below_the_balance_and_the_traction_controller_does_not():
+    """On grass, whose balance is near 0.126, with 0.05 as the target of steady motion."""
+    options = {"scenario": "straight", "terrain": "grass", "seed": 201, "duration_s": 40.0}
+    assert TABLE.lookup("unknown")["steady"].slip_ratio == 0.05
+    plain, thesis, limited = (
+        final_speed(history(name, **options)) for name in ("plain", "thesis", "target:0.05")
+    )
+    assert thesis < 0.8 * plain
+    assert limited == pytest.approx(plain, rel=0.005)
+
+
+def test_backward_and_sideways_slip_is_estimated_and_limited_as_forward():
+    run, _ = driven("known:grass", "complex", "grass", 202)
+    control, truth = run.streams["control"], history("known:grass", "complex", "grass", 202)
+    at = np.searchsorted(truth.time_s, control.time_s - 0.02)  # the estimate is that old
+    true = np.nan_to_num(truth.slip_ratio[at], nan=-1.0).max(axis=1)
+    fast = (np.abs(truth.ground_mps[at]) > 0.25).all(axis=1) & (control.time_s > 1.0)
+    error = control.channel("slip_ratio")[fast] - true[fast]
+    assert fast.sum() > 500
+    assert np.sqrt(np.mean(error**2)) < 0.05
+    why = control.channel("status_code")[control.time_s > 1.0]
+    assert (why == TractionStatus.UNSOUND).mean() < 0.01  # a dropout of the camera
+    assert set(why) <= {TractionStatus.OK, TractionStatus.UNCERTAIN, TractionStatus.UNSOUND}
+    assert slip_peak(truth) < slip_peak(history("plain", "complex", "grass", 202))
+
+
+def off_the_path(scenario, terrain, seed, duration_s):
+    """Return the distance from the path at each step with a good status, and how many steps have one.
+
+    The path is that of the tracking itself, fed with the true motion: it starts anew at each standstill, and
+    the robot is on it wherever along it slip has let it come.
+    """
+    run, situation = driven("fallback+track", scenario, terrain, seed, duration_s=duration_s)
+    truth, control = run.streams["truth"], run.streams["control"]
+    time_s = control.time_s
+
+    def at(source_s, columns):
+        return np.column_stack([np.interp(time_s, source_s, column) for column in columns])
+
+    pose = at(truth.time_s, [truth.channel(name) for name in ("position_x_m", "position_y_m", "yaw_rad")])
+    ground = at(truth.time_s, [truth.channel(name) for name in TWIST])
+    desired = at(situation.scenario.time_s, situation.scenario.twist.T)
+    settings, state, off_m = check_tracking(ROBOT, TRACKING, DELAY_S), initial_tracking(), []
+    for place, twist, motion in zip(pose, desired, ground, strict=True):
+        seen = PoseEstimate(*map(float, place), yaw_std_rad=0.0, stale_s=0.0)
+        _, state, report = track_step(settings, state, twist.copy(), seen, motion.copy(), 0.02)
+        off_m.append(abs(report.cross_track_m))
+    tracked = np.isin(control.channel("track_status_code"), (TrackStatus.OK, TrackStatus.CLAMPED))
+    good = tracked & (control.channel("status_code") == TractionStatus.OK)
+    return np.array(off_m)[good], good
+
+
+def test_a_minute_on_the_path():
+    off_m, good = off_the_path("complex", "tiles", 63, 60.0)
+    assert np.nanmax(off_m) < 0.3
+    assert good.mean() > 0.5  # the others stand
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["straight", "complex"])
+@pytest.mark.parametrize("terrain", ["tiles", "grass", "dry_sand"])
+def test_ten_minutes_on_the_path(scenario, terrain):
+    off_m, good = off_the_path(scenario, terrain, 64, 600.0)
+    assert np.nanmax(off_m) < 0.3
+    assert good.mean() > 0.8
