@@ -11,11 +11,10 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import re
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import cache, partial
 from importlib import import_module
@@ -35,10 +34,6 @@ from pipelines.report.versions import COMPUTING, installed
 from terrain.errors import ConfigError, TerrainError
 
 LOCAL = "local"
-_ADDRESS = re.compile(
-    r"dask:(?:(?P<scheme>tcp|tls)://)?(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:]+\]):(?P<port>\d{1,5})"
-)
-MAX_PORT = 65535
 
 PARENT_POLL_S = 0.5
 """From one look at the process that started a pool to the next."""
@@ -80,13 +75,21 @@ def scheduler_address(compute: str) -> str | None:
     """
     if compute == LOCAL:
         return None
-    found = _ADDRESS.fullmatch(compute)
-    if found is None or not 0 < int(found["port"]) <= MAX_PORT:
-        raise ConfigError(
-            f"--compute is {compute!r}: 'local' or the address of a Dask scheduler is accepted, "
-            "as dask:tcp://127.0.0.1:8786"
-        )
-    return f"{found['scheme'] or 'tcp'}://{found['host']}:{found['port']}"
+    kind, _, place = compute.partition(":")
+    with suppress(ValueError):  # of a port that is no port
+        where = urlsplit(place if "://" in place else f"tcp://{place}")
+        if (
+            kind == "dask"
+            and where.scheme in ("tcp", "tls")
+            and where.hostname
+            and where.port
+            and not where.path
+        ):
+            return where.geturl()
+    raise ConfigError(
+        f"--compute is {compute!r}: 'local' or the address of a Dask scheduler is accepted, "
+        "as dask:tcp://127.0.0.1:8786"
+    )
 
 
 class ComputeSettings(Settings):

@@ -68,10 +68,6 @@ class Samples(NamedTuple):
         """Run (n,) of each window, as text."""
         return np.asarray(self.windows.run_id.astype(str))
 
-    def of(self, rows: Array) -> Samples:
-        """Return some of the windows."""
-        return self._replace(windows=self.windows[rows], group=self.group[rows])
-
 
 class Protocol(NamedTuple):
     """What is held out, and how.
