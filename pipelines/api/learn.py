@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from features.recipes import make_recipe
 from features.windows import SteadyMotion, WindowRule
 from features.windows import cut_windows as cut
 from pipelines.learn.classifier import TerrainClassifier
 from pipelines.learn.comparison import ComparisonResult
 from pipelines.learn.crossval import cross_validate as evaluate
 from pipelines.learn.evaluation import CrossvalResult
-from pipelines.learn.recipes import make_recipe
 from terrain.errors import DataError
 from terrain.records import RunLog, Windows
 

@@ -11,10 +11,10 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
 from features.motion import window_motion
+from features.recipes import make_recipe
 from features.windows import WindowRule
 from pipelines.learn.load import load_model
 from pipelines.learn.model_file import TerrainModel, model_info, write_model
-from pipelines.learn.recipes import make_recipe
 from terrain.classify.limits import learn_limits
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS

@@ -35,9 +35,9 @@ from terrain.errors import DataError
 if TYPE_CHECKING:
     import pandas as pd
 
+    from features.recipes import WindowPipeline
     from pipelines.learn.model_file import TerrainModel
     from pipelines.learn.protocols import Samples
-    from pipelines.learn.recipes import WindowPipeline
     from terrain.classify.paired import Comparison, Difference
     from terrain.records import RunLog
 

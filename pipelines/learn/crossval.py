@@ -23,9 +23,9 @@ from pipelines.report.settings import setting
 from terrain.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
+    from features.recipes import WindowPipeline
     from pipelines.learn.comparison import ComparisonResult
     from pipelines.learn.protocols import Samples
-    from pipelines.learn.recipes import WindowPipeline
     from terrain.records import RunLog, Windows
 
 EXAMPLE = "terrain crossval --data runs/ --recipe svm"
@@ -164,8 +164,8 @@ def cross_validate(
     >>> found.recipe, found.n_features, found.accuracy
     ('KNeighborsClassifier', 52, 1.0)
     """
+    from features.recipes import make_recipe
     from pipelines.learn.protocols import Samples
-    from pipelines.learn.recipes import make_recipe
 
     functions = options.pop("functions", ())
     recipes = list(recipe) if isinstance(recipe, list | tuple) else [recipe]

@@ -36,7 +36,7 @@ from terrain.files.regular import MEBIBYTE, check_inside, read_regular
 from terrain.records import Array, Windows
 
 if TYPE_CHECKING:
-    from pipelines.learn.recipes import WindowPipeline
+    from features.recipes import WindowPipeline
 
 MODEL_FILE, ONNX_FILE, MANIFEST_FILE = "model.skops", "network.onnx", "terrain_model.json"
 CARD_FILE, TRAINING_FILE = "model_card.md", "training.json"
@@ -59,7 +59,7 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "features.sample_extractor.SampleExtractor",
     "features.windows.Layout",
     "numpy.dtype",
-    "pipelines.learn.recipes.WindowPipeline",
+    "features.recipes.WindowPipeline",
     "terrain.classify.augment.Augmentation",
     "terrain.classify.grouped_network.GroupedNetwork",
     "terrain.classify.grouped_network.NetworkChoice",
@@ -386,7 +386,7 @@ def _without_network(recipe: WindowPipeline) -> tuple[WindowPipeline, Any]:
 def _load(file: Path, content: bytes) -> tuple[WindowPipeline, NoveltyNumbers | None]:
     from skops import io
 
-    from pipelines.learn.recipes import WindowPipeline
+    from features.recipes import WindowPipeline
 
     try:
         with zipfile.ZipFile(streams.BytesIO(content)) as archive:

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from features.windows import WindowRule
 
 RECIPES = ("svm", "cnn", "stack", "best", "response")
-"""SVM on features, network on samples, both joined, and which of these three held-out runs favour; and what
-wheels answer to how they are driven."""
+"""The names of ``features.recipes.RECIPES``."""
 FEATURE_RECIPE = "svm"
 """The recipe that learns from features alone, and so from cached ones."""
 WITHOUT_SVM = ("cnn", "response")

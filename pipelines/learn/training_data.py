@@ -11,11 +11,12 @@ import numpy as np
 from features.extractor import FeatureExtractor
 from features.matrix import FeatureMatrix
 from features.motion import Motion, window_motion
+from features.recipes import WindowPipeline, feature_matrix
 from features.windows import Layout, cut_windows
 from pipelines.learn.cache import CachedFeatures
 from pipelines.learn.model_file import ModelInfo, TerrainModel, model_info
 from pipelines.learn.protocols import Samples, samples_of
-from pipelines.learn.recipes import WindowPipeline, feature_matrix, recipe_of
+from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from terrain.errors import DataError
 from terrain.estimation.live.choice import ESTIMATED

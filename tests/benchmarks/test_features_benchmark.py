@@ -16,10 +16,10 @@ from sklearn.svm import SVC
 
 from features.extractor import FeatureExtractor
 from features.motion import window_motion
+from features.recipes import make_recipe
 from features.stream import WindowStream
 from features.windows import WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import load_runs
-from pipelines.learn.recipes import make_recipe
 from pipelines.live.model import assess
 from terrain.classify.novelty import NoveltyScore
 from terrain.classify.support import learn_support

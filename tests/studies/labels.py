@@ -16,10 +16,11 @@ import numpy as np
 from sklearn.base import clone
 
 from features.motion import Motion, window_motion
+from features.recipes import feature_matrix
 from pipelines.data.datasets import load_runs
 from pipelines.learn.parallel import parallel
 from pipelines.learn.protocols import folds_of, samples_of
-from pipelines.learn.recipes import feature_matrix, recipe_of
+from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import LearnSettings
 from pipelines.report import Column, Progress, Report, Result, Table, described, silent
 from pipelines.report.settings import Settings as BaseSettings

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from features.motion import Motion, window_motion
+from features.recipes import feature_matrix
 from pipelines.data.datasets import load_runs, run_loaders
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn import cache
@@ -17,7 +18,7 @@ from pipelines.learn.cache import cached_features
 from pipelines.learn.crossval import EvaluationSettings
 from pipelines.learn.evaluate import evaluate_recipe
 from pipelines.learn.protocols import samples_of
-from pipelines.learn.recipes import feature_matrix, recipe_of
+from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_cache, data_of_runs, same_features
 from pipelines.report.json_file import as_json

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict, cross_validate
 
+from features import recipes
+from features.recipes import WindowPipeline, feature_matrix, make_recipe
 from pipelines.data.datasets import load_runs
+from pipelines.learn import settings as learn_settings
 from pipelines.learn.crossval import EvaluationSettings, Settings, crossval, run
 from pipelines.learn.evaluate import evaluate
 from pipelines.learn.parallel import computing
 from pipelines.learn.protocols import PROTOCOLS, folds_of, samples_of
-from pipelines.learn.recipes import WindowPipeline, feature_matrix, make_recipe
 from pipelines.learn.settings import ProtocolName
 from pipelines.report.json_file import as_json
 from terrain.classify.held_out import Examples
@@ -58,9 +60,10 @@ def test_the_screen_answers_first_and_fits(report):
     assert report.to_pandas().shape == (3, 5)
 
 
-def test_the_protocols_of_the_command_line_are_those_that_there_are():
+def test_protocols_and_recipes_of_the_command_line_are_those_that_there_are():
     """They are written twice, so that help need not load what offers them."""
     assert get_args(ProtocolName) == tuple(PROTOCOLS)
+    assert learn_settings.RECIPES == recipes.RECIPES
 
 
 def test_the_report_has_what_is_promised_and_is_json(report):

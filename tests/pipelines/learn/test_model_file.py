@@ -12,6 +12,7 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from skops import io as skops_io
 
+from features.recipes import WindowPipeline, make_recipe
 from features.windows import SteadyMotion, WindowRule, cut_windows
 from pipelines.learn.model_file import (
     MANIFEST_FILE,
@@ -22,7 +23,6 @@ from pipelines.learn.model_file import (
     seal,
     write_model,
 )
-from pipelines.learn.recipes import WindowPipeline, make_recipe
 from terrain.errors import ModelError
 
 

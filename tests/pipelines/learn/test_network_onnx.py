@@ -10,9 +10,9 @@ import onnxruntime
 import pytest
 from skops import io
 
+from features.recipes import feature_matrix, inform, make_recipe
 from features.windows import WindowRule, cut_windows
 from pipelines.learn.model_file import MODEL_FILE, ONNX_FILE, TRUSTED_TYPES, read_model, seal, write_model
-from pipelines.learn.recipes import feature_matrix, inform, make_recipe
 from terrain.classify.network_onnx import network_onnx, time_of_onnx
 from terrain.errors import ConfigError, ModelError
 

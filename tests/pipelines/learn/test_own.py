@@ -5,9 +5,9 @@ import pytest
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.linear_model import LogisticRegression, RidgeClassifier
 
+from features.recipes import feature_matrix, make_recipe
 from features.windows import WindowRule, cut_windows
 from pipelines.learn.crossval import cross_validate, crossval
-from pipelines.learn.recipes import feature_matrix, make_recipe
 from terrain.classify.own import OwnClassifier
 from terrain.errors import ConfigError
 
