@@ -21,7 +21,7 @@ from terrain.logs.topic_mapping import Mapping as TopicMapping
 from terrain.logs.topic_mapping import check_stream, load_mapping, standard_mapping
 from terrain.logs.topic_streams import MappedTopics
 from terrain.records import RunLog, Stream
-from terrain.robots import Robot, packaged_robot
+from terrain.robots import Robot, robot_named
 
 
 def find_runs(place: Path, mapping: str | Path | None, robot: Robot | None) -> list[Callable[..., RunLog]]:
@@ -74,7 +74,7 @@ def read_run(
     name = robot.name if robot is not None else mapping.robot
     if not name:
         raise ConfigError(f"{place}: a bag does not name its robot: give it by --robot or in the mapping")
-    found = _mapped(bag, mapping, topics, _wheel_radius_m(mapping, robot), faults)
+    found = _mapped(bag, mapping, topics, wheel_radius_m(name, robot), faults)
     start_ns, streams = found.streams()
     parts = _parts(path, folder)
     refuse_apart("_".join(parts), streams)
@@ -94,7 +94,7 @@ def read_stream(
     name: str,
     described_stream: Mapping[str, object],
     repairs: Counter[str] | None,
-    wheel_radius_m: float | None = None,
+    radius_m: float | None = None,
 ) -> Stream:
     """Return one stream of a bag that is joined with other files: its times are seconds since 1970.
 
@@ -104,7 +104,7 @@ def read_stream(
     name : of the stream
     described_stream : its keys, as in a mapping of topics
     repairs : counts by kind of what is dropped; None refuses
-    wheel_radius_m : of the robot; None where unknown
+    radius_m : of the robot's wheels; None where unknown
 
     Raises
     ------
@@ -114,17 +114,17 @@ def read_stream(
     stream = check_stream(f"stream {name}", described_stream)
     mapping = TopicMapping(streams={name: stream})
     bag = open_bag(path)
-    found = _mapped(bag, mapping, topics_of(bag), wheel_radius_m, Faults(repairs))
+    found = _mapped(bag, mapping, topics_of(bag), radius_m, Faults(repairs))
     return found.streams(start_ns=0)[1][name]
 
 
 def _mapped(
-    bag: Bag, mapping: TopicMapping, topics: Mapping[str, Topic], wheel_radius_m: float | None, faults: Faults
+    bag: Bag, mapping: TopicMapping, topics: Mapping[str, Topic], radius_m: float | None, faults: Faults
 ) -> MappedTopics:
     """Return the topics of a mapping, with the messages of a bag."""
     place = short_name(bag.path)
     decoder = partial(decoder_of, place, distro=bag.distro)
-    found = MappedTopics(place, mapping, topics, KINDS, decoder, wheel_radius_m, faults)
+    found = MappedTopics(place, mapping, topics, KINDS, decoder, radius_m, faults)
     for message in messages_of(bag, found.names, faults):
         found.take(*message)
     return found
@@ -172,9 +172,10 @@ def recorded_windows(path: Path) -> tuple[str, list[RecordedWindow]] | None:
     return run_id, [window_of_text(place, text) for text in texts[WINDOW_TOPIC]]
 
 
-def _wheel_radius_m(mapping: TopicMapping, robot: Robot | None) -> float | None:
+def wheel_radius_m(name: str, given: Robot | None) -> float | None:
+    """Return the wheel radius of a robot by its name, or of the one that is given; None where it is unknown."""
     try:
-        return (packaged_robot(mapping.robot) if robot is None else robot).wheel_radius_m
+        return robot_named(name, given).wheel_radius_m
     except ConfigError:
         return None
 

@@ -102,11 +102,6 @@ class _Assembler:
         if self._there >= self._needed:
             self.finish()
 
-    def finish_before(self, time_s: float) -> None:
-        """End a sample that began before a time."""
-        if self._there and self._time_s < time_s:
-            self.finish()
-
     def finish(self) -> None:
         """End the sample, complete or not."""
         if not self._there:
@@ -123,8 +118,10 @@ class _Assembler:
         self._row, self._there = [math.nan] * self._width, set()
         self._last, self._counter = self._counter, None
 
-    def reading(self) -> Reading | None:
-        """Return the samples that are done, and hold them no more; None where there is none."""
+    def reading(self, before_s: float) -> Reading | None:
+        """Return the samples that are done or began before a time, and hold them no more; None without any."""
+        if self._time_s < before_s:
+            self.finish()
         if not self._done:
             return None
         rows = np.array(self._done).reshape(-1, 1 + self._width)
@@ -185,8 +182,7 @@ class Receiver:
         """Return the samples since the last call, by stream; of incomplete ones those that are old enough."""
         found = {}
         for name, assembler in self._streams.items():
-            assembler.finish_before(now_s - INCOMPLETE_S)
-            reading = assembler.reading()
+            reading = assembler.reading(now_s - INCOMPLETE_S)
             if reading is not None:
                 found[name] = reading
         return found
@@ -225,6 +221,7 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
     for frame in _frames(path):
         first_s = frame.time_s if first_s is None else first_s
         receiver.take(frame._replace(time_s=frame.time_s - first_s))
+    readings = receiver.readings(math.inf)
     dropped = Counter(receiver.dropped)
     faults = {kind: n for kind, n in dropped.items() if kind not in USUAL}
     if faults and not repair:
@@ -233,7 +230,7 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
     repairs: Counter[str] | None = Counter() if repair else None
     streams = {
         "commands" if name == "twist" else name: _stream(path, layout, name, reading, repairs)
-        for name, reading in receiver.readings(math.inf).items()
+        for name, reading in readings.items()
         if name in RECEIVED
     }
     if not streams:

@@ -247,14 +247,10 @@ def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:
     from pipelines.data import bag_runs
     from terrain.logs import mapping as by_mapping
     from terrain.logs.topic_mapping import check_stream
-    from terrain.robots import robot_named
 
     read = by_mapping.load_mapping(mapping, check_stream)
-    try:
-        radius_m = robot_named(read.robot, robot).wheel_radius_m
-    except ConfigError:
-        radius_m = None
-    return by_mapping.find_runs(folder, read, partial(bag_runs.read_stream, wheel_radius_m=radius_m))
+    radius_m = bag_runs.wheel_radius_m(read.robot, robot)
+    return by_mapping.find_runs(folder, read, partial(bag_runs.read_stream, radius_m=radius_m))
 
 
 def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> Readers:
