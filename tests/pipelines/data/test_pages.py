@@ -6,12 +6,8 @@ from pathlib import Path
 import cantools
 
 from pipelines.data.run_writers import messages_of_run
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
 from terrain.files.resources import data_folder
 from terrain.logs.topic_mapping import TYPES, load_mapping, short_type
-from terrain.robots import load_robot
-from terrain.simulation.run import simulate_run
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 ROW = re.compile(
@@ -62,11 +58,9 @@ def test_the_mapping_of_the_page_is_accepted_and_begins_with_the_packaged_one(tm
     assert shown.labels == "/terrain_name"
 
 
-def test_topics_of_the_page_are_those_of_an_export():
+def test_topics_of_the_page_are_those_of_an_export(estimated_run):
     page = (DOCS / "bags.md").read_text(encoding="utf-8")
-    robot = load_robot("agrimaro")
-    run = enriched(estimate_run(simulate_run(robot, "grass", "starts", 1, duration_s=8.0), robot, "vio15"))
-    topics = {each.topic: each.kind for each in messages_of_run(run)}
+    topics = {each.topic: each.kind for each in messages_of_run(estimated_run)}
     rows = [line for line in page.splitlines() if re.match(r"\| `/", line)]
     named = {topic for row in rows for topic in re.findall(r"`(/[\w/]+)`", row)} - {"/terrain/window"}
     assert named == {topic for topic in topics if not topic.startswith("/terrain/")} | {
@@ -78,8 +72,8 @@ def test_topics_of_the_page_are_those_of_an_export():
             first = re.search(r"`(/[\w/]+)`", row)
             if first:
                 assert short_type(topics.get(first[1], "std_msgs/msg/String")) == kind
-    assert "slip_1_ratio" in run.streams["slip"].channels
-    assert {"speed_x_mps"} <= set(run.streams["estimator"].channels)
+    assert "slip_1_ratio" in estimated_run.streams["slip"].channels
+    assert {"speed_x_mps"} <= set(estimated_run.streams["estimator"].channels)
 
 
 def test_kinds_of_the_page_are_those_there_are():

@@ -21,8 +21,6 @@ from pipelines.data.datasets import load_runs
 from pipelines.data.mcap_file import McapWriter
 from pipelines.data.run_writers import messages_of_run, write
 from terrain.errors import ConfigError, DataError, LogError
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
 from terrain.logs.digest import data_digest
 from terrain.logs.read import read_run
 from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
@@ -36,12 +34,10 @@ TARGETS = ("mcap", "ros2", "ros2-mcap")
 
 
 @pytest.fixture(scope="module")
-def raw(tmp_path_factory):
+def raw(tmp_path_factory, estimated_run):
     """Return a folder with a simulated run of each robot, one of them with its estimates."""
     folder = tmp_path_factory.mktemp("raw")
-    swerve = load_robot("agrimaro")
-    run = simulate_run(swerve, "grass", "survey", 7, duration_s=9.0)
-    write_run(enriched(estimate_run(run, swerve, "vio15")), folder)
+    write_run(estimated_run, folder)
     write_run(simulate_run(load_robot("husky"), "clay", "arc", 2, duration_s=6.0), folder)
     return folder
 
@@ -69,8 +65,8 @@ def test_an_export_is_imported_as_the_same_runs(raw, datasets_dir, tmp_path, tar
                 assert stream.values.tobytes() == other.streams[name].values.tobytes()
 
 
-def test_other_libraries_read_the_same_numbers(raw, tmp_path):
-    (run,) = (run for run in load_runs(raw) if run.robot == "agrimaro")
+def test_other_libraries_read_the_same_numbers(raw, estimated_run, tmp_path):
+    run = estimated_run
     for target in TARGETS:
         exported(raw, tmp_path / target, target)
     path = tmp_path / "mcap" / f"{run.run_id}.mcap"
@@ -124,8 +120,8 @@ def check(run, messages):
     assert json.loads(messages["/terrain/run"][0].data)["run_id"] == run.run_id
 
 
-def test_standard_messages_of_an_export_are_a_run_by_a_mapping_too(raw, tmp_path):
-    (run,) = (run for run in load_runs(raw) if run.robot == "agrimaro")
+def test_standard_messages_of_an_export_are_a_run_by_a_mapping_too(raw, estimated_run, tmp_path):
+    run = estimated_run
     exported(raw, tmp_path)
     (tmp_path / "own.yaml").write_text(
         "robot: agrimaro\nstreams:\n  imu: {topic: /imu, kind: imu}\n"
