@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from terrain.estimation.live.choice import Estimate
 from terrain.records import Sample
+
+if TYPE_CHECKING:
+    from terrain.estimation.live.choice import Estimate
 
 
 class TerrainEstimate(NamedTuple):
