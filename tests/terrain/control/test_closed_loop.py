@@ -25,7 +25,7 @@ ROBOT, TABLE, DELAY_S = load_robot("agrimaro"), load_slip_table(), 0.05
 
 
 class Loop:
-    """A controller by name with its estimator, where it is told the terrain or none."""
+    """A controller by name with its estimator, with a known terrain or none."""
 
     def __init__(self, name):
         controller = make_controller(name, TABLE, DELAY_S)
