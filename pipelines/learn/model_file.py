@@ -193,7 +193,7 @@ class TerrainModel(NamedTuple):
 
 
 def write_model(folder: Path, model: TerrainModel) -> None:
-    """Write a model's files into a folder, the manifest last.
+    """Write a model's files into a folder in place of those that lie there, the manifest last.
 
     Raises
     ------
@@ -207,8 +207,8 @@ def write_model(folder: Path, model: TerrainModel) -> None:
     recipe, network = _without_network(model.recipe)
     content = io.dumps({"recipe": recipe, "novelty": model.novelty})
     _refuse_foreign(content)
-    (folder / MANIFEST_FILE).unlink(missing_ok=True)
-    (folder / ONNX_FILE).unlink(missing_ok=True)
+    for name in (MANIFEST_FILE, *FILES):  # of a model that lay there
+        (folder / name).unlink(missing_ok=True)
     atomic_write(folder / MODEL_FILE, content)
     if network is not None:
         classes = [str(name) for name in model.info.classes]

@@ -6,6 +6,7 @@ the tracking server had stopped.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -270,11 +271,9 @@ def train_on(
     drawn = enumerate(figures_of(evaluation.report), start=1)
     pictures = {f"figures/{place}.png": figure_png(figure) for place, figure in drawn}
     with TemporaryDirectory() as place:
-        folder = Path(place)
+        folder = settings.out or Path(place)
         write_model(folder, TerrainModel(recipe, info, limits.novelty, limits.support))
         write_training(folder, settings.name, info, record)
-        if settings.out is not None:
-            _keep(folder, settings.out)
         registered = _registered(settings, folder, Bench(data, held_out, settings.seed), pictures)
     return TrainResult(
         *registered,
@@ -342,24 +341,11 @@ def _registered(
         kept = settings.out
         if kept is None:
             kept = Path(f"{settings.name}-not-registered")
-            _keep(folder, kept)
+            shutil.copytree(folder, kept, dirs_exist_ok=True)
         raise TrackingError(
             f"{error}; the model is kept in {kept}: register it by "
             f"terrain train --register {kept} --name {settings.name}"
         ) from error
-
-
-def _keep(folder: Path, out: Path) -> None:
-    """Copy a model's files into a folder, the manifest last."""
-    from pipelines.learn.model_file import FILES, MANIFEST_FILE
-    from terrain.files.atomic import atomic_write
-
-    (out / MANIFEST_FILE).unlink(missing_ok=True)
-    for name in (*FILES, MANIFEST_FILE):
-        if (folder / name).is_file():
-            atomic_write(out / name, (folder / name).read_bytes())
-        else:
-            (out / name).unlink(missing_ok=True)
 
 
 def _evaluated(

@@ -9,6 +9,7 @@ from sklearn.ensemble import RandomForestClassifier
 from sklearn.neighbors import KNeighborsClassifier
 
 from features.windows import WindowRule, cut_windows
+from pipelines.learn.card import model_result
 from pipelines.learn.classifier import TerrainClassifier
 from terrain.errors import ConfigError, DataError, ModelError
 
@@ -41,7 +42,9 @@ def test_what_is_saved_predicts_the_same_wherever_it_is_loaded(fitted, windows, 
     assert table.columns.tolist() == ["run_id", "start_s", "terrain", "ASPHALT", "GRASS", "GRAVEL"]
     assert again.model_.novelty is not None
     assert again.model_.support is not None
+    (folder / "training.json").write_text("of another model")
     fitted.save(folder)  # a model takes the place of a model
+    assert model_result(folder, "field").training is None
 
 
 def test_labels_of_ones_own_take_the_place_of_those_of_the_runs(windows):
