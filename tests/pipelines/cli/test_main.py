@@ -7,11 +7,9 @@ import sys
 
 import numpy as np
 import pytest
-from sklearn.linear_model import LogisticRegression
-from skops import io as skops_io
 
 from pipelines.cli.table import COMMANDS
-from pipelines.learn.model_file import MODEL_FILE, read_model, seal
+from pipelines.learn.model_file import MODEL_FILE
 from pipelines.report import format_value
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
@@ -35,11 +33,6 @@ SPOILT_FILES = {
     "dead channel": (
         lambda lines: [lines[0], *(line.rpartition(",")[0] + ",nan" for line in lines[1:])],
         "imu_01.csv: channel accel_z_mps2 (column az) has nothing finite in its 200 rows",
-    ),
-    "empty file": (lambda lines: [], "imu_01.csv: is empty"),
-    "no number": (
-        lambda lines: [*lines[:7], "half" + lines[7][lines[7].index(",") :], *lines[8:]],
-        "imu_01.csv: time at row 8 is 'half', which is no number",
     ),
     "streams apart": (
         lambda lines: [
@@ -77,15 +70,10 @@ def test_a_unit_that_is_unknown_is_one_sentence(refused, place):
 
 
 def test_data_that_cannot_answer_are_one_sentence(refused, place, drive, drive_all):
-    keep(drive_all(("GRASS",), 6, duration_s=8.0), place)
+    keep(drive_all(("GRASS",), 5, duration_s=6.0), place)
     quick = ("--data", place / "data", "--jobs", 1)
-    for command in (("crossval",), ("crossval", "--protocol", "leave-one-run-out"), ("train", "--name", "m")):
+    for command in (("crossval",), ("train", "--name", "m")):
         refused("all windows are 'GRASS': a classifier needs at least two classes", *command, *quick)
-    shutil.rmtree(place / "data")
-    keep(drive_all(("GRASS", "GRAVEL"), 2, duration_s=8.0), place)
-    refused("4 runs are fewer than 5 folds", "crossval", *quick)
-    refused("4 runs are fewer than 5 folds", "train", "--name", "m", *quick)
-    refused("fewer than 5 partitions of 5 s", "crossval", "--protocol", "published", *quick)
     keep([drive("GRASS_9", "GRASS", 0, duration_s=1.2)], place)
     refused("run GRASS_9 lasts 1.20 s, shorter than a window of 2 s", "crossval", *quick)
     refused("window length_s is 0.0; it must be positive and finite", "crossval", *quick, "--window", 0)
@@ -105,16 +93,10 @@ def test_a_model_that_cannot_be_trusted_is_one_sentence(refused, place, drive, t
     model = shutil.copytree(tracked[0] / "model", place / "model")
     ask = ("predict", "--data", data, "--model")
     refused("neither a folder nor a model URI", *ask, "nothing")
-    refused("mlflow.db does not exist: train a model here first", *ask, "models:/drawn@champion")
     content = bytearray((model / MODEL_FILE).read_bytes())
     content[len(content) // 2] ^= 4
     (model / MODEL_FILE).write_bytes(content)
     refused("model.skops: is damaged (SHA-256", *ask, model)
-    (model / MODEL_FILE).write_bytes(skops_io.dumps(LogisticRegression().fit([[0.0], [1.0]], [0, 1])))
-    seal(model, read_model(tracked[0] / "model").info)
-    refused("holds a LogisticRegression, not a recipe of this package", *ask, model)
-    (place / "table.yaml").write_text("name: [")
-    refused("table.yaml: is no YAML", *ask, tracked[0] / "model", "--table", place / "table.yaml")
 
 
 def test_an_output_that_cannot_be_written_is_reported_before_the_work(refused, place, drive_all, monkeypatch):
