@@ -282,7 +282,7 @@ def predict(
 
     from features.windows import cut_windows, join_windows
     from pipelines.live.model import assess
-    from pipelines.live.windows import lacking_estimates
+    from pipelines.live.windows import needs_filter
     from terrain.logs.digest import data_digest
 
     other = next((each for each in runs if table.robot and each.robot != table.robot), None)
@@ -290,7 +290,7 @@ def predict(
         raise ConfigError(
             f"table {table.name} is for robot {table.robot!r}, run {other.run_id} is of {other.robot!r}"
         )
-    raw = [each for each in runs if lacking_estimates(each, model.info)]
+    raw = [each for each in runs if needs_filter(model.info, each.streams)]
     cuts = [model_windows(each, model, robot, skip_short=skip_short) for each in runs]
     windows = join_windows(
         [cut_windows([], model.rule, layout=model.layout).windows, *(cut.windows for cut in cuts)]
@@ -410,10 +410,10 @@ def model_windows(
     skip_short : leave out and count a run that is shorter than a window instead of refusing it
     """
     from features.windows import cut_windows
-    from pipelines.live.windows import lacking_estimates, windows_of_log
+    from pipelines.live.windows import needs_filter, windows_of_log
     from terrain.robots import robot_named
 
-    if lacking_estimates(log, model.info):
+    if needs_filter(model.info, log.streams):
         return windows_of_log(log, model.info, robot_named(log.robot, robot), skip_short=skip_short)
     return cut_windows([log], model.rule, layout=model.layout, skip_short=skip_short)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeVar, cast
 
@@ -41,9 +41,9 @@ STRIDE_S = 0.25
 """From window to window of a model whose outputs are filtered over time, in place of a dwell."""
 
 
-def needs_filter(info: WindowsInfo, channels: Mapping[str, Sequence[str]]) -> bool:
-    """Say whether a model needs a stream that only a filter gives."""
-    return any(stream in info.channels and stream not in channels for stream in ESTIMATED)
+def needs_filter(info: WindowsInfo, streams: Container[str]) -> bool:
+    """Say whether a model needs a stream that only a filter gives, and that is not among some streams."""
+    return any(stream in info.channels and stream not in streams for stream in ESTIMATED)
 
 
 def live_filter(info: WindowsInfo, robot: Robot) -> str:
@@ -101,11 +101,6 @@ def feed_of(info: WindowsInfo, channels: Mapping[str, Sequence[str]], robot: Rob
     if robot is not None and robot.drive in LIVE_FILTERS and needs_filter(info, channels):
         estimated = estimated_channels(live_filter(info, robot), robot)
     return WindowFeed(info.rule, info.layout, channels, estimated, robot)
-
-
-def lacking_estimates(run: RunLog, info: WindowsInfo) -> tuple[str, ...]:
-    """Return the streams of estimates that a model uses and a run does not have."""
-    return tuple(stream for stream in ESTIMATED if stream in info.channels and stream not in run.streams)
 
 
 def windows_of_log(run: RunLog, info: WindowsInfo, robot: Robot, *, skip_short: bool = False) -> WindowCut:
