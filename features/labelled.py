@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from sklearn.model_selection import StratifiedKFold
 
 from features.windows import (
     TIME_TOLERANCE_S,
@@ -108,3 +110,34 @@ def cut_partitions(
         for start, run_id in zip(cut.windows.start_s, cut.windows.run_id, strict=True)
     ]
     return cut, np.array(partition, dtype=object)
+
+
+def deal_partitions(y: Array, partition: Array, n_folds: int, rng: np.random.Generator) -> Array:
+    """Deal partitions of runs into folds at random, stratified by class.
+
+    Parameters
+    ----------
+    y, partition : (n,) class and partition of each window
+    n_folds : at least 2
+    rng : source of the deal
+
+    Returns
+    -------
+    (n,) int
+        the fold that tests each window.
+
+    Raises
+    ------
+    DataError
+        if a class has fewer partitions than there are folds.
+    """
+    names, first, group_of = np.unique(partition, return_index=True, return_inverse=True)
+    labels = y[first]
+    short = [f"{name} ({n})" for name, n in sorted(Counter(labels.tolist()).items()) if n < n_folds]
+    if short:
+        raise DataError(f"fewer than {n_folds} partitions of {PARTITION_S:g} s: {', '.join(short)}")
+    number = np.empty(len(names), dtype=int)
+    deal = StratifiedKFold(n_folds, shuffle=True, random_state=int(rng.integers(2**31)))
+    for fold, (_, test) in enumerate(deal.split(names, labels)):
+        number[test] = fold
+    return number[group_of]

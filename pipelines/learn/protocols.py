@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from sklearn.model_selection import StratifiedKFold
 
-from features.labelled import PARTITION_S, cut_labelled, cut_partitions
+from features.labelled import cut_labelled, cut_partitions, deal_partitions
 from features.motion import fastest_wheel
 from pipelines.learn.settings import WindowSettings
 from terrain.classify.folds import Fold, block_groups, fold_numbers, numbered_folds, single_run_classes
@@ -76,7 +75,8 @@ class Protocol(NamedTuple):
     ----------
     held_out : in words
     units : (n,) what is held out together; empty of a window that neither trains nor tests
-    deal : from class, unit and random numbers of the repeat, the fold (n,) that tests each window, -1 for none
+    deal : from class, unit, number of folds and random numbers of the repeat, the fold (n,) that tests each window,
+        -1 for none
     repeats : fold assignments by default; 1 where there is one only
     note : what a reader of the figures must know of it
     whole_runs : whether a run is on one side of a split, but for the blocks of a class with one unit
@@ -84,40 +84,15 @@ class Protocol(NamedTuple):
 
     held_out: str
     units: Callable[[Samples], Array]
-    deal: Callable[[Array, Array, np.random.Generator], Array]
+    deal: Callable[[Array, Array, int, np.random.Generator], Array]
     repeats: int = 1
     note: str = ""
     whole_runs: bool = True
 
 
-def deal_groups(y: Array, group: Array, rng: np.random.Generator) -> Array:
-    """Deal whole groups into folds, evenly within classes (not scikit-learn's: see terrain.classify.folds)."""
-    return fold_numbers(y, group, N_FOLDS, rng)
-
-
-def leave_one_out(y: Array, group: Array, rng: np.random.Generator) -> Array:
-    """Return the number of each group: it is a fold of its own."""
+def leave_one_out(y: Array, group: Array, n_folds: int, rng: np.random.Generator) -> Array:
+    """Return the number of each group: it is a fold of its own, however many there are."""
     return np.asarray(np.unique(group, return_inverse=True)[1])
-
-
-def deal_partitions(y: Array, group: Array, rng: np.random.Generator) -> Array:
-    """Deal partitions of runs into folds at random, stratified by class.
-
-    Raises
-    ------
-    DataError
-        if a class has fewer partitions than there are folds.
-    """
-    names, first, group_of = np.unique(group, return_index=True, return_inverse=True)
-    labels = y[first]
-    short = [f"{name} ({n})" for name, n in sorted(Counter(labels.tolist()).items()) if n < N_FOLDS]
-    if short:
-        raise DataError(f"fewer than {N_FOLDS} partitions of {PARTITION_S:g} s: {', '.join(short)}")
-    number = np.empty(len(names), dtype=int)
-    deal = StratifiedKFold(N_FOLDS, shuffle=True, random_state=int(rng.integers(2**31)))
-    for fold, (_, test) in enumerate(deal.split(names, labels)):
-        number[test] = fold
-    return number[group_of]
 
 
 def sessions(samples: Samples) -> Array:
@@ -170,7 +145,7 @@ def _from_to(trained: str, tested: str) -> Protocol:
     held_out = f"{tested} runs held out, {trained} ones trained on"
     note = f"{held_out}, on either side of the median speed of each terrain"
 
-    def deal(_: Array, side: Array, __: np.random.Generator) -> Array:
+    def deal(_: Array, side: Array, *__: Any) -> Array:
         return np.where(side == tested, 0, -1)
 
     return Protocol(held_out, sides, deal, note=note, whole_runs=False)
@@ -181,14 +156,14 @@ def _groups(samples: Samples) -> Array:
 
 
 PROTOCOLS: dict[str, Protocol] = {
-    "grouped": Protocol("whole runs held out", _groups, deal_groups, 5),
+    "grouped": Protocol("whole runs held out", _groups, fold_numbers, 5),
     "leave-one-run-out": Protocol("one run held out at a time", _groups, leave_one_out),
     "leave-sessions-out": Protocol("one session held out at a time", sessions, leave_one_out),
-    "leave-regimes-out": Protocol("speeds and directions of driving held out", regimes, deal_groups, 5),
+    "leave-regimes-out": Protocol("speeds and directions of driving held out", regimes, fold_numbers, 5),
     "leave-terrain-out": Protocol(
         "whole runs held out",
         _groups,
-        deal_groups,
+        fold_numbers,
         note="accuracy and the table of classes are of folds in which all terrains are known",
     ),
     "published": Protocol(
@@ -220,18 +195,20 @@ def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed
     if len(np.unique(y)) < 2:
         raise DataError(f"all windows are {str(y[0])!r}: a classifier needs at least two classes")
     n_runs = len(np.unique(samples.run_id))
-    if scheme.whole_runs and scheme.deal is deal_groups and n_runs < N_FOLDS:
+    if scheme.whole_runs and scheme.deal is fold_numbers and n_runs < N_FOLDS:
         raise DataError(f"{n_runs} runs are fewer than {N_FOLDS} folds")
     cut, alone = unit.astype(str), []
     if scheme.whole_runs:
         alone = [np.flatnonzero(y == name) for name in single_run_classes(y, cut)]
         cut = block_groups(y, unit, N_FOLDS).astype(str)
-    drawn = scheme.deal in (deal_groups, deal_partitions)
+    drawn = scheme.deal in (fold_numbers, deal_partitions)
     return [
         Fold(repeat, number, used[train], used[test])
         for repeat in range(repeats if drawn else 1)
         for number, (train, test) in enumerate(
-            numbered_folds(scheme.deal(y, cut, np.random.default_rng((seed, repeat))), alone, samples.gap)
+            numbered_folds(
+                scheme.deal(y, cut, N_FOLDS, np.random.default_rng((seed, repeat))), alone, samples.gap
+            )
         )
     ]
 
