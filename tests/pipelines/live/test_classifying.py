@@ -23,7 +23,6 @@ from pipelines.live.pilot import LivePilot
 from terrain.control.pilot_settings import PilotSettings, PilotStatus
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import SWITCHING, OutputStatus
-from terrain.errors import DataError
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
@@ -100,21 +99,6 @@ def test_the_belief_outlasts_a_stop_and_ends_when_a_sensor_of_its_windows_is_los
     assert (code[time_s > last_s + 5.1] == -1).all()
     assert target[-1] == TABLE.lookup("")["traction"].slip_ratio
     assert np.abs(np.diff(target)).max() <= SWITCHING.rate_ratio * 0.0201
-
-
-@pytest.mark.parametrize(
-    ("stream", "channel"), [("imu", "accel_q_mps2"), ("gnss", "speed_x_mps"), ("estimator", "speed_z_mps")]
-)
-def test_a_model_that_requires_a_missing_channel_is_refused(swerve_model, stream, channel):
-    channels = dict(swerve_model.info.channels)
-    channels[stream] = (*channels.get(stream, ()), channel)
-    rates = {**swerve_model.info.rate_hz, stream: 50.0}
-    wanting = swerve_model._replace(info=replace(swerve_model.info, channels=channels, rate_hz=rates))
-    with pytest.raises(DataError) as refused:
-        Classifier(wanting, ROBOT)
-    assert str(refused.value).startswith(
-        f"the model requires {channel!r} of the stream {stream!r}, which is neither measured nor estimated"
-    )
 
 
 # What a model says of a window, and the thread that asks it

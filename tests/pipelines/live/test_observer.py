@@ -11,6 +11,7 @@ import pytest
 from pipelines.data.datasets import load_runs
 from pipelines.learn.predict import predict
 from pipelines.learn.training_data import fitted_model
+from pipelines.live.classifying import Classifier
 from pipelines.live.observer import Observer
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
@@ -200,6 +201,13 @@ def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model, grass):
     measured = {name: swerve_model.info.channels[name] for name in ("imu", "wheels")}
     with pytest.raises(DataError, match=r"requires .* of the stream 'estimator', which is neither"):
         Observer(swerve_model, channels=measured)
+    for stream, channel in (("imu", "accel_q_mps2"), ("gnss", "speed_x_mps"), ("estimator", "speed_z_mps")):
+        channels, rates = dict(swerve_model.info.channels), {**swerve_model.info.rate_hz, stream: 50.0}
+        channels[stream] = (*channels.get(stream, ()), channel)
+        other = swerve_model._replace(info=replace(swerve_model.info, channels=channels, rate_hz=rates))
+        lacks = f"the model requires '{channel}' of the stream '{stream}', which is neither measured nor estimated"
+        with pytest.raises(DataError, match=lacks):
+            Classifier(other, AGRIMARO)
     table = replace(TABLE, robot="warthog")
     with pytest.raises(ConfigError, match="is of the robot 'warthog', not of 'agrimaro'"):
         Observer(swerve_model, table, AGRIMARO, channels_of(grass))
