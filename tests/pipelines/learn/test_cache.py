@@ -1,7 +1,6 @@
 """Cached features are those of the runs, an interrupted cache goes on, and what is damaged is made again."""
 
 import gc
-import json
 import os
 import weakref
 from dataclasses import replace
@@ -16,12 +15,10 @@ from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn import cache
 from pipelines.learn.cache import cached_features
 from pipelines.learn.crossval import EvaluationSettings
-from pipelines.learn.evaluate import evaluate_recipe
 from pipelines.learn.protocols import samples_of
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_cache, data_of_runs, same_features
-from pipelines.report.json_file import as_json
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.digest import joint_digest
 from terrain.logs.write import write_run
@@ -61,15 +58,8 @@ def test_cached_features_are_those_of_the_runs_bit_for_bit(runs_dir, tmp_path):
         motion = window_motion(samples.windows)
         for name in Motion._fields:
             assert getattr(found.motion, name).tobytes() == getattr(motion, name).tobytes()
-
-
-def test_an_evaluation_of_cached_features_is_that_of_the_runs(runs_dir, tmp_path):
-    found, recipe = cached(runs_dir, tmp_path / "cache"), recipe_of(SETTINGS)
-    given = found.features, found.motion
-    there, _ = evaluate_recipe(recipe, "svm", found.samples, SETTINGS, cached=given)
-    here, _ = evaluate_recipe(recipe, "svm", samples_of(load_runs(runs_dir), SETTINGS), SETTINGS)
-    assert there.support
-    assert json.dumps(as_json(there)) == json.dumps(as_json(here))
+    other = cached(runs_dir, tmp_path / "cache", SETTINGS.with_(window_s=1.0))  # beside the first
+    assert (other.n_computed, cached(runs_dir, tmp_path / "cache").n_computed) == (8, 0)
 
 
 def test_what_is_trained_is_the_same_from_two_processes(runs_dir, tmp_path):
@@ -103,14 +93,6 @@ def test_an_interrupted_cache_goes_on_and_ends_the_same(runs_dir, tmp_path, monk
     assert found.n_computed == 5
     assert found.features.tobytes() == whole.features.tobytes()
     assert files_of(tmp_path / "cache") == files_of(tmp_path / "whole")
-
-
-def test_windows_of_another_rule_lie_beside_the_first(runs_dir, tmp_path):
-    folder = tmp_path / "cache"
-    cached(runs_dir, folder)
-    other = cached(runs_dir, folder, SETTINGS.with_(window_s=1.0))
-    assert other.n_computed == 8
-    assert cached(runs_dir, folder).n_computed == 0
 
 
 @pytest.mark.parametrize("damage", ["cut", "flip", "empty", "gone"])

@@ -10,7 +10,7 @@ import onnxruntime
 import pytest
 from skops import io
 
-from features.recipes import feature_matrix, inform, make_recipe
+from features.recipes import feature_matrix, make_recipe
 from features.windows import WindowRule, cut_windows
 from pipelines.learn.model_file import MODEL_FILE, ONNX_FILE, TRUSTED_TYPES, read_model, seal, write_model
 from terrain.classify.network_onnx import network_onnx, time_of_onnx
@@ -129,12 +129,3 @@ def test_without_onnx_there_is_one_sentence(windows, monkeypatch):
         network_onnx(recipe[-1].numbers_, ["a"], 2.0, {})
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     assert time_of_onnx(b"", windows[0], 1) is None
-
-
-def test_only_a_classifier_of_samples_is_informed_of_columns(windows):
-    svm = make_recipe("svm")
-    inform(svm, svm[0].fit(windows))
-    assert "columns" not in svm[-1].get_params()
-    cnn = make_recipe("cnn")
-    inform(cnn, cnn[0].fit(windows))
-    assert [each.stream for each in cnn[-1].columns] == list(windows.channels)
