@@ -27,13 +27,6 @@ def drive(scenario="straight", terrain="grass", seed=0, **options):
     return simulate_run(ROBOT, terrain, scenario, seed, **options)
 
 
-KEYS = {
-    *("run_id", "filter", "slip_mean", "slip_std", "slip_true_mean", "slip_observable", "slip_peak"),
-    *("steady_s", "stale_s", "nis", "nees", "consistency", "speed_rmse_mps", "n_dropped", "n_gated"),
-    *("dropped", "finite"),
-}
-
-
 def tuned_on(runs, *names):
     return estimate_runs(runs, filter="vio15", tuning="likelihood", tune_on=names).result
 
@@ -64,7 +57,6 @@ def test_runs_are_written_with_their_tracks_and_pictures(straight, tmp_path):
     assert seen == [("estimate vio15", 1, 1)]
     document = result.as_json()
     assert set(document) == {"filter", "tuning", "tuned", "out", "runs", "skipped", "clocks"}
-    assert set(document["runs"][0]) >= KEYS
     assert json.loads(json.dumps(document)) == document
     found = read_run(out / straight.run_id)
     assert found.streams["slip"].channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")

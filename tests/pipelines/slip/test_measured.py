@@ -58,14 +58,6 @@ def test_the_same_input_and_seed_give_the_same_result(one_ground):
     assert first == second
 
 
-def test_runs_come_with_their_slip(one_ground):
-    tracks = estimate_runs(one_ground[:3], filter="pose", delay="0")
-    assert [run.run_id for run in tracks.runs] == [run.run_id for run in one_ground[:3]]
-    slip = tracks.runs[0].streams["slip"]
-    assert slip.channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
-    assert np.nanmedian(np.abs(slip.values)) == pytest.approx(0.1, abs=0.03)
-
-
 def test_changes_are_found_and_judged(one_ground, two_grounds):
     from pipelines.learn.ground_changes import find_changes
 
@@ -82,21 +74,16 @@ def test_changes_are_found_and_judged(one_ground, two_grounds):
 
 
 def test_what_cannot_be_measured_is_refused_in_one_sentence(one_ground):
-    blind = [
-        replace(run, streams={name: s for name, s in run.streams.items() if name != "pose"})
-        for run in one_ground[:2]
-    ]
-    with pytest.raises(
-        DataError, match=r"none of 2 runs has a slip; the first for this: run cork_00: nothing"
-    ):
-        measured_slips(blind)
+    blind = [replace(run, streams={"wheels": run.streams["wheels"]}) for run in one_ground[:2]]
     other = replace(one_ground[0], robot="husky", run_id="other")
-    with pytest.raises(DataError, match="of the robots husky, robotino"):
-        measured_slips([one_ground[0], other])
-    with pytest.raises(DataError, match="there is no session 'loaded'"):
-        measured_slips(one_ground, predict=True, hold_out=("loaded",))
-    with pytest.raises(ConfigError, match="drive 'skid_steer' has no rollers"):
-        measured_slips([other], rollers=True)
+    for runs, options, error, sentence in (
+        (blind, {}, DataError, r"none of 2 runs has a slip; the first for this: run cork_00: nothing"),
+        ([one_ground[0], other], {}, DataError, "of the robots husky, robotino"),
+        (one_ground, {"predict": True, "hold_out": ("loaded",)}, DataError, "there is no session 'loaded'"),
+        ([other], {"rollers": True}, ConfigError, "drive 'skid_steer' has no rollers"),
+    ):
+        with pytest.raises(error, match=sentence):
+            measured_slips(runs, **options)
 
 
 def test_the_command_writes_result_runs_and_pictures(tmp_path, one_ground):
@@ -110,7 +97,9 @@ def test_the_command_writes_result_runs_and_pictures(tmp_path, one_ground):
     document = json.loads((tmp_path / "slip.json").read_text(encoding="utf-8"))
     assert document["surfaces"][1]["slip_ratio"] == pytest.approx(0.4, abs=0.01)
     assert document["figures"][0].endswith("slip_by_surface.png")
-    assert "slip" in load_runs(tmp_path / "out")[0].streams
+    slip = load_runs(tmp_path / "out")[0].streams["slip"]
+    assert slip.channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
+    assert np.nanmedian(np.abs(slip.values)) == pytest.approx(0.1, abs=0.03)
     assert isinstance(CliRunner().invoke(app, words).exception, LogError)
 
 

@@ -52,22 +52,15 @@ def test_commands_of_the_measured_marmotte_held_out(measured):
     assert result.adaptive.n_runs > 100
 
 
-@pytest.mark.parametrize(
-    ("also", "error", "message"),
-    [
+def test_what_cannot_be_judged_is_refused_and_a_model_that_is_there_left_as_it_is(turns, tmp_path):
+    (tmp_path / "slip.yaml").write_text("mine")
+    for also, error, message in (
         ({"robot": "husky"}, ConfigError, "drive 'skid_steer' has no tracks"),
         ({"lengths": "0"}, ConfigError, "--lengths: 0.2 to 3600 seconds"),
         ({"lengths": "60"}, DataError, "no run has poses"),
         ({"folds": 7}, DataError, "6 runs have legs, at least 7 are required"),
-    ],
-)
-def test_what_cannot_be_judged_is_refused(turns, also, error, message):
-    with pytest.raises(error, match=message):
-        judged(turns, **also)
-
-
-def test_a_model_that_is_there_is_left_as_it_is(turns, tmp_path):
-    (tmp_path / "slip.yaml").write_text("mine")
-    with pytest.raises(ConfigError, match="is there already"):
-        judged(turns, out=tmp_path / "slip.yaml")
+        ({"out": tmp_path / "slip.yaml"}, ConfigError, "is there already"),
+    ):
+        with pytest.raises(error, match=message):
+            judged(turns, **also)
     assert (tmp_path / "slip.yaml").read_text() == "mine"

@@ -23,7 +23,6 @@ HEADER = (
     "avg_angle,avg_Z,std_Z"
 )
 SPEEDS_MMPS = (0.0, 5.0, 10.0, 20.0, 40.0)
-QUICK = {"what": "soil", "laws": ("simulator", "wong_reece"), "draws": 2}
 
 
 def write_trials(path, seed=0):
@@ -53,52 +52,39 @@ def write_trials(path, seed=0):
 
 @pytest.fixture(scope="module")
 def fitted(tmp_path_factory):
+    """The command over trials that are also those to check on: its folder, its JSON, and its screen."""
     folder = tmp_path_factory.mktemp("soil")
-    data = write_trials(folder / "bed")
-    settings = Settings(data=data, out=folder / "out", figures=folder / "out", check=data, **QUICK)
-    return settings, run(settings, silent)
+    data, out = str(write_trials(folder / "bed")), str(folder / "out")
+    words = ["--data", data, "--check", data, "--out", out, "--figures", out, "--draws", "2"]
+    words += ["--laws", "simulator,wong_reece", "--json", str(folder / "soil.json")]
+    done = CliRunner().invoke(app, ["calibrate", "--what", "soil", *words])
+    assert done.exception is None, done.output
+    return folder / "out", json.loads((folder / "soil.json").read_text()), done.output
 
 
 def test_the_law_that_made_the_trials_holds_on_what_was_left_out(fitted):
-    _, result = fitted
-    (wheel,) = result.wheels
-    simulator, wong_reece = wheel.laws
-    assert (wheel.wheel, wheel.n_trials, wheel.n_settings) == ("smooth", 35, 35)
-    assert wong_reece.angle.load.pull_ratio < 0.06
-    assert wong_reece.angle.reached
-    assert simulator.angle.load.pull_ratio > wong_reece.angle.load.pull_ratio
-    assert wheel.checked.load.pull_ratio < 0.06
-    assert wheel.parameters["tan_friction"].value == pytest.approx(FORCE["tan_friction"][0], abs=0.1)
-    assert "Cohesion against friction" in wheel.not_identified[0]
+    out, result, screen = fitted
+    (wheel,) = result["wheels"]
+    simulator, wong_reece = wheel["laws"]
+    assert (wheel["wheel"], wheel["n_trials"], wheel["n_settings"]) == ("smooth", 35, 35)
+    assert wong_reece["angle"]["load"]["pull_ratio"] < 0.06
+    assert wong_reece["angle"]["reached"]
+    assert simulator["angle"]["load"]["pull_ratio"] > wong_reece["angle"]["load"]["pull_ratio"]
+    assert wheel["checked"]["load"]["pull_ratio"] < 0.06
+    true = FORCE["tan_friction"][0]
+    assert wheel["parameters"]["tan_friction"]["value"] == pytest.approx(true, abs=0.1)
+    assert "Cohesion against friction" in wheel["not_identified"][0]
+    assert "35 further trials" in screen
+    assert sorted(map(str, out.iterdir())) == sorted(result["files"])
 
 
 def test_the_soil_is_one_that_the_simulator_takes(fitted):
-    settings, result = fitted
-    soil = load_soil(result.wheels[0].soil.file)
+    out, result, _ = fitted
+    soil, file = load_soil(out / "testbed_sand_smooth.yaml"), result["wheels"][0]["soil"]
     assert soil.name == "testbed_sand_smooth"
-    assert soil.kphi_npmn2 == pytest.approx(result.wheels[0].soil.fit.values["kphi_npmn2"], rel=1e-3)
-    text = (settings.out / "testbed_sand_smooth.yaml").read_text()
-    assert text.count("assumed") == 5
-    assert text.count("95 %") == 4
-
-
-def test_the_command_gives_the_same_result_and_page(fitted, tmp_path):
-    settings, result = fitted
-    again, page = tmp_path / "again", tmp_path / "soil.html"
-    options = ["--data", str(settings.data), "--check", str(settings.data), "--out", str(again)]
-    options += ["--laws", "simulator,wong_reece", "--draws", "2", "--figures", str(again)]
-    options += ["--json", str(tmp_path / "soil.json"), "--report", str(page)]
-    done = CliRunner().invoke(app, ["calibrate", "--what", "soil", *options])
-    assert done.exception is None, done.output
-    assert "35 further trials" in done.output
-    found, first = json.loads((tmp_path / "soil.json").read_text()), result.as_json()
-    assert sorted(file.name for file in settings.out.iterdir()) == sorted(
-        file.rpartition("/")[2] for file in result.files
-    )
-    for each in (found, first):
-        del each["out"], each["files"], each["wheels"][0]["soil"]["file"]
-    assert found == json.loads(json.dumps(first))
-    assert "wong_reece" in page.read_text()
+    assert soil.kphi_npmn2 == pytest.approx(file["fit"]["values"]["kphi_npmn2"], rel=1e-3)
+    text = (out / "testbed_sand_smooth.yaml").read_text()
+    assert (text.count("assumed"), text.count("95 %")) == (5, 4)
 
 
 @pytest.mark.parametrize(
