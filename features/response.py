@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from features.extractor import FeatureExtractor
+from features.windows import WindowRule, cut_windows, layout_of
 from terrain.classify.response import ResponseColumns
 from terrain.errors import DataError
-from terrain.records import Array, Windows
+from terrain.logs.regimes import regime_of
+from terrain.measured_slip.prediction_scores import Cases
+from terrain.measured_slip.slips import MeasuredSlip
+from terrain.records import Array, RunLog, Windows
 
 RESPONSES: Mapping[str, tuple[str, str]] = {"currents": ("current", "a"), "slip": ("slip", "ratio")}
 """Quantity and unit of the channels that are responses, by signal set."""
@@ -118,6 +122,48 @@ class ResponseExtractor(FeatureExtractor):
                 f"{' and '.join(RESPONSES)}) is needed beside the wheel speeds"
             )
         return found
+
+
+def slip_cases(measured: Sequence[RunLog], slips: Sequence[MeasuredSlip], window_s: float) -> Cases:
+    """Return the windows of runs whose slip was measured in steady motion, with what may predict it.
+
+    Raises
+    ------
+    DataError
+        if the runs have no currents, or no window has a slip.
+    """
+    steady = {each.run_id: each for each in slips if each.known.size}
+    runs = [run for run in measured if run.run_id in steady]
+    if not runs:
+        raise DataError(
+            f"no window of {window_s:g} s has a measured slip in steady motion that could be predicted; a "
+            "shorter --window may"
+        )
+    sets, rule = ("wheels", "currents"), WindowRule(window_s, None, None)
+    starts = {name: each.start_s[each.known] for name, each in steady.items()}
+    layout = layout_of(runs, sets, speeds=True)
+    windows = cut_windows(runs, rule, layout=layout, starts_s=starts, skip_short=True).windows
+    places = {
+        (name, round(float(each.start_s[k]), 6)): each.body_slip[k]
+        for name, each in steady.items()
+        for k in each.known
+    }
+    found = [
+        places[name, round(float(s), 6)] for name, s in zip(windows.run_id, windows.start_s, strict=True)
+    ]
+    about = {
+        run.run_id: (run.terrains[0] if len(run.terrains) == 1 else "", run.session, regime_of(run))
+        for run in runs
+    }
+    terrain, session, regime = zip(*(about[name] for name in windows.run_id), strict=True)
+    extractor = ResponseExtractor(sets).fit(windows)
+    return Cases(
+        extractor.transform(windows),
+        extractor.columns_,
+        np.array(found),
+        windows.run_id.astype(str),
+        *(np.array(each) for each in (terrain, session, regime)),
+    )
 
 
 def _mean(values: Array, used: Array) -> Array:

@@ -168,6 +168,24 @@ def layout_of(
     return layout
 
 
+def shared_layout(own: Layout, other: Layout) -> Layout:
+    """Return the streams and channels that two layouts have in common, at the rates of the first.
+
+    Raises
+    ------
+    DataError
+        if there are none.
+    """
+    channels = {
+        stream: both
+        for stream, names in own.channels.items()
+        if (both := tuple(name for name in names if name in other.channels.get(stream, ())))
+    }
+    if not channels:
+        raise DataError("simulated and measured runs have no channel in common")
+    return Layout(channels, {stream: own.rate_hz[stream] for stream in channels})
+
+
 @lru_cache(maxsize=1024)
 def rows_of_sets(stream: str, channels: tuple[str, ...], sets: frozenset[str]) -> tuple[int, ...]:
     """Return which channels of a stream belong to some signal sets; all runs of a data set ask for the same."""

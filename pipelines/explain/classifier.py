@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from features.labelled import labelled
-from features.windows import Layout, cut_windows, layout_of
+from features.windows import cut_windows, layout_of, shared_layout
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
-from pipelines.report import Progress, silent
+from pipelines.report import Progress, plural, silent
 from terrain.discrepancy.filter_gain import Comparison, accuracy_change
-from terrain.errors import DataError, TerrainError
+from terrain.errors import TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS
-from terrain.records import Array, RunLog, Windows
+from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
@@ -55,26 +55,20 @@ def classifier_gain(
     terrains = tuple(sorted({run.terrains[0] for run in known}))
     unknown = Comparison(FEATURE_RECIPE, None, len(known), {}, terrains)
     if len(terrains) < MIN_TERRAINS:
-        plural = "s" * (len(terrains) != 1)
-        return unknown._replace(
-            reason=f"the held-out runs are on {len(terrains)} known terrain{plural}, at least {MIN_TERRAINS} "
-            "are required"
-        )
+        on = plural(len(terrains), "known terrain")
+        return unknown._replace(reason=f"the held-out runs are on {on}, at least {MIN_TERRAINS} are required")
     if len(known) < MIN_RUNS:
         return unknown._replace(reason=f"{len(known)} runs are held out, at least {MIN_RUNS} are required")
     bare = replace(robot, effects={}, effects_cov=np.empty((0, 0)))
+    tested, correct = [with_wheel_speeds(run, bare) for run in known], []
     try:
-        correct = []
-        for step, effects in enumerate((before, after)):
+        for step, effects in enumerate((dict(before), dict(after))):
             trained = [
-                with_wheel_speeds(
-                    simulate_run(bare, terrain, SCENARIO, seed, number, vary=True, effects=dict(effects)),
-                    bare,
-                )
+                simulate_run(bare, terrain, SCENARIO, seed, number, vary=True, effects=effects)
                 for terrain in terrains
                 for number in range(1, runs_a_terrain + 1)
             ]
-            tested = [with_wheel_speeds(run, bare) for run in known]
+            trained = [with_wheel_speeds(run, bare) for run in trained]
             correct.append(_correct_windows(trained, tested, settings))
             progress("classifier", step + 1, 2)
     except TerrainError as error:
@@ -87,26 +81,12 @@ def _correct_windows(
     trained: Sequence[RunLog], known: Sequence[RunLog], settings: LearnSettings
 ) -> tuple[Array, Array]:
     """Return which windows (n,) of the known runs are classified correctly, and their runs (n,)."""
-    layout = _shared_layout(trained, known, settings)
-    train, test = (_windows(runs, settings, layout) for runs in (trained, known))
+    layout = shared_layout(*(layout_of(runs, SIGNAL_SETS, speeds=True) for runs in (trained, known)))
+    train, test = (
+        labelled(cut_windows(runs, settings.rule, layout=layout, skip_short=True)).windows
+        for runs in (trained, known)
+    )
     recipe = recipe_of(settings)
     recipe.fit(train, train.terrain.astype(str))
     predicted = np.asarray(recipe.predict(test)).astype(str)
     return predicted == test.terrain.astype(str), test.run_id.astype(str)
-
-
-def _shared_layout(trained: Sequence[RunLog], known: Sequence[RunLog], settings: LearnSettings) -> Layout:
-    """Return the channels that simulated and measured runs both have."""
-    own, theirs = (layout_of(runs, SIGNAL_SETS, speeds=True) for runs in (trained, known))
-    channels = {
-        stream: both
-        for stream, names in own.channels.items()
-        if (both := tuple(name for name in names if name in theirs.channels.get(stream, ())))
-    }
-    if not channels:
-        raise DataError("simulated and measured runs have no channel in common")
-    return Layout(channels, {stream: own.rate_hz[stream] for stream in channels})
-
-
-def _windows(runs: Sequence[RunLog], settings: LearnSettings, layout: Layout) -> Windows:
-    return labelled(cut_windows(runs, settings.rule, layout=layout, skip_short=True)).windows

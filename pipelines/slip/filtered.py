@@ -149,7 +149,7 @@ def report(result: FilterResult) -> Report:
         parts,
         sections(
             all_runs,
-            ("At rest, moving, stuck", [_motion_text(row) for row in result.runs if row.motion is not None]),
+            ("At rest, moving, stuck", [row.motion_text for row in result.runs if row.motion is not None]),
             ("Pictures", list(pictures.values())),
             ("Not read", result.skipped),
         ),
@@ -169,16 +169,6 @@ def _answer(result: FilterResult) -> str:
         n_stuck = sum(bool(row.stuck) for row in result.runs)
         return f"Motion of {n} is estimated without slip; the robot was stuck in {n_stuck} of them."
     return f"Motion of {n} is estimated; slip is not known in steady motion."
-
-
-def _motion_text(row: EstimateSummary) -> str:
-    """Return when a robot was stuck, and for how long nothing is known of its motion."""
-    motion = row.motion or {}
-    times = ", ".join(f"{each.start_s:.1f} to {each.end_s:.1f} s" for each in row.stuck or ())
-    return (
-        f"{row.run_id}: {f'stuck from {times}' if times else 'not seen to be stuck'}; moving for "
-        f"{motion['moving']:.1f} s, at rest for {motion['at_rest']:.1f} s, unknown for {motion['unknown']:.1f} s"
-    )
 
 
 SWERVE_PANELS = (

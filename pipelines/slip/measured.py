@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from features.response import ResponseExtractor
-from features.windows import WindowRule, cut_windows, layout_of
+from features.response import slip_cases
 from pipelines.report import (
     Bars,
     Figure,
@@ -30,7 +29,6 @@ from pipelines.report import (
 )
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
-from terrain.logs.regimes import regime_of
 from terrain.measured_slip.delay import Delay
 from terrain.measured_slip.measure import (
     NO_ROLLERS,
@@ -41,9 +39,8 @@ from terrain.measured_slip.measure import (
     named_surfaces,
     one_robot,
     rollers_of,
-    single_terrain,
 )
-from terrain.measured_slip.prediction_scores import Cases, PredictionFigures, predictions
+from terrain.measured_slip.prediction_scores import PredictionFigures, predictions
 from terrain.measured_slip.rollers import RollerFindings
 from terrain.measured_slip.slips import measured_slip
 from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
@@ -118,7 +115,7 @@ def estimate_all(
     surfaces = tuple(surface_slip(name, own.slips, rng) for name, own in by_terrain.items())
     predicted = []
     if options.predict:
-        cases = cases_of(found, options.window_s)
+        cases = slip_cases(found.runs, found.slips, options.window_s)
         predicted = predictions(cases, options.hold_out, seed, progress)
     rollers = rollers_of(found, robot, seed) if options.rollers else None
     if keep is not None:
@@ -156,45 +153,6 @@ def _hand_over(found: Measured, robot: Robot, keep: Keep, progress: Progress) ->
         )
         keep(replace(run, streams={**run.streams, "slip": slip.track.as_stream()}), dict)
         progress("write runs", done, len(found.runs))
-
-
-def cases_of(found: Measured, window_s: float) -> Cases:
-    """Return the windows of runs whose slip was measured in steady motion.
-
-    Raises
-    ------
-    DataError
-        if the runs have no currents, or no window has a slip.
-    """
-    steady = {each.run_id: each for each in found.slips if each.known.size}
-    runs = [run for run in found.runs if run.run_id in steady]
-    if not runs:
-        raise DataError(
-            f"no window of {window_s:g} s has a measured slip in steady motion that could be predicted; a "
-            "shorter --window may"
-        )
-    sets, rule = ("wheels", "currents"), WindowRule(window_s, None, None)
-    starts = {name: each.start_s[each.known] for name, each in steady.items()}
-    layout = layout_of(runs, sets, speeds=True)
-    windows = cut_windows(runs, rule, layout=layout, starts_s=starts, skip_short=True).windows
-    places = {
-        (name, round(float(each.start_s[k]), 6)): each.body_slip[k]
-        for name, each in steady.items()
-        for k in each.known
-    }
-    slips = [
-        places[name, round(float(s), 6)] for name, s in zip(windows.run_id, windows.start_s, strict=True)
-    ]
-    about = {run.run_id: (single_terrain(run), run.session, regime_of(run)) for run in runs}
-    terrain, session, regime = zip(*(about[name] for name in windows.run_id), strict=True)
-    extractor = ResponseExtractor(sets).fit(windows)
-    return Cases(
-        extractor.transform(windows),
-        extractor.columns_,
-        np.array(slips),
-        windows.run_id.astype(str),
-        *(np.array(each) for each in (terrain, session, regime)),
-    )
 
 
 SURFACES = (

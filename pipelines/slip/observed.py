@@ -119,7 +119,7 @@ def report(result: ObserverResult) -> Report:
         [first],
         sections(
             all_rows,
-            ("Statuses", [_status_text(row) for row in result.runs]),
+            ("Statuses", [row.status_text for row in result.runs]),
             ("Pictures", pictures[1:]),
             ("Not read", result.skipped),
         ),
@@ -141,13 +141,6 @@ def _answer(result: ObserverResult) -> str:
         worst = format_value(max(errors), ".3f", "m")
         return f"The position of {n} is estimated; it is off by at most {worst} RMS in a run."
     return f"The position of {n} is estimated; slip is not."
-
-
-def _status_text(row: ObserverSummary) -> str:
-    times = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in row.status_s.items())
-    dropped = f"; left out: {sum(row.dropped.values())} samples" if row.dropped else ""
-    missing = f"; not measured: {', '.join(row.missing)}" if row.missing else ""
-    return f"{row.run_id}: {times}{dropped}{missing}"
 
 
 def figures_of(found: ObserverEstimate) -> dict[str, Figure]:

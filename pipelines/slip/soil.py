@@ -171,11 +171,9 @@ def report(result: SoilResult) -> Report:
     details: list[Section] = []
     for wheel in result.wheels:
         figures = [each for name, each in result.pictures.items() if name.startswith(f"{wheel.wheel},")]
-        parts += [_laws_table(wheel), Text(verdict(wheel))]
+        parts += [_laws_table(wheel), Text(wheel.verdict)]
         details += sections((f"{wheel.wheel} wheel", [*_wheel_details(wheel), *figures]))
-    answers = " and ".join(
-        f"{_forces(each.laws[-1].slip.load)} ({each.wheel} wheel)" for each in result.wheels
-    )
+    answers = " and ".join(f"{each.laws[-1].slip.load.forces} ({each.wheel} wheel)" for each in result.wheels)
     soil = next((wheel.soil.file for wheel in result.wheels if wheel.soil.file is not None), "FILE")
     return Report(
         f"Wheel in sand, {result.dataset}",
@@ -184,24 +182,6 @@ def report(result: SoilResult) -> Report:
         details=[*details, *sections(("Not read", result.skipped))],
         next_step=f"terrain simulate --robot husky --terrain {soil} --scenario straight --out runs/",
     )
-
-
-def verdict(wheel: WheelResult) -> str:
-    """Return whether the last law reaches what is aimed at, and where it stops."""
-    parts = []
-    for held, found in (("slips", wheel.laws[-1].slip), ("angles", wheel.laws[-1].angle)):
-        without = f"({_forces(found.below_axle_angle)} without the wheel dragged along its axle)"
-        state = "reached" if found.reached else f"not reached {without}"
-        parts.append(
-            f"{held} left out, traction and side force off by {_forces(found.load)} of the load: {state}"
-        )
-    if wheel.checked is not None:
-        parts.append(f"{wheel.checked.load.n_trials} further trials: {_forces(wheel.checked.load)}")
-    return f"{wheel.wheel}: {format_value(BAR_RATIO, '.0%')} aimed at; {'; '.join(parts)}."
-
-
-def _forces(errors: Misfit) -> str:
-    return f"{format_value(errors.pull_ratio, ERROR)} and {format_value(errors.side_ratio, ERROR)}"
 
 
 def _errors(of: str, *titles: str) -> list[Shown]:
@@ -269,7 +249,7 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
         Text(
             f"{wheel.n_trials} trials at {wheel.n_settings} settings, load "
             f"{format_value(wheel.load_range_n, '.1f', 'N')}, sinkage {1e3 * low_m:.0f} to {1e3 * high_m:.0f} mm, "
-            f"{wheel.deeper_than_axle} trials deeper than the axle; {_coupling_text(wheel)}."
+            f"{wheel.deeper_than_axle} trials deeper than the axle; {wheel.coupling.text}."
         ),
         table(wheel.parameters.values(), PARAMETERS, f"parameters of {wheel.law}", PRIOR),
         *(
@@ -278,21 +258,10 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
         ),
         *(Text(sentence) for sentence in wheel.not_identified),
         Text(
-            f"On trials that roll nearly straight the simulator's law is off by {_forces(soil)} (traction and side "
+            f"On trials that roll nearly straight the simulator's law is off by {soil.forces} (traction and side "
             f"force) and {format_value(1e3 * soil.sinkage_m, '.1f', 'mm')}."
         ),
     ]
-
-
-def _coupling_text(wheel: WheelResult) -> str:
-    """Return by how much the measured traction is corrected, or that it is not."""
-    ratio, std, n_trials = wheel.coupling
-    if math.isnan(ratio):
-        return "traction as measured, no trials of a locked wheel along its axle"
-    return (
-        f"traction less {ratio:.3f} ± {std:.3f} of the side force, what {n_trials} trials of a locked wheel "
-        "along its axle show"
-    )
 
 
 def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> Figure:

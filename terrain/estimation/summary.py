@@ -63,6 +63,16 @@ class EstimateSummary:
     motion: Mapping[str, float] | None
     stuck: tuple[StuckInterval, ...] | None
 
+    @property
+    def motion_text(self) -> str:
+        """When the robot was stuck, and for how long nothing is known of its motion, in words."""
+        motion = self.motion or {}
+        times = ", ".join(f"{each.start_s:.1f} to {each.end_s:.1f} s" for each in self.stuck or ())
+        return (
+            f"{self.run_id}: {f'stuck from {times}' if times else 'not seen to be stuck'}; moving for "
+            f"{motion['moving']:.1f} s, at rest for {motion['at_rest']:.1f} s, unknown for {motion['unknown']:.1f} s"
+        )
+
 
 def summarize(estimate: Estimate) -> EstimateSummary:
     """Return the figures of an estimate."""

@@ -148,6 +148,20 @@ class WheelResult:
     not_identified: tuple[str, ...]
     soil: SoilFile
 
+    @property
+    def verdict(self) -> str:
+        """Whether the last law reaches what is aimed at, and where it stops, in words."""
+        parts = []
+        for held, found in (("slips", self.laws[-1].slip), ("angles", self.laws[-1].angle)):
+            without = f"({found.below_axle_angle.forces} without the wheel dragged along its axle)"
+            state = "reached" if found.reached else f"not reached {without}"
+            parts.append(
+                f"{held} left out, traction and side force off by {found.load.forces} of the load: {state}"
+            )
+        if self.checked is not None:
+            parts.append(f"{self.checked.load.n_trials} further trials: {self.checked.load.forces}")
+        return f"{self.wheel}: {100.0 * BAR_RATIO:.0f} % aimed at; {'; '.join(parts)}."
+
 
 def compare_laws(
     trials: Trials,

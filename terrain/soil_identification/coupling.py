@@ -8,6 +8,7 @@ What is measured there is the instrument's, as of a mount that bends under the s
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -29,6 +30,16 @@ class Coupling(NamedTuple):
     ratio: float
     std_ratio: float
     n_trials: int
+
+    @property
+    def text(self) -> str:
+        """By how much the measured traction is corrected, or that it is not, in words."""
+        if math.isnan(self.ratio):
+            return "traction as measured, no trials of a locked wheel along its axle"
+        return (
+            f"traction less {self.ratio:.3f} ± {self.std_ratio:.3f} of the side force, what {self.n_trials} trials "
+            "of a locked wheel along its axle show"
+        )
 
 
 def calibration_rows(trials: Trials) -> Array:
