@@ -8,18 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.explain import figures
-from pipelines.explain.sentences import (
-    PERCENT,
-    channel_label,
-    effect_label,
-    gain_text,
-    in_words_of,
-    limit_text,
-    quantity_interval,
-    value_with_interval,
-    varying_text,
-    verdict_text,
-)
 from pipelines.report import (
     Column,
     Pairs,
@@ -32,7 +20,6 @@ from pipelines.report import (
     described,
     enumerated,
     format_value,
-    quantity,
     sentence,
 )
 from pipelines.report.json_file import as_json
@@ -42,6 +29,18 @@ from terrain.discrepancy.compared import ComparedRun, channels_of, example_stret
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain_answer import PowertrainAnswer
 from terrain.discrepancy.response_slopes import Slope
+from terrain.discrepancy.robot_terms import quantity
+from terrain.discrepancy.sentences import (
+    channel_label,
+    effect_label,
+    gain_text,
+    in_words_of,
+    limit_text,
+    quantity_interval,
+    value_with_interval,
+    varying_text,
+    verdict_text,
+)
 from terrain.discrepancy.statements import (
     SESSION_COLUMNS,
     Statement,
@@ -68,8 +67,8 @@ ERROR_LABELS = {
 }
 """What an error of a filter or a classifier is called, and its unit."""
 
-Z = ".1f"
-"""Format of evidence in standard deviations."""
+Z, PERCENT = ".1f", ".1%"
+"""Formats of evidence in standard deviations, and of ratios of squares, wherever one stands."""
 
 WHY, NEEDS = Column("why", long=True), Column("driving that shows it", long=True)
 

@@ -6,13 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.explain.sentences import channel_label
-from pipelines.report import Band, Figure, Line, Mark, Panel, Points, quantity
+from pipelines.report import Band, Figure, Line, Mark, Panel, Points
 from terrain.discrepancy.channel_words import CHANNEL_WORDS, INPUT_LABELS
 from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, spread_of, strongest_input
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.parts import PartValues
 from terrain.discrepancy.residual_statistics import binned_means, noise_spectrum, run_means, spectrum
+from terrain.discrepancy.robot_terms import quantity
+from terrain.discrepancy.sentences import channel_label
 from terrain.effects import CHANNELS
 from terrain.records import Array
 

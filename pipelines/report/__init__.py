@@ -6,7 +6,6 @@ from pipelines.report.numbers import format_counts as format_counts
 from pipelines.report.numbers import format_value as format_value
 from pipelines.report.numbers import interval as interval
 from pipelines.report.numbers import plural as plural
-from pipelines.report.numbers import quantity as quantity
 from pipelines.report.numbers import sentence as sentence
 from pipelines.report.results import Progress as Progress
 from pipelines.report.results import Result as Result

@@ -15,25 +15,6 @@ NOT_KNOWN = "\N{EN DASH}"
 NBSP = "\N{NO-BREAK SPACE}"
 MINUS = "\N{MINUS SIGN}"
 
-SI = {
-    "ratio": "",
-    "radps": "rad/s",
-    "mps2": "m/s²",
-    "mps": "m/s",
-    "s2": "s²",
-    "s2pm": "s²/m",
-    "s2pm2": "s²/m²",
-    "a": "A",
-    "n": "N",
-    "nm": "Nm",
-    "hz": "Hz",
-    "nspm": "N s/m",
-}
-"""How the last word of a parameter's name is written as a unit; others are written as they are."""
-
-SMALL = {"rad": "mrad", "radps": "mrad/s", "s": "ms", "m": "mm"}
-"""Units of a thousandth."""
-
 TINY = 1e-12
 """Ends of an interval below this are written as 0: rounding of two equal numbers."""
 
@@ -108,17 +89,16 @@ def plain_line(text: str) -> str:
     return NBSP.join(printable(part) for part in text.split(NBSP))
 
 
-def format_number(number: float, digits: int = 3) -> str:
-    """Return a number with three significant digits, or so many.
+def format_number(number: float) -> str:
+    """Return a number with three significant digits.
 
     Examples
     --------
-    >>> format_number(0.12648), format_number(3.81e-4), format_number(7e-6), format_number(0.0127, 2)
-    ('0.126', '3.81·10⁻⁴', '7·10⁻⁶', '0.013')
+    >>> format_number(0.12648), format_number(3.81e-4), format_number(7e-6)
+    ('0.126', '3.81·10⁻⁴', '7·10⁻⁶')
     >>> format_number(-2.0), format_number(4096.0)
     ('−2', '4096')
     """
-    number = float(f"{number:.{digits}g}") if digits < 3 else number
     if number == 0:
         return "0"
     if not 1e-3 <= abs(number) < 1e5:
@@ -127,40 +107,6 @@ def format_number(number: float, digits: int = 3) -> str:
     else:
         text = f"{number:.3g}" if abs(number) < 1000 else f"{number:.0f}"
     return text.replace("-", MINUS)
-
-
-def unit_of(parameter: str) -> str:
-    """Return the unit that the last word of a parameter's name gives.
-
-    Examples
-    --------
-    >>> unit_of("gyro_bias_radps"), unit_of("scrub_ratio")
-    ('rad/s', '')
-    """
-    unit = parameter.rpartition("_")[2]
-    return SI.get(unit, unit)
-
-
-def quantity(parameter: str, value: float) -> str:
-    r"""Return the value of an effect's parameter with its unit, in two significant digits.
-
-    Examples
-    --------
-    >>> quantity("gyro_bias_radps", 0.0031), quantity("wheel_radius_ratio", 0.004)
-    ('3.1\xa0mrad/s', '0.4\xa0%')
-    >>> quantity("scrub_ratio", 0.02), quantity("lever_x_m", math.nan)
-    ('0.02', '–')
-    """
-    from terrain.effects import PARAMETER
-
-    if not math.isfinite(value):
-        return NOT_KNOWN
-    if parameter in PARAMETER and PARAMETER[parameter].as_percent:
-        return f"{format_number(100.0 * value, 2)}{NBSP}%"
-    unit = parameter.rpartition("_")[2]
-    if unit in SMALL and abs(value) < 0.0995:
-        return f"{format_number(1000.0 * value, 2)}{NBSP}{SMALL[unit]}"
-    return f"{format_number(value, 2)}{NBSP}{unit_of(parameter)}".strip(NBSP)
 
 
 def format_counts(counts: Mapping[str, int]) -> str:

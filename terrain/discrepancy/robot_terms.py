@@ -24,16 +24,23 @@ FAST_RADPS, FAST_MPS = 1.0, 2.0
 UNITS = {
     "ratio": "",
     "radps": "rad/s",
+    "mps": "m/s",
     "mps2": "m/s²",
     "s2": "s²",
     "s2pm": "s²/m",
     "s2pm2": "s²/m²",
     "npr": "N/rad",
     "a": "A",
+    "n": "N",
+    "nm": "Nm",
+    "hz": "Hz",
     "nspm": "N s/m",
     "nmpa": "N m/A",
 }
 """How sentences write the last word of a name, where that is not the unit itself."""
+
+SMALL = {"rad": "mrad", "radps": "mrad/s", "s": "ms", "m": "mm"}
+"""Units of a thousandth."""
 
 Total = Mapping[str, float]
 
@@ -93,6 +100,29 @@ def value_in_robot_terms(parameter: str, value: float, low: float, high: float, 
     at, *ends = (rounded(number, 0.5 * abs(numbers[2] - numbers[1])) for number in numbers)
     low_end, high_end = sorted(ends, key=float)
     return f"{f'{at} {UNITS.get(unit, unit)}'.strip()} ({low_end} to {high_end})"
+
+
+def quantity(parameter: str, value: float) -> str:
+    r"""Return the value of an effect's parameter with its unit, in two significant digits.
+
+    Examples
+    --------
+    >>> quantity("gyro_bias_radps", 0.0031), quantity("wheel_radius_ratio", 0.004)
+    ('3.1\xa0mrad/s', '0.4\xa0%')
+    >>> quantity("scrub_ratio", 0.02), quantity("accel_bias_mps2", -0.046), quantity("lever_x_m", math.nan)
+    ('0.02', '−0.046\xa0m/s²', '–')
+    """
+    if not math.isfinite(value):
+        return "\N{EN DASH}"
+    unit = parameter.rpartition("_")[2]
+    if parameter in PARAMETER and PARAMETER[parameter].as_percent:
+        value, written = 100.0 * value, "%"
+    elif unit in SMALL and abs(value) < 0.0995:
+        value, written = 1000.0 * value, SMALL[unit]
+    else:
+        written = UNITS.get(unit, unit)
+    number = f"{float(f'{value:.2g}'):g}".replace("-", "\N{MINUS SIGN}")
+    return f"{number}\N{NO-BREAK SPACE}{written}".rstrip("\N{NO-BREAK SPACE}")
 
 
 def rounded(value: float, half: float) -> str:

@@ -177,7 +177,7 @@ def _repair(of: Statement, diagnosis: Diagnosis, robot: Robot, unit: str) -> str
     causes = [in_robot_terms(name, by_name[name].values, robot) for name in names]
     if not (changed or causes):
         return ""
-    words = _listed(causes) if causes else "what is named for other channels"
+    words = listed(causes) if causes else "what is named for other channels"
     if not changed:
         return f"with {words} its error stays at {_size(of.rms_after)} {unit} {of.where}"
     verb, sizes = "falls" if change < 0 else "rises", f"{_size(of.rms_before)} to {_size(of.rms_after)}"
@@ -193,7 +193,7 @@ def _rivals(of: Statement, diagnosis: Diagnosis, robot: Robot) -> str:
         known = [name for name in names if name in diagnosis.ambiguous_values]
         each = [in_robot_terms(name, diagnosis.ambiguous_values[name], robot) for name in known]
         if each:
-            texts.append(f"{_listed(each, 'or')} explains it, and these runs do not distinguish which")
+            texts.append(f"{listed(each, 'or')} explains it, and these runs do not distinguish which")
     return "; ".join(texts)
 
 
@@ -236,7 +236,8 @@ def _remainder(of: Statement, diagnosis: Diagnosis, robot: Robot, repaired: bool
     return "; ".join(texts)
 
 
-def _listed(words: Sequence[str], last: str = "and") -> str:
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """Return words as a sentence lists them."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
 
 
@@ -309,15 +310,15 @@ def notes_of(
         if match.effective_ratio is not None and match.effective_ratio < 1.0
     ]
     if apart:
-        each = _listed([f"{slope.ratio:.2f} on {label}" for label, slope in apart.items()])
-        alone = _listed([f"--terrain {label}" for label in apart], "or")
+        each = listed([f"{slope.ratio:.2f} on {label}" for label, slope in apart.items()])
+        alone = listed([f"--terrain {label}" for label in apart], "or")
         notes.append(
             f"Terrains differ: measured over simulated is {each}. Explain each by itself with {alone}."
         )
     for session in diagnosis.by_session:
         if not session.agree:
             parameter = PARAMETER[session.parameter]
-            values = _listed([f"{own.text} in {own.session}" for own in session.sessions])
+            values = listed([f"{own.text} in {own.session}" for own in session.sessions])
             of = f" of {session.terrain}" if session.terrain else ""
             notes.append(
                 f"Sessions{of} differ: the {parameter.label} is {values}, with the same causes in each; one "

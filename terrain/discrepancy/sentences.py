@@ -7,17 +7,17 @@ import re
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from pipelines.report import enumerated, format_value, interval, plural, quantity
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.robot_terms import quantity
+from terrain.discrepancy.statements import listed
 from terrain.discrepancy.verdict import Diagnosis, Limit, Value, Varying
 from terrain.effects import PARAMETER, TRACKED
 
+MINUS, NBSP = "\N{MINUS SIGN}", "\N{NO-BREAK SPACE}"
+
 SHOWN_RUNS = 5
 """Names of runs that a sentence lists."""
-
-PERCENT = ".1%"
-"""Format of ratios of squares, wherever one stands."""
 
 OF_TRACKS = {
     "wheel radius": "sprocket radius",
@@ -75,15 +75,15 @@ def verdict_text(diagnosis: Diagnosis) -> str:
             f"{effect_label(cause.name)}, {' and '.join(map(value_with_interval, cause.values))}"
             for cause in diagnosis.causes
         ]
-        sentences.append(f"The simulation of {diagnosis.robot} lacks {enumerated(causes)}.")
+        sentences.append(f"The simulation of {diagnosis.robot} lacks {listed(causes)}.")
     for names in diagnosis.ambiguous_sets:
-        rivals = enumerated([effect_label(name) for name in names], "or")
+        rivals = listed([effect_label(name) for name in names], "or")
         sentences.append(f"One of {rivals} is present, and these runs cannot distinguish them.")
     if diagnosis.varying:
-        varying = enumerated([effect_label(each.name) for each in diagnosis.varying])
+        varying = listed([effect_label(each.name) for each in diagnosis.varying])
         sentences.append(f"The size of {varying} differs from run to run.")
     if diagnosis.unexplained:
-        channels = enumerated([*dict.fromkeys(channel_label(left.channel) for left in diagnosis.unexplained)])
+        channels = listed([*dict.fromkeys(channel_label(left.channel) for left in diagnosis.unexplained)])
         also = " also" if sentences else ""
         sentences.append(f"The residual is{also} systematic, without a known cause, in {channels}.")
     if not sentences:
@@ -97,13 +97,17 @@ def gain_text(gain: Gain | None, reason: str | None) -> str:
         return f"The gain on held-out runs was not measured: {reason}."
     n, (ratio, low, high) = len(gain.run_ids), gain.reduction
     runs = f"{n} held-out runs" if n != 1 else "one held-out run"
+    part, least, most = (f"{100.0 * each:.1f}".replace("-", MINUS) for each in (ratio, low, high))
     removes = (
-        f"the extension removes {format_value(ratio, PERCENT)} ({interval(low, high, PERCENT)}) of the whitened "
-        "squared residual"
+        f"the extension removes {part}{NBSP}% ({least} to {most}{NBSP}%) of the whitened squared residual"
     )
     return (
         f"On {runs} {f'no gain can be claimed: {removes}, which includes zero' if gain.refused else removes}."
     )
+
+
+def _runs(n: int) -> str:
+    return f"{n} run{'s' * (n != 1)}"
 
 
 def varying_text(each: Varying) -> str:
@@ -118,13 +122,11 @@ def varying_text(each: Varying) -> str:
         names = ", ".join(
             (*group.run_ids[:SHOWN_RUNS], *(["..."] if len(group.run_ids) > SHOWN_RUNS else []))
         )
-        parts.append(
-            f"{quantity(each.parameter, group.value)} in {plural(len(group.run_ids), 'run')} ({names})"
-        )
+        parts.append(f"{quantity(each.parameter, group.value)} in {_runs(len(group.run_ids))} ({names})")
     if parts:
         text += f" Two groups: {', and '.join(parts)}."
     if each.rivals:
-        rivals = enumerated([effect_label(rival) for rival in each.rivals], "or")
+        rivals = listed([effect_label(rival) for rival in each.rivals], "or")
         text += f" These runs do not distinguish that from {rivals}."
     return text
 
