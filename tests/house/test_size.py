@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 
-MAX_LINES = {"terrain": 73_520, "features": 2_700, "pipelines": 24_430, "tests": 54_800}
+MAX_LINES = {"terrain": 73_765, "features": 2_761, "pipelines": 24_124, "tests": 54_800}
 """Lines of Python, docstrings included."""
 
 
