@@ -77,12 +77,12 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
     )
     grounds = hard_grounds() if settings.hard is None else settings.hard
     findings = findings_of(runs, description, robot, grounds)
-    progress("calibrate", 1, 1)
     if not any(finding.determined for finding in findings):
         reasons = "; ".join(dict.fromkeys(finding.note for finding in findings))
         raise DataError(
             f"{settings.data}: nothing of robot {robot.name} can be calibrated from this: {reasons}"
         )
+    progress("calibrate", 1, 1)
     calibrated = described_with(description, findings)
     variances: Mapping[str, float] = {}
     if isinstance(robot, SwerveRobot):
