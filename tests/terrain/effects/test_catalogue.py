@@ -192,7 +192,7 @@ exec(compile((place / "__init__.py").read_text(), "effects", "exec"), package.__
 from dataclasses import replace
 import terrain.effects as effects
 from terrain.discrepancy.sentences import limit_text
-from pipelines.report import quantity
+from terrain.discrepancy.robot_terms import quantity
 from terrain.discrepancy import residuals, search, information
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit
