@@ -8,7 +8,6 @@ computes a task again whose worker is lost.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import os
 import warnings
@@ -16,11 +15,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from functools import cache, partial
-from importlib import import_module
+from functools import partial
 from importlib.util import find_spec
 from itertools import islice
-from pathlib import Path
 from socket import create_connection
 from time import monotonic
 from typing import Any, NamedTuple, Self
@@ -30,7 +27,7 @@ from pydantic import model_validator
 
 from pipelines.report import Progress
 from pipelines.report.settings import Settings, setting
-from pipelines.report.versions import COMPUTING, installed
+from pipelines.report.versions import difference, software
 from terrain.errors import ConfigError, TerrainError
 
 LOCAL = "local"
@@ -52,8 +49,6 @@ NO_WORKER_S = 60.0
 
 TASKS_A_THREAD = 3
 """In progress at once for each thread of a worker: one is computed, the next are there when it ends."""
-
-PACKAGES = ("terrain", "features", "pipelines")
 
 
 def scheduler_address(compute: str) -> str | None:
@@ -265,37 +260,6 @@ def end_with_parent(parent: int) -> None:
         os._exit(1)
 
     Thread(target=watch, name="end with parent", daemon=True).start()
-
-
-def software() -> dict[str, str]:
-    """Return the versions that the bytes of a result depend on, by name, and a digest of this package's code."""
-    return {**installed(COMPUTING), "its code": code_digest()}
-
-
-@cache
-def code_digest() -> str:
-    """Return the start of a SHA-256 over all source files of this package."""
-    digest = hashlib.sha256()
-    for name in PACKAGES:
-        folder = Path(str(import_module(name).__file__)).parent
-        for path in sorted(folder.rglob("*.py")):
-            digest.update(f"{name}/{path.relative_to(folder).as_posix()}".encode())
-            digest.update(path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
-def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str | None:
-    """Return in words what differs first between two of them, None where nothing does.
-
-    Examples
-    --------
-    >>> difference({"numpy": "2.3"}, {"numpy": "2.1"})
-    'numpy 2.1 where 2.3 is needed'
-    """
-    for name, needed in here.items():
-        if there.get(name) != needed:
-            return f"{name} {there.get(name, 'missing')} where {needed} is needed"
-    return None
 
 
 @contextmanager

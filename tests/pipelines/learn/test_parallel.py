@@ -21,11 +21,10 @@ from pipelines.learn import parallel as cluster
 from pipelines.learn.parallel import (
     ComputeSettings,
     computing,
-    difference,
     parallel,
     scheduler_address,
-    software,
 )
+from pipelines.report.versions import difference, software
 from terrain.errors import ConfigError, TerrainError
 
 ROOT = Path(__file__).resolve().parents[3]
