@@ -58,8 +58,7 @@ class LivePilot(Chain):
 
     Examples
     --------
-    >>> from terrain.control.terrain_source import TerrainSource
-    from terrain.control.traction import TractionStatus
+    >>> from terrain.control.traction import TractionStatus
     >>> from terrain.robots import load_robot
     >>> pilot = LivePilot(load_robot("agrimaro"), load_slip_table())
     >>> command = pilot.step(Sample(0.0, np.array([0.5, 0.0, 0.0]), {}))  # nothing is known yet
