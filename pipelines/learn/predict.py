@@ -435,11 +435,13 @@ def report(result: Predictions) -> Report:
         f"{name} {format_value(count / result.n_windows, '.0%')}" for name, count in counts.most_common(5)
     )
     found = f"{plural(result.n_windows, 'window')} of {plural(result.n_runs, 'run')}: {shares or 'none'}"
-    judged = (
-        ""
-        if result.accuracy is None
-        else (f"; {format_value(result.accuracy, PERCENT)} of {result.n_judged} labelled ones are right")
-    )
+    judged = ""
+    if result.accuracy is not None:
+        trained = (
+            f", {len(result.training_runs)} runs of which trained the model" if result.training_runs else ""
+        )
+        right = format_value(result.accuracy, PERCENT)
+        judged = f"; {right} of {result.n_judged} labelled ones are right{trained}"
     return Report(
         title=f"Terrain of {result.dataset or 'runs'}",
         answer=f"{found}{judged}.",
@@ -501,10 +503,7 @@ def _stretches_table(stretches: Sequence[Sequence[WindowPrediction]], n_all: int
 def _notes(result: Predictions) -> list[Part]:
     found: list[str] = []
     if result.training_runs:
-        found.append(
-            f"the model was trained on {len(result.training_runs)} of {result.n_runs} runs: the accuracy is no "
-            "measure of its skill"
-        )
+        found.append("of runs that the model was trained on the accuracy is no measure of its skill")
     if result.n_unknown:
         found.append(
             f"{result.n_unknown} windows are like no terrain that was learned, as are 5 % of those of learned "

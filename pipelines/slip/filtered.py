@@ -167,7 +167,8 @@ def _answer(result: FilterResult) -> str:
         return f"Slip in steady motion is {slip} in {n}, with a standard deviation of at most {deviation}."
     if any(row.motion is not None for row in result.runs):
         n_stuck = sum(bool(row.stuck) for row in result.runs)
-        return f"Motion of {n} is estimated without slip; the robot was stuck in {n_stuck} of them."
+        stuck = f"stuck in {n_stuck} of them" if n_stuck else "not seen to be stuck"
+        return f"Motion of {n} is estimated without slip; the robot was {stuck}."
     return f"Motion of {n} is estimated; slip is not known in steady motion."
 
 
