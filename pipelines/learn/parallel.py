@@ -8,6 +8,7 @@ computes a task again whose worker is lost.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import warnings
@@ -291,6 +292,7 @@ def _connected(address: str) -> Iterator[Any]:
             yield client
         finally:
             client.close(timeout=PARENT_POLL_S)
+            gc.collect()  # tasks of dask that ended with it are logged when they are collected
             logging.disable(logged)
 
 
