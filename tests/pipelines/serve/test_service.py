@@ -29,18 +29,25 @@ def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(
 ):
     run, observer = two_drives[4], Observer(mower_model)
     found, seen = [], []
+    for sample in replay(run):
+        found += observer.update(sample.readings)
+    ends_s = [one.start_s + 2.0 for one in found]
     with service.socket() as socket:
         say = partial(ask, socket, packed=packed)
         welcome = say(hello(f"alone-{packed}"))
         assert (welcome["type"], welcome["served"]["classes"]) == ("welcome", ["a", "b"])
+
+        def is_classified(n_windows):
+            seen.append(say({"type": "samples", "streams": {}, "step": True})["observation"])
+            return len({one["window"]["start_s"] for one in seen if one["window"]}) >= n_windows
+
         for message in messages(run):
             answer = say(message)
             assert (answer["type"], answer["time_s"]) == ("step", message["time_s"])
             seen.append(answer["observation"])
-        time.sleep(0.2)
-        seen.append(say({"type": "samples", "streams": {}, "step": True})["observation"])
-    for sample in replay(run):
-        found += observer.update(sample.readings)
+            due = sum(end_s < message["time_s"] - 0.1 for end_s in ends_s)
+            until(lambda due=due: is_classified(due))
+        until(lambda: is_classified(len(found)))
     windows = {}
     for one in seen:
         if one["window"]:
