@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from terrain.classify.network_numbers import SampleColumns
 from terrain.records import Array
@@ -110,20 +111,26 @@ def augmented(
         fraction = rng.random(n)
         for i, values in enumerate(found):
             length = values.shape[2]
-            places = (np.arange(length) + (fraction * length).astype(int)[:, None]) % length
-            found[i] = np.take_along_axis(values, places[:, None], axis=2)
+            begins = sliding_window_view(np.concatenate([values, values], axis=2), length, axis=2)
+            found[i] = begins[np.arange(n), :, (fraction * length).astype(int)]
     if used.gain:
         gains = [np.exp(GAIN_STD * fast * rng.standard_normal((n, 1, 1))) for fast in vibrates]
         found = [values * gain.astype(values.dtype) for values, gain in zip(found, gains, strict=True)]
     if used.mirror and mirrors is not None:
-        turned = (rng.random(n) < 0.5)[:, None, None]
+        turned = np.flatnonzero(rng.random(n) < 0.5)
         for i, (values, mirror) in enumerate(zip(found, mirrors, strict=True)):
-            image = values[:, list(mirror.places)] * np.array(mirror.signs, values.dtype)[:, None]
-            found[i] = np.where(turned, image, values)
+            image = values[turned][:, list(mirror.places)] * np.array(mirror.signs, values.dtype)[:, None]
+            found[i] = _with_rows(values, turned, image)
     if used.dropout and len(found) > 1:
         failed = rng.random(n) < DROPOUT_RATIO
         which = rng.integers(len(found), size=n)
         for i, (values, mean) in enumerate(zip(found, means, strict=True)):
-            out = (failed & (which == i))[:, None, None]
-            found[i] = np.where(out, mean[:, None].astype(values.dtype), values)
+            found[i] = _with_rows(values, np.flatnonzero(failed & (which == i)), mean[:, None])
+    return found
+
+
+def _with_rows(values: Array, rows: Array, others: Array) -> Array:
+    """Return values (n, ...) with others in the place of some rows."""
+    found = values.copy()
+    found[rows] = others
     return found

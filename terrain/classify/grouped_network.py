@@ -88,7 +88,7 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
         n_inner_folds: int = 5,
         n_members: int = 3,
         epochs: int = 30,
-        trial_epochs: int = 12,
+        trial_epochs: int = 10,
         gap: int = 1,
         seed: int = 0,
     ) -> None:

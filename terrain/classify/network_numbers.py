@@ -19,6 +19,7 @@ All is computed window by window in the same order, so that one window gives the
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -145,11 +146,13 @@ def power_spectrogram(values: Array, frame: int, hop: int) -> Array:
     """
     centred = values - values.mean(axis=2, keepdims=True)
     frames = np.ascontiguousarray(sliding_window_view(centred, frame, axis=2)[:, :, ::hop])
-    spectra = frames @ fourier_kernel(frame).astype(values.dtype)
+    squares = frames @ fourier_kernel(frame).astype(values.dtype)
+    np.square(squares, out=squares)
     half = frame // 2
-    return np.asarray((spectra[..., :half] ** 2 + spectra[..., half:] ** 2).swapaxes(2, 3))
+    return np.asarray((squares[..., :half] + squares[..., half:]).swapaxes(2, 3))
 
 
+@cache
 def fourier_kernel(frame: int) -> Array:
     """Return the windowed cosines and sines (frame, frame) of frequencies 1 to ``frame / 2``."""
     time = np.arange(frame)
@@ -168,8 +171,9 @@ def seen(columns: SampleColumns, values: Array, floor: Array) -> Array:
 
 def standardised(branch: BranchNumbers, found: Array) -> Array:
     """Return what a branch sees, standardised and clipped, as the rows of a convolution (n, c f, t)."""
-    scaled = (found - branch.mean[:, :, None]) / branch.std[:, :, None]
-    return np.clip(scaled, -CLIP_STD, CLIP_STD).reshape(len(found), -1, found.shape[3])
+    scaled = found - branch.mean[:, :, None]
+    scaled /= branch.std[:, :, None]
+    return np.clip(scaled, -CLIP_STD, CLIP_STD, out=scaled).reshape(len(found), -1, found.shape[3])
 
 
 def probabilities(numbers: NetworkNumbers, samples: Array) -> Array:

@@ -74,7 +74,7 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
         candidates: Sequence[Sequence[float]] = CANDIDATES,
         n_members: int = 3,
         epochs: int = 30,
-        trial_epochs: int = 12,
+        trial_epochs: int = 10,
         gap: int = 1,
         seed: int = 0,
     ) -> None:
