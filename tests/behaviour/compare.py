@@ -66,6 +66,7 @@ IGNORED: dict[str, str] = {
     "onnx_latency_ms": "time that computing took",
     "times_real_time": "how fast computing was",
     "created": "time of writing",
+    "model.skops": "size of a compressed file that holds names of its parts drawn anew",
     "commit": "state of the code",
     "data_digest": "the last bit of one sample changes it; the samples are compared themselves",
     "digest": "the last bit of one sample changes it; the samples are compared themselves",
