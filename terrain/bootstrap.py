@@ -25,6 +25,27 @@ def bootstrap_counts(n: int, n_draws: int, seed: int) -> Array:
     return counts
 
 
+def stratified_counts(stratum: Array, n_draws: int, rng: np.random.Generator) -> Array:
+    """Return how often each run is drawn (n_draws, runs), of each stratum as many as it has.
+
+    Parameters
+    ----------
+    stratum : (runs,) that each run belongs to, as its class
+    n_draws : bootstrap samples
+    rng : source of the draws
+
+    Examples
+    --------
+    >>> stratified_counts(np.array(["ice", "ice", "mud"]), 2, np.random.default_rng(0))[:, 2]
+    array([1., 1.])
+    """
+    counts = np.zeros((n_draws, len(stratum)))
+    for name in np.unique(stratum):
+        members = np.flatnonzero(stratum == name)
+        counts[:, members] = rng.multinomial(len(members), np.full(len(members), 1 / len(members)), n_draws)
+    return counts
+
+
 def bootstrap_rows(n: int, n_draws: int, rng: np.random.Generator) -> Array:
     """Return which of ``n`` runs are drawn in each bootstrap sample (n_draws, n).
 

@@ -254,9 +254,9 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
     for name, own in gain.channels.items():
         ratio, low, high = own.reduction
         remark = "" if not own.reduction.refused else "worse" if high < 0.0 else "no gain to claim"
-        nameless = learned[name].ratio if name in learned else None
+        black_box = learned[name].ratio if name in learned else None
         sizes = (own.rms_before, own.rms_after, ratio, (low, high))
-        gains.append((*CHANNEL_WORDS[name], *sizes, remark, nameless))
+        gains.append((*CHANNEL_WORDS[name], *sizes, remark, black_box))
     excluded = enumerated([run.run_id for run in gain.excluded])
     note = (
         f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "

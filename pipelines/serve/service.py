@@ -75,15 +75,15 @@ class Service:
             if folder is not None:
                 ensure_writable(folder)
                 folder.mkdir(parents=True, exist_ok=True)
-        with ExitStack() as undone:
-            self._socket = undone.enter_context(_listen(settings.host, settings.port))
+        with ExitStack() as cleanup:
+            self._socket = cleanup.enter_context(_listen(settings.host, settings.port))
             self._stride_s = settings.filter_stride_s
             model = self._load(settings.model)
             served, limits = Served(1, model, settings.model, table), Limits(sessions=settings.max_sessions)
             self.hub = Hub(served, robot, limits, settings.state, settings.record)
-            undone.callback(self.hub.stop)
+            cleanup.callback(self.hub.stop)
             warm_up(model, robot)
-            self._undo = undone.pop_all()
+            self._cleanup = cleanup.pop_all()
         host, port = self._socket.getsockname()[:2]
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -112,7 +112,7 @@ class Service:
 
     def close(self) -> None:
         """Give the port back, and end the threads."""
-        self._undo.close()
+        self._cleanup.close()
 
     def run(self, announce: Callable[[str], None]) -> None:
         """Serve until it has to end: at SIGTERM or Ctrl-C in order, at the second one at once.
@@ -124,7 +124,7 @@ class Service:
         self._announce = announce
         gc.collect()
         gc.freeze()  # what is loaded now stays: no collection has to look at it
-        with self._undo:
+        with self._cleanup:
             self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.bootstrap import percentile_interval
+from terrain.bootstrap import percentile_interval, stratified_counts
 from terrain.records import Array
 
 COVERAGES = (0.8, 0.5)
@@ -86,13 +86,15 @@ def run_weights(run_id: Array, terrain: Array, n_draws: int, rng: np.random.Gene
     >>> run_weights(np.array(["a", "a", "b"]), np.array(["ice"] * 3), 1, np.random.default_rng(1))
     array([[1., 1., 1.]])
     """
-    weights = np.zeros((n_draws, len(run_id)))
-    for name in np.unique(terrain):
-        rows = np.flatnonzero(terrain == name)
-        runs, run_of = np.unique(run_id[rows], return_inverse=True)
-        drawn = rng.multinomial(len(runs), np.full(len(runs), 1 / len(runs)), n_draws)
-        weights[:, rows] = drawn[:, run_of]
-    return weights
+    class_of, place = runs_of_classes(run_id, terrain)
+    return np.asarray(stratified_counts(class_of, n_draws, rng)[:, place])
+
+
+def runs_of_classes(run_id: Array, terrain: Array) -> tuple[Array, Array]:
+    """Return the class (runs,) of each run, one of several classes once for each, and the run (n,) of each window."""
+    names = np.char.add(np.char.add(terrain.astype(str), "\n"), run_id.astype(str))
+    _, first, place = np.unique(names, return_index=True, return_inverse=True)
+    return terrain[first], place
 
 
 def confidence_auc(confidence: Array, correct: Array, weights: Array) -> Array:

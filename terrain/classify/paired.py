@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from terrain.bootstrap import percentile_interval
+from terrain.bootstrap import percentile_interval, stratified_counts
 from terrain.classify.confidence import Interval, confidence_auc
 from terrain.classify.held_out import HeldOut
 from terrain.classify.support import SupportLevel
@@ -150,7 +150,7 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
     """
     cells, places = _common_cells(a, b)
     terrain = np.array([name for _, name in cells])
-    counts = _drawn_counts(terrain, N_DRAWS, rng)
+    counts = stratified_counts(terrain, N_DRAWS, rng)
 
     def compared(figure: Callable[[Outcome, Array, Array], Array], kept: Array) -> Difference:
         weights = np.vstack([np.ones(len(cells)), counts]) * kept
@@ -180,15 +180,6 @@ def _common_cells(a: Outcome, b: Outcome) -> tuple[list[tuple[str, str]], list[A
         raise DataError(f"run {other[0]} ({other[1]}) was judged by one of the two only")
     number = {cell: i for i, cell in enumerate(cells)}
     return cells, [np.array([number[pair] for pair in each]) for each in pairs]
-
-
-def _drawn_counts(terrain: Array, n_draws: int, rng: np.random.Generator) -> Array:
-    """Return how often each run is drawn (n_draws, runs), as many of a class as there are."""
-    counts = np.zeros((n_draws, len(terrain)))
-    for name in np.unique(terrain):
-        members = np.flatnonzero(terrain == name)
-        counts[:, members] = rng.multinomial(len(members), np.full(len(members), 1 / len(members)), n_draws)
-    return counts
 
 
 def _cell_accuracies(each: Outcome, place: Array, n_cells: int) -> Array:

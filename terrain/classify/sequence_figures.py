@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
+from terrain.classify.confidence import runs_of_classes
 from terrain.classify.metrics import TIME_TOLERANCE_S
 from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
 from terrain.records import Array, Label
@@ -259,10 +260,8 @@ def _changes(labels: Array) -> Array:
 
 def _draws(stretches: Stretches, rng: np.random.Generator) -> Array:
     """Return how often each stretch counts in each bootstrap sample of runs within their classes."""
-    names = [f"{run}\n{terrain}" for run, terrain in zip(stretches.run, stretches.terrain, strict=True)]
-    _, first, run_of = np.unique(names, return_index=True, return_inverse=True)
-    terrain_of = stretches.terrain[first]
-    times = np.zeros((N_BOOTSTRAP, len(first)))
+    terrain_of, run_of = runs_of_classes(stretches.run, stretches.terrain)
+    times = np.zeros((N_BOOTSTRAP, len(terrain_of)))
     for terrain in np.unique(terrain_of):
         members = np.flatnonzero(terrain_of == terrain)
         drawn = members[bootstrap_rows(len(members), N_BOOTSTRAP, rng)]

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.bootstrap import percentile_interval
-from terrain.classify.confidence import Interval, confidence_auc
+from terrain.bootstrap import percentile_interval, stratified_counts
+from terrain.classify.confidence import Interval, confidence_auc, runs_of_classes
 from terrain.classify.held_out import HeldOut
 from terrain.classify.metrics import N_BOOTSTRAP
 from terrain.classify.regimes import Motion
@@ -118,7 +118,9 @@ def support_accuracy(
     >>> found.by_true_terrain["1 to 3 runs"].accuracy, found.auc
     (1.0, 1.0)
     """
-    weights, place = _run_weights(run_id, terrain, rng)
+    class_of, place = runs_of_classes(run_id, terrain)
+    drawn = stratified_counts(class_of, N_BOOTSTRAP, rng)
+    weights = np.vstack([np.ones(len(class_of)), drawn])  # the first as they are
     level = support_levels(held_out.true_runs)
 
     def part(inside: Array) -> PartFigures:
@@ -135,19 +137,6 @@ def support_accuracy(
         part(held_out.supported),
         float(np.mean(np.array(areas)[known])) if known.any() else None,
     )
-
-
-def _run_weights(run_id: Array, terrain: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return how often each run of a class is drawn (1 + draws, runs), first once each, and of windows."""
-    names = np.char.add(np.char.add(terrain.astype(str), "\n"), run_id.astype(str))
-    _, first, place = np.unique(names, return_index=True, return_inverse=True)
-    of_class = terrain[first]
-    weights = np.ones((1 + N_BOOTSTRAP, len(first)))
-    for name in np.unique(of_class):
-        members = np.flatnonzero(of_class == name)
-        odds = np.full(len(members), 1 / len(members))
-        weights[1:, members] = rng.multinomial(len(members), odds, N_BOOTSTRAP)
-    return weights, place
 
 
 def _part(inside: Array, correct: Array, place: Array, weights: Array) -> PartFigures:

@@ -49,7 +49,7 @@ _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")
 _OF_SLIP = tuple(SENSORS.index(name) for name in SLIP_SENSORS)
 _of_slip = itemgetter(*_OF_SLIP)
 # Order in which sensors are named, by health: one that steps or freezes takes others with it, which are lost.
-_BLAMED = (0, 1, 2, 3, 4, 6, 7, 5)
+_NAMED_FIRST = (0, 1, 2, 3, 4, 6, 7, 5)
 # as plain numbers, which compare in a tenth of the time
 _SOUND, _DISAGREES, _LOST = int(SOUND), int(Health.DISAGREES), int(Health.LOST)
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
@@ -224,8 +224,8 @@ class RobotControl:
         worst = max(_of_slip(health))
         if worst <= _SOUND:
             return -1, worst
-        blamed = max(_OF_SLIP, key=lambda i: _BLAMED[health[i]])
-        return blamed, health[blamed]
+        place = max(_OF_SLIP, key=lambda i: _NAMED_FIRST[health[i]])
+        return place, health[place]
 
     def _target(self, terrain: str, seen: LiveEstimate | None, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
