@@ -56,6 +56,7 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
     columns : of the samples, the last columns of a row; the features are before them
     choose : use whichever of the SVM, the network and the stack held-out runs favour, instead of the stack
     candidates : of the SVM
+    n_inner_folds : of both, which are thus weighed on the same held-out runs
     n_members, epochs, trial_epochs : of the network
     gap, seed : of both
 
@@ -72,6 +73,7 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
         columns: Sequence[SampleColumns] = (),
         choose: bool = False,
         candidates: Sequence[Sequence[float]] = CANDIDATES,
+        n_inner_folds: int = 3,
         n_members: int = 3,
         epochs: int = 30,
         trial_epochs: int = 10,
@@ -81,6 +83,7 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
         self.columns = columns
         self.choose = choose
         self.candidates = candidates
+        self.n_inner_folds = n_inner_folds
         self.n_members = n_members
         self.epochs = epochs
         self.trial_epochs = trial_epochs
@@ -98,14 +101,14 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
         X, y = validate_data(self, X, y, ensure_all_finite="allow-nan")
         groups = np.arange(len(y)) if groups is None else np.asarray(groups)
         features, samples = self._parts(X)
-        svm = GroupedSVC(self.candidates, gap=self.gap, seed=self.seed).fit(features, y, groups)
+        of_both = {"n_inner_folds": self.n_inner_folds, "gap": self.gap, "seed": self.seed}
+        svm = GroupedSVC(self.candidates, **of_both).fit(features, y, groups)
         network = GroupedNetwork(
             self.columns,
             n_members=self.n_members,
             epochs=self.epochs,
             trial_epochs=self.trial_epochs,
-            gap=self.gap,
-            seed=self.seed,
+            **of_both,
         ).fit(samples, y, groups)
         self.classes_ = svm.classes_
         both = np.stack([svm.inner_probability_, network.inner_probability_])
