@@ -16,18 +16,15 @@ import numpy as np
 
 from pipelines.learn.evaluate import weaknesses
 from pipelines.learn.model_file import ModelInfo, TerrainModel, window_words
-from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.metrics import runs_by_terrain
+from terrain.classify.paired import MIN_RUNS, Difference, paired_accuracy
 from terrain.logs.digest import joint_digest
-from terrain.records import Array
 
 if TYPE_CHECKING:
     from pipelines.learn.card import Evaluated
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.protocols import Samples
     from pipelines.learn.training_data import TrainingData
-
-N_BOOTSTRAP = 2000
 
 
 class Champion(NamedTuple):
@@ -54,7 +51,7 @@ class Bench(NamedTuple):
 
 
 class HeldOutRun(NamedTuple):
-    """Windows of a run and how many of them were classified correctly while it was held out."""
+    """Windows of a run, and which part of them was classified correctly while it was held out."""
 
     n_windows: int
     accuracy: float
@@ -70,24 +67,6 @@ def held_out_runs(samples: Samples, report: CrossvalResult) -> dict[str, HeldOut
         n_all[name] = n_all.get(name, 0) + row.n_windows
         n_right[name] = n_right.get(name, 0.0) + row.n_windows * row.accuracy
     return {name: HeldOutRun(n_all[name], n_right[name] / n_all[name]) for name in n_all}
-
-
-class Comparison(NamedTuple):
-    """Two models on the same windows, of runs that neither was trained on when it predicted them.
-
-    Parameters
-    ----------
-    n_runs : compared
-    n_unknown : runs on which the champion cannot be judged
-    champion, candidate : accuracy of each
-    difference_ci : 95 % interval of candidate less champion, over runs
-    """
-
-    n_runs: int
-    n_unknown: int
-    champion: float
-    candidate: float
-    difference_ci: tuple[float, float]
 
 
 def scope_of(info: ModelInfo) -> dict[str, str]:
@@ -150,7 +129,22 @@ def judge(
         if evaluated.macro_f1 > best:
             return True, f"macro F1 {evaluated.macro_f1:.4f} is better than {comparison}{remark}"
         return False, f"macro F1 {evaluated.macro_f1:.4f} is not better than {comparison}"
-    return _on_new_data(version, None if bench is None else compare(model, bench), remark)
+    found = None if bench is None else compare(model, bench)
+    if found is None:
+        return False, (
+            f"new data: no run on which version {version} can be judged: it was trained on them and has no "
+            "figures by run, or it needs other rates, features or the samples of runs"
+        )
+    unknown = len(bench.held_out) - found.n_runs if bench is not None else 0
+    verdict = (
+        f"new data: on {found.n_runs} runs{f', {unknown} more not compared' if unknown else ''}, each held out, "
+        f"accuracy {found.b:.1%} against {found.a:.1%} of version {version}"
+    )
+    if found.n_runs >= MIN_RUNS:
+        low, high = (100 * end for end in found.interval)
+        verdict += f" (difference 95 % over runs: {low:+.1f} to {high:+.1f} points)"
+    better = found.b >= found.a
+    return better, f"{verdict}{remark if better else ''}"
 
 
 def _digests(info: ModelInfo, data: TrainingData) -> tuple[str, str]:
@@ -158,67 +152,27 @@ def _digests(info: ModelInfo, data: TrainingData) -> tuple[str, str]:
     return info.data_digest, joint_digest([run.digest for run in data.runs])
 
 
-def _on_new_data(version: str, found: Comparison | None, remark: str) -> tuple[bool, str]:
-    if found is None:
-        return False, (
-            f"new data: no run on which version {version} can be judged: it was trained on them and has no "
-            "figures by run, or it needs other rates, features or the samples of runs"
-        )
-    low, high = found.difference_ci
-    unknown = f", {found.n_unknown} more not compared" if found.n_unknown else ""
-    verdict = (
-        f"new data: on {found.n_runs} runs{unknown}, each held out, accuracy {found.candidate:.1%} against "
-        f"{found.champion:.1%} of version {version} (difference 95 % over runs: {100 * low:+.1f} to "
-        f"{100 * high:+.1f} points)"
-    )
-    return (
-        found.candidate >= found.champion,
-        f"{verdict}{remark if found.candidate >= found.champion else ''}",
-    )
-
-
-def compare(model: TerrainModel, bench: Bench) -> Comparison | None:
-    """Return how a model does against the held-out figures of another one, None where it cannot be judged.
+def compare(model: TerrainModel, bench: Bench) -> Difference | None:
+    """Return the accuracy of a model, and that of another while each run was held out, on the same runs.
 
     A run that the model was not trained on is predicted, where it can be; one that it was trained on counts
-    with the accuracy that it had when it was held out, where that is known.
+    with the accuracy that it had when it was held out, where that is known.  None where there is no such run.
     """
     data, held_out, seed = bench
     run_id, terrain = data.samples.run_id, data.samples.terrain
     digests = {run.run_id: run.digest for run in data.runs}
-    theirs: dict[str, float] = {}
     new = [name for name in held_out if digests[name] not in model.info.run_digests]
+    known = model.info.run_accuracy
+    theirs = {name: known[digests[name]] for name in held_out if digests[name] in known and name not in new}
     rows = np.isin(run_id, new)
     probability = data.probabilities(model, rows) if rows.any() else None
     if probability is not None:
         right = np.asarray(model.recipe.classes_, dtype=str)[probability.argmax(axis=1)] == terrain[rows]
-        theirs = {name: float(right[run_id[rows] == name].mean()) for name in new}
-    known = model.info.run_accuracy
-    theirs |= {name: known[digests[name]] for name in held_out if digests[name] in known and name not in new}
+        theirs |= {name: float(right[run_id[rows] == name].mean()) for name in new}
     if not theirs:
         return None
     names = sorted(theirs)
-    weight = np.array([held_out[name].n_windows for name in names], dtype=float)
-    own = np.array([held_out[name].accuracy for name in names])
+    n_windows, own = np.array([held_out[name] for name in names]).T
     other = np.array([theirs[name] for name in names])
-    first = [str(terrain[run_id == name][0]) for name in names]
-    return Comparison(
-        len(names),
-        len(held_out) - len(names),
-        float(np.average(other, weights=weight)),
-        float(np.average(own, weights=weight)),
-        _interval(weight, own - other, np.array(first), np.random.default_rng(seed)),
-    )
-
-
-def _interval(
-    weight: Array, difference: Array, terrain: Array, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Return the 95 % interval of a weighted mean over runs, which are drawn within their classes."""
-    total, weights = np.zeros((2, N_BOOTSTRAP))
-    for name in np.unique(terrain):
-        members = np.flatnonzero(terrain == name)
-        drawn = members[bootstrap_rows(len(members), N_BOOTSTRAP, rng)]
-        total += (weight * difference)[drawn].sum(axis=1)
-        weights += weight[drawn].sum(axis=1)
-    return percentile_interval(total / weights)
+    first = np.array([terrain[run_id == name][0] for name in names])
+    return paired_accuracy(first, n_windows, other, own, np.random.default_rng(seed))

@@ -24,9 +24,9 @@ from terrain.files.names import printable
 if TYPE_CHECKING:
     from pipelines.learn.training_data import TrainingData
     from pipelines.report import Progress
+    from terrain.classify.folds import Fold
     from terrain.classify.held_out import Examples
     from terrain.classify.paired import Difference
-    from terrain.records import Array
 
 BATCH = 4
 """Trials that are suggested together; a batch does not depend on how many are computed at once."""
@@ -110,13 +110,13 @@ def search(
     while len(trials) < n_trials:
         suggested = _suggest(optuna, trials, n_trials, seed)
         each = ((params,) for params in suggested)
-        for trial in parallel(_evaluate, (kept, samples.gap, seed), each, n_jobs):
+        for trial in parallel(_tried, (kept, samples.gap, seed), each, n_jobs):
             trials.append(trial)
             progress("trials", len(trials), n_trials)
         lines = "".join(json.dumps(as_json(trial)) + "\n" for trial in trials)
         atomic_write(folder / TRIALS_FILE, lines)
     best = max(trials[:n_trials], key=lambda trial: trial.accuracy)
-    held_out = _held_out(examples, outer.train, outer.test, best.params, samples.gap, seed)
+    held_out = _held_out(examples, outer, best.params, samples.gap, seed)
     runs = tuple(np.unique(samples.group[outer.test].astype(str)).tolist())
     found = SearchResult(len(trials), resumed, best, held_out, runs, folder / BEST_FILE)
     document = {"version": VERSION, "data_digest": data.digest, "held_out": held_out, **best._asdict()}
@@ -174,46 +174,38 @@ def _suggest(optuna: Any, trials: Sequence[Trial], n_trials: int, seed: int) -> 
     return [SvmParams(**{name: float(f"{value:.4g}") for name, value in each.items()}) for each in asked]
 
 
-def _evaluate(examples: Examples, gap: int, seed: int, params: SvmParams) -> Trial:
+def _tried(examples: Examples, gap: int, seed: int, params: SvmParams) -> Trial:
     """Return the accuracy of one candidate on inner folds of whole runs."""
     import numpy as np
 
+    from pipelines.learn.evaluate import evaluate
     from terrain.bootstrap import percentile_interval
     from terrain.classify.confidence import run_weights
+    from terrain.classify.folds import Fold
     from terrain.classify.inner import inner_splits
+    from terrain.classify.svm import GroupedSVC
 
-    correct = np.full(len(examples.terrain), np.nan)
-    for train, test in inner_splits(examples.terrain, examples.group, N_INNER_FOLDS, seed, gap):
-        fitted = _fit((params,), examples, train, gap, seed)
-        correct[test] = fitted.predict(examples.features[test]) == examples.terrain[test]
-    known = np.isfinite(correct)
-    weights = run_weights(
-        examples.group[known].astype(str), examples.terrain[known], N_DRAWS, np.random.default_rng(seed)
-    )
-    draws = weights @ correct[known] / weights.sum(axis=1)
-    return Trial(params, float(correct[known].mean()), percentile_interval(draws))
-
-
-def _fit(candidates: Sequence[SvmParams], examples: Examples, rows: Array, gap: int, seed: int) -> Any:
-    from terrain.classify.svm import CANDIDATES, GroupedSVC
-
-    classifier = GroupedSVC(candidates or CANDIDATES, gap=gap, seed=seed)
-    return classifier.fit(examples.features[rows], examples.terrain[rows], groups=examples.group[rows])
+    _, terrain, group = examples
+    splits = inner_splits(terrain, group, N_INNER_FOLDS, seed, gap)
+    folds = [Fold(0, number, *rows) for number, rows in enumerate(splits)]
+    held_out = evaluate(GroupedSVC((params,), gap=gap, seed=seed), examples, folds)
+    known = held_out.tested
+    correct = held_out.correct[0, known]
+    weights = run_weights(group[known].astype(str), terrain[known], N_DRAWS, np.random.default_rng(seed))
+    draws = weights @ correct / weights.sum(axis=1)
+    return Trial(params, float(correct.mean()), percentile_interval(draws))
 
 
-def _held_out(
-    examples: Examples, train: Array, test: Array, best: SvmParams, gap: int, seed: int
-) -> Difference:
+def _held_out(examples: Examples, outer: Fold, best: SvmParams, gap: int, seed: int) -> Difference:
     """Return the accuracy of the default choice and of the best candidate on runs that no trial has seen."""
     import numpy as np
 
+    from pipelines.learn.evaluate import evaluate
     from terrain.classify.paired import Outcome, compare_outcomes
+    from terrain.classify.svm import CANDIDATES, GroupedSVC
 
-    outcomes = []
-    for candidates in ((), (best,)):
-        fitted = _fit(candidates, examples, train, gap, seed)
-        probability = fitted.predict_proba(examples.features[test])
-        correct = fitted.classes_[probability.argmax(axis=1)] == examples.terrain[test]
-        run_id = examples.group[test].astype(str)
-        outcomes.append(Outcome(run_id, examples.terrain[test], correct[None], probability.max(axis=1)[None]))
-    return compare_outcomes(outcomes[0], outcomes[1], np.random.default_rng(seed)).accuracy
+    default, found = (
+        Outcome.of(evaluate(GroupedSVC(each, gap=gap, seed=seed), examples, [outer]), examples.group)
+        for each in (CANDIDATES, (best,))
+    )
+    return compare_outcomes(default, found, np.random.default_rng(seed)).accuracy

@@ -171,6 +171,28 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
     )
 
 
+def paired_accuracy(
+    terrain: Array, n_windows: Array, a: Array, b: Array, rng: np.random.Generator
+) -> Difference:
+    """Return the difference of two accuracies over runs, which are drawn within their classes.
+
+    Parameters
+    ----------
+    terrain, n_windows : (n,) class of each run, and by how many windows it counts
+    a, b : (n,) accuracy of both on each run
+    rng : source of the bootstrap
+
+    Examples
+    --------
+    >>> terrain, n_windows = np.repeat(["ice", "mud"], 4), np.full(8, 10)
+    >>> paired_accuracy(terrain, n_windows, np.full(8, 0.5), np.full(8, 0.75), np.random.default_rng(0)).interval
+    (0.25, 0.25)
+    """
+    weights = np.vstack([np.ones(len(terrain)), stratified_counts(terrain, N_DRAWS, rng)]) * n_windows
+    of_a, of_b = (weights @ each / weights.sum(axis=1) for each in (a, b))
+    return _difference(of_a, of_b, len(terrain))
+
+
 def _common_cells(a: Outcome, b: Outcome) -> tuple[list[tuple[str, str]], list[Array]]:
     """Return the runs with their classes, and of each classifier's windows which of them they belong to."""
     pairs = [list(zip(each.run_id.astype(str), each.terrain.astype(str), strict=True)) for each in (a, b)]
