@@ -7,29 +7,31 @@ table, which are read only, and the thread that classifies.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
 from time import monotonic, time
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
 
 from pipelines.live.chain import Chain, CommandStatus
 from pipelines.live.classifying import Classifier, ClassifierThread, WindowOutput
 from pipelines.live.model import LiveModel
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.recording import SessionRecorder
+from pipelines.live.recording import RecordingThread, SessionRecorder
 from pipelines.live.state import LiveState
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable
-from terrain.control.switching import TerrainBelief
+from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.arrivals import Inbox, StreamHealth, as_numbers
 from terrain.estimation.live.clocks import SessionClock
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.skid_live import LiveSkidEstimate
-from terrain.records import Array, Command, Sample, SlipTarget
+from terrain.records import Command, Sample
 from terrain.robots import Robot
 
 TWIST_FRESH_S = 0.5
@@ -37,6 +39,10 @@ TWIST_FRESH_S = 0.5
 
 COMMAND_VALID_S = 0.25
 """What drives the wheels has to stop them when it has had no newer command for so long."""
+
+CONTROL_RATE_LEAST_HZ = 5.0
+"""Of commands: a longer step than half a second is taken for a clock that was set, and a command holds for a
+quarter of a second."""
 
 _NO_TWIST = np.zeros(3)
 
@@ -56,54 +62,64 @@ class Served(NamedTuple):
     model_name: str
     table: SlipTable
 
+    def content(self) -> dict[str, Any]:
+        """Return which model and table are used."""
+        return {
+            "number": self.number,
+            "model": self.model_name or None,
+            "classes": [] if self.model is None else list(self.model.info.classes),
+            "table": self.table.name,
+        }
 
-@dataclass(frozen=True, slots=True)
-class SessionRequest:
-    """What a robot says of itself before its first sample.
+
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9 ._+-]*$", max_length=64)]
+Channel = Annotated[str, StringConstraints(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=64)]
+
+
+class Hello(BaseModel):
+    """What a robot says of itself before its first sample: what it is, what it sends, and what it asks for.
 
     Parameters
     ----------
     session : name of the session, one a robot
     robot : name of its description; a robot that has none is observed by its channels
-    channels : of each stream that it sends, in the order of the columns
+    streams : channels of each stream that it sends, in the order of the columns
     control : whether commands are asked for
     follows : whether they drive the wheels; not where another controller does and these are only watched
+    rate_hz : of the answers; 0 asks for one at each message with ``"step": true``
+    record : whether the session is recorded
     """
 
-    session: str
-    robot: str
-    channels: Mapping[str, tuple[str, ...]]
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    type: Literal["hello"] = "hello"
+    protocol: Literal[2] = 2
+    session: Name
+    robot: Name
+    streams: Annotated[
+        dict[Name, Annotated[tuple[Channel, ...], Field(min_length=1, max_length=64, strict=False)]],
+        Field(min_length=1, max_length=16),
+    ]
     control: bool = False
     follows: bool = True
+    rate_hz: Annotated[float, Field(ge=0.0, le=200.0, strict=False)] = 10.0
+    record: bool = False
 
+    @field_validator("streams")
+    @classmethod
+    def _check_streams(cls, streams: dict[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
+        for stream, channels in streams.items():
+            if len(set(channels)) < len(channels):
+                raise ValueError(f"stream {stream!r} names a channel twice")
+        return streams
 
-class Observation(NamedTuple):
-    """What is known of the robot at a step; NaN and None where it is not.
-
-    Parameters
-    ----------
-    terrain, probability : believed, and that of its last window; empty and NaN where unknown
-    window : output of the last window
-    target : target slip by drive state
-    slip_ratio, slip_std, wheel_speed_mps, current_a : of each wheel
-    speed_x_mps, speed_y_mps, yaw_rate_radps : of the robot
-    sensors : health by name of the sensor, or of the stream where sensors are not judged one by one
-    served : number of what was used
-    """
-
-    terrain: str
-    probability: float
-    window: WindowOutput | None
-    target: Mapping[str, SlipTarget]
-    slip_ratio: Array
-    slip_std: Array
-    wheel_speed_mps: Array
-    current_a: Array
-    speed_x_mps: float
-    speed_y_mps: float
-    yaw_rate_radps: float
-    sensors: Mapping[str, str]
-    served: int
+    @field_validator("rate_hz")
+    @classmethod
+    def _check_rate(cls, rate_hz: float, others: ValidationInfo) -> float:
+        if others.data.get("control") and 0.0 < rate_hz < CONTROL_RATE_LEAST_HZ:
+            least = f"{CONTROL_RATE_LEAST_HZ:g} Hz or more"
+            raise ValueError(f"commands need {least}, or 0: one at each message")
+        return rate_hz
 
 
 class StepOutput(NamedTuple):
@@ -115,7 +131,9 @@ class StepOutput(NamedTuple):
     number : of the step, from 1
     message : number of the last message that is in it; 0 before the first
     command, status : None where none was asked for
-    observation : of the robot
+    windows : outputs of windows that were finished, in most cases none
+    failure : why the step failed; empty where it did not
+    observation : what is known of the robot, as ``docs/service.md`` describes it; None and NaN where it is not
     latency_s : from the arrival of the newest sample to the end of the step; NaN without one
     """
 
@@ -124,8 +142,26 @@ class StepOutput(NamedTuple):
     message: int
     command: Command | None
     status: CommandStatus
-    observation: Observation
+    windows: Sequence[WindowOutput]
+    failure: str
+    observation: dict[str, Any]
     latency_s: float
+
+    def content(self) -> dict[str, Any]:
+        """Return the message of the step."""
+        names = ("time_s", "number", "message", "latency_s", "observation")
+        content = {"type": "step"} | {name: getattr(self, name) for name in names}
+        if (command := self.command) is not None:
+            code = int(command.status.get("status_code", TractionStatus.UNSOUND))
+            content["command"] = {
+                "status": self.status.value,
+                "traction": TractionStatus(code).label,
+                "valid_s": COMMAND_VALID_S,
+                "wheel_radps": command.wheel_radps,
+                "steer_rad": command.steer_rad,
+                "twist": command.twist,
+            }
+        return content
 
 
 class RobotSession:
@@ -133,17 +169,19 @@ class RobotSession:
 
     Parameters
     ----------
-    request : of the robot
+    hello : of the robot
     served : model and table
     robot : its description; None for a robot that has none
     thread : that classifies its windows; at once without one
+    leave : called with a code and a sentence where the robot cannot be served any longer
 
     Attributes
     ----------
     inbox : of its samples
     chain : that its samples go through
-    finished : outputs of windows at the last step, in most cases none
-    failure : why the last step that failed did; empty where none has
+    restored : what it was started from; None where it was not
+    received_s : when its last message came, on the local clock that never goes back
+    last : output of the last step; None before the first
 
     Raises
     ------
@@ -155,28 +193,37 @@ class RobotSession:
 
     def __init__(
         self,
-        request: SessionRequest,
+        hello: Hello,
         served: Served,
         robot: Robot | None,
         thread: ClassifierThread | None = None,
+        leave: Callable[[str, str], None] = lambda code, sentence: None,
     ) -> None:
-        self.request, self.served = request, served
-        self.inbox = Inbox({stream: len(names) for stream, names in request.channels.items()})
-        self.chain = _chain(request, served, robot, thread)
+        self.hello, self.served, self.leave = hello, served, leave
+        self.inbox = Inbox({stream: len(names) for stream, names in hello.streams.items()})
+        pilot = PilotSettings(follows=hello.follows) if hello.control else None
+        if pilot is not None and robot is None:
+            raise ConfigError(
+                f"robot {hello.robot!r} has no description here: commands cannot be given to it"
+            )
+        self.chain = chain_of(robot, hello.streams, served.model, served.table, pilot, thread)
         self._wheels = () if robot is None else robot.wheels
-        self._streams = StreamHealth(request.channels)
+        self._streams = StreamHealth(hello.streams)
         self._clock = SessionClock()
         self._twist, self._twist_s = _NO_TWIST, -math.inf
-        self._received_s = self._known_s = math.nan
+        self._sampled_s = self._known_s = math.nan
         self._n_steps = self._n_messages = 0
-        self.finished: Sequence[WindowOutput] = ()
-        self.failure = ""
-        self._window: WindowOutput | None = None
+        self.received_s = monotonic()
+        self.last: StepOutput | None = None
+        self.restored: LiveState | None = None
         self._recorder: SessionRecorder | None = None
+        self._window: dict[str, Any] | None = None
 
-    def record(self, recorder: SessionRecorder) -> None:
-        """Record samples, commands and windows from now on."""
-        self._recorder = recorder
+    def record(self, folder: Path, writer: RecordingThread) -> None:
+        """Record samples, commands and windows from now on, as a file of a folder that a thread writes."""
+        hello, wheels = self.hello, self._wheels if self.hello.control else ()
+        name = f"{hello.session}_{datetime.now(UTC):%Y%m%d_%H%M%S}"
+        self._recorder = SessionRecorder(folder, name, hello.robot, hello.streams, wheels, writer=writer)
 
     @property
     def recording(self) -> str:
@@ -188,10 +235,31 @@ class RobotSession:
         if self._recorder is not None:
             self._recorder.close()
 
-    @property
-    def belief(self) -> TerrainBelief:
-        """The terrain that is believed."""
-        return self.chain.belief
+    def welcome(self) -> dict[str, Any]:
+        """Return the answer to the hello."""
+        hello, restored = self.hello, self.restored
+        known = restored and {
+            "age_s": max(time() - restored.saved_s, 0.0),
+            "biases": sorted(restored.biases),
+            "terrain": restored.terrain or None,
+        }
+        return {
+            "type": "welcome",
+            **{name: getattr(hello, name) for name in ("protocol", "session", "rate_hz", "control")},
+            "command_valid_s": COMMAND_VALID_S,
+            "served": self.served.content(),
+            "recording": self.recording,
+            "restored": known,
+        }
+
+    def content(self) -> dict[str, Any]:
+        """Return what is shown of the session."""
+        return {
+            **{name: getattr(self.hello, name) for name in ("session", "robot", "control")},
+            "terrain": self.chain.belief.terrain or None,
+            "recording": self.recording,
+            "dropped": self.dropped,
+        }
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -199,21 +267,14 @@ class RobotSession:
         counts = dict(self.inbox.refused) | self.chain.dropped
         return counts | ({"time: clock set": n} if (n := self._clock.times_set) else {})
 
-    def state(self, now_s: float | None = None) -> LiveState:
-        """Return what is worth keeping over a restart.
+    def state(self) -> LiveState:
+        """Return what is worth keeping over a restart; it is as old as the last sample."""
+        return self.chain.state(time() if math.isnan(self._known_s) else self._known_s)
 
-        Parameters
-        ----------
-        now_s : in seconds since 1970; by default when the last sample came: what is known is as old as that
-        """
-        if now_s is None:
-            now_s = time() if math.isnan(self._known_s) else self._known_s
-        return self.chain.state(now_s)
-
-    def restore(self, state: LiveState, now_s: float | None = None) -> LiveState:
-        """Start from a saved state, before the first step; return what of it is used."""
+    def restore(self, state: LiveState) -> None:
+        """Start from a saved state, before the first step."""
         self._known_s = state.saved_s
-        return self.chain.restore(state, time() if now_s is None else now_s)
+        self.restored = self.chain.restore(state, time())
 
     def check(self, served: Served) -> None:
         """Raise what :meth:`swap` would."""
@@ -253,7 +314,7 @@ class RobotSession:
                 newest_s = self.inbox.put(str(name), time_s, values)
                 if newest_s is not None:
                     self._clock.received(newest_s, now_s)
-                    self._received_s, self._known_s = now_s, time()
+                    self._sampled_s, self._known_s = now_s, time()
         elif streams is not None:
             self.inbox.refused["samples that are not given by stream"] += 1
         if twist is not None:
@@ -284,8 +345,8 @@ class RobotSession:
         if done.command is not None and status is CommandStatus.OK and not fresh:
             status = CommandStatus.NO_TWIST
         self._n_steps += 1
-        self.finished, self.failure = done.windows, done.failure or self.failure
-        self._window = done.windows[-1] if done.windows else self._window
+        if done.windows:
+            self._window = _window_content(done.windows[-1])
         self._streams.take(readings, time_s)
         if self._recorder is not None:
             if readings:
@@ -294,18 +355,22 @@ class RobotSession:
                 self._recorder.command(time_s, twist, done.command)
             for output in done.windows:
                 self._recorder.window(output)
-        return StepOutput(
+        self.last = StepOutput(
             time_s,
             self._n_steps,
             self._n_messages,
             done.command,
             status,
+            done.windows,
+            done.failure,
             self._observation(time_s),
-            now_s - self._received_s + (monotonic() - begun_s),
+            now_s - self._sampled_s + (monotonic() - begun_s),
         )
+        return self.last
 
-    def _observation(self, time_s: float) -> Observation:
+    def _observation(self, time_s: float) -> dict[str, Any]:
         belief, seen = self.chain.belief, self.chain.estimate
+        target = self.served.table.lookup(belief.terrain)
         slip_ratio = slip_std = np.full(len(self._wheels), math.nan)
         motion = math.nan, math.nan, math.nan
         if isinstance(seen, LiveEstimate):
@@ -322,34 +387,61 @@ class RobotSession:
         sensors = self.chain.health or self._streams.health(time_s)
         if math.isnan(time_s):
             sensors = dict.fromkeys(sensors, "lost")
-        return Observation(
-            belief.terrain,
-            belief.probability,
-            self._window,
-            self.served.table.lookup(belief.terrain),
-            slip_ratio,
-            slip_std,
-            speeds_mps,
-            currents_a,
-            *motion,
-            sensors,
-            self.served.number,
-        )
+        return {
+            "terrain": belief.terrain or None,
+            "probability": belief.probability,
+            "window": self._window,
+            "target_slip": {
+                state: {"slip_ratio": one.slip_ratio, "slip_std": one.slip_std, "status": str(one.status)}
+                for state, one in target.items()
+            },
+            "target_of": next(iter(target.values())).terrain,
+            "slip_ratio": slip_ratio,
+            "slip_std": slip_std,
+            "wheel_speed_mps": speeds_mps,
+            "current_a": currents_a,
+            **dict(zip(("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), motion, strict=True)),
+            "sensors": sensors,
+            "served": self.served.number,
+        }
 
 
 _NOT_DECIDED = (CommandStatus.NO_SAMPLES, CommandStatus.FAILED)
 """Statuses of commands that no controller has decided on: they are not recorded."""
 
 
-def _chain(
-    request: SessionRequest, served: Served, robot: Robot | None, thread: ClassifierThread | None
+def _window_content(window: WindowOutput) -> dict[str, Any]:
+    return {
+        "start_s": window.start_s,
+        "end_s": window.end_s,
+        "terrain": window.terrain or None,
+        "probabilities": dict(zip(window.classes, window.probabilities.tolist(), strict=True)),
+        "refused": window.refused or None,
+        "nearest": window.nearest or None,
+        "novelty": window.novelty,
+        "supported": window.supported,
+    }
+
+
+def chain_of(
+    robot: Robot | None,
+    channels: Mapping[str, Sequence[str]],
+    model: LiveModel | None,
+    table: SlipTable,
+    pilot: PilotSettings | None = None,
+    thread: ClassifierThread | None = None,
 ) -> Chain:
-    """Return what the samples of a robot go through."""
-    if not request.control:
-        if served.model is None:
-            raise DataError("no model is served: only a robot that asks for commands can be served")
-        return Observer(served.model, served.table, robot, request.channels, thread=thread)
-    if robot is None:
-        raise ConfigError(f"robot {request.robot!r} has no description here: commands cannot be given to it")
-    settings, source = PilotSettings(follows=request.follows), Classifier(served.model, robot, thread)
-    return LivePilot(robot, served.table, source, settings, channels=request.channels)
+    """Return what the samples of a robot go through: a pilot of these settings, without them an observer.
+
+    Raises
+    ------
+    ConfigError
+        if the robot has no pilot, or the table is another robot's.
+    DataError
+        if the model needs channels that the robot does not send, or there is neither model nor pilot.
+    """
+    if pilot is not None and robot is not None:
+        return LivePilot(robot, table, Classifier(model, robot, thread), pilot, channels=channels)
+    if model is None:
+        raise DataError("no model is served: only a robot that asks for commands can be served")
+    return Observer(model, table, robot, channels, thread=thread)

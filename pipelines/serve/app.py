@@ -19,7 +19,6 @@ from pipelines.report.json_file import as_json
 from pipelines.serve.connection import Connection
 from pipelines.serve.guard import Guard
 from pipelines.serve.hub import Hub
-from pipelines.serve.messages import served_content
 from pipelines.serve.wire import encode
 from terrain import __version__
 from terrain.control.slip_table import SlipTable, load_slip_table
@@ -84,7 +83,7 @@ def make_app(
 
     @app.websocket("/robots")
     async def robots(socket: WebSocket) -> None:
-        await Connection(socket, hub, token, guard.wrong_token).serve()
+        await Connection(socket, hub, guard).serve()
 
     @app.get("/health")
     async def health() -> dict[str, str]:
@@ -108,7 +107,7 @@ def make_app(
         """Return the card of the model that is served: how it was trained, on what, and how well it did."""
         served = hub.served
         return {
-            "served": served_content(served),
+            "served": served.content(),
             "card": {} if served.model is None else as_json(served.model.info),
         }
 
@@ -128,7 +127,7 @@ def make_app(
         try:
             found = await asyncio.to_thread(read, text)
             async with hub.changing:
-                return served_content(hub.swap(*changed(found)))
+                return hub.swap(*changed(found)).content()
         except TerrainError as error:
             raise HTTPException(409, str(error)) from None
 

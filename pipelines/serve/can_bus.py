@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines import report as reports
 from pipelines.data.can_codec import (
     MISSING_PACKAGE,
     OPTIONAL,
@@ -32,29 +33,16 @@ from pipelines.data.can_codec import (
 )
 from pipelines.data.can_logs import Receiver
 from pipelines.live.chain import Chain, CommandStatus
-from pipelines.live.classifying import Classifier, ClassifierThread
-from pipelines.live.pilot import LivePilot
-from pipelines.live.windows import filtered
-from pipelines.report import (
-    Column,
-    Pairs,
-    Progress,
-    Report,
-    Result,
-    Section,
-    Table,
-    described,
-    format_value,
-    interval,
-    silent,
-)
+from pipelines.live.classifying import ClassifierThread
+from pipelines.live.session import chain_of
+from pipelines.report import Progress, Result, described, format_value, silent
 from pipelines.report.stopping import stopping
-from pipelines.serve.serve import Settings
+from pipelines.serve.serve import Settings, loaded
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import step_or_period
 from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics, corrections, last_samples
-from terrain.errors import ConfigError
+from terrain.errors import ConfigError, one_line
 from terrain.estimation.live.clocks import SessionClock
 from terrain.records import Array, Sample
 from terrain.robots import SwerveRobot, as_drive, load_robot
@@ -78,7 +66,6 @@ MAX_READ = 2000
 KEPT = 100_000
 """Latencies that are kept: half an hour at 50 Hz."""
 
-_STATUS = channels_of("status")
 _NOT_DECIDED = {
     CommandStatus.NO_SAMPLES: BridgeState.STEERING,
     CommandStatus.NOT_FINITE: BridgeState.NOT_FINITE,
@@ -106,8 +93,7 @@ def open_bus(interface: str, channel: str, bitrate: int | None = None) -> Any:
     try:
         return can.Bus(channel=channel, interface=interface, ignore_config=True, **options)
     except Exception as error:  # each interface has errors of its own, and of the library it loads
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"the bus {interface} {channel!r} cannot be opened ({text[:160]})") from error
+        raise ConfigError(f"the bus {interface} {channel!r} cannot be opened ({one_line(error)})") from error
 
 
 class Link:
@@ -198,8 +184,7 @@ class Link:
                 notifier.bus.shutdown()
 
     def _count(self, what: str, error: Exception) -> None:
-        text = " ".join(str(error).split()) or type(error).__name__
-        self.errors[f"{what}: {text[:80]}"] += 1
+        self.errors[f"{what}: {one_line(error, 80)}"] += 1
 
 
 class Bridge:
@@ -335,15 +320,12 @@ class Bridge:
         self, added: Array, status: Mapping[str, float], state: BridgeState, now_s: float
     ) -> list[Frame]:
         figures = {**status, "bridge_code": float(state)}
-        values = [figures.get(name, math.nan) for name in _STATUS]
-        # a code below zero stands for none
-        coded = [
-            math.nan if n.endswith("_code") and v < 0.0 else v for n, v in zip(_STATUS, values, strict=True)
-        ]
+        known = {name: v for name, v in figures.items() if v >= 0.0 or not name.endswith("_code")}
+        values = [known.get(name, math.nan) for name in channels_of("status")]  # a code below zero is none
         counter, self._counter = self._counter, self._counter + 1
         return [
             *encode(self._layout, "corrections", added.tolist(), counter, now_s, self.clipped),
-            *encode(self._layout, "status", coded, counter, now_s, self.clipped),
+            *encode(self._layout, "status", values, counter, now_s, self.clipped),
         ]
 
 
@@ -361,11 +343,10 @@ def latency_of(times_s: Sequence[float]) -> Latency:
     >>> latency_of([])
     {'median_ms': None, 'p99_ms': None}
     """
-    found = np.percentile(np.asarray(times_s), [50.0, 99.0]).tolist() if times_s else [None, None]
-    return {
-        name: None if each is None else round(1e3 * each, 4)
-        for name, each in zip(("median_ms", "p99_ms"), found, strict=True)
-    }
+    median_ms = p99_ms = None
+    if times_s:
+        median_ms, p99_ms = np.percentile(1e3 * np.array(times_s), [50.0, 99.0]).round(4).tolist()
+    return {"median_ms": median_ms, "p99_ms": p99_ms}
 
 
 @dataclass(frozen=True, repr=False)
@@ -407,21 +388,13 @@ def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
         load_robot(settings.robot or "agrimaro"),
         "robot {name}: drive {drive!r} has no pilot, only 'swerve' has",
     )
-    table, model = load_slip_table(settings.table), None
-    if settings.model is not None:
-        from pipelines.learn.load import load_model
-
-        model = filtered(load_model(settings.model), settings.filter_stride_s)
-    source, chosen = (
-        Classifier(model, robot, ClassifierThread()),
-        PilotSettings(controller=settings.controller),
-    )
-    chain = LivePilot(
+    chain = chain_of(
         robot,
-        table,
-        source,
-        chosen,
-        channels={name: channels_of(name) for name in RECEIVED if name != "twist"},
+        {name: channels_of(name) for name in RECEIVED if name != "twist"},
+        loaded(settings, settings.model),
+        load_slip_table(settings.table),
+        PilotSettings(controller=settings.controller),
+        ClassifierThread(),
     )
     bridge, link = Bridge(layout, robot, chain), Link(lambda: open_bus(interface, channel, settings.bitrate))
     with stopping(bridge.stop):
@@ -458,39 +431,26 @@ def bus_of(text: str) -> tuple[str, str]:
     return (interface, channel) if colon else ("socketcan", text)
 
 
-def report(result: BridgeResult) -> Report:
+def report(result: BridgeResult) -> reports.Report:
     """Return what a bridge did: frames, states and latencies, then what was not used, by kind."""
-    n_steps, latency = sum(result.states.values()), result.wheels_to_correction
-    n_active = result.states.get("ACTIVE", 0)
     answer = (
-        f"Corrections were the controller's in {n_active} of {n_steps} control steps, "
-        f"{format_value(result.duration_s, '.1f', 's')} on {result.interface} {result.channel}."
+        f"Corrections were the controller's in {result.states.get('ACTIVE', 0)} of {sum(result.states.values())} "
+        f"control steps, {format_value(result.duration_s, '.1f', 's')} on {result.interface} {result.channel}."
     )
-    counts = {
-        "samples": result.samples,
-        "dropped": result.dropped,
-        "bus errors": result.bus_errors,
-        "sent as the end of the range": result.clipped,
-        "control steps": result.states,
-    }
-    rows = tuple((kind, name, n) for kind, found in counts.items() for name, n in found.items())
-    pairs = (
-        ("frames in, used, out", f"{result.frames_in}, {result.frames_used}, {result.frames_out}"),
-        ("control steps left out", result.ticks_missed),
-        (
-            "wheels to correction, median to p99",
-            interval(latency["median_ms"], latency["p99_ms"], ".2f", "ms"),
-        ),
-        (
-            "control step, median to p99",
-            interval(result.step["median_ms"], result.step["p99_ms"], ".2f", "ms"),
-        ),
-    )
-    columns = (Column("kind"), Column("name", long=True), Column("number"))
-    return Report(
+    rows = [
+        (kind.replace("_", " "), name, n)
+        for kind in ("samples", "dropped", "bus_errors", "clipped", "states")
+        for name, n in getattr(result, kind).items()
+    ]
+    pairs = result.pairs("frames_in", "frames_used", "frames_out", "ticks_missed")
+    for name, found in (("wheels to correction", result.wheels_to_correction), ("control step", result.step)):
+        span = reports.interval(found["median_ms"], found["p99_ms"], ".2f", "ms")
+        pairs.append((f"{name}, median to p99", span))
+    columns = ("kind", reports.Column("name", long=True), "number")
+    return reports.Report(
         "CAN bus",
         answer,
-        parts=(Pairs(pairs), Table(columns, rows)) if rows else (Pairs(pairs),),
-        details=(Section("Setup", (Pairs((("robot", result.robot), ("DBC", result.dbc))),)),),
+        parts=(reports.Pairs(pairs), reports.Table(columns, rows)) if rows else (reports.Pairs(pairs),),
+        details=reports.sections(("Setup", [reports.Pairs(result.pairs("robot", "dbc"))])),
         next_step="terrain serve --can BUS --json FILE keeps these figures",
     )

@@ -11,27 +11,22 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import Counter, deque
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from time import monotonic, perf_counter
 from typing import Any
 
 from fastapi import WebSocket
+from pydantic import ValidationError
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from pipelines.live.chain import CommandStatus
-from pipelines.live.session import StepOutput
-from pipelines.serve.guard import LONGEST_TOKEN, bearer, token_fits
-from pipelines.serve.hub import Hub, OpenSession
-from pipelines.serve.messages import (
-    Hello,
-    error_content,
-    read_hello,
-    step_content,
-    welcome,
-)
+from pipelines.live.session import Hello, RobotSession, StepOutput
+from pipelines.serve.guard import LONGEST_TOKEN, Guard, bearer
+from pipelines.serve.hub import Hub
 from pipelines.serve.wire import WireError, decode, encode
 from terrain.estimation.live.clocks import number
+from terrain.files.documents import first_fault
 
 MAX_NOTES = 1000
 """Answers to messages that wait to be read; of more, the oldest are left out."""
@@ -87,17 +82,13 @@ class Connection:
     ----------
     socket : not accepted yet
     hub : of the sessions
-    token : that is required; empty for none
-    wrong_token : counts a wrong token, and waits
+    guard : knows the token that is required
     """
 
-    _hello: Hello
-    _opened: OpenSession
+    _session: RobotSession
 
-    def __init__(
-        self, socket: WebSocket, hub: Hub, token: str, wrong_token: Callable[[], Awaitable[None]]
-    ) -> None:
-        self._socket, self._hub, self._token, self._wrong_token = socket, hub, token, wrong_token
+    def __init__(self, socket: WebSocket, hub: Hub, guard: Guard) -> None:
+        self._socket, self._hub, self._guard = socket, hub, guard
         self._packed = False
         self._end: tuple[int, str] = (1000, "")
         self._budgets = Budgets(hub.limits.per_s)
@@ -110,7 +101,7 @@ class Connection:
         """Talk until the other end leaves or has to; nothing is raised."""
         try:
             await self._socket.accept()
-            if await self._admitted():
+            if await self._admitted() and await self._greeted():
                 await self._talk()
         except GONE:
             pass
@@ -122,15 +113,15 @@ class Connection:
 
     async def _admitted(self) -> bool:
         """Say whether the token is the required one: that of the header, or the first frame, undecoded."""
-        if token_fits(self._token, bearer(self._socket.headers)):
+        if self._guard.admits(bearer(self._socket.headers)):
             return True
         first: str | bytes = ""
         with suppress(TimeoutError):
             async with asyncio.timeout(self._hub.limits.hello_s):
                 first = await self._received()
-        if isinstance(first, str) and len(first) <= LONGEST_TOKEN and token_fits(self._token, first):
+        if isinstance(first, str) and len(first) <= LONGEST_TOKEN and self._guard.admits(first):
             return True
-        await self._wrong_token()
+        await self._guard.wrong_token()
         await self._write(self._error("token", NO_TOKEN, fatal=True))
         self._end = (POLICY, "token")
         return False
@@ -149,31 +140,12 @@ class Connection:
     async def _write(self, content: dict[str, Any]) -> None:
         message = encode(content, packed=self._packed)
         async with asyncio.timeout(self._hub.limits.too_slow_s):
-            if isinstance(message, str):
-                await self._socket.send_text(message)
-            else:
-                await self._socket.send_bytes(message)
+            await self._socket.send({"type": "websocket.send", "bytes" if self._packed else "text": message})
 
     def _error(self, code: str, sentence: str, *, fatal: bool = False) -> dict[str, Any]:
+        """Count an error and return its message; after a fatal one the connection is closed."""
         self._hub.metrics.errors.labels(code).inc()
-        return error_content(code, sentence, fatal=fatal)
-
-    async def _talk(self) -> None:
-        if not await self._greeted():
-            return
-        talking: list[Coroutine[Any, Any, None]] = [self._receive(), self._send()]
-        if self._hello.rate_hz > 0.0:
-            talking.append(self._tick(1.0 / self._hello.rate_hz))
-        tasks = [asyncio.create_task(one) for one in talking]
-        try:
-            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            for task in tasks:
-                task.cancel()
-            self._hub.close(self._opened)
-            for result in await asyncio.gather(*tasks, return_exceptions=True):
-                if isinstance(result, Exception) and not isinstance(result, GONE):
-                    self._hub.trouble["connection"] = f"{type(result).__name__}: {result}"
+        return {"type": "error", "code": code, "message": sentence, "fatal": fatal}
 
     def leave(self, code: str, sentence: str) -> None:
         """End the connection with an error, from outside."""
@@ -181,9 +153,8 @@ class Connection:
         self._note(code, sentence, fatal=True)
 
     async def _greeted(self) -> bool:
-        """Wait for a hello and answer it; say whether one came in time and was not refused for good."""
-        limits = self._hub.limits
-        latest_s = asyncio.get_running_loop().time() + limits.hello_s
+        """Wait for a hello and begin its session; say whether one came in time and was not refused for good."""
+        latest_s = asyncio.get_running_loop().time() + self._hub.limits.hello_s
         while True:
             try:
                 async with asyncio.timeout_at(latest_s):
@@ -192,9 +163,8 @@ class Connection:
                     raise WireError(
                         "too-large", f"the first message has {len(message)} bytes, {LARGE} are accepted"
                     )
-                self._hello = read_hello(decode(message))
-                self._opened = opened = await self._hub.open(self._hello, self.leave)
-                break
+                self._session = await self._hub.open(read_hello(decode(message)), self.leave)
+                return True
             except WireError as error:
                 final = error.code == "closing"
                 await self._write(self._error(error.code, str(error), fatal=final))
@@ -205,21 +175,33 @@ class Connection:
             except TimeoutError:
                 self._end = (POLICY, "no hello came in time")
                 return False
-        accepted = {name: value for name, value in limits._asdict().items() if name != "sessions"}
+
+    async def _talk(self) -> None:
+        """Receive, step and send at once; each of them ends all by what it raises."""
         try:
-            await self._write(welcome(self._hello, opened.chain, opened.restored, accepted))
-        except BaseException:  # it has left meanwhile
-            self._hub.close(opened)
-            raise
-        return True
+            limits = self._hub.limits._asdict()
+            del limits["sessions"]
+            await self._write(self._session.welcome() | {"limits": limits})
+            async with asyncio.TaskGroup() as talking:
+                talking.create_task(self._receive())
+                talking.create_task(self._send())
+                if self._session.hello.rate_hz > 0.0:
+                    talking.create_task(self._tick(1.0 / self._session.hello.rate_hz))
+        except* GONE:
+            pass
+        except* Exception as errors:
+            error = errors.exceptions[0]
+            self._hub.trouble["connection"] = f"{type(error).__name__}: {error}"
+        finally:
+            self._hub.close(self._session)
 
     async def _receive(self) -> None:
-        """Take messages until one says goodbye; a robot that owes is not read until it owes nothing."""
+        """Take messages until one is a goodbye; a robot that owes is not read until it owes nothing."""
         n_taken = 0
         while True:
             try:
                 message = await self._received()
-                now_s = self._opened.received_s = monotonic()
+                now_s = self._session.received_s = monotonic()
                 self._hub.metrics.messages.inc()
                 n_taken += 1
                 if n_taken % TURN == 0:
@@ -232,11 +214,11 @@ class Connection:
                 content = await self._decoded(message)
                 kind = str(content.get("type"))
                 if kind == "bye":
-                    return
+                    raise WebSocketDisconnect
                 if kind != "samples":
                     raise WireError("unknown-type", f"there is no message of the type {kind[:40]!r}")
                 self._take(content, now_s)
-                if self._hello.rate_hz == 0.0 and content.get("step") is True:
+                if self._session.hello.rate_hz == 0.0 and content.get("step") is True:
                     time_s = number(content.get("time_s"))
                     self._run(time_s if math.isfinite(time_s) else None)
             except WireError as error:
@@ -255,9 +237,9 @@ class Connection:
 
     def _take(self, content: dict[str, Any], now_s: float) -> None:
         """Take the samples of a message; what is refused of it is named in one error, the rest is used."""
-        inbox = self._opened.chain.inbox
+        inbox = self._session.inbox
         before = inbox.refused.copy()
-        n_rows = self._opened.chain.put(content.get("streams"), content.get("twist"), now_s)
+        n_rows = self._session.put(content.get("streams"), content.get("twist"), now_s)
         self._budgets.spend(now_s, rows=n_rows)
         self._hub.metrics.rows.inc(n_rows)
         if refused := inbox.refused - before:
@@ -277,8 +259,8 @@ class Connection:
             self._run()
 
     def _run(self, time_s: float | None = None) -> None:
-        metrics, chain, begun_s = self._hub.metrics, self._opened.chain, perf_counter()
-        output = chain.step(time_s=time_s)
+        metrics, begun_s = self._hub.metrics, perf_counter()
+        output = self._session.step(time_s=time_s)
         metrics.step_s.observe(perf_counter() - begun_s)
         metrics.steps.inc()
         if not math.isnan(output.latency_s):
@@ -286,13 +268,13 @@ class Connection:
         if output.status is not CommandStatus.OK:
             metrics.stopped.labels(output.status.value).inc()
         if output.status is CommandStatus.FAILED:
-            self._hub.trouble[f"session {self._opened.name}"] = chain.failure
-        for window in chain.finished:
+            self._hub.trouble[f"session {self._session.hello.session}"] = output.failure
+        for window in output.windows:
             metrics.window_s.observe(window.took_s)
             metrics.windows.labels(window.terrain or "refused").inc()
         if self._step is not None:
             metrics.unsent.inc()
-        self._step = self._opened.last = output
+        self._step = output
         self._changed.set()
 
     async def _send(self) -> None:
@@ -305,14 +287,14 @@ class Connection:
                     note = self._notes.popleft()
                     await self._write(note)
                     if note["fatal"]:
-                        return
+                        raise WebSocketDisconnect
                 output, self._step = self._step, None
                 if output is not None:
-                    await self._write(step_content(output))
+                    await self._write(output.content())
             except TimeoutError:
                 self._end = (TRY_AGAIN_LATER, "the receiver did not read for too long")
                 self._hub.metrics.errors.labels("too-slow").inc()
-                return
+                raise
 
     def _drop(self, most: str) -> None:
         """Count a message that comes too fast; those of a twentieth of a second are named in one error."""
@@ -328,3 +310,29 @@ class Connection:
     def _note(self, code: str, sentence: str, *, fatal: bool = False) -> None:
         self._notes.append(self._error(code, sentence, fatal=fatal))
         self._changed.set()
+
+
+def read_hello(content: dict[str, Any]) -> Hello:
+    """Return a hello.
+
+    Raises
+    ------
+    WireError
+        if it is none, or something in it is not accepted; the sentence names the first thing that is not.
+
+    Examples
+    --------
+    >>> hello = {"type": "hello", "session": "r7", "robot": "husky", "streams": {"imu": ["gyro_z_radps"]}}
+    >>> read_hello(hello).rate_hz
+    10.0
+    >>> read_hello({"type": "samples"})
+    Traceback (most recent call last):
+    pipelines.serve.wire.WireError: the first message is of the type 'samples', a hello is required
+    """
+    if content.get("type") != "hello":
+        kind = str(content.get("type"))[:40]
+        raise WireError("hello-first", f"the first message is of the type {kind!r}, a hello is required")
+    try:
+        return Hello.model_validate(content)
+    except ValidationError as error:
+        raise WireError("malformed", f"hello: {first_fault(error)}"[:300]) from None

@@ -90,11 +90,6 @@ def required_token(host: str, file: Path | None) -> str:
     return token
 
 
-def token_fits(required: str, given: str) -> bool:
-    """Say whether a token is the required one, in a time that does not tell how much of it is right."""
-    return not required or hmac.compare_digest(required.encode(), given.encode("utf-8", "replace"))
-
-
 def bearer(headers: Mapping[str, str]) -> str:
     """Return the token of an ``Authorization: Bearer`` header; empty without one."""
     kind, _, token = headers.get("authorization", "").partition(" ")
@@ -161,7 +156,7 @@ class Guard:
         app, given = self._app, bearer(headers)
         if reason := foreign(headers, loopback=self._loopback):
             app = PlainTextResponse(f"{reason}\n", 403)
-        elif ((is_http and scope["path"] not in self._open) or given) and not token_fits(self._token, given):
+        elif ((is_http and scope["path"] not in self._open) or given) and not self.admits(given):
             await self.wrong_token()
             app = PlainTextResponse("a token is required (Authorization: Bearer)\n", 401)
 
@@ -185,6 +180,11 @@ class Guard:
             await app(scope, receive, send)
         finally:
             connection.abort_in(FLUSH_S)
+
+    def admits(self, given: str) -> bool:
+        """Say whether a token is the required one, in a time that does not tell how much of it is right."""
+        required = self._token.encode()
+        return not required or hmac.compare_digest(required, given.encode("utf-8", "replace"))
 
     async def wrong_token(self) -> None:
         """Count a token that is missing or another, and let who gave it wait."""

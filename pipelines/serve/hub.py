@@ -5,18 +5,15 @@ from __future__ import annotations
 import asyncio
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic
 from typing import Any, NamedTuple
 
 from pipelines.live.classifying import ClassifierThread
 from pipelines.live.model import LiveModel
-from pipelines.live.recording import RecordingThread, SessionRecorder
-from pipelines.live.session import RobotSession, Served, StepOutput
+from pipelines.live.recording import RecordingThread
+from pipelines.live.session import Hello, RobotSession, Served
 from pipelines.live.state import LiveState, load_state, save_state
-from pipelines.serve.messages import Hello, served_content, step_content
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.wire import WireError
 from terrain.control.slip_table import SlipTable
@@ -62,30 +59,6 @@ class Limits(NamedTuple):
 LIMITS = Limits()
 
 
-@dataclass(eq=False)
-class OpenSession:
-    """A session and who is connected to it."""
-
-    name: str
-    chain: RobotSession
-    restored: LiveState | None
-    leave: Callable[[str, str], None]
-    received_s: float = field(default_factory=monotonic)
-    last: StepOutput | None = None
-
-    def content(self) -> dict[str, Any]:
-        """Return what is shown of it."""
-        chain = self.chain
-        return {
-            "session": self.name,
-            "robot": chain.request.robot,
-            "control": chain.request.control,
-            "terrain": chain.belief.terrain or None,
-            "recording": chain.recording,
-            "dropped": chain.dropped,
-        }
-
-
 class Hub:
     """Sessions of robots on one model and table.
 
@@ -113,7 +86,7 @@ class Hub:
     ) -> None:
         self.served, self.limits, self.metrics = served, limits, Metrics()
         self.metrics.served.set(served.number)
-        self.sessions: dict[str, OpenSession] = {}
+        self.sessions: dict[str, RobotSession] = {}
         self.changing = asyncio.Lock()
         self.closing = False
         self.trouble: dict[str, str] = {}
@@ -129,7 +102,7 @@ class Hub:
         except ConfigError:
             return None
 
-    async def open(self, hello: Hello, leave: Callable[[str, str], None]) -> OpenSession:
+    async def open(self, hello: Hello, leave: Callable[[str, str], None]) -> RobotSession:
         """Begin a session.
 
         Parameters
@@ -154,40 +127,38 @@ class Hub:
             if len(self.sessions) >= self.limits.sessions:
                 raise WireError("too-many", f"{self.limits.sessions} sessions are open, no more are accepted")
             try:
-                chain, restored = await asyncio.to_thread(self._begin, hello)
+                opened = await asyncio.to_thread(self._begin, hello, leave)
                 if hello.record and self._recording is not None:
-                    chain.record(self._recorder(hello, *self._recording))
+                    opened.record(*self._recording)
             except (ConfigError, DataError, LogError) as error:
                 raise WireError("refused", str(error)) from None
-            opened = self.sessions[hello.session] = OpenSession(hello.session, chain, restored, leave)
+            self.sessions[hello.session] = opened
         self.metrics.opened.inc()
         self.metrics.sessions.set(len(self.sessions))
         return opened
 
-    def _begin(self, hello: Hello) -> tuple[RobotSession, LiveState | None]:
-        chain = RobotSession(hello.request, self.served, self.robot(hello.robot), self._thread)
+    def _begin(self, hello: Hello, leave: Callable[[str, str], None]) -> RobotSession:
+        opened = RobotSession(hello, self.served, self.robot(hello.robot), self._thread, leave)
         state = self._left.get(hello.session)
         if state is None and self._folder is not None:
             try:
                 state = load_state(self._folder / f"{hello.session}.json")
             except DataError as error:  # a damaged state is none
                 self.trouble[f"state of {hello.session}"] = str(error)
-        return chain, None if state is None else chain.restore(state)
+        if state is not None:
+            opened.restore(state)
+        return opened
 
-    def _recorder(self, hello: Hello, folder: Path, writer: RecordingThread) -> SessionRecorder:
-        robot, name = self.robot(hello.robot), f"{hello.session}_{datetime.now(UTC):%Y%m%d_%H%M%S}"
-        wheels = robot.wheels if robot is not None and hello.control else ()
-        return SessionRecorder(folder, name, hello.robot, hello.request.channels, wheels, writer=writer)
-
-    def close(self, opened: OpenSession) -> None:
+    def close(self, opened: RobotSession) -> None:
         """End a session; its state is kept for the robot's return."""
-        if self.sessions.get(opened.name) is not opened:
+        name = opened.hello.session
+        if self.sessions.get(name) is not opened:
             return
-        del self.sessions[opened.name]
-        opened.chain.end()
+        del self.sessions[name]
+        opened.end()
         self.metrics.sessions.set(len(self.sessions))
-        self._left[opened.name] = opened.chain.state()
-        self._left.move_to_end(opened.name)
+        self._left[name] = opened.state()
+        self._left.move_to_end(name)
         while len(self._left) > REMEMBERED:
             self._left.popitem(last=False)
 
@@ -196,14 +167,14 @@ class Hub:
         opened = self.sessions.get(session) or next(iter(self.sessions.values()), None)
         shown = None
         if opened is not None:
-            robot = self.robot(opened.chain.request.robot)
+            robot = self.robot(opened.hello.robot)
             shown = opened.content() | {
                 "wheels": () if robot is None else robot.wheels,
-                "step": None if opened.last is None else step_content(opened.last),
+                "step": None if opened.last is None else opened.last.content(),
             }
         return {
             "sessions": list(self.sessions),
-            "served": served_content(self.served),
+            "served": self.served.content(),
             "trouble": list(self.trouble.values()),
             "session": shown,
         }
@@ -217,20 +188,20 @@ class Hub:
             if they do not suit a session, which the sentence names; nothing has changed then.
         """
         served = Served(self.served.number + 1, model, model_name, table)
-        for opened in self.sessions.values():
+        for name, opened in self.sessions.items():
             try:
-                opened.chain.check(served)
+                opened.check(served)
             except (ConfigError, DataError) as error:
-                raise DataError(f"session {opened.name!r}: {error}") from None
+                raise DataError(f"session {name!r}: {error}") from None
         for opened in self.sessions.values():
-            opened.chain.swap(served)
+            opened.swap(served)
         self.served = served
         self.metrics.served.set(served.number)
         return served
 
     def states(self) -> dict[str, LiveState]:
         """Return the states of all robots that are or were connected."""
-        return {**self._left, **{name: opened.chain.state() for name, opened in self.sessions.items()}}
+        return {**self._left, **{name: opened.state() for name, opened in self.sessions.items()}}
 
     def save_states(self, states: dict[str, LiveState]) -> None:
         """Write states to the folder, if there is one; one that cannot be written is named in ``trouble``."""

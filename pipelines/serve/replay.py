@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from threading import Event
 from time import perf_counter
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,33 +13,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from features.windows import label_windows
+from pipelines import report as reports
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.settings import ReadSettings, load
 from pipelines.live.chain import Chain
-from pipelines.live.classifying import Classifier
 from pipelines.live.model import LiveModel
-from pipelines.live.observer import Observer
-from pipelines.live.pilot import LivePilot
-from pipelines.live.windows import filtered, needs_filter
-from pipelines.report import (
-    Column,
-    Figure,
-    Panel,
-    Progress,
-    Report,
-    Result,
-    Section,
-    Strip,
-    Table,
-    Text,
-    described,
-    format_counts,
-    format_value,
-    plural,
-    silent,
-)
+from pipelines.live.session import chain_of
+from pipelines.live.windows import needs_filter
+from pipelines.report import Progress, Result, described, format_value, silent
 from pipelines.report.stopping import stopping
-from pipelines.serve.serve import Settings
+from pipelines.serve.serve import Settings, loaded
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError
@@ -118,11 +101,15 @@ def replayed(
 ) -> dict[str, Any]:
     """Return the figures of windows, of which those are judged whose label is a class of the model."""
     right = [each.terrain == each.label for each in windows if not each.refused and each.label in classes]
-    accuracy, ratio = (
-        float(np.mean(right)) if right else None,
-        duration_s / elapsed_s if elapsed_s else math.nan,
-    )
-    return asdict(Replayed(len(windows), accuracy, len(right), duration_s, elapsed_s, ratio, interrupted))
+    return {
+        "n_windows": len(windows),
+        "accuracy": float(np.mean(right)) if right else None,
+        "n_judged": len(right),
+        "duration_s": duration_s,
+        "elapsed_s": elapsed_s,
+        "times_real_time": duration_s / elapsed_s if elapsed_s else math.nan,
+        "interrupted": interrupted,
+    }
 
 
 @dataclass(frozen=True)
@@ -170,11 +157,7 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
         if the log, the model or the table cannot be read, or do not fit each other.
     """
     assert settings.replay is not None
-    table, model = load_slip_table(settings.table), None
-    if settings.model is not None:
-        from pipelines.learn.load import load_model
-
-        model = filtered(load_model(settings.model), settings.filter_stride_s)
+    table, model = load_slip_table(settings.table), loaded(settings, settings.model)
     classes = () if model is None else model.info.classes
     read = {name: getattr(settings, name) for name in ("robot", *ReadSettings.model_fields)}
     logs, skipped = load(InspectSettings(data=settings.replay, **read))
@@ -183,7 +166,7 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     stop = Event()
     with stopping(stop.set):
         for each in logs:
-            chain = chain_of(each, model, table, robot)
+            chain = chain_of_run(each, model, table, robot)
             runs.append(replay_run(each, chain, settings, classes, progress, stop))
             if runs[-1].interrupted:
                 break
@@ -199,7 +182,7 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     )
 
 
-def chain_of(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robot | None = None) -> Chain:
+def chain_of_run(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robot | None = None) -> Chain:
     """Return the live chain of a run's robot.
 
     Parameters
@@ -226,19 +209,18 @@ def chain_of(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robo
     except ConfigError:
         if model is None or needs_filter(model.info, channels):
             raise
+    pilot = None
     if found is not None and found.drive == "swerve":
+        pilot = PilotSettings(follows=False)  # another controller drove when the log was written
         for name in channels.keys() & CHANNELS.keys():
-            lacking = [channel for channel in CHANNELS[name] if channel not in channels[name]]
-            if set(lacking) - {UNNEEDED}:
+            if lacking := [each for each in CHANNELS[name] if each not in (*channels[name], UNNEEDED)]:
                 raise DataError(
                     f"run {run.run_id}: stream {name} has no channel {lacking[0]!r} for the pilot"
                 )
-        settings = PilotSettings(follows=False)  # another controller drove when the log was written
-        return LivePilot(found, table, Classifier(model, found), settings, channels=channels)
-    if model is None:
+    elif model is None:
         raise ConfigError(f"run {run.run_id}: robot {run.robot!r} has no pilot: give a model with --model")
     try:
-        return Observer(model, table, found, channels)
+        return chain_of(found, channels, model, table, pilot)
     except (ConfigError, DataError) as error:
         raise DataError(f"run {run.run_id}: {error}") from error
 
@@ -265,7 +247,7 @@ def replay_run(
     stop = stop or Event()
     windows: list[ObservedWindow] = []
     believed: Counter[str] = Counter()
-    passed_s, start_s, last, interrupted = 0.0, math.nan, ("", ""), False
+    passed_s, start_s, interrupted = 0.0, math.nan, False
     end_s = max(stream.time_s[-1] for stream in run.streams.values())
     begin_s = perf_counter()
     for sample in replay(run, settings.rate_hz):
@@ -283,9 +265,9 @@ def replay_run(
             label = label_windows(run, np.array([output.start_s]), output.end_s - output.start_s)[0] or None
             known = output.start_s, output.end_s, output.terrain, output.probability, output.refused
             window = ObservedWindow(*known, belief, chain.target_ratio, label)
-            if not windows or (window.terrain, window.believed) != last:
+            before = windows[-1] if windows else None
+            if before is None or (window.terrain, window.believed) != (before.terrain, before.believed):
                 print(printable(f"{run.run_id}  {window}"), flush=True)
-            last = window.terrain, window.believed
             windows.append(window)
     elapsed_s = perf_counter() - begin_s
     counts = Counter(window.terrain for window in windows if not window.refused)
@@ -303,50 +285,34 @@ def replay_run(
     )
 
 
-def report(result: ReplayResult) -> Report:
+def report(result: ReplayResult) -> reports.Report:
     """Return what was found in the runs and how fast, a row a run, and what the chains did not use."""
     accuracy = (
         f", {format_value(result.accuracy, PERCENT)} of {result.n_judged} with a label classified rightly"
         if result.accuracy is not None
         else ""
     )
-    columns = (
-        Column("run"),
-        Column("length", ".1f", "s"),
-        Column("windows"),
-        Column("accuracy", PERCENT),
-        Column("times real time", ".0f"),
-        Column("terrain"),
-        Column("believed"),
-    )
-    rows = [
-        (
-            run.run_id,
-            run.duration_s,
-            run.n_windows,
-            run.accuracy,
-            run.times_real_time,
-            _fractions(run.terrains),
-            _fractions(run.believed),
-        )
-        for run in result.runs
-    ]
     panels = [
-        Panel([Strip([(w.start_s, w.end_s, w.believed or UNKNOWN) for w in run.windows])], title=run.run_id)
+        reports.Panel(
+            [reports.Strip([(w.start_s, w.end_s, w.believed or UNKNOWN) for w in run.windows])],
+            title=run.run_id,
+        )
         for run in result.runs[:MAX_STRIPS]
         if run.windows
     ]
-    unused = [f"{run.run_id}: not used {format_counts(run.dropped)}" for run in result.runs if run.dropped]
-    notes = [Text(f"skipped: {sentence}", "warning") for sentence in result.skipped]
+    unused = [
+        f"{run.run_id}: not used {reports.format_counts(run.dropped)}" for run in result.runs if run.dropped
+    ]
+    notes = [reports.Text(f"skipped: {sentence}", "warning") for sentence in result.skipped]
     if result.interrupted:
-        notes.insert(0, Text("stopped before the end", "note"))
-    return Report(
+        notes.insert(0, reports.Text("stopped before the end", "note"))
+    return reports.Report(
         "Replay of a log",
-        f"{plural(result.n_windows, 'window')} in {format_value(result.duration_s, '.1f', 's')} of driving{accuracy}; "
-        f"{format_value(result.times_real_time, '.0f')} times real time.",
-        picture=Figure("Terrain that was believed", panels, x_label="time in s") if panels else None,
-        parts=[Table(columns, rows), *notes],
-        details=[Section("Not used", [Text(each) for each in unused or ("nothing",)])],
+        f"{reports.plural(result.n_windows, 'window')} in {format_value(result.duration_s, '.1f', 's')} of driving"
+        f"{accuracy}; {format_value(result.times_real_time, '.0f')} times real time.",
+        picture=reports.Figure("Terrain that was believed", panels, x_label="time in s") if panels else None,
+        parts=[reports.table(result.runs, COLUMNS), *notes],
+        details=reports.sections(("Not used", unused or ("nothing",))),
         lead=f"model {result.model or 'none'}, table {result.table_name}",
         next_step=f"terrain serve --model {result.model}" if result.model else "terrain train --data RUNS",
     )
@@ -354,3 +320,14 @@ def report(result: ReplayResult) -> Report:
 
 def _fractions(found: Mapping[str, float]) -> str:
     return ", ".join(f"{terrain or UNKNOWN} {format_value(ratio, '.0%')}" for terrain, ratio in found.items())
+
+
+COLUMNS = (
+    reports.Shown("run", "run_id"),
+    reports.Shown("length", "duration_s", ".1f", "s"),
+    reports.Shown("windows", "n_windows"),
+    reports.Shown("accuracy", "accuracy", PERCENT),
+    reports.Shown("times real time", "times_real_time", ".0f"),
+    reports.Shown("terrain", lambda run: _fractions(run.terrains)),
+    reports.Shown("believed", lambda run: _fractions(run.believed)),
+)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import field_validator, model_validator
 
@@ -19,6 +19,9 @@ from pipelines.data.settings import ReadSettings
 from pipelines.report import Pairs, Progress, Report, Result, Section, described, enumerated, plural, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import option_name, setting
+
+if TYPE_CHECKING:
+    from pipelines.learn.model_file import TerrainModel
 
 EXAMPLE = "terrain serve --model models:/field@champion --robot agrimaro --state states/"
 
@@ -45,6 +48,16 @@ class ServedSettings(BaseSettings):
     rate_hz: float = setting(
         50.0, "Steps a second of the live chain on a bus or over a log.", "--rate", ge=1.0, le=1000.0
     )
+
+
+def loaded(settings: ServedSettings, name: str | None) -> TerrainModel | None:
+    """Return a model by its name, filtered over time where the settings have it so; None without a name."""
+    if name is None:
+        return None
+    from pipelines.learn.load import load_model
+    from pipelines.live.windows import filtered
+
+    return filtered(load_model(name), settings.filter_stride_s)
 
 
 class ServiceSettings(BaseSettings):

@@ -16,8 +16,8 @@ import pytest
 
 from pipelines.live.session import Served
 from pipelines.serve.client import ServiceError, TerrainClient
+from pipelines.serve.connection import read_hello
 from pipelines.serve.hub import Hub
-from pipelines.serve.messages import read_hello
 from terrain.control.slip_table import load_slip_table
 
 from .strangers import CHANNELS, ask, until
@@ -129,10 +129,10 @@ def test_a_session_that_is_beginning_leaves_nothing_behind_or_gets_the_model_tha
     hub = Hub(Served(1, mower_model, "one", load_slip_table()), recordings=tmp_path)
     begun, go_on, begin = threading.Event(), threading.Event(), hub._begin
 
-    def slowly(hello):
+    def slowly(*request):
         begun.set()
         assert go_on.wait(20.0)
-        return begin(hello)
+        return begin(*request)
 
     monkeypatch.setattr(hub, "_begin", slowly)
 
@@ -151,7 +151,7 @@ def test_a_session_that_is_beginning_leaves_nothing_behind_or_gets_the_model_tha
         await asyncio.wait([opening, replacing])
 
     asyncio.run(changes())
-    names = [opened.chain.served.model_name for opened in hub.sessions.values()]
+    names = [opened.served.model_name for opened in hub.sessions.values()]
     hub.stop()
     assert names == ([] if leaves else ["two"])
     assert list(tmp_path.iterdir()) == []

@@ -14,7 +14,7 @@ import pytest
 from pipelines.learn.model_file import write_model
 from pipelines.learn.predict import predict
 from pipelines.live.pilot import LivePilot
-from pipelines.serve.replay import chain_of, replay_run
+from pipelines.serve.replay import chain_of_run, replay_run
 from pipelines.serve.serve import Settings
 from pipelines.serve.serve import run as serve
 from terrain.control.pilot_settings import PilotSettings
@@ -48,7 +48,7 @@ def replayed(run, model, stop_at_s=np.inf, **settings):
         if done >= stop_at_s:
             stop.set()
 
-    chain, classes = chain_of(run, model, TABLE), () if model is None else model.info.classes
+    chain, classes = chain_of_run(run, model, TABLE), () if model is None else model.info.classes
     return replay_run(run, chain, Settings(replay="a log", **settings), classes, progress, stop), moments
 
 
