@@ -29,8 +29,7 @@ from pipelines.report import (
     format_value,
     silent,
 )
-from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
+from pipelines.report.settings import JobsSettings, setting
 from terrain.errors import DataError
 
 if TYPE_CHECKING:
@@ -46,14 +45,13 @@ SIMULATED = "simulated AgriMaRo"
 REPEATS = 1
 
 
-class Settings(BaseSettings):
+class Settings(JobsSettings):
     """Which runs are used, where the report goes, and under which name the model is registered."""
 
     data: Path | None = setting(None, "Folder of labelled runs; without, runs are simulated.")
     out: Path = setting(Path("terrain-report"), "Folder of the runs and the report.")
     name: str = setting("quickstart", "Name of the registered model.")
     seed: int = setting(0, "Deals runs into folds; of the simulation, too.", ge=0)
-    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
     merge_duplicates: bool = setting(
         False, "Treat runs that hold the same measurements as one run instead of refusing them."
     )

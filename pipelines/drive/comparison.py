@@ -185,7 +185,7 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
     ) -> dict[str, list[Drive]]:
         """Return the drives of each controller, one a seed, in as many processes as the settings say."""
         jobs = [(inputs.of(each), each, seed) for each in controllers for seed in settings.all_seeds]
-        found = parallel(_drive_one, (settings,), jobs, min(settings.n_jobs, len(jobs)))
+        found = parallel(_drive_one, (settings,), jobs, min(settings.jobs, len(jobs)))
         drives, n = [*counted(found, len(jobs), task, progress)], len(settings.all_seeds)
         return {each.name: drives[n * place : n * place + n] for place, each in enumerate(controllers)}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from pipelines.report.settings import JobsSettings, option_name, setting
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import option_name, setting
 from terrain.control.controllers import CONTROLLERS, KINDS, uses_classifier
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ ALL = "all"
 Ratio = Annotated[float, Field(ge=0.5, le=2.0)]
 
 
-class DrivenSettings(BaseSettings):
+class DrivenSettings(JobsSettings):
     """Robot, terrain and seeds."""
 
     robot: str = setting("agrimaro", "Robot by name, or its YAML file; a car-like one with --path.")
@@ -54,12 +53,6 @@ class DrivenSettings(BaseSettings):
     )
     first_seed: int = setting(0, "First seed.", option="--seed", ge=0)
     out: Path | None = setting(None, "Folder of the page, with --path also of the table of the drive.")
-    jobs: int = setting(0, "Processes at once; 0 for one a core.", ge=0)
-
-    @property
-    def n_jobs(self) -> int:
-        """Number of processes."""
-        return self.jobs or os.cpu_count() or 1
 
 
 class ComparisonSettings(BaseSettings):
@@ -211,7 +204,7 @@ class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
             raise ValueError("--faults and --path are two kinds of drives: give one of them")
         if self.path is not None:
             self._refuse(
-                (*ComparisonSettings.model_fields, "terrain", "table", "seeds", "jobs"), "without --path"
+                (*ComparisonSettings.model_fields, "terrain", "table", "seeds", "n_jobs"), "without --path"
             )
         elif self.faults:
             self._refuse((*ComparisonSettings.model_fields, "speed_mps"), "without --faults")

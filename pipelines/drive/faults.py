@@ -190,7 +190,7 @@ def drive_faults(
     chosen, places, loop = _chosen_faults(settings, robot), _places(settings), fault_loop(robot, slips)
 
     def computed(task: str, function: Callable[..., Any], tasks: Sequence[Sequence[Any]]) -> list[Any]:
-        found = parallel(function, (loop,), tasks, min(settings.n_jobs, len(tasks)))
+        found = parallel(function, (loop,), tasks, min(settings.jobs, len(tasks)))
         return [*counted(found, len(tasks), task, progress)]
 
     made = computed("drive without faults", drive_references, [(place,) for place in places])

@@ -8,19 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report import (
-    Column,
-    Part,
-    Progress,
-    Report,
-    Result,
-    Table,
-    Text,
-    described,
-    format_value,
-    plural,
-    silent,
-)
+from pipelines.learn.parallel import counted
+from pipelines.report import Progress, Result, described, format_value, plural, silent, tree
 from terrain.measured_slip.ground_changes import WatchedRun, quiet_detector, watch
 from terrain.measured_slip.measure import one_robot
 from terrain.records import RunLog
@@ -53,9 +42,8 @@ class ChangesResult(Result):
         """Return a row a change."""
         import pandas as pd
 
-        return pd.DataFrame(
-            [{"run_id": run.run_id, **each._asdict()} for run in self.runs for each in run.changes]
-        )
+        changes = [{"run_id": run.run_id, **each._asdict()} for run in self.runs for each in run.changes]
+        return pd.DataFrame(changes)
 
 
 def find_changes(
@@ -82,10 +70,8 @@ def find_changes(
     """
     described_robot = one_robot([*runs, *quiet], None if robot is None else load_robot(robot))
     detector = quiet_detector(quiet, runs, described_robot, false_alarms)
-    watched = []
-    for done, run in enumerate(runs, start=1):
-        watched.append(watch(run, described_robot, detector))
-        progress("watch", done, len(runs))
+    found = (watch(run, described_robot, detector) for run in runs)
+    watched = [*counted(found, len(runs), "watch", progress)]
     with_step = [run for run in watched if run.step is not None]
     without = [run for run in watched if run.judged and run.step is None]
     delays = np.array([run.delay_s for run in with_step if run.found])
@@ -104,18 +90,14 @@ def find_changes(
     )
 
 
-def report(result: ChangesResult) -> Report:
+def report(result: ChangesResult) -> tree.Report:
     """Return the alarms of each run, and how many changes were found how fast."""
-    n_alarms = sum(len(run.changes) for run in result.runs)
-    answer = (
-        f"{plural(n_alarms, 'change')} of the ground in {plural(len(result.runs), 'run')} of {result.robot}"
-    )
+    n_alarms, n_runs = sum(len(run.changes) for run in result.runs), len(result.runs)
+    answer = f"{plural(n_alarms, 'change')} of the ground in {plural(n_runs, 'run')} of {result.robot}"
     notes = []
     if result.n_steps:
-        found = format_value(result.found_ratio, ".1%")
-        answer += (
-            f"; of {plural(result.n_steps, 'change')} that a measurement from outside shows, {found} found"
-        )
+        steps, found = plural(result.n_steps, "change"), format_value(result.found_ratio, ".1%")
+        answer += f"; of {steps} that a measurement from outside shows, {found} found"
         notes.append(
             f"alarms come {format_value(result.delay_median_s, '+.2f', 's')} after the middle of the crossing in "
             f"the median, {format_value(result.delay_p90_s, '+.2f', 's')} at nine tenths"
@@ -125,37 +107,34 @@ def report(result: ChangesResult) -> Report:
             f"slip does not change in {result.n_without_step} runs; {result.n_alarms_without_step} of them "
             "have an alarm"
         )
-    rows = [
-        (
-            run.run_id,
-            ", ".join(f"{change.alarm_s:.2f}" for change in run.changes) or "none",
-            *(
-                ("no change" if run.judged else "not measured", None, None)
-                if run.step is None
-                else (f"{run.step.before:.2f} to {run.step.after:.2f}", run.step.time_s, run.delay_s)
-            ),
-            run.n_early,
-        )
-        for run in result.runs
-    ]
     columns = (
-        "run",
-        Column("alarms", unit="s"),
-        "slip measured from outside",
-        Column("changes at", ".2f", "s"),
-        Column("delay", "+.2f", "s"),
-        "early",
+        tree.Shown("run", "run_id"),
+        tree.Shown(
+            "alarms", lambda run: ", ".join(f"{c.alarm_s:.2f}" for c in run.changes) or "none", "", "s"
+        ),
+        tree.Shown("slip measured from outside", _slip_words),
+        tree.Shown("changes at", "step.time_s", ".2f", "s"),
+        tree.Shown("delay", "delay_s", "+.2f", "s"),
+        tree.Shown("early", "n_early"),
     )
-    more = f"{len(rows) - MAX_ROWS} runs more: --details" if len(rows) > MAX_ROWS else ""
-    parts: list[Part] = [Table(columns, rows[:MAX_ROWS], note=more)]
-    return Report(
+    more = f"{n_runs - MAX_ROWS} runs more: --details" if n_runs > MAX_ROWS else ""
+    return tree.Report(
         title=f"Changes of the ground under {result.robot}",
         answer=f"{answer}.",
         lead=(
             f"threshold {format_value(result.threshold, '.1f')}, exceeded in "
             f"{format_value(result.false_alarm_ratio, '.1%')} of {result.n_calibration_runs} runs on one ground"
         ),
-        parts=[*parts, *(Text(text, "note") for text in (*notes, *result.skipped))],
-        details=[],
-        next_step="terrain label --data runs/ --propose",
+        parts=[
+            tree.table(result.runs[:MAX_ROWS], columns, note=more),
+            *(tree.Text(text, "note") for text in (*notes, *result.skipped)),
+        ],
+        details=tree.sections(("All runs", [tree.table(result.runs, columns)] if more else [])),
+        next_step="terrain label runs/ --run ID --from S --to S --terrain NAME",
     )
+
+
+def _slip_words(run: WatchedRun) -> str:
+    if run.step is None:
+        return "no change" if run.judged else "not measured"
+    return f"{run.step.before:.2f} to {run.step.after:.2f}"

@@ -2,43 +2,36 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from pydantic import model_validator
+from pydantic import ConfigDict, TypeAdapter, ValidationError, model_validator
 
-from pipelines.report import (
-    Column,
-    Progress,
-    Report,
-    Result,
-    Section,
-    Table,
-    Text,
-    described,
-    enumerated,
-    plural,
-    silent,
-)
+from pipelines.report import Progress, Result, described, enumerated, plural, silent, tree
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
-from terrain.errors import ConfigError, DataError
-from terrain.files.names import plain_name
+from terrain.errors import ConfigError, DataError, LogError
+from terrain.files.names import plain_name, shown
 
 if TYPE_CHECKING:
-    from pipelines.learn.model_file import TerrainModel
     from terrain.classify.proposals import LabelSource, Proposal
     from terrain.logs.recorded_windows import DoubtfulWindow, RunWindows
-    from terrain.records import Label, RunLog
+    from terrain.records import Label
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
 
 SOURCES_FILE = "label_sources.json"
 """Beside a run: where each of its labels comes from."""
+
+TOLERANCE_S = 0.5
+"""A stretch of a table may be that far outside of its run, and reach into the next one."""
 
 
 class Settings(BaseSettings):
@@ -46,8 +39,10 @@ class Settings(BaseSettings):
 
     data: Path = setting(..., "A run folder, or a folder of run folders.", option="FOLDER")
     run: str | None = setting(None, "Id of the run that is listed or labelled.")
-    from_s: float | None = setting(None, "Start of the label in s, on the clock of the run.", option="--from")
-    to_s: float | None = setting(None, "End of the label in s.", option="--to")
+    from_s: float | None = setting(
+        None, "Start of the label in s, on the clock of the run.", "--from", allow_inf_nan=False
+    )
+    to_s: float | None = setting(None, "End of the label in s.", "--to", allow_inf_nan=False)
     whole: bool = setting(False, "Label the whole run.", option="--all")
     terrain: str | None = setting(None, "Terrain that the label names; an empty one removes labels.")
     remove: bool = setting(False, "Remove labels in place of setting one.")
@@ -64,43 +59,42 @@ class Settings(BaseSettings):
         """Whether labels are changed."""
         return self.remove or self.terrain is not None
 
-    @property
-    def new_terrain(self) -> str:
-        """Terrain of the label; empty where labels are removed."""
-        return "" if self.remove else (self.terrain or "")
-
-    @model_validator(mode="after")
-    def _check_proposals(self) -> Self:
-        if self.model is not None and (self.answers is not None or self.sets):
-            raise ConfigError("--model proposes labels: leave out --answers, --terrain and --remove")
-        if (self.answers is None) != (self.out is None):
-            raise ConfigError("--answers FILE sets labels in the new folder --out DIR: give both")
-        return self
-
     @model_validator(mode="after")
     def _check(self) -> Self:
-        placed = self.whole or self.from_s is not None or self.to_s is not None
-        if placed and not self.sets:
-            raise ConfigError("an interval needs --terrain NAME, or --remove")
-        if not self.sets:
-            return self
-        if self.run is None:
-            raise ConfigError("a label needs --run ID")
-        if self.remove and self.terrain:
-            raise ConfigError("--terrain sets a label and --remove removes it: give one of the two")
-        if self.terrain and not plain_name(self.terrain):
-            raise ConfigError(f"--terrain is {self.terrain!r}: use letters, digits and ' ._+-'")
-        if self.whole == (self.from_s is not None and self.to_s is not None):
-            raise ConfigError("a label needs --from and --to in s, or --all for the whole run")
-        if self.whole and (self.from_s is not None or self.to_s is not None):
-            raise ConfigError("--all is the whole run: leave out --from and --to")
-        for option, value in (("--from", self.from_s), ("--to", self.to_s)):
-            if value is not None and not math.isfinite(value):
-                raise ConfigError(f"{option} is {value!r}, a time in s is required")
-        if self.from_s is not None and self.to_s is not None and not self.from_s < self.to_s:
-            raise ConfigError(
-                f"--from is {self.from_s:g} and --to {self.to_s:g}: the label ends before it starts"
-            )
+        begins, ends = self.from_s is not None, self.to_s is not None
+        proposed = self.model is not None and (self.answers is not None or self.sets)
+        refusals = (
+            (proposed, "--model proposes labels: leave out --answers, --terrain and --remove"),
+            (
+                (self.answers is None) != (self.out is None),
+                "--answers FILE sets labels in the new folder --out DIR: give both",
+            ),
+            (
+                (self.whole or begins or ends) and not self.sets,
+                "an interval needs --terrain NAME, or --remove",
+            ),
+            (self.sets and self.run is None, "a label needs --run ID"),
+            (
+                self.remove and self.terrain,
+                "--terrain sets a label and --remove removes it: give one of the two",
+            ),
+            (
+                self.terrain and not plain_name(self.terrain),
+                f"--terrain is {self.terrain!r}: use letters, digits and ' ._+-'",
+            ),
+            (
+                self.sets and self.whole == (begins and ends),
+                "a label needs --from and --to in s, or --all for the whole run",
+            ),
+            (self.whole and (begins or ends), "--all is the whole run: leave out --from and --to"),
+            (
+                self.from_s is not None and self.to_s is not None and self.from_s >= self.to_s,
+                f"--from is {self.from_s} and --to {self.to_s}: the label ends before it starts",
+            ),
+        )
+        for applies, sentence in refusals:
+            if applies:
+                raise ConfigError(sentence)
         return self
 
 
@@ -168,21 +162,18 @@ def run(
     from terrain.logs.recorded_windows import doubtful_windows
 
     if settings.model is not None:
-        from pipelines.learn.load import load_model
-
-        return propose_labels(settings, load_model(settings.model))
+        return propose_labels(settings, settings.model)
     if settings.answers is not None and settings.out is not None:
         return write_labels(settings, settings.answers, settings.out)
     if settings.sets and settings.run is not None:
-        terrain = settings.new_terrain
+        terrain = "" if settings.remove else settings.terrain or ""
         changed = set_label(settings.data, settings.run, terrain, settings.from_s, settings.to_s)
-        folder, start_s, end_s, labels = changed
-        return LabelResult(settings.run, folder, start_s, end_s, terrain, labels)
+        return LabelResult(run_id=settings.run, terrain=terrain, **changed._asdict())
     return DoubtfulResult(settings.data, *doubtful_windows(settings.data, settings.run))
 
 
-def propose_labels(settings: Settings, model: TerrainModel) -> ProposalsResult:
-    """Write the proposals of a model for the runs of a folder, the questions first.
+def propose_labels(settings: Settings, model_uri: str) -> ProposalsResult:
+    """Write the proposals of a model for the runs of a folder as CSV with empty answers, the questions first.
 
     Raises
     ------
@@ -190,26 +181,33 @@ def propose_labels(settings: Settings, model: TerrainModel) -> ProposalsResult:
         if there is no run, or a run lacks what the model requires.
     """
     from pipelines.data.datasets import load_runs
-    from pipelines.learn.predict import model_windows
-    from pipelines.learn.proposals import write_proposals
+    from pipelines.learn.load import load_model
     from pipelines.live.model import assess
-    from pipelines.live.windows import filter_of
+    from pipelines.live.windows import filter_of, windows_of_log
     from terrain.classify.proposals import propose, questions
+    from terrain.files.atomic import atomic_write
 
-    runs = load_runs(settings.data)
+    model, runs = load_model(model_uri), load_runs(settings.data)
+    of_model = model.info.classes, filter_of(model.info).prior
     proposals: list[Proposal] = []
     for run in runs:
-        windows = model_windows(run, model, skip_short=True).windows
+        windows = windows_of_log(run, model.info, skip_short=True).windows
         if len(windows):
             found = assess(model, windows)
             outputs = found.probability, found.supported, found.unknown
-            of_model = model.info.classes, filter_of(model.info).prior
             proposals += propose(run.run_id, windows.start_s, windows.length_s, *outputs, *of_model)
     if not proposals:
         raise DataError(f"{settings.data}: no run holds a window that the model classifies")
     asked = questions(proposals, settings.ask)
-    write_proposals(settings.proposals, proposals, asked)
-    taken = sum(each.taken_over(settings.accept) for i, each in enumerate(proposals) if i not in set(asked))
+    rest = [i for i in range(len(proposals)) if i not in set(asked)]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow((*proposals[0]._fields, "ask", "answer"))
+    for rank, i in [*enumerate(asked, 1), *(("", i) for i in rest)]:
+        row = [f"{each:.6g}" if isinstance(each, float) else each for each in proposals[i]]
+        writer.writerow([*row, rank, ""])
+    atomic_write(settings.proposals, text.getvalue())
+    taken = sum(proposals[i].taken_over(settings.accept) for i in rest)
     return ProposalsResult(settings.data, settings.proposals, len(runs), len(asked), taken, tuple(proposals))
 
 
@@ -227,54 +225,107 @@ def write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
     Raises
     ------
     LogError, ConfigError
-        as :func:`pipelines.learn.proposals.read_answers`; also if no label would be added.
+        as :func:`read_answers`; also if no label would be added.
     """
     from pipelines.data.datasets import load_runs
-    from pipelines.learn.proposals import read_answers
     from terrain.classify.proposals import LabelSource, label_of, with_label
     from terrain.files.atomic import atomic_folder
+    from terrain.logs.borealtc import whole_run_label
     from terrain.logs.write import write_run
     from terrain.records import Label
 
     if out.exists():
         raise ConfigError(f"{out}: exists already; the runs are written to a folder of their own")
     runs = load_runs(settings.data)
-    spans_s = {run.run_id: _span_s(run) for run in runs}
+    spans_s = {run.run_id: whole_run_label(run.streams, "")[:2] for run in runs}
     terrains = sorted({label.terrain for run in runs for label in run.labels})
     rows = read_answers(answers, spans_s, terrains, new_class=settings.new_class)
-    written: dict[str, tuple[LabelSource, ...]] = {}
+    labels = {run.run_id: [LabelSource(*label, "measured", None) for label in run.labels] for run in runs}
     left_open = 0
-    labelled = []
-    for run in runs:
-        labels = [LabelSource(*label, "measured", None) for label in run.labels]
-        for row in (row for row in rows if row.proposal.run_id == run.run_id):
-            added = label_of(row.proposal, row.answer, settings.accept)
-            if added is None:
-                left_open += not row.answer
-            else:
-                labels = with_label(labels, added)
-        written[run.run_id] = tuple(sorted(labels))
-        labelled.append(replace(run, labels=tuple(Label(*each[:3]) for each in written[run.run_id])))
-    if not any(each.source != "measured" for labels in written.values() for each in labels):
+    for proposal, answer in rows:
+        added = label_of(proposal, answer, settings.accept)
+        if added is None:
+            left_open += not answer
+        else:
+            labels[proposal.run_id] = with_label(labels[proposal.run_id], added)
+    counts = Counter(each.source for of_run in labels.values() for each in of_run)
+    if not set(counts) - {"measured"}:
         raise ConfigError(
             f"{answers}: no answer, and no proposal of a confidence of {settings.accept:g}, adds a label: "
             "nothing is written"
         )
+    written = {run_id: tuple(sorted(of_run)) for run_id, of_run in labels.items()}
     with atomic_folder(out) as folder:
-        for run in labelled:
-            sources = [each._asdict() for each in written[run.run_id]]
-            text = json.dumps({"labels": sources}, indent=2, allow_nan=False) + "\n"
-            write_run(run, folder, beside={SOURCES_FILE: text})
-    counts = Counter(each.source for labels in written.values() for each in labels)
+        for run in runs:
+            of_run = written[run.run_id]
+            sources = {"labels": [each._asdict() for each in of_run]}
+            text = json.dumps(sources, indent=2, allow_nan=False) + "\n"
+            labelled = replace(run, labels=tuple(Label(*each[:3]) for each in of_run))
+            write_run(labelled, folder, beside={SOURCES_FILE: text})
     return AnswersResult(out, len(runs), dict(sorted(counts.items())), left_open, written)
 
 
-def _span_s(run: RunLog) -> tuple[float, float]:
-    streams = run.streams.values()
-    return (
-        float(min(stream.time_s[0] for stream in streams)),
-        float(max(stream.time_s[-1] + 1.0 / stream.rate_hz for stream in streams)),
-    )
+def read_answers(
+    file: Path, spans_s: Mapping[str, tuple[float, float]], terrains: Sequence[str], *, new_class: bool
+) -> list[tuple[Proposal, str]]:
+    """Return the proposals of a table with their answers; an empty one leaves a proposal to its confidence.
+
+    Parameters
+    ----------
+    file : as :func:`propose_labels` writes it
+    spans_s : first and last time of each run that may be named
+    terrains : that may be answered beside those that are proposed
+    new_class : whether others may be answered, too
+
+    Raises
+    ------
+    LogError
+        if it is no such table.
+    ConfigError
+        if it names a run that is not there, stretches that overlap or lie outside of their run, or a terrain
+        that is not known.
+    """
+    from terrain.classify.proposals import NONE, YES
+
+    rows = _answer_rows(file)
+    known = {*terrains, *(proposal.terrain for proposal, _ in rows), YES, NONE, ""}
+    until_s: dict[str, float] = {}
+    for (run_id, start_s, end_s, *_), answer in sorted(rows, key=lambda row: row[0][:2]):
+        if run_id not in spans_s:
+            raise ConfigError(f"{file}: run {shown(run_id)} is none of those whose labels are set")
+        first_s, last_s = spans_s[run_id]
+        if not first_s - TOLERANCE_S <= start_s < end_s <= last_s + TOLERANCE_S:
+            raise ConfigError(
+                f"{file}: {start_s:g} to {end_s:g} s is no stretch of run {run_id}, which is from "
+                f"{first_s:g} to {last_s:g} s"
+            )
+        if start_s < until_s.get(run_id, -math.inf) - TOLERANCE_S:
+            raise ConfigError(f"{file}: stretches of run {run_id} overlap at {start_s:g} s")
+        until_s[run_id] = end_s
+        if answer not in known and not (new_class and plain_name(answer)):
+            raise ConfigError(
+                f"{file}: {shown(answer)} is no terrain that is known here "
+                f"({', '.join(sorted(known - {''}))}); --new-class accepts others"
+            )
+    return rows
+
+
+def _answer_rows(file: Path) -> list[tuple[Proposal, str]]:
+    from terrain.classify.proposals import Proposal
+    from terrain.files.documents import first_fault
+    from terrain.logs.csv_table import text_rows
+
+    proposal = TypeAdapter(Proposal, config=ConfigDict(allow_inf_nan=False))
+    rows = []
+    for number, cells in text_rows(file, (*Proposal._fields, "answer")):
+        if cells is None:
+            raise LogError(f"{file}, line {number}: is no proposal: it is longer or shorter than the header")
+        try:
+            found = proposal.validate_python(dict(zip(Proposal._fields, cells[:-1], strict=True)))
+        except ValidationError as error:
+            raise LogError(f"{file}, line {number}: is no proposal ({first_fault(error)})") from error
+        rows.append((found, cells[-1].strip()))
+    return rows
 
 
 def time_text(time_s: float) -> str:
@@ -288,7 +339,7 @@ def time_text(time_s: float) -> str:
     return f"{time_s + 0.0:.6f}".rstrip("0").rstrip(".")
 
 
-def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResult) -> Report:
+def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResult) -> tree.Report:
     """Return what is doubtful, was changed, is asked or was written."""
     if isinstance(result, LabelResult):
         return _label_report(result)
@@ -296,7 +347,7 @@ def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResul
         return _proposals_report(result)
     if isinstance(result, AnswersResult):
         counts = enumerated([f"{n} by {source}" for source, n in result.n_labels.items()])
-        return Report(
+        return tree.Report(
             title="Labels",
             answer=f"{plural(result.n_runs, 'run')} in {result.out}: labels {counts}; "
             f"{result.n_left_open} stretches without one",
@@ -305,84 +356,73 @@ def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResul
     return _doubtful_report(result)
 
 
-def _doubtful_report(result: DoubtfulResult) -> Report:
+INTERVAL = (
+    tree.Shown("from s", lambda row: time_text(row.start_s)),
+    tree.Shown("to s", lambda row: time_text(row.end_s)),
+)
+
+
+def _doubtful_report(result: DoubtfulResult) -> tree.Report:
+    columns = (
+        tree.Shown("run", "run_id"),
+        *INTERVAL,
+        tree.Shown(
+            "classified",
+            lambda row: row.terrain or (f"refused: {row.refused}" if row.refused else "unknown"),
+        ),
+        tree.Shown("probability", "probability", ".2f"),
+        tree.Shown("label", "label"),
+    )
+    of_run = (
+        tree.Shown("run", "run_id"),
+        tree.Shown("windows", "n_windows"),
+        tree.Shown("low confidence", "n_doubtful"),
+        tree.Shown("without label", "n_without_label"),
+    )
     n_windows = sum(run.n_windows or 0 for run in result.runs)
-    open_ones = sum(run.n_without_label for run in result.runs)
-    windows = tuple(
-        (
-            row.run_id,
-            time_text(row.start_s),
-            time_text(row.end_s),
-            row.terrain or (f"refused: {row.refused}" if row.refused else "unknown"),
-            row.probability,
-            row.label or "",
-        )
-        for row in result.windows
-    )
-    columns = ("run", "from s", "to s", "classified", Column("probability", ".2f"), "label")
-    runs = tuple(
-        (
-            run.run_id,
-            "none recorded" if run.n_windows is None else run.n_windows,
-            run.n_doubtful,
-            run.n_without_label,
-        )
-        for run in result.runs
-    )
-    return Report(
+    return tree.Report(
         title="Windows of low confidence",
         answer=f"{len(result.windows)} of {plural(n_windows, 'recorded window')} are of low confidence, "
-        f"{open_ones} of them without a label",
-        parts=(Table(columns, windows),) if windows else (),
-        details=(Section("By run", (Table(("run", "windows", "low confidence", "without label"), runs),)),),
+        f"{sum(run.n_without_label for run in result.runs)} of them without a label",
+        parts=(tree.table(result.windows, columns),) if result.windows else (),
+        details=(tree.Section("By run", (tree.table(result.runs, of_run),)),),
         next_step=f"terrain label {result.data} --run ID --from S --to S --terrain NAME",
     )
 
 
-def _label_report(result: LabelResult) -> Report:
+def _label_report(result: LabelResult) -> tree.Report:
     done = f"labelled {result.terrain}" if result.terrain else "without a label"
-    labels = tuple((time_text(a), time_text(b), terrain) for a, b, terrain in result.labels)
-    return Report(
+    labels = tree.table(result.labels, (*INTERVAL, tree.Shown("terrain", "terrain")))
+    return tree.Report(
         title="Labels",
         answer=f"{result.run_id}: {time_text(result.start_s)} to {time_text(result.end_s)} s {done}",
-        parts=(Table(("from s", "to s", "terrain"), labels),) if labels else (),
+        parts=(labels,) if result.labels else (),
         next_step=f"terrain inspect {result.folder}",
     )
 
 
-def _proposals_report(result: ProposalsResult) -> Report:
+def _proposals_report(result: ProposalsResult) -> tree.Report:
     from terrain.classify.proposals import questions
 
-    asked = [result.proposals[i] for i in questions(result.proposals, result.n_asked)]
-    rows = tuple(
-        (
-            row.run_id,
-            row.start_s,
-            row.end_s,
-            row.terrain,
-            row.confidence,
-            row.supported_ratio,
-            row.unknown_ratio,
-        )
-        for row in asked
-    )
     columns = (
-        "run",
-        Column("from s", ".1f"),
-        Column("to s", ".1f"),
-        "proposed",
-        Column("confidence", ".2f"),
-        Column("supported", ".1%"),
-        Column("unknown", ".1%"),
+        tree.Shown("run", "run_id"),
+        tree.Shown("from s", "start_s", ".1f"),
+        tree.Shown("to s", "end_s", ".1f"),
+        tree.Shown("proposed", "terrain"),
+        tree.Shown("confidence", "confidence", ".2f"),
+        tree.Shown("supported", "supported_ratio", ".1%"),
+        tree.Shown("unknown", "unknown_ratio", ".1%"),
     )
+    asked = [result.proposals[i] for i in questions(result.proposals, result.n_asked)]
+    table = tree.table(asked, columns, title="worth an answer, the first the most")
     rest = len(result.proposals) - result.n_asked
-    return Report(
+    return tree.Report(
         title="Proposed labels",
         answer=f"{plural(len(result.proposals), 'proposal')} for {plural(result.n_runs, 'run')} in {result.file}: "
         f"{plural(result.n_asked, 'question')}; of the other {rest}, {result.n_taken_over} need no answer",
         parts=(
-            *((Table(columns, rows, title="worth an answer, the first the most"),) if rows else ()),
-            Text("answer with a terrain, 'yes' or 'none' in the column answer", kind="note"),
+            *((table,) if asked else ()),
+            tree.Text("answer with a terrain, 'yes' or 'none' in the column answer", kind="note"),
         ),
         next_step=f"terrain label {result.data} --answers {result.file} --out NEW",
     )

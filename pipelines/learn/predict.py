@@ -11,29 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from pydantic import model_validator
 
 from pipelines.data.settings import AlignedRunsSettings, load
-from pipelines.report import (
-    Column,
-    Figure,
-    Panel,
-    Part,
-    Progress,
-    Report,
-    Result,
-    Section,
-    Strip,
-    Table,
-    Text,
-    described,
-    format_counts,
-    format_value,
-    plural,
-    silent,
-)
+from pipelines.report import Progress, Result, described, format_counts, format_value, plural, silent, tree
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from terrain.errors import ConfigError
@@ -41,12 +25,10 @@ from terrain.errors import ConfigError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from features.windows import WindowCut
     from pipelines.learn.ground_changes import ChangesResult
     from pipelines.learn.model_file import TerrainModel
-    from pipelines.live.model import Assessed
     from terrain.control.slip_table import SlipTable
-    from terrain.records import Array, RunLog, SlipTarget, Windows
+    from terrain.records import RunLog, SlipTarget, Windows
     from terrain.robots import Robot
 
 EXAMPLE = "terrain predict --data runs/ --model models:/field@champion --out predicted.csv"
@@ -186,17 +168,12 @@ class Predictions(Result):
         """Return a row a window; its target slips in a column each."""
         import pandas as pd
 
-        rows = []
-        for each in self.windows:
-            row = each._asdict()
-            targets, status = row.pop("target_slip"), row.pop("status")
-            row["terrain_set"] = None if each.terrain_set is None else " ".join(each.terrain_set)
-            rows.append(
-                row
-                | {f"target_slip_{state}": targets[state] for state in DRIVE_STATES}
-                | {f"status_{state}": status[state] for state in DRIVE_STATES}
-            )
-        return pd.DataFrame(rows)
+        from pipelines.report.json_file import as_json
+
+        table = pd.json_normalize([as_json(each) for each in self.windows], sep="_")
+        if len(table):
+            table["terrain_set"] = table["terrain_set"].str.join(" ")
+        return table
 
 
 def run(settings: Settings, progress: Progress = silent) -> Predictions | ChangesResult:
@@ -208,47 +185,39 @@ def run(settings: Settings, progress: Progress = silent) -> Predictions | Change
         if a setting is not accepted, a run or the model cannot be read, or the runs are not such as the model
         needs.
     """
-    from pipelines.learn.load import load_model
-    from pipelines.live.windows import filtered
-    from terrain.control.slip_table import load_slip_table
-    from terrain.files.atomic import ensure_writable
-    from terrain.robots import load_robot
+    from terrain.files.atomic import atomic_write, ensure_writable
 
     if settings.out is not None:
         ensure_writable(settings.out.resolve().parent)
-    if settings.changes is not None:
-        from pipelines.learn.ground_changes import find_changes
+    result = _predictions(settings) if settings.changes is None else _changes(settings, progress)
+    if settings.out is not None:
+        table = result.to_pandas()
+        as_csv = settings.out.suffix == ".csv"
+        atomic_write(settings.out, table.to_csv(index=False) if as_csv else table.to_parquet(index=False))
+    return result
 
-        runs, skipped = load(settings)
-        quiet, skipped_quiet = load(settings.with_(data=settings.changes, only=(), without=()))
-        found = find_changes(runs, quiet, settings.robot, settings.false_alarms, progress)
-        changes = replace(found, skipped=(*skipped, *skipped_quiet))
-        _write_table(changes, settings.out)
-        return changes
+
+def _changes(settings: Settings, progress: Progress) -> ChangesResult:
+    from pipelines.learn.ground_changes import find_changes
+
+    runs, skipped = load(settings)
+    quiet, skipped_quiet = load(settings.with_(data=settings.changes, only=(), without=()))
+    found = find_changes(runs, quiet, settings.robot, settings.false_alarms, progress)
+    return replace(found, skipped=(*skipped, *skipped_quiet))
+
+
+def _predictions(settings: Settings) -> Predictions:
+    from pipelines.learn.load import load_model
+    from pipelines.live.windows import filtered
+    from terrain.control.slip_table import load_slip_table
+    from terrain.robots import load_robot
+
     table = load_slip_table(settings.table)
     runs, skipped = load(settings)
     robot = None if settings.robot is None else load_robot(settings.robot)
     model = filtered(load_model(settings.model), settings.filter_stride_s)
-    predicted = predict(runs, model, table, robot=robot, skip_short=settings.repair)
-    result = replace(predicted, model=settings.model, dataset=settings.dataset, skipped=tuple(skipped))
-    _write_table(result, settings.out)
-    return result
-
-
-def _write_table(result: Result, out: Path | None) -> None:
-    """Write the natural table of a result, whole or not at all."""
-    if out is None:
-        return
-    from io import BytesIO
-
-    from terrain.files.atomic import atomic_write
-
-    table, stream = result.to_pandas(), BytesIO()
-    if out.suffix == ".csv":
-        table.to_csv(stream, index=False)
-    else:
-        table.to_parquet(stream, index=False)
-    atomic_write(out, stream.getvalue())
+    found = predict(runs, model, table, robot=robot, skip_short=settings.repair)
+    return replace(found, model=settings.model, dataset=settings.dataset, skipped=tuple(skipped))
 
 
 def predict(
@@ -278,77 +247,63 @@ def predict(
     ConfigError
         if the table is for another robot than a run is of.
     """
-    import numpy as np
-
-    from features.windows import cut_windows, join_windows
-    from pipelines.live.model import assess
-    from pipelines.live.windows import needs_filter
+    from pipelines.live.windows import needs_filter, windows_of_log
     from terrain.logs.digest import data_digest
 
-    other = next((each for each in runs if table.robot and each.robot != table.robot), None)
-    if other is not None:
-        raise ConfigError(
-            f"table {table.name} is for robot {table.robot!r}, run {other.run_id} is of {other.robot!r}"
-        )
-    raw = [each for each in runs if needs_filter(model.info, each.streams)]
-    cuts = [model_windows(each, model, robot, skip_short=skip_short) for each in runs]
-    windows = join_windows(
-        [cut_windows([], model.rule, layout=model.layout).windows, *(cut.windows for cut in cuts)]
-    )
-    classes = np.asarray(model.recipe.classes_, dtype=str)
-    assessed = assess(model, windows) if len(windows) else _nothing(len(classes))
-    predicted = classes[assessed.probability.argmax(axis=1)]
-    label = windows.terrain.astype(str)
-    over_time = filtered_terrains(windows, assessed, model)
-    targets = {terrain: table.lookup(terrain) for terrain in classes.tolist()}
-    rows = _rows(windows, assessed, over_time, model, table)
-    known = np.isin(label, classes)
-    unknown, counts = np.unique(label[(label != "") & ~known], return_counts=True)
+    for each in runs:
+        if table.robot and each.robot != table.robot:
+            raise ConfigError(
+                f"table {table.name} is for robot {table.robot!r}, run {each.run_id} is of {each.robot!r}"
+            )
+    cuts = [windows_of_log(each, model.info, robot, skip_short=skip_short) for each in runs]
+    rows = [row for cut in cuts for row in _predict_windows(cut.windows, model, table)]
+    classes = model.info.classes
+    judged = [row for row in rows if row.label in classes]
+    unknown = Counter(sorted(row.label for row in rows if row.label and row.label not in classes))
     return Predictions(
-        windows=rows,
+        windows=tuple(rows),
         n_windows=len(rows),
         n_runs=len(runs),
-        classes=tuple(targets),
-        accuracy=float(np.mean(predicted[known] == label[known])) if known.any() else None,
-        filtered_accuracy=float(np.mean(over_time[known] == label[known])) if known.any() else None,
-        n_judged=int(known.sum()),
+        classes=classes,
+        accuracy=_ratio([row.nearest == row.label for row in judged]),
+        filtered_accuracy=_ratio([row.filtered_terrain == row.label for row in judged]),
+        n_judged=len(judged),
         training_runs=tuple(each.run_id for each in runs if data_digest([each]) in model.info.run_digests),
         repaired=dict(sum((Counter(each.dropped) for each in runs), Counter())),
-        unknown_labels={str(name): int(count) for name, count in zip(unknown, counts, strict=True)},
-        n_unknown_labels=int(counts.sum()),
+        unknown_labels=dict(unknown),
+        n_unknown_labels=unknown.total(),
         dropped=dict(sum((Counter(cut.dropped) for cut in cuts), Counter())),
-        filtered=tuple(each.run_id for each in raw),
+        filtered=tuple(each.run_id for each in runs if needs_filter(model.info, each.streams)),
         table_name=table.name,
-        table={terrain: _table_row(found) for terrain, found in targets.items()},
-        n_unknown=int(assessed.unknown.sum()),
-        n_unsupported=None if model.support is None else int((assessed.supported == 0).sum()),
+        table={terrain: _table_row(table.lookup(terrain)) for terrain in classes},
+        n_unknown=sum(row.terrain != row.nearest for row in rows),
+        n_unsupported=None if model.support is None else sum(row.supported is False for row in rows),
     )
 
 
-def _nothing(n_classes: int) -> Assessed:
+def _ratio(right: Sequence[bool]) -> float | None:
+    return sum(right) / len(right) if right else None
+
+
+def _predict_windows(windows: Windows, model: TerrainModel, table: SlipTable) -> list[WindowPrediction]:
+    """Return the prediction of each window of a run; an unknown one has no terrain, and the table's fallback."""
     import numpy as np
 
-    from pipelines.live.model import Assessed
-
-    empty = np.zeros(0)
-    return Assessed(np.zeros((0, n_classes)), empty, empty.astype(bool), empty, empty)
-
-
-def _rows(
-    windows: Windows, assessed: Assessed, over_time: Array, model: TerrainModel, table: SlipTable
-) -> tuple[WindowPrediction, ...]:
-    """Return the prediction of each window; an unknown one has no terrain, and the table's fallback."""
-    import numpy as np
-
-    from pipelines.live.model import class_sets
+    from pipelines.live.model import assess, class_sets
+    from pipelines.live.windows import filter_of
+    from terrain.classify.terrain_filter import filter_run, novelty_evidence, reported
     from terrain.control.switching import UNKNOWN
 
-    classes = np.asarray(model.recipe.classes_, dtype=str)
-    best = assessed.probability.argmax(axis=1)
-    sets = class_sets(model, assessed.probability)
+    if not len(windows):
+        return []
+    assessed, settings = assess(model, windows), filter_of(model.info)
+    best, sets = assessed.probability.argmax(axis=1), class_sets(model, assessed.probability)
+    evidence = novelty_evidence(assessed.novelty, assessed.unknown)
+    end_s = windows.start_s + windows.length_s
+    over_time = reported(filter_run(assessed.probability, end_s, settings, evidence), settings.threshold)
     rows = []
     for i in range(len(windows)):
-        nearest = str(classes[best[i]])
+        nearest = model.info.classes[best[i]]
         terrain = UNKNOWN if assessed.unknown[i] else nearest
         targets = table.lookup(terrain)
         rows.append(
@@ -361,61 +316,14 @@ def _rows(
                 slip_entry=targets["traction"].terrain,
                 status={state: targets[state].status for state in DRIVE_STATES},
                 label=str(windows.terrain[i]) or None,
-                filtered_terrain=str(over_time[i]) or None,
+                filtered_terrain=None if over_time[i] < 0 else model.info.classes[over_time[i]],
                 nearest=nearest,
                 novelty=None if np.isnan(assessed.novelty[i]) else float(assessed.novelty[i]),
                 supported=None if np.isnan(assessed.supported[i]) else bool(assessed.supported[i]),
                 terrain_set=None if sets is None else sets[i],
             )
         )
-    return tuple(rows)
-
-
-def filtered_terrains(windows: Windows, assessed: Assessed, model: TerrainModel) -> Array:
-    """Return the terrain (n,) by each run's windows up to each; empty where none is certain enough.
-
-    Parameters
-    ----------
-    windows : n, of each run in order of time
-    assessed : what the model says of them
-    model : whose training gives the class shares; equal ones where it does not know them
-    """
-    import numpy as np
-
-    from pipelines.live.windows import filter_of
-    from terrain.classify.terrain_filter import filter_run, novelty_evidence, reported
-
-    classes = np.asarray(model.recipe.classes_, dtype=str)
-    settings = filter_of(model.info)
-    evidence = novelty_evidence(assessed.novelty, assessed.unknown)
-    named = np.append(classes, "")  # the last, at -1, is unknown
-    found = np.full(len(windows), "", dtype=object)
-    for run_id in dict.fromkeys(windows.run_id):
-        rows = np.flatnonzero(windows.run_id == run_id)
-        end_s = windows.start_s[rows] + windows.length_s
-        belief = filter_run(assessed.probability[rows], end_s, settings, evidence[rows])
-        found[rows] = named[reported(belief, settings.threshold)]
-    return found
-
-
-def model_windows(
-    log: RunLog, model: TerrainModel, robot: Robot | None = None, *, skip_short: bool
-) -> WindowCut:
-    """Return the windows of a log that a model takes; where it lacks estimates, the live chain runs over it.
-
-    Parameters
-    ----------
-    log, model : run log, and the model whose rule cuts it
-    robot : description of the robot of runs that bear its name; the package's by default
-    skip_short : leave out and count a run that is shorter than a window instead of refusing it
-    """
-    from features.windows import cut_windows
-    from pipelines.live.windows import needs_filter, windows_of_log
-    from terrain.robots import robot_named
-
-    if needs_filter(model.info, log.streams):
-        return windows_of_log(log, model.info, robot_named(log.robot, robot), skip_short=skip_short)
-    return cut_windows([log], model.rule, layout=model.layout, skip_short=skip_short)
+    return rows
 
 
 def _table_row(targets: Mapping[str, SlipTarget]) -> TargetSlipRow:
@@ -427,7 +335,7 @@ def _table_row(targets: Mapping[str, SlipTarget]) -> TargetSlipRow:
     )
 
 
-def report(result: Predictions) -> Report:
+def report(result: Predictions) -> tree.Report:
     """Return the terrains along the runs, how far they are right, and what is not certain of them."""
     stretches = [list(rows) for _, rows in groupby(result.windows, lambda row: (row.run_id, row.terrain))]
     counts = Counter(row.terrain for row in result.windows)
@@ -435,25 +343,40 @@ def report(result: Predictions) -> Report:
         f"{name} {format_value(count / result.n_windows, '.0%')}" for name, count in counts.most_common(5)
     )
     found = f"{plural(result.n_windows, 'window')} of {plural(result.n_runs, 'run')}: {shares or 'none'}"
-    judged = ""
     if result.accuracy is not None:
-        trained = (
-            f", {len(result.training_runs)} runs of which trained the model" if result.training_runs else ""
-        )
         right = format_value(result.accuracy, PERCENT)
-        judged = f"; {right} of {result.n_judged} labelled ones are right{trained}"
-    return Report(
+        found += f"; {right} of {result.n_judged} labelled ones are right"
+        if result.training_runs:
+            found += f", {len(result.training_runs)} runs of which trained the model"
+    more = len(stretches) - MAX_ROWS
+    note = f"{more} stretches more; --out FILE.csv has every window" if more > 0 else ""
+    return tree.Report(
         title=f"Terrain of {result.dataset or 'runs'}",
-        answer=f"{found}{judged}.",
+        answer=f"{found}.",
         lead=f"model {result.model or 'given'}, target slips of the table {result.table_name!r}",
         picture=_picture(stretches),
-        parts=[_stretches_table(stretches[:MAX_ROWS], len(stretches)), *_notes(result)],
-        details=[Section("All stretches", [_stretches_table(stretches, len(stretches))])],
+        parts=[tree.table(stretches[:MAX_ROWS], STRETCH_COLUMNS, note=note), *_notes(result)],
+        details=[tree.Section("All stretches", [tree.table(stretches, STRETCH_COLUMNS)])],
         next_step=f"terrain serve --model {result.model} --robot ROBOT" if result.model else "",
     )
 
 
-def _picture(stretches: Sequence[Sequence[WindowPrediction]]) -> Figure | None:
+def _target_column(state: str) -> tree.Shown:
+    return tree.Shown(f"slip, {state}", lambda rows: rows[0].target_slip[state], "+.2f")
+
+
+STRETCH_COLUMNS = (
+    tree.Shown("run", lambda rows: rows[0].run_id),
+    tree.Shown("from", lambda rows: rows[0].start_s, ".1f", "s"),
+    tree.Shown("windows", len),
+    tree.Shown("terrain", lambda rows: rows[0].terrain),
+    tree.Shown("probability", lambda rows: fmean(row.probability for row in rows), ".2f"),
+    *map(_target_column, DRIVE_STATES),
+)
+"""Of windows of a run that follow each other and are of one terrain."""
+
+
+def _picture(stretches: Sequence[Sequence[WindowPrediction]]) -> tree.Figure | None:
     """Return a strip of terrains for each of the first runs."""
     panels: dict[str, list[tuple[float, float, str]]] = {}
     for rows in stretches:
@@ -462,72 +385,52 @@ def _picture(stretches: Sequence[Sequence[WindowPrediction]]) -> Figure | None:
         spans.append((rows[0].start_s, rows[-1].start_s + step_s, rows[0].terrain))
     if not panels:
         return None
-    shown = list(panels.items())[:MAX_STRIPS]
     more = f" The first {MAX_STRIPS} of {len(panels)} runs." if len(panels) > MAX_STRIPS else ""
-    return Figure(
+    return tree.Figure(
         "Predicted terrain along the runs",
-        [Panel([Strip(spans)], title=name) for name, spans in shown],
+        [tree.Panel([tree.Strip(spans)], title=name) for name, spans in list(panels.items())[:MAX_STRIPS]],
         caption=f"Colours are terrains.{more}",
         x_label="time [s]",
     )
 
 
-def _stretches_table(stretches: Sequence[Sequence[WindowPrediction]], n_all: int) -> Table:
-    rows = [
+def _notes(result: Predictions) -> list[tree.Part]:
+    without = {row.terrain for row in result.windows if row.slip_entry != row.terrain == row.nearest}
+    unestimated = any("unestimated" in row.status.values() for row in result.windows)
+    accuracy = format_value(result.filtered_accuracy, PERCENT)
+    notes = (
         (
-            rows[0].run_id,
-            rows[0].start_s,
-            len(rows),
-            rows[0].terrain,
-            sum(row.probability for row in rows) / len(rows),
-            *(rows[0].target_slip[state] for state in DRIVE_STATES),
-        )
-        for rows in stretches
-    ]
-    return Table(
-        (
-            "run",
-            Column("from", ".1f", "s"),
-            "windows",
-            "terrain",
-            Column("probability", ".2f"),
-            *(Column(f"slip, {state}", "+.2f") for state in DRIVE_STATES),
+            result.training_runs,
+            "of runs that the model was trained on the accuracy is no measure of its skill",
         ),
-        rows,
-        note=""
-        if len(rows) == n_all
-        else f"{n_all - len(rows)} stretches more; --out FILE.csv has every window",
-    )
-
-
-def _notes(result: Predictions) -> list[Part]:
-    found: list[str] = []
-    if result.training_runs:
-        found.append("of runs that the model was trained on the accuracy is no measure of its skill")
-    if result.n_unknown:
-        found.append(
+        (
+            result.n_unknown,
             f"{result.n_unknown} windows are like no terrain that was learned, as are 5 % of those of learned "
-            "ones: unknown, for which the table's fallback is used"
-        )
-    if result.n_unsupported:
-        found.append(
-            f"{result.n_unsupported} predictions are supported by no training run that drove like this"
-        )
-    if result.filtered_accuracy is not None:
-        accuracy = format_value(result.filtered_accuracy, PERCENT)
-        found.append(f"filtered over time {accuracy} are right; what stays uncertain counts as wrong")
-    if result.filtered:
-        found.append(
-            f"{len(result.filtered)} runs had no estimates: filtered as on the robot, sample by sample"
-        )
-    without = sorted({row.terrain for row in result.windows if row.slip_entry != row.terrain == row.nearest})
-    if without:
-        found.append(f"no entry in the table of target slips for {', '.join(without)}: the fallback is used")
-    if any("unestimated" in row.status.values() for row in result.windows):
-        found.append(f"target slips of the table {result.table_name!r} are unestimated: not measured")
-    for name, count in result.unknown_labels.items():
-        found.append(f"{count} windows are labelled {name}, which the model was not trained on: not judged")
-    for text, counts in (("windows left out", result.dropped), ("repaired", result.repaired)):
-        if counts:
-            found.append(f"{text}: {format_counts(counts)}")
-    return [Text(text, "note") for text in (*found, *(result.skipped or ()))]
+            "ones: unknown, for which the table's fallback is used",
+        ),
+        (
+            result.n_unsupported,
+            f"{result.n_unsupported} predictions are supported by no training run that drove like this",
+        ),
+        (
+            result.filtered_accuracy is not None,
+            f"filtered over time {accuracy} are right; what stays uncertain counts as wrong",
+        ),
+        (
+            result.filtered,
+            f"{len(result.filtered)} runs had no estimates: filtered as on the robot, sample by sample",
+        ),
+        (
+            without,
+            f"no entry in the table of target slips for {', '.join(sorted(without))}: the fallback is used",
+        ),
+        (unestimated, f"target slips of the table {result.table_name!r} are unestimated: not measured"),
+        *(
+            (count, f"{count} windows are labelled {name}, which the model was not trained on: not judged")
+            for name, count in result.unknown_labels.items()
+        ),
+        (result.dropped, f"windows left out: {format_counts(result.dropped)}"),
+        (result.repaired, f"repaired: {format_counts(result.repaired)}"),
+        *((True, text) for text in result.skipped or ()),
+    )
+    return [tree.Text(text, "note") for applies, text in notes if applies]

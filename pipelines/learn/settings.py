@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, model_validator
 
-from pipelines.report.settings import Settings, setting
+from pipelines.report.settings import JobsSettings, Settings, setting
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 
@@ -44,23 +43,6 @@ RECIPE_TEXT = (
 )
 
 
-def split_recipes(texts: tuple[str, ...]) -> tuple[str, ...]:
-    """Return recipes that are written one a text or several by commas; a signal set belongs to its recipe.
-
-    Examples
-    --------
-    >>> split_recipes(("svm@imu,wheels,cnn", "mine:make"))
-    ('svm@imu,wheels', 'cnn', 'mine:make')
-    """
-    found: list[str] = []
-    for part in (part.strip() for text in texts for part in text.split(",")):
-        if part in SIGNAL_SETS and found and "@" in found[-1]:
-            found[-1] += f",{part}"
-        elif part:
-            found.append(part)
-    return tuple(found)
-
-
 def check_signal_sets(names: tuple[str, ...]) -> tuple[str, ...]:
     """Raise ``ConfigError`` where no signal set is named, or one that is not known."""
     if not names:
@@ -83,29 +65,21 @@ def check_recipe(text: str) -> str:
     return text
 
 
-def checked_recipes(texts: tuple[str, ...]) -> tuple[str, ...]:
-    """Return recipes one a text; raise ``ConfigError`` where one is not known."""
-    return tuple(check_recipe(text) for text in split_recipes(texts))
+def split_recipes(texts: tuple[str, ...]) -> tuple[str, ...]:
+    """Return recipes that are written one a text or several by commas; a signal set belongs to its recipe.
 
-
-def check_params(params: Path | None, recipes: tuple[str, ...]) -> None:
-    """Raise ``ConfigError`` where hyper-parameters of the SVM are given to a recipe without one."""
-    for text in recipes:
-        name = text.partition("@")[0]
-        if params is not None and (name in WITHOUT_SVM or ":" in name):
-            raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
-
-
-def speeds_of(text: str) -> tuple[float, float]:
-    """Read ``LOW:HIGH``; raise ``ConfigError`` where these are no speeds."""
-    low, _, high = text.partition(":")
-    try:
-        low_mps, high_mps = float(low), float(high)
-    except ValueError:
-        low_mps = high_mps = 0.0
-    if not 0.0 <= low_mps < high_mps < math.inf:
-        raise ConfigError(f"--speed is {text!r}; LOW:HIGH in m/s is required, as in 0:0.15")
-    return low_mps, high_mps
+    Examples
+    --------
+    >>> split_recipes(("svm@imu,wheels,cnn", "mine:make"))
+    ('svm@imu,wheels', 'cnn', 'mine:make')
+    """
+    found: list[str] = []
+    for part in (part.strip() for text in texts for part in text.split(",")):
+        if part in SIGNAL_SETS and found and "@" in found[-1]:
+            found[-1] += f",{part}"
+        elif part:
+            found.append(part)
+    return tuple(map(check_recipe, found))
 
 
 class WindowSettings(Settings):
@@ -138,12 +112,11 @@ class WindowSettings(Settings):
         return WindowRule(length_s, self.stride_s, WindowRule().steady if self.steady else None)
 
 
-class LearnSettings(WindowSettings):
-    """Learning: folds of runs, processes, features and hyper-parameters."""
+class LearnSettings(WindowSettings, JobsSettings):
+    """Learning: folds of runs, features and hyper-parameters."""
 
     repeats: int | None = setting(None, "Fold assignments (5).", ge=1)
     seed: int = setting(0, "Deals runs into folds.", ge=0)
-    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
     feature: tuple[str, ...] = setting(
         (),
         "MODULE:NAME of a function of a window of your own, beside the features; may be given again.",
@@ -152,9 +125,17 @@ class LearnSettings(WindowSettings):
     params: Path | None = setting(None, "Result of a search, in place of the SVM's own choice.")
 
     @property
-    def jobs(self) -> int:
-        """Processes at once: what was asked for, or one a core."""
-        return self.n_jobs if self.n_jobs > 0 else os.cpu_count() or 1
+    def recipes(self) -> tuple[str, ...]:
+        """The recipes by name; the SVM where none is given."""
+        given: str | tuple[str, ...] = getattr(self, "recipe", ())
+        return ((given,) if isinstance(given, str) else given) or (FEATURE_RECIPE,)
+
+    @model_validator(mode="after")
+    def _check_params(self) -> Self:
+        for name in (text.partition("@")[0] for text in self.recipes):
+            if self.params is not None and (name in WITHOUT_SVM or ":" in name):
+                raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
+        return self
 
     def shared(self) -> dict[str, Any]:
         """Return the fields that evaluation and training have in common, by name."""
@@ -166,16 +147,11 @@ class RecipeSettings(LearnSettings):
 
     recipe: Annotated[str, AfterValidator(check_recipe)] = setting(FEATURE_RECIPE, RECIPE_TEXT)
 
-    @model_validator(mode="after")
-    def _check_params(self) -> Self:
-        check_params(self.params, (self.recipe,))
-        return self
-
 
 class EvaluationSettings(LearnSettings):
     """Evaluation: what is compared, and which windows are held out."""
 
-    recipe: Annotated[tuple[str, ...], AfterValidator(checked_recipes)] = setting(
+    recipe: Annotated[tuple[str, ...], AfterValidator(split_recipes)] = setting(
         (), f"Recipes to evaluate (svm), by commas or repeated: {RECIPE_TEXT}", repeated=True
     )
     model: tuple[str, ...] = setting(
@@ -191,7 +167,6 @@ class EvaluationSettings(LearnSettings):
     def _check_protocol(self) -> Self:
         if self.model and self.recipe:
             raise ConfigError("--model and --recipe do not go together: compare models, or recipes")
-        check_params(self.params, self.recipe)
         _ = self.speed_mps
         if self.protocol == "published" and (self.stride_s is not None or not self.steady):
             raise ConfigError(
@@ -202,16 +177,26 @@ class EvaluationSettings(LearnSettings):
         return self
 
     @property
-    def recipes(self) -> tuple[str, ...]:
-        """The recipes by name; the SVM where none is given."""
-        return self.recipe or (FEATURE_RECIPE,)
-
-    @property
     def default_window_s(self) -> float:
         """Length of a window where none is asked for."""
         return PUBLISHED_WINDOW_S if self.protocol == "published" else WINDOW_S
 
     @property
     def speed_mps(self) -> tuple[float, float] | None:
-        """Speeds of the runs that are used; None for all."""
-        return None if self.speed is None else speeds_of(self.speed)
+        """Speeds of the runs that are used; None for all.
+
+        Raises
+        ------
+        ConfigError
+            if the text is no ``LOW:HIGH``.
+        """
+        if self.speed is None:
+            return None
+        low, _, high = self.speed.partition(":")
+        try:
+            low_mps, high_mps = float(low), float(high)
+        except ValueError:
+            low_mps = high_mps = 0.0
+        if not 0.0 <= low_mps < high_mps < math.inf:
+            raise ConfigError(f"--speed is {self.speed!r}; LOW:HIGH in m/s is required, as in 0:0.15")
+        return low_mps, high_mps

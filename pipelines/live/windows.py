@@ -33,7 +33,7 @@ from terrain.estimation.live.choice import (
 from terrain.extension import correct_live
 from terrain.logs.replay import SENSORS, replay
 from terrain.records import RunLog
-from terrain.robots import Robot
+from terrain.robots import Robot, robot_named
 
 Model = TypeVar("Model", bound=LiveModel)
 
@@ -103,15 +103,17 @@ def feed_of(info: WindowsInfo, channels: Mapping[str, Sequence[str]], robot: Rob
     return WindowFeed(info.rule, info.layout, channels, estimated, robot)
 
 
-def windows_of_log(run: RunLog, info: WindowsInfo, robot: Robot, *, skip_short: bool = False) -> WindowCut:
-    """Return the windows of a log that lacks estimates, as the live observer cuts them.
+def windows_of_log(
+    run: RunLog, info: WindowsInfo, robot: Robot | None = None, *, skip_short: bool = False
+) -> WindowCut:
+    """Return the windows of a log that a model takes; of one without estimates, as the live observer cuts them.
 
     Parameters
     ----------
-    run : log of the robot's sensors
+    run : log of a robot
     info : of the model
-    robot : whose log it is
-    skip_short : leave out a run that is shorter than a window instead of refusing it
+    robot : description of the robot of runs that bear its name; the package's by default
+    skip_short : leave out and count a run that is shorter than a window instead of refusing it
 
     Returns
     -------
@@ -123,6 +125,9 @@ def windows_of_log(run: RunLog, info: WindowsInfo, robot: Robot, *, skip_short: 
     DataError
         if the log lacks what the model or its filter needs, or a stream has another rate.
     """
+    if not needs_filter(info, run.streams):
+        return cut_windows([run], info.rule, layout=info.layout, skip_short=skip_short)
+    robot = robot_named(run.robot, robot)
     streams = {name: stream for name, stream in run.streams.items() if name in SENSORS}
     channels = {name: stream.channels for name, stream in streams.items()}
     try:

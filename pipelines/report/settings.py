@@ -7,6 +7,7 @@ Nothing heavy is imported here, nor by a module of settings: ``--help`` reads th
 
 from __future__ import annotations
 
+import os
 import typing
 from typing import Any, Self
 
@@ -68,6 +69,17 @@ class Settings(BaseModel):
     def with_(self, **changed: Any) -> Self:
         """Return the same settings with some changed, checked anew."""
         return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changed)
+
+
+class JobsSettings(Settings):
+    """Processes."""
+
+    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
+
+    @property
+    def jobs(self) -> int:
+        """Processes at once: what was asked for, or one a core."""
+        return self.n_jobs or os.cpu_count() or 1
 
 
 def option_of(model: type[Settings], name: str) -> tuple[str | None, bool]:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
@@ -117,7 +117,7 @@ def read_run(class_folder: Path, number: str, *, repair: bool = False) -> RunLog
     return checked_names(f"run {shown(run_id)}", run)
 
 
-def whole_run_label(streams: dict[str, Stream], terrain: str) -> Label:
+def whole_run_label(streams: Mapping[str, Stream], terrain: str) -> Label:
     """Return the label that covers every sample of a run, the last one with its sampling period.
 
     Examples

@@ -45,7 +45,7 @@ def label_intervals(
     >>> label_intervals([(10**9, "ICE"), (10**9 + 5 * 10**8, "ICE"), (2 * 10**9, "")], 0, {"imu": imu})
     (Label(start_s=1.0, end_s=2.0, terrain='ICE'),)
     """
-    end_s = whole_run_label(dict(streams), "all").end_s
+    end_s = whole_run_label(streams, "all").end_s
     changes = [((log_ns - start_ns) / 1e9, terrain.strip()) for log_ns, terrain in texts]
     labels: list[Label] = []
     for (begin_s, terrain), (stop_s, _) in pairwise([*changes, (end_s, "")]):

@@ -11,6 +11,7 @@ import pytest
 
 from pipelines.cli import main as cli
 from pipelines.data.can_codec import QUATERNION, RECEIVED, SIGNALS, encode
+from pipelines.learn.model_file import read_model
 from pipelines.learn.training_data import fitted_model
 from terrain.angles import wrapped
 from terrain.estimation.enriched import enriched
@@ -193,6 +194,12 @@ def tracked(tmp_path_factory, runs):
         if named is not None:
             os.environ["MLFLOW_TRACKING_URI"] = named
     return folder, result
+
+
+@pytest.fixture(scope="session")
+def model(tracked):
+    """The model that ``tracked`` has trained."""
+    return read_model(tracked[0] / "model")
 
 
 @pytest.fixture

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from pipelines.report import Progress, Report, Result, Table, described, format_value, silent
-from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
+from pipelines.report.settings import JobsSettings, setting
 from terrain.control.comparison import MeanInterval, mean_interval
 from terrain.estimation.coverage import nees_by_group, slip_coverage
 from terrain.estimation.estimate import estimate_run
@@ -64,7 +62,7 @@ def consistency_by_terrain(
     runs: int = RUNS_A_SCENARIO,
     filter_name: str = FILTER,
     progress: Progress = silent,
-    n_jobs: int = 0,
+    n_jobs: int = 1,
     terrains: Sequence[str] = soil_names(),
     scenarios: Sequence[str] = SCENARIOS,
     lost_s: float = 0.0,
@@ -78,7 +76,7 @@ def consistency_by_terrain(
     runs : of each scenario on each terrain
     filter_name : one of :data:`terrain.estimation.estimate.FILTERS`
     progress : of the runs
-    n_jobs : processes at once; 0 for one a core
+    n_jobs : processes at once
     terrains : names of soils
     scenarios : names of scenarios
     lost_s : for so long from the middle of each run there is no camera, and coverage is that of this time
@@ -96,7 +94,7 @@ def consistency_by_terrain(
         for scenario in scenarios
         for number in range(1, runs + 1)
     ]
-    pool = Parallel(n_jobs=n_jobs or os.cpu_count() or 1, return_as="generator")
+    pool = Parallel(n_jobs=n_jobs, return_as="generator")
     found: dict[str, list[dict[str, float]]] = {terrain: [] for terrain in terrains}
     work = pool(delayed(_run_figures)(robot, *job, seed, filter_name, lost_s) for job in jobs)
     for done, ((terrain, _, _), figures) in enumerate(zip(jobs, work, strict=True), 1):
@@ -125,7 +123,7 @@ def _terrain_row(terrain: str, rows: Sequence[dict[str, float]]) -> TerrainConsi
     return TerrainConsistency(terrain, len(rows), means, coverage)
 
 
-class Settings(BaseSettings):
+class Settings(JobsSettings):
     """Which runs are simulated and filtered."""
 
     runs: int = setting(RUNS_A_SCENARIO, "Of each scenario on each terrain.", ge=1)
@@ -137,7 +135,6 @@ class Settings(BaseSettings):
     camera_lost_s: float = setting(
         0.0, "Time in s without a camera, from the middle of each run.", "--camera-lost", ge=0.0
     )
-    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
 
 
 @dataclass(frozen=True)
@@ -153,7 +150,7 @@ def run(settings: Settings, progress: Progress = silent) -> Consistency:
     """Simulate and filter runs of some scenarios on each terrain, and compare errors with their variance."""
     rows = consistency_by_terrain(
         *(load_robot(settings.robot), settings.seed, settings.runs, settings.filter_name, progress),
-        *(settings.n_jobs, settings.terrains, settings.scenarios, settings.camera_lost_s),
+        *(settings.jobs, settings.terrains, settings.scenarios, settings.camera_lost_s),
     )
     return Consistency(settings.seed, settings.filter_name, rows)
 

@@ -23,8 +23,7 @@ from pipelines.learn.protocols import folds_of, samples_of
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import LearnSettings
 from pipelines.report import Column, Progress, Report, Result, Table, described, silent
-from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
+from pipelines.report.settings import JobsSettings, setting
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import Examples
 from terrain.classify.paired import Difference, Outcome, compare_outcomes
@@ -37,13 +36,12 @@ EXAMPLE = "python tests/studies labels --data runs --repeats 5"
 STRATEGIES = ("first run of each terrain", "random", "doubt", "random, self-trained", "doubt, self-trained")
 
 
-class Settings(BaseSettings):
+class Settings(JobsSettings):
     """On which runs label strategies are compared."""
 
     data: Path = setting(..., "Folder of labelled runs, more than two of each terrain.")
     repeats: int = setting(5, "Fold assignments.", ge=1)
     seed: int = setting(0, "Deals runs into folds, and draws the first labels.", ge=0)
-    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
 
 
 class Strategy(NamedTuple):

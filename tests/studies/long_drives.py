@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
-from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
+from pipelines.report.settings import JobsSettings, setting
 from studies.consistency import GROUPS
 from terrain.angles import wrapped
 from terrain.errors import ConfigError
@@ -27,14 +25,13 @@ LOST_S = 60.0
 """For so long at the end of a drive there is no camera."""
 
 
-class Settings(BaseSettings):
+class Settings(JobsSettings):
     """Which drives are simulated."""
 
     runs: int = setting(12, "Number of drives, over the terrains in turn.", ge=1)
     minutes: float = setting(30.0, "Length of each.")
     seed: int = setting(0, "Of all drives.", ge=0)
     robot: str = setting("agrimaro", "Swerve robot.")
-    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
 
 
 class LongDrive(NamedTuple):
@@ -99,7 +96,7 @@ def run(settings: Settings, progress: Progress = silent) -> LongDrives:
 
     robot, terrains, duration_s = load_robot(settings.robot), soil_names(), 60.0 * settings.minutes
     jobs = [(terrains[i % len(terrains)], settings.seed, i + 1, duration_s) for i in range(settings.runs)]
-    pool = Parallel(n_jobs=settings.n_jobs or os.cpu_count() or 1, return_as="generator")
+    pool = Parallel(n_jobs=settings.jobs, return_as="generator")
     found = []
     for drive in pool(delayed(drive_long)(robot, *job) for job in jobs):
         found.append(drive)

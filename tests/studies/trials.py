@@ -5,7 +5,6 @@ The trials themselves are those of :mod:`terrain.discrepancy.trials`.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,8 +13,7 @@ import numpy as np
 from pydantic import field_validator
 
 from pipelines.report import Column, Progress, Report, Result, Table, Text, described, silent
-from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
+from pipelines.report.settings import JobsSettings, setting
 from terrain.discrepancy.preparation import MIN_RUNS
 from terrain.discrepancy.trials.hidden_effects import Case, cases_of
 from terrain.discrepancy.trials.rows import Row
@@ -26,7 +24,7 @@ from terrain.errors import ConfigError
 EXAMPLE = "python tests/studies trials --n 100 --seed 2211 --rows none,strong"
 
 
-class Settings(BaseSettings):
+class Settings(JobsSettings):
     """Blind trials: how many of which kind."""
 
     n: int = setting(
@@ -38,7 +36,6 @@ class Settings(BaseSettings):
     seed: int = setting(0, "Of all that is drawn.", ge=0)
     rows: tuple[str, ...] = setting(tuple(row.value for row in Row), "Kinds of trials, by commas.")
     runs: int = setting(8, "Runs of each trial; 80 of 6 s in rows short and known.")
-    n_jobs: int = setting(0, "Processes at once; 0 for one a core.", "--jobs", ge=0)
 
     @field_validator("rows")
     @classmethod
@@ -101,7 +98,7 @@ def run(settings: Settings, progress: Progress = silent) -> TrialsResult:
     cases = [
         case for row in settings.rows for case in cases_of(Row(row), settings.n, settings.seed, settings.runs)
     ]
-    trials = run_trials(cases, settings.n_jobs or os.cpu_count() or 1, progress)
+    trials = run_trials(cases, settings.jobs, progress)
     seconds = [trial.seconds for trial in trials]
     return TrialsResult(
         n=settings.n,

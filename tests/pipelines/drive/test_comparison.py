@@ -40,7 +40,7 @@ SHORT = Settings(
     seeds=2,
     first_seed=300,
     duration_s=6.0,
-    jobs=1,
+    n_jobs=1,
 )
 ALL = SHORT.with_(controllers=("plain", "ramp", "thesis", "fallback", "true_terrain+track", "known:clay"))
 ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
@@ -58,7 +58,7 @@ def test_every_controller_has_every_metric_on_any_number_of_processes():
         assert low < metrics["distance_m"].mean < high
     ramp, track = (result.controllers[name]["distance_m"].mean for name in ("ramp", "true_terrain+track"))
     assert ramp == pytest.approx(track, rel=0.01)  # the ramp travels as far
-    two = compare(ALL.with_(jobs=2), INPUTS)
+    two = compare(ALL.with_(n_jobs=2), INPUTS)
     assert json.dumps(result.as_json(), allow_nan=False) == json.dumps(two.as_json(), allow_nan=False)
 
 

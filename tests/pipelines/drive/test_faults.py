@@ -37,7 +37,7 @@ SLIPS = load_slip_table()
 LOOP = fault_loop(ROBOT, SLIPS)
 TABLE = Path(__file__).resolve().parents[3] / "data" / "target_slip" / "default.yaml"
 FEW = Settings(
-    faults="loss_odometry,duplicates_imu", situations="steady", durations_s="3,inf", first_seed=400, jobs=1
+    faults="loss_odometry,duplicates_imu", situations="steady", durations_s="3,inf", first_seed=400, n_jobs=1
 )
 
 
@@ -95,7 +95,7 @@ def test_a_lost_camera_ends_ok_late_and_duplicates_cost_nothing(few):
 
 @pytest.mark.slow
 def test_the_result_does_not_depend_on_the_number_of_processes(few):
-    two = drive_faults(FEW.with_(jobs=2), ROBOT, SLIPS)
+    two = drive_faults(FEW.with_(n_jobs=2), ROBOT, SLIPS)
     assert json.dumps(as_json(few), allow_nan=False) == json.dumps(as_json(two), allow_nan=False)
 
 

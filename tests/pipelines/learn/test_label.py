@@ -1,20 +1,19 @@
-"""Labels are set where a person says so, and nothing else of a run changes."""
+"""Labels: set by a person, where nothing else of a run changes; or proposed by a model and answered."""
 
+import csv
 import json
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from pipelines.learn.label import Settings, time_text
+from pipelines.data.datasets import load_runs
+from pipelines.learn.label import SOURCES_FILE, Settings, time_text
 from pipelines.learn.label import run as label
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.recording import recorded
-from terrain.errors import ConfigError, LogError
+from terrain.errors import ConfigError, DataError, LogError
 from terrain.files import atomic
-from terrain.logs.labels import relabelled
 from terrain.logs.read import read_run
 from terrain.logs.recorded_windows import WINDOWS_FILE, windows_text
 from terrain.logs.write import write_run
@@ -99,32 +98,32 @@ def test_a_whole_run_is_labelled_to_the_end_of_its_last_sample(folder):
     assert end_s == pytest.approx(4.0)
 
 
+NO_INTERVAL, NEW_FOLDER = (
+    "a label needs --from and --to in s, or --all",
+    "sets labels in the new folder --out",
+)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"run": "SNOW_03", "whole": True, "terrain": "ICE"}, "there is no run 'SNOW_03'"),
-        (
-            {"from_s": 3.0, "to_s": 4.5, "terrain": "ICE"},
-            "SNOW_01 is from 0 to 4 s: 3 to 4.5 s is not within",
-        ),
+        ({"from_s": 3.0, "to_s": 4.5, "terrain": "ICE"}, "is from 0 to 4 s: 3 to 4.5 s is not within"),
         ({"from_s": -1.0, "to_s": 2.0, "terrain": "ICE"}, "is not within"),
         ({"from_s": 2.0, "to_s": 2.0, "terrain": "ICE"}, "ends before it starts"),
         ({"from_s": 2.0, "to_s": float("nan"), "terrain": "ICE"}, "--to is nan"),
-        ({"from_s": 2.0, "terrain": "ICE"}, "needs --from and --to"),
+        ({"from_s": 2.0, "terrain": "ICE"}, NO_INTERVAL),
         ({"from_s": 2.0, "whole": True, "terrain": "ICE"}, "leave out --from"),
-        (
-            {"from_s": 2.0, "to_s": 3.0, "whole": True, "terrain": "ICE"},
-            "needs --from and --to in s, or --all",
-        ),
-        ({"terrain": "ICE"}, "needs --from and --to"),
+        ({"from_s": 2.0, "to_s": 3.0, "whole": True, "terrain": "ICE"}, NO_INTERVAL),
+        ({"terrain": "ICE"}, NO_INTERVAL),
         ({"whole": True}, "needs --terrain NAME, or --remove"),
         ({"whole": True, "terrain": "../ICE"}, "use letters"),
         ({"whole": True, "terrain": "ICE", "remove": True}, "give one of the two"),
         ({"run": None, "whole": True, "terrain": "ICE"}, "needs --run"),
         ({"model": "a", "answers": "b", "out": "c"}, "--model proposes labels"),
         ({"model": "a", "terrain": "ICE", "whole": True}, "--model proposes labels"),
-        ({"answers": "b"}, "--answers FILE sets labels in the new folder --out DIR"),
-        ({"out": "c"}, "--answers FILE sets labels in the new folder --out DIR"),
+        ({"answers": "b"}, NEW_FOLDER),
+        ({"out": "c"}, NEW_FOLDER),
     ],
 )
 def test_what_is_not_accepted_changes_nothing(folder, options, message):
@@ -162,25 +161,120 @@ def test_a_write_that_fails_leaves_the_run_as_it_was(folder, monkeypatch):
     ]
 
 
-times = st.integers(0, 20).map(float)
-intervals = st.tuples(times, times).filter(lambda each: each[0] < each[1])
-
-
-@given(st.lists(st.tuples(intervals, st.sampled_from(["a", "b", ""])), max_size=6))
-def test_the_last_label_of_an_instant_holds(settings):
-    """Two routes to the label of an instant: the labels after all changes, and the last change over it."""
-    labels = ()
-    for (start_s, end_s), terrain in settings:
-        labels = relabelled(labels, start_s, end_s, terrain)
-    assert all(one.end_s <= other.start_s for one, other in pairwise(labels))
-    for instant in np.arange(0.5, 20.0):
-        last = [t for (start_s, end_s), t in settings if start_s <= instant < end_s]
-        holds = [label.terrain for label in labels if label.start_s <= instant < label.end_s]
-        assert holds == [t for t in last[-1:] if t]
-    joined = [one for one, other in pairwise(labels) if one[1:] == (other[0], other[2])]
-    assert joined == []
-
-
 def test_times_are_printed_as_they_can_be_given_back():
     for time_s in (0.0, 4.73, 1732345678.123456, 0.000001):
         assert float(time_text(time_s)) == pytest.approx(time_s, abs=1e-6)
+
+
+@pytest.fixture
+def unlabelled(tmp_path, drive):
+    """Three runs of known ground without a label, and one with."""
+    for number, name in enumerate(("ASPHALT", "GRASS", "GRAVEL")):
+        write_run(drive(f"new_{name}", name, 60 + number, label=None), tmp_path / "data")
+    write_run(drive("old", "GRASS", 70), tmp_path / "data")
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def proposed(unlabelled, tracked, tmp_path):
+    """What a model proposes for them, two questions first."""
+    table = tmp_path / "proposals.csv"
+    return label(Settings(data=unlabelled, model=str(tracked[0] / "model"), ask=2, proposals=table))
+
+
+def rows_of(file):
+    with file.open() as text:
+        return list(csv.DictReader(text))
+
+
+def changed(file, change):
+    """Change the rows of a table."""
+    rows = rows_of(file)
+    with file.open("w", newline="") as text:
+        writer = csv.DictWriter(text, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(change(rows))
+    return file
+
+
+def answered(proposed, out, accept=1.01, *, new_class=False, **answers):
+    """Take answers by the id of a run."""
+    table = changed(
+        proposed.file, lambda rows: [row | {"answer": answers.get(row["run_id"], "")} for row in rows]
+    )
+    return label(Settings(data=proposed.data, answers=table, out=out, accept=accept, new_class=new_class))
+
+
+def test_proposals_cover_the_runs_and_questions_come_first(proposed):
+    assert (proposed.n_runs, proposed.n_asked) == (4, 2)
+    right = sum(p.n_windows for p in proposed.proposals if p.run_id == f"new_{p.terrain}")
+    assert right > 0.6 * sum(p.n_windows for p in proposed.proposals if p.run_id != "old")
+    rows = rows_of(proposed.file)
+    assert [row["ask"] for row in rows[:3]] == ["1", "2", ""]
+    assert len({row["run_id"] for row in rows[:2]}) == 2  # not two of one run
+    assert {row["run_id"] for row in rows} == {"new_ASPHALT", "new_GRASS", "new_GRAVEL", "old"}
+    for run_id in {row["run_id"] for row in rows}:
+        spans = sorted((float(r["start_s"]), float(r["end_s"])) for r in rows if r["run_id"] == run_id)
+        assert spans[0][0] == 0.0
+        assert spans[-1][1] == pytest.approx(24.0)
+        assert all(a[1] <= b[0] + 1e-6 for a, b in pairwise(spans))
+
+
+def test_answers_stand_above_what_the_model_proposes_and_measured_labels_stay(proposed, tmp_path):
+    answers = {"new_ASPHALT": "LAVA", "new_GRASS": "none", "new_GRAVEL": "yes"}
+    found = answered(proposed, tmp_path / "out", new_class=True, **answers)
+    runs, before = ({run.run_id: run for run in load_runs(at)} for at in (found.out, proposed.data))
+    assert {label.terrain for label in runs["new_ASPHALT"].labels} == {"LAVA"}
+    assert runs["new_GRASS"].labels == before["new_GRAVEL"].labels == ()  # what was recorded is as it was
+    assert runs["old"].labels == before["old"].labels != ()
+    assert (found.n_labels["measured"], "model" in found.n_labels) == (1, False)
+    sources = json.loads((found.out / "new_GRAVEL" / SOURCES_FILE).read_text())["labels"]
+    assert {each["source"] for each in sources} == {"person"}
+    for run_id, run in before.items():
+        np.testing.assert_array_equal(runs[run_id].streams["imu"].values, run.streams["imu"].values)
+
+
+def test_what_the_model_is_certain_of_needs_no_answer(proposed, tmp_path):
+    found = answered(proposed, tmp_path / "out", accept=0.0)
+    of_model = [each for labels in found.runs.values() for each in labels if each.source == "model"]
+    assert len(of_model) == found.n_labels["model"] >= 1
+    assert all(0 < each.confidence <= 1 for each in of_model)
+    assert not any(each.source == "model" for each in found.runs["old"])  # it is labelled already
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "sentence"),
+    [
+        (lambda rows: rows, ConfigError, "nothing is written"),
+        (lambda rows: [row | {"run_id": "other"} for row in rows], ConfigError, "none of those"),
+        (lambda rows: [*rows, rows[0]], ConfigError, "overlap"),
+        (lambda rows: [rows[0] | {"answer": "LAVA"}], ConfigError, "--new-class"),
+        (lambda rows: [rows[0] | {"end_s": "900"}], ConfigError, "no stretch of run"),
+        (lambda rows: [rows[0] | {"start_s": "nan"}], LogError, "line 2: is no proposal .start_s is 'nan'"),
+        (lambda rows: [rows[0] | {"n_windows": "many"}], LogError, "line 2: is no proposal .n_windows is"),
+    ],
+)
+def test_a_table_that_does_not_fit_is_refused_in_one_sentence(proposed, tmp_path, change, error, sentence):
+    changed(proposed.file, change)
+    with pytest.raises(error, match=sentence) as refusal:
+        label(Settings(data=proposed.data, answers=proposed.file, out=tmp_path / "out", accept=1.01))
+    assert len(str(refusal.value).splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_files_short_rows_and_folders_that_are_there_are_refused(proposed, tmp_path, tracked, drive):
+    head = proposed.file.read_text().splitlines()[0]
+    for name, text, sentence in (
+        ("notes.csv", "a,b\n1,2\n", "column 'run_id' is missing"),
+        ("short.csv", f"{head}\nold,0\n", "line 2: is no proposal: it is longer or shorter"),
+        ("nowhere.csv", None, "cannot be opened"),
+    ):
+        if text is not None:
+            (tmp_path / name).write_text(text)
+        with pytest.raises(LogError, match=sentence):
+            label(Settings(data=proposed.data, answers=tmp_path / name, out=tmp_path / "out"))
+    with pytest.raises(ConfigError, match="exists already"):
+        answered(proposed, proposed.data)
+    write_run(drive("short", "GRASS", 3, duration_s=1.5), tmp_path / "short")
+    with pytest.raises(DataError, match="no run holds a window"):
+        label(Settings(data=tmp_path / "short", model=str(tracked[0] / "model")))
