@@ -11,15 +11,13 @@ import inspect
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
-import click
-
-from pipelines.cli.options import COMMON, OneFile, Option
+from pipelines.cli.options import described_options
 from pipelines.cli.table import COMMANDS
 from pipelines.report import Column, Table
 from pipelines.report.markdown import markdown_table
 from pipelines.report.results import Result
+from pipelines.report.settings import Settings
 
 PAGE = Path(__file__).with_name("commands.md")
 
@@ -38,25 +36,14 @@ def commands_page() -> str:
             blocks.append(f"## {group}")
         module = import_module(command.module)
         text = " ".join((module.__doc__ or command.text).split("\n\n")[0].split())
-        blocks += [
-            f"### terrain {command.name}",
-            text,
-            f"```\n{module.EXAMPLE}\n```",
-            _options(OneFile(command)),
-        ]
+        example = f"```\n{module.EXAMPLE}\n```"
+        blocks += [f"### terrain {command.name}", text, example, _options(module.Settings)]
         blocks += [_fields(kind) for kind in _results(module)]
     return "\n\n".join(blocks) + "\n"
 
 
-def _options(command: click.Command) -> str:
-    context = click.Context(command, info_name="terrain")
-    rows: list[tuple[Any, ...]] = []
-    for parameter in command.params:
-        if isinstance(parameter, Option) and parameter.heading != COMMON:
-            written, text = parameter.get_help_record(context) or ("", "")
-            rows.append((written, text))
-        elif isinstance(parameter, click.Argument):
-            rows.append((parameter.make_metavar(context), getattr(parameter, "text", "")))
+def _options(model: type[Settings]) -> str:
+    rows = [row for options in described_options(model).values() for row in options]
     return markdown_table(Table(("option", Column("meaning", long=True)), rows))
 
 

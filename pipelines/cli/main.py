@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
+from collections.abc import Callable
 from difflib import get_close_matches
 from typing import Any
 
@@ -64,24 +65,20 @@ class Terrain(click.Group):
                 formatter.write(f"  {name:<12}{text}\n")
 
 
-@click.group(cls=Terrain, context_settings=HELP)
-@click.version_option(__version__, prog_name="terrain")
-def app() -> None:
-    """Terrain classification and slip learning for off-road robots."""
+app = click.version_option(__version__, prog_name="terrain")(Terrain(context_settings=HELP))
 
 
-class _Notes:
-    """Shows warnings of drives outside a robot's region in a sentence, the first of a command."""
+def note_once(usual: Callable[..., None]) -> Callable[..., None]:
+    """Return what shows warnings: as usual, but of drives outside a robot's region the first alone, as a note."""
 
-    def __init__(self) -> None:
-        self._usual, self._shown = warnings.showwarning, False
-
-    def __call__(self, message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
         if not issubclass(category, OutsideRegionWarning):
-            self._usual(message, category, *place, **more)
-        elif not self._shown:
-            self._shown = True
-            click.echo(f"note: {message}", err=True)
+            usual(message, category, *place, **more)
+            return
+        warnings.simplefilter("ignore", OutsideRegionWarning)
+        click.echo(f"note: {message}", err=True)
+
+    return show
 
 
 def one_line(message: str) -> str:
@@ -100,12 +97,10 @@ def one_line(message: str) -> str:
 
 def main() -> None:
     """Run the command line: a user's mistake is one sentence and exit code 2, a fault keeps its traceback."""
-    warnings.showwarning = _Notes()
+    warnings.showwarning = note_once(warnings.showwarning)
     try:
         code = app(standalone_mode=False, prog_name="terrain")
-        if getattr(
-            code, "interrupted", False
-        ):  # a result that shows what was found until the command was stopped
+        if getattr(code, "interrupted", False):  # it shows what was found until the command was stopped
             code = 130
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())

@@ -13,20 +13,25 @@ from pydantic.fields import FieldInfo
 
 from pipelines.cli.table import Command
 from pipelines.report.results import Result
-from pipelines.report.settings import Settings, option_name, option_of
+from pipelines.report.settings import Settings, setting
 
-PATH = click.Path(path_type=Path)
-WIDTH = 110
-"""Characters of a line of help at most."""
-
-COMMON, REQUIRED = "Output", "Required"
-"""Headings of the options that every command has, and of those that have to be given."""
+REQUIRED = "Required"
+"""Heading of what has to be given."""
 
 
-class Option(click.Option):
-    """An option that knows under which heading help lists it."""
+class Output(Settings):
+    """Output."""
 
-    heading: str = COMMON
+    json_file: Path | None = setting(None, "Write the result as JSON.", "--json")
+    report_file: Path | None = setting(
+        None, "Write the report as a page (.html) or as Markdown (.md).", "--report"
+    )
+    details: bool = setting(False, "Print the details, too.")
+
+
+def separated(text: str) -> list[str]:
+    """Return several values that are given in one text, by commas."""
+    return [part.strip() for part in text.split(",") if part.strip()]
 
 
 class OneFile(click.Command):
@@ -34,36 +39,31 @@ class OneFile(click.Command):
 
     def __init__(self, command: Command) -> None:
         self.module, self.command = import_module(command.module), command
-        model = self.module.Settings
-        super().__init__(
-            command.name,
-            params=[*(one for name in model.model_fields for one in _parameters(model, name)), *_common()],
-            callback=self._execute,
-            context_settings={"help_option_names": ["-h", "--help"], "max_content_width": WIDTH},
-        )
+        fields = self.module.Settings.model_fields | Output.model_fields
+        parameters = [_parameter(name, field) for name, field in fields.items() if field.alias]
+        super().__init__(command.name, params=parameters, callback=self._execute)
 
-    def _execute(
-        self, json_file: Path | None, report_file: Path | None, details: bool, **given: Any
-    ) -> Result:
+    def _execute(self, **options: Any) -> Result:
         from pipelines.report.json_file import write_json
         from pipelines.report.terminal import output_console, print_report, progress_bar
         from pipelines.report.writing import ENDINGS, check_file
 
-        if json_file is not None:
-            check_file(json_file, "--json")
-        if report_file is not None:
-            check_file(report_file, "--report", ENDINGS)
-        settings = self.module.Settings(
-            **{name: value for name, value in given.items() if value not in (None, ())}
-        )
+        # what is not given is None, or () of an option that may be repeated
+        given = {name: value for name, value in options.items() if value not in (None, ())}
+        output = Output(**{name: given.pop(name) for name in Output.model_fields if name in given})
+        if output.json_file is not None:
+            check_file(output.json_file, "--json")
+        if output.report_file is not None:
+            check_file(output.report_file, "--report", ENDINGS)
+        settings = self.module.Settings(**given)
         with progress_bar() as progress:
             result: Result = self.module.run(settings, progress)
         report = result.report
-        print_report(report, output_console(), details=details)
-        if json_file is not None:
-            write_json(json_file, result)
-        if report_file is not None:
-            report.save(report_file)
+        print_report(report, output_console(), details=output.details)
+        if output.json_file is not None:
+            write_json(output.json_file, result)
+        if output.report_file is not None:
+            report.save(output.report_file)
         return result
 
     def format_help(self, context: click.Context, formatter: click.HelpFormatter) -> None:
@@ -71,59 +71,54 @@ class OneFile(click.Command):
         formatter.write(f"{self.module.EXAMPLE}\n\n")
         text = (self.module.__doc__ or self.command.text).strip()
         formatter.write_text(" ".join(text.split("\n\n")[0].split()))
-        arguments = [each for each in self.params if isinstance(each, click.Argument)]
-        groups: dict[str, list[tuple[str, str]]] = {}
-        for parameter in self.params:
-            if isinstance(parameter, Option):
-                record = parameter.get_help_record(context)
-                if record is not None:
-                    groups.setdefault(parameter.heading, []).append(record)
-        if arguments:
-            with formatter.section("Arguments"):
-                formatter.write_dl(
-                    [(each.make_metavar(context), getattr(each, "text", "")) for each in arguments]
-                )
-        kinds = self.module.Settings.__mro__  # what is the command's own comes first
-        order = [REQUIRED, *(_headline(kind) for kind in kinds), COMMON]
-        for heading in sorted(groups, key=order.index):
+        for heading, rows in (described_options(self.module.Settings) | described_options(Output)).items():
             with formatter.section(heading):
-                formatter.write_dl(groups[heading])
+                formatter.write_dl(rows)
 
 
-def _parameters(model: type[Settings], name: str) -> list[click.Parameter]:
+def _parameter(name: str, field: FieldInfo) -> click.Parameter:
     """Return the parameter of a field; the model reads all values, so that they are texts here."""
-    field, (option_given, several) = model.model_fields[name], option_of(model, name)
-    if option_given == "":
-        return []
-    shown = option_name(model, name)
+    shown, extra = str(field.alias), typing.cast("dict[str, Any]", field.json_schema_extra)
     if not shown.startswith("-"):
-        argument = click.Argument([name], required=False, nargs=-1 if several else 1, metavar=shown)
-        argument.text = field.description  # type: ignore[attr-defined]
-        return [argument]
-    default = None if field.is_required() else field.get_default(call_default_factory=True)
-    flag = field.annotation is bool
-    names = f"{shown}/--no-{shown.removeprefix('--')}" if flag and default else shown
-    option = Option(
-        [names, name],
-        help=_help(field, default),
-        is_flag=flag,
-        multiple=several,
-        default=None,
-        metavar=None if flag else _metavar(field.annotation),
-        type=bool if flag else str,
+        return click.Argument([name], required=False)
+    if field.annotation is bool:
+        names = f"{shown}/--no-{shown.removeprefix('--')}" if field.default else shown
+        return click.Option([names, name], is_flag=True, default=None, type=bool)
+    kind = separated if _is_tuple(field) and not extra["repeated"] else str
+    return click.Option([shown, name], multiple=extra["repeated"], type=kind)
+
+
+def _is_tuple(field: FieldInfo) -> bool:
+    return any(
+        typing.get_origin(kind) is tuple for kind in (field.annotation, *typing.get_args(field.annotation))
     )
-    option.heading = _heading(model, name)
-    return [option]
 
 
-def _help(field: FieldInfo, default: Any) -> str:
-    text = field.description or ""
-    if field.is_required():
-        return text
-    if default is None or isinstance(default, bool) or default in ("", ()):
-        return text
-    shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
-    return f"{text} [default: {shown}]"
+def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]:
+    """Return how options are written and what they are, by the first line of the class that declares them.
+
+    What has to be given comes first, then what is the command's own.
+    """
+    groups: dict[str, list[tuple[str, str]]] = {REQUIRED: []}
+    heading_of: dict[str, str] = {}
+    for kind in model.__mro__:  # the first class that has a field is the last one here
+        heading = (kind.__doc__ or "Options").strip().splitlines()[0].rstrip(".")
+        groups[heading] = []
+        heading_of |= dict.fromkeys(vars(kind).get("__annotations__", ()), heading)
+    for name, field in model.model_fields.items():
+        if field.alias:
+            heading = REQUIRED if field.is_required() else heading_of[name]
+            groups[heading].append((_written(field, field.alias), _text(field)))
+    return {heading: rows for heading, rows in groups.items() if rows}
+
+
+def _written(field: FieldInfo, option: str) -> str:
+    """Return an option with what stands for its value."""
+    if not option.startswith("-"):
+        return option
+    if field.annotation is bool:
+        return f"{option} / --no-{option.removeprefix('--')}" if field.default else option
+    return f"{option} {_metavar(field.annotation)}"
 
 
 def _metavar(kind: Any) -> str:
@@ -135,25 +130,10 @@ def _metavar(kind: Any) -> str:
     return {int: "N", float: "X", Path: "PATH"}.get(kind, "TEXT")
 
 
-def _heading(model: type[Settings], name: str) -> str:
-    """Return under what help lists a field: the first line of the docstring of the class that declares it."""
-    if model.model_fields[name].is_required():
-        return REQUIRED
-    return _headline([kind for kind in model.__mro__ if name in vars(kind).get("__annotations__", {})][-1])
-
-
-def _headline(kind: type) -> str:
-    return (kind.__doc__ or "Options").strip().splitlines()[0].rstrip(".")
-
-
-def _common() -> list[click.Parameter]:
-    return [
-        Option(["--json", "json_file"], metavar="FILE", type=PATH, help="Write the result as JSON."),
-        Option(
-            ["--report", "report_file"],
-            metavar="FILE",
-            type=PATH,
-            help="Write the report as a page (.html) or as Markdown (.md).",
-        ),
-        Option(["--details"], is_flag=True, help="Print the details, too."),
-    ]
+def _text(field: FieldInfo) -> str:
+    """Return the help of a field with its default; none is shown of a flag."""
+    text, default = field.description or "", field.default
+    if field.is_required() or default is None or isinstance(default, bool) or default in ("", ()):
+        return text
+    shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
+    return f"{text} [default: {shown}]"

@@ -194,11 +194,9 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
 
 def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot | None) -> Readers:
     """Return the readers of a layout, which ``auto`` finds; none where there is no run."""
-    from pipelines.data.bag_files import find_bags
-
     if layout not in LAYOUTS:
         raise ConfigError(f"layout {layout!r} is unknown: choose one of {', '.join(LAYOUTS)}")
-    if layout == "bag" or (layout == "auto" and folder.is_file() and find_bags(folder)):
+    if layout == "bag" or (layout == "auto" and folder.is_file() and _holds_bags(folder)):
         return _bags(folder, mapping, robot)
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
@@ -234,7 +232,7 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
     if len(names) > 1:
         raise LogError(f"{folder}: mixes the layouts {' and '.join(names)}; choose one with --format")
     if not names:
-        return _bags(folder, None, robot) if layout == "auto" and find_bags(folder) else []
+        return _bags(folder, None, robot) if layout == "auto" and _holds_bags(folder) else []
     if names == ["drive"]:
         return drive.find_runs(folder, drive_robot(robot))
     if names == ["drive-recording"]:
@@ -251,6 +249,12 @@ def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:
     read = by_mapping.load_mapping(mapping, check_stream)
     radius_m = bag_runs.wheel_radius_m(read.robot, robot)
     return by_mapping.find_runs(folder, read, partial(bag_runs.read_stream, radius_m=radius_m))
+
+
+def _holds_bags(place: Path) -> bool:
+    from pipelines.data.bag_files import find_bags
+
+    return bool(find_bags(place))
 
 
 def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> Readers:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from pipelines.report.settings import JobsSettings, option_name, setting
+from pipelines.report.settings import JobsSettings, setting
 from pipelines.report.settings import Settings as BaseSettings
 from terrain.control.controllers import CONTROLLERS, KINDS, uses_classifier
 
@@ -217,7 +217,7 @@ class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
     def _refuse(self, names: Iterable[str], accepted: str) -> None:
         for name in names:
             if getattr(self, name) != type(self).model_fields[name].default:
-                raise ValueError(f"{option_name(type(self), name)} is accepted {accepted}")
+                raise ValueError(f"{type(self).model_fields[name].alias} is accepted {accepted}")
 
     @property
     def all_seeds(self) -> range:

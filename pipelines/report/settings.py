@@ -8,10 +8,9 @@ Nothing heavy is imported here, nor by a module of settings: ``--help`` reads th
 from __future__ import annotations
 
 import os
-import typing
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from terrain.errors import ConfigError
 
@@ -28,9 +27,11 @@ def setting(default: Any, text: str, option: str | None = None, repeated: bool =
     repeated : of a tuple: each value has an option of its own; otherwise they are one text, by commas
     bounds : of a number, as pydantic names them: ``ge``, ``gt``, ``le``, ``lt``
     """
-    return Field(
-        default, description=text, json_schema_extra={"option": option, "repeated": repeated}, **bounds
-    )
+    return Field(default, description=text, alias=option, json_schema_extra={"repeated": repeated}, **bounds)
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 class Settings(BaseModel):
@@ -40,15 +41,20 @@ class Settings(BaseModel):
     --------
     >>> class Shown(Settings):
     ...     seed: int = setting(0, "Of all that is drawn.", ge=0)
-    ...     names: tuple[str, ...] = setting(("a",), "By commas.")
-    >>> Shown(names="b, c").names
-    ('b', 'c')
+    >>> Shown.model_fields["seed"].alias
+    '--seed'
     >>> Shown(seed=-1)
     Traceback (most recent call last):
     terrain.errors.ConfigError: --seed is -1: input should be greater than or equal to 0
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", arbitrary_types_allowed=True)
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        arbitrary_types_allowed=True,
+        populate_by_name=True,
+        alias_generator=_option,
+    )
 
     def __init__(self, **values: Any) -> None:
         try:
@@ -56,19 +62,9 @@ class Settings(BaseModel):
         except ValidationError as error:
             raise ConfigError(_one_sentence(type(self), error)) from None
 
-    @model_validator(mode="before")
-    @classmethod
-    def _separate(cls, values: dict[str, Any]) -> dict[str, Any]:
-        separated = {
-            name: tuple(part.strip() for part in value.split(",") if part.strip())
-            for name, value in values.items()
-            if isinstance(value, str) and name in cls.model_fields and is_separated(cls, name)
-        }
-        return values | separated
-
     def with_(self, **changed: Any) -> Self:
         """Return the same settings with some changed, checked anew."""
-        return type(self)(**{name: getattr(self, name) for name in type(self).model_fields} | changed)
+        return type(self)(**dict(self) | changed)
 
 
 class JobsSettings(Settings):
@@ -82,24 +78,6 @@ class JobsSettings(Settings):
         return self.n_jobs or os.cpu_count() or 1
 
 
-def option_of(model: type[Settings], name: str) -> tuple[str | None, bool]:
-    """Return the option that a field is given, or None, and whether it is repeated for several values."""
-    extra: Any = model.model_fields[name].json_schema_extra or {"option": None, "repeated": False}
-    return extra["option"], extra["repeated"]
-
-
-def is_separated(model: type[Settings], name: str) -> bool:
-    """Return whether several values of a field are given in one text, by commas."""
-    kind = model.model_fields[name].annotation
-    is_tuple = any(typing.get_origin(each) is tuple for each in (kind, *typing.get_args(kind)))
-    return is_tuple and not option_of(model, name)[1]
-
-
-def option_name(model: type[Settings], name: str) -> str:
-    """Return the option of a field, as ``--window``."""
-    return option_of(model, name)[0] or f"--{name.replace('_', '-')}"
-
-
 def _one_sentence(model: type[Settings], error: ValidationError) -> str:
     """Return the first thing that is not accepted."""
     first = error.errors()[0]
@@ -109,10 +87,9 @@ def _one_sentence(model: type[Settings], error: ValidationError) -> str:
     name, given = str(first["loc"][0]), first["input"]
     if first["type"] == "extra_forbidden":
         return f"there is no setting {name!r}"
-    option = option_name(model, name)
     if first["type"] == "missing":
-        return f"{option} is missing"
-    return f"{option} is {_shown(given)}: {message[:1].lower()}{message[1:]}"
+        return f"{name} is missing"
+    return f"{model.model_fields[name].alias} is {_shown(given)}: {message[:1].lower()}{message[1:]}"
 
 
 def _shown(given: Any) -> str:

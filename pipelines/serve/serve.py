@@ -18,7 +18,7 @@ from pydantic import field_validator, model_validator
 from pipelines.data.settings import ReadSettings
 from pipelines.report import Pairs, Progress, Report, Result, Section, described, enumerated, plural, silent
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import option_name, setting
+from pipelines.report.settings import setting
 
 if TYPE_CHECKING:
     from pipelines.learn.model_file import TerrainModel
@@ -129,9 +129,7 @@ class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
         for name, group in (modes | {"the WebSocket service": ServiceSettings}).items():
             for field, about in group.model_fields.items():
                 if name != mode and getattr(self, field) != about.get_default():
-                    raise ValueError(
-                        f"{option_name(type(self), field)} is an option of {name}, not of {mode}"
-                    )
+                    raise ValueError(f"{about.alias} is an option of {name}, not of {mode}")
         return self
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from pipelines.report.settings import Settings, option_name
+from pipelines.report.settings import Settings
 from terrain.errors import ConfigError
 
 
@@ -26,4 +26,4 @@ def refuse_others(settings: Settings, groups: Mapping[str, type[Settings]], used
     for purpose, group in groups.items():
         for name, field in {} if purpose == used else group.model_fields.items():
             if getattr(settings, name) != field.get_default(call_default_factory=True):
-                raise ConfigError(f"{option_name(group, name)} is for {purpose}, not for {chosen}")
+                raise ConfigError(f"{field.alias} is for {purpose}, not for {chosen}")

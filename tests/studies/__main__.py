@@ -51,7 +51,8 @@ def main(words: list[str]) -> int:
             raise click.UsageError(f"there is no study {words[0]!r}; there are {', '.join(STUDIES)}")
         command = OneFile(Command("", words[0], *STUDIES[words[0]]))
         prog_name = f"python tests/studies {words[0]}"
-        result: Any = command.main(words[1:], prog_name=prog_name, standalone_mode=False)
+        options: dict[str, Any] = {"standalone_mode": False, "help_option_names": ["-h", "--help"]}
+        result: Any = command.main(words[1:], prog_name, **options)
     except click.exceptions.Exit as stop:
         return stop.exit_code
     except (TerrainError, click.ClickException) as error:

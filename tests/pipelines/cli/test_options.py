@@ -11,7 +11,7 @@ from pipelines.cli import main as cli
 from pipelines.cli.table import COMMANDS, FORMER, Command
 from pipelines.report import Report, Result, Section, Text, described
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import option_name, setting
+from pipelines.report.settings import setting
 from terrain.errors import ConfigError, DataError
 
 EXAMPLE = "terrain draw --folder a"
@@ -146,7 +146,7 @@ def test_unknown_settings_are_refused_and_settings_do_not_change():
     assert settings.with_(seed=2).seed == 2
     with pytest.raises(ConfigError, match="--seed is -2"):
         settings.with_(seed=-2)
-    assert option_name(Settings, "window_s") == "--window"
+    assert Settings.model_fields["window_s"].alias == "--window"
 
 
 def test_every_command_has_what_a_command_needs():

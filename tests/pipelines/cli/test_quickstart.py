@@ -38,7 +38,7 @@ def test_the_runs_that_are_predicted_took_no_part(held_out):
     assert {each.run_id for each in result.crossval.per_run} == {each.run_id for each in training}
     assert [" --without ASPHALT_3" in step for step in result.commands] == [True, True, False]
     assert result.commands[-1].endswith(" --only ASPHALT_3")
-    loaded = load(AlignedRunsSettings(data=folder / "data", without="ASPHALT_3")).runs
+    loaded = load(AlignedRunsSettings(data=folder / "data", without=("ASPHALT_3",))).runs
     assert data_digest(loaded) == result.data_digest
 
     page = result.report_file.read_text()
@@ -92,10 +92,10 @@ def test_runs_are_chosen_by_id(make_run, tmp_path):
         return [each.run_id for each in load(AlignedRunsSettings(data=tmp_path, **options)).runs]
 
     assert chosen() == ["a0", "a1", "a2"]
-    assert chosen(only="a2, a0") == ["a0", "a2"]
-    assert chosen(without="a1") == ["a0", "a2"]
-    assert chosen(only="a0,a1", without="a1") == ["a0"]
+    assert chosen(only=("a2", "a0")) == ["a0", "a2"]
+    assert chosen(without=("a1",)) == ["a0", "a2"]
+    assert chosen(only=("a0", "a1"), without=("a1",)) == ["a0"]
     with pytest.raises(ConfigError, match="--without: there is no run 'b'; there are a0, a1, a2"):
-        chosen(without="b")
+        chosen(without=("b",))
     with pytest.raises(ConfigError, match="leave no run"):
-        chosen(only="a0", without="a0")
+        chosen(only=("a0",), without=("a0",))
