@@ -4,6 +4,9 @@ The command line prints the message of a :class:`TerrainError` as one sentence a
 anything else that is raised is a fault of this package and keeps its traceback.
 """
 
+from importlib import import_module
+from typing import Any
+
 
 class TerrainError(Exception):
     """Base of every error that input, options or files can cause."""
@@ -38,3 +41,23 @@ def one_line(error: BaseException, most: int = 160) -> str:
     ('no end', 'EOFError')
     """
     return " ".join(str(error).split())[:most] or type(error).__name__
+
+
+def library(name: str, need: str, extra: str) -> Any:
+    """Return a module of a package that not everybody needs.
+
+    Parameters
+    ----------
+    name : of the module
+    need : what needs which package, as the refusal begins
+    extra : of this package that installs it
+
+    Raises
+    ------
+    ConfigError
+        if the package is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise ConfigError(f"{need}: pip install 'terrain-slip[{extra}]'") from error

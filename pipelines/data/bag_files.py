@@ -12,13 +12,14 @@ import re
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from pydantic import BaseModel, ValidationError
 
-from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, McapReader, library
+from pipelines.data.mcap_file import MAGIC, MAX_RECORD_BYTES, library, mcap_messages, mcap_topics
 from terrain.errors import LogError, TerrainError, one_line
 from terrain.files.documents import first_fault, read_yaml
 from terrain.files.names import shown
@@ -128,123 +129,6 @@ def open_bag(path: Path) -> Bag:
     return Bag(path, files, f"ROS2_{head.ros_distro.upper()}" if head.ros_distro else "")
 
 
-def reader_of(path: Path, faults: Faults) -> McapReader | RosbagsReader:
-    """Return the reader of a file of messages, by its first bytes.
-
-    Raises
-    ------
-    LogError
-        if it is of an unknown type.
-    """
-    try:
-        with path.open("rb") as file:
-            begin = file.read(len(SQLITE_MAGIC))
-    except OSError as error:
-        raise LogError(f"{short_name(path)}: cannot be opened ({error.strerror or error})") from error
-    if begin.startswith(MAGIC):
-        return McapReader(path, faults)
-    if begin.startswith((ROS1_MAGIC, SQLITE_MAGIC)):
-        return RosbagsReader(path, faults, is_ros1=begin.startswith(ROS1_MAGIC))
-    what = f"begins with {begin[:12]!r}" if begin else "is empty"
-    raise LogError(f"{short_name(path)}: {what}, which is no bag of a known type: {ACCEPTED}")
-
-
-class RosbagsReader:
-    """A bag of ROS 1 or a storage file of ROS 2 in SQLite, by rosbags.
-
-    Parameters
-    ----------
-    path : of the file
-    faults : gets what is damaged
-    is_ros1 : which of the two
-    """
-
-    def __init__(self, path: Path, faults: Faults, *, is_ros1: bool) -> None:
-        self._path, self._faults, self._place, self._is_ros1 = path, faults, short_name(path), is_ros1
-
-    def _open(self) -> Any:
-        rosbags = library("rosbags.rosbag1" if self._is_ros1 else "rosbags.rosbag2")
-        try:
-            if not self._is_ros1:
-                self._refuse_views()
-            reader = rosbags.Reader(self._path)
-            reader.open()
-        except TerrainError:
-            raise
-        except Exception as error:  # whatever the library makes of a damaged file
-            raise LogError(f"{self._place}: is damaged ({one_line(error)})") from error
-        if self._is_ros1:
-            for position, chunk in reader.chunks.items():
-                reader.chunks[position] = chunk._replace(decompressor=_bounded(chunk.decompressor))
-        return reader
-
-    def _refuse_views(self) -> None:
-        """Refuse a database whose messages are a view: to look into it could take forever."""
-        query = (
-            "select count(*) from sqlite_master where name in ('topics', 'messages') "
-            "and type = 'table' and sql not like '%virtual%'"
-        )
-        place = f"file:{quote(str(self._path.absolute()))}?mode=ro&immutable=1"
-        with closing(sqlite3.connect(place, uri=True)) as store:
-            if store.execute(query).fetchone()[0] != 2:
-                raise LogError(f"{self._place}: is no bag, it lacks the tables 'topics' and 'messages'")
-
-    def topics(self) -> list[Topic]:
-        """Return the topics.
-
-        Raises
-        ------
-        LogError
-            if the file is damaged.
-        """
-        found = []
-        with closing(self._open()) as reader:
-            for each in reader.connections:
-                if self._is_ros1:
-                    encoding, schema = "ros1", "ros1msg"
-                else:
-                    encoding, schema = each.ext.serialization_format, f"ros2{each.msgdef.format.name.lower()}"
-                found.append(Topic(each.topic, each.msgtype, encoding, schema, each.msgdef.data or ""))
-        return found
-
-    def messages(self, names: frozenset[str]) -> Iterator[tuple[str, int, bytes]]:
-        """Yield topic, log time in ns and content of the messages of some topics, in the order of log times.
-
-        Raises
-        ------
-        LogError
-            if the file is damaged.
-        """
-        with closing(self._open()) as reader:
-            connections = [each for each in reader.connections if each.topic in names]
-            try:
-                for connection, log_ns, content in reader.messages(connections) if connections else ():
-                    yield connection.topic, log_ns, content
-            except ValueError as error:
-                self._faults.found(self._place, DAMAGED_BLOCK, one_line(error))
-            except Exception as error:  # whatever the library makes of a damaged file
-                self._faults.found(self._place, EARLY_END, f"is damaged ({one_line(error)})")
-
-
-def _bounded(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
-    """Return what unpacks a chunk of ROS 1 as the library's function does, but no more than is accepted."""
-
-    def unpack(packed: bytes) -> bytes:
-        if packed[:3] == b"BZh":
-            content = bz2.BZ2Decompressor().decompress(packed, MAX_RECORD_BYTES + 1)
-        elif packed[:4] == b"\x04\x22\x4d\x18":
-            import lz4.frame
-
-            content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, MAX_RECORD_BYTES + 1))
-        else:
-            content = decompress(packed)
-        if len(content) > MAX_RECORD_BYTES:
-            raise ValueError(f"a chunk of {len(packed)} bytes would have more than {MAX_RECORD_BYTES} bytes")
-        return content
-
-    return unpack
-
-
 def topics_of(bag: Bag) -> dict[str, Topic]:
     """Return the topics of all files of a bag, by name.
 
@@ -255,7 +139,8 @@ def topics_of(bag: Bag) -> dict[str, Topic]:
     """
     found: dict[str, Topic] = {}
     for file in bag.files:
-        for topic in reader_of(file, Faults(None)).topics():
+        magic = _magic(file)
+        for topic in mcap_topics(file) if magic == MAGIC else _rosbags_topics(file, magic):
             if found.setdefault(topic.name, topic).kind != topic.kind:
                 place = short_name(bag.path)
                 raise LogError(f"{place}: topic {shown(topic.name)} has messages of two types")
@@ -263,9 +148,104 @@ def topics_of(bag: Bag) -> dict[str, Topic]:
 
 
 def messages_of(bag: Bag, names: frozenset[str], faults: Faults) -> Iterator[tuple[str, int, bytes]]:
-    """Yield topic, log time in ns and content of the messages of some topics, of one file after another."""
+    """Yield topic, log time in ns and content of the messages of some topics, of one file after another.
+
+    Those of a file of MCAP come in its order, of others in the order of log times.
+
+    Raises
+    ------
+    LogError
+        if a file is damaged, unless faults are counted.
+    """
     for file in bag.files:
-        yield from reader_of(file, faults).messages(names)
+        magic = _magic(file)
+        read = mcap_messages if magic == MAGIC else partial(_rosbags_messages, magic)
+        yield from read(file, names, faults)
+
+
+def _magic(path: Path) -> bytes:
+    """Return by which of the beginnings that are read a file begins."""
+    try:
+        with path.open("rb") as file:
+            begin = file.read(len(SQLITE_MAGIC))
+    except OSError as error:
+        raise LogError(f"{short_name(path)}: cannot be opened ({error.strerror or error})") from error
+    for magic in (MAGIC, ROS1_MAGIC, SQLITE_MAGIC):
+        if begin.startswith(magic):
+            return magic
+    what = f"begins with {begin[:12]!r}" if begin else "is empty"
+    raise LogError(f"{short_name(path)}: {what}, which is no bag of a known type: {ACCEPTED}")
+
+
+def _open_by_rosbags(path: Path, magic: bytes) -> Any:
+    """Return the reader of rosbags of a bag of ROS 1, or of a storage file of ROS 2 in SQLite."""
+    rosbags = library("rosbags.rosbag1" if magic == ROS1_MAGIC else "rosbags.rosbag2")
+    try:
+        if magic == SQLITE_MAGIC:
+            _refuse_views(path)
+        reader = rosbags.Reader(path)
+        reader.open()
+    except TerrainError:
+        raise
+    except Exception as error:  # whatever the library makes of a damaged file
+        raise LogError(f"{short_name(path)}: is damaged ({one_line(error)})") from error
+    if magic == ROS1_MAGIC:
+        for position, chunk in reader.chunks.items():
+            reader.chunks[position] = chunk._replace(decompressor=_bounded(chunk.decompressor))
+    return reader
+
+
+def _refuse_views(path: Path) -> None:
+    """Refuse a database whose messages are a view: to look into it could take forever."""
+    query = (
+        "select count(*) from sqlite_master where name in ('topics', 'messages') "
+        "and type = 'table' and sql not like '%virtual%'"
+    )
+    place = f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1"
+    with closing(sqlite3.connect(place, uri=True)) as store:
+        if store.execute(query).fetchone()[0] != 2:
+            raise LogError(f"{short_name(path)}: is no bag, it lacks the tables 'topics' and 'messages'")
+
+
+def _bounded(decompress: Callable[[bytes], bytes]) -> Callable[[bytes], bytes]:
+    """Return what unpacks a chunk of ROS 1 as the library's function does, but no more than is accepted."""
+    lz4 = library("lz4.frame")
+    unpackers = {bz2.decompress: bz2.BZ2Decompressor, lz4.decompress: lz4.LZ4FrameDecompressor}
+    unpacker = unpackers.get(decompress)
+
+    def unpack(packed: bytes) -> bytes:
+        content = bytes(unpacker().decompress(packed, MAX_RECORD_BYTES + 1) if unpacker else packed)
+        if len(content) > MAX_RECORD_BYTES:
+            raise ValueError(f"a chunk of {len(packed)} bytes would have more than {MAX_RECORD_BYTES} bytes")
+        return content
+
+    return unpack
+
+
+def _rosbags_topics(path: Path, magic: bytes) -> list[Topic]:
+    found = []
+    with closing(_open_by_rosbags(path, magic)) as reader:
+        for each in reader.connections:
+            if magic == ROS1_MAGIC:
+                encoding, schema = "ros1", "ros1msg"
+            else:
+                encoding, schema = each.ext.serialization_format, f"ros2{each.msgdef.format.name.lower()}"
+            found.append(Topic(each.topic, each.msgtype, encoding, schema, each.msgdef.data or ""))
+    return found
+
+
+def _rosbags_messages(
+    magic: bytes, path: Path, names: frozenset[str], faults: Faults
+) -> Iterator[tuple[str, int, bytes]]:
+    with closing(_open_by_rosbags(path, magic)) as reader:
+        connections = [each for each in reader.connections if each.topic in names]
+        try:
+            for connection, log_ns, content in reader.messages(connections) if connections else ():
+                yield connection.topic, log_ns, content
+        except ValueError as error:
+            faults.found(short_name(path), DAMAGED_BLOCK, one_line(error))
+        except Exception as error:  # whatever the library makes of a damaged file
+            faults.found(short_name(path), EARLY_END, f"is damaged ({one_line(error)})")
 
 
 def decoder_of(place: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
@@ -309,9 +289,7 @@ def _of_protobuf(at: str, topic: Topic) -> Callable[[bytes], Any]:
 
 
 def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
-    library("rosbags.typesys")
-    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-
+    typesys = library("rosbags.typesys")
     if len(topic.definition) > MAX_DEFINITION_CHARACTERS:
         raise LogError(f"{at}: its definition is longer than {MAX_DEFINITION_CHARACTERS} characters")
     package, _, name = short_type(topic.kind).partition("/")
@@ -322,14 +300,15 @@ def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
             if topic.schema_encoding == "ros2idl":
                 for part in topic.definition.split("=" * 80 + "\n"):
                     idl = part.partition("\n")[2] if part.startswith("IDL:") else part
-                    types.update(get_types_from_idl(idl) if idl.strip() else {})
+                    types.update(typesys.get_types_from_idl(idl) if idl.strip() else {})
             else:
-                types = dict(get_types_from_msg(topic.definition, kind))
+                types = dict(typesys.get_types_from_msg(topic.definition, kind))
             _refuse_strange_types(at, types)
-            store = get_typestore(Stores.EMPTY)
+            store = typesys.get_typestore(typesys.Stores.EMPTY)
             store.register(types)
         else:
-            store = get_typestore(Stores.__members__.get(distro, Stores[DISTRO]))
+            releases = typesys.Stores
+            store = typesys.get_typestore(releases.__members__.get(distro, releases[DISTRO]))
         if kind not in store.types:
             raise LogError(f"{at} is of type {shown(topic.kind)}, which is not defined")
         store.get_msgdef(kind)

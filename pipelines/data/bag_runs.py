@@ -15,7 +15,15 @@ from terrain.logs.faults import Faults, Topic
 from terrain.logs.log_files import checked_names, short_name
 from terrain.logs.parquet_file import MAX_VALUES
 from terrain.logs.recorded_windows import RecordedWindow, window_of_text
-from terrain.logs.run_topics import RUN_TOPIC, STRING, WINDOW_TOPIC, read_document, run_of, string_of
+from terrain.logs.run_topics import (
+    RUN_TOPIC,
+    STRING,
+    WINDOW_TOPIC,
+    RunDocument,
+    read_document,
+    run_of,
+    string_of,
+)
 from terrain.logs.samples import refuse_apart
 from terrain.logs.topic_mapping import Mapping as TopicMapping
 from terrain.logs.topic_mapping import check_stream, load_mapping, standard_mapping
@@ -135,20 +143,27 @@ def _exported_run(bag: Bag, place: str, topics: Mapping[str, Topic], *, repair: 
     prefix = RUN_TOPIC.rpartition("/")[0]
     names = frozenset(name for name in topics if name.startswith(prefix))
     counted = Faults(Counter())
-    messages: dict[str, list[bytes]] = {}
-    n_bytes = 0
-    for topic, _, content in messages_of(bag, names, counted):
-        messages.setdefault(topic, []).append(content)
-        n_bytes += len(content)
-        if n_bytes > 8 * MAX_VALUES:
-            raise LogError(f"{place}: has more than {MAX_VALUES} values")
-    if not messages.get(RUN_TOPIC):
-        raise LogError(f"{place}: {RUN_TOPIC} has no message")
-    document = read_document(place, string_of(place, messages[RUN_TOPIC][-1]), topics)
+    document, messages = _document(bag, place, topics, names, counted)
     tolerant = document.live or repair
     if counted.first and not tolerant:
         raise LogError(counted.first)
     return run_of(place, document, messages, counted if tolerant else Faults(None))
+
+
+def _document(
+    bag: Bag, place: str, topics: Mapping[str, Topic], names: frozenset[str], faults: Faults
+) -> tuple[RunDocument, dict[str, list[bytes]]]:
+    """Return the document of the run of a bag, and the messages of some topics, that of documents too."""
+    messages: dict[str, list[bytes]] = {name: [] for name in names}
+    n_bytes = 0
+    for topic, _, content in messages_of(bag, names, faults):
+        messages[topic].append(content)
+        n_bytes += len(content)
+        if n_bytes > 8 * MAX_VALUES:
+            raise LogError(f"{place}: has more than {MAX_VALUES} values")
+    if not messages[RUN_TOPIC]:
+        raise LogError(f"{place}: {RUN_TOPIC} has no message")
+    return read_document(place, string_of(place, messages[RUN_TOPIC][-1]), topics), messages
 
 
 def recorded_windows(path: Path) -> tuple[str, list[RecordedWindow]] | None:
@@ -160,16 +175,12 @@ def recorded_windows(path: Path) -> tuple[str, list[RecordedWindow]] | None:
         if the bag cannot be read, or a window is damaged.
     """
     bag, place = open_bag(path), short_name(path)
-    texts: dict[str, list[str]] = {WINDOW_TOPIC: [], RUN_TOPIC: []}
-    topics = topics_of(bag)
-    if not set(texts) <= set(topics):
+    topics, names = topics_of(bag), frozenset((WINDOW_TOPIC, RUN_TOPIC))
+    if not names <= set(topics):
         return None
-    for topic, _, content in messages_of(bag, frozenset(texts), Faults(Counter())):
-        texts[topic].append(string_of(place, content))
-    if not texts[RUN_TOPIC]:
-        return None
-    run_id = read_document(place, texts[RUN_TOPIC][-1], topics).run_id
-    return run_id, [window_of_text(place, text) for text in texts[WINDOW_TOPIC]]
+    document, messages = _document(bag, place, topics, names, Faults(Counter()))
+    texts = [string_of(place, message) for message in messages[WINDOW_TOPIC]]
+    return document.run_id, [window_of_text(place, text) for text in texts]
 
 
 def wheel_radius_m(name: str, given: Robot | None) -> float | None:

@@ -17,11 +17,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from terrain import errors
 from terrain.errors import ConfigError, one_line
 from terrain.files.resources import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
@@ -35,12 +37,15 @@ from terrain.logs.schema import (
     unit_of,
 )
 
+if TYPE_CHECKING:
+    from can import Message as Frame
+
 DEFAULT_DBC = "agrimaro.dbc"
 MAX_BYTES = 8
 UNITLESS = ("", "-", "1")
 """Units of a code; the empty one also of a ratio."""
 
-MISSING_PACKAGE = "CAN needs the packages python-can and cantools: pip install 'terrain-slip[can]'"
+library = partial(errors.library, need="CAN needs the packages python-can and cantools", extra="can")
 
 BUS_OFF_BIT = 0x40
 """In the identifier of an error frame of socketcan."""
@@ -108,37 +113,6 @@ def channels_of(stream: str) -> tuple[str, ...]:
     ('speed_x_mps', 'speed_y_mps', 'yaw_rate_radps')
     """
     return tuple(SIGNALS[stream])
-
-
-class Frame(NamedTuple):
-    """One frame of a bus.
-
-    Parameters
-    ----------
-    time_s : its time on the clock of the bus
-    arbitration_id : identifier; of an error frame its kinds
-    data : up to 8 bytes
-    is_extended, is_remote, is_error : kinds of frames
-    """
-
-    time_s: float
-    arbitration_id: int
-    data: bytes
-    is_extended: bool = False
-    is_remote: bool = False
-    is_error: bool = False
-
-
-def frame_of(message: Any) -> Frame:
-    """Return a message of python-can as a frame."""
-    return Frame(
-        message.timestamp,
-        message.arbitration_id,
-        bytes(message.data),
-        message.is_extended_id,
-        message.is_remote_frame,
-        message.is_error_frame,
-    )
 
 
 class Drop(StrEnum):
@@ -299,10 +273,7 @@ def load_layout(path: str | Path | None = None, streams: Iterable[str] = SIGNALS
 
 
 def _read(path: Path) -> Any:
-    try:
-        import cantools
-    except ImportError as error:
-        raise ConfigError(MISSING_PACKAGE) from error
+    cantools = library("cantools")
     try:
         return cantools.database.load_file(path, database_format="dbc", strict=True)
     except OSError as error:
@@ -382,29 +353,33 @@ def _crc_of(plan: MessagePlan, data: bytes) -> int:
 def decode(layout: Layout, frame: Frame) -> Part | Drop:
     """Return what a frame has of a sample, or why it is not used.
 
+    The time of a frame is on the clock of the bus; the identifier of an error frame states its kinds.
+
     Examples
     --------
     >>> layout = load_layout()
     >>> frame, = encode(layout, "steering", [0.1, -0.2, math.nan], counter=7)
     >>> decode(layout, frame)
     Part(stream='steering', counter=7, columns=(0, 1, 2), values=(0.09999, -0.20001, nan), n_out_of_range=0)
-    >>> decode(layout, frame._replace(data=frame.data[:5]))
+    >>> frame.data = frame.data[:5]
+    >>> decode(layout, frame)
     <Drop.LENGTH: 'wrong length'>
     """
-    if frame.is_error:
+    if frame.is_error_frame:
         return Drop.BUS_OFF if frame.arbitration_id & BUS_OFF_BIT else Drop.ERROR
-    if frame.is_remote:
+    if frame.is_remote_frame:
         return Drop.REMOTE
-    plan = layout.by_key.get((frame.arbitration_id, frame.is_extended))
+    plan = layout.by_key.get((frame.arbitration_id, frame.is_extended_id))
     if plan is None:
         return Drop.UNKNOWN
     if len(frame.data) != plan.message.length:
         return Drop.LENGTH
-    if not math.isfinite(frame.time_s):
+    if not math.isfinite(frame.timestamp):
         return Drop.TIME
+    data = bytes(frame.data)
     try:
-        decoded = plan.message.decode(frame.data, decode_choices=False)
-        if plan.crc_bits and decoded[CRC] != _crc_of(plan, frame.data):
+        decoded = plan.message.decode(data, decode_choices=False)
+        if plan.crc_bits and decoded[CRC] != _crc_of(plan, data):
             return Drop.CHECKSUM
         counter = int(decoded[COUNTER]) if plan.counter_bits else None
     except Exception:  # whatever a DBC makes of bytes, as of a multiplexer that it does not describe
@@ -444,6 +419,7 @@ def encode(
     time_s : of the frames
     clipped : gets the number of values beyond their range, by signal
     """
+    can = library("can")
     frames = []
     for plan in layout.by_stream.get(stream, ()):
         sent: dict[str, Any] = dict(plan.others)
@@ -460,5 +436,6 @@ def encode(
         if plan.crc_bits:
             sent[CRC] = _crc_of(plan, data)
             data = bytes(plan.message.encode(sent, padding=False, strict=False))
-        frames.append(Frame(time_s, plan.message.frame_id, data, plan.message.is_extended_frame))
+        about = {"arbitration_id": plan.message.frame_id, "is_extended_id": plan.message.is_extended_frame}
+        frames.append(can.Message(time_s, data=data, **about))
     return frames

@@ -14,26 +14,28 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipelines.data.can_codec import (
-    MISSING_PACKAGE,
     QUATERNION,
     RECEIVED,
     SIGNALS,
     Drop,
-    Frame,
     Layout,
     Part,
     channels_of,
     decode,
-    frame_of,
+    library,
 )
-from terrain.errors import ConfigError, LogError, one_line
+from terrain.errors import LogError, one_line
 from terrain.logs.borealtc import whole_run_label
 from terrain.logs.samples import checked_stream
 from terrain.records import Reading, RunLog, Stream
+
+if TYPE_CHECKING:
+    from can import Message as Frame
 
 READERS = {
     ".asc": ("ASCReader", "r"),
@@ -174,7 +176,7 @@ class Receiver:
         if assembler is None:
             self.dropped[f"{part.stream}: not read here"] += 1
             return None
-        assembler.take(frame.time_s, part)
+        assembler.take(frame.timestamp, part)
         self.n_used += 1
         return part.stream
 
@@ -219,8 +221,9 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
     receiver = Receiver(layout, tuple(SIGNALS), most=math.inf)
     first_s: float | None = None
     for frame in _frames(path):
-        first_s = frame.time_s if first_s is None else first_s
-        receiver.take(frame._replace(time_s=frame.time_s - first_s))
+        first_s = frame.timestamp if first_s is None else first_s
+        frame.timestamp -= first_s
+        receiver.take(frame)
     readings = receiver.readings(math.inf)
     dropped = Counter(receiver.dropped)
     faults = {kind: n for kind, n in dropped.items() if kind not in USUAL}
@@ -242,15 +245,11 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
 
 
 def _frames(path: Path) -> Iterator[Frame]:
-    try:
-        import can
-    except ImportError as error:
-        raise ConfigError(MISSING_PACKAGE) from error
+    can = library("can")
     name, mode = READERS[path.suffix.lower()]
     try:
         with path.open(mode) as file:  # a reader that fails leaves a file of its own open
-            for message in getattr(can, name)(file):
-                yield frame_of(message)
+            yield from getattr(can, name)(file)
     except OSError as error:
         raise LogError(f"{path}: cannot be read ({error.strerror or error})") from error
     except Exception as error:  # whatever a parser does with a damaged file

@@ -115,7 +115,7 @@ def load_runs(
     runs: list[RunLog] = []
     skipped: list[str] = []
     places: dict[str, list[str]] = {}
-    for load in _loaders(Path(folder), layout, mapping, robot, repair=repair, align=align):
+    for load in run_loaders(folder, layout=layout, mapping=mapping, repair=repair, align=align, robot=robot):
         try:
             run = load()
         except LogError as error:
@@ -150,22 +150,10 @@ def run_loaders(
     LogError, ConfigError
         as :func:`load_runs`, where no run is found or a setting is not accepted.
     """
-    return _loaders(Path(folder).resolve(), layout, mapping, robot, repair=repair, align=align)
-
-
-def _loaders(
-    folder: Path,
-    layout: str,
-    mapping: str | Path | None,
-    robot: str | Path | None,
-    *,
-    repair: bool,
-    align: bool,
-) -> list[RunLoader]:
     from terrain.robots import load_robot
 
     given = None if robot is None else load_robot(robot)
-    readers = _readers(folder, layout, mapping, given)
+    readers = _readers(Path(folder), layout, mapping, given)
     if not readers:
         raise LogError(f"{folder}: holds no run; {ACCEPTED}")
     return [RunLoader(read, repair, align, given) for read in readers]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,20 +62,6 @@ class InspectedRun:
     clock: ClockEstimate | None
     odd_stretches: tuple[OddStretch, ...] = ()
     plausibility: tuple[Check, ...] = ()
-
-    def as_json(self) -> dict[str, Any]:
-        """Return all fields, the figures of channels by quantity."""
-        found = {each.name: getattr(self, each.name) for each in fields(self)}
-        return found | {"streams": {name: _stream_json(quality) for name, quality in self.streams.items()}}
-
-
-def _stream_json(quality: StreamQuality) -> dict[str, Any]:
-    channels = quality.channels.items()
-    return {key: value for key, value in quality._asdict().items() if key != "channels"} | {
-        "stuck": quality.stuck,
-        "n_nonfinite": {name: channel.n_nonfinite for name, channel in channels},
-        "longest_constant_s": {name: channel.longest_constant_s for name, channel in channels},
-    }
 
 
 @dataclass(frozen=True)
@@ -191,7 +177,7 @@ def report(result: Inspection) -> Report:
 
 def _row(run: InspectedRun, name: str) -> tuple[Any, ...]:
     stream = run.streams[name]
-    missing = sum(channel.n_nonfinite for channel in stream.channels.values())
+    missing = sum(stream.n_nonfinite.values())
     longest = stream.longest_gap_s if stream.n_gaps else None
     stuck = ", ".join(stream.stuck)
     return run.run_id, name, stream.rate_hz, stream.duration_s, stream.n_gaps, longest, missing, stuck

@@ -10,11 +10,12 @@ import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from importlib import import_module
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from terrain.errors import ConfigError, LogError, one_line
+from terrain import errors
+from terrain.errors import LogError, one_line
 from terrain.files.names import shown
 from terrain.files.regular import MEBIBYTE
 from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
@@ -24,8 +25,8 @@ from terrain.logs.run_topics import Head, Messages
 if TYPE_CHECKING:
     from mcap.records import Chunk
 
-MISSING_PACKAGE = (
-    "bags need the packages rosbags, mcap and mcap-protobuf-support: pip install 'terrain-slip[logs]'"
+library = partial(
+    errors.library, need="bags need the packages rosbags, mcap and mcap-protobuf-support", extra="logs"
 )
 
 LIBRARY = "terrain-slip"
@@ -40,20 +41,6 @@ MAX_RATIO = 200
 SMALL_BYTES = 16 * MEBIBYTE
 
 _LATEST_NS = 2**63 - 1
-
-
-def library(name: str) -> Any:
-    """Return a module of a package that not everybody needs.
-
-    Raises
-    ------
-    ConfigError
-        if the package is not installed.
-    """
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise ConfigError(MISSING_PACKAGE) from error
 
 
 class McapWriter:
@@ -71,11 +58,9 @@ class McapWriter:
     """
 
     def __init__(self, file: BinaryIO, head: Head) -> None:
-        library("mcap.writer")
-        from mcap.writer import CompressionType, Writer
-
+        mcap = library("mcap.writer")
         self._file = file
-        self._writer = Writer(file, compression=CompressionType.ZSTD)
+        self._writer = mcap.Writer(file, compression=mcap.CompressionType.ZSTD)
         self._writer.start(profile="ros2", library=LIBRARY)
         texts = {name: value for name, value in head._asdict().items() if isinstance(value, str)}
         self._writer.add_metadata("terrain_run", texts)
@@ -101,122 +86,33 @@ class McapWriter:
         self._file.flush()
 
 
-class McapReader:
-    """An MCAP file.
-
-    Parameters
-    ----------
-    path : of the file
-    faults : gets what is damaged
+def mcap_topics(path: Path) -> list[Topic]:
+    """Return the topics of a file: those that its end lists, else all that a walk through it finds.
 
     Raises
     ------
+    LogError
+        if the file cannot be read.
     ConfigError
         if mcap is not installed.
     """
-
-    def __init__(self, path: Path, faults: Faults) -> None:
-        self._path, self._faults, self._place = path, faults, short_name(path)
-        library("mcap.stream_reader")
-
-    def topics(self) -> list[Topic]:
-        """Return the topics: those that the end of the file lists, else all that a walk through it finds.
-
-        Raises
-        ------
-        LogError
-            if the file cannot be read.
-        """
-        from mcap.reader import SeekingReader
-
-        try:
-            with self._path.open("rb") as file:
-                summary = SeekingReader(file, record_size_limit=MAX_RECORD_BYTES).get_summary()
-        except OSError as error:
-            raise LogError(f"{self._place}: cannot be read ({error.strerror or error})") from error
-        except Exception:  # whatever the end of a file that was not closed looks like
-            summary = None
-        schemas, channels = (
-            (summary.schemas, summary.channels) if summary and summary.channels else self._walk()
-        )
-        return [_topic(each, schemas) for each in channels.values()]
-
-    def _walk(self) -> tuple[dict[int, Any], dict[int, Any]]:
-        """Return the schemas and channels in the order of the file, by number."""
-        from mcap.records import Channel, Schema
-
-        found: dict[type, dict[int, Any]] = {Schema: {}, Channel: {}}
-        counted = McapReader(self._path, Faults(Counter()))  # faults are found when messages are read
-        for record in counted._records():
-            if type(record) in found:
-                found[type(record)][record.id] = record
-        return found[Schema], found[Channel]
-
-    def messages(self, names: frozenset[str]) -> Iterator[tuple[str, int, bytes]]:
-        """Yield topic, log time in ns and content of the messages of some topics, in the order of the file.
-
-        Raises
-        ------
-        LogError
-            if the file is damaged.
-        """
-        from mcap.records import Channel, Message
-
-        channels: dict[int, str] = {}
-        for record in self._records():
-            if isinstance(record, Message):
-                topic = channels.get(record.channel_id)
-                if topic is None:
-                    text = f"a message is of channel {record.channel_id}, which is unknown"
-                    self._faults.found(self._place, DAMAGED_BLOCK, text)
-                elif topic in names:
-                    yield topic, min(record.log_time, _LATEST_NS), record.data
-            elif isinstance(record, Channel):
-                channels[record.id] = record.topic
-
-    def _records(self) -> Iterator[Any]:
-        """Yield the records before the end of the data, those of chunks too."""
-        from mcap.exceptions import EndOfFile, McapError
-        from mcap.records import Chunk, DataEnd
-        from mcap.stream_reader import StreamReader
-
-        try:
-            with self._path.open("rb") as file:
-                if file.read(len(MAGIC)) != MAGIC:
-                    raise LogError(f"{self._place}: is no MCAP file")
-                reader = StreamReader(
-                    file, skip_magic=True, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES
-                )
-                for record in reader.records:
-                    if isinstance(record, DataEnd):
-                        return
-                    if isinstance(record, Chunk):
-                        yield from self._chunk_records(record)
-                    else:
-                        yield record
-        except OSError as error:
-            raise LogError(f"{self._place}: cannot be read ({error.strerror or error})") from error
-        except (EndOfFile, struct.error):
-            self._faults.found(self._place, EARLY_END, "ends in the middle of a record, it was not closed")
-        except (McapError, ValueError) as error:
-            self._faults.found(self._place, DAMAGED_BLOCK, one_line(error))
-
-    def _chunk_records(self, chunk: Chunk) -> list[Any]:
-        """Return the records of a chunk; none where it is damaged."""
-        from mcap.exceptions import EndOfFile
-        from mcap.stream_reader import breakup_chunk
-
-        try:
-            records: list[Any] = breakup_chunk(
-                replace(chunk, compression="", data=_unpacked(chunk)), validate_crc=True
-            )
-            return records
-        except (EndOfFile, struct.error):
-            text = "a chunk ends in the middle of a record"
-        except ValueError as error:
-            text = one_line(error)
-        self._faults.found(self._place, DAMAGED_BLOCK, text)
-        return []
+    records, reader = library("mcap.records"), library("mcap.reader")
+    try:
+        with path.open("rb") as file:
+            summary = reader.SeekingReader(file, record_size_limit=MAX_RECORD_BYTES).get_summary()
+    except OSError as error:
+        raise LogError(f"{short_name(path)}: cannot be read ({error.strerror or error})") from error
+    except Exception:  # whatever the end of a file that was not closed looks like
+        summary = None
+    if summary and summary.channels:
+        return [_topic(each, summary.schemas) for each in summary.channels.values()]
+    schemas, channels = {}, {}
+    for record in _records(path, Faults(Counter())):  # faults are found when messages are read
+        if isinstance(record, records.Schema):
+            schemas[record.id] = record
+        elif isinstance(record, records.Channel):
+            channels[record.id] = record
+    return [_topic(each, schemas) for each in channels.values()]
 
 
 def _topic(channel: Any, schemas: Mapping[int, Any]) -> Topic:
@@ -225,6 +121,71 @@ def _topic(channel: Any, schemas: Mapping[int, Any]) -> Topic:
         return Topic(channel.topic, "", channel.message_encoding, "", "")
     text = schema.data.decode("latin-1" if schema.encoding == "protobuf" else "utf-8", "replace")
     return Topic(channel.topic, schema.name, channel.message_encoding, schema.encoding, text)
+
+
+def mcap_messages(path: Path, names: frozenset[str], faults: Faults) -> Iterator[tuple[str, int, bytes]]:
+    """Yield topic, log time in ns and content of the messages of some topics, in the order of the file.
+
+    Raises
+    ------
+    LogError
+        if the file is damaged, unless faults are counted.
+    """
+    from mcap.records import Channel, Message
+
+    channels: dict[int, str] = {}
+    for record in _records(path, faults):
+        if isinstance(record, Message):
+            topic = channels.get(record.channel_id)
+            if topic is None:
+                text = f"a message is of channel {record.channel_id}, which is unknown"
+                faults.found(short_name(path), DAMAGED_BLOCK, text)
+            elif topic in names:
+                yield topic, min(record.log_time, _LATEST_NS), record.data
+        elif isinstance(record, Channel):
+            channels[record.id] = record.topic
+
+
+def _records(path: Path, faults: Faults) -> Iterator[Any]:
+    """Yield the records before the end of the data, those of chunks too."""
+    from mcap.exceptions import EndOfFile, McapError
+    from mcap.records import Chunk, DataEnd
+    from mcap.stream_reader import StreamReader
+
+    place = short_name(path)
+    try:
+        with path.open("rb") as file:
+            file.seek(len(MAGIC))
+            reader = StreamReader(file, skip_magic=True, emit_chunks=True, record_size_limit=MAX_RECORD_BYTES)
+            for record in reader.records:
+                if isinstance(record, DataEnd):
+                    return
+                if isinstance(record, Chunk):
+                    yield from _chunk_records(place, record, faults)
+                else:
+                    yield record
+    except OSError as error:
+        raise LogError(f"{place}: cannot be read ({error.strerror or error})") from error
+    except (EndOfFile, struct.error):
+        faults.found(place, EARLY_END, "ends in the middle of a record, it was not closed")
+    except (McapError, ValueError) as error:
+        faults.found(place, DAMAGED_BLOCK, one_line(error))
+
+
+def _chunk_records(place: str, chunk: Chunk, faults: Faults) -> list[Any]:
+    """Return the records of a chunk; none where it is damaged."""
+    from mcap.exceptions import EndOfFile
+    from mcap.stream_reader import breakup_chunk
+
+    try:
+        unpacked = replace(chunk, compression="", data=_unpacked(chunk))
+        return list(breakup_chunk(unpacked, validate_crc=True))
+    except (EndOfFile, struct.error):
+        text = "a chunk ends in the middle of a record"
+    except ValueError as error:
+        text = one_line(error)
+    faults.found(place, DAMAGED_BLOCK, text)
+    return []
 
 
 def _unpacked(chunk: Chunk) -> bytes:

@@ -54,10 +54,8 @@ def serialized(topic: StandardTopic, log_ns: Array) -> Messages:
     ConfigError
         if rosbags is not installed.
     """
-    library("rosbags.typesys")
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores[DISTRO])
+    typesys = library("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores[DISTRO])
     message = _zero(store, topic.kind)
     for path, value in topic.fixed.items():
         _setter(message, path)(value)
@@ -149,15 +147,12 @@ def write(place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: T
 
 
 def _write_ros2(folder: Path, topics: Sequence[Messages], storage: str) -> None:
-    library("rosbags.rosbag2")
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores[DISTRO])
+    rosbag2, typesys = library("rosbags.rosbag2"), library("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores[DISTRO])
     for each in topics:
         if each.kind not in store.types:
-            store.register(get_types_from_msg(each.definition.partition("=" * 80)[0], each.kind))
-    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage]) as writer:
+            store.register(typesys.get_types_from_msg(each.definition.partition("=" * 80)[0], each.kind))
+    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as writer:
         connections: dict[tuple[str, str], Any] = {}
         for each in topics:
             if (each.topic, each.kind) not in connections:

@@ -103,7 +103,7 @@ class CachedFeatures(NamedTuple):
 def loaders_of(source: AlignedRunsSettings) -> list[RunLoader]:
     """Return what reads each run of a command, without reading any."""
     return run_loaders(
-        source.data,
+        source.data.resolve(),
         layout=source.layout,
         mapping=source.mapping,
         repair=source.repair,

@@ -14,21 +14,19 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipelines import report as reports
 from pipelines.data.can_codec import (
-    MISSING_PACKAGE,
     OPTIONAL,
     RECEIVED,
     SIGNALS,
-    Frame,
     Layout,
     channels_of,
     encode,
-    frame_of,
+    library,
     load_layout,
 )
 from pipelines.data.can_logs import Receiver
@@ -46,6 +44,9 @@ from terrain.errors import ConfigError, one_line
 from terrain.estimation.live.clocks import SessionClock
 from terrain.records import Array, Sample
 from terrain.robots import SwerveRobot, as_drive, load_robot
+
+if TYPE_CHECKING:
+    from can import Message as Frame
 
 REQUIRED = tuple(name for name, channels in SIGNALS.items() if not set(channels) <= OPTIONAL)
 """Streams without which a pilot makes no correction."""
@@ -82,10 +83,7 @@ def open_bus(interface: str, channel: str, bitrate: int | None = None) -> Any:
     ConfigError
         if there is no such interface, or it cannot be opened.
     """
-    try:
-        import can
-    except ImportError as error:
-        raise ConfigError(MISSING_PACKAGE) from error
+    can = library("can")
     if interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise ConfigError(f"the interface of --can is {interface!r}; python-can knows {known}")
@@ -131,9 +129,9 @@ class Link:
 
         self._notifier = can.Notifier(bus, [self], timeout=RECEIVE_S)
 
-    def __call__(self, message: Any) -> None:
-        """Take a message, in the thread of the notifier."""
-        self._read.append((frame_of(message), time.monotonic()))
+    def __call__(self, frame: Frame) -> None:
+        """Take a frame, in the thread of the notifier."""
+        self._read.append((frame, time.monotonic()))
 
     def on_error(self, error: Exception) -> None:
         """Note that the bus failed, in the thread of the notifier; it is closed by the next :meth:`frames`."""
@@ -161,14 +159,9 @@ class Link:
         """Send frames; those that cannot be sent at once are not sent later. Say whether all were."""
         if self._notifier is None:
             return False
-        import can
-
         for frame in frames:
-            message = can.Message(
-                arbitration_id=frame.arbitration_id, data=frame.data, is_extended_id=frame.is_extended
-            )
             try:
-                self._notifier.bus.send(message, timeout=0)
+                self._notifier.bus.send(frame, timeout=0)
             except Exception as error:
                 self._count("send", error)
                 return False
@@ -274,7 +267,7 @@ class Bridge:
         """Take a frame that was read at a time of this computer."""
         self.n_in += 1
         if self.receiver.take(frame) is not None:
-            self._clock.received(frame.time_s, read_s)
+            self._clock.received(frame.timestamp, read_s)
 
     def tick(self, read_s: float) -> list[Frame]:
         """Return the frames of a control step at a time of this computer."""

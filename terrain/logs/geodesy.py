@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrain.errors import ConfigError, LogError
+from terrain.errors import LogError, library
 from terrain.records import Array
 
 
@@ -33,12 +33,7 @@ def local_metres(
     >>> local_metres(np.radians([45.0, 45.001]), np.radians([7.0, 7.0]))[1, 1].round(2)
     np.float64(111.13)
     """
-    try:
-        from pymap3d import geodetic2enu
-    except ImportError as error:
-        raise ConfigError(
-            "latitude and longitude need the package pymap3d: pip install 'terrain-slip[logs]'"
-        ) from error
+    pymap3d = library("pymap3d", "latitude and longitude need the package pymap3d", "logs")
     known = np.isfinite(latitude_rad) & np.isfinite(longitude_rad)
     if not known.any():
         raise LogError("no latitude and longitude are known")
@@ -52,6 +47,7 @@ def local_metres(
         origin = (float(latitude_rad[first]), float(longitude_rad[first]), base_m)
     heights_m = np.full(latitude_rad.shape, origin[2]) if height_m is None else height_m
     heights_m = np.where(np.isfinite(heights_m), heights_m, origin[2])
-    east_north_up = np.column_stack(geodetic2enu(latitude_rad, longitude_rad, heights_m, *origin, deg=False))
+    enu_m = pymap3d.geodetic2enu(latitude_rad, longitude_rad, heights_m, *origin, deg=False)
+    east_north_up: Array = np.column_stack(enu_m)
     east_north_up[~known] = np.nan
     return east_north_up

@@ -23,21 +23,12 @@ it changes at most 7 times."""
 IMU_QUANTITIES = ("gyro", "accel")
 
 
-class ChannelQuality(NamedTuple):
-    """Missing samples of a channel, and its longest stretch of one value."""
-
-    n_nonfinite: int
-    longest_constant_s: float
-    constant_from_s: float
-    stuck: bool
-
-
 class StreamQuality(NamedTuple):
     """Sampling of a stream and the quality of its channels.
 
     A gap is an interval of more than ``GAP_PERIODS`` median periods.  ``longest_gap_s`` is 0 and
     ``longest_gap_at_s`` NaN where there is none.  ``jitter_s`` is the standard deviation of the other
-    intervals.
+    intervals.  ``stuck`` names channels; missing samples and the longest stretch of one value are by channel.
     """
 
     n: int
@@ -47,12 +38,9 @@ class StreamQuality(NamedTuple):
     longest_gap_s: float
     longest_gap_at_s: float
     jitter_s: float
-    channels: dict[str, ChannelQuality]
-
-    @property
-    def stuck(self) -> tuple[str, ...]:
-        """Names of the stuck channels."""
-        return tuple(name for name, channel in self.channels.items() if channel.stuck)
+    stuck: tuple[str, ...]
+    n_nonfinite: dict[str, int]
+    longest_constant_s: dict[str, float]
 
 
 def stream_quality(stream: Stream) -> StreamQuality:
@@ -73,6 +61,7 @@ def stream_quality(stream: Stream) -> StreamQuality:
     intervals_s = np.diff(stream.time_s)
     gap = intervals_s > GAP_PERIODS * np.median(intervals_s)
     longest = int(np.argmax(intervals_s))
+    constant = {name: constant_stretches(stream.channel(name)) for name in stream.channels}
     return StreamQuality(
         n=len(stream),
         rate_hz=stream.rate_hz,
@@ -81,7 +70,12 @@ def stream_quality(stream: Stream) -> StreamQuality:
         longest_gap_s=float(intervals_s[longest]) if gap.any() else 0.0,
         longest_gap_at_s=float(stream.time_s[longest]) if gap.any() else float("nan"),
         jitter_s=float(np.std(intervals_s[~gap])),
-        channels={name: _channel_quality(stream, name) for name in stream.channels},
+        stuck=tuple(name for name, (first, last) in constant.items() if _is_stuck(stream, name, first, last)),
+        n_nonfinite={name: int(np.sum(~np.isfinite(stream.channel(name)))) for name in stream.channels},
+        longest_constant_s={
+            name: float(np.max(stream.time_s[last] - stream.time_s[first], initial=0.0))
+            for name, (first, last) in constant.items()
+        },
     )
 
 
@@ -100,23 +94,10 @@ def constant_stretches(values: Array) -> tuple[Array, Array]:
     return first[finite], last[finite]
 
 
-def _channel_quality(stream: Stream, name: str) -> ChannelQuality:
-    values = stream.channel(name)
-    n_nonfinite = int(np.sum(~np.isfinite(values)))
-    first, last = constant_stretches(values)
-    if not first.size:
-        return ChannelQuality(n_nonfinite, 0.0, float("nan"), False)
-    longest = int(np.argmax(stream.time_s[last] - stream.time_s[first]))
-    return ChannelQuality(
-        n_nonfinite,
-        float(stream.time_s[last[longest]] - stream.time_s[first[longest]]),
-        float(stream.time_s[first[longest]]),
-        _is_stuck(stream, name, first, last),
-    )
-
-
 def _is_stuck(stream: Stream, name: str, first: Array, last: Array) -> bool:
     quantity = name.partition("_")[0]
+    if not first.size:
+        return False
     if quantity in IMU_QUANTITIES:
         return bool(np.max(last - first) + 1 >= STUCK_IMU_SAMPLES)
     if quantity not in ("speed", "current"):

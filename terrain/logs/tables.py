@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from terrain.errors import ConfigError, LogError
+from terrain.errors import LogError, library
 from terrain.files.names import listed, normal_name, shown
 from terrain.logs.csv_table import MAX_UNPACKED_BYTES, PLAIN, TextLayout, data_row, number_in, read_columns
 from terrain.logs.log_files import short_name
@@ -70,10 +70,6 @@ def table_row(path: Path, index: int, *, layout: TextLayout = PLAIN) -> int:
     return layout.first_row + index + 1 if kind == ".xlsx" else data_row(path, index, layout=layout)
 
 
-def _missing_package(name: str, path: Path) -> ConfigError:
-    return ConfigError(f"{short_name(path)}: needs the package {name}: pip install 'terrain-slip[logs]'")
-
-
 def _mat_columns(path: Path, columns: Sequence[str]) -> Array:
     """Return variables of a ``.mat``, each a vector of the same length."""
     variables = _mat_variables(path, {column.partition(".")[0].partition("[")[0] for column in columns})
@@ -123,10 +119,7 @@ def _mat_variables(path: Path, names: set[str]) -> Mapping[str, Any]:
 
 
 def _hdf5_variables(path: Path, names: set[str]) -> Mapping[str, Any]:
-    try:
-        import h5py
-    except ImportError as error:
-        raise _missing_package("h5py", path) from error
+    h5py = library("h5py", f"{short_name(path)}: needs the package h5py", "logs")
 
     def content(item: Any) -> Any:
         if isinstance(item, h5py.Group):
@@ -182,10 +175,7 @@ def _sheet_columns(
     import pandas as pd
 
     place = short_name(path)
-    try:
-        import openpyxl  # noqa: F401
-    except ImportError as error:
-        raise _missing_package("openpyxl", path) from error
+    library("openpyxl", f"{place}: needs the package openpyxl", "logs")
     try:
         with zipfile.ZipFile(path) as packed:
             if sum(each.file_size for each in packed.infolist()) > MAX_UNPACKED_BYTES:

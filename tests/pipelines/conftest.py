@@ -264,7 +264,7 @@ def run_frames(layout, run):
         rows = np.column_stack([stream.values, np.full(len(stream), np.nan)])[:, places]
         for number, (time_s, row) in enumerate(zip(stream.time_s.tolist(), rows.tolist(), strict=True)):
             frames += encode(layout, name, as_sent(name, row), number, time_s)
-    return sorted(frames, key=lambda frame: frame.time_s)
+    return sorted(frames, key=lambda frame: frame.timestamp)
 
 
 @pytest.fixture(scope="session", name="as_sent")

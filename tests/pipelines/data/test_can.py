@@ -1,5 +1,6 @@
 """CAN: values come back, damaged frames do not, frames of one instant are a sample, and a log is its run."""
 
+import copy
 import math
 import re
 import sys
@@ -17,7 +18,6 @@ from pipelines.data.can_codec import (
     QUATERNION,
     SIGNALS,
     Drop,
-    Frame,
     channels_of,
     decode,
     encode,
@@ -41,6 +41,18 @@ PLANS = {
 STREAMS = sorted(SIGNALS)
 REAL_PART = ("odometry", QUATERNION[3])
 """A channel that is not sent: it follows from others."""
+
+
+def frame_of(arbitration_id, data=b"", **fields):
+    return can.Message(**{"arbitration_id": arbitration_id, "data": data, "is_extended_id": False} | fields)
+
+
+def changed(frame, **fields):
+    """Return a copy of a frame with other fields."""
+    other = copy.copy(frame)
+    for name, value in fields.items():
+        setattr(other, name, value)
+    return other
 
 
 def bounds(stream, column):
@@ -95,7 +107,7 @@ def test_any_bytes_are_decoded_to_values_in_range_or_refused(stream, data):
     """Bytes of a damaged frame: no exception, no infinity, nothing beyond the bounds of the DBC."""
     plan = data.draw(st.sampled_from(LAYOUT.by_stream[stream]))
     payload = data.draw(st.binary(min_size=0, max_size=8))
-    part = decode(LAYOUT, Frame(1.0, plan.message.frame_id, payload))
+    part = decode(LAYOUT, frame_of(plan.message.frame_id, payload))
     if len(payload) != 8:
         assert part is Drop.LENGTH
     elif not isinstance(part, Drop):
@@ -110,20 +122,20 @@ def test_each_wrong_bit_of_a_checked_message_is_found(stream):
     for bit in range(64):
         data = bytearray(frame.data)
         data[bit // 8] ^= 1 << bit % 8
-        assert decode(LAYOUT, frame._replace(data=bytes(data))) is Drop.CHECKSUM
-    other = frame._replace(arbitration_id=0x101 if stream != "corrections" else 0x102)
+        assert decode(LAYOUT, changed(frame, data=bytes(data))) is Drop.CHECKSUM
+    other = changed(frame, arbitration_id=0x101 if stream != "corrections" else 0x102)
     assert decode(LAYOUT, other) is Drop.CHECKSUM, "the identifier is checked too"
 
 
 @pytest.mark.parametrize(
     ("frame", "drop"),
     [
-        (Frame(0.0, 0x40, b"", is_error=True), Drop.BUS_OFF),
-        (Frame(0.0, 0x04, b"", is_error=True), Drop.ERROR),
-        (Frame(0.0, 0x120, b"", is_remote=True), Drop.REMOTE),
-        (Frame(0.0, 0x7FF, bytes(8)), Drop.UNKNOWN),
-        (Frame(0.0, 0x120, bytes(8), is_extended=True), Drop.UNKNOWN),
-        (Frame(math.nan, 0x120, bytes(8)), Drop.TIME),
+        (frame_of(0x40, is_error_frame=True), Drop.BUS_OFF),
+        (frame_of(0x04, is_error_frame=True), Drop.ERROR),
+        (frame_of(0x120, is_remote_frame=True), Drop.REMOTE),
+        (frame_of(0x7FF, bytes(8)), Drop.UNKNOWN),
+        (frame_of(0x120, bytes(8), is_extended_id=True), Drop.UNKNOWN),
+        (frame_of(0x120, bytes(8), timestamp=math.nan), Drop.TIME),
     ],
 )
 def test_a_frame_that_is_not_used_says_why(frame, drop):
@@ -185,7 +197,7 @@ def received(sent, streams=("imu", "wheels"), now_s=10.0):
 def test_a_sample_has_the_stamp_of_its_first_frame_whatever_their_order():
     rates, accels, attitude = frames(0, 1.0)
     wheels = frames(4, 1.0, "wheels")
-    late = accels._replace(time_s=1.001), wheels[1], attitude, rates._replace(time_s=1.002), wheels[0]
+    late = changed(accels, timestamp=1.001), wheels[1], attitude, changed(rates, timestamp=1.002), wheels[0]
     _, found = received([attitude, *late])
     assert found["imu"].time_s.tolist() == [1.0]
     np.testing.assert_allclose(found["imu"].values, [np.arange(9) * 0.1], atol=3e-4)
@@ -312,7 +324,7 @@ def test_another_dbc_with_units_and_layouts_of_its_own_is_read(tmp_path):
     for name, values in sent:
         message = database.get_message_by_name(name)
         data = database.encode_message(name, values, strict=False)
-        receiver.take(Frame(2.0, message.frame_id, bytes(data), message.is_extended_frame))
+        receiver.take(frame_of(message.frame_id, data, is_extended_id=message.is_extended_frame))
     readings = receiver.readings(3.0)
     rpm = 2 * math.pi / 60
     np.testing.assert_allclose(
@@ -332,10 +344,10 @@ def write(path, frames, start_s=1.7e9):
     path.parent.mkdir(parents=True, exist_ok=True)
     with can.Logger(path) as log:
         for number, frame in enumerate(frames):
-            message = {"timestamp": start_s + frame.time_s, "is_extended_id": False}
-            log(can.Message(arbitration_id=frame.arbitration_id, data=frame.data, **message))
+            sent = changed(frame, timestamp=start_s + frame.timestamp)
+            log(sent)
             if number % 100 == 0:
-                log(can.Message(arbitration_id=0x7F0, data=b"other", **message))
+                log(changed(sent, arbitration_id=0x7F0, data=b"other", dlc=5))
 
 
 @pytest.mark.parametrize("suffix", [suffix for suffix in READERS if suffix != ".trc"])
@@ -359,7 +371,7 @@ def test_lost_and_damaged_frames_are_refused_or_counted(tmp_path, estimated_run,
     frames = run_frames(LAYOUT, estimated_run)
     imu = [place for place, frame in enumerate(frames) if frame.arbitration_id == 0x141]
     twist = [place for place, frame in enumerate(frames) if frame.arbitration_id == 0x110]
-    frames[twist[9]] = frames[twist[9]]._replace(data=bytes(8))
+    frames[twist[9]] = changed(frames[twist[9]], data=bytes(8))
     del frames[imu[-1]], frames[imu[20]]  # one in the last sample, which nothing follows
     write(tmp_path / "drive.log", frames)
     with pytest.raises(LogError, match=r"drive\.log.*--repair"):

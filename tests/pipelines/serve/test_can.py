@@ -1,5 +1,6 @@
 """Corrections are the controller's or zero: never stale, never not finite, whatever is received or fails."""
 
+import copy
 import math
 import os
 import signal
@@ -15,11 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.data.can_codec import (
-    Frame,
     channels_of,
     decode,
     encode,
-    frame_of,
     load_layout,
 )
 from pipelines.live.chain import CommandStatus, Step
@@ -53,6 +52,14 @@ def pilot(controller):
     return LivePilot(ROBOT, TABLE, settings=PilotSettings(controller=controller))
 
 
+def changed(frame, **fields):
+    """Return a copy of a frame with other fields."""
+    other = copy.copy(frame)
+    for name, value in fields.items():
+        setattr(other, name, value)
+    return other
+
+
 class Slower:
     """A chain that commands each wheel 1 rad/s less than the kinematics: corrections are -1, or zero.
 
@@ -79,7 +86,7 @@ def bridged(chain=None):
     return Bridge(LAYOUT, ROBOT, chain or Slower())
 
 
-def ticks(bridge, frames, until_s, read_at=lambda frame: frame.time_s):
+def ticks(bridge, frames, until_s, read_at=lambda frame: frame.timestamp):
     """Give frames as their time comes; return time, corrections and state of each control step."""
     frames, place, rows = sorted(frames, key=read_at), 0, []
     for k in range(round(until_s / PERIOD_S)):
@@ -133,19 +140,19 @@ def test_a_stream_that_ends_stops_corrections_in_time_and_one_that_returns_start
     ids, last, n_ended = [plan.message.frame_id for plan in LAYOUT.by_stream[stream]], {}, Counter()
 
     def ended(frame):
-        if not of(stream)(frame) or not 3.0 < frame.time_s < 4.0:
+        if not of(stream)(frame) or not 3.0 < frame.timestamp < 4.0:
             last[frame.arbitration_id] = frame
             return [frame]
         if how == "hung":
-            return [last[frame.arbitration_id]._replace(time_s=frame.time_s)]
+            return [changed(last[frame.arbitration_id], timestamp=frame.timestamp)]
         if how == "not measured":
             n_ended[frame.arbitration_id] += 1
             values = [math.nan] * len(channels_of(stream))
-            sent = encode(LAYOUT, stream, values, 90 + n_ended[frame.arbitration_id], frame.time_s)
+            sent = encode(LAYOUT, stream, values, 90 + n_ended[frame.arbitration_id], frame.timestamp)
             return [sent[ids.index(frame.arbitration_id)]]
         if how == "damaged":  # the twist has a CRC
             flipped = bytes([frame.data[0] ^ 0x40, *frame.data[1:]])
-            return [frame._replace(data=flipped if stream == "twist" else frame.data[:5])]
+            return [changed(frame, data=flipped if stream == "twist" else frame.data[:5])]
         return []
 
     bridge = bridged()
@@ -170,12 +177,13 @@ def test_the_clock_of_the_bus_may_be_any_and_one_that_is_set_is_followed(frames,
     """An hour ahead and back, as a computer's is by the network: corrections are zero, then go on."""
 
     def stamped(frame):
-        return frame._replace(time_s=frame.time_s + offset_s + 3600.0 * (3.0 < frame.time_s < 6.0))
+        jump_s = 3600.0 * (3.0 < frame.timestamp < 6.0)
+        return changed(frame, timestamp=frame.timestamp + offset_s + jump_s)
 
-    changed = [stamped(frame) for frame in frames]
-    read = {id(new): frame.time_s for new, frame in zip(changed, frames, strict=True)}
+    sent = [stamped(frame) for frame in frames]
+    read = {id(new): frame.timestamp for new, frame in zip(sent, frames, strict=True)}
     bridge = bridged()
-    rows = ticks(bridge, changed, 10.0, read_at=lambda frame: read[id(frame)])
+    rows = ticks(bridge, sent, 10.0, read_at=lambda frame: read[id(frame)])
     for start_s, end_s in ((0.05, 3.0), (4.2, 6.0), (7.2, 10.0)):
         assert states(rows, start_s, end_s) == {ACTIVE}
     assert np.percentile(bridge.latencies_s, 95) < 0.021
@@ -207,14 +215,17 @@ def test_a_chain_that_fails_leaves_corrections_of_zero(frames, radps, status, st
     assert bool(bridge.receiver.dropped) == (state == BridgeState.STEP_FAILED)
 
 
+SELDOM = st.integers(0, 20).map(lambda n: n == 0)
 ANY_FRAME = st.builds(
-    Frame,
-    st.one_of(st.floats(0.0, 3.0), st.floats()),
-    st.sampled_from([*sorted(plan.message.frame_id for plan in LAYOUT.by_key.values()), 0x7FF]),
-    st.binary(min_size=0, max_size=9),
-    st.booleans(),
-    st.integers(0, 20).map(lambda n: n == 0),
-    st.integers(0, 20).map(lambda n: n == 0),
+    can.Message,
+    timestamp=st.one_of(st.floats(0.0, 3.0), st.floats()),
+    arbitration_id=st.sampled_from(
+        [*sorted(plan.message.frame_id for plan in LAYOUT.by_key.values()), 0x7FF]
+    ),
+    data=st.binary(min_size=0, max_size=9),
+    is_extended_id=st.booleans(),
+    is_remote_frame=SELDOM,
+    is_error_frame=SELDOM,
 )
 
 
@@ -222,8 +233,8 @@ ANY_FRAME = st.builds(
 @given(st.lists(ANY_FRAME, max_size=60), st.integers(0, 200))
 def test_no_frame_breaks_the_rule(frames, extra, every):
     """Random frames between those of a drive: finite corrections, and zero where the state says so."""
-    mixed = [frame for frame in frames if frame.time_s < 0.6]
-    read = {id(frame): frame.time_s for frame in mixed}
+    mixed = [frame for frame in frames if frame.timestamp < 0.6]
+    read = {id(frame): frame.timestamp for frame in mixed}
     for k, frame in enumerate(extra):
         read[id(frame)] = (k * 0.01 + every * 0.003) % 0.6
     bridge = bridged()
@@ -257,9 +268,9 @@ class ScriptedLink:
         ]
 
     def frames(self):
-        n = sum(frame.time_s <= self._clock() for frame in self._due)
+        n = sum(frame.timestamp <= self._clock() for frame in self._due)
         taken, self._due = self._due[:n], self._due[n:]
-        return [(frame, frame.time_s) for frame in taken]
+        return [(frame, frame.timestamp) for frame in taken]
 
     def send(self, frames):
         if self._full_s[0] <= self._clock() < self._full_s[1]:
@@ -269,12 +280,6 @@ class ScriptedLink:
 
     def close(self):
         self.n_closed += 1
-
-
-def message(frame, time_s=0.0):
-    return can.Message(
-        arbitration_id=frame.arbitration_id, data=frame.data, is_extended_id=False, timestamp=time_s
-    )
 
 
 def last_state(frame):
@@ -348,7 +353,7 @@ def test_a_bus_that_fails_is_opened_again_and_what_it_refuses_is_counted(monkeyp
         return opened[-1]
 
     link, bridge = Link(make_bus), bridged()
-    assert not link.send([Frame(0.0, 0x101, bytes(8))])
+    assert not link.send([can.Message(arbitration_id=0x101, data=bytes(8), is_extended_id=False)])
     until(lambda: link.errors["receive: Network is down"])
     found = link.frames()
     assert not link.send([]), "a bus that is closed sends nothing"
@@ -375,7 +380,7 @@ def test_on_a_real_virtual_bus_a_wheels_frame_is_answered_within_a_period_beside
         for number in range(25):
             for name, row in rows.items():
                 for frame in encode(LAYOUT, name, row, number):
-                    robot.send(message(frame))
+                    robot.send(frame)
             for _ in range(50):
                 robot.send(can.Message(arbitration_id=0x7FF, data=bytes(8), is_extended_id=False))
             time.sleep(0.02)
@@ -397,7 +402,7 @@ def test_a_signal_ends_it_in_order():
         received = list(iter(lambda: robot.recv(0), None))
     assert result.duration_s < 5.0
     assert result.frames_out == len(received)
-    assert last_state(frame_of(received[-1])) == BridgeState.STOPPED
+    assert last_state(received[-1]) == BridgeState.STOPPED
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     n_steps = sum(result.states.values())
     assert f"the controller's in 0 of {n_steps} control steps" in result.report.answer
@@ -432,7 +437,7 @@ class RobotSide:
 
     def _send(self, name, row, time_s):
         for frame in encode(LAYOUT, name, self._as_sent(name, row), self._counters[name]):
-            self.bus.send(message(frame, float(time_s)))
+            self.bus.send(changed(frame, timestamp=float(time_s)))
         self._counters[name] += 1
 
     def step(self, sample):
@@ -441,11 +446,11 @@ class RobotSide:
                 self._send(name, row, time_s)
         self._send("twist", sample.twist, sample.time_s)
         while (received := self.other.recv(0)) is not None:
-            self.bridge.receive(frame_of(received), sample.time_s)
+            self.bridge.receive(received, sample.time_s)
         for frame in self.bridge.tick(sample.time_s):
-            self.other.send(message(frame))
+            self.other.send(frame)
         theory = self._kinematics.step(sample)
-        added, _ = (decode(LAYOUT, frame_of(self.bus.recv(0))).values for _ in range(2))
+        added, _ = (decode(LAYOUT, self.bus.recv(0)).values for _ in range(2))
         self.added.append(added)
         return Command(theory.wheel_radps + np.array(added), theory.steer_rad, theory.twist, {})
 
