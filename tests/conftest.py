@@ -115,6 +115,97 @@ def noisy_run(run_id="SNOW_01", terrain="SNOW", seed=0, duration_s=4.0):
     return RunLog(run_id, "husky", streams, (Label(0.0, duration_s, terrain),), source="noise")
 
 
+IMU = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps", "accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
+WHEELS = ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a")
+IMU_RATE_HZ, WHEEL_RATE_HZ = 50.0, 10.0
+
+LEVEL = {"ASPHALT": 0.7, "GRASS": 0.9, "GRAVEL": 1.2}
+"""Vibration of the terrains in m/s^2, one standard deviation."""
+SMOOTHNESS = {"ASPHALT": 0.40, "GRASS": 0.46, "GRAVEL": 0.43}
+"""How much of a vibration is left after one sample: the colour of the noise."""
+CURRENT_A = {"ASPHALT": 2.0, "GRASS": 2.1, "GRAVEL": 2.0}
+
+
+def coloured_noise(rng, n, width, smoothness):
+    """Return noise of unit variance that keeps ``smoothness`` of itself from sample to sample."""
+    white = rng.standard_normal((n, width))
+    noise = np.empty_like(white)
+    noise[0] = white[0]
+    for i in range(1, n):
+        noise[i] = smoothness * noise[i - 1] + np.sqrt(1 - smoothness**2) * white[i]
+    return noise
+
+
+def driven_run(
+    run_id,
+    terrain,
+    seed,
+    duration_s=24.0,
+    speed_mps=0.6,
+    start_s=0.0,
+    level=None,
+    smoothness=None,
+    current_a=None,
+    label=...,
+):
+    """Return a run driven straight on at one speed over a terrain with vibrations of its own.
+
+    ``level``, ``smoothness`` and ``current_a`` replace what the terrain does; ``label`` what it is called.
+    """
+    rng = np.random.default_rng(seed)
+    level = LEVEL[terrain] if level is None else level
+    smoothness = SMOOTHNESS[terrain] if smoothness is None else smoothness
+    current_a = CURRENT_A[terrain] if current_a is None else current_a
+    n_imu, n_wheels = round(duration_s * IMU_RATE_HZ), round(duration_s * WHEEL_RATE_HZ)
+    level *= np.exp(0.08 * rng.standard_normal())  # no two runs are the same
+    shaking = level * coloured_noise(rng, n_imu, len(IMU), smoothness) * [0.1, 0.1, 0.05, 1.0, 1.0, 1.0]
+    imu = shaking + rng.normal(0, 0.05, len(IMU)) + [0, 0, 0, 0, 0, 9.81]
+    speed = speed_mps + 0.01 * rng.standard_normal((n_wheels, 2))
+    current = current_a * (1 + 0.2 * rng.standard_normal((n_wheels, 2)))
+    streams = {
+        "imu": Stream(start_s + np.arange(n_imu) / IMU_RATE_HZ, imu, IMU),
+        "wheels": Stream(start_s + np.arange(n_wheels) / WHEEL_RATE_HZ, np.hstack([speed, current]), WHEELS),
+    }
+    name = terrain if label is ... else label
+    labels = () if name is None else (Label(start_s, start_s + duration_s, name),)
+    return RunLog(run_id, "husky", streams, labels, source="drawn")
+
+
+def driven_runs(terrains=("ASPHALT", "GRASS", "GRAVEL"), n_runs=4, seed=0, **options):
+    """Return ``n_runs`` runs of each terrain, each at a speed of its own."""
+    rng = np.random.default_rng(seed)
+    options = {"duration_s": 24.0} | options
+    return [
+        driven_run(
+            f"{terrain}_{number}",
+            terrain,
+            int(rng.integers(2**31)),
+            speed_mps=float(rng.uniform(0.3, 0.9)),
+            **options,
+        )
+        for terrain in terrains
+        for number in range(1, n_runs + 1)
+    ]
+
+
+@pytest.fixture(scope="session")
+def drive():
+    """Return the maker of one run, :func:`driven_run`."""
+    return driven_run
+
+
+@pytest.fixture(scope="session")
+def drive_all():
+    """Return the maker of a data set, :func:`driven_runs`."""
+    return driven_runs
+
+
+@pytest.fixture(scope="session")
+def runs():
+    """Twelve runs of three terrains that are easy to distinguish."""
+    return driven_runs()
+
+
 COLUMNS = {
     "imu": ["wx", "wy", "wz", "ax", "ay", "az"],
     "pro": ["velL", "velR", "curL", "curR"],

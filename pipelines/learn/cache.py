@@ -21,11 +21,11 @@ import numpy as np
 
 from features.extractor import FeatureExtractor
 from features.motion import Motion, wheel_stream, window_motion
+from features.protocols import Samples
 from features.windows import Layout, WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import RunLoader, run_loaders
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.learn.parallel import parallel
-from pipelines.learn.protocols import Samples
 from pipelines.report import Progress, format_counts, silent
 from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError

@@ -21,9 +21,9 @@ from terrain.classify.paired import MIN_RUNS, Difference, paired_accuracy
 from terrain.logs.digest import joint_digest
 
 if TYPE_CHECKING:
+    from features.protocols import Samples
     from pipelines.learn.card import Evaluated
     from pipelines.learn.evaluation import CrossvalResult
-    from pipelines.learn.protocols import Samples
     from pipelines.learn.training_data import TrainingData
 
 

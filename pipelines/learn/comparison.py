@@ -35,9 +35,9 @@ from terrain.errors import DataError
 if TYPE_CHECKING:
     import pandas as pd
 
+    from features.protocols import Samples
     from features.recipes import WindowPipeline
     from pipelines.learn.model_file import TerrainModel
-    from pipelines.learn.protocols import Samples
     from terrain.classify.paired import Comparison, Difference
     from terrain.records import RunLog
 
@@ -113,9 +113,9 @@ def compare_models(
     """
     import numpy as np
 
+    from features.protocols import Samples
     from features.windows import cut_windows
     from pipelines.learn.evaluate import evaluation_of
-    from pipelines.learn.protocols import Samples
     from terrain.classify.held_out import HeldOut
     from terrain.classify.paired import Outcome, compare_with_first
     from terrain.logs.digest import data_digest

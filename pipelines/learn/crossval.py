@@ -23,9 +23,9 @@ from pipelines.report.settings import setting
 from terrain.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
+    from features.protocols import Samples
     from features.recipes import WindowPipeline
     from pipelines.learn.comparison import ComparisonResult
-    from pipelines.learn.protocols import Samples
     from terrain.records import RunLog, Windows
 
 EXAMPLE = "terrain crossval --data runs/ --recipe svm"
@@ -107,15 +107,23 @@ def crossval(
         if the data cannot answer: one class, fewer runs than folds, a run shorter than a window; or if two
         recipes cut different windows from them.
     """
-    from pipelines.learn.protocols import samples_of
+    from features.protocols import samples_of
     from pipelines.learn.recipes import recipe_of
 
     several, contenders = len(settings.recipes) > 1, []
     settings = settings.with_(extras=settings.extras and not several)
     for name in settings.recipes:
         recipe = recipe_of(settings, name)
-        cut = settings.with_(signal_sets=tuple(recipe[0].signal_sets)) if several else settings
-        contenders.append((name, recipe, samples_of(runs, cut, settings.protocol, settings.speed_mps)))
+        samples = samples_of(
+            runs,
+            settings.rule,
+            recipe[0].signal_sets if several else settings.signal_sets,
+            settings.protocol,
+            speed_mps=settings.speed_mps,
+            merge_duplicates=settings.merge_duplicates,
+            skip_short=settings.skip_short,
+        )
+        contenders.append((name, recipe, samples))
     return _evaluated(contenders, settings, progress)
 
 
@@ -164,8 +172,8 @@ def cross_validate(
     >>> found.recipe, found.n_features, found.accuracy
     ('KNeighborsClassifier', 52, 1.0)
     """
+    from features.protocols import Samples
     from features.recipes import make_recipe
-    from pipelines.learn.protocols import Samples
 
     functions = options.pop("functions", ())
     recipes = list(recipe) if isinstance(recipe, list | tuple) else [recipe]

@@ -10,11 +10,11 @@ import numpy as np
 
 from features.extractor import FeatureExtractor
 from features.motion import NO_MOTION, Motion, fastest_wheel, wheel_stream, window_motion
+from features.protocols import N_FOLDS, PROTOCOLS, Samples, folds_of, slow_and_fast
 from features.recipes import WindowPipeline, feature_matrix
 from features.sequences import following
 from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import counted, parallel
-from pipelines.learn.protocols import N_FOLDS, PROTOCOLS, Samples, folds_of, slow_and_fast
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings
 from pipelines.report import Progress, format_counts, format_value, interval, silent

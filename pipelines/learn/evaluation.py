@@ -189,7 +189,7 @@ def notes(*texts: str) -> list[Text]:
 
 def held_out_words(protocol: str) -> str:
     """Return what a protocol holds out, in words."""
-    from pipelines.learn.protocols import PROTOCOLS
+    from features.protocols import PROTOCOLS
 
     return PROTOCOLS[protocol].held_out if protocol in PROTOCOLS else protocol
 

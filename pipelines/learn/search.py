@@ -91,8 +91,8 @@ def search(
     """
     import numpy as np
 
+    from features.protocols import folds_of
     from pipelines.learn.parallel import parallel
-    from pipelines.learn.protocols import folds_of
     from pipelines.report.json_file import as_json
     from terrain.classify.held_out import Examples
 

@@ -31,7 +31,7 @@ ProtocolName = Literal[
     "slow-fast",
     "fast-slow",
 ]
-"""The names of ``pipelines.learn.protocols.PROTOCOLS``."""
+"""The names of ``features.protocols.PROTOCOLS``."""
 SEVERAL_REPEATS = ("grouped", "leave-regimes-out", "leave-terrain-out", "published")
 
 WINDOW_S = 2.0

@@ -11,11 +11,11 @@ import numpy as np
 from features.extractor import FeatureExtractor
 from features.matrix import FeatureMatrix
 from features.motion import Motion, window_motion
+from features.protocols import Samples, samples_of
 from features.recipes import WindowPipeline, feature_matrix
 from features.windows import Layout, cut_windows
 from pipelines.learn.cache import CachedFeatures
 from pipelines.learn.model_file import ModelInfo, TerrainModel, model_info
-from pipelines.learn.protocols import Samples, samples_of
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from terrain.errors import DataError
@@ -115,9 +115,15 @@ def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingDa
     Raises
     ------
     DataError
-        as :func:`pipelines.learn.protocols.samples_of`.
+        as :func:`features.protocols.samples_of`.
     """
-    samples = samples_of(runs, settings)
+    samples = samples_of(
+        runs,
+        settings.rule,
+        settings.signal_sets,
+        merge_duplicates=settings.merge_duplicates,
+        skip_short=settings.skip_short,
+    )
     windows, recipe = samples.windows, recipe_of(settings, settings.recipe)
     rows = feature_matrix(recipe, windows)
     return TrainingData(

@@ -16,10 +16,10 @@ import numpy as np
 from sklearn.base import clone
 
 from features.motion import Motion, window_motion
+from features.protocols import folds_of, samples_of
 from features.recipes import feature_matrix
 from pipelines.data.datasets import load_runs
 from pipelines.learn.parallel import parallel
-from pipelines.learn.protocols import folds_of, samples_of
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import LearnSettings
 from pipelines.report import Column, Progress, Report, Result, Table, described, silent
@@ -79,7 +79,7 @@ def run(settings: Settings, progress: Progress = silent) -> LabelStudy:
     """
     data, repeats = settings.data, settings.repeats
     evaluation = LearnSettings(repeats=repeats, seed=settings.seed, n_jobs=settings.n_jobs)
-    samples = samples_of(load_runs(data), evaluation)
+    samples = samples_of(load_runs(data), evaluation.rule)
     windows = samples.windows
     recipe = recipe_of(evaluation)
     examples = Examples(feature_matrix(recipe, windows), samples.terrain, samples.group)

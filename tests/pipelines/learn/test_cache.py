@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from features.motion import Motion, window_motion
+from features.protocols import samples_of
 from features.recipes import feature_matrix
 from pipelines.data.datasets import load_runs, run_loaders
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn import cache
 from pipelines.learn.cache import cached_features
 from pipelines.learn.crossval import EvaluationSettings
-from pipelines.learn.protocols import samples_of
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_cache, data_of_runs, same_features
@@ -46,7 +46,7 @@ def files_of(folder):
 
 
 def test_cached_features_are_those_of_the_runs_bit_for_bit(runs_dir, tmp_path):
-    samples = samples_of(load_runs(runs_dir), SETTINGS)
+    samples = samples_of(load_runs(runs_dir), SETTINGS.rule)
     features = feature_matrix(recipe_of(SETTINGS), samples.windows)
     for n_computed in (8, 0):
         found = cached(runs_dir, tmp_path / "cache")

@@ -12,13 +12,13 @@ import pytest
 from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict, cross_validate
 
 from features import recipes
+from features.protocols import PROTOCOLS, folds_of, samples_of
 from features.recipes import WindowPipeline, feature_matrix, make_recipe
 from pipelines.data.datasets import load_runs
 from pipelines.learn import settings as learn_settings
 from pipelines.learn.crossval import EvaluationSettings, Settings, crossval, run
 from pipelines.learn.evaluate import evaluate
 from pipelines.learn.parallel import computing
-from pipelines.learn.protocols import PROTOCOLS, folds_of, samples_of
 from pipelines.learn.settings import ProtocolName
 from pipelines.report.json_file import as_json
 from terrain.classify.held_out import Examples
@@ -95,7 +95,7 @@ def test_one_seed_gives_one_report_and_another_seed_another(report, runs, settin
 def test_scikit_learn_cross_validates_whole_recipes_to_the_same_answers(drive, drive_all, settings):
     runs = drive_all(("ASPHALT", "GRASS"), n_runs=4, duration_s=16.0)
     runs.append(drive("GRAVEL_1", "GRAVEL", 5, duration_s=50.0))
-    samples = samples_of(runs, settings())
+    samples = samples_of(runs, settings().rule)
     windows, y, recipe = samples.windows, samples.terrain, make_recipe("svm", seed=3)
     examples = Examples(feature_matrix(recipe, windows), y, samples.group)
     held_out = evaluate(recipe[-1], examples, folds_of(samples, "grouped", 1, seed=3), on_all=True)
@@ -129,7 +129,7 @@ def test_the_recipe_gives_its_last_step_the_run_of_each_window(runs, settings):
             seen["groups"] = groups
             return self
 
-    windows = samples_of(runs[:2], settings()).windows
+    windows = samples_of(runs[:2], settings().rule).windows
     WindowPipeline([("features", make_recipe("svm")[0]), ("last", Spy())]).fit(windows, windows.terrain)
     np.testing.assert_array_equal(seen["groups"], windows.run_id)
     with pytest.raises(ConfigError, match="there is no recipe 'oracle'; there are svm"):

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from features.protocols import samples_of
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
 from pipelines.learn.crossval import crossval
-from pipelines.learn.protocols import samples_of
 from terrain.errors import DataError
 from terrain.logs.write import write_run
 from terrain.records import Label, Stream
@@ -40,8 +40,8 @@ def test_copies_are_refused_by_name_with_what_to_do(runs, settings, protocol):
 @pytest.mark.slow
 def test_merged_copies_leave_every_window_as_it_was(runs, settings):
     copies = [copy_of(run, f"{run.run_id}_again", 50.0) for run in runs]
-    merged = samples_of([*runs, *copies], settings(merge_duplicates=True))
-    alone = samples_of(runs, settings())
+    merged = samples_of([*runs, *copies], settings().rule, merge_duplicates=True)
+    alone = samples_of(runs, settings().rule)
     assert merged.windows.run_id.tolist() == alone.windows.run_id.tolist()
     np.testing.assert_array_equal(merged.windows.values["imu"], alone.windows.values["imu"])
     report = crossval([*runs, *copies], settings(merge_duplicates=True))

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from features.motion import window_motion
+from features.protocols import samples_of
 from pipelines.learn import tracking
 from pipelines.learn.card import limits_of, model_result
 from pipelines.learn.model_file import CARD_FILE, TRAINING_FILE, read_model, seal
-from pipelines.learn.protocols import samples_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.train import Settings, TrainingSettings, register, run, train
 from pipelines.report.json_file import as_json
@@ -109,7 +109,7 @@ def test_a_model_has_its_card_and_its_figures(model_dir, tracked):
 
 
 def test_limits_name_what_is_weak(tracked, runs):
-    windows, evaluation = samples_of(runs, RecipeSettings()).windows, tracked[1].crossval
+    windows, evaluation = samples_of(runs, RecipeSettings().rule).windows, tracked[1].crossval
     weak = {name: row._replace(recall=0.3) for name, row in evaluation.per_class.items() if name == "GRASS"}
     evaluation = replace(evaluation, per_class={**evaluation.per_class, **weak})
     info = read_model(tracked[0] / "model").info

@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 
 from features.labelled import PARTITION_S, PUBLISHED_STRIDE_S
-from pipelines.learn.protocols import N_FOLDS, folds_of, samples_of
-from pipelines.learn.settings import EvaluationSettings
+from features.protocols import N_FOLDS, folds_of, samples_of
+from features.windows import WindowRule
 from terrain.errors import DataError
 from terrain.logs.regimes import driven_at
 from terrain.records import Label, RunLog, Stream
 
 
-def samples_under(protocol, runs, **options):
-    return samples_of(runs, EvaluationSettings(protocol=protocol, **options), protocol)
+def samples_under(protocol, runs, stride_s=None):
+    return samples_of(runs, WindowRule(1.7 if protocol == "published" else 2.0, stride_s), protocol=protocol)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ has its own run in training; it serves to compare with papers only.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from features.labelled import cut_labelled, cut_partitions, deal_partitions
 from features.motion import fastest_wheel
-from pipelines.learn.settings import WindowSettings
+from features.windows import WindowRule
 from terrain.classify.folds import Fold, block_groups, fold_numbers, numbered_folds, single_run_classes
 from terrain.classify.slow_fast import (
     MIN_CLASSES,
@@ -30,6 +30,7 @@ from terrain.classify.slow_fast import (
 from terrain.errors import DataError
 from terrain.logs.merge import distinct_runs
 from terrain.logs.regimes import driven_at, regime_of
+from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 
 N_FOLDS = 5
@@ -215,18 +216,24 @@ def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed
 
 def samples_of(
     runs: Sequence[RunLog],
-    settings: WindowSettings,
+    rule: WindowRule,
+    signal_sets: Iterable[str] = SIGNAL_SETS,
     protocol: str = "grouped",
+    *,
     speed_mps: tuple[float, float] | None = None,
+    merge_duplicates: bool = False,
+    skip_short: bool = False,
 ) -> Samples:
     """Cut the labelled windows that a protocol asks for, of distinct runs, with their groups.
 
     Parameters
     ----------
     runs : labelled
-    settings : how windows are cut, and of which signal sets
+    rule, signal_sets : how windows are cut, and of which signals
     protocol : one of :data:`PROTOCOLS`
     speed_mps : only runs that were driven between these speeds
+    merge_duplicates : whether runs that hold the same measurements are one run, in place of being refused
+    skip_short : whether runs shorter than a window are left out and counted
 
     Raises
     ------
@@ -238,14 +245,14 @@ def samples_of(
         runs = [run for run in runs if driven_at(run, *speed_mps)]
         if not runs:
             raise DataError(f"no run is driven at a speed of {speed_mps[0]:g} to {speed_mps[1]:g} m/s")
-    distinct = distinct_runs(runs, merge=settings.merge_duplicates)
-    cut_of = distinct.runs, settings.rule, settings.signal_sets
+    distinct = distinct_runs(runs, merge=merge_duplicates)
+    cut_of = distinct.runs, rule, signal_sets
     if protocol == "published":
         cut, group = cut_partitions(*cut_of)
         gap = 0
     else:
-        cut = cut_labelled(*cut_of, skip_short=settings.skip_short)
-        group, gap = cut.windows.run_id, settings.rule.overlap
+        cut = cut_labelled(*cut_of, skip_short=skip_short)
+        group, gap = cut.windows.run_id, rule.overlap
     values = cut.windows.values
     if not any((each != each[:1, :, :1]).any() for each in values.values()):
         streams = " and ".join(repr(name) for name in values)
