@@ -346,7 +346,7 @@ def _entries(described: Any, place: str = "") -> Iterable[tuple[str, dict[str, A
 
 def report_of(result: Reproduction) -> Report:
     """Return the report: the counts, the paper's figures beside the simulation's, then the reasons."""
-    from pipelines.report import Card, Cards, Column, Report, Section, Table, Text, format_value
+    from pipelines.report import Column, Report, Section, Table, Text, format_value
 
     columns = (Column("measured", long=True), Column("in the paper", long=True), "in simulation", "verdict")
     tables, reasons = [], []
@@ -371,12 +371,13 @@ def report_of(result: Reproduction) -> Report:
         f"{len(result.rows)} figures and claims of the paper, measured again on simulated runs: "
         f"{', '.join(counted)}.{few}",
         parts=(
-            Cards(
-                tuple(
-                    Card(verdict.value, count, text=MEANINGS[verdict])
+            Table(
+                ("verdict", "figures and claims", Column("which is", long=True)),
+                [
+                    (verdict.value, count, MEANINGS[verdict])
                     for verdict, count in result.verdicts.items()
                     if count
-                )
+                ],
             ),
         ),
         details=(

@@ -14,8 +14,6 @@ from pipelines.report.results import frame as frame
 from pipelines.report.results import silent as silent
 from pipelines.report.tree import Band as Band
 from pipelines.report.tree import Bars as Bars
-from pipelines.report.tree import Card as Card
-from pipelines.report.tree import Cards as Cards
 from pipelines.report.tree import Column as Column
 from pipelines.report.tree import Figure as Figure
 from pipelines.report.tree import Later as Later

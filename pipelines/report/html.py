@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pipelines.report.json_file import as_json
-from pipelines.report.tree import Figure, Part, Report, Section, figures_of
+from pipelines.report.tree import Figure, Part, Report, Section
 
 ASSETS = Path(__file__).parent / "assets"
 DIGITS = 6
@@ -53,24 +53,22 @@ def html_page(report: Report) -> str:
     >>> "<h1>Runs of &lt;ice&gt;</h1>" in page, "<script" in page
     (True, False)
     """
-    figures = figures_of(report)
-    places = {id(figure): number for number, figure in enumerate(figures)}
-    data = json.dumps([figure_data(each) for each in figures], separators=(",", ":"), allow_nan=False)
+    figures: list[Figure] = []
 
     def picture(figure: Figure) -> Markup:
+        figures.append(figure)
         holder = Markup('<div class="plot" role="img" aria-label="{}" data-figure="{}"></div>')
-        return holder.format(figure.alt or figure.caption or figure.title, places[id(figure)])
+        return holder.format(figure.alt or figure.caption or figure.title, len(figures) - 1)
 
-    return (
-        _environment()
-        .get_template("page.html.j2", globals={"picture": picture})
-        .render(
-            report=report,
-            picture=picture,
-            style=Markup(_asset("report.css") + (_asset("uplot.css") if figures else "")),
-            figures=Markup(data.replace("<", "\\u003c")) if figures else "",
-            scripts=Markup(_asset("uplot.js") + _asset("report.js")),
-        )
+    body = _body(report, picture)
+    data = json.dumps([figure_data(each) for each in figures], separators=(",", ":"), allow_nan=False)
+    page = _environment().get_template("page.html.j2")
+    return page.render(
+        title=report.title,
+        body=body,
+        style=Markup(_asset("report.css") + (_asset("uplot.css") if figures else "")),
+        figures=Markup(data.replace("<", "\\u003c")) if figures else "",
+        scripts=Markup(_asset("uplot.js") + _asset("report.js")),
     )
 
 
@@ -85,8 +83,13 @@ def html_fragment(report: Report) -> str:
         source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
         return Markup('<img src="{}" alt="{}">').format(source, figure.alt or figure.caption or figure.title)
 
-    module = _environment().get_template("parts.html.j2").make_module({"picture": picture})
-    return f'<div class="terrain-report">{module.body(report)}</div>'  # type: ignore[attr-defined]
+    return f'<div class="terrain-report">{_body(report, picture)}</div>'
+
+
+def _body(report: Report, picture: Callable[[Figure], Markup]) -> Markup:
+    parts = _environment().get_template("parts.html.j2").make_module({"picture": picture})
+    body: Markup = parts.body(report)  # type: ignore[attr-defined]
+    return body
 
 
 def figure_data(figure: Figure) -> dict[str, Any]:

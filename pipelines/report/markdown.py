@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 from pipelines.report.numbers import plain_line
-from pipelines.report.tree import Cards, Figure, Pairs, Part, Report, Section, Table, Text
+from pipelines.report.tree import Figure, Pairs, Part, Report, Section, Table, Text
 
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~&!])")
 _ADDRESS = re.compile(r"(https?|ftp)(?=://)", re.IGNORECASE)
@@ -63,12 +63,6 @@ def _blocks(parts: Sequence[Part], level: int) -> Iterator[str]:
             yield "\n".join(
                 f"- {escape_markdown(name)}: {escape_markdown(value)}" for name, value in part.cells
             )
-        elif isinstance(part, Cards):
-            yield "\n".join(
-                f"- {escape_markdown(card.title)}: **{escape_markdown(card.written)}**"
-                + (f", {escape_markdown(card.text)}" if card.text else "")
-                for card in part.cards
-            )
         elif isinstance(part, Figure):
             yield f"*{escape_markdown(part.title)}: {escape_markdown(part.caption or part.alt)}*"
         elif isinstance(part, Section):
@@ -86,6 +80,7 @@ def markdown_table(table: Table) -> str:
     |---|---:|
     | a\|b | 3 |
     """
-    rows = [tuple(head.heading for head in table.heads), *table.cells]
-    head, *body = (f"| {' | '.join(map(escape_markdown, row))} |" for row in rows)
-    return "\n".join([head, f"|{'|'.join('---:' if each else '---' for each in table.numeric)}|", *body])
+    columns = table.written
+    lines = [[each.heading for each in columns], *zip(*(each.texts for each in columns), strict=True)]
+    head, *body = (f"| {' | '.join(map(escape_markdown, line))} |" for line in lines)
+    return "\n".join([head, f"|{'|'.join('---:' if each.right else '---' for each in columns)}|", *body])

@@ -9,13 +9,12 @@ from contextlib import contextmanager
 
 from rich.box import SIMPLE
 from rich.console import Console, RenderableType
-from rich.table import Column as RichColumn
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
 from pipelines.report.numbers import plain_line
 from pipelines.report.results import Progress
-from pipelines.report.tree import Cards, Pairs, Part, Report, Section, Table, Text
+from pipelines.report.tree import Pairs, Part, Report, Section, Table, Text
 
 WIDTH_OF_A_FILE = 110
 """Characters of a line where the output is no terminal, which has a width of its own."""
@@ -98,9 +97,7 @@ def _parts(parts: Sequence[Part]) -> Iterator[RenderableType]:
             if part.note:
                 yield RichText(part.note, style="dim")
         elif isinstance(part, Pairs):
-            yield _grid(part.cells, part.title)
-        elif isinstance(part, Cards):
-            yield _grid([(card.title, card.written, card.text) for card in part.cards])
+            yield _pairs(part)
         elif isinstance(part, Section):
             if part.title:
                 yield RichText(f"\n{part.title}", style="bold")
@@ -109,28 +106,25 @@ def _parts(parts: Sequence[Part]) -> Iterator[RenderableType]:
 
 
 def _table(table: Table) -> RenderableType:
-    columns = [
-        RichColumn(
-            RichText(head.heading),
-            justify="right" if right else "left",
+    drawn = RichTable(title=table.title or None, box=SIMPLE, padding=(0, 1, 0, 0), title_justify="left")
+    columns = table.written
+    for each in columns:
+        drawn.add_column(
+            RichText(each.heading),
+            justify="right" if each.right else "left",
             overflow="fold",
-            min_width=24 if head.long else None,
+            min_width=24 if each.column.long else None,
         )
-        for head, right in zip(table.heads, table.numeric, strict=True)
-    ]
-    drawn = RichTable(
-        *columns, title=table.title or None, box=SIMPLE, padding=(0, 1, 0, 0), title_justify="left"
-    )
-    for row in table.cells:
-        drawn.add_row(*map(RichText, row))
+    for texts in zip(*(each.texts for each in columns), strict=True):
+        drawn.add_row(*map(RichText, texts))
     return drawn
 
 
-def _grid(rows: Sequence[Sequence[str]], title: str = "") -> RichTable:
+def _pairs(pairs: Pairs) -> RenderableType:
     grid = RichTable.grid(padding=(0, 2, 0, 0))
-    grid.title, grid.title_justify = title or None, "left"
-    for _ in rows[0] if rows else ():
+    grid.title, grid.title_justify = pairs.title or None, "left"
+    for _ in ("name", "value"):
         grid.add_column(overflow="fold")
-    for row in rows:
+    for row in pairs.cells:
         grid.add_row(*map(RichText, row))
     return grid

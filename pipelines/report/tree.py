@@ -26,13 +26,15 @@ class Text(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Heading of a column, how its values are written, and whether their size is shown as a shade.
+    """Heading of a column, how its values are written, and where a record has them.
 
     Parameters
     ----------
     title : heading
     form : format of the values, as :func:`pipelines.report.numbers.format_value` takes it
     unit : stands in the heading
+    of : attribute or key of a record, as ``case.seed``, or a function of it; without one a row is a sequence of
+        the values of all columns
     shade : of ratios between 0 and 1: the larger, the darker
     long : holds sentences, which are wrapped
     """
@@ -40,64 +42,57 @@ class Column(NamedTuple):
     title: str
     form: str = ""
     unit: str = ""
+    of: str | Callable[[Any], Any] | None = None
     shade: bool = False
     long: bool = False
 
-    @property
-    def heading(self) -> str:
-        """The title with its unit."""
-        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+class Written(NamedTuple):
+    """A column as it is written: numbers are aligned on the right, values are kept for their shade."""
+
+    column: Column
+    heading: str
+    right: bool
+    values: list[Any]
+    texts: list[str]
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of values under headings; a heading alone may stand for a :class:`Column`.
+    """Rows of values, or records, under headings; a heading alone may stand for a :class:`Column`.
 
     Examples
     --------
     >>> recalls = Table(("terrain", Column("speed", ".1f", "m/s")), [("grass", 0.5), ("ice", None)])
-    >>> recalls.heads[1].heading, recalls.numeric, recalls.cells
-    ('speed [m/s]', (False, True), [('grass', '0.5'), ('ice', '–')])
+    >>> [(each.heading, each.right, each.texts) for each in recalls.written]
+    [('terrain', False, ['grass', 'ice']), ('speed [m/s]', True, ['0.5', '–'])]
+    >>> speeds = Column("speed", of=lambda row: row), Column("ahead", of="real")
+    >>> [each.values for each in Table(speeds, [1.5 + 2j]).written]
+    [[(1.5+2j)], [1.5]]
     """
 
     columns: Sequence[Column | str]
-    rows: Sequence[Sequence[Any]]
+    rows: Sequence[Any]
     title: str = ""
     note: str = ""
 
     @property
-    def heads(self) -> tuple[Column, ...]:
-        """The columns, all of them with their format."""
-        return tuple(each if isinstance(each, Column) else Column(each) for each in self.columns)
-
-    @property
-    def cells(self) -> list[tuple[str, ...]]:
-        """The rows as they are written."""
-        heads = self.heads
-        return [
-            tuple(format_value(value, head.form) for value, head in zip(row, heads, strict=True))
-            for row in self.rows
-        ]
-
-    @property
-    def numeric(self) -> tuple[bool, ...]:
-        """Whether each column is aligned on the right: it has a format, or holds no text."""
+    def written(self) -> list[Written]:
+        """The columns as they are written."""
         found = []
-        for place, head in enumerate(self.heads):
-            known = [row[place] for row in self.rows if row[place] is not None]
-            texts = any(isinstance(value, str) for value in known)
-            found.append(bool(head.form) or (bool(known) and not texts))
-        return tuple(found)
+        for place, named in enumerate(self.columns):
+            column = named if isinstance(named, Column) else Column(named)
+            values = [value_at(row, place if column.of is None else column.of) for row in self.rows]
+            known = [value for value in values if value is not None]
+            right = bool(column.form) or (bool(known) and not any(isinstance(each, str) for each in known))
+            heading = f"{column.title} [{column.unit}]" if column.unit else column.title
+            texts = [format_value(value, column.form) for value in values]
+            found.append(Written(column, heading, right, values, texts))
+        return found
 
 
 class Shown(NamedTuple):
-    """A column of a table of records.
-
-    Parameters
-    ----------
-    title, form, unit, long : as :class:`Column`
-    of : attribute or key of a record, as ``case.seed``, or a function of it
-    """
+    """A column of a table of records."""
 
     title: str
     of: str | Callable[[Any], Any]
@@ -107,28 +102,17 @@ class Shown(NamedTuple):
 
 
 def table(rows: Iterable[Any], columns: Sequence[Shown], title: str = "", note: str = "") -> Table:
-    """Return a table of records.
-
-    Examples
-    --------
-    >>> table([1.5, 2.0], [Shown("speed", lambda row: row, ".1f", "m/s"), Shown("whole", "real")]).rows
-    ((1.5, 1.5), (2.0, 2.0))
-    >>> table([{"speed": 1.5 + 2j}, {"speed": None}], [Shown("ahead", "speed.real", ".1f")]).rows
-    ((1.5,), (None,))
-    """
-    return Table(
-        [Column(each.title, each.form, each.unit, long=each.long) for each in columns],
-        tuple(
-            tuple(each.of(row) if callable(each.of) else value_at(row, each.of) for each in columns)
-            for row in rows
-        ),
-        title,
-        note,
-    )
+    """Return a table of records."""
+    made = [Column(each.title, each.form, each.unit, each.of, long=each.long) for each in columns]
+    return Table(made, tuple(rows), title, note)
 
 
-def value_at(record: Any, place: str) -> Any:
+def value_at(record: Any, place: str | int | Callable[[Any], Any]) -> Any:
     """Return what a record has at a place, as ``slip.interval``; None where a mapping has nothing there."""
+    if callable(place):
+        return place(record)
+    if isinstance(place, int):
+        return record[place]
     for name in place.split("."):
         if record is None:
             return None
@@ -147,28 +131,6 @@ class Pairs:
     def cells(self) -> list[tuple[str, str]]:
         """The names, and the values as they are written."""
         return [(str(row[0]), format_value(*row[1:])) for row in self.rows]
-
-
-class Card(NamedTuple):
-    """A figure that is written large, its name above and a line on it below."""
-
-    title: str
-    value: Any
-    text: str = ""
-    form: str = ""
-    unit: str = ""
-
-    @property
-    def written(self) -> str:
-        """The value as it is written."""
-        return format_value(self.value, self.form, self.unit)
-
-
-@dataclass(frozen=True)
-class Cards:
-    """Figures side by side."""
-
-    cards: Sequence[Card]
 
 
 class Line(NamedTuple):
@@ -277,7 +239,7 @@ class Section:
     parts: Sequence[Part] = ()
 
 
-Part: TypeAlias = Text | Table | Pairs | Cards | Figure | Section
+Part: TypeAlias = Text | Table | Pairs | Figure | Section
 
 
 def sections(*titled: tuple[str, Sequence[Part | str]]) -> tuple[Section, ...]:

@@ -16,8 +16,6 @@ from hypothesis import strategies as st
 from pipelines.report import (
     Band,
     Bars,
-    Card,
-    Cards,
     Column,
     Figure,
     Line,
@@ -66,7 +64,7 @@ REPORT = Report(
     "95.8 % of windows are right.",
     YAW,
     parts=[
-        Cards([Card("accuracy", 0.9584, "over <b>runs</b>", ".1%")]),
+        Pairs([("accuracy over <b>runs</b>", 0.9584, ".1%")], "Accuracy"),
         Section(
             "By terrain",
             [
