@@ -24,7 +24,7 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
     uri = str(settings.data)
     if uri.startswith(("models:/", "runs:/")) or (settings.data / "terrain_model.json").is_file():
         from pipelines.learn.card import model_result
-        from pipelines.learn.load import model_folder
+        from pipelines.learn.model_file import model_folder
 
         with model_folder(uri) as folder:
             return model_result(folder, uri)

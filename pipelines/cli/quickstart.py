@@ -98,7 +98,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     """
     from pipelines.data.datasets import load_runs
     from pipelines.data.tracking import ensure_tracking
-    from pipelines.learn.load import load_model
+    from pipelines.learn.model_file import read_model
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
     from terrain.classify.folds import hold_out_runs
@@ -121,7 +121,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
         )
         # without an evaluation given, that of the training shares its fits with the worth of the channels
         trained = train(training, asked, dataset, progress)
-        predicted = predict(held_out or runs, load_model(trained.model_uri), load_slip_table())
+        predicted = predict(held_out or runs, read_model(trained.model_uri), load_slip_table())
     result = QuickstartResult(
         dataset=dataset,
         data_digest=trained.data_digest,

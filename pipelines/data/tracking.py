@@ -13,6 +13,7 @@ import os
 import re
 import socket
 import subprocess
+import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
@@ -137,6 +138,29 @@ def mlflow_store(*, create: bool) -> Iterator[Any]:
             raise TrackingError(f"MLflow: {' '.join(str(error).split())[:300]}") from error
 
 
+def fetch_model(uri: str, into: str) -> Path:
+    """Return the folder of a registered model, copied to where a store is not of this machine.
+
+    Parameters
+    ----------
+    uri : ``models:/...`` or ``runs:/...``
+    into : folder of the copy
+
+    Raises
+    ------
+    ModelError
+        if there is no such model.
+    """
+    if os.environ.get("MLFLOW_TRACKING_URI"):
+        ensure_tracking()
+    try:
+        with mlflow_store(create=False) as mlflow:
+            return Path(mlflow.artifacts.download_artifacts(uri, dst_path=into))
+    except TrackingError as error:
+        reason = str(error).removeprefix("MLflow: ")[:200]
+        raise ModelError(f"{uri}: cannot be loaded ({reason})") from error
+
+
 def log_learning(
     name: str,
     params: Mapping[str, Any],
@@ -212,3 +236,10 @@ def _place(folder: str, file: str) -> Path:
 def _plain(name: str) -> str:
     """Return a name of the characters that a metric's may have."""
     return re.sub(r"[^\w\-. /]", "_", name)
+
+
+if __name__ == "__main__":
+    try:
+        print(fetch_model(*sys.argv[1:3]))
+    except TerrainError as error:
+        sys.exit(str(error))

@@ -135,9 +135,9 @@ def run(settings: Settings, progress: Progress) -> DriveResult:
     if settings.needs_model and settings.model is None:
         inputs = replace(inputs, model=train_classifier(robot, settings.first_seed, progress))
     elif settings.model is not None:
-        from pipelines.learn.load import load_model
+        from pipelines.learn.model_file import read_model
 
-        inputs = replace(inputs, model=load_model(settings.model))
+        inputs = replace(inputs, model=read_model(settings.model))
     return compare(settings, inputs, progress)
 
 

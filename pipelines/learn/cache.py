@@ -26,6 +26,9 @@ from features.windows import Layout, WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import RunLoader, run_loaders
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.learn.parallel import parallel
+from pipelines.learn.recipes import recipe_of
+from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
+from pipelines.learn.training_data import TrainingData, trained_runs
 from pipelines.report import Progress, format_counts, silent
 from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError
@@ -72,34 +75,6 @@ def _pair(channels: tuple[str, ...], period_s: float) -> Stream:
     return Stream(time_s, np.zeros((len(time_s), len(channels))), channels)
 
 
-class CachedFeatures(NamedTuple):
-    """Labelled windows of runs by their features.
-
-    Parameters
-    ----------
-    samples : windows without their samples
-    features : (n, f) in 64 bits
-    motion : how the robot moved in each window; None where no wheel speed was measured
-    layout : channels and rates that all runs have
-    runs : that the windows are of, sorted by their id
-    n_computed : runs whose features were not there
-    skipped : a sentence for each run that could not be read
-    """
-
-    samples: Samples
-    features: Array
-    motion: Motion | None
-    layout: Layout
-    runs: tuple[RunHead, ...]
-    n_computed: int
-    skipped: tuple[str, ...]
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 over the digests of the runs: not that of the runs read whole, which needs all at once."""
-        return joint_digest([run.digest for run in self.runs])
-
-
 def loaders_of(source: AlignedRunsSettings) -> list[RunLoader]:
     """Return what reads each run of a command, without reading any."""
     return run_loaders(
@@ -112,25 +87,28 @@ def loaders_of(source: AlignedRunsSettings) -> list[RunLoader]:
     )
 
 
-def cached_features(
+def cached_data(
     loaders: Sequence[RunLoader],
-    rule: WindowRule,
-    signal_sets: Sequence[str],
+    settings: LearnSettings,
     cache_dir: Path,
-    n_jobs: int = 1,
     progress: Progress = silent,
-    source: AlignedRunsSettings | None = None,
-) -> CachedFeatures:
-    """Return the features of the labelled windows of runs, out of a cache as far as they are there.
+    recipe: str = FEATURE_RECIPE,
+) -> tuple[TrainingData, list[str]]:
+    """Return the labelled windows of runs by their features, out of a cache as far as they are there.
 
     Parameters
     ----------
     loaders : one a run, as :func:`loaders_of`
-    rule, signal_sets : how windows are cut, and whose channels the features use
+    settings : how windows are cut, processes at once, and, where they have them, ``--only`` and ``--without``
     cache_dir : folder of the cache, which several data sets and rules may share
-    n_jobs : processes at once on this machine
     progress : called as runs are done
-    source : whose ``--only`` and ``--without`` choose among the runs
+    recipe : of features
+
+    Returns
+    -------
+    data : with windows without their samples; its digest is over those of the runs, as that of the runs read
+        whole needs all at once
+    skipped : a sentence for each run that could not be read
 
     Raises
     ------
@@ -143,28 +121,36 @@ def cached_features(
     if cache_dir.exists() and not cache_dir.is_dir():
         raise ConfigError(f"--cache {cache_dir}: is no folder")
     ensure_writable(cache_dir)
-    place = cache_dir.resolve()
+    place, rule, n_jobs = cache_dir.resolve(), settings.rule, settings.jobs
     for folder in ("runs", "features"):
         (place / folder).mkdir(parents=True, exist_ok=True)
     heads, pairs = _heads(loaders, place, n_jobs, progress)
-    skipped = tuple(f"run skipped: {head.fault}" for head in heads if head.fault)
+    skipped = [f"run skipped: {head.fault}" for head in heads if head.fault]
     readable = [head for head in heads if not head.fault]
-    chosen = readable if source is None else chosen_runs(readable, source)
+    chosen = chosen_runs(readable, settings) if isinstance(settings, AlignedRunsSettings) else readable
     names = {head.run_id for head in chosen}
     load_of = dict(zip([head.run_id or str(i) for i, head in enumerate(heads)], loaders, strict=True))
     _refuse_shared([(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= names], n_jobs, progress)
     chosen = sorted(chosen, key=lambda head: head.run_id)
+    unfitted = recipe_of(settings, recipe)
+    extractor, signal_sets = unfitted[0], unfitted[0].signal_sets
     layout = layout_of([head.sketch() for head in chosen], signal_sets, speeds=rule.steady is not None)
-    extractor = FeatureExtractor(signal_sets).fit(cut_windows([], rule, layout=layout).windows)
-    identity = _identity(rule, signal_sets, layout)
+    extractor.fit(cut_windows([], rule, layout=layout).windows)
     width = len(extractor.get_feature_names_out())
-    files = [place / "features" / f"{_key(head.digest, identity)}.parquet" for head in chosen]
+    channels = {name: list(names) for name, names in layout.channels.items()}
+    made_of = [FORMAT_VERSION, __version__, asdict(rule), list(signal_sets), channels, dict(layout.rate_hz)]
+    keys = [_sha256([head.digest, _sha256(made_of)])[:32] for head in chosen]
+    files = [place / "features" / f"{key}.parquet" for key in keys]
     todo = [i for i, file in enumerate(files) if _read(file, width) is None]
     each = ((load_of[chosen[i].run_id], files[i]) for i in todo)
     progress("features", len(files) - len(todo), len(files))
     for done, _ in enumerate(parallel(_store_run, (rule, layout, extractor), each, n_jobs), start=1):
         progress("features", len(files) - len(todo) + done, len(files))
-    return _table(chosen, files, width, layout, rule)._replace(n_computed=len(todo), skipped=skipped)
+    samples, features, moved = _table(chosen, files, width, rule)
+    motion = None if wheel_stream(layout.channels) is None else moved
+    runs = trained_runs([(head, head.digest) for head in chosen], samples)
+    digest = joint_digest([head.digest for head in chosen])
+    return TrainingData(samples, layout, unfitted, features, motion, runs, digest), skipped
 
 
 def _heads(
@@ -264,9 +250,9 @@ def _store_run(
 
 
 def _table(
-    heads: Sequence[RunHead], files: Sequence[Path], width: int, layout: Layout, rule: WindowRule
-) -> CachedFeatures:
-    """Return the labelled windows of all runs, run by run and in order of time."""
+    heads: Sequence[RunHead], files: Sequence[Path], width: int, rule: WindowRule
+) -> tuple[Samples, Array, Motion]:
+    """Return the labelled windows of all runs, run by run and in order of time, their features and motion."""
     parts, dropped = [], Counter[str]()
     for head, file in zip(heads, files, strict=True):
         found = _read(file, width)
@@ -288,22 +274,9 @@ def _table(
     if np.array_equal(features, np.broadcast_to(features[:1], features.shape), equal_nan=True):
         raise DataError("no feature ever varies: nothing can be learned from them")
     windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], table["terrain"])
-    measured = wheel_stream(layout.channels) is not None
-    motion = Motion(*(table[name] for name in Motion._fields)) if measured else None
     repaired = dict(sum((Counter(head.repaired) for head in heads), Counter()))
     samples = Samples(windows, dict(dropped), windows.run_id, rule.overlap, repaired=repaired)
-    return CachedFeatures(samples, features, motion, layout, tuple(heads), 0, ())
-
-
-def _identity(rule: WindowRule, signal_sets: Sequence[str], layout: Layout) -> str:
-    """Return a digest of all that features depend on beside the run."""
-    channels = {name: list(names) for name, names in layout.channels.items()}
-    rates = dict(layout.rate_hz)
-    return _sha256([FORMAT_VERSION, __version__, asdict(rule), list(signal_sets), channels, rates])
-
-
-def _key(digest: str, identity: str) -> str:
-    return _sha256([digest, identity])[:32]
+    return samples, features, Motion(*(table[name] for name in Motion._fields))
 
 
 def _sha256(document: Any) -> str:

@@ -6,16 +6,18 @@ inspect MODEL`` shows it, and it lies beside the model as Markdown.
 
 from __future__ import annotations
 
+import math
 import time
-from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, field_validator
+import numpy as np
+from pydantic import BaseModel, ConfigDict
 
+from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.model_file import (
     CARD_FILE,
     MODEL_FILE,
@@ -26,29 +28,34 @@ from pipelines.learn.model_file import (
     read_files,
     read_model,
     seal,
-    window_words,
 )
+from pipelines.learn.training_data import TrainedRun
 from pipelines.report import (
     NOT_KNOWN,
-    Bars,
-    Column,
-    Figure,
     Pairs,
-    Panel,
     Report,
     Result,
     Section,
-    Table,
     Text,
     described,
     enumerated,
     format_value,
-    interval,
     plural,
     sentence,
 )
-from terrain.classify.confidence import CoverageFigures
-from terrain.classify.metrics import ClassFigures
+from terrain.classify.breakaway import Breakaway
+from terrain.classify.confidence import CoverageFigures, ReliabilityBin
+from terrain.classify.conformal_figures import ConformalFigures
+from terrain.classify.held_out import FoldFigures
+from terrain.classify.importance import ChannelImportance
+from terrain.classify.learning_curve import LearningCurve
+from terrain.classify.metrics import ClassFigures, RunFigures
+from terrain.classify.next_drives import NextDrive, SupportRow
+from terrain.classify.sequence_figures import DelayFigures, SequenceFigures
+from terrain.classify.slow_fast import SlowFast, run_speeds
+from terrain.classify.stiffness_figures import StiffnessFigures
+from terrain.classify.support_figures import PartFigures
+from terrain.classify.unknown_figures import LeftOutTerrain
 from terrain.errors import ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import parse_document
@@ -58,53 +65,13 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from features.motion import Motion
-    from pipelines.learn.evaluation import CrossvalResult
-    from terrain.records import Array, Windows
+    from terrain.records import Windows
 
 N_TIMED = 50
 """Windows whose time is measured, one by one; the median is stated."""
 
 WEAK_BELOW = 0.5
 """A terrain that is recognised less often is named among the limits."""
-
-MOVING_MPS = 0.03
-
-PERCENT = ".1%"
-
-
-@dataclass(frozen=True, slots=True)
-class RunRow:
-    """A run that a model was trained on, as the tracking library lists it."""
-
-    run_id: str
-    robot: str
-    terrain: str
-    n_windows: int
-    digest: str
-
-
-class Evaluated(BaseModel):
-    """What the card and the choice of the champion need of an evaluation's JSON; it may hold other figures."""
-
-    model_config = ConfigDict(frozen=True, extra="allow")
-
-    accuracy: float
-    accuracy_ci: tuple[float, float]
-    macro_f1: float
-    per_class: dict[str, ClassFigures]
-    per_run: tuple[dict[str, Any], ...]
-    protocol: str
-    repeats: int
-    seed: int
-    notes: tuple[str, ...]
-    accuracy_at_coverage: tuple[CoverageFigures, ...] = ()
-    support: tuple[dict[str, Any], ...] = ()
-
-    @property
-    def chance(self) -> float:
-        """Accuracy of always predicting the class with the most windows."""
-        counts = [figures.n_windows for figures in self.per_class.values()]
-        return max(counts) / sum(counts)
 
 
 class TrainingRecord(BaseModel):
@@ -114,39 +81,38 @@ class TrainingRecord(BaseModel):
     ----------
     params : as MLflow holds them
     runs : of the data set
-    evaluation, importance : on held-out runs, as ``train --json`` has them
+    evaluation, importance : on held-out runs
     chosen : hyper-parameters that inner folds chose
     limits : in sentences, what the model is not for
     versions : of the packages that it was trained with
     latency_ms, onnx_latency_ms : median time of one window, and of its network alone; None where not measured
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", ser_json_inf_nan="strings")
 
     params: dict[str, Any]
-    runs: tuple[RunRow, ...]
-    evaluation: dict[str, Any]
-    importance: tuple[dict[str, Any], ...]
+    runs: tuple[TrainedRun, ...]
+    evaluation: CrossvalResult
+    importance: tuple[ChannelImportance, ...]
     chosen: dict[str, Any]
     limits: tuple[str, ...]
     versions: str
     latency_ms: float | None = None
     onnx_latency_ms: float | None = None
 
-    @field_validator("evaluation")
-    @classmethod
-    def _check_evaluation(cls, document: dict[str, Any]) -> dict[str, Any]:
-        Evaluated.model_validate(document)
-        return document
-
-    @property
-    def evaluated(self) -> Evaluated:
-        """The evaluation, checked."""
-        return Evaluated.model_validate(self.evaluation)
-
     def as_json(self) -> dict[str, Any]:
         """Return all fields by name."""
-        return self.model_dump(mode="json")
+        return dict(self)
+
+
+_RECORDS = (
+    *(Breakaway, ClassFigures, ConformalFigures, CoverageFigures, DelayFigures, FoldFigures, LearningCurve),
+    *(LeftOutTerrain, NextDrive, PartFigures, ReliabilityBin, RunFigures, SequenceFigures, SlowFast),
+    *(StiffnessFigures, SupportRow),
+)
+"""Types of the fields of an evaluation, whose own module imports them for a type checker alone."""
+
+TrainingRecord.model_rebuild(_types_namespace={kind.__name__: kind for kind in _RECORDS})
 
 
 @dataclass(frozen=True, repr=False)
@@ -176,8 +142,7 @@ class ModelResult(Result):
         """Return a row a terrain."""
         import pandas as pd
 
-        figures = {} if self.training is None else self.training.evaluated.per_class
-        return pd.DataFrame([{"terrain": name, **row._asdict()} for name, row in figures.items()])
+        return pd.DataFrame() if self.training is None else self.training.evaluation.to_pandas()
 
 
 def model_result(folder: Path, name: str) -> ModelResult:
@@ -190,20 +155,16 @@ def model_result(folder: Path, name: str) -> ModelResult:
     """
     model = read_model(folder)
     info, record = read_training(folder)
-    fields = "recipe classes window_s channels rate_hz robots filter dataset data_digest commit"
+    fields = "recipe classes window_s windows channels rate_hz robots filter dataset data_digest commit"
+    files = [file for file in (folder / MODEL_FILE, folder / ONNX_FILE) if file.is_file()]
     return ModelResult(
         model=name,
         **{field: getattr(info, field) for field in fields.split()},
-        windows=window_words(info),
         n_training_runs=len(info.run_digests),
         finds_unknown=model.novelty is not None,
         counts_support=model.support is not None,
         names_sets=info.conformal is not None,
-        files={
-            file: (folder / file).stat().st_size
-            for file in (MODEL_FILE, ONNX_FILE)
-            if (folder / file).is_file()
-        },
+        files={file.name: file.stat().st_size for file in files},
         training=record,
     )
 
@@ -226,38 +187,30 @@ def read_training(folder: Path) -> tuple[ModelInfo, TrainingRecord | None]:
         raise ModelError(f"{folder / TRAINING_FILE}: is no record of a training ({text})") from None
 
 
-def write_training(folder: Path, name: str, info: ModelInfo, record: TrainingRecord) -> None:
-    """Write how a model was trained, and its card, beside the model, whose time is then measured."""
-    from pipelines.report.markdown import markdown_text
-
-    timed = record.model_copy(update=_measured(folder))
-    atomic_write(folder / TRAINING_FILE, timed.model_dump_json(indent=1) + "\n")
-    seal(folder, info)
-    atomic_write(folder / CARD_FILE, markdown_text(report(model_result(folder, name))))
-    seal(folder, info)
-
-
-def _measured(folder: Path) -> dict[str, float | None]:
-    """Return the time that one window takes the model in a folder, and its network by ONNX."""
-    import numpy as np
-
+def write_training(folder: Path, name: str, record: TrainingRecord) -> None:
+    """Write how a model was trained, and its card, beside the model; the time of one window is measured here."""
     from pipelines.live.model import assess
+    from pipelines.report.markdown import markdown_text
     from terrain.classify.network_onnx import time_of_onnx
 
     model = read_model(folder)
-    window = drawn_window(model.layout, model.info.window_s)
+    window = drawn_window(model.info)
     assess(model, window)  # compiles and fills caches
-    times_s = np.empty(N_TIMED)
-    for number in range(N_TIMED):
+    times_s = []
+    for _ in range(N_TIMED):
         began_s = time.perf_counter()
         assess(model, window)
-        times_s[number] = time.perf_counter() - began_s
-    onnx = folder / ONNX_FILE
-    onnx_times_s = time_of_onnx(onnx.read_bytes(), window, N_TIMED) if onnx.is_file() else None
-    return {
-        "latency_ms": 1e3 * float(np.median(times_s)),
-        "onnx_latency_ms": None if onnx_times_s is None else 1e3 * float(np.median(onnx_times_s)),
-    }
+        times_s.append(time.perf_counter() - began_s)
+    timed: dict[str, Any] = {"latency_ms": 1e3 * float(np.median(times_s))}
+    if (folder / ONNX_FILE).is_file():
+        onnx_times_s = time_of_onnx((folder / ONNX_FILE).read_bytes(), window, N_TIMED)
+        if onnx_times_s is not None:
+            timed["onnx_latency_ms"] = 1e3 * float(np.median(onnx_times_s))
+    record = record.model_copy(update=timed)
+    atomic_write(folder / TRAINING_FILE, record.model_dump_json(indent=1) + "\n")
+    seal(folder, model.info)
+    atomic_write(folder / CARD_FILE, markdown_text(model_result(folder, name).report))
+    seal(folder, model.info)
 
 
 def limits_of(
@@ -284,7 +237,8 @@ def limits_of(
         limits.append(
             f"standing, and speed changes above {info.steady.max_accel_mps2:g} m/s²: such windows are left out"
         )
-    if speeds := [] if motion is None else _run_speeds(windows.run_id.astype(str), motion.speed_mps):
+    by_run = {} if motion is None else run_speeds(motion.speed_mps[:, None], windows.run_id.astype(str))
+    if speeds := [speed for speed in by_run.values() if not math.isnan(speed)]:
         limits.append(
             f"speeds outside of {min(speeds):.2f} to {max(speeds):.2f} m/s, the medians of the slowest and "
             "the fastest training run"
@@ -302,71 +256,15 @@ def limits_of(
     return tuple(sentence(text) for text in limits)
 
 
-def _run_speeds(run_id: Array, speed_mps: Array) -> list[float]:
-    """Return the median speed of the windows of each run in which it moves, of runs that have such."""
-    import numpy as np
-
-    moving = speed_mps > MOVING_MPS
-    return [float(np.median(speed_mps[moving & (run_id == run)])) for run in np.unique(run_id[moving])]
-
-
 def report(result: ModelResult) -> Report:
-    """Return what a model states of itself."""
-    title, next_step = f"Model {result.model}", f"terrain predict --data runs/ --model {result.model}"
-    lead = (
-        f"recipe {result.recipe}, windows of {result.window_s:g} s, "
-        f"{plural(result.n_training_runs, 'training run')}"
-    )
-    uses = _uses(result)
-    if result.training is None:
-        answer = f"A model for {enumerated(result.classes)} that was not evaluated when it was stored."
-        return Report(title, answer, parts=[uses], lead=lead, next_step=next_step)
-    limits, evaluated = result.training.limits, result.training.evaluated
-    n_runs = Counter(str(row["terrain"]) for row in evaluated.per_run)
-    recall = [row.recall for row in evaluated.per_class.values()]
-    columns = (
-        *("terrain", "runs"),
-        *(Column("precision", PERCENT), Column("recall", PERCENT), Column("F1", ".3f")),
-        "windows",
-    )
-    accuracy, ends = format_value(evaluated.accuracy, PERCENT), interval(*evaluated.accuracy_ci, PERCENT)
-    return Report(
-        title=title,
-        answer=(f"Of windows of held-out runs {accuracy} are classified correctly ({ends}, 95 % over runs)."),
-        lead=lead,
-        picture=Figure(
-            "Windows of each terrain that are recognised",
-            [
-                Panel(
-                    [Bars("recall", list(evaluated.per_class), recall)], x_label="recall", x_range=(0.0, 1.0)
-                )
-            ],
-            caption="On runs that were held out of training.",
-        ),
-        parts=[
-            Table(columns, [(name, n_runs[name], *row) for name, row in evaluated.per_class.items()]),
-            Section("Not for", [Text(text) for text in limits[:3]]),
-        ],
-        details=[
-            Section("Not for, further", [Text(text) for text in limits[3:]]),
-            _figures(evaluated),
-            _support(evaluated),
-            Section("Notes", [Text(sentence(text), "note") for text in evaluated.notes]),
-            Section("Needs", [uses]),
-            Section("Made", [_made(result, result.training)]),
-        ],
-        next_step=next_step,
-    )
-
-
-def _uses(result: ModelResult) -> Pairs:
+    """Return what a model states of itself: its evaluation first, and what it is not for."""
     answers = {
         "unknown terrain": result.finds_unknown,
         "how far training runs support it": result.counts_support,
         "sets of terrains": result.names_sets,
     }
     also = ", ".join(name for name, there in answers.items() if there)
-    return Pairs(
+    uses = Pairs(
         [
             ("terrains", ", ".join(result.classes)),
             ("robots", ", ".join(result.robots) or NOT_KNOWN),
@@ -376,62 +274,48 @@ def _uses(result: ModelResult) -> Pairs:
         ],
         "What it needs and gives",
     )
-
-
-def _figures(evaluated: Evaluated) -> Section:
-    from pipelines.learn.evaluation import CrossvalResult
-
-    rows = [("always the most frequent terrain", format_value(evaluated.chance, PERCENT), NOT_KNOWN)]
-    for each in fields(CrossvalResult):
-        value, ends = getattr(evaluated, each.name, None), getattr(evaluated, f"{each.name}_ci", None)
-        if isinstance(value, float) and each.metadata["unit"] != "s":
-            form = each.metadata["form"]
-            shown = NOT_KNOWN if ends is None else interval(ends[0], ends[1], form)
-            rows.append((each.metadata["description"], format_value(value, form), shown))
-    for part in evaluated.accuracy_at_coverage:
-        text = f"accuracy of the most confident {part.coverage:.0%} of windows"
-        rows.append((text, format_value(part.accuracy, PERCENT), interval(*part.accuracy_ci, PERCENT)))
-    protocol = (
-        f"Protocol {evaluated.protocol}: whole runs are held out; {evaluated.repeats} fold assignments "
-        f"from seed {evaluated.seed}. Scaling, selection and calibration are fitted inside of each "
-        "training part."
+    title, next_step = f"Model {result.model}", f"terrain predict --data runs/ --model {result.model}"
+    lead = (
+        f"recipe {result.recipe}, windows of {result.window_s:g} s, "
+        f"{plural(result.n_training_runs, 'training run')}"
     )
-    return Section("Figures", [Table(("figure", "value", "95 % over runs"), rows), Text(protocol)])
-
-
-def _support(evaluated: Evaluated) -> Section:
-    """Return runs, windows and accuracy of each terrain by regime of driving."""
-    if not evaluated.support:
-        return Section("Support", [Text("How the robot moved is not known.")])
-    cells: dict[str, list[str]] = {}
-    for row in evaluated.support:
-        accuracy = format_value(row.get("accuracy"), ".0%")
-        shown = f"{row.get('n_runs')}/{row['windows']} {accuracy}" if row.get("windows") else "none"
-        cells.setdefault(str(row.get("regime")), []).append(shown)
-    table = Table(
-        ("driving", *evaluated.per_class),
-        [(regime, *row) for regime, row in cells.items()],
-        note="Runs/windows, and accuracy when held out.",
-    )
-    return Section("Support", [table])
-
-
-def _made(result: ModelResult, training: TrainingRecord) -> Pairs:
-    chosen = ", ".join(f"{name} {format_value(value)}" for name, value in training.chosen.items())
+    training = result.training
+    if training is None:
+        answer = f"A model for {enumerated(result.classes)} that was not evaluated when it was stored."
+        return Report(title, answer, parts=[uses], lead=lead, next_step=next_step)
+    evaluated, limits = training.evaluation.report, [Text(text) for text in training.limits]
     timed = f"median of {N_TIMED}, on the machine that trained it"
-    times_ms = {
-        f"time of one window, {timed}": training.latency_ms,
-        "its network by ONNX": training.onnx_latency_ms,
-    }
-    return Pairs(
+    made = Pairs(
         [
-            ("chosen", chosen or NOT_KNOWN),
+            ("chosen", chosen_words(training.chosen) or NOT_KNOWN),
             ("data", f"{result.dataset} ({result.data_digest[:12]})"),
             ("windows", result.windows),
-            *((text, value, ".2f", "ms") for text, value in times_ms.items() if value is not None),
+            (f"time of one window, {timed}", training.latency_ms, ".2f", "ms"),
+            ("its network by ONNX", training.onnx_latency_ms, ".2f", "ms"),
             *((f"size of {name}", n_bytes, ",", "bytes") for name, n_bytes in result.files.items()),
             ("code", result.commit),
             ("licence", metadata.metadata("terrain-slip")["License-Expression"]),
             ("versions", training.versions),
+            ("scaling, selection and calibration", "fitted inside of each training part of the evaluation"),
         ]
     )
+    return Report(
+        title=title,
+        answer=evaluated.answer,
+        lead=lead,
+        picture=evaluated.picture,
+        parts=[*evaluated.parts[:1], Section("Not for", limits[:3])],
+        details=[
+            Section("Not for, further", limits[3:]),
+            Section("Notes", evaluated.parts[1:]),
+            Section("Needs", [uses]),
+            Section("Made", [made]),
+            *evaluated.details,
+        ],
+        next_step=next_step,
+    )
+
+
+def chosen_words(chosen: Mapping[str, Any]) -> str:
+    """Return hyper-parameters in words."""
+    return ", ".join(f"{name} {format_value(value)}" for name, value in chosen.items())

@@ -15,14 +15,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipelines.learn.evaluate import weaknesses
-from pipelines.learn.model_file import ModelInfo, TerrainModel, window_words
+from pipelines.learn.model_file import ModelInfo, TerrainModel
 from terrain.classify.metrics import runs_by_terrain
 from terrain.classify.paired import MIN_RUNS, Difference, paired_accuracy
 from terrain.logs.digest import joint_digest
 
 if TYPE_CHECKING:
     from features.protocols import Samples
-    from pipelines.learn.card import Evaluated
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.training_data import TrainingData
 
@@ -78,12 +77,12 @@ def scope_of(info: ModelInfo) -> dict[str, str]:
     return {
         "robots": ", ".join(sorted(info.robots)),
         "classes": ", ".join(sorted(info.classes)),
-        "windows": window_words(info),
+        "windows": info.windows,
         "channels": digest,
     }
 
 
-def tags_of(info: ModelInfo, evaluated: Evaluated) -> dict[str, str]:
+def tags_of(info: ModelInfo, evaluated: CrossvalResult) -> dict[str, str]:
     """Return the tags of a registered version: what it is compared by."""
     low, high = evaluated.accuracy_ci
     return {
@@ -96,7 +95,7 @@ def tags_of(info: ModelInfo, evaluated: Evaluated) -> dict[str, str]:
 
 
 def judge(
-    champion: Champion | None, info: ModelInfo, evaluated: Evaluated, bench: Bench | None = None
+    champion: Champion | None, info: ModelInfo, evaluated: CrossvalResult, bench: Bench | None = None
 ) -> tuple[bool, str]:
     """Return whether a new version becomes champion, and why.
 
@@ -124,7 +123,7 @@ def judge(
             return False, f"{different}: choose another --name"
     digests = (info.data_digest,) if bench is None else _digests(info, bench.data)
     if model.info.data_digest in digests or joint_digest(model.info.run_digests) == info.data_digest:
-        best = float(champion.tags.get("macro_f1", model.info.evaluation.get("macro_f1", "-inf")))
+        best = float(champion.tags.get("macro_f1", "-inf"))
         comparison = f"{best:.4f} of version {version} on the same data"
         if evaluated.macro_f1 > best:
             return True, f"macro F1 {evaluated.macro_f1:.4f} is better than {comparison}{remark}"

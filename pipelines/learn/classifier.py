@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -11,11 +12,11 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
 from features.motion import window_motion
+from features.protocols import Samples
 from features.recipes import make_recipe
 from features.windows import WindowRule
-from pipelines.learn.load import load_model
-from pipelines.learn.model_file import TerrainModel, model_info, write_model
-from terrain.classify.limits import learn_limits
+from pipelines.learn.model_file import MANIFEST_FILE, TerrainModel, model_info, read_model, write_model
+from pipelines.learn.training_data import with_limits
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
@@ -82,39 +83,24 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         known = np.array([bool(name) for name in terrain], dtype=bool)
         if not known.any():
             raise DataError("no window has a terrain label: nothing can be trained")
-        windows, terrain = windows[known], terrain[known].astype(str)
-        recipe = make_recipe(
-            self.recipe, self.signal_sets, gap=_overlap(windows), seed=self.seed, functions=self.functions
-        )
-        recipe.fit(windows, terrain)
-        self.classes_ = np.asarray(recipe.classes_, dtype=object)
-        self.model_ = self._model(recipe, windows, terrain)
-        return self
-
-    def _model(self, recipe: Any, windows: Windows, terrain: Array) -> TerrainModel:
-        """Return the model with its limits, as far as the windows give them."""
-        motion = window_motion(windows)
-        limits = learn_limits(
-            recipe[-1],
-            recipe.matrix.of(windows),
-            terrain,
-            windows.run_id.astype(str),
-            None if motion is None else motion[:2],
-            _overlap(windows),
-            self.seed,
-        )
+        windows = replace(windows, terrain=terrain)[known]
+        gap = _overlap(windows)
+        recipe = make_recipe(self.recipe, self.signal_sets, gap=gap, seed=self.seed, functions=self.functions)
+        samples = Samples(windows, {}, windows.run_id, gap)
+        recipe.fit(windows, samples.terrain)
         info = model_info(
             recipe[0].layout_,
             WindowRule(windows.length_s, None, None),
-            terrain,
+            samples.terrain,
             run_digests=(),
             recipe=self.recipe if isinstance(self.recipe, str) else type(self.recipe).__name__,
             signal_sets=tuple(self.signal_sets),
             seed=self.seed,
-            support=None if limits.support is None else limits.support.as_json(),
-            conformal=limits.conformal,
         )
-        return TerrainModel(recipe, info, limits.novelty, limits.support)
+        features, motion = recipe.matrix.of(windows), window_motion(windows)
+        self.model_, _ = with_limits(recipe, info, samples, features, motion)
+        self.classes_ = np.asarray(recipe.classes_, dtype=object)
+        return self
 
     def predict(self, X: Windows) -> Array:
         """Return the most probable terrain (n,) of each window.
@@ -157,7 +143,7 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         check_is_fitted(self, "model_")
         place = Path(folder)
         if place.exists() and (
-            not place.is_dir() or (any(place.iterdir()) and not (place / "terrain_model.json").is_file())
+            not place.is_dir() or (any(place.iterdir()) and not (place / MANIFEST_FILE).is_file())
         ):
             raise ConfigError(f"{place}: holds something else than a model; choose another folder")
         place.mkdir(parents=True, exist_ok=True)
@@ -173,7 +159,7 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         ModelError
             if there is no such model, or it is damaged or foreign.
         """
-        model = load_model(str(source))
+        model = read_model(source)
         found = cls(model.info.recipe, tuple(model.info.signal_sets) or SIGNAL_SETS, model.info.seed)
         found.model_ = model
         found.classes_ = np.asarray(model.recipe.classes_, dtype=object)

@@ -134,8 +134,8 @@ def compare_models(
         notes.append(f"the models have other classes: compared on windows of {classes or 'no terrain'}")
     results, outcomes = [], []
     for name, model in zip(settings.model, models, strict=True):
-        rule = model.rule
-        cut = cut_windows(kept, rule, layout=model.layout)
+        rule = model.info.rule
+        cut = cut_windows(kept, rule, layout=model.info.layout)
         windows = cut.windows[np.isin(cut.windows.terrain.astype(str), shared)]
         if not len(windows):
             raise DataError(f"no window of these runs is labelled as a class of all models ({classes})")

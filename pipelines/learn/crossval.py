@@ -73,9 +73,9 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
         asked = settings.with_(skip_short=settings.repair)
         if settings.model:
             from pipelines.learn.comparison import compare_models
-            from pipelines.learn.load import load_model
+            from pipelines.learn.model_file import read_model
 
-            found = compare_models(runs, [load_model(each) for each in settings.model], asked)
+            found = compare_models(runs, [read_model(each) for each in settings.model], asked)
         else:
             found = crossval(runs, asked, progress)
     named = replace(found, dataset=settings.dataset, data_digest=data_digest(runs), data=str(settings.data))
@@ -84,16 +84,14 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
 
 def _of_cache(settings: Settings, folder: Path, progress: Progress) -> CrossvalResult:
     """Evaluate the SVM on cached features; what is missing among them is computed first."""
-    from pipelines.learn.cache import cached_features, loaders_of
+    from pipelines.learn.cache import cached_data, loaders_of
     from pipelines.learn.evaluate import evaluate_recipe
-    from pipelines.learn.recipes import recipe_of
 
-    cut = settings.rule, settings.signal_sets, folder
-    cached = cached_features(loaders_of(settings), *cut, settings.jobs, progress, settings)
-    recipe, given = recipe_of(settings, FEATURE_RECIPE), (cached.features, cached.motion)
-    found, _ = evaluate_recipe(recipe, FEATURE_RECIPE, cached.samples, settings, progress, given)
-    of_data: dict[str, Any] = {"dataset": settings.dataset, "data_digest": cached.digest}
-    return replace(found, **of_data, data=str(settings.data), skipped=cached.skipped)
+    data, skipped = cached_data(loaders_of(settings), settings, folder, progress)
+    given = data.rows, data.motion
+    found, _ = evaluate_recipe(data.recipe, FEATURE_RECIPE, data.samples, settings, progress, given)
+    of_data: dict[str, Any] = {"dataset": settings.dataset, "data_digest": data.digest}
+    return replace(found, **of_data, data=str(settings.data), skipped=tuple(skipped))
 
 
 def crossval(

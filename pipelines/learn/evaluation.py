@@ -119,7 +119,7 @@ class CrossvalResult(Result):
     )
     unknown_by_terrain: Mapping[str, LeftOutTerrain] | None = optional("by terrain left out")
     support: tuple[SupportRow, ...] | None = optional("windows and accuracy by terrain and driving")
-    accuracy_by_support: tuple[Mapping[str, Any], ...] | None = optional(
+    accuracy_by_support: tuple[Mapping[str, str | float | tuple[float, float] | None], ...] | None = optional(
         "accuracy by training runs of the true terrain near the motion of a window"
     )
     unsupported: PartFigures | None = optional("predictions without training runs near them")

@@ -181,13 +181,13 @@ def propose_labels(settings: Settings, model_uri: str) -> ProposalsResult:
         if there is no run, or a run lacks what the model requires.
     """
     from pipelines.data.datasets import load_runs
-    from pipelines.learn.load import load_model
+    from pipelines.learn.model_file import read_model
     from pipelines.live.model import assess
     from pipelines.live.windows import filter_of, windows_of_log
     from terrain.classify.proposals import propose, questions
     from terrain.files.atomic import atomic_write
 
-    model, runs = load_model(model_uri), load_runs(settings.data)
+    model, runs = read_model(model_uri), load_runs(settings.data)
     of_model = model.info.classes, filter_of(model.info).prior
     proposals: list[Proposal] = []
     for run in runs:

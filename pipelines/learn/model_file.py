@@ -3,7 +3,7 @@
 The scikit-learn part is loaded by skops with the fixed list of types below and nothing else, so that a file
 cannot bring code of its own; the network is stored as ONNX, from which its numbers are read.  The manifest,
 written last, says how windows must be cut and holds the checksums of all files: a damaged folder is
-distinguished from an intact one.
+distinguished from an intact one.  A registered model is a copy of such a folder.
 """
 
 from __future__ import annotations
@@ -11,10 +11,14 @@ from __future__ import annotations
 import copy
 import hashlib
 import io as streams
+import subprocess
+import sys
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -26,7 +30,7 @@ from terrain import __version__
 from terrain.classify.network_numbers import check_network
 from terrain.classify.network_onnx import network_onnx, numbers_of_onnx
 from terrain.classify.novelty_numbers import NoveltyNumbers, check_novelty
-from terrain.classify.support import SupportTable
+from terrain.classify.support import SupportTable, check_support
 from terrain.classify.terrain_filter import TerrainFilter
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
@@ -43,7 +47,9 @@ CARD_FILE, TRAINING_FILE = "model_card.md", "training.json"
 FILES = (MODEL_FILE, ONNX_FILE, CARD_FILE, TRAINING_FILE)
 """Files that a manifest may list; what else lies beside them is not read."""
 
-VERSION = 3
+VERSION = 4
+
+FETCH_TIMEOUT_S = 120.0
 
 MAX_MODEL_BYTES = 256 * MEBIBYTE
 """Of a file as it lies on disk; those of this package have some MiB."""
@@ -74,6 +80,7 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "terrain.classify.response.ResponseColumns",
     "terrain.classify.stack.GroupedStack",
     "terrain.classify.stack.StackChoice",
+    "terrain.classify.support.SupportTable",
     "terrain.classify.svm.Candidate",
     "terrain.classify.svm.GroupedSVC",
     "terrain.classify.svm.Preparation",
@@ -96,11 +103,9 @@ class ModelInfo:
     commit, package_version : of the code
     robots : whose runs the training runs were, by name
     filter : that made the streams ``estimator`` and ``slip``; empty where the model uses neither
-    evaluation : figures on held-out runs by name, as ``accuracy``; empty where it was not evaluated
     class_ratio : share of each class among the training windows
     run_accuracy : of the windows of each training run when it was held out, by its digest
-    support : training runs of each terrain by motion, a :class:`~terrain.classify.support.SupportTable`
-    conformal : threshold of the sets of classes; None, as ``support``, where there is none
+    conformal : threshold of the sets of classes; None where there is none
     """
 
     classes: tuple[str, ...]
@@ -119,10 +124,8 @@ class ModelInfo:
     package_version: str = ""
     robots: tuple[str, ...] = ()
     filter: str = ""
-    evaluation: Mapping[str, float] = field(default_factory=dict)
     class_ratio: Mapping[str, float] = field(default_factory=dict)
     run_accuracy: Mapping[str, float] = field(default_factory=dict)
-    support: Mapping[str, Any] | None = None
     conformal: float | None = None
 
     @property
@@ -134,6 +137,12 @@ class ModelInfo:
     def rule(self) -> WindowRule:
         """How windows must be cut."""
         return WindowRule(self.window_s, self.stride_s, self.steady)
+
+    @property
+    def windows(self) -> str:
+        """How windows must be cut, in words."""
+        motion = "all motion" if self.steady is None else "steady motion"
+        return f"{self.window_s:g} s every {self.rule.step_s:g} s, {motion}"
 
 
 def model_info(layout: Layout, rule: WindowRule, terrain: Array, **known: Any) -> ModelInfo:
@@ -150,12 +159,6 @@ def model_info(layout: Layout, rule: WindowRule, terrain: Array, **known: Any) -
         class_ratio=dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True)),
         **known,
     )
-
-
-def window_words(info: ModelInfo) -> str:
-    """Return how the windows of a model are cut, in words."""
-    motion = "all motion" if info.steady is None else "steady motion"
-    return f"{info.window_s:g} s every {info.rule.step_s:g} s, {motion}"
 
 
 class Manifest(BaseModel):
@@ -181,16 +184,6 @@ class TerrainModel(NamedTuple):
     support: SupportTable | None = None
     over_time: TerrainFilter | None = None
 
-    @property
-    def layout(self) -> Layout:
-        """Channels and rates that a log must have."""
-        return self.info.layout
-
-    @property
-    def rule(self) -> WindowRule:
-        """How windows must be cut for this model."""
-        return self.info.rule
-
 
 def write_model(folder: Path, model: TerrainModel) -> None:
     """Write a model's files into a folder in place of those that lie there, the manifest last.
@@ -198,85 +191,134 @@ def write_model(folder: Path, model: TerrainModel) -> None:
     Raises
     ------
     ModelError
-        if the model holds a type that could not be read back.
+        as :func:`packed`.
     ConfigError
         if it has a network and onnx is not installed.
     """
-    from skops import io
-
     recipe, network = _without_network(model.recipe)
-    content = io.dumps({"recipe": recipe, "novelty": model.novelty})
-    _refuse_foreign(content)
+    content = packed({"recipe": recipe, "novelty": model.novelty, "support": model.support})
     for name in (MANIFEST_FILE, *FILES):  # of a model that lay there
         (folder / name).unlink(missing_ok=True)
     atomic_write(folder / MODEL_FILE, content)
     if network is not None:
-        classes = [str(name) for name in model.info.classes]
+        levels = recipe[0].matrix.level_sets
         centred = {
-            each.stream: [
-                is_centred(each.stream, name, recipe[0].matrix.level_sets) for name in each.channels
-            ]
+            each.stream: [is_centred(each.stream, name, levels) for name in each.channels]
             for each in network.numbers_.columns
         }
-        atomic_write(
-            folder / ONNX_FILE, network_onnx(network.numbers_, classes, model.info.window_s, centred)
-        )
+        onnx = network_onnx(network.numbers_, model.info.classes, model.info.window_s, centred)
+        atomic_write(folder / ONNX_FILE, onnx)
     seal(folder, model.info)
 
 
-def check_storable(estimator: Any) -> None:
-    """Raise ``ModelError`` where a fitted estimator holds a type that a model file may not hold."""
-    from skops import io
-
-    _refuse_foreign(io.dumps(estimator))
-
-
-def _refuse_foreign(content: bytes) -> None:
-    if foreign := _foreign_types(content):
-        raise ModelError(
-            f"{foreign[0]} cannot be stored: a model file holds only types that can be checked when it is read, "
-            "those of this package and most of scikit-learn's, trees not among them; crossval evaluates all"
-        )
-
-
-def seal(folder: Path, info: ModelInfo) -> None:
-    """Write the manifest of the files that lie in a folder."""
-    files = {name: _sha256((folder / name).read_bytes()) for name in FILES if (folder / name).is_file()}
-    manifest = Manifest(version=VERSION, files=files, info=info)
-    atomic_write(folder / MANIFEST_FILE, manifest.model_dump_json(indent=2) + "\n")
-
-
-def read_model(folder: Path) -> TerrainModel:
-    """Read a model folder.
+def packed(fitted: Any) -> bytes:
+    """Return what a model file holds of fitted parts.
 
     Raises
     ------
     ModelError
-        if it is no model of this package, is damaged, or holds a type that is not on the list.
+        if one is of a type that could not be read back.
     """
-    info, contents = read_files(folder)
+    from skops import io
+
+    content: bytes = io.dumps(fitted)
+    if foreign := _foreign_type(content):
+        raise ModelError(
+            f"{foreign} cannot be stored: a model file holds only types that can be checked when it is read, "
+            "those of this package and most of scikit-learn's, trees not among them; crossval evaluates all"
+        )
+    return content
+
+
+def seal(folder: Path, info: ModelInfo) -> None:
+    """Write the manifest of the files that lie in a folder."""
+    contents = {name: (folder / name).read_bytes() for name in FILES if (folder / name).is_file()}
+    files = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+    manifest = Manifest(version=VERSION, files=files, info=info)
+    atomic_write(folder / MANIFEST_FILE, manifest.model_dump_json(indent=2) + "\n")
+
+
+def read_model(source: str | Path) -> TerrainModel:
+    """Read a model: a folder, or a registered one (``models:/NAME@champion``, ``models:/NAME/3``, ``runs:/...``).
+
+    Raises
+    ------
+    ModelError
+        if there is no such model, it is none of this package, is damaged, or holds a type that is not on the
+        list.
+    """
+    with model_folder(source) as folder:
+        info, contents = read_files(folder)
     file = folder / MODEL_FILE
-    recipe, novelty = _load(file, contents[MODEL_FILE])
     try:
-        support = None if info.support is None else SupportTable.from_json(info.support, info.classes)
-    except DataError as error:
-        raise _damaged(folder / MANIFEST_FILE, error) from error
-    try:
+        recipe, novelty, support = _unpacked(contents[MODEL_FILE])
         _, network = _without_network(recipe)
         if network is not None:
             file = folder / ONNX_FILE
             network.numbers_ = numbers_of_onnx(contents[ONNX_FILE], network.columns)
             check_network(network.numbers_, len(info.classes))
             file = folder / MODEL_FILE
+        if tuple(str(name) for name in recipe.classes_) != info.classes:
+            raise DataError("its classes are not those of the manifest")
+        window = drawn_window(info)
+        probability = np.asarray(recipe.predict_proba(window))
+        if probability.shape != (1, len(info.classes)):
+            raise DataError(f"it gives probabilities of the shape {probability.shape}")
+        if support is not None:
+            check_support(support, info.classes)
         if novelty is not None:
             check_novelty(novelty, len(info.classes))
-        model = TerrainModel(recipe, info, novelty, support)
-        _try(model)
+            n_features = recipe.matrix.of(window).shape[1]
+            if novelty.settings[1] != n_features:
+                raise DataError(
+                    f"its novelty score is of {novelty.settings[1]:.0f} features; it has {n_features}"
+                )
     except ConfigError:
         raise
-    except Exception as error:  # numbers of a stranger lead anything to anything
+    except Exception as error:  # skops, numpy and scikit-learn raise whatever a stranger's file leads them to
         raise ModelError(f"{file}: cannot be loaded ({_words(error)})") from error
-    return model
+    return TerrainModel(recipe, info, novelty, support)
+
+
+@contextmanager
+def model_folder(source: str | Path) -> Iterator[Path]:
+    """Give the folder of a model; a copy, while the block lasts, of one that is registered.
+
+    The tracking library takes longer to import than all of a live service, and a hundred megabytes: unless it
+    is there already, the copy is made by a process of its own.
+
+    Raises
+    ------
+    ModelError
+        if there is no such folder or registered model.
+    """
+    uri = str(source)
+    try:
+        there = Path(uri).exists()
+    except OSError as error:
+        raise ModelError(f"{uri[:100]}: cannot be opened ({error.strerror})") from None
+    if there:
+        yield Path(uri)
+        return
+    if not uri.startswith(("models:/", "runs:/")):
+        raise ModelError(f"{uri}: is neither a folder nor a model URI such as models:/NAME@champion")
+    with TemporaryDirectory() as folder:
+        if "mlflow" in sys.modules:
+            from pipelines.data.tracking import fetch_model
+
+            yield fetch_model(uri, folder)
+            return
+        command = [sys.executable, "-m", "pipelines.data.tracking", uri, folder]
+        try:
+            done = subprocess.run(
+                command, capture_output=True, text=True, timeout=FETCH_TIMEOUT_S, check=False
+            )
+        except subprocess.TimeoutExpired:
+            raise ModelError(f"{uri}: was not loaded within {FETCH_TIMEOUT_S:g} s") from None
+        if done.returncode != 0:
+            lines = done.stderr.strip().splitlines()
+            raise ModelError(lines[-1] if lines else f"{uri}: cannot be loaded")
+        yield Path(done.stdout.strip().splitlines()[-1])
 
 
 def read_files(folder: Path) -> tuple[ModelInfo, dict[str, bytes]]:
@@ -303,33 +345,35 @@ def read_files(folder: Path) -> tuple[ModelInfo, dict[str, bytes]]:
         if MODEL_FILE not in listed or not set(listed) <= set(FILES):
             raise DataError("its list of files is not that of a model")
     except (ConfigError, DataError, ArithmeticError, LookupError, TypeError, ValueError) as error:
-        raise _damaged(place, error) from error
+        raise ModelError(f"{place}: is damaged ({_words(error)})") from error
     contents = {}
     for name, expected in listed.items():
         file = folder / name
         check_inside(file, folder, str(file), ModelError)
         contents[name] = read_regular(file, str(file), ModelError, MAX_MODEL_BYTES)
-        if (found := _sha256(contents[name])) != expected:
+        if (found := hashlib.sha256(contents[name]).hexdigest()) != expected:
             raise ModelError(
                 f"{file}: is damaged (SHA-256 {found[:12]}..., {printable(expected[:12])}... expected)"
             )
     return info, contents
 
 
-def drawn_window(layout: Layout, length_s: float) -> Windows:
-    """Return a window of noise with the channels and rates of a layout, to try a model with."""
+def drawn_window(info: ModelInfo) -> Windows:
+    """Return a window of noise with the channels and rates of a model, to try it with."""
     rng = np.random.default_rng(0)
-    values = {
-        stream: rng.standard_normal((1, len(names), layout.n_samples(stream, length_s)))
-        for stream, names in layout.channels.items()
-    }
-    return _windows(layout, length_s, values)
+    return _windows(
+        info,
+        {
+            stream: rng.standard_normal((1, len(names), info.layout.n_samples(stream, info.window_s)))
+            for stream, names in info.channels.items()
+        },
+    )
 
 
-def _windows(layout: Layout, length_s: float, values: Mapping[str, Array]) -> Windows:
+def _windows(info: ModelInfo, values: Mapping[str, Array]) -> Windows:
     n = len(next(iter(values.values())))
     unknown = np.full(n, "", dtype=object)
-    return Windows(values, layout.channels, layout.rate_hz, length_s, np.zeros(n), unknown, unknown)
+    return Windows(values, info.channels, info.rate_hz, info.window_s, np.zeros(n), unknown, unknown)
 
 
 class WindowProbabilities:
@@ -349,15 +393,14 @@ class WindowProbabilities:
         """
         import pandas as pd
 
-        layout = self.model.layout
+        recipe, info = self.model.recipe, self.model.info
         values = {
             stream: np.stack(
                 [np.stack([*model_input[f"{stream}.{name}"]]).astype(float) for name in names], axis=1
             )
-            for stream, names in layout.channels.items()
+            for stream, names in info.channels.items()
         }
-        found = self.model.recipe.predict_proba(_windows(layout, self.model.info.window_s, values))
-        return pd.DataFrame(found, columns=list(self.model.info.classes))
+        return pd.DataFrame(recipe.predict_proba(_windows(info, values)), columns=list(info.classes))
 
 
 def _load_pyfunc(path: str) -> WindowProbabilities:
@@ -383,66 +426,37 @@ def _without_network(recipe: WindowPipeline) -> tuple[WindowPipeline, Any]:
     return changed, network
 
 
-def _load(file: Path, content: bytes) -> tuple[WindowPipeline, NoveltyNumbers | None]:
+def _unpacked(content: bytes) -> tuple[WindowPipeline, NoveltyNumbers | None, SupportTable | None]:
+    """Return recipe, novelty score and support of a model file; ``DataError`` says why it is none."""
     from skops import io
 
     from features.recipes import WindowPipeline
 
-    try:
-        with zipfile.ZipFile(streams.BytesIO(content)) as archive:
-            unpacked_bytes = sum(entry.file_size for entry in archive.infolist())
-        if unpacked_bytes > MAX_UNPACKED_BYTES:
-            raise ModelError(f"{file}: unpacks to {unpacked_bytes} bytes, {MAX_UNPACKED_BYTES} are read")
-        if foreign := _foreign_types(content):
-            raise ModelError(f"{file}: holds {foreign[0]}, a type that models of this package do not hold")
-        found = io.loads(content, trusted=list(TRUSTED_TYPES))
-    except ModelError:
-        raise
-    except Exception as error:  # skops, numpy and scikit-learn raise whatever a damaged archive leads them to
-        raise ModelError(f"{file}: cannot be loaded ({_words(error)})") from error
-    recipe, novelty = (
-        (found.get("recipe"), found.get("novelty")) if isinstance(found, dict) else (found, None)
-    )
+    with zipfile.ZipFile(streams.BytesIO(content)) as archive:
+        unpacked_bytes = sum(entry.file_size for entry in archive.infolist())
+    if unpacked_bytes > MAX_UNPACKED_BYTES:
+        raise DataError(f"it unpacks to {unpacked_bytes} bytes, {MAX_UNPACKED_BYTES} are read")
+    if foreign := _foreign_type(content):
+        raise DataError(f"it holds {foreign}, a type that models of this package do not hold")
+    found = io.loads(content, trusted=list(TRUSTED_TYPES))
+    parts = found if isinstance(found, dict) else {"recipe": found}
+    recipe, novelty, support = (parts.get(name) for name in ("recipe", "novelty", "support"))
     if not isinstance(recipe, WindowPipeline):
-        raise ModelError(f"{file}: holds a {type(recipe).__name__}, not a recipe of this package")
+        raise DataError(f"it holds a {type(recipe).__name__}, not a recipe of this package")
     if not hasattr(recipe[0], "layout_"):
-        raise ModelError(f"{file}: holds a recipe that was never fitted")
-    if novelty is not None and not isinstance(novelty, NoveltyNumbers):
-        raise ModelError(f"{file}: holds a {type(novelty).__name__}, not a novelty score")
-    return recipe, novelty
+        raise DataError("it holds a recipe that was never fitted")
+    for limit, kind in ((novelty, NoveltyNumbers), (support, SupportTable)):
+        if limit is not None and not isinstance(limit, kind):
+            raise DataError(f"it holds a {type(limit).__name__}, {kind.__name__} is read")
+    return recipe, novelty, support
 
 
-def _foreign_types(content: bytes) -> list[str]:
-    """Return the types in a file that are not on the list, sorted."""
+def _foreign_type(content: bytes) -> str:
+    """Return the first type in a file that is not on the list; empty where all are."""
     from skops import io
 
     foreign = sorted(set(io.get_untrusted_types(data=content)) - set(TRUSTED_TYPES))
-    return [printable(name[:MAX_NAME]) for name in foreign]
-
-
-def _try(model: TerrainModel) -> None:
-    """Refuse a model that cannot classify a window with the channels that it names."""
-    info, recipe = model.info, model.recipe
-    window = drawn_window(info.layout, info.window_s)
-    if tuple(str(name) for name in recipe.classes_) != info.classes:
-        raise DataError("its classes are not those of the manifest")
-    probability = np.asarray(recipe.predict_proba(window))
-    if probability.shape != (1, len(info.classes)):
-        raise DataError(f"it gives probabilities of the shape {probability.shape}")
-    if model.novelty is not None:
-        n_features = recipe.matrix.of(window).shape[1]
-        if model.novelty.settings[1] != n_features:
-            raise DataError(
-                f"its novelty score is of {model.novelty.settings[1]:.0f} features; it has {n_features}"
-            )
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
-
-
-def _damaged(place: Path, error: Exception) -> ModelError:
-    return ModelError(f"{place}: is damaged ({_words(error)})")
+    return printable(foreign[0][:MAX_NAME]) if foreign else ""
 
 
 def _words(error: Exception) -> str:

@@ -207,7 +207,7 @@ def _changes(settings: Settings, progress: Progress) -> ChangesResult:
 
 
 def _predictions(settings: Settings) -> Predictions:
-    from pipelines.learn.load import load_model
+    from pipelines.learn.model_file import read_model
     from pipelines.live.windows import filtered
     from terrain.control.slip_table import load_slip_table
     from terrain.robots import load_robot
@@ -215,7 +215,7 @@ def _predictions(settings: Settings) -> Predictions:
     table = load_slip_table(settings.table)
     runs, skipped = load(settings)
     robot = None if settings.robot is None else load_robot(settings.robot)
-    model = filtered(load_model(settings.model), settings.filter_stride_s)
+    model = filtered(read_model(settings.model), settings.filter_stride_s)
     found = predict(runs, model, table, robot=robot, skip_short=settings.repair)
     return replace(found, model=settings.model, dataset=settings.dataset, skipped=tuple(skipped))
 

@@ -18,13 +18,13 @@ from pydantic import model_validator
 from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.learn.parallel import ComputeSettings
 from pipelines.learn.settings import FEATURE_RECIPE, RecipeSettings
+from pipelines.learn.tracking import Registered
 from pipelines.report import (
     Column,
     Pairs,
     Part,
     Progress,
     Report,
-    Result,
     Section,
     Table,
     Text,
@@ -40,12 +40,9 @@ from terrain.errors import ConfigError
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.learn.card import TrainingRecord
     from pipelines.learn.champion import Bench
     from pipelines.learn.evaluation import CrossvalResult
-    from pipelines.learn.model_file import ModelInfo
     from pipelines.learn.search import SearchResult
-    from pipelines.learn.tracking import Registered
     from pipelines.learn.training_data import TrainingData
     from terrain.classify.folds import Fold
     from terrain.classify.held_out import Examples
@@ -57,7 +54,6 @@ EXAMPLE = "terrain train --data runs/ --name field"
 NETWORKS = ("cnn", "stack", "best")
 """Recipes whose fits take a minute: by default they are evaluated by one fold assignment, the SVM by five."""
 
-METRICS = ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece")
 PERCENT = ".1%"
 
 
@@ -109,14 +105,9 @@ class Settings(TrainingSettings, AlignedRunsSettings, ComputeSettings):
 
 
 @dataclass(frozen=True, repr=False)
-class TrainResult(Result):
+class TrainResult(Registered):
     """A trained and registered model, and the evaluation that it is judged by."""
 
-    model_uri: str = described("of the registered version")
-    version: str = described("its number")
-    run_id: str = described("of the run in MLflow")
-    alias_moved: bool = described("whether it is the champion now")
-    alias_reason: str = described("why, or why not")
     dataset: str = described("name of the data")
     data_digest: str = described("digest of the runs")
     commit: str = described("of the code")
@@ -133,7 +124,7 @@ class TrainResult(Result):
         shown = replace(self, crossval=replace(self.crossval, dataset=None, data_digest=None, skipped=None))
         return {
             name: value
-            for name, value in Result.as_json(shown).items()
+            for name, value in Registered.as_json(shown).items()
             if name != "ui" and not (name in ("skipped", "search") and value is None)
         }
 
@@ -143,14 +134,9 @@ class TrainResult(Result):
 
 
 @dataclass(frozen=True, repr=False)
-class RegisterResult(Result):
+class RegisterResult(Registered):
     """A model that was kept in a folder, and is registered now."""
 
-    model_uri: str = described("of the registered version")
-    version: str = described("its number")
-    run_id: str = described("of the run in MLflow")
-    alias_moved: bool = described("whether it is the champion now")
-    alias_reason: str = described("why, or why not")
     folder: str = described("that the model lay in")
 
 
@@ -163,6 +149,7 @@ def run(settings: Settings, progress: Progress = silent) -> TrainResult | Regist
         if a setting is not accepted, the data do not suffice, or the tracking store fails; a model that was
         trained by then is kept in a folder, which the message names.
     """
+    from pipelines.data.tracking import ensure_tracking
     from pipelines.learn.parallel import computing
 
     if settings.kept is not None:
@@ -171,23 +158,14 @@ def run(settings: Settings, progress: Progress = silent) -> TrainResult | Regist
         if settings.cache is None:
             runs, skipped = load(settings)
             found = train(runs, settings.with_(skip_short=settings.repair), settings.dataset, progress)
-            return replace(found, skipped=tuple(skipped))
-        from pipelines.data.tracking import ensure_tracking
-        from pipelines.learn.cache import cached_features, loaders_of
-        from pipelines.learn.training_data import data_of_cache
+        else:
+            from pipelines.learn.cache import cached_data, loaders_of
 
-        ensure_tracking()
-        cached = cached_features(
-            loaders_of(settings),
-            settings.rule,
-            settings.signal_sets,
-            settings.cache,
-            settings.jobs,
-            progress,
-            settings,
-        )
-        found = train_on(data_of_cache(cached, settings), settings, settings.dataset, progress)
-        return replace(found, skipped=cached.skipped)
+            ensure_tracking()
+            cached = loaders_of(settings), settings, settings.cache, progress, settings.recipe
+            data, skipped = cached_data(*cached)
+            found = train_on(data, settings, settings.dataset, progress)
+    return replace(found, skipped=tuple(skipped))
 
 
 def train(
@@ -226,16 +204,17 @@ def train_on(
     """
     from features.motion import NO_MOTION
     from pipelines.data.tracking import code_commit, ui_line
-    from pipelines.learn.card import write_training
+    from pipelines.learn.card import TrainingRecord, limits_of, write_training
     from pipelines.learn.champion import Bench, held_out_runs
-    from pipelines.learn.model_file import TerrainModel, write_model
-    from pipelines.learn.training_data import info_of
+    from pipelines.learn.model_file import write_model
+    from pipelines.learn.training_data import info_of, with_limits
     from pipelines.report.drawing import figure_png
+    from pipelines.report.json_file import as_json
     from pipelines.report.tree import figures_of
-    from terrain.classify.limits import learn_limits
+    from pipelines.report.versions import versions
 
     _check_storable(data)
-    searched = None
+    searched, notes = None, []
     if settings.search:
         from pipelines.learn.search import search
         from terrain.classify.svm import Candidate
@@ -243,42 +222,59 @@ def train_on(
         folder = settings.trials or Path(f"search-{settings.name}")
         searched = search(data, settings.search, folder, settings.seed, settings.jobs, progress)
         data.recipe[-1].set_params(candidates=(Candidate(*searched.best.params),))
+        default, best = (format_value(value, PERCENT) for value in searched.held_out[:2])
+        notes.append(
+            "hyper-parameters were searched on these runs, which makes the accuracy optimistic: on "
+            f"{plural(len(searched.held_out_runs), 'run')} that no trial saw it is {best}, by the default "
+            f"choice {default}"
+        )
     evaluation, importance, fitted = _evaluated(data, settings, progress)
-    recipe, samples, motion = data.with_fitted(fitted), data.samples, data.motion
-    limits = learn_limits(
-        recipe[-1],
-        data.features,
-        samples.terrain,
-        samples.group.astype(str),
-        None if motion is None else motion[:2],
-        settings.rule.overlap,
-        settings.seed,
+    recipe, samples, rule = data.recipe, data.samples, settings.rule
+    recipe.steps[-1] = (recipe.steps[-1][0], fitted)
+    info = info_of(data, settings, dataset, code_commit())
+    model, missing = with_limits(recipe, info, samples, data.features, data.motion)
+    unknown = (f"support: {NO_MOTION}",) if data.motion is None else ()
+    evaluation = replace(
+        evaluation,
+        dataset=dataset,
+        data_digest=data.digest,
+        notes=(*evaluation.notes, *missing, *unknown, *notes),
     )
-    unknown = (f"support: {NO_MOTION}",) if motion is None else ()
-    notes = (*evaluation.notes, *limits.notes, *unknown, *_search_notes(searched))
-    evaluation = replace(evaluation, dataset=dataset, data_digest=data.digest, notes=notes)
     held_out = held_out_runs(samples, evaluation)
-    info = replace(
-        info_of(data, settings, dataset, code_commit()),
-        evaluation={name: getattr(evaluation, name) for name in METRICS},
-        run_accuracy={
-            run.digest: held_out[run.run_id].accuracy for run in data.runs if run.run_id in held_out
+    accuracy = {run.digest: held_out[run.run_id].accuracy for run in data.runs if run.run_id in held_out}
+    info = replace(model.info, run_accuracy=accuracy)
+    record = TrainingRecord(
+        params={
+            "recipe": settings.recipe,
+            "window_s": rule.length_s,
+            "stride_s": rule.step_s,
+            "steady": rule.steady is not None,
+            "seed": settings.seed,
+            "skip_short": settings.skip_short,
+            "signal_sets": ",".join(settings.signal_sets),
+            "repeats": evaluation.repeats,
+            "n_windows": len(data),
+            "n_runs": evaluation.n_runs,
+            "dataset": dataset,
         },
-        support=None if limits.support is None else limits.support.as_json(),
-        conformal=limits.conformal,
+        runs=data.runs,
+        evaluation=evaluation,
+        importance=importance,
+        chosen=as_json(getattr(fitted, "best_", {})),
+        limits=limits_of(info, samples.windows, data.motion, evaluation),
+        versions=versions(),
     )
-    record = _record(data, settings, evaluation, importance, info)
     drawn = enumerate(figures_of(evaluation.report), start=1)
     pictures = {f"figures/{place}.png": figure_png(figure) for place, figure in drawn}
     with TemporaryDirectory() as place:
         folder = settings.out or Path(place)
-        write_model(folder, TerrainModel(recipe, info, limits.novelty, limits.support))
-        write_training(folder, settings.name, info, record)
+        write_model(folder, model._replace(info=info))
+        write_training(folder, settings.name, record)
         registered = _registered(settings, folder, Bench(data, held_out, settings.seed), pictures)
     return TrainResult(
-        *registered,
+        **vars(registered),
         dataset=dataset,
-        data_digest=info.data_digest,
+        data_digest=data.digest,
         commit=info.commit,
         n_windows=len(data),
         chosen=record.chosen,
@@ -306,7 +302,7 @@ def register(folder: Path, name: str) -> RegisterResult:
     from pipelines.learn.tracking import log_training
 
     ensure_tracking()
-    return RegisterResult(*log_training(name, folder), folder=str(folder))
+    return RegisterResult(**vars(log_training(name, folder)), folder=str(folder))
 
 
 def _check_storable(data: TrainingData) -> None:
@@ -315,7 +311,7 @@ def _check_storable(data: TrainingData) -> None:
     from sklearn.base import clone
 
     from features.own import FunctionExtractor
-    from pipelines.learn.model_file import check_storable
+    from pipelines.learn.model_file import packed
     from terrain.classify.own import OwnClassifier
     from terrain.errors import ModelError
 
@@ -325,7 +321,7 @@ def _check_storable(data: TrainingData) -> None:
     if isinstance(own, OwnClassifier):
         terrain = data.samples.terrain
         rows = np.concatenate([np.flatnonzero(terrain == name)[:20] for name in np.unique(terrain)])
-        check_storable(clone(own.estimator).fit(np.nan_to_num(data.rows[rows]), terrain[rows]))
+        packed(clone(own.estimator).fit(np.nan_to_num(data.rows[rows]), terrain[rows]))
 
 
 def _registered(
@@ -377,60 +373,6 @@ def _evaluated(
     return evaluation, channel_importance(channels, drops), held_out.fitted
 
 
-def _search_notes(found: SearchResult | None) -> list[str]:
-    if found is None:
-        return []
-    a, b = (format_value(value, PERCENT) for value in (found.held_out.a, found.held_out.b))
-    return [
-        "hyper-parameters were searched on these runs, which makes the accuracy optimistic: on "
-        f"{plural(len(found.held_out_runs), 'run')} that no trial saw it is {b}, by the default choice {a}"
-    ]
-
-
-def _record(
-    data: TrainingData,
-    settings: TrainingSettings,
-    evaluation: CrossvalResult,
-    importance: Sequence[ChannelImportance],
-    info: ModelInfo,
-) -> TrainingRecord:
-    """Return what is kept of a training beside its model."""
-    import numpy as np
-
-    from pipelines.learn.card import RunRow, TrainingRecord, limits_of
-    from pipelines.report.json_file import as_json
-    from pipelines.report.versions import versions
-
-    rule, samples = settings.rule, data.samples
-    rows = []
-    for each in data.runs:
-        inside = samples.run_id == each.run_id
-        terrains = ", ".join(np.unique(samples.terrain[inside]).tolist())
-        rows.append(RunRow(each.run_id, each.robot, terrains, int(inside.sum()), each.digest))
-    best = getattr(data.recipe[-1], "best_", None)
-    return TrainingRecord(
-        params={
-            "recipe": settings.recipe,
-            "window_s": rule.length_s,
-            "stride_s": rule.step_s,
-            "steady": rule.steady is not None,
-            "seed": settings.seed,
-            "skip_short": settings.skip_short,
-            "signal_sets": ",".join(settings.signal_sets),
-            "repeats": evaluation.repeats,
-            "n_windows": len(data),
-            "n_runs": evaluation.n_runs,
-            "dataset": info.dataset,
-        },
-        runs=tuple(rows),
-        evaluation=as_json(evaluation),
-        importance=as_json(importance),
-        chosen={} if best is None else as_json(best),
-        limits=limits_of(info, samples.windows, data.motion, evaluation),
-        versions=versions(),
-    )
-
-
 def report(result: TrainResult | RegisterResult) -> Report:
     """Return where the model is, how good it is on held-out runs, and what its channels are worth."""
     verdict = "champion" if result.alias_moved else "not champion"
@@ -441,10 +383,12 @@ def report(result: TrainResult | RegisterResult) -> Report:
             f"{registered}.",
             next_step=f"terrain inspect {result.model_uri}",
         )
+    from pipelines.learn.card import chosen_words
+
     evaluated = result.crossval.report
     accuracy = format_value(result.crossval.accuracy, PERCENT)
     parts: list[Part] = [
-        Pairs([("hyper-parameters", _chosen(result.chosen))]),
+        Pairs([("hyper-parameters", chosen_words(result.chosen) or "none")]),
         Text(f"tracked, to be seen by: {result.ui}"),
     ]
     if result.search is not None:
@@ -471,12 +415,8 @@ def report(result: TrainResult | RegisterResult) -> Report:
                     )
                 ],
             ),
-            Section("Notes", [*evaluated.parts[1:]]),
+            Section("Notes", evaluated.parts[1:]),
             *evaluated.details,
         ],
         next_step=f"terrain predict --data runs/ --model {result.model_uri}",
     )
-
-
-def _chosen(chosen: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {format_value(value)}" for name, value in chosen.items()) or "none"

@@ -1,10 +1,10 @@
-"""What a recipe is fitted on: labelled windows, cut from runs or read from a cache of features."""
+"""What a recipe is fitted on: labelled windows, and the runs that they are of."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -13,11 +13,11 @@ from features.matrix import FeatureMatrix
 from features.motion import Motion, window_motion
 from features.protocols import Samples, samples_of
 from features.recipes import WindowPipeline, feature_matrix
-from features.windows import Layout, cut_windows
-from pipelines.learn.cache import CachedFeatures
+from features.windows import Layout
 from pipelines.learn.model_file import ModelInfo, TerrainModel, model_info
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
+from terrain.classify.limits import learn_limits
 from terrain.errors import DataError
 from terrain.estimation.live.choice import ESTIMATED
 from terrain.logs.digest import data_digest
@@ -27,13 +27,43 @@ SAME_RATE = 1e-6
 """Rates that differ by less, relative to one another, give the same features but for rounding."""
 
 
-class RunIdentity(NamedTuple):
-    """Id, robot and filter of a run, and the digest of its content."""
+class TrainedRun(NamedTuple):
+    """A run that a model is trained on.
+
+    Parameters
+    ----------
+    run_id, robot, filter, digest : of the run; the digest is of its content
+    terrain : of its windows; several by commas
+    n_windows : of the run
+    """
 
     run_id: str
     robot: str
     filter: str
     digest: str
+    terrain: str
+    n_windows: int
+
+
+class Named(Protocol):
+    """What names a run: its log, or what a cache keeps of it."""
+
+    @property
+    def run_id(self) -> str: ...  # noqa: D102
+    @property
+    def robot(self) -> str: ...  # noqa: D102
+    @property
+    def filter(self) -> str: ...  # noqa: D102
+
+
+def trained_runs(runs: Iterable[tuple[Named, str]], samples: Samples) -> tuple[TrainedRun, ...]:
+    """Return what is kept of runs, each beside its digest, in a model that is trained on their windows."""
+    found = []
+    for run, digest in runs:
+        terrain = samples.terrain[samples.run_id == run.run_id]
+        named = ", ".join(np.unique(terrain).tolist())
+        found.append(TrainedRun(run.run_id, run.robot, run.filter, digest, named, len(terrain)))
+    return tuple(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +76,6 @@ class TrainingData:
     layout : channels and rates that a log must have
     recipe : whose steps before the last one are fitted
     rows : (n, columns) output of these steps
-    features : (n, f)
     motion : how the robot moved in each window; None where no wheel speed was measured
     runs : those that windows were cut from
     digest : of the data
@@ -56,18 +85,18 @@ class TrainingData:
     layout: Layout
     recipe: WindowPipeline
     rows: Array
-    features: Array
     motion: Motion | None
-    runs: tuple[RunIdentity, ...]
+    runs: tuple[TrainedRun, ...]
     digest: str
 
     def __len__(self) -> int:
         return len(self.samples.windows)
 
-    def with_fitted(self, classifier: Any) -> WindowPipeline:
-        """Return the recipe with its last step fitted on all rows, as by ``recipe.fit(windows, terrain)``."""
-        self.recipe.steps[-1] = (self.recipe.steps[-1][0], classifier)
-        return self.recipe
+    @property
+    def features(self) -> Array:
+        """Features (n, f) of the windows, which are the rows of most recipes."""
+        plain = type(self.recipe[0]) is FeatureExtractor
+        return self.rows if plain else self.recipe.matrix.of(self.samples.windows)
 
     def probabilities(self, model: TerrainModel, rows: Array) -> Array | None:
         """Return what a model gives for some windows (m, k); None where it cannot be applied to them.
@@ -75,16 +104,15 @@ class TrainingData:
         It cannot where windows have other rates than its own, and those without samples where it needs
         samples or other features.
         """
-        windows = self.samples.windows
+        windows, recipe = self.samples.windows, model.recipe
         if windows.values:
             try:
-                return np.asarray(model.recipe.predict_proba(windows[rows]))
+                return np.asarray(recipe.predict_proba(windows[rows]))
             except DataError:
                 return None
-        recipe = model.recipe
         if type(recipe[0]) is not FeatureExtractor or not same_features(recipe.matrix, self.recipe.matrix):
             return None
-        return np.asarray(recipe[-1].predict_proba(self.features[rows]))
+        return np.asarray(recipe[-1].predict_proba(self.rows[rows]))
 
 
 def same_features(a: FeatureMatrix, b: FeatureMatrix) -> bool:
@@ -104,11 +132,6 @@ def same_features(a: FeatureMatrix, b: FeatureMatrix) -> bool:
     ) and all(abs(one / other - 1.0) < SAME_RATE for one, other in rates)
 
 
-def identities(runs: Iterable[RunLog]) -> tuple[RunIdentity, ...]:
-    """Return what is kept of runs in a model."""
-    return tuple(RunIdentity(run.run_id, run.robot, run.filter, data_digest([run])) for run in runs)
-
-
 def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingData:
     """Return what a recipe is fitted on, of runs.
 
@@ -125,33 +148,14 @@ def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingDa
         skip_short=settings.skip_short,
     )
     windows, recipe = samples.windows, recipe_of(settings, settings.recipe)
-    rows = feature_matrix(recipe, windows)
     return TrainingData(
         samples,
         Layout(windows.channels, windows.rate_hz),
         recipe,
-        rows,
-        rows if type(recipe[0]) is FeatureExtractor else recipe.matrix.of(windows),
+        feature_matrix(recipe, windows),
         window_motion(windows),
-        identities(runs),
+        trained_runs([(run, data_digest([run])) for run in runs], samples),
         data_digest(runs),
-    )
-
-
-def data_of_cache(cached: CachedFeatures, settings: RecipeSettings) -> TrainingData:
-    """Return what a recipe of features is fitted on, of cached ones.
-
-    Parameters
-    ----------
-    cached : features of runs
-    settings : of the recipe
-    """
-    recipe = recipe_of(settings, settings.recipe)
-    recipe[0].fit(cut_windows([], settings.rule, layout=cached.layout).windows)
-    runs = tuple(RunIdentity(run.run_id, run.robot, run.filter, run.digest) for run in cached.runs)
-    features = cached.features
-    return TrainingData(
-        cached.samples, cached.layout, recipe, features, features, cached.motion, runs, cached.digest
     )
 
 
@@ -182,6 +186,23 @@ def info_of(data: TrainingData, settings: RecipeSettings, dataset: str, commit: 
         robots=tuple(sorted({each.robot for each in runs})),
         filter=filters.pop(),
     )
+
+
+def with_limits(
+    recipe: WindowPipeline, info: ModelInfo, samples: Samples, features: Array, motion: Motion | None
+) -> tuple[TerrainModel, tuple[str, ...]]:
+    """Return a fitted recipe with what it knows of its own limits, and in sentences which of them are missing.
+
+    Parameters
+    ----------
+    recipe, info : fitted on the windows, and what is known of it
+    samples, features, motion : the windows, their features (n, f), and how the robot moved in each, if known
+    """
+    moved = None if motion is None else motion[:2]
+    terrain, run_id = samples.terrain, samples.run_id
+    limits = learn_limits(recipe[-1], features, terrain, run_id, moved, samples.gap, info.seed)
+    info = replace(info, conformal=limits.conformal)
+    return TerrainModel(recipe, info, limits.novelty, limits.support), limits.notes
 
 
 def fitted_model(

@@ -54,10 +54,10 @@ def loaded(settings: ServedSettings, name: str | None) -> TerrainModel | None:
     """Return a model by its name, filtered over time where the settings have it so; None without a name."""
     if name is None:
         return None
-    from pipelines.learn.load import load_model
+    from pipelines.learn.model_file import read_model
     from pipelines.live.windows import filtered
 
-    return filtered(load_model(name), settings.filter_stride_s)
+    return filtered(read_model(name), settings.filter_stride_s)
 
 
 class ServiceSettings(BaseSettings):

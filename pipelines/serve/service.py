@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 import uvicorn
 
-from pipelines.learn.load import load_model
-from pipelines.learn.model_file import TerrainModel
+from pipelines.learn.model_file import TerrainModel, read_model
 from pipelines.live.classifying import Classifier, classify_window
 from pipelines.live.pilot import LivePilot
 from pipelines.live.session import Served
@@ -108,7 +107,7 @@ class Service:
         )
 
     def _load(self, name: str) -> TerrainModel:
-        return filtered(load_model(name), self._stride_s)
+        return filtered(read_model(name), self._stride_s)
 
     def close(self) -> None:
         """Give the port back, and end the threads."""
@@ -204,7 +203,7 @@ def warm_up(model: TerrainModel, robot: Robot | None) -> None:
             f"the model was trained on runs of {', '.join(model.info.robots)}, not of {robot.name}"
         )
     rng = np.random.default_rng(0)
-    layout, rule = model.layout, model.rule
+    layout, rule = model.info.layout, model.info.rule
     values = {
         stream: rng.normal(size=(1, len(names), layout.n_samples(stream, rule.length_s)))
         for stream, names in layout.channels.items()

@@ -13,10 +13,10 @@ marked unsupported.  ``n / (1 + n)`` is the rule of succession with no observati
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,26 +77,6 @@ class SupportTable:
     classes: tuple[str, ...]
     n_runs: Array
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the counts by terrain, each row a speed cell."""
-        counts = {name: self.n_runs[i].tolist() for i, name in enumerate(self.classes)}
-        return {"speed_step_mps": SPEED_STEP_MPS, "yaw_step_radps": YAW_STEP_RADPS, "n_runs": counts}
-
-    @classmethod
-    def from_json(cls, document: Mapping[str, Any], classes: Sequence[str]) -> Self:
-        """Return the table of a document; ``DataError`` where it is no such table of these classes."""
-        try:
-            steps = float(document["speed_step_mps"]), float(document["yaw_step_radps"])
-            counts = np.array([document["n_runs"][name] for name in classes])
-            extra = set(document["n_runs"]) - set(classes)
-        except (TypeError, KeyError, ValueError, AttributeError) as error:
-            raise DataError("the table of support is damaged") from error
-        if steps != (SPEED_STEP_MPS, YAW_STEP_RADPS) or extra:
-            raise DataError("the table of support has other cells or classes")
-        if counts.ndim != 3 or counts.dtype.kind not in "iu" or counts.size == 0 or counts.min() < 0:
-            raise DataError("the table of support does not hold numbers of runs")
-        return cls(tuple(classes), counts)
-
     def near_runs(self, speed_mps: Array, yaw_rate_radps: Array) -> Array:
         """Return the training runs (n, classes) of each terrain near the motion of n windows.
 
@@ -110,6 +90,23 @@ class SupportTable:
         inside = (speed < n_speed) & (yaw < n_yaw)
         found = self.n_runs[:, np.minimum(speed, n_speed - 1), np.minimum(yaw, n_yaw - 1)].T
         return np.asarray(np.where(inside[:, None], found, 0))
+
+
+def check_support(table: SupportTable, classes: Sequence[str]) -> None:
+    """Refuse a table that is not one of these classes.
+
+    Raises
+    ------
+    DataError
+        if its classes are others, or its numbers of runs are none.
+    """
+    if table.classes != tuple(classes):
+        raise DataError("the table of support is of other classes")
+    counts = np.asarray(table.n_runs)
+    if counts.ndim != 3 or len(counts) != len(classes) or counts.dtype.kind not in "iu" or not counts.size:
+        raise DataError(f"the table of support has the shape {counts.shape}, in numbers of {counts.dtype}")
+    if counts.min() < 0:
+        raise DataError("the table of support holds negative numbers of runs")
 
 
 def motion_cells(speed_mps: Array, yaw_rate_radps: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ from time import monotonic, perf_counter, sleep
 from typing import Any, NamedTuple
 
 from features.windows import cut_windows
-from pipelines.learn.load import load_model
+from pipelines.learn.model_file import read_model
 from pipelines.live.classifying import Classifier, ClassifierThread, classify_window
 from pipelines.live.pilot import LivePilot
 from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
@@ -167,13 +167,15 @@ def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
     n_stages = 5 + len(SHARES)
     with TemporaryDirectory() as folder:
         uri = model_folder(settings.model, settings.seed, Path(folder) / "model")
-        model = load_model(uri)
+        model = read_model(uri)
         progress("live", 1, n_stages)
         steps, beside = step_times_us(robot, model, log)
         progress("live", 2, n_stages)
         paced = paced_step_times_us(robot, model, log, settings.seconds)
         progress("live", 3, n_stages)
-        cut = cut_windows([enriched(estimate_run(log, robot, "vio15"))], model.rule, layout=model.layout)
+        cut = cut_windows(
+            [enriched(estimate_run(log, robot, "vio15"))], model.info.rule, layout=model.info.layout
+        )
         window_ms = window_times_ms(cut.windows, model)
         progress("live", 4, n_stages)
         channels = sent_channels(log)

@@ -256,13 +256,12 @@ def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
 
 
 def _measure(runs: Path, n_runs: int, n_workers: int) -> Point:
-    from features.windows import WindowRule
-    from pipelines.learn.cache import cached_features
-    from terrain.logs.schema import SIGNAL_SETS
+    from pipelines.learn.cache import cached_data
+    from pipelines.learn.settings import LearnSettings
 
     with TemporaryDirectory(dir=runs.parent, prefix="store-") as out, peak_memory() as peak:
         begun_s, begun_cpu_s = perf_counter(), cpu_s()
-        cached_features(loaders(runs, n_runs), WindowRule(), SIGNAL_SETS, Path(out), n_workers)
+        cached_data(loaders(runs, n_runs), LearnSettings(n_jobs=n_workers), Path(out))
         seconds, used_s = perf_counter() - begun_s, cpu_s() - begun_cpu_s
     return Point(n_runs, n_workers, seconds, n_runs / seconds, used_s, peak.mb)
 

@@ -8,7 +8,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from pipelines.learn.load import load_model
+from pipelines.learn.model_file import read_model
 from studies import live, soak
 from studies.service import (
     ROBOT,
@@ -54,7 +54,7 @@ def test_messages_hold_every_sample_of_the_drive_once(run):
 
 @pytest.mark.slow
 def test_steps_are_timed(run, uri):
-    robot, model = load_robot(ROBOT), load_model(uri)
+    robot, model = load_robot(ROBOT), read_model(uri)
     alone, beside = live.step_times_us(robot, model, run, repeats=1)
     assert 5.0 < alone.median <= alone.p99 <= alone.largest < 1e6
     assert beside.median > 5.0

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.cli.quickstart import Settings, run
 from pipelines.data.settings import AlignedRunsSettings, load
-from pipelines.learn.load import load_model
+from pipelines.learn.model_file import read_model
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.errors import ConfigError, DataError
@@ -31,7 +31,7 @@ def test_the_runs_that_are_predicted_took_no_part(held_out):
     assert result.held_out == ("ASPHALT_3",)
     assert {row.run_id for row in result.predict.windows} == {"ASPHALT_3"}
     assert result.predict.training_runs == ()
-    info = load_model(result.train.model_uri).info
+    info = read_model(result.train.model_uri).info
     training = [each for each in runs if each.run_id != "ASPHALT_3"]
     assert sorted(info.run_digests) == sorted(data_digest([each]) for each in training)
     assert info.data_digest == result.data_digest == data_digest(training)

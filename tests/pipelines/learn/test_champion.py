@@ -10,7 +10,7 @@ from pipelines.learn.champion import Bench, Champion, compare, held_out_runs, ju
 from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.model_file import TerrainModel, read_model
 from pipelines.learn.settings import RecipeSettings
-from pipelines.learn.training_data import data_of_runs, identities
+from pipelines.learn.training_data import data_of_runs
 
 TRAINING = RecipeSettings(repeats=1, n_jobs=1)
 EVALUATION = EvaluationSettings(repeats=1, n_jobs=1, extras=False)
@@ -53,7 +53,7 @@ def judged(model, runs):
 def test_the_champion_moves_to_what_is_comparable_and_better(tracked, model, changed, moved, reason):
     info, record = read_training(tracked[0] / "model")
     figures = {name: changed.pop(name) for name in ("macro_f1", "accuracy_ci") if name in changed}
-    evaluated = record.evaluated.model_copy(update={"macro_f1": 0.99, "accuracy_ci": (0.9, 0.95)} | figures)
+    evaluated = replace(record.evaluation, **{"macro_f1": 0.99, "accuracy_ci": (0.9, 0.95)} | figures)
     candidate = replace(info, **changed), evaluated
     found = judge(Champion("1", {"macro_f1": "0.8"}, model), *candidate)
     assert (found[0], found[1][: len(reason)]) == (moved, reason)
@@ -103,7 +103,7 @@ def test_its_own_runs_count_with_the_figures_of_when_they_were_held_out(model, r
     assert np.mean([each.accuracy for each in held_out.values()]) == pytest.approx(report.accuracy)
     cheat = TerrainModel(Oracle(model.info.classes, True), model.info)
     found = compare(cheat, Bench(data, held_out, 0))
-    own = [model.info.run_accuracy[run.digest] for run in identities(runs)]
+    own = list(model.info.run_accuracy.values())
     assert found.n_runs == 15
     assert found.a == pytest.approx((np.sum(own) + 3) / 15)  # what it was trained on is not predicted
     unknown = TerrainModel(cheat.recipe, replace(model.info, run_accuracy={}))

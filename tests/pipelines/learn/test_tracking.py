@@ -17,7 +17,6 @@ import pytest
 from features.windows import cut_windows
 from pipelines.data.tracking import ensure_tracking
 from pipelines.learn.champion import Bench, held_out_runs
-from pipelines.learn.load import load_model
 from pipelines.learn.model_file import TRAINING_FILE, read_model, seal
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.tracking import log_training
@@ -95,8 +94,8 @@ def test_a_training_run_holds_what_is_needed_to_judge_and_repeat_it(in_tracked, 
 
 
 def test_the_pyfunc_flavour_gives_the_probabilities_of_the_recipe(in_tracked, mlflow, runs):
-    model = load_model(in_tracked.model_uri)
-    windows = cut_windows(runs, model.rule).windows
+    model = read_model(in_tracked.model_uri)
+    windows = cut_windows(runs, model.info.rule).windows
     table = pd.DataFrame(
         {
             f"{stream}.{name}": list(samples[:, place])
@@ -116,8 +115,8 @@ def test_a_model_is_loaded_by_alias_version_run_and_folder(in_tracked, runs, tra
         f"runs:/{in_tracked.run_id}/model",
         str(tracked[0] / "model"),
     ]
-    models = [load_model(uri) for uri in uris]
-    windows = cut_windows(runs[::4], models[0].rule).windows
+    models = [read_model(uri) for uri in uris]
+    windows = cut_windows(runs[::4], models[0].info.rule).windows
     for model in models:
         assert model.info == models[0].info
         np.testing.assert_array_equal(
@@ -153,12 +152,13 @@ def test_the_alias_is_at_the_champion_whatever_is_registered(in_tracked, log, ml
         "new data: on 12 runs, each held out, accuracy 75.0% against 75.0% of version 2 "
         "(difference 95 % over runs: +0.0 to +0.0 points)",
     ]
-    model = load_model("models:/by_rule@champion")
+    model = read_model("models:/by_rule@champion")
     assert model.info.data_digest == "bb"
     assert in_tracked.alias_reason.startswith("first version")
     folder = Path(mlflow.artifacts.download_artifacts("models:/by_rule/4"))
     (folder / "model.skops").write_bytes(b"")
-    assert log("by_rule", 0.5, "cc")[3:] == (True, "version 4 cannot be loaded")
+    last = log("by_rule", 0.5, "cc")
+    assert (last.alias_moved, last.alias_reason) == (True, "version 4 cannot be loaded")
 
 
 def test_a_first_version_at_chance_is_registered_and_no_champion(in_tracked, log):
@@ -215,12 +215,12 @@ def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path
     monkeypatch.chdir(tmp_path / "work")
     monkeypatch.setenv("MLFLOW_TRACKING_URI", f"sqlite:///{tmp_path / 'other.db'}")
     log("elsewhere", 0.5)
-    assert load_model("models:/elsewhere@champion").info.data_digest == "aa"
+    assert read_model("models:/elsewhere@champion").info.data_digest == "aa"
     assert list((tmp_path / "work").iterdir()) == []  # no ./mlruns beside the server that was named
     monkeypatch.delenv("MLFLOW_TRACKING_URI")
     monkeypatch.chdir(tracked[0])
     with pytest.raises(ModelError, match="elsewhere"):
-        load_model("models:/elsewhere@champion")
+        read_model("models:/elsewhere@champion")
 
 
 @pytest.mark.parametrize(
@@ -234,13 +234,13 @@ def test_the_server_that_is_named_is_the_one_that_is_used(tracked, log, tmp_path
 )
 def test_a_model_that_is_not_there_is_one_sentence(in_tracked, uri, sentence):
     with pytest.raises(ModelError, match=sentence) as error:
-        load_model(uri)
+        read_model(uri)
     assert "\n" not in str(error.value)
 
 
 def test_a_server_that_does_not_answer_is_named_before_the_work(monkeypatch):
     monkeypatch.setenv("MLFLOW_TRACKING_URI", "http://127.0.0.1:1")
-    for act in (ensure_tracking, lambda: load_model("models:/m@champion")):
+    for act in (ensure_tracking, lambda: read_model("models:/m@champion")):
         with pytest.raises(TerrainError, match=r"MLFLOW_TRACKING_URI=http://127.0.0.1:1: cannot be reached"):
             act()
 
@@ -249,7 +249,7 @@ def test_looking_for_a_model_makes_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     with pytest.raises(ModelError, match=r"mlflow\.db does not exist: train a model here first"):
-        load_model("models:/drawn@champion")
+        read_model("models:/drawn@champion")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -258,7 +258,7 @@ def test_a_database_that_is_none_is_one_sentence(tmp_path, monkeypatch, log):
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
     (tmp_path / "mlruns").mkdir()
     (tmp_path / "mlruns" / "mlflow.db").write_text("no database, though as long as one. " * 100)
-    for use in (lambda: load_model("models:/drawn@champion"), lambda: log("drawn", 0.5)):
+    for use in (lambda: read_model("models:/drawn@champion"), lambda: log("drawn", 0.5)):
         with pytest.raises(TerrainError) as error:
             use()
         assert "\n" not in str(error.value)

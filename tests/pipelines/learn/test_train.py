@@ -95,7 +95,7 @@ def test_a_model_has_its_card_and_its_figures(model_dir, tracked):
     training = result.training
     assert (result.data_digest, result.dataset) == (tracked[1].data_digest, "twelve runs")
     assert sum(row.n_windows for row in training.runs) == training.params["n_windows"] == 144
-    assert training.evaluation == as_json(evaluation)
+    assert as_json(training.evaluation) == as_json(evaluation)
     assert training.latency_ms > 0
     assert result.files == {"model.skops": (model_dir / "model.skops").stat().st_size}
     assert any("robots other than husky" in text.lower() for text in training.limits)

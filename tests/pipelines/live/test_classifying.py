@@ -60,7 +60,7 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(swerve_model, 
         new = classifier.update(sample, estimator.step(sample.readings))
         found += new
         late_s += [sample.time_s - one.time_s for one in new]
-    batch = cut_windows([estimated(survey)], swerve_model.rule, layout=swerve_model.layout).windows
+    batch = cut_windows([estimated(survey)], swerve_model.info.rule, layout=swerve_model.info.layout).windows
     assert len(shown) == len(batch) == len(found) > 5
     for k, window in enumerate(shown):
         assert window.start_s[0] == batch.start_s[k]
