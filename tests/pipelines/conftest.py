@@ -11,7 +11,7 @@ import pytest
 
 from pipelines.cli import main as cli
 from pipelines.data.can_codec import QUATERNION, RECEIVED, SIGNALS, encode
-from pipelines.learn.model_file import read_model
+from pipelines.learn.model_file import TerrainModel, read_model
 from pipelines.learn.training_data import fitted_model
 from terrain.angles import wrapped
 from terrain.estimation.enriched import enriched
@@ -110,6 +110,19 @@ def tracked(tmp_path_factory, runs):
 def model(tracked):
     """The model that ``tracked`` has trained."""
     return read_model(tracked[0] / "model")
+
+
+class Giving:
+    """Stands in for a recipe: gives what a function of windows returns."""
+
+    def __init__(self, classes, outputs):
+        self.classes_, self.predict_proba = np.array(classes), outputs
+
+
+@pytest.fixture(scope="session")
+def giving(model):
+    """Return a function that makes a model like ``model``, whose outputs are those of a function of windows."""
+    return lambda outputs: TerrainModel(Giving(model.info.classes, outputs), model.info)
 
 
 @pytest.fixture

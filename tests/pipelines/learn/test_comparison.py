@@ -7,7 +7,6 @@ import pytest
 
 from pipelines.learn.comparison import compare_models
 from pipelines.learn.crossval import crossval
-from pipelines.learn.model_file import TerrainModel, read_model
 from pipelines.report.json_file import as_json
 from terrain.classify.paired import Verdict
 from terrain.classify.support import SupportLevel
@@ -50,24 +49,9 @@ def test_a_recipe_has_the_figures_of_its_cross_validation_and_does_not_differ_fr
     assert found.accuracy.verdict is Verdict.NOT_DISTINGUISHED
 
 
-class Constant:
-    """Stands in for a recipe: the same class with the same probability, always."""
-
-    def __init__(self, classes, probability):
-        self.classes_, self.probability = np.array(classes), np.array(probability)
-
-    def predict_proba(self, windows):
-        return np.tile(self.probability, (len(windows), 1))
-
-
-@pytest.fixture
-def model(tracked):
-    return read_model(tracked[0] / "model")
-
-
-def test_models_are_compared_on_runs_that_none_was_trained_on(model, runs, drive_all, settings):
+def test_models_are_compared_on_runs_that_none_was_trained_on(model, giving, runs, drive_all, settings):
     new = drive_all(n_runs=2, seed=91)
-    constant = TerrainModel(Constant(model.info.classes, [1.0, 0.0, 0.0]), model.info)
+    constant = giving(lambda windows: np.tile([1.0, 0.0, 0.0], (len(windows), 1)))
     asked = settings(model=("old", "new"))
     digests = {data_digest([run]) for run in runs}
     assert digests == set(model.info.run_digests)

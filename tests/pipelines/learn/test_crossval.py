@@ -2,23 +2,20 @@
 
 import json
 import re
-import warnings
 from dataclasses import fields
 from typing import get_args
 
-import distributed
 import numpy as np
 import pytest
-from sklearn.model_selection import StratifiedGroupKFold, cross_val_predict, cross_validate
+from sklearn.model_selection import cross_val_predict, cross_validate
 
 from features import recipes
 from features.protocols import PROTOCOLS, folds_of, samples_of
-from features.recipes import WindowPipeline, feature_matrix, make_recipe
+from features.recipes import feature_matrix, make_recipe
 from pipelines.data.datasets import load_runs
 from pipelines.learn import settings as learn_settings
 from pipelines.learn.crossval import EvaluationSettings, Settings, crossval, run
 from pipelines.learn.evaluate import evaluate
-from pipelines.learn.parallel import computing
 from pipelines.learn.settings import ProtocolName
 from pipelines.report.json_file import as_json
 from terrain.classify.held_out import Examples
@@ -114,26 +111,6 @@ def test_scikit_learn_cross_validates_whole_recipes_to_the_same_answers(drive, d
         assert score == pytest.approx(right.mean())
         assert 0 < estimator[-1].n_inner_fits_ <= 20
         assert estimator[-1].best_._asdict() == result.chosen
-    several = windows[y != "GRAVEL"]
-    cv = StratifiedGroupKFold(2, shuffle=True, random_state=0)
-    names = several.terrain.astype(str)
-    found = cross_validate(make_recipe("svm"), several, names, groups=several.run_id, cv=cv)
-    assert np.all(found["test_score"] > 0.6)
-
-
-def test_the_recipe_gives_its_last_step_the_run_of_each_window(runs, settings):
-    seen = {}
-
-    class Spy:
-        def fit(self, X, y, groups=None):
-            seen["groups"] = groups
-            return self
-
-    windows = samples_of(runs[:2], settings().rule).windows
-    WindowPipeline([("features", make_recipe("svm")[0]), ("last", Spy())]).fit(windows, windows.terrain)
-    np.testing.assert_array_equal(seen["groups"], windows.run_id)
-    with pytest.raises(ConfigError, match="there is no recipe 'oracle'; there are svm"):
-        make_recipe("oracle")
 
 
 @pytest.mark.slow
@@ -160,32 +137,6 @@ def test_where_labels_only_identify_runs_grouped_gives_chance_and_published_does
     assert published.support is None  # runs lie on both sides
 
 
-def test_gaps_and_missing_values_drop_the_windows_they_touch_and_are_counted(runs, settings):
-    victim = runs[0]
-    imu = victim.streams["imu"]
-    values = imu.values.copy()
-    values[250:253, 4] = np.nan  # from 5.00 s: within the window from 4 s
-    values[401, 0] = np.inf  # 8.02 s
-    kept = np.r_[0:700, 720:1200]  # 14.0 to 14.4 s
-    streams = {**victim.streams, "imu": Stream(imu.time_s[kept], values[kept], imu.channels)}
-    found = crossval([RunLog(victim.run_id, "husky", streams, victim.labels), *runs[1:]], settings())
-    assert found.dropped == {"gap": 1, "not finite": 2}
-    assert found.n_windows == 144 - 3
-    assert "windows left out: 1 gap, 2 not finite" in found.notes
-
-
-def test_signal_sets_are_switched_off_by_name(runs, settings, report):
-    def n_features(*names):
-        return crossval(runs, settings(signal_sets=names)).n_features
-
-    imu, wheels = n_features("imu"), n_features("wheels", "currents")
-    assert 0 < wheels < imu < imu + wheels < report.n_features  # together they give features of both
-    with pytest.raises(ConfigError, match="unknown signal set 'sonar'; there are imu, wheels"):
-        n_features("sonar")
-    with pytest.raises(DataError, match="no channel of the signal sets slip"):
-        n_features("slip")
-
-
 def test_a_signal_set_carries_its_own_information_only(drive_all, settings):
     alike = {"level": 0.8, "smoothness": 0.4}  # only the currents differ from terrain to terrain
     runs = [
@@ -193,13 +144,19 @@ def test_a_signal_set_carries_its_own_information_only(drive_all, settings):
         for terrain, current_a in (("ASPHALT", 1.0), ("GRASS", 2.0), ("GRAVEL", 4.0))
         for run in drive_all((terrain,), 4, seed=int(current_a), current_a=current_a, **alike)
     ]
-    assert crossval(runs, settings(signal_sets=("currents",))).accuracy > 0.95
-    assert crossval(runs, settings(signal_sets=("imu",))).accuracy < 0.6
+    found = [crossval(runs, settings(signal_sets=(name,))) for name in ("currents", "imu")]
+    assert found[0].accuracy > 0.95
+    assert found[1].accuracy < 0.6
+    with pytest.raises(DataError, match="no channel of the signal sets slip"):
+        crossval(runs, settings(signal_sets=("slip",)))
 
 
 def test_leave_one_run_out_and_single_runs(drive, drive_all, settings):
     runs = [*drive_all(("ASPHALT", "GRASS"), 3, duration_s=16.0), drive("GRAVEL_1", "GRAVEL", 3, 40.0)]
-    found = crossval(runs, settings(protocol="leave-one-run-out"))
+    still = drive("still", "GRASS", 4, speed_mps=0.0)
+    found = crossval([*runs, still], settings(protocol="leave-one-run-out"))
+    assert found.dropped == {"not moving": 12}
+    assert "windows left out: 12 not moving" in found.notes
     assert (len(found.folds), found.repeats, found.accuracy_spread) == (6 + 5, 1, None)
     assert any(note.startswith("GRAVEL: one run only, cut into 5 contiguous blocks") for note in found.notes)
 
@@ -319,7 +276,9 @@ def test_settings_that_make_no_sense_are_refused():
         ({"repeats": 0}, "--repeats is 0: input should be greater than or equal to 1"),
         ({"protocol": "fast-slow", "repeats": 3}, "^'fast-slow' has a single fold assignment"),
         ({"recipe": ("svm",), "model": ("models:/field/1",)}, "--model and --recipe do not go together"),
+        ({"recipe": ("oracle",)}, "there is no recipe 'oracle'; there are svm"),
         ({"recipe": ("svm@radar", "svm")}, "unknown signal set 'radar'"),
+        ({"signal_sets": ("sonar",)}, "unknown signal set 'sonar'; there are imu, wheels"),
         *(({"speed": text}, "LOW:HIGH") for text in ("fast", "0.3:0.1", "-1:2", "0:inf")),
     ):
         with pytest.raises(ConfigError, match=sentence):
@@ -347,23 +306,6 @@ def test_a_window_with_few_samples_of_a_slow_stream_is_classified_and_one_with_f
     assert np.isfinite(found.accuracy)
     with pytest.raises(DataError, match=r"^a window of 0\.3 s holds 3 samples of stream 'wheels' at 10 Hz; "):
         crossval(runs, settings(window_s=0.3))
-
-
-@pytest.mark.slow
-def test_a_cluster_gives_the_report_of_this_machine(drive_all):
-    runs = drive_all(("ASPHALT", "GRASS"), 4, duration_s=12.0)
-    settings = EvaluationSettings(repeats=1, steady=False, n_jobs=2)
-    here = crossval(runs, settings)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with (
-            distributed.LocalCluster(
-                n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
-            ) as running,
-            computing("dask:" + running.scheduler_address),
-        ):
-            there = crossval(runs, settings)
-    assert json.dumps(as_json(there)) == json.dumps(as_json(here))
 
 
 def test_cached_features_give_the_figures_of_the_runs(drive_all, tmp_path):

@@ -1,5 +1,6 @@
 """Tasks give the same wherever they are computed, and what is lost is one sentence."""
 
+import json
 import os
 import signal
 import socket
@@ -7,7 +8,7 @@ import subprocess
 import sys
 import time
 import warnings
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import distributed
@@ -18,39 +19,32 @@ from distributed.utils import open_port
 
 from features.windows import WindowRule
 from pipelines.learn import parallel as cluster
-from pipelines.learn.parallel import (
-    ComputeSettings,
-    computing,
-    parallel,
-    scheduler_address,
-)
+from pipelines.learn.crossval import EvaluationSettings, crossval
+from pipelines.learn.parallel import ComputeSettings, computing, parallel, scheduler_address
+from pipelines.report.json_file import as_json
 from pipelines.report.versions import difference, software
 from terrain.errors import ConfigError, TerrainError
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
-def test_an_address_is_read_and_another_text_refused_in_one_sentence():
-    for compute, address in (
+@pytest.mark.parametrize(
+    ("compute", "address"),
+    [
         ("dask:127.0.0.1:8786", "tcp://127.0.0.1:8786"),
         ("dask:tcp://node-3.lab:1", "tcp://node-3.lab:1"),
         ("dask:tls://[::1]:8786", "tls://[::1]:8786"),
         ("local", None),
-    ):
-        assert scheduler_address(compute) == address
-        assert ComputeSettings(compute=compute).compute == compute
-    for text in (
-        "",
-        "dask",
-        "dask:",
-        "dask:host",
-        "dask:host:0",
-        "dask:host:65536",
-        "dask:http://h:1",
-        "ray:h:1",
-    ):
+        *((text, ...) for text in ("", "dask", "dask:", "dask:host", "dask:host:0", "dask:host:65536")),
+        *((text, ...) for text in ("dask:http://h:1", "ray:h:1")),
+    ],
+)
+def test_an_address_is_read_and_another_text_refused_in_one_sentence(compute, address):
+    if address is ...:
         with pytest.raises(ConfigError, match="'local' or the address of a Dask scheduler"):
-            ComputeSettings(compute=text)
+            ComputeSettings(compute=compute)
+    else:
+        assert scheduler_address(ComputeSettings(compute=compute).compute) == address
 
 
 def test_results_of_two_processes_come_in_the_order_of_their_tasks():
@@ -115,33 +109,30 @@ def test_no_process_is_left_where_the_command_is_ended(request_to_end):
     assert all(map(is_over, started))
 
 
-def test_software_that_differs_is_named():
-    here = software()
-    assert difference(here, software()) is None
-    assert difference(here, here | {"its code": "0"}) == f"its code 0 where {here['its code']} is needed"
-    assert "scipy missing" in difference(here, {k: v for k, v in here.items() if k != "scipy"})
+@contextmanager
+def quiet_cluster(n_workers):
+    """A cluster in this process."""
+    here = {"processes": False, "protocol": "tcp", "dashboard_address": None}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        with distributed.LocalCluster(n_workers=n_workers, threads_per_worker=1, **here) as running:
+            yield "dask:" + running.scheduler_address
 
 
 @pytest.fixture(scope="module")
 def threads_cluster():
-    """A cluster in this process."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
-        ) as running:
-            yield "dask:" + running.scheduler_address
+    with quiet_cluster(2) as compute:
+        yield compute
 
 
-def test_a_cluster_gives_the_bytes_of_this_machine(threads_cluster):
-    rng = np.random.default_rng(0)
-    table = rng.normal(size=(500, 20))
-    each = [(float(k),) for k in rng.normal(size=30)]
+@pytest.mark.slow
+def test_a_cluster_gives_the_report_of_this_machine(threads_cluster, drive_all):
+    runs = drive_all(("ASPHALT", "GRASS"), 4, duration_s=12.0)
+    settings = EvaluationSettings(repeats=1, steady=False, n_jobs=2)
+    here = crossval(runs, settings)
     with computing(threads_cluster) as place:
         assert place == threads_cluster.removeprefix("dask:")
-        there = list(parallel(np.multiply, (table,), each, 1))
-    here = list(parallel(np.multiply, (table,), each, 1))
-    assert [a.tobytes() for a in here] == [b.tobytes() for b in there]
+        assert json.dumps(as_json(crossval(runs, settings))) == json.dumps(as_json(here))
 
 
 def test_errors_of_a_task_keep_their_sentence(threads_cluster):
@@ -159,17 +150,12 @@ def test_other_software_on_a_worker_is_refused(threads_cluster, monkeypatch):
 
 
 def test_a_cluster_without_workers_is_one_sentence(monkeypatch):
-    distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(cluster, "FIRST_WORKER_S", 0.2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        with (
-            distributed.LocalCluster(
-                n_workers=0, processes=False, protocol="tcp", dashboard_address=None
-            ) as empty,
-            pytest.raises(TerrainError, match="has no worker: start one with 'dask worker tcp://"),
-        ):
-            computing("dask:" + empty.scheduler_address).__enter__()
+    with (
+        quiet_cluster(0) as empty,
+        pytest.raises(TerrainError, match="has no worker: start one with 'dask worker tcp://"),
+    ):
+        computing(empty).__enter__()
 
 
 class Processes:
@@ -196,13 +182,6 @@ class Processes:
 
     def add_worker(self, nanny="--no-nanny"):
         return self.start("dask_worker", f"tcp://127.0.0.1:{self.port} --nthreads 1 {nanny}")
-
-    def disturbed(self, disturb):
-        """Compute many tasks, and disturb the cluster when the first is done."""
-        with computing(self.compute):
-            for number, _ in enumerate(parallel(time.sleep, (), [(0.2,)] * 200, 1)):
-                if number == 0:
-                    disturb()
 
 
 @pytest.fixture
@@ -231,18 +210,26 @@ def test_a_killed_worker_costs_its_task_only(processes):
 
 
 @pytest.mark.slow
-def test_a_dead_scheduler_is_one_sentence_soon(processes):
-    processes.add_worker()
-    with pytest.raises(TerrainError, match=r"does not answer any more"):
-        processes.disturbed(lambda: processes.scheduler.kill())
-
-
-@pytest.mark.slow
-def test_a_stopped_scheduler_is_one_sentence_in_a_bounded_time(processes, monkeypatch):
-    monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
-    processes.add_worker()
-    with pytest.raises(TerrainError, match=r"does not answer any more"):
-        processes.disturbed(lambda: processes.scheduler.send_signal(signal.SIGSTOP))
+@pytest.mark.parametrize(
+    ("lost", "request_to_end", "sentence"),
+    [
+        ("scheduler", signal.SIGKILL, "does not answer any more"),
+        ("scheduler", signal.SIGSTOP, "does not answer any more"),
+        ("worker", signal.SIGKILL, "no worker of .* has taken a task"),
+    ],
+)
+def test_what_is_lost_is_one_sentence_in_a_bounded_time(
+    processes, monkeypatch, lost, request_to_end, sentence
+):
+    monkeypatch.setattr(cluster, "ANSWER_S", 2.0 if lost == "scheduler" else 0.5)
+    monkeypatch.setattr(cluster, "NO_WORKER_S", 2.0)
+    running = {"scheduler": processes.scheduler, "worker": processes.add_worker()}
+    with computing(processes.compute):
+        results = parallel(time.sleep, (), [(0.2,)] * 200, 1)
+        next(results)
+        running[lost].send_signal(request_to_end)
+        with pytest.raises(TerrainError, match=sentence):
+            list(results)
 
 
 @pytest.mark.slow
@@ -250,12 +237,3 @@ def test_tasks_that_end_their_worker_are_one_sentence(processes):
     processes.add_worker("--nanny")
     with computing(processes.compute), pytest.raises(TerrainError, match="were killed or ran out of memory"):
         list(parallel(os._exit, (), [(3,)], 1))
-
-
-@pytest.mark.slow
-def test_no_worker_left_is_one_sentence(processes, monkeypatch):
-    monkeypatch.setattr(cluster, "ANSWER_S", 0.5)
-    monkeypatch.setattr(cluster, "NO_WORKER_S", 2.0)
-    worker = processes.add_worker()
-    with pytest.raises(TerrainError, match=r"no worker of .* has taken a task"):
-        processes.disturbed(worker.kill)

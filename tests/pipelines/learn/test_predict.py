@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.learn.model_file import TerrainModel
 from pipelines.learn.predict import NOT_LEARNED, Settings, predict, run
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import fitted_model
@@ -126,24 +125,14 @@ def test_runs_that_do_not_fit_model_or_table_are_named(model, drive):
     assert (skipped.n_windows, skipped.dropped) == (12, {"run too short": 1})
 
 
-class Planned:
-    """Stands in for a recipe: given probabilities of windows in their order."""
-
-    def __init__(self, classes, probability):
-        self.classes_, self.probability = np.array(classes), np.array(probability)
-
-    def predict_proba(self, windows):
-        return self.probability[: len(windows)]
-
-
-def test_the_filtered_terrain_is_that_of_the_run_so_far(model, drive):
+def test_the_filtered_terrain_is_that_of_the_run_so_far(model, giving, drive):
     """One window alone changes nothing, outputs that bring no evidence name no terrain, runs are apart."""
     info, log = model.info, drive("a", "GRASS", 21)
     certain = np.tile([0.05, 0.9, 0.05], (12, 1))
     certain[6] = [0.6, 0.2, 0.2]
     flat = np.tile([info.class_ratio[name] for name in info.classes], (12, 1))
     for outputs, expected in ((certain, info.classes[1]), (flat, None)):
-        planned = TerrainModel(Planned(info.classes, outputs), info)
+        planned = giving(lambda windows, outputs=outputs: outputs[: len(windows)])
         found = predict([log, replace(log, run_id="b")], planned, TABLE).windows
         assert [row.filtered_terrain for row in found] == [expected] * 24
 

@@ -86,9 +86,7 @@ def test_another_search_in_the_folder_is_refused(runs, data, searched, tmp_path)
         sweep(data, tmp_path)
 
 
-@pytest.mark.parametrize(
-    "line", ["{", "[]", '{"params": {"C": 1}}', '{"params": {"q": 1}, "accuracy_ci": [0, 1]}']
-)
+@pytest.mark.parametrize("line", ["{", '{"params": {"q": 1}, "accuracy_ci": [0, 1]}'])
 def test_a_damaged_search_is_one_sentence(data, searched, tmp_path, line):
     (tmp_path / STUDY_FILE).write_text((searched[0] / STUDY_FILE).read_text())
     (tmp_path / TRIALS_FILE).write_text(line + "\n")
@@ -104,27 +102,21 @@ def test_without_optuna_there_is_one_sentence(data, tmp_path, monkeypatch):
     assert not (tmp_path / "new").exists()
 
 
+BEST = {"C": 1, "gamma": 1, "percentile": 50}
+
+
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [
         ("{", "no result of a search"),
-        ('{"version": 9, "params": {}}', "version: Input should be 1"),
-        (
-            '{"version": 1, "params": {"C": 1, "gamma": 1, "percentile": 50, "depth": 3}}',
-            "params.depth: Extra inputs",
-        ),
-        ('{"version": 1, "params": {"C": 1, "gamma": 1}}', "params.percentile: Field required"),
-        (
-            '{"version": 1, "params": {"C": -1, "gamma": 1, "percentile": 50}}',
-            "params.C: Input should be greater",
-        ),
-        (
-            '{"version": 1, "params": {"C": 1, "gamma": 1, "percentile": 500}}',
-            "params.percentile: Input should be less",
-        ),
+        ({"version": 9, "params": BEST}, "version: Input should be 1"),
+        ({"version": 1, "params": BEST | {"depth": 3}}, "params.depth: Extra inputs"),
+        ({"version": 1, "params": {"C": 1, "gamma": 1}}, "params.percentile: Field required"),
+        ({"version": 1, "params": BEST | {"C": -1}}, "params.C: Input should be greater"),
+        ({"version": 1, "params": BEST | {"percentile": 500}}, "params.percentile: Input should be less"),
     ],
 )
 def test_parameters_that_are_none_are_refused(tmp_path, content, sentence):
-    (tmp_path / "best.json").write_text(content)
+    (tmp_path / "best.json").write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(ConfigError, match=sentence):
         read_params(tmp_path / "best.json")
