@@ -30,9 +30,12 @@ def commanded(run_id, terrain, speed_mps=0.5, session="", length_s=12.0, start_s
 
 SPEEDS = (0.2, 0.4, 0.6, 0.8, 1.0, 1.2)
 RUNS = [
-    *(commanded(f"ICE_{i}", "ICE", speed, f"day {i % 3}", 12.0 + 4.0 * i) for i, speed in enumerate(SPEEDS)),
-    *(commanded(f"SAND_{i}", "SAND", speed, "one day", 14.0 + 6.0 * i) for i, speed in enumerate(SPEEDS[:5])),
-    commanded("MUD", "MUD", 1.4, session="another day", length_s=50.0),
+    *(
+        commanded(f"ICE_{i}", "ICE", speed, f"session {i % 3}", 12.0 + 4.0 * i)
+        for i, speed in enumerate(SPEEDS)
+    ),
+    *(commanded(f"SAND_{i}", "SAND", speed, "alone", 14.0 + 6.0 * i) for i, speed in enumerate(SPEEDS[:5])),
+    commanded("MUD", "MUD", 1.4, session="other", length_s=50.0),
 ]
 """Six runs in three sessions, five in one session, a single run; of unequal length."""
 
@@ -40,7 +43,7 @@ UNIT = {
     "grouped": lambda run: run.run_id,
     "leave-terrain-out": lambda run: run.run_id,
     "leave-one-run-out": lambda run: run.run_id,
-    "leave-sessions-out": lambda run: run.run_id if run.session == "one day" else run.session,
+    "leave-sessions-out": lambda run: run.run_id if run.session == "alone" else run.session,
     "leave-regimes-out": lambda run: str(run.streams["commands"].values[0, 0]),
 }
 """What a protocol holds out together; of a terrain with one session, its runs."""
