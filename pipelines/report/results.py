@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import builtins
 import sys
-import types
-import typing
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, field, fields, is_dataclass
-from enum import Enum
-from pathlib import Path
+from dataclasses import MISSING, field, fields
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -56,8 +51,8 @@ class Result:
     ...     length_m: float = described("of the path", "m")
     >>> Length(1.5).as_json()
     {'length_m': 1.5}
-    >>> Length.schema()["properties"]["length_m"]
-    {'type': 'number', 'description': 'of the path', 'unit': 'm'}
+    >>> Length.schema()["properties"]
+    {'length_m': {'description': 'of the path', 'unit': 'm'}}
     """
 
     @property
@@ -70,37 +65,40 @@ class Result:
         """Return the fields by name, as :func:`pipelines.report.json_file.as_json` writes them."""
         from pipelines.report.json_file import as_json
 
-        assert is_dataclass(self)
-        return {
-            each.name: as_json(getattr(self, each.name))
-            for each in fields(self)
-            if "description" in each.metadata
-        }
+        return {name: as_json(getattr(self, name)) for name in self.about()}
 
     def pairs(self, *names: str) -> list[tuple[Any, ...]]:
         """Return rows of :class:`~pipelines.report.tree.Pairs`: what fields are, their values and forms."""
-        about = {each.name: each.metadata for each in fields(self)}  # type: ignore[arg-type]
         rows = []
         for name in names:
-            value, unit = getattr(self, name), about[name]["unit"]
+            value, about = getattr(self, name), self.about()[name]
             if isinstance(value, tuple) and all(isinstance(each, str) for each in value):
                 value = ", ".join(value)
-            rows.append((about[name]["description"], value, about[name]["form"], "" if unit == "1" else unit))
+            unit = "" if about["unit"] == "1" else about["unit"]
+            rows.append((about["description"], value, about["form"], unit))
         return rows
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the fields that are numbers, texts or intervals as a table of one row."""
         import pandas as pd
 
-        assert is_dataclass(self)
         plain = (bool, int, float, str)
-        values = {each.name: getattr(self, each.name) for each in fields(self)}
-        return pd.DataFrame([{name: value for name, value in values.items() if isinstance(value, plain)}])
+        return pd.DataFrame([{name: each for name, each in vars(self).items() if isinstance(each, plain)}])
+
+    @classmethod
+    def about(cls) -> dict[str, Mapping[str, str]]:
+        """Return description, unit and form of each described field, by its name."""
+        named = {each.name: each.metadata for each in fields(cls)}  # type: ignore[arg-type]
+        return {name: about for name, about in named.items() if "description" in about}
 
     @classmethod
     def schema(cls) -> dict[str, Any]:
-        """Return the JSON schema of what ``--json`` writes."""
-        return type_schema(cls)
+        """Return the JSON schema of what ``--json`` writes: its keys, what each is, and its unit."""
+        keys = ("description", "unit")
+        properties = {
+            name: {key: about[key] for key in keys if about[key]} for name, about in cls.about().items()
+        }
+        return {"type": "object", "properties": properties}
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.report.answer}>"
@@ -123,57 +121,3 @@ def frame(records: Iterable[Any]) -> pd.DataFrame:
     from pipelines.report.json_file import as_json
 
     return pd.DataFrame([as_json(record) for record in records])
-
-
-_PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", Path: "string"}
-
-
-class _Names(dict[str, Any]):
-    """Names of a module; those that are there for a type checker alone stand for any type."""
-
-    def __init__(self, module: types.ModuleType) -> None:
-        super().__init__(vars(module))
-
-    def __missing__(self, name: str) -> Any:
-        return getattr(builtins, name, Any)
-
-
-def type_schema(kind: Any) -> dict[str, Any]:
-    """Return the JSON schema of a type: records by their fields, mappings and sequences by what they hold.
-
-    Examples
-    --------
-    >>> type_schema(tuple[float, float] | None)
-    {'anyOf': [{'type': 'array', 'items': {'type': 'number'}}, {'type': 'null'}]}
-    """
-    if kind in _PLAIN:
-        return {"type": _PLAIN[kind]}
-    if kind is type(None):
-        return {"type": "null"}
-    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
-        return {"anyOf": [type_schema(each) for each in arguments]}
-    if origin is typing.Literal:
-        return {"enum": list(arguments)}
-    if isinstance(origin, type) and issubclass(origin, Mapping):
-        return {"type": "object", "additionalProperties": type_schema(arguments[1]) if arguments else {}}
-    if origin in (tuple, list) or (isinstance(origin, type) and issubclass(origin, typing.Sequence)):
-        kinds = [each for each in dict.fromkeys(arguments) if each is not Ellipsis]
-        items = type_schema(kinds[0]) if len(kinds) == 1 else {"anyOf": [type_schema(each) for each in kinds]}
-        return {"type": "array", "items": items if kinds else {}}
-    if isinstance(kind, type) and issubclass(kind, Enum):
-        return {"enum": [each.value for each in kind]}
-    if is_dataclass(kind) or hasattr(kind, "_fields"):
-        hints = typing.get_type_hints(kind, localns=_Names(sys.modules[kind.__module__]))
-        described_fields = {each.name: each.metadata for each in fields(kind)} if is_dataclass(kind) else {}
-        names = tuple(described_fields) or kind._fields
-        properties = {}
-        for name in names:
-            if issubclass(kind, Result) and "description" not in described_fields[name]:
-                continue
-            about = {
-                key: text for key, text in described_fields.get(name, {}).items() if text and key != "form"
-            }
-            properties[name] = type_schema(hints[name]) | about
-        return {"type": "object", "properties": properties}
-    return {}
