@@ -17,20 +17,20 @@ from terrain.kernel_caches import discard_stale
 __version__ = "0.1.0"
 
 FACE = {
-    "load_runs": "pipelines.api.runs",
-    "Runs": "pipelines.api.runs",
-    "load_robot": "terrain.robots",
-    "simulate": "pipelines.api.runs",
-    "estimate": "pipelines.api.runs",
-    "learn_slip": "pipelines.api.runs",
-    "cut_windows": "pipelines.api.learn",
-    "TerrainClassifier": "pipelines.learn.classifier",
-    "cross_validate": "pipelines.api.learn",
-    "explain": "pipelines.api.runs",
-    "Observer": "pipelines.live.observer",
-    "replay": "terrain.logs.replay",
+    "load_runs": "pipelines.api.runs.load_runs",
+    "Runs": "pipelines.api.runs.Runs",
+    "load_robot": "terrain.robots.load_robot",
+    "simulate": "pipelines.api.runs.simulate",
+    "estimate": "pipelines.slip.estimate.estimate_runs",
+    "learn_slip": "pipelines.slip.learn_slip.learn_slip_table",
+    "cut_windows": "pipelines.api.learn.cut_windows",
+    "TerrainClassifier": "pipelines.learn.classifier.TerrainClassifier",
+    "cross_validate": "pipelines.api.learn.cross_validate",
+    "explain": "pipelines.api.runs.explain",
+    "Observer": "pipelines.live.observer.Observer",
+    "replay": "terrain.logs.replay.replay",
 }
-"""The names that ``import terrain`` offers, and the modules that have them."""
+"""The names that ``import terrain`` offers, and what they are."""
 
 __all__ = ["__version__", *FACE]
 
@@ -40,7 +40,8 @@ def __getattr__(name: str) -> Any:
     if name not in FACE:
         raise AttributeError(f"module 'terrain' has no attribute {name!r}; it has {', '.join(FACE)}")
     refuse_hidden_packages()
-    return getattr(import_module(FACE[name]), name)
+    module, _, found = FACE[name].rpartition(".")
+    return getattr(import_module(module), found)
 
 
 def __dir__() -> list[str]:

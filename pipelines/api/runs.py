@@ -1,4 +1,4 @@
-"""Runs in Python: read or simulated, estimated, learned from and explained."""
+"""Runs in Python: read, simulated and explained."""
 
 from __future__ import annotations
 
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pipelines.explain.explanation import ExplainResult
-    from pipelines.slip.estimate import Estimates
-    from pipelines.slip.table import LearnedSlipTable
 
 
 class Runs(Sequence[RunLog]):
@@ -138,40 +136,6 @@ def simulate(
 
     described = load_robot(robot) if isinstance(robot, str | Path) else robot
     return simulate_run(described, terrain, scenario, seed, number, duration_s=duration_s, vary=vary)
-
-
-def estimate(
-    runs: Iterable[RunLog], robot: Robot | None = None, filter: Any = "skid", **options: Any
-) -> Estimates:
-    """Estimate motion and slip of runs by a filter, an observer or a pose from outside.
-
-    Parameters
-    ----------
-    runs, robot, filter, options : as :func:`pipelines.slip.estimate.estimate_runs`
-
-    Returns
-    -------
-    Estimates
-        with ``runs`` (the logs and what was estimated of them), ``report`` and ``to_pandas()``
-    """
-    from pipelines.slip.estimate import estimate_runs
-
-    return estimate_runs(list(runs), robot, filter, **options)
-
-
-def learn_slip(tracks: Estimates | Iterable[RunLog], robot: Robot, **options: Any) -> LearnedSlipTable:
-    """Learn target slips by terrain from estimated runs.
-
-    Parameters
-    ----------
-    tracks : what :func:`estimate` returned, or runs
-    robot : whose they are
-    options : as :func:`pipelines.slip.learn_slip.learn_slip_table`
-    """
-    from pipelines.slip.estimate import Estimates
-    from pipelines.slip.learn_slip import learn_slip_table
-
-    return learn_slip_table(tracks.runs if isinstance(tracks, Estimates) else list(tracks), robot, **options)
 
 
 def explain(runs: Iterable[RunLog], robot: Robot | str, **options: Any) -> ExplainResult:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -147,6 +147,9 @@ class Estimates:
     def __len__(self) -> int:
         return len(self.runs)
 
+    def __iter__(self) -> Iterator[RunLog]:
+        return iter(self.runs)
+
     def __repr__(self) -> str:
         return f"<Estimates of {len(self.runs)} runs: {self.report.answer}>"
 
@@ -155,7 +158,7 @@ class Estimates:
 
 
 def estimate_runs(
-    runs: Sequence[RunLog],
+    runs: Iterable[RunLog],
     robot: Robot | None = None,
     filter: Filter = "skid",
     *,
@@ -192,7 +195,7 @@ def estimate_runs(
 
     kept: list[RunLog] = []
     asked = EstimateOptions(filter=filter, **options)
-    result = _estimated(runs, robot, asked, progress or silent, lambda run, figures: kept.append(run))
+    result = _estimated(list(runs), robot, asked, progress or silent, lambda run, figures: kept.append(run))
     return Estimates(tuple(kept), result)
 
 

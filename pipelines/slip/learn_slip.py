@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -74,7 +74,7 @@ def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
 
 
 def learn_slip_table(
-    runs: Sequence[RunLog],
+    runs: Iterable[RunLog],
     robot: Robot,
     *,
     seed: int = 0,
@@ -86,8 +86,8 @@ def learn_slip_table(
 
     Parameters
     ----------
-    runs : labelled logs: of a swerve robot with motor currents, of others with an outside measurement of
-        motion
+    runs : labelled logs, as the estimates of :func:`pipelines.slip.estimate.estimate_runs`: of a swerve robot with
+        motor currents, of others with an outside measurement of motion
     robot : whose they are
     seed : of the bootstrap
     name : of the table
@@ -106,7 +106,7 @@ def learn_slip_table(
     from pipelines.slip.steady import learn_steady
     from terrain.robots import SwerveRobot
 
-    progress = progress or silent
+    runs, progress = list(runs), progress or silent
     if isinstance(robot, SwerveRobot):
         return learn_curves(runs, robot, seed, name, repair, progress)
     return learn_steady(runs, robot, seed, name, progress)
