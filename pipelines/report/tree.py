@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from pipelines.report.numbers import format_value
+from pipelines.report.writing import ENDINGS, check_file
+from terrain.files.atomic import atomic_write
 
 
 class Text(NamedTuple):
@@ -275,22 +277,37 @@ class Report:
     lead: str = ""
 
     def save(self, path: str | Path) -> Path:
-        """Write the report as a page (``.html``) or as Markdown (``.md``), by the ending of the path."""
-        saved: Path = _writer("writing").save_report(self, Path(path))
-        return saved
+        """Write the report as a page (``.html``) or as Markdown (``.md``), by the ending of the path.
+
+        Raises
+        ------
+        ConfigError
+            if the path has another ending, or cannot be written.
+        """
+        path = Path(path)
+        check_file(path, "--report", ENDINGS)
+        atomic_write(path, _written(self, "markdown_text" if path.suffix.lower() == ".md" else "html_page"))
+        return path
 
     def __str__(self) -> str:
-        text: str = _writer("terminal").terminal_text(self)
-        return text
+        return _written(self, "terminal_text")
 
     def _repr_html_(self) -> str:
-        markup: str = _writer("html").html_fragment(self)
-        return markup
+        return _written(self, "html_fragment")
 
 
-def _writer(name: str) -> Any:
-    """Return a module that writes reports, which imports this one."""
-    return import_module(f"pipelines.report.{name}")
+WRITERS = {
+    "html_page": "html",
+    "html_fragment": "html",
+    "markdown_text": "markdown",
+    "terminal_text": "terminal",
+}
+"""Functions that write a report, and their modules, which import this one."""
+
+
+def _written(report: Report, writer: str) -> str:
+    text: str = getattr(import_module(f"pipelines.report.{WRITERS[writer]}"), writer)(report)
+    return text
 
 
 def figures_of(report: Report) -> list[Figure]:

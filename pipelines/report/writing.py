@@ -1,18 +1,18 @@
-"""Reports as files, by the ending of their name, whole or not at all; and checks of files that are to be written."""
+"""Checks of files that are to be written, before the work is done."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from pipelines.report.tree import Report
 from terrain.errors import ConfigError
-from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.files.atomic import ensure_writable
 
 ENDINGS = (".html", ".md")
+"""Of reports."""
 
 
 def check_file(path: Path, option: str, endings: tuple[str, ...] = ()) -> None:
-    """Refuse a file that cannot be written before the work is done, not after.
+    """Refuse a file that cannot be written.
 
     Raises
     ------
@@ -26,23 +26,3 @@ def check_file(path: Path, option: str, endings: tuple[str, ...] = ()) -> None:
             f"{option} is {str(path)!r}; a name that ends in {' or '.join(endings)} is required"
         )
     ensure_writable(path.parent)
-
-
-def save_report(report: Report, path: Path) -> Path:
-    """Write a report as a page (``.html``) or as Markdown (``.md``) and return the path.
-
-    Raises
-    ------
-    ConfigError
-        if the path has another ending, or cannot be written.
-    """
-    check_file(path, "--report", ENDINGS)
-    if path.suffix.lower() == ".md":
-        from pipelines.report.markdown import markdown_text
-
-        atomic_write(path, markdown_text(report))
-    else:
-        from pipelines.report.html import html_page
-
-        atomic_write(path, html_page(report))
-    return path
