@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from pipelines.learn.evaluation import (
@@ -18,7 +19,6 @@ from pipelines.learn.evaluation import (
 from pipelines.learn.settings import EvaluationSettings
 from pipelines.report import (
     Column,
-    Later,
     Part,
     Progress,
     Report,
@@ -198,8 +198,8 @@ def report(result: ComparisonResult) -> Report:
             *notes(*result.notes, *([left_out] if result.excluded_runs else ())),
         ],
         details=[
-            *(Section(f"{each.b} less {each.a}", Later(_paired, each)) for each in result.differences),
-            *(Section(f"{each.recipe} alone", Later(_alone, each)) for each in result.contenders),
+            *(Section(f"{each.b} less {each.a}", partial(_paired, each)) for each in result.differences),
+            *(Section(f"{each.recipe} alone", partial(_alone, each)) for each in result.contenders),
         ],
         next_step=f"terrain train --data {result.data or 'DIR'} --recipe RECIPE --name NAME"
         if result.kind == "recipes"

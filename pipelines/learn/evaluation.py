@@ -11,7 +11,6 @@ from pipelines.report import (
     Bars,
     Column,
     Figure,
-    Later,
     Line,
     Mark,
     Pairs,
@@ -228,7 +227,7 @@ def _details(result: CrossvalResult) -> list[Section]:
     """Return what is folded: confusion, runs, confidence, coverage, checks, time, and how it was done."""
     over_time = result.courses or result.recorded_courses or result.breakaways
     return [
-        Section(title, Later(make, result))
+        Section(title, partial(make, result))
         for title, make, known in (
             ("Confusion", _confusion, True),
             ("Runs", _runs, True),

@@ -16,7 +16,6 @@ from pipelines.report.tree import Band as Band
 from pipelines.report.tree import Bars as Bars
 from pipelines.report.tree import Column as Column
 from pipelines.report.tree import Figure as Figure
-from pipelines.report.tree import Later as Later
 from pipelines.report.tree import Line as Line
 from pipelines.report.tree import Mark as Mark
 from pipelines.report.tree import Pairs as Pairs

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
@@ -220,25 +220,23 @@ class Figure:
     x_label: str = ""
 
 
-class Later(Sequence[Any]):
-    """Parts of a section that are made when a writer comes to them: a screen without details needs none."""
-
-    def __init__(self, make: Callable[..., Sequence[Part]], *arguments: Any) -> None:
-        self._made = cache(lambda: make(*arguments))
-
-    def __getitem__(self, place: Any) -> Any:
-        return self._made()[place]
-
-    def __len__(self) -> int:
-        return len(self._made())
-
-
 @dataclass(frozen=True)
 class Section:
-    """Parts under a heading."""
+    """Parts under a heading.
+
+    Parameters
+    ----------
+    title : heading
+    given : the parts, or what makes them when a writer comes to them: a screen without details needs none
+    """
 
     title: str
-    parts: Sequence[Part] = ()
+    given: Sequence[Part] | Callable[[], Sequence[Part]] = ()
+
+    @cached_property
+    def parts(self) -> Sequence[Part]:
+        """The parts."""
+        return self.given() if callable(self.given) else self.given
 
 
 Part: TypeAlias = Text | Table | Pairs | Figure | Section
