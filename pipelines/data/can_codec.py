@@ -232,43 +232,38 @@ def load_layout(path: str | Path | None = None, streams: Iterable[str] = SIGNALS
     owner: dict[str, Any] = {}
     by_stream: dict[str, list[MessagePlan]] = {}
     for message in _read(path).messages:
-        plans: dict[str, list[SignalPlan]] = {}
-        for signal in message.signals:
-            if signal.name not in places:
-                continue
+        used = [signal for signal in message.signals if signal.name in places]
+        for signal in used:
             if owner.setdefault(signal.name, message) is not message:
                 both = f"{owner[signal.name].name!r} and {message.name!r}"
                 raise ConfigError(
                     f"{path}: the signal {signal.name!r} is in the messages {both}; one is required"
                 )
-            stream, column, channel = places[signal.name]
-            plans.setdefault(stream, []).append(_signal_plan(path, signal, channel, column))
-        if len(plans) > 1:
-            both = " and ".join(map(repr, list(plans)[:2]))
+        signals = tuple(_signal_plan(path, signal, *places[signal.name][1:]) for signal in used)
+        carried = list(dict.fromkeys(places[signal.name][0] for signal in used))
+        if not carried:
+            continue
+        if len(carried) > 1:
+            both = " and ".join(map(repr, carried[:2]))
             raise ConfigError(
                 f"{path}: the message {message.name!r} has signals of {both}; each needs messages of its own"
             )
-        for stream, signals in plans.items():
-            if message.length > MAX_BYTES:
-                raise ConfigError(
-                    f"{path}: the message {message.name!r} has {message.length} bytes; "
-                    f"a frame of classical CAN has at most {MAX_BYTES}"
-                )
-            by_stream.setdefault(stream, []).append(_message_plan(message, stream, signals))
-    needed = [places[name] for name in places if name not in owner]
+        if message.length > MAX_BYTES:
+            raise ConfigError(
+                f"{path}: the message {message.name!r} has {message.length} bytes; "
+                f"a frame of classical CAN has at most {MAX_BYTES}"
+            )
+        by_stream.setdefault(carried[0], []).append(_message_plan(message, carried[0], signals))
     missing = [
-        SIGNALS[stream][channel]
-        for stream, _, channel in needed
-        if stream in set(streams) and channel not in OPTIONAL
+        name
+        for name, (stream, _, channel) in places.items()
+        if name not in owner and stream in set(streams) and channel not in OPTIONAL
     ]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ConfigError(f"{path}: lacks the signal {missing[0]!r}{more}; docs/can.md lists those required")
-    by_key = {
-        (plan.message.frame_id, plan.message.is_extended_frame): plan
-        for plans_of_stream in by_stream.values()
-        for plan in plans_of_stream
-    }
+    plans = [plan for of_stream in by_stream.values() for plan in of_stream]
+    by_key = {(plan.message.frame_id, plan.message.is_extended_frame): plan for plan in plans}
     return Layout(path.name, by_key, by_stream)
 
 
@@ -282,7 +277,7 @@ def _read(path: Path) -> Any:
         raise ConfigError(f"{path}: is no DBC ({one_line(error)})") from error
 
 
-def _signal_plan(path: Path, signal: Any, channel: str, column: int) -> SignalPlan:
+def _signal_plan(path: Path, signal: Any, column: int, channel: str) -> SignalPlan:
     scale, offset = float(signal.scale), float(signal.offset)
     if not (math.isfinite(scale) and scale and math.isfinite(offset)):
         raise ConfigError(f"{path}: the signal {signal.name!r} has the scale {scale:g}; 0 is not accepted")
@@ -314,10 +309,8 @@ def _factor(path: Path, signal: Any, channel: str) -> float:
     if required == "code" or (required == "ratio" and given == ""):
         if given in UNITLESS:
             return 1.0
-    elif (
-        given not in UNIT_OFFSETS and UNIT_SCALES.get(given, ("",))[0] == required
-    ):  # a DBC has its own offsets
-        return UNIT_SCALES[given][1]
+    elif given not in UNIT_OFFSETS and UNIT_SCALES.get(given, ("",))[0] == required:
+        return UNIT_SCALES[given][1]  # a DBC has its own offsets
     fitting = [repr(unit) for unit, (word, _) in UNIT_SCALES.items() if word == required] or ["none"]
     raise ConfigError(
         f"{path}: the signal {signal.name!r} has the unit {given!r}, which does not fit {channel}; "
@@ -325,7 +318,7 @@ def _factor(path: Path, signal: Any, channel: str) -> float:
     )
 
 
-def _message_plan(message: Any, stream: str, signals: list[SignalPlan]) -> MessagePlan:
+def _message_plan(message: Any, stream: str, signals: tuple[SignalPlan, ...]) -> MessagePlan:
     used = {signal.name for signal in signals}
     by_name = {signal.name: signal for signal in message.signals}
     others = {
@@ -338,7 +331,7 @@ def _message_plan(message: Any, stream: str, signals: list[SignalPlan]) -> Messa
     if CRC in by_name and by_name[CRC].length == 8:
         raw = dict.fromkeys(by_name, 0) | {CRC: 255}
         crc_bits = int.from_bytes(message.encode(raw, scaling=False, padding=False, strict=False), "big")
-    return MessagePlan(message, stream, tuple(signals), counter_bits, crc_bits, others)
+    return MessagePlan(message, stream, signals, counter_bits, crc_bits, others)
 
 
 def _crc_of(plan: MessagePlan, data: bytes) -> int:

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import field_validator
-
 from pipelines.report import Progress, Report, Result, described, plural, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from terrain.errors import ConfigError, LogError
 
 EXAMPLE = "terrain simulate --robot husky --terrain grass --scenario survey --runs 8 --out runs/"
 EVERY = "all"
@@ -44,18 +43,6 @@ class Settings(BaseSettings):
         (), "NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again.", repeated=True
     )
 
-    @property
-    def camera_lost_s(self) -> tuple[tuple[float, float], ...]:
-        """Intervals (start, end) without the camera."""
-        return tuple(_interval(text) for text in self.camera_lost)
-
-    @field_validator("camera_lost")
-    @classmethod
-    def _check_intervals(cls, texts: tuple[str, ...]) -> tuple[str, ...]:
-        for text in texts:
-            _interval(text)
-        return texts
-
 
 def _interval(text: str) -> tuple[float, float]:
     """Read ``START:END``."""
@@ -65,7 +52,7 @@ def _interval(text: str) -> tuple[float, float]:
     except ValueError:
         start_s = end_s = 0.0
     if not 0.0 <= start_s < end_s:
-        raise ValueError(f"--camera-lost is {text!r}; START:END in seconds is required, as in 10:13")
+        raise ConfigError(f"--camera-lost is {text!r}; START:END in seconds is required, as in 10:13")
     return start_s, end_s
 
 
@@ -96,7 +83,6 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     import math
 
     from terrain.effects import read_effects_of
-    from terrain.errors import LogError
     from terrain.files.atomic import ensure_writable
     from terrain.logs.write import run_folder, write_run
     from terrain.robots import load_robot
@@ -106,6 +92,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     from terrain.terramechanics.soil import load_soil, soil_names
 
     scenario, out = settings.scenario, settings.out
+    camera_lost_s = tuple(_interval(text) for text in settings.camera_lost)
     robot = load_robot(settings.robot)
     effects = read_effects_of(settings.effect, robot.drive)
     ensure_writable(out)
@@ -128,7 +115,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
             duration_s=settings.duration_s,
             vary=settings.vary,
             conditions=Conditions(payload_kg=settings.payload_kg, grade_ratio=(gradient, 0.0)),
-            faults=Faults(camera_lost_s=settings.camera_lost_s),
+            faults=Faults(camera_lost_s=camera_lost_s),
             gnss=Gnss() if settings.gnss else None,
             effects=effects,
         )

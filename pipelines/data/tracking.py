@@ -161,37 +161,13 @@ def fetch_model(uri: str, into: str) -> Path:
         raise ModelError(f"{uri}: cannot be loaded ({reason})") from error
 
 
-def log_learning(
-    name: str,
-    params: Mapping[str, Any],
-    metrics: Mapping[str, float],
-    tags: Mapping[str, str],
-    documents: Mapping[str, Any],
-    pictures: Mapping[str, bytes],
-) -> str:
-    """Log a run in which something other than a model was learned; return its id.
-
-    Parameters are those of :func:`log_run`.
-
-    Raises
-    ------
-    TrackingError
-        if the tracking folder cannot be written or the server cannot be reached.
-    """
-    with mlflow_store(create=True) as mlflow:
-        run_id = log_run(mlflow, name, params, metrics, tags, documents, pictures)
-        mlflow.MlflowClient().set_terminated(run_id)
-        return run_id
-
-
 def log_run(
     mlflow: Any,
     name: str,
     params: Mapping[str, Any],
     metrics: Mapping[str, float],
     tags: Mapping[str, str],
-    documents: Mapping[str, Any],
-    pictures: Mapping[str, bytes],
+    files: Mapping[str, Any],
 ) -> str:
     """Log what every run has, in few calls, and return the id of the run, which is not ended yet.
 
@@ -200,8 +176,7 @@ def log_run(
     mlflow : as :func:`mlflow_store` gives it
     name : of the run
     params, metrics, tags : as MLflow holds them
-    documents : texts and JSON documents by file name
-    pictures : content of image files by file name
+    files : bytes, texts and JSON documents by file name
     """
     from mlflow.entities import Metric, Param, RunTag
     from mlflow.utils.time import get_current_time_millis
@@ -212,30 +187,22 @@ def log_run(
     now_ms = get_current_time_millis()
     client.log_batch(
         run_id,
-        [Metric(_plain(key), float(value), now_ms, 0) for key, value in metrics.items()],
+        [  # of the characters that a name may have there
+            Metric(re.sub(r"[^\w\-. /]", "_", key), float(value), now_ms, 0) for key, value in metrics.items()
+        ],
         [Param(key, str(value)[:500]) for key, value in params.items()],
         [RunTag(key, str(value)) for key, value in tags.items()],
     )
     with TemporaryDirectory() as folder:
-        for file, document in documents.items():
-            text = document if isinstance(document, str) else json.dumps(document, indent=2)
-            _place(folder, file).write_text(text, encoding="utf-8")
-        for file, content in pictures.items():
-            _place(folder, file).write_bytes(content)
-        if any(Path(folder).iterdir()):
+        for file, content in files.items():
+            path = Path(folder) / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not isinstance(content, bytes):
+                content = (content if isinstance(content, str) else json.dumps(content, indent=2)).encode()
+            path.write_bytes(content)
+        if files:
             client.log_artifacts(run_id, folder)
     return run_id
-
-
-def _place(folder: str, file: str) -> Path:
-    path = Path(folder) / file
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def _plain(name: str) -> str:
-    """Return a name of the characters that a metric's may have."""
-    return re.sub(r"[^\w\-. /]", "_", name)
 
 
 if __name__ == "__main__":

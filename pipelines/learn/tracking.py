@@ -74,9 +74,10 @@ def log_training(
         for terrain, row in evaluation.per_class.items()
         for figure in ("precision", "recall", "f1")
     }
-    documents = {
+    files = {
         "crossval.json": as_json(evaluation),
         "importance.json": {"channels": as_json(record.importance)},
+        **(pictures or {}),
     }
     params = record.params | {f"chosen_{key}": value for key, value in record.chosen.items()}
     tags = {key: str(getattr(info, key)) for key in ("data_digest", "commit", "seed")}
@@ -84,7 +85,7 @@ def log_training(
         from mlflow.entities import DatasetInput, InputTag
 
         client = mlflow.MlflowClient()
-        run_id = log_run(mlflow, name, params, metrics, tags, documents, pictures or {})
+        run_id = log_run(mlflow, name, params, metrics, tags, files)
         rows, digest = pd.DataFrame(record.runs), info.data_digest[:36]
         dataset = mlflow.data.from_pandas(rows, name=info.dataset or "runs", digest=digest)
         context = [InputTag("mlflow.data.context", "training")]

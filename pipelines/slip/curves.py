@@ -97,32 +97,27 @@ def log_curves(result: LearnedCurves) -> str:
     TerrainError
         if the tracking folder cannot be written or the server cannot be reached.
     """
-    from pipelines.data.tracking import code_commit, log_learning
+    from pipelines.data.tracking import code_commit, log_run, mlflow_store
     from pipelines.report.drawing import figure_png
 
     assert result.table is not None
-    return log_learning(
-        result.table.stem,
-        {
-            "robot": result.robot,
-            "filter": result.filter,
-            "n_bootstrap": N_BOOTSTRAP,
-            "dataset": result.dataset,
-            "n_runs": result.n_runs,
-        },
-        _metrics(result.terrains),
-        {
-            "data_digest": result.data_digest,
-            "commit": code_commit(),
-            "seed": str(result.seed),
-            "kind": "slip table",
-        },
-        {
-            result.table.name: result.table.read_text(encoding="utf-8"),
-            "learn_slip.json": {"terrains": as_json(result.terrains)},
-        },
-        {f"figures/{name}.png": figure_png(figure) for name, figure in result.pictures.items()},
-    )
+    params = {key: getattr(result, key) for key in ("robot", "filter", "dataset", "n_runs")}
+    tags = {
+        "data_digest": result.data_digest,
+        "commit": code_commit(),
+        "seed": str(result.seed),
+        "kind": "slip table",
+    }
+    files = {
+        result.table.name: result.table.read_bytes(),
+        "learn_slip.json": {"terrains": as_json(result.terrains)},
+        **{f"figures/{name}.png": figure_png(figure) for name, figure in result.pictures.items()},
+    }
+    params["n_bootstrap"] = N_BOOTSTRAP
+    with mlflow_store(create=True) as mlflow:
+        run_id = log_run(mlflow, result.table.stem, params, _metrics(result.terrains), tags, files)
+        mlflow.MlflowClient().set_terminated(run_id)
+    return run_id
 
 
 def _metrics(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:

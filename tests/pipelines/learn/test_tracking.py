@@ -170,12 +170,13 @@ def test_a_first_version_at_chance_is_registered_and_no_champion(in_tracked, log
 TWO_AT_ONCE = """
 import os, sys, time
 from pathlib import Path
-from pipelines.data.tracking import ensure_tracking, log_learning
+from pipelines.data.tracking import ensure_tracking, log_run, mlflow_store
 Path(f"ready_{sys.argv[1]}").touch()
 while len(list(Path().glob("ready_*"))) < 3:
     time.sleep(0.01)
 ensure_tracking()
-print(log_learning("together", {}, {"figure": 1.0}, {}, {}, {}))
+with mlflow_store(create=True) as mlflow:
+    print(log_run(mlflow, "together", {}, {"figure": 1.0}, {}, {}))
 """
 
 
