@@ -56,10 +56,10 @@ def serialized(topic: StandardTopic, log_ns: Array) -> Messages:
     """
     typesys = library("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores[DISTRO])
-    message = _zero(store, topic.kind)
+    message = zero_message(store, topic.kind)
     for path, value in topic.fixed.items():
-        _setter(message, path)(value)
-    setters = [_setter(message, path) for path in topic.paths]
+        setter(message, path)(value)
+    setters = [setter(message, path) for path in topic.paths]
     contents = []
     for stamp_ns, row in zip(log_ns.tolist(), topic.numbers.tolist(), strict=True):
         message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
@@ -70,7 +70,7 @@ def serialized(topic: StandardTopic, log_ns: Array) -> Messages:
     return Messages(topic.topic, topic.kind, definition, log_ns, contents)
 
 
-def _setter(message: Any, path: str) -> Callable[[Any], None]:
+def setter(message: Any, path: str) -> Callable[[Any], None]:
     """Return what sets the field, or the element of an array, that a path names."""
     *parents, field = path.split(".")
     for name in parents:
@@ -81,14 +81,14 @@ def _setter(message: Any, path: str) -> Callable[[Any], None]:
     return partial(setattr, message, field)
 
 
-def _zero(store: Any, kind: str) -> Any:
+def zero_message(store: Any, kind: str) -> Any:
     """Return a message whose numbers are 0, texts empty, and sequences of no element."""
     from rosbags.interfaces import Nodetype
 
     values: dict[str, Any] = {}
     for name, (node, described) in store.fielddefs[kind][1]:
         if node == Nodetype.NAME:
-            values[name] = _zero(store, described)
+            values[name] = zero_message(store, described)
         elif node == Nodetype.BASE:
             values[name] = "" if described[0] == "string" else 0
         else:  # those that are written are arrays of float64

@@ -5,40 +5,38 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from rosbags.interfaces import Nodetype
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-TYPES = STORE.types
+from pipelines.data.datasets import load_runs
+from pipelines.data.run_writers import setter, zero_message
+from terrain.errors import ConfigError, LogError
+
+STORE, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
 START_NS = 1_700_000_000_123_456_789
+
+
+def refused(fault, place, **options):
+    """Assert that a folder or file is refused in one sentence that has a fault."""
+    with pytest.raises((LogError, ConfigError), match=fault) as raised:
+        load_runs(place, **options)
+    assert "\n" not in str(raised.value)
 
 
 def message(kind, stamp_ns=None, **fields):
     """Return a message whose fields are 0 or empty, but for some: a number, text or array, or x, y, z and w."""
-    values = {}
-    for name, (node, about) in STORE.fielddefs[kind][1]:
-        if node == Nodetype.NAME:
-            values[name] = message(about)
-        elif node == Nodetype.BASE:
-            values[name] = "" if about[0] == "string" else 0
-        else:
-            values[name] = np.zeros(about[1] if node == Nodetype.ARRAY else 0)
-    made = TYPES[kind](**values)
+    made = zero_message(STORE, kind)
     if stamp_ns is not None:
         made.header.stamp.sec, made.header.stamp.nanosec = divmod(stamp_ns, 10**9)
     for path, value in fields.items():
-        *parents, last = path.split("__")
-        owner = made
-        for name in parents:
-            owner = getattr(owner, name)
-        if isinstance(value, tuple):
-            for axis, number in zip("xyzw", value, strict=False):
-                setattr(getattr(owner, last), axis, number)
-        else:
-            setattr(owner, last, value)
+        path = path.replace("__", ".")
+        parts = zip("xyzw", value, strict=False) if isinstance(value, tuple) else [("", value)]
+        for axis, number in parts:
+            setter(made, f"{path}.{axis}".rstrip("."))(number)
     return made
 
 
@@ -73,58 +71,65 @@ def text(content):
     return message("std_msgs/msg/String", data=content)
 
 
-def write_bag(folder, rows, storage="sqlite3"):
-    """Write ``(topic, log time in ns, message)`` as a bag of rosbag2."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
-        connections = {}
-        for topic, log_ns, message in rows:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=STORE)
-            content = STORE.serialize_cdr(message, message.__msgtype__)
-            writer.write(connections[topic], log_ns, content)
-    return folder
-
-
-def write_mcap(path, rows, compression=CompressionType.ZSTD, chunk_size=20_000, **options):
-    """Write ``(topic, log time in ns, message)`` as an MCAP file of one's own."""
+def write_messages(path, rows, **options):
+    """Write ``(topic, log time in ns, content, kind, message encoding, schema encoding, definition)`` as MCAP."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
-        writer = McapWriter(file, compression=compression, chunk_size=chunk_size, **options)
+        writer, channels = McapWriter(file, **options), {}
         writer.start(profile="ros2", library="test")
-        channels = {}
-        for topic, log_ns, message in rows:
-            kind = message.__msgtype__
+        for topic, log_ns, content, kind, encoding, *schema in rows:
             if topic not in channels:
-                definition = STORE.generate_msgdef(kind, ros_version=2)[0]
-                schema = writer.register_schema(kind, "ros2msg", definition.encode())
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            content = bytes(STORE.serialize_cdr(message, kind))
+                channels[topic] = writer.register_channel(
+                    topic, encoding, writer.register_schema(kind, *schema)
+                )
             writer.add_message(channels[topic], log_ns, content, log_ns)
         writer.finish()
     return path
 
 
-def write_ros1(path, rows, compression=None):
-    """Write ``(topic, log time in ns, message)`` as a bag of ROS 1."""
-    from rosbags.rosbag1 import Writer
+def write_mcap(path, rows, compression=CompressionType.ZSTD, chunk_size=20_000, **options):
+    """Write ``(topic, log time in ns, message)`` as an MCAP file of one's own."""
+    kinds = {each.__msgtype__ for _, _, each in rows}
+    definitions = {kind: STORE.generate_msgdef(kind, ros_version=2)[0].encode() for kind in kinds}
+    written = []
+    for topic, log_ns, each in rows:
+        kind = each.__msgtype__
+        about = (kind, "cdr", "ros2msg", definitions[kind])
+        written.append((topic, log_ns, bytes(STORE.serialize_cdr(each, kind)), *about))
+    return write_messages(path, written, compression=compression, chunk_size=chunk_size, **options)
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    store = get_typestore(Stores.ROS1_NOETIC)
-    writer = Writer(path)
-    if compression is not None:
-        writer.set_compression(Writer.CompressionFormat[compression])
+
+def write_by_rosbags(writer, store, serialize, rows):
     with writer:
         connections = {}
-        for topic, log_ns, message in rows:
-            kind = message.__msgtype__
+        for topic, log_ns, each in rows:
             if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            header = getattr(message, "header", None)
-            if header is not None:
-                stamped = store.types["std_msgs/msg/Header"](0, header.stamp, header.frame_id)
-                message = dataclasses.replace(message, header=stamped)
-            writer.write(connections[topic], log_ns, store.serialize_ros1(message, kind))
+                connections[topic] = writer.add_connection(topic, each.__msgtype__, typestore=store)
+            writer.write(connections[topic], log_ns, serialize(each, each.__msgtype__))
+
+
+def write_bag(folder, rows, storage="sqlite3"):
+    """Write ``(topic, log time in ns, message)`` as a bag of rosbag2."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    writer = Writer(folder, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    write_by_rosbags(writer, STORE, STORE.serialize_cdr, rows)
+    return folder
+
+
+def write_ros1(path, rows, compression=None):
+    """Write ``(topic, log time in ns, message)`` as a bag of ROS 1, whose headers have a number."""
+
+    def serialize(each, kind):
+        if hasattr(each, "header"):
+            header = ROS1.types["std_msgs/msg/Header"](0, each.header.stamp, each.header.frame_id)
+            each = dataclasses.replace(each, header=header)
+        return ROS1.serialize_ros1(each, kind)
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    writer = Ros1Writer(path)
+    if compression is not None:
+        writer.set_compression(Ros1Writer.CompressionFormat[compression])
+    write_by_rosbags(writer, ROS1, serialize, rows)
     return path
 
 
