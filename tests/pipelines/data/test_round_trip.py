@@ -3,7 +3,6 @@
 import json
 import string
 import sys
-from io import BytesIO
 
 import numpy as np
 import pytest
@@ -24,11 +23,13 @@ from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.digest import data_digest
 from terrain.logs.read import read_run
 from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
-from terrain.logs.run_topics import Head, RunRecorder, string_message
+from terrain.logs.run_topics import Head, string_message
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
+
+from .foreign_bags import refused
 
 TARGETS = ("mcap", "ros2", "ros2-mcap")
 
@@ -109,21 +110,16 @@ def check(run, messages):
         assert [each.time_s for each in seen] == stream.time_s.tolist()
         for channel in stream.channels:
             np.testing.assert_array_equal([getattr(m, channel) for m in seen], stream.channel(channel))
-    imu = messages["/imu"]
-    np.testing.assert_array_equal(
-        [m.linear_acceleration.z for m in imu], run.streams["imu"].channel("accel_z_mps2")
-    )
-    angles = Rotation.from_quat(
-        [[m.orientation.x, m.orientation.y, m.orientation.z, m.orientation.w] for m in imu]
-    ).as_euler("ZYX")
-    np.testing.assert_allclose(angles[:, 2], run.streams["imu"].channel("roll_rad"), atol=1e-12)
+    imu, streams = messages["/imu"], run.streams
+    quaternions = [[getattr(m.orientation, axis) for axis in "xyzw"] for m in imu]
     driven = [m for m in messages["/joint_states"] if m.name[0] == "motor_1"]
-    np.testing.assert_array_equal(
-        [m.velocity[2] for m in driven], run.streams["wheels"].channel("motor_3_radps")
-    )
-    np.testing.assert_array_equal(
-        [m.twist.angular.z for m in messages["/cmd_vel"]], run.streams["commands"].channel("yaw_rate_radps")
-    )
+    for seen, sent in (
+        ([m.linear_acceleration.z for m in imu], streams["imu"].channel("accel_z_mps2")),
+        (Rotation.from_quat(quaternions).as_euler("ZYX")[:, 2], streams["imu"].channel("roll_rad")),
+        ([m.velocity[2] for m in driven], streams["wheels"].channel("motor_3_radps")),
+        ([m.twist.angular.z for m in messages["/cmd_vel"]], streams["commands"].channel("yaw_rate_radps")),
+    ):
+        np.testing.assert_allclose(seen, sent, rtol=0.0, atol=1e-12)
     assert messages["/terrain/label"][0].data == run.labels[0].terrain
     assert json.loads(messages["/terrain/run"][0].data)["run_id"] == run.run_id
 
@@ -157,9 +153,8 @@ def runs(draw):
     start_s = draw(st.sampled_from([0.0, -3.5, 1.7e9, 1e12]))
     for name in draw(st.lists(words, min_size=1, max_size=3, unique=True)):
         channels = draw(st.lists(words, min_size=1, max_size=4, unique=True))
-        channels = [
-            f"{channel}_{unit}" for channel, unit in zip(channels, ("m", "radps", "ratio", "s"), strict=False)
-        ]
+        units = ("m", "radps", "ratio", "s")
+        channels = [f"{channel}_{unit}" for channel, unit in zip(channels, units, strict=False)]
         n = draw(st.integers(2, 6))
         steps = draw(st.lists(st.floats(1e-3, 2.0), min_size=n - 1, max_size=n - 1))
         time_s = start_s + np.concatenate([[0.0], np.cumsum(steps)])
@@ -167,11 +162,8 @@ def runs(draw):
         values = np.array(values).reshape(n, len(channels))
         values[0] = 1.0
         streams[name] = Stream(time_s, values, tuple(channels))
-    labels = draw(
-        st.sampled_from(
-            [(), (Label(start_s - 1, start_s + 1, "мокрая трава"), Label(start_s + 1, start_s + 9, "A"))]
-        )
-    )
+    labels = (Label(start_s - 1, start_s + 1, "мокрая трава"), Label(start_s + 1, start_s + 9, "A"))
+    labels = draw(st.sampled_from([(), labels]))
     dropped = draw(st.dictionaries(words, st.integers(0, 9), max_size=2))
     return RunLog(draw(words), draw(words), streams, labels, "drawn", dropped, draw(words), draw(words))
 
@@ -190,18 +182,6 @@ def test_whatever_a_run_folder_keeps_a_bag_keeps(tmp_path_factory, run):
     by_bag = read(repair=False)
     assert data_digest([by_bag]) == data_digest([by_folder])
     assert (by_bag.filter, dict(by_bag.dropped)) == (by_folder.filter, dict(by_folder.dropped))
-
-
-def test_nothing_is_overwritten_and_nothing_is_left_behind(raw, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    other = load_runs(raw)[1]
-    taken = out / f"{other.run_id}.mcap"
-    taken.write_text("mine")
-    with pytest.raises(LogError, match="is there already"):
-        exported(raw, out)
-    assert [path.name for path in out.iterdir()] == [taken.name]
-    assert taken.read_text() == "mine"
 
 
 def test_a_run_that_is_too_long_for_stamps_is_refused(tmp_path):
@@ -234,9 +214,7 @@ def test_an_export_whose_document_is_changed_is_refused(raw, tmp_path, old, new)
                     message = string_message(message[8:-1].decode().replace(old, new, 1))
                 writer.write(topic, stamp_ns, message)
         writer.finish()
-    with pytest.raises((LogError, ConfigError)) as raised:
-        load_runs(tmp_path / "changed.mcap")
-    assert "\n" not in str(raised.value)
+    refused(None, tmp_path / "changed.mcap")
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -249,9 +227,8 @@ def test_recorded_windows_go_with_their_run_out_and_in(raw, tmp_path, target):
         "probabilities": {"ICE": 0.75},
         "doubtful": False,
     }
-    windows = [
-        RecordedWindow(**given, probability=p, refused=why) for p, why in ((0.75, ""), (None, "not finite"))
-    ]
+    figures = ((0.75, ""), (None, "not finite"))
+    windows = [RecordedWindow(**given, probability=p, refused=why) for p, why in figures]
     place = write_run(run, tmp_path / "raw", beside={WINDOWS_FILE: windows_text(windows)})
     result = exported(tmp_path / "raw", tmp_path / "out", target)
     assert result.topics["/terrain/window"] == 2
@@ -263,12 +240,6 @@ def test_recorded_windows_go_with_their_run_out_and_in(raw, tmp_path, target):
             exported(tmp_path / "raw", tmp_path / "other", target)
 
 
-def test_a_damaged_bag_beside_files_of_another_layout_is_no_matter(borealtc_dir, tmp_path):
-    (borealtc_dir / "notes.mcap").write_text("no bag")
-    result = convert(Settings(data=borealtc_dir, out=tmp_path / "out"))
-    assert result.n_runs == 3
-
-
 @pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
 def test_a_missing_package_is_named_in_one_sentence(raw, tmp_path, monkeypatch, package):
     exported(raw, tmp_path / "mcap")
@@ -278,33 +249,3 @@ def test_a_missing_package_is_named_in_one_sentence(raw, tmp_path, monkeypatch, 
     with pytest.raises(ConfigError, match=r"pip install 'terrain-slip\[logs\]'"):
         exported(tmp_path / "mcap" if package == "zstandard" else raw, tmp_path / "out")
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
-
-
-@given(st.data())
-@settings(max_examples=40, deadline=None)
-def test_of_a_recording_that_ends_anywhere_all_that_was_flushed_is_read(tmp_path_factory, data):
-    """A recording is cut off where a process was killed: the samples before the last flush are there."""
-    file = BytesIO()
-    head = Head("drive", "husky", live=True)
-    recorder = RunRecorder(McapWriter(file, head), head)
-    recorder.register("imu", ("gyro_z_radps",))
-    flushed = [0]
-    for part in range(6):
-        if part == 2:  # streams may come later, and samples out of order
-            recorder.register("late one", ("speed_left_mps", "dead_m"))
-            recorder.append("late one", [0.19, 0.2, 0.18], [[1.0, np.nan]] * 3)
-        recorder.append("imu", 0.1 * part + 0.01 * np.arange(10), np.full((10, 1), float(part)))
-        recorder.flush()
-        flushed.append(len(file.getvalue()))
-    recorder.finish()
-    whole = file.getvalue()
-    end = data.draw(st.integers(flushed[1], len(whole)))
-    path = tmp_path_factory.mktemp("cut") / "drive.mcap"
-    path.write_bytes(whole[:end])
-    (run,) = load_runs(path)
-    n_flushed = sum(each <= end for each in flushed) - 1
-    assert len(run.streams["imu"]) >= 10 * n_flushed
-    if n_flushed > 3:
-        assert run.streams["late one"].channels == ("speed_left_mps",)
-        assert len(run.streams["late one"]) == 2
-        assert run.dropped["rows with a bad time"] == 1
