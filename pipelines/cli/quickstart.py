@@ -101,6 +101,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     from pipelines.learn.model_file import read_model
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
+    from pipelines.learn.training_data import data_of_runs
     from terrain.classify.folds import hold_out_runs
     from terrain.control.slip_table import load_slip_table
     from terrain.files.atomic import ensure_writable
@@ -120,7 +121,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
             name=settings.name, seed=settings.seed, n_jobs=settings.n_jobs, repeats=REPEATS
         )
         # without an evaluation given, that of the training shares its fits with the worth of the channels
-        trained = train(training, asked, dataset, progress)
+        trained = train(data_of_runs(training, asked), asked, dataset, progress)
         predicted = predict(held_out or runs, read_model(trained.model_uri), load_slip_table())
     result = QuickstartResult(
         dataset=dataset,

@@ -1,9 +1,10 @@
-"""A cache of features: one Parquet file a run, named by the run's digest and by how its windows are cut.
+"""A cache of features: one file a run, named by the run's digest and by how its windows are cut.
 
 Two passes, so that memory is bounded by a run and the table: the first finds channels and rates that all runs
 have in common, the second cuts, computes and writes what is not there yet; one that was interrupted goes on.  Of
 a run folder whose files did not change since, only the cache is read.  Fingerprints of each run show which pairs
-of runs may hold the same measurements; these are read again and compared.
+of runs may hold the same measurements; these are read again and compared.  Files are numpy's ``.npz``, archives
+with a checksum of each array.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -30,6 +30,7 @@ from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
 from pipelines.learn.training_data import TrainingData, trained_runs
 from pipelines.report import Progress, format_counts, silent
+from pipelines.report.json_file import as_json
 from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
@@ -39,8 +40,7 @@ from terrain.logs.fingerprints import RunPrint, run_print
 from terrain.logs.merge import sentences
 from terrain.records import Array, RunLog, Stream, Windows
 
-FORMAT_VERSION = 3
-KEY = b"terrain"
+FORMAT_VERSION = 4
 
 
 class RunHead(NamedTuple):
@@ -59,14 +59,14 @@ class RunHead(NamedTuple):
     robot: str = ""
     filter: str = ""
     digest: str = ""
-    streams: tuple[tuple[str, tuple[str, ...], float], ...] = ()
+    streams: Sequence[tuple[str, Sequence[str], float]] = ()
     repaired: Mapping[str, int] = {}
     print_digest: str = ""
     fault: str = ""
 
     def sketch(self) -> RunLog:
         """Return a run of two samples a stream that has these channels and rates, and nothing else."""
-        return RunLog(self.run_id, self.robot, {name: _pair(c, p) for name, c, p in self.streams})
+        return RunLog(self.run_id, self.robot, {name: _pair(tuple(c), p) for name, c, p in self.streams})
 
 
 @lru_cache(maxsize=1024)
@@ -128,27 +128,25 @@ def cached_data(
     skipped = [f"run skipped: {head.fault}" for head in heads if head.fault]
     readable = [head for head in heads if not head.fault]
     chosen = chosen_runs(readable, settings) if isinstance(settings, AlignedRunsSettings) else readable
-    names = {head.run_id for head in chosen}
+    used = {head.run_id for head in chosen}
     load_of = dict(zip([head.run_id or str(i) for i, head in enumerate(heads)], loaders, strict=True))
-    _refuse_shared([(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= names], n_jobs, progress)
+    _refuse_shared([(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= used], n_jobs, progress)
     chosen = sorted(chosen, key=lambda head: head.run_id)
     unfitted = recipe_of(settings, recipe)
     extractor, signal_sets = unfitted[0], unfitted[0].signal_sets
     layout = layout_of([head.sketch() for head in chosen], signal_sets, speeds=rule.steady is not None)
     extractor.fit(cut_windows([], rule, layout=layout).windows)
-    width = len(extractor.get_feature_names_out())
-    channels = {name: list(names) for name, names in layout.channels.items()}
-    made_of = [FORMAT_VERSION, __version__, asdict(rule), list(signal_sets), channels, dict(layout.rate_hz)]
-    keys = [_sha256([head.digest, _sha256(made_of)])[:32] for head in chosen]
-    files = [place / "features" / f"{key}.parquet" for key in keys]
-    todo = [i for i, file in enumerate(files) if _read(file, width) is None]
+    names = extractor.get_feature_names_out().tolist()
+    made_of = _sha256([FORMAT_VERSION, __version__, as_json([rule, layout, signal_sets, names])])
+    files = [place / "features" / f"{_sha256([head.digest, made_of])[:32]}.npz" for head in chosen]
+    todo = [i for i, file in enumerate(files) if _read(file) is None]
     each = ((load_of[chosen[i].run_id], files[i]) for i in todo)
     progress("features", len(files) - len(todo), len(files))
     for done, _ in enumerate(parallel(_store_run, (rule, layout, extractor), each, n_jobs), start=1):
         progress("features", len(files) - len(todo) + done, len(files))
-    samples, features, moved = _table(chosen, files, width, rule)
+    samples, features, moved = _table(chosen, files, rule)
     motion = None if wheel_stream(layout.channels) is None else moved
-    runs = trained_runs([(head, head.digest) for head in chosen], samples)
+    runs = trained_runs([head[:4] for head in chosen], samples)
     digest = joint_digest([head.digest for head in chosen])
     return TrainingData(samples, layout, unfitted, features, motion, runs, digest), skipped
 
@@ -181,11 +179,10 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
         parts = sorted(path for path in load.plain_folder.iterdir() if path.is_file())
         states = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in parts]
         name = _sha256([str(load.plain_folder), states, repr(load.robot), __version__, FORMAT_VERSION])
-        file = place / "runs" / f"{name}.parquet"
-        if (found := _read_columns(file)) is not None:
-            document, columns = found
-            streams = tuple((name, tuple(channels), period) for name, channels, period in document["streams"])
-            return RunHead(**{**document, "streams": streams}), columns["code"], columns["time_s"]
+        file = place / "runs" / f"{name}.npz"
+        if (found := _read(file)) is not None:
+            about, arrays = found
+            return RunHead(**about), arrays["code"], arrays["time_s"]
     try:
         run = load()
     except LogError as error:
@@ -204,7 +201,7 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
         prints.digest.hex(),
     )
     if file is not None:
-        _write_columns(file, head._asdict(), {"code": prints.codes, "time_s": prints.time_s})
+        _write(file, head._asdict(), code=prints.codes, time_s=prints.time_s)
     return head, prints.codes, prints.time_s
 
 
@@ -237,30 +234,27 @@ def _store_run(
     windows = cut.windows
     moved = window_motion(windows)
     motion = Motion(*np.full((len(Motion._fields), len(windows)), np.nan)) if moved is None else moved
-    _write_columns(
+    _write(
         file,
         {"dropped": dict(cut.dropped)},
-        {
-            "start_s": windows.start_s,
-            "terrain": np.array([str(name) for name in windows.terrain], dtype=object),
-            **motion._asdict(),
-        },
-        extractor.transform(windows),
+        start_s=windows.start_s,
+        terrain=windows.terrain.astype(str),
+        features=extractor.transform(windows).astype(np.float64),
+        **motion._asdict(),
     )
 
 
 def _table(
-    heads: Sequence[RunHead], files: Sequence[Path], width: int, rule: WindowRule
+    heads: Sequence[RunHead], files: Sequence[Path], rule: WindowRule
 ) -> tuple[Samples, Array, Motion]:
     """Return the labelled windows of all runs, run by run and in order of time, their features and motion."""
     parts, dropped = [], Counter[str]()
     for head, file in zip(heads, files, strict=True):
-        found = _read(file, width)
-        if found is None:
+        if (found := _read(file)) is None:
             raise LogError(f"{file}: was changed while it was used")
-        document, columns = found
+        about, columns = found
         known = columns["terrain"] != ""
-        dropped.update(document["dropped"])
+        dropped.update(about["dropped"])
         if not known.all():
             dropped["no single label"] += int((~known).sum())
         kept = {name: values[known] for name, values in columns.items()}
@@ -273,7 +267,8 @@ def _table(
         raise DataError("no window has a terrain label: nothing can be trained or tested")
     if np.array_equal(features, np.broadcast_to(features[:1], features.shape), equal_nan=True):
         raise DataError("no feature ever varies: nothing can be learned from them")
-    windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], table["terrain"])
+    terrain = table["terrain"].astype(object)
+    windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], terrain)
     repaired = dict(sum((Counter(head.repaired) for head in heads), Counter()))
     samples = Samples(windows, dict(dropped), windows.run_id, rule.overlap, repaired=repaired)
     return samples, features, Motion(*(table[name] for name in Motion._fields))
@@ -283,62 +278,17 @@ def _sha256(document: Any) -> str:
     return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()
 
 
-def _read(file: Path, width: int) -> tuple[dict[str, Any], dict[str, Array]] | None:
-    """Return what is kept of a run's windows; None where it is not there, damaged or of other features."""
-    found = _read_columns(file)
-    if found is None or found[1].get("features", np.zeros((0, 0))).shape[1:] != (width,):
-        return None
-    return found
-
-
-def _write_columns(
-    file: Path, document: Mapping[str, Any], columns: Mapping[str, Array], features: Array | None = None
-) -> None:
+def _write(file: Path, about: Mapping[str, Any], **arrays: Any) -> None:
     """Write a file of the cache, whole or not at all; the same content gives the same bytes."""
-    import pyarrow
-    from pyarrow import parquet
-
-    arrays: dict[str, Any] = {name: pyarrow.array(values) for name, values in columns.items()}
-    if features is not None:
-        flat = pyarrow.array(np.ascontiguousarray(features, dtype=np.float64).ravel())
-        arrays["features"] = pyarrow.FixedSizeListArray.from_arrays(flat, features.shape[1])
-    checked = {**columns, **({} if features is None else {"features": features})}
-    text = json.dumps(dict(document), sort_keys=True)
-    metadata = {KEY: text, b"sha256": _checksum(text, checked)}
-    table = pyarrow.table(arrays).replace_schema_metadata(metadata)
     with atomic_file(file) as stream:
-        parquet.write_table(table, stream, compression="zstd")
+        np.savez_compressed(stream, about=np.array(json.dumps(about, sort_keys=True)), **arrays)
 
 
-def _read_columns(file: Path) -> tuple[dict[str, Any], dict[str, Array]] | None:
-    """Return the document and the columns of a file; None where it is missing or damaged."""
-    import pyarrow
-    from pyarrow import parquet
-
+def _read(file: Path) -> tuple[dict[str, Any], dict[str, Array]] | None:
+    """Return what a file says of its arrays, and these; None where it is missing or damaged."""
     try:
-        with file.open("rb") as stream:
-            table = parquet.read_table(stream, use_threads=False)
-        columns = {}
-        for name in table.column_names:
-            column = table.column(name).combine_chunks()
-            if pyarrow.types.is_fixed_size_list(column.type):
-                flat = column.flatten().to_numpy(zero_copy_only=False)
-                columns[name] = flat.reshape(table.num_rows, column.type.list_size)
-            else:
-                columns[name] = column.to_numpy(zero_copy_only=False)
-        text = table.schema.metadata[KEY].decode()
-        if table.schema.metadata[b"sha256"].decode() != _checksum(text, columns):
-            return None
-        return json.loads(text), columns
-    except (pyarrow.ArrowException, OSError, ValueError, KeyError, TypeError, AttributeError):
+        with file.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
+            arrays = dict(archive)
+        return json.loads(str(arrays.pop("about"))), arrays
+    except Exception:  # zipfile, zlib and numpy raise whatever a damaged archive leads them to
         return None
-
-
-def _checksum(text: str, columns: Mapping[str, Array]) -> str:
-    """Return a SHA-256 over all that a file holds; page checksums of Parquet leave its headers out."""
-    digest = hashlib.sha256(text.encode())
-    for name, values in columns.items():
-        digest.update(name.encode())
-        plain = values.dtype.kind in "if"
-        digest.update(np.ascontiguousarray(values).tobytes() if plain else "\n".join(values).encode())
-    return digest.hexdigest()

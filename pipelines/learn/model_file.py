@@ -8,7 +8,6 @@ distinguished from an intact one.  A registered model is a copy of such a folder
 
 from __future__ import annotations
 
-import copy
 import hashlib
 import io as streams
 import subprocess
@@ -195,18 +194,25 @@ def write_model(folder: Path, model: TerrainModel) -> None:
     ConfigError
         if it has a network and onnx is not installed.
     """
-    recipe, network = _without_network(model.recipe)
-    content = packed({"recipe": recipe, "novelty": model.novelty, "support": model.support})
+    network = _network(model.recipe)
+    numbers = None if network is None else network.numbers_
+    try:
+        if network is not None:
+            network.numbers_ = None  # they lie in a file of their own
+        content = packed({"recipe": model.recipe, "novelty": model.novelty, "support": model.support})
+    finally:
+        if network is not None:
+            network.numbers_ = numbers
     for name in (MANIFEST_FILE, *FILES):  # of a model that lay there
         (folder / name).unlink(missing_ok=True)
     atomic_write(folder / MODEL_FILE, content)
-    if network is not None:
-        levels = recipe[0].matrix.level_sets
+    if numbers is not None:
+        levels = model.recipe[0].matrix.level_sets
         centred = {
             each.stream: [is_centred(each.stream, name, levels) for name in each.channels]
-            for each in network.numbers_.columns
+            for each in numbers.columns
         }
-        onnx = network_onnx(network.numbers_, model.info.classes, model.info.window_s, centred)
+        onnx = network_onnx(numbers, model.info.classes, model.info.window_s, centred)
         atomic_write(folder / ONNX_FILE, onnx)
     seal(folder, model.info)
 
@@ -252,8 +258,7 @@ def read_model(source: str | Path) -> TerrainModel:
     file = folder / MODEL_FILE
     try:
         recipe, novelty, support = _unpacked(contents[MODEL_FILE])
-        _, network = _without_network(recipe)
-        if network is not None:
+        if (network := _network(recipe)) is not None:
             file = folder / ONNX_FILE
             network.numbers_ = numbers_of_onnx(contents[ONNX_FILE], network.columns)
             check_network(network.numbers_, len(info.classes))
@@ -408,22 +413,10 @@ def _load_pyfunc(path: str) -> WindowProbabilities:
     return WindowProbabilities(read_model(Path(path)))
 
 
-def _without_network(recipe: WindowPipeline) -> tuple[WindowPipeline, Any]:
-    """Return a recipe whose network, where it has one, lacks its numbers; and that network."""
+def _network(recipe: WindowPipeline) -> Any:
+    """Return the fitted network of a recipe; None where it has none."""
     last = recipe[-1]
-    network = last if hasattr(last, "numbers_") else getattr(last, "network_", None)
-    if network is None:
-        return recipe, None
-    bare = copy.copy(network)
-    bare.numbers_ = None
-    if network is last:
-        last = bare
-    else:
-        last = copy.copy(last)
-        last.network_ = bare
-    changed = copy.copy(recipe)
-    changed.steps = [*recipe.steps[:-1], (recipe.steps[-1][0], last)]
-    return changed, network
+    return last if hasattr(last, "numbers_") else getattr(last, "network_", None)
 
 
 def _unpacked(content: bytes) -> tuple[WindowPipeline, NoveltyNumbers | None, SupportTable | None]:

@@ -7,7 +7,7 @@ the tracking server had stopped.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from terrain.classify.folds import Fold
     from terrain.classify.held_out import Examples
     from terrain.classify.importance import ChannelImportance
-    from terrain.records import RunLog
 
 EXAMPLE = "terrain train --data runs/ --name field"
 
@@ -135,7 +134,11 @@ class TrainResult(Registered):
 
 @dataclass(frozen=True, repr=False)
 class RegisterResult(Registered):
-    """A model that was kept in a folder, and is registered now."""
+    """A model that was kept in a folder when the tracking server had stopped, and is registered now.
+
+    It becomes champion where there is none, or where it is better on the same data; on other data the two
+    cannot be compared any more.
+    """
 
     folder: str = described("that the model lay in")
 
@@ -150,57 +153,45 @@ def run(settings: Settings, progress: Progress = silent) -> TrainResult | Regist
         trained by then is kept in a folder, which the message names.
     """
     from pipelines.data.tracking import ensure_tracking
+    from pipelines.learn.cache import cached_data, loaders_of
     from pipelines.learn.parallel import computing
+    from pipelines.learn.tracking import log_training
+    from pipelines.learn.training_data import data_of_runs
 
+    ensure_tracking()
     if settings.kept is not None:
-        return register(settings.kept, settings.name)
+        return RegisterResult(**vars(log_training(settings.name, settings.kept)), folder=str(settings.kept))
+    asked = settings.with_(skip_short=settings.repair)
     with computing(settings.compute):
         if settings.cache is None:
             runs, skipped = load(settings)
-            found = train(runs, settings.with_(skip_short=settings.repair), settings.dataset, progress)
+            data = data_of_runs(runs, asked)
         else:
-            from pipelines.learn.cache import cached_data, loaders_of
-
-            ensure_tracking()
-            cached = loaders_of(settings), settings, settings.cache, progress, settings.recipe
-            data, skipped = cached_data(*cached)
-            found = train_on(data, settings, settings.dataset, progress)
+            data, skipped = cached_data(
+                loaders_of(settings), asked, settings.cache, progress, settings.recipe
+            )
+        found = train(data, asked, settings.dataset, progress)
     return replace(found, skipped=tuple(skipped))
 
 
 def train(
-    runs: Sequence[RunLog], settings: TrainingSettings, dataset: str, progress: Progress = silent
+    data: TrainingData, settings: TrainingSettings, dataset: str, progress: Progress = silent
 ) -> TrainResult:
-    """Evaluate, fit, track and register a recipe.
+    """Evaluate a recipe, fit it, find its limits, and track and register it.
+
+    The fits of the evaluation's first fold assignment also tell what each channel is worth.
 
     Parameters
     ----------
-    runs : labelled runs
-    settings : recipe, windows, seed, and the name of the registered model
+    data : labelled windows, as :func:`pipelines.learn.training_data.data_of_runs` makes them of runs
+    settings : that the data were made with, and the name of the registered model
     dataset : name of the data set, for the record
     progress : called as the work goes on
 
     Raises
     ------
     TerrainError
-        if the data do not suffice or the tracking folder cannot be written.
-    """
-    from pipelines.data.tracking import ensure_tracking
-    from pipelines.learn.training_data import data_of_runs
-    from terrain.classify.network_onnx import require_onnx
-
-    if settings.recipe.partition("@")[0] in NETWORKS:
-        require_onnx()
-    ensure_tracking()
-    return train_on(data_of_runs(runs, settings), settings, dataset, progress)
-
-
-def train_on(
-    data: TrainingData, settings: TrainingSettings, dataset: str, progress: Progress = silent
-) -> TrainResult:
-    """Evaluate a recipe, fit it, find its limits, and track and register it; parameters as :func:`train`.
-
-    The fits of the evaluation's first fold assignment also tell what each channel is worth.
+        if the data do not suffice, the model could not be stored, or the tracking store fails.
     """
     from features.motion import NO_MOTION
     from pipelines.data.tracking import code_commit, ui_line
@@ -285,39 +276,24 @@ def train_on(
     )
 
 
-def register(folder: Path, name: str) -> RegisterResult:
-    """Register a model that was kept in a folder when the tracking server had stopped.
-
-    It becomes champion where there is none, or where it is better on the same data; on other data the two
-    cannot be compared any more.
-
-    Raises
-    ------
-    ModelError
-        if there is no model, or it was not trained by ``train``.
-    TerrainError
-        if the tracking store fails again.
-    """
-    from pipelines.data.tracking import ensure_tracking
-    from pipelines.learn.tracking import log_training
-
-    ensure_tracking()
-    return RegisterResult(**vars(log_training(name, folder)), folder=str(folder))
-
-
 def _check_storable(data: TrainingData) -> None:
-    """Refuse a user's own classifier that could not be stored, before the work: by a fit on a few windows."""
+    """Refuse what could not be stored before the work; a user's own classifier by a fit on a few windows."""
     import numpy as np
     from sklearn.base import clone
 
     from features.own import FunctionExtractor
     from pipelines.learn.model_file import packed
+    from terrain.classify.grouped_network import GroupedNetwork
+    from terrain.classify.network_onnx import require_onnx
     from terrain.classify.own import OwnClassifier
+    from terrain.classify.stack import GroupedStack
     from terrain.errors import ModelError
 
     if isinstance(data.recipe[0], FunctionExtractor):
         raise ModelError("a model with features of your own cannot be stored: terrain crossval evaluates it")
     own = data.recipe[-1]
+    if isinstance(own, GroupedNetwork | GroupedStack):
+        require_onnx()
     if isinstance(own, OwnClassifier):
         terrain = data.samples.terrain
         rows = np.concatenate([np.flatnonzero(terrain == name)[:20] for name in np.unique(terrain)])

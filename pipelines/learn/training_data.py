@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,24 +45,12 @@ class TrainedRun(NamedTuple):
     n_windows: int
 
 
-class Named(Protocol):
-    """What names a run: its log, or what a cache keeps of it."""
-
-    @property
-    def run_id(self) -> str: ...  # noqa: D102
-    @property
-    def robot(self) -> str: ...  # noqa: D102
-    @property
-    def filter(self) -> str: ...  # noqa: D102
-
-
-def trained_runs(runs: Iterable[tuple[Named, str]], samples: Samples) -> tuple[TrainedRun, ...]:
-    """Return what is kept of runs, each beside its digest, in a model that is trained on their windows."""
+def trained_runs(runs: Iterable[tuple[str, str, str, str]], samples: Samples) -> tuple[TrainedRun, ...]:
+    """Return what is kept of runs, given by their first four fields, in a model trained on their windows."""
     found = []
-    for run, digest in runs:
-        terrain = samples.terrain[samples.run_id == run.run_id]
-        named = ", ".join(np.unique(terrain).tolist())
-        found.append(TrainedRun(run.run_id, run.robot, run.filter, digest, named, len(terrain)))
+    for run in runs:
+        terrain = samples.terrain[samples.run_id == run[0]]
+        found.append(TrainedRun(*run, ", ".join(np.unique(terrain).tolist()), len(terrain)))
     return tuple(found)
 
 
@@ -154,7 +142,7 @@ def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingDa
         recipe,
         feature_matrix(recipe, windows),
         window_motion(windows),
-        trained_runs([(run, data_digest([run])) for run in runs], samples),
+        trained_runs([(run.run_id, run.robot, run.filter, data_digest([run])) for run in runs], samples),
         data_digest(runs),
     )
 

@@ -12,7 +12,7 @@ import pytest
 from pipelines.cli import main as cli
 from pipelines.data.can_codec import QUATERNION, RECEIVED, SIGNALS, encode
 from pipelines.learn.model_file import TerrainModel, read_model
-from pipelines.learn.training_data import fitted_model
+from pipelines.learn.training_data import data_of_runs, fitted_model
 from terrain.angles import wrapped
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
@@ -96,7 +96,8 @@ def tracked(tmp_path_factory, runs):
     before, named = Path.cwd(), os.environ.pop("MLFLOW_TRACKING_URI", None)
     os.chdir(folder)
     try:
-        result = train(runs, TrainingSettings(name="drawn", repeats=1, n_jobs=1), "twelve runs")
+        asked = TrainingSettings(name="drawn", repeats=1, n_jobs=1)
+        result = train(data_of_runs(runs, asked), asked, "twelve runs")
         (model,) = Path("mlruns").rglob("model.skops")
         shutil.copytree(model.parent, "model")
     finally:

@@ -85,28 +85,51 @@ def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir, put)
     assert all(sentence.isprintable() for sentence in refusals)
 
 
-def test_a_model_of_another_package_is_foreign(model_dir, put, tmp_path):
-    other = LogisticRegression().fit([[0.0], [1.0]], [0, 1])
-    put(skops_io.dumps(other))
-    with pytest.raises(ModelError, match="holds a LogisticRegression, not a recipe of this package"):
-        read_model(model_dir)
-    put(skops_io.dumps(make_recipe("svm")))
-    with pytest.raises(ModelError, match="holds a recipe that was never fitted"):
-        read_model(model_dir)
-    put(skops_io.dumps(WindowPipeline([("scale", StandardScaler()), ("classify", other)])))
-    with pytest.raises(ModelError, match="holds a recipe that was never fitted"):
-        read_model(model_dir)
+def whole(recipe):
+    return skops_io.dumps(WindowPipeline(recipe))
 
 
-def test_a_type_that_is_not_on_the_list_is_named_and_never_called(model_dir, put, tmp_path):
-    marker = tmp_path / "called"
-    hostile = FunctionTransformer(os.mkdir, kw_args={"path": str(marker)})
-    put(skops_io.dumps(WindowPipeline([("features", hostile), ("last", LogisticRegression())])))
-    with pytest.raises(
-        ModelError, match=r"holds posix\.mkdir, a type that models of this package do not hold"
-    ):
+@pytest.mark.parametrize(
+    ("content", "sentence"),
+    [
+        (lambda: skops_io.dumps(OTHER), "holds a LogisticRegression, not a recipe of this package"),
+        (lambda: skops_io.dumps({"recipe": 3, "novelty": OTHER}), "holds a int, not a recipe"),
+        (lambda: skops_io.dumps(make_recipe("svm")), "holds a recipe that was never fitted"),
+        (
+            lambda: whole([("scale", StandardScaler()), ("last", OTHER)]),
+            "holds a recipe that was never fitted",
+        ),
+        (
+            lambda: whole(
+                [("make", FunctionTransformer(os.mkdir, kw_args={"path": "called"})), ("last", OTHER)]
+            ),
+            r"holds posix\.mkdir, a type that models of this package do not hold",
+        ),
+        (lambda: archive(b" " * (1 << 20), 17), "unpacks to"),
+        (lambda: archive(b"[" * 100_000, 1), "cannot be loaded"),
+    ],
+)
+def test_what_is_no_model_of_this_package_is_named_and_never_called(
+    model_dir, put, tmp_path, monkeypatch, content, sentence
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pipelines.learn.model_file.MAX_UNPACKED_BYTES", 1 << 24)
+    put(content())
+    with pytest.raises(ModelError, match=sentence):
         read_model(model_dir)
-    assert not marker.exists()
+    assert not (tmp_path / "called").exists()
+
+
+OTHER = LogisticRegression().fit([[0.0], [1.0]], [0, 1])
+
+
+def archive(content, n):
+    """Return an archive of a schema and further members of the same content."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
+        for number in range(n):
+            target.writestr(f"{number}.bin" if number else "schema.json", content)
+    return packed.getvalue()
 
 
 class Bomb:
@@ -197,18 +220,6 @@ def test_a_link_out_of_the_model_folder_is_refused(model_dir, tmp_path, name):
     (tmp_path / name).rename(model_dir / name)
     (tmp_path / "link").symlink_to(model_dir)
     read_model(tmp_path / "link")
-
-
-def test_an_archive_that_unpacks_to_gigabytes_or_nests_deep_is_refused(model_dir, put, monkeypatch):
-    monkeypatch.setattr("pipelines.learn.model_file.MAX_UNPACKED_BYTES", 1 << 24)
-    for content, fault in ((b" " * (1 << 20), "unpacks to"), (b"[" * 100_000, "cannot be loaded")):
-        packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-            for number in range(17 if fault == "unpacks to" else 1):
-                archive.writestr(f"{number}.bin" if number else "schema.json", content)
-        put(packed.getvalue())
-        with pytest.raises(ModelError, match=fault):
-            read_model(model_dir)
 
 
 def test_an_estimator_of_ones_own_is_refused_before_it_is_stored(model_dir, tmp_path):
