@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,36 +17,28 @@ from pipelines.drive.run_figures import run_figures
 from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report import (
-    NOT_KNOWN,
-    Bars,
     Column,
     Figure,
-    Line,
-    Mark,
     Pairs,
-    Panel,
     Part,
-    Points,
     Progress,
     Report,
     Result,
-    Strip,
     Table,
     Text,
     described,
-    format_value,
-    interval,
-    plural,
+    frame,
     sections,
     silent,
+    tree,
 )
-from pipelines.report.numbers import MINUS, NBSP
+from pipelines.report.numbers import MINUS, NBSP, NOT_KNOWN, format_value, interval, plural
 from pipelines.report.versions import versions
+from pipelines.slip.table import law_marks
 from terrain.control.comparison import Difference, MeanInterval
 from terrain.control.controllers import (
     TRACK,
     Controller,
-    Source,
     adapts,
     kind_of,
     make_controller,
@@ -67,7 +59,7 @@ from terrain.control.drive_evaluation import metric_label
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS
 from terrain.control.situations import COURSE, SITUATIONS, SLOPE, Situation, SituationOptions, make_situation
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.errors import ConfigError
+from terrain.records import RunLog
 from terrain.robots import load_robot
 
 if TYPE_CHECKING:
@@ -102,14 +94,10 @@ class DriveResult(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the metrics, a row for each controller and seed."""
-        import pandas as pd
-
-        return pd.DataFrame(
-            [
-                {"controller": name, "seed": seed, **metrics}
-                for name, rows in self.rows.items()
-                for seed, metrics in zip(self.seeds, rows, strict=True)
-            ]
+        return frame(
+            {"controller": name, "seed": seed, **metrics}
+            for name, rows in self.rows.items()
+            for seed, metrics in zip(self.seeds, rows, strict=True)
         )
 
     @cached_property
@@ -119,15 +107,7 @@ class DriveResult(Result):
 
 
 def run(settings: Settings, progress: Progress) -> DriveResult:
-    """Drive all controllers of the settings at the same seeds.
-
-    Raises
-    ------
-    ConfigError
-        if a controller does not exist on the robot or the table, or the situation does not.
-    TerrainError
-        if the robot, the table or the classifier cannot be read.
-    """
+    """Drive all controllers of the settings at the same seeds; what cannot be driven is refused before a training."""
     robot = load_robot(settings.robot)
     plant = None if settings.plant is None else load_robot(settings.plant)
     inputs = DriveInputs(robot, load_slip_table(settings.table, robot.name), plant=plant)
@@ -149,10 +129,8 @@ def check_drive(settings: Settings, inputs: DriveInputs) -> list[Controller]:
     ConfigError
         if a controller does not exist on the robot or the table, or the situation does not.
     """
-    controllers = [
-        make_controller(name, inputs.table, settings.delay_s, settings.ramp_mps2)
-        for name in settings.controllers
-    ]
+    delay_s, ramp_mps2 = settings.delay_s, settings.ramp_mps2
+    controllers = [make_controller(name, inputs.table, delay_s, ramp_mps2) for name in settings.controllers]
     for controller in controllers:
         LivePilot(inputs.robot, controller.table, None, controller.pilot)
     _situation(settings, inputs, settings.first_seed)
@@ -167,18 +145,9 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
     settings : what is driven
     inputs : robots, table, and the classifier where a controller needs one
     progress : of the drives
-
-    Raises
-    ------
-    ConfigError
-        if a setting is not accepted.
     """
     names, table = settings.controllers, inputs.table
     controllers = check_drive(settings, inputs)
-    if inputs.model is None:
-        for each in controllers:
-            if each.source is Source.CLASSIFIER:
-                raise ConfigError(f"controller {each.name!r} needs a classifier: give a model")
 
     def drive_all(
         task: str, controllers: Sequence[Controller], progress: Progress = progress
@@ -224,17 +193,9 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
     )
 
 
-def _situation(
-    settings: Settings, inputs: DriveInputs, seed: int, grade_deg: float | None = None
-) -> Situation:
-    options = SituationOptions(
-        duration_s=settings.duration_s,
-        speed_mps=1.0 if settings.speed_mps is None else settings.speed_mps,
-        accel_mps2=settings.accel_mps2,
-        grade_deg=settings.grade_deg if grade_deg is None else grade_deg,
-        radius_factors=settings.radius_factors,
-        leg_backlash_rad=settings.leg_backlash_rad,
-    )
+def _situation(settings: Settings, inputs: DriveInputs, seed: int) -> Situation:
+    chosen = {each.name: getattr(settings, each.name) for each in fields(SituationOptions)}
+    options = SituationOptions(**{name: value for name, value in chosen.items() if value is not None})
     return make_situation(settings.scenario, inputs.simulated, settings.terrain, seed, options)
 
 
@@ -242,10 +203,13 @@ def _drive_one(settings: Settings, inputs: DriveInputs, controller: Controller, 
     situation = _situation(settings, inputs, seed)
     log = drive_once(inputs, controller, situation)
     drive = evaluated(log, inputs.simulated, situation, controller, shown=seed == settings.first_seed)
+
+    def climb(grade_deg: float) -> RunLog:
+        steeper = settings.model_copy(update={"grade_deg": grade_deg})
+        return drive_once(inputs, controller, _situation(steeper, inputs, seed))
+
     if settings.scenario == SLOPE:
-        drive.metrics["steepest_deg"] = steepest_grade(
-            lambda grade_deg: drive_once(inputs, controller, _situation(settings, inputs, seed, grade_deg))
-        )
+        drive.metrics["steepest_deg"] = steepest_grade(climb)
     return drive
 
 
@@ -272,12 +236,12 @@ def report(result: DriveResult) -> Report:
         picture=_picture(result),
         parts=[*map(Text, belief_notes(compared)), Table(columns, means)],
         details=sections(
-            ("Who differs, and by how much", list(_difference_parts(compared, pairs))),
+            ("Who differs, and by how much", _difference_parts(compared, pairs)),
             ("Controllers", [Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
-            ("All figures", list(_metric_parts(result))),
-            ("The first seed, run by run", list(_run_parts(result))),
-            ("The curves behind the targets", list(_curve_parts(result.slip_table))),
-            ("Where these numbers come from", list(_provenance(result))),
+            ("All figures", _metric_parts(result)),
+            ("The first seed, run by run", _run_parts(result)),
+            ("The curves behind the targets", _curve_parts(result.slip_table)),
+            ("Where these numbers come from", _provenance(result)),
         ),
         next_step=f"terrain drive --faults all --robot {result.robot}",
     )
@@ -351,7 +315,7 @@ def _picture(result: DriveResult) -> Figure | None:
         values = [result.compared.value(name, key) for name in names]
         means = [math.nan if value.mean is None else value.mean for value in values]
         low, high = zip(*(value.ci or (math.nan, math.nan) for value in values), strict=True)
-        panels.append(Panel([Bars(metric_label(key).with_unit, names, means, low, high)]))
+        panels.append(tree.Panel([tree.Bars(metric_label(key).with_unit, names, means, low, high)]))
     n = len(result.seeds)
     caption = "One seed, which gives no interval."
     if n > 1:
@@ -362,11 +326,9 @@ def _picture(result: DriveResult) -> Figure | None:
     return Figure("What it costs, and what it brings", panels, caption) if panels else None
 
 
-def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) -> Iterator[Part]:
+def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) -> list[Part]:
     found = {(pair, key): compared.difference(*pair, key) for pair in pairs for key in compared.shown}
     keys = [key for key in compared.shown if any(found[pair, key] is not None for pair in pairs)]
-    if not keys:
-        return
     rows = [
         (f"{name} compared with {other}", *(_difference_text(found[(name, other), key], key) for key in keys))
         for name, other in pairs
@@ -376,7 +338,7 @@ def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) ->
         "interval excludes zero, which happens by chance in one of twenty. The energy per metre is over the "
         "distance that all travelled who travelled at least half of the longest."
     )
-    yield Table(("", *(metric_label(key).text for key in keys)), rows, note=note)
+    return [Table(("", *(metric_label(key).text for key in keys)), rows, note=note)] if keys else []
 
 
 def _difference_text(found: Difference | None, key: str) -> str:
@@ -406,12 +368,9 @@ def signed_difference(difference: float, key: str) -> str:
     return ("+" if difference > 0.0 else MINUS) + text
 
 
-def _metric_parts(result: DriveResult) -> Iterator[Part]:
-    """Yield all metrics, those that are compared first, and the names of those that no controller has."""
-    if text := SITUATIONS.get(result.scenario):
-        yield Text(text)
-    compared = result.compared
-    rows, undefined = [], []
+def _metric_parts(result: DriveResult) -> list[Part | str]:
+    """Return all metrics, those that are compared first, and the names of those that no controller has."""
+    compared, rows, undefined = result.compared, [], []
     known = [key for metrics in result.controllers.values() for key in metrics]
     for key in dict.fromkeys([*compared.shown, *known]):
         values = [compared.value(name, key) for name in result.controllers]
@@ -428,7 +387,8 @@ def _metric_parts(result: DriveResult) -> Iterator[Part]:
         note += " Controllers that do not use the terrain have no time to its target."
     if undefined:
         note += f" Not defined here: {', '.join(undefined)}."
-    yield Table(("metric", "key", *result.controllers), rows, note=note)
+    of_scenario = [text] if (text := SITUATIONS.get(result.scenario)) else []
+    return [*of_scenario, Table(("metric", "key", *result.controllers), rows, note=note)]
 
 
 def _metric_text(value: MeanInterval, n_seeds: int) -> str:
@@ -440,53 +400,47 @@ def _metric_text(value: MeanInterval, n_seeds: int) -> str:
     return f"{text} ({interval(*value.ci)})"
 
 
-def _run_parts(result: DriveResult) -> Iterator[Part]:
-    if result.examples:
-        yield Text(
-            "Above: desired and commanded speed, and the speed over ground. Below: the true slip, with the range "
-            "of the wheels, its estimate, the target, and the target with its floor: at least the slip of steady "
-            f"motion and a margin. Below {PEAK_ABOVE_MPS:g} m/s no slip is drawn. All drives have the same axes."
-        )
-        yield from run_figures(result.examples)
+def _run_parts(result: DriveResult) -> list[Part]:
+    """Return what the drives of the first seed were like; nothing without their curves."""
+    text = (
+        "Above: desired and commanded speed, and the speed over ground. Below: the true slip, with the range "
+        "of the wheels, its estimate, the target, and the target with its floor: at least the slip of steady "
+        f"motion and a margin. Below {PEAK_ABOVE_MPS:g} m/s no slip is drawn. All drives have the same axes."
+    )
+    return [Text(text), *run_figures(result.examples)] if result.examples else []
 
 
-def _curve_parts(table: SlipTable | None) -> Iterator[Part]:
-    """Yield the slip curves of a table, without measurements, which it does not hold."""
+def _curve_parts(table: SlipTable | None) -> list[Part]:
+    """Return the slip curves of a table, without measurements, which it does not hold."""
     if table is None or not table.curves:
-        return
+        return []
     panels = []
     for terrain, curve in table.curves.items():
-        measured = np.linspace(*curve.slip_range_ratio, 60)
-        beyond = np.linspace(curve.slip_range_ratio[1], 1.0, 30)
+        law, ranges = curve.thrust_ratio, (curve.slip_range_ratio, curve.peak_interval_ratio)
         targets = np.array([table.targets[terrain][state].slip_ratio for state in ("traction", "steady")])
-        marks: list[Mark] = [
-            Strip([(*curve.peak_interval_ratio, "peak slip, 90 %")]),
-            Line("law, in the slips measured", measured, curve.thrust_ratio(measured), 0),
-            Line("beyond", beyond, curve.thrust_ratio(beyond), 0, dashed=True),
-            Line("resistance", [0.0, 1.0], [curve.resistance_ratio] * 2, 6, dashed=True),
-            Points("targets of traction and steady motion", targets, curve.thrust_ratio(targets), colour=2),
-        ]
-        panels.append(Panel(marks, "thrust over load", f"{terrain}: {curve.law}, {curve.n_runs} runs"))
+        points = tree.Points("targets of traction and steady motion", targets, law(targets), colour=2)
+        marks = [*law_marks(law, *ranges, curve.resistance_ratio), points]
+        panels.append(tree.Panel(marks, "thrust over load", f"{terrain}: {curve.law}, {curve.n_runs} runs"))
     caption = (
         "The law fitted to measured runs, and the targets on it; the thrust above the resistance is available to "
         "accelerate and to climb."
     )
-    yield Figure(f"Slip curves of the table {table.name}", panels, caption, x_label="slip ratio")
+    return [Figure(f"Slip curves of the table {table.name}", panels, caption, x_label="slip ratio")]
 
 
-def _provenance(result: DriveResult) -> Iterator[Part]:
-    yield Text(
-        "Robot and terrain are models: controllers are compared on them, and what a robot in a field would do is "
-        "not predicted."
-    )
+def _provenance(result: DriveResult) -> list[Part | str]:
     first, last = result.seeds[0], result.seeds[-1]
-    yield Pairs(
-        [
-            ("seeds", f"{first} to {last}" if last > first else first),
-            ("delay from a sample to the wheel", result.delay_s, "", "s"),
-            ("table", result.table),
-            ("ramp", result.ramp_mps2, "", "m/s²"),
-            ("grade", result.grade_deg, "", "°"),
-            ("versions", versions()),
-        ]
-    )
+    return [
+        "Robot and terrain are models: controllers are compared on them, and what a robot in a field would do is "
+        "not predicted.",
+        Pairs(
+            [
+                ("seeds", f"{first} to {last}" if last > first else first),
+                ("delay from a sample to the wheel", result.delay_s, "", "s"),
+                ("table", result.table),
+                ("ramp", result.ramp_mps2, "", "m/s²"),
+                ("grade", result.grade_deg, "", "°"),
+                ("versions", versions()),
+            ]
+        ),
+    ]

@@ -19,25 +19,23 @@ from pipelines.drive.drive import ALL
 from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report import (
-    NOT_KNOWN,
     Column,
     Figure,
-    Line,
     Mark,
     Pairs,
-    Panel,
     Progress,
     Report,
     Result,
     Shown,
-    Strip,
     Table,
     described,
-    plural,
+    frame,
     sections,
     silent,
     table,
+    tree,
 )
+from pipelines.report.numbers import NOT_KNOWN, plural
 from pipelines.report.versions import versions
 from terrain.control.fault_drives import (
     CleanDrive,
@@ -110,21 +108,11 @@ class FaultsResult(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the drives with a fault, a row each."""
-        import pandas as pd
-
-        return pd.DataFrame([row.as_json() for row in self.rows])
+        return frame(self.rows)
 
 
 def run(settings: Settings, progress: Progress) -> FaultsResult:
-    """Drive each fault in each situation, and evaluate what the controller makes of it.
-
-    Raises
-    ------
-    ConfigError
-        if a fault, a situation or a terrain is unknown, or the robot is no swerve robot with all sections.
-    TerrainError
-        if the robot or the table cannot be read.
-    """
+    """Drive each fault in each situation, and evaluate what the controller makes of it."""
     robot = checked_robot(settings)
     if settings.table is not None:
         slips = load_slip_table(settings.table, robot.name)
@@ -243,30 +231,32 @@ def fault_figure(case: FaultCase, driven: Driven, references: References) -> Fig
     """
     drive, plain, start_s = driven.drive, references.plain, references.start_s
     time_s, last_s = drive.time_s, float(drive.time_s[-1])
-    acts = Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])
+    acts = tree.Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])
     estimated = np.where(np.abs(driven.speed_mps) < FASTEST_MPS, driven.speed_mps, math.nan)
     shown_s = max(start_s - BEFORE_S, 0.0), last_s
     speeds: list[Mark] = [
         acts,
-        Line("desired", time_s, drive.desired_mps, 6, dashed=True),
-        Line("commanded", time_s, drive.commanded_mps, 2),
-        Line("over ground, true", time_s, drive.speed_mps, 0),
-        Line("over ground, estimated", time_s, estimated, 1),
+        tree.Line("desired", time_s, drive.desired_mps, 6, dashed=True),
+        tree.Line("commanded", time_s, drive.commanded_mps, 2),
+        tree.Line("over ground, true", time_s, drive.speed_mps, 0),
+        tree.Line("over ground, estimated", time_s, estimated, 1),
     ]
     slips: list[Mark] = [
         acts,
-        Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
-        Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
-        Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
-        Line("estimated", time_s, drive.slip_ratio, 1),
+        tree.Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
+        tree.Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
+        tree.Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
+        tree.Line("estimated", time_s, drive.slip_ratio, 1),
     ]
+    ok: list[Mark] = [acts, tree.Line("", time_s, drive.ok.astype(float), 2)]
+    panels = (
+        (speeds, "speed [m/s]", (-0.5, 2.0)),
+        (slips, "slip ratio", (-1.1, 1.1)),
+        (ok, "status is OK", None),
+    )
     return Figure(
         f"{case.fault}, {duration_text(case.duration_s)}: {case.situation} on {case.terrain}, seed {case.seed}",
-        [
-            Panel(speeds, "speed [m/s]", x_range=shown_s, y_range=(-0.5, 2.0)),
-            Panel(slips, "slip ratio", x_range=shown_s, y_range=(-1.1, 1.1)),
-            Panel([acts, Line("", time_s, drive.ok.astype(float), 2)], "status is OK", x_range=shown_s),
-        ],
+        [tree.Panel(marks, label, x_range=shown_s, y_range=y_range) for marks, label, y_range in panels],
         x_label="time [s]",
     )
 

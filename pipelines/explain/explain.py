@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ from pydantic import field_validator
 from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipelines.explain.explanation import ExplainResult
@@ -63,24 +65,17 @@ class Settings(ExplainOptions, AlignedRunsSettings):
 
 
 def run(settings: Settings, progress: Progress) -> ExplainResult:
-    """Read runs, explain them, and write the page, the extended robot and the next drive.
+    """Read runs, explain them as :func:`explain_runs`, and write the page, the extended robot and the next drive.
 
     Raises
     ------
     ConfigError
-        if the robot, the model or an effect is not accepted, or ``out`` has an extended description already.
-    DataError
-        if the runs are of another robot, too few, or cannot be compared with the simulation.
-    TerrainError
-        if runs cannot be read, or ``out`` cannot be written.
+        if the model is another robot's or has no covariance, or ``out`` has an extended description already.
     """
-    from dataclasses import replace
-
     import numpy as np
     import yaml
 
     from terrain.discrepancy.extend import extended_effects
-    from terrain.errors import ConfigError
     from terrain.extension import extended_yaml
     from terrain.files.atomic import atomic_write, ensure_writable
     from terrain.robots import load_robot
@@ -156,8 +151,6 @@ def explain_runs(
     DataError
         if the runs are of another robot, too few, or cannot be compared with the simulation.
     """
-    from dataclasses import replace
-
     from pipelines.explain.explanation import ExplainResult
     from pipelines.report import silent
     from terrain.discrepancy.diagnosed_runs import diagnose_runs, held_out_gain

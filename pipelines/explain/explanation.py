@@ -8,21 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.explain import figures
-from pipelines.report import (
-    Column,
-    Pairs,
-    Part,
-    Report,
-    Result,
-    Section,
-    Table,
-    Text,
-    described,
-    enumerated,
-    format_value,
-    sentence,
-)
+from pipelines.report import Column, Pairs, Part, Report, Result, Section, Table, Text, described
 from pipelines.report.json_file import as_json
+from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.versions import versions
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
@@ -41,14 +29,8 @@ from terrain.discrepancy.sentences import (
     varying_text,
     verdict_text,
 )
-from terrain.discrepancy.statements import (
-    SESSION_COLUMNS,
-    Statement,
-    notes_of,
-    session_rows,
-    split_ruled_out,
-)
-from terrain.discrepancy.verdict import Diagnosis
+from terrain.discrepancy.statements import SESSION_COLUMNS, Statement, notes_of, session_rows, split_ruled_out
+from terrain.discrepancy.verdict import Diagnosis, Value
 from terrain.effects import effect_named
 from terrain.robots import Robot
 
@@ -140,22 +122,19 @@ class ExplainResult(Result):
         """Return the parameters of the named causes, a row each."""
         import pandas as pd
 
-        return pd.DataFrame(
-            [
-                {"cause": cause.name, **value._asdict(), "held_out_gain": cause.gain, "z": cause.z}
-                for cause in self.diagnosis.causes
-                for value in cause.values  # noqa: PD011
-            ],
-            columns=["cause", "name", "value", "unit", "low", "high", "held_out_gain", "z"],
-        )
+        rows = [
+            {"cause": cause.name, **value._asdict(), "held_out_gain": cause.gain, "z": cause.z}
+            for cause in self.diagnosis.causes
+            for value in cause.values  # noqa: PD011
+        ]
+        return pd.DataFrame(rows, columns=["cause", *Value._fields, "held_out_gain", "z"])
 
 
 def report(result: ExplainResult) -> Report:
     """Return what the simulation gets wrong and the gain, then the causes, then all that they rest on."""
     diagnosis, runs = result.diagnosis, result.diagnosed
-    lead = [f"{diagnosis.n_runs} runs compared"]
-    if runs.held_out:
-        lead.append(f"{len(runs.held_out)} held out for the gain")
+    held_out = f"{len(runs.held_out)} held out for the gain" if runs.held_out else ""
+    lead = f"{diagnosis.n_runs} runs compared", held_out, result.data, result.terrain
     picture = None
     if shown := result.gain.judged or runs.compared:  # held-out runs where there are any
         stretch = example_stretch(shown, runs.noise)
@@ -168,7 +147,7 @@ def report(result: ExplainResult) -> Report:
         picture=picture,
         parts=list(_decisive_parts(result)),
         details=[section for section in _details(result) if section.parts],
-        lead=" · ".join([*lead, *filter(None, (result.data, result.terrain))]),
+        lead=" · ".join(filter(None, lead)),
     )
     worded: Report = in_words_of(result.robot.drive, written)
     return replace(worded, next_step=result.next_command or "")
@@ -206,24 +185,20 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
 def _causes(result: ExplainResult) -> Table:
     rows: list[tuple[Any, ...]] = []
     notes = ["Values are added to what the description has already."]
-    varying = {each.name for each in result.diagnosis.varying}
+    varying = [each.name for each in result.diagnosis.varying]
     for cause in result.diagnosis.causes:
-        label, terms = effect_label(cause.name), result.terms.get(cause.name, "")
+        label = effect_label(cause.name)
+        beside: tuple[Any, ...] = (cause.gain, cause.z, result.terms.get(cause.name, ""))
         for place, value in enumerate(cause.values):
             numbers = quantity(value.name, value.value), quantity_interval(value)
-            rows.append(
-                ("", *numbers, None, None, "") if place else (label, *numbers, cause.gain, cause.z, terms)
-            )
+            rows.append(("", *numbers, None, None, "") if place else (label, *numbers, *beside))
         if cause.aliases:
             aliases = enumerated([effect_label(alias) for alias in cause.aliases])
             notes.append(f"No log distinguishes {label} from {aliases}.")
         if cause.caveat and cause.name not in varying:
             notes.append(f"{label}: {cause.caveat}.")
-    columns = (
-        *("cause", "value", "95 %", Column("held-out gain", PERCENT), Column("z", Z)),
-        Column("the robot has", long=True),
-    )
-    return Table(columns, rows, note=" ".join(notes))
+    gain, terms = Column("held-out gain", PERCENT), Column("the robot has", long=True)
+    return Table(("cause", "value", "95 %", gain, Column("z", Z), terms), rows, note=" ".join(notes))
 
 
 def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:
@@ -254,9 +229,8 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
     for name, own in gain.channels.items():
         ratio, low, high = own.reduction
         remark = "" if not own.reduction.refused else "worse" if high < 0.0 else "no gain to claim"
-        black_box = learned[name].ratio if name in learned else None
-        sizes = (own.rms_before, own.rms_after, ratio, (low, high))
-        gains.append((*CHANNEL_WORDS[name], *sizes, remark, black_box))
+        sizes, black_box = (own.rms_before, own.rms_after), learned[name].ratio if name in learned else None
+        gains.append((*CHANNEL_WORDS[name], *sizes, ratio, (low, high), remark, black_box))
     excluded = enumerated([run.run_id for run in gain.excluded])
     note = (
         f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "
@@ -273,8 +247,7 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
         note=f"{note} Excluded as unfit: {excluded}." if excluded else note,
     )
     for kind, words in COMPARISON_TITLES.items():
-        compared = found.comparisons.get(kind)
-        if compared is None:
+        if (compared := found.comparisons.get(kind)) is None:
             continue
         title = words.format(name=compared.name)
         if compared.reason:
@@ -291,28 +264,18 @@ def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
     """Yield the effects that were withdrawn, what is left unexplained, and the effects that are ruled out."""
     withdrawn, ruled_out = split_ruled_out(diagnosis)
     if withdrawn:
-        rows = [
-            (
-                effect_label(each.name),
-                " and ".join(map(value_with_interval, each.values)),
-                sentence(each.reason),
-                each.z,
-            )
-            for each in withdrawn
-        ]
+        rows: list[tuple[Any, ...]] = []
+        for each in withdrawn:
+            values = " and ".join(map(value_with_interval, each.values))
+            rows.append((effect_label(each.name), values, sentence(each.reason), each.z))
         note = "These effects reduce the residual, and something speaks against each as its cause."
         yield Table(("withdrawn", "value it would have", WHY, Column("z", Z)), rows, note=note)
     if diagnosis.unexplained:
         alike = {each.name: f"resembles {effect_label(each.name)}, which was withdrawn" for each in withdrawn}
-        unexplained = [
-            (
-                channel_label(left.channel),
-                alike.get(left.input, f"depends on {left.input}"),
-                left.z,
-                left.ratio or None,
-            )
-            for left in diagnosis.unexplained
-        ]
+        unexplained = []
+        for left in diagnosis.unexplained:
+            how = alike.get(left.input, f"depends on {left.input}")
+            unexplained.append((channel_label(left.channel), how, left.z, left.ratio or None))
         note = (
             "Beside all causes the residual of the channel depends on the input, and no effect of the library "
             "explains it. The input is the clearest of some thirty that were tried."
@@ -348,22 +311,31 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         whole = telling_runs(whole, runs.noise, result.n_pictures)
     drawn = [figures.run_figure(run, runs.noise, channels_of([run])) for run in whole]
     yield Section("Whole runs", drawn)
-    yield Section("What would not have been detected", list(_limit_parts(diagnosis)))
+    missed = [limit.name for limit in diagnosis.not_excited]
+    limits: list[Part] = []
+    for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
+        listed = [limit for limit in diagnosis.limits if (limit.name in missed) is is_missed]
+        if listed:
+            texts = [(limit_text(limit, is_missed), limit.needs) for limit in listed]
+            limits.append(Table((Column(title, long=True), NEEDS), texts))
+    meaning = "Not detected does not mean absent: at its limit an effect is found nine times in ten."
+    yield Section("What would not have been detected", [*limits, Text(meaning, "note")])
     health: list[Part] = []
     if diagnosis.excluded_runs:
         health.append(Table(("excluded run", WHY), diagnosis.excluded_runs))
     if diagnosis.clocks:
         behind = Column("IMU and camera behind the wheels", ".1f", "ms")
-        columns = ("clock of the run", behind, Column("standard deviation", ".1f", "ms"))
         clocks = [(each.run_id, 1e3 * each.offset_s, 1e3 * each.std_s) for each in diagnosis.clocks]
-        health.append(Table(columns, clocks))
+        health.append(
+            Table(("clock of the run", behind, behind._replace(title="standard deviation")), clocks)
+        )
     yield Section("Health of the logs", health)
     built_in = [f"{name} {format_value(value)}" for name, value in runs.simulation.effects.items()]
     provenance: list[tuple[Any, ...]] = [
         ("data", f"{result.data} ({result.data_digest[:12]})"),
         ("description", result.description),
         ("effects built in already", ", ".join(built_in) or "none"),
-        ("terrain", "; ".join(match.text for match in runs.terrains)),
+        ("terrain", "; ".join([match.text for match in runs.terrains])),
         ("effects that may be named", f"{len(result.effects)}: {enumerated(result.effects)}"),
         ("runs behind the diagnosis", enumerated([run.run_id for run in runs.used])),
         ("runs held out, drawn by the seed", enumerated([run.run_id for run in runs.held_out]) or "none"),
@@ -371,19 +343,6 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         ("versions", versions()),
     ]
     yield Section("Where these numbers come from", [Pairs(provenance)])
-
-
-def _limit_parts(diagnosis: Diagnosis) -> Iterator[Part]:
-    """Yield what would not have been detected: first the effects that the driving did not excite."""
-    missed = {limit.name for limit in diagnosis.not_excited}
-    for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
-        listed = [limit for limit in diagnosis.limits if (limit.name in missed) is is_missed]
-        if listed:
-            texts = [(limit_text(limit, is_missed), limit.needs) for limit in listed]
-            yield Table((Column(title, long=True), NEEDS), texts)
-    yield Text(
-        "Not detected does not mean absent: at its limit an effect is found nine times in ten.", "note"
-    )
 
 
 def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
@@ -414,8 +373,7 @@ def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
     )
     if compared:
         channels = channels_of(compared)
-        yield figures.strongest_figure(compared, channels)
+        strongest, every = figures.dependence_figures(compared, runs.noise, channels)
+        yield strongest
         yield figures.spectra_figure(compared, runs.noise, runs.low_pass.cutoff_hz, channels)
-        yield Section(
-            "Every input", [figures.dependence_figure(compared, runs.noise, name) for name in channels]
-        )
+        yield Section("Every input", every)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.report import Band, Figure, Line, Mark, Panel, Points
+from pipelines.report import Figure, Mark, tree
 from terrain.discrepancy.channel_words import CHANNEL_WORDS, INPUT_LABELS
 from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, spread_of, strongest_input
 from terrain.discrepancy.noise import Noise
@@ -22,6 +22,9 @@ BAND_STDS = 2.0
 
 MEASURED, BEFORE, AFTER = "measured", "simulated", "with the causes built in"
 BLUE, VERMILION, GREY = 0, 1, 6
+AXIS = "{} [{}]"
+"""Of what a channel is called, and its unit."""
+
 LEAST_POWER = 1e-300
 """Under the logarithm of a spectrum."""
 
@@ -41,15 +44,15 @@ def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figur
     panels = []
     for name in channels:
         c = CHANNELS.index(name)
-        measured = run.measured[:, c]
+        measured, band = run.measured[:, c], bands[:, c]
         marks: list[Mark] = [
-            Band("noise, 95 %", run.time_s, measured - bands[:, c], measured + bands[:, c], GREY),
-            Line(MEASURED, run.time_s, measured, GREY),
-            Line(BEFORE, run.time_s, run.before[:, c], VERMILION),
+            tree.Band("noise, 95 %", run.time_s, measured - band, measured + band, GREY),
+            tree.Line(MEASURED, run.time_s, measured, GREY),
+            tree.Line(BEFORE, run.time_s, run.before[:, c], VERMILION),
         ]
         if run.after is not None:
-            marks.append(Line(AFTER, run.time_s, run.after[:, c], BLUE))
-        panels.append(_panel(name, marks))
+            marks.append(tree.Line(AFTER, run.time_s, run.after[:, c], BLUE))
+        panels.append(tree.Panel(marks, AXIS.format(*CHANNEL_WORDS[name])))
     held_out = ", held out of the diagnosis" if run.held_out else ""
     title = f"{run.run_id}{f', {run.terrain}' if run.terrain else ''}{held_out}"
     caption = (
@@ -59,45 +62,65 @@ def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figur
     return Figure(title, panels, caption, x_label="time in the run [s]")
 
 
-def strongest_figure(runs: Sequence[ComparedRun], channels: Sequence[str]) -> Figure:
-    """Return the mean residual of each channel over the input on which it depends most."""
-    panels = [_means(runs, name, strongest_input(runs, name)) for name in channels]
+def dependence_figures(
+    runs: Sequence[ComparedRun], noise: Noise, channels: Sequence[str]
+) -> tuple[Figure, list[Figure]]:
+    """Return the mean residual of each channel over the input on which it depends most, and over every one.
+
+    Parameters
+    ----------
+    runs : compared
+    noise : of the fit runs
+    channels : names
+
+    Returns
+    -------
+    strongest : a panel a channel
+    every : a figure a channel: panels of every input that varies, of time and of run
+    """
+    strongest, every = [], []
+    for name in channels:
+        c, axis = CHANNELS.index(name), AXIS.format(*CHANNEL_WORDS[name])
+        residuals, most = _residuals(runs, c), strongest_input(runs, name)
+        panels = {}
+        for key in runs[0].inputs:
+            given = [run.inputs[key] for run in runs]
+            if key == most or spread_of(runs, key) > MIN_SPREAD:
+                marks = [
+                    _points(kind, *binned_means(given, left), colour) for kind, colour, left in residuals
+                ]
+                panels[key] = tree.Panel(marks, axis, x_label=INPUT_LABELS[key])
+        strongest.append(panels[most])
+        at, sizes = np.arange(1.0, len(runs) + 1), [noise.size(run.pace_mps)[:, c] for run in runs]
+        marks = [
+            _points(kind, at, *run_means(left, sizes, noise.filters[c]), colour)
+            for kind, colour, left in residuals
+        ]
+        caption = (
+            "Measured minus simulated. Intervals are over runs; those of single runs come from the noise, and do "
+            "not include differences from run to run. Turn: wheel speed right minus left, or last minus first "
+            "wheel."
+        )
+        panels["run"] = tree.Panel(marks, axis, x_label="run")
+        every.append(Figure(channel_label(name), list(panels.values()), caption))
     caption = (
         "Measured minus simulated: means over bins of the input on which the residual depends most, with 95 % "
         "intervals over runs. A residual that is noise depends on nothing: its means lie on zero."
     )
-    return Figure("What each channel depends on most", panels, caption)
-
-
-def dependence_figure(runs: Sequence[ComparedRun], noise: Noise, channel: str) -> Figure:
-    """Return the mean residual of a channel over every input, time and run."""
-    panels = [_means(runs, channel, key) for key in runs[0].inputs if spread_of(runs, key) > MIN_SPREAD]
-    c, at = CHANNELS.index(channel), np.arange(1.0, len(runs) + 1)
-    sizes = [noise.size(run.pace_mps)[:, c] for run in runs]
-    marks = []
-    for kind, colour, residuals in _residuals(runs, c):
-        marks.append(_points(kind, at, *run_means(residuals, sizes, noise.filters[c]), colour))
-    panels.append(_panel(channel, marks, "run"))
-    caption = (
-        "Measured minus simulated. Intervals are over runs; those of single runs come from the noise, and do "
-        "not include differences from run to run. Turn: wheel speed right minus left, or last minus first "
-        "wheel."
-    )
-    return Figure(channel_label(channel), panels, caption)
+    return Figure("What each channel depends on most", strongest, caption), every
 
 
 def parts_figure(parts: Sequence[PartValues]) -> Figure:
     """Return the value of each cause in thirds of the time and in halves of the runs."""
     panels = []
     for each in parts:
-        at = np.arange(1.0, len(each.parts) + 1)
-        values = np.array([part.value for part in each.parts])
-        halves = np.array([part.half for part in each.parts])
-        ends = np.array([0.5, len(each.parts) + 0.5])
-        band = Band("all runs, 95 %", ends, np.full(2, each.value.low), np.full(2, each.value.high), GREY)
+        at, ends = np.arange(1.0, len(each.parts) + 1), np.array([0.5, len(each.parts) + 0.5])
+        values, halves = np.array([(part.value, part.half) for part in each.parts]).T
+        low, high = np.full(2, each.value.low), np.full(2, each.value.high)
         title = f"{each.value.name}: {quantity(each.value.name, each.value.value)}"
-        panels.append(Panel([band, _points("a part", at, values, halves, BLUE)], each.value.unit, title))
-    names = "; ".join(f"{i}: {part.name}" for i, part in enumerate(parts[0].parts, start=1))
+        band = tree.Band("all runs, 95 %", ends, low, high, GREY)
+        panels.append(tree.Panel([band, _points("a part", at, values, halves, BLUE)], each.value.unit, title))
+    names = "; ".join([f"{i}: {part.name}" for i, part in enumerate(parts[0].parts, start=1)])
     caption = (
         "The value of each cause fitted to a part of the data: thirds of each run's time, and halves of the "
         f"runs. Bars and band: 95 % intervals. {names}."
@@ -113,25 +136,23 @@ def spectra_figure(
     panels = []
     for name in channels:
         c, unit = CHANNELS.index(name), CHANNEL_WORDS[name][1]
-        marks = []
-        for kind, colour, residuals in _residuals(runs, c):
-            frequency_hz, density = spectrum(residuals, rate_hz)
-            marks.append(Line(kind, frequency_hz, _decibels(density), colour))
+        curves = [
+            (kind, *spectrum(residuals, rate_hz), colour) for kind, colour, residuals in _residuals(runs, c)
+        ]
         power = float(np.concatenate([noise.size(run.pace_mps)[:, c] ** 2 for run in runs]).mean())
-        frequency_hz = np.geomspace(frequency_hz[0], rate_hz / 2, 100)
-        density = power * noise_spectrum(noise.filters[c], frequency_hz, rate_hz)
-        marks.append(Line("noise", frequency_hz, _decibels(density), GREY, dashed=True))
-        panels.append(Panel(marks, f"dB of ({unit})²/Hz", channel_label(name), log_x=True))
+        frequency_hz = np.geomspace(curves[0][1][0], rate_hz / 2, 100)
+        shape = noise_spectrum(noise.filters[c], frequency_hz, rate_hz)
+        curves.append(("noise", frequency_hz, power * shape, GREY))
+        marks = [
+            tree.Line(kind, at_hz, 10.0 * np.log10(np.maximum(density, LEAST_POWER)), colour, kind == "noise")
+            for kind, at_hz, density, colour in curves
+        ]
+        panels.append(tree.Panel(marks, f"dB of ({unit})²/Hz", channel_label(name), log_x=True))
     caption = (
         "Spectrum of measured minus simulated, mean over runs. A line above that of the noise is more than "
         f"noise. Beyond the cut-off of the low-pass, {cutoff_hz:.2g} Hz, nothing is compared."
     )
     return Figure("At which frequencies", panels, caption, x_label="frequency [Hz]")
-
-
-def _panel(channel: str, marks: Sequence[Mark], x_label: str = "") -> Panel:
-    words, unit = CHANNEL_WORDS[channel]
-    return Panel(marks, f"{words} [{unit}]", x_label=x_label)
 
 
 def _residuals(runs: Sequence[ComparedRun], c: int) -> list[tuple[str, int, list[Array]]]:
@@ -140,20 +161,7 @@ def _residuals(runs: Sequence[ComparedRun], c: int) -> list[tuple[str, int, list
     return [(kind, colour, [run.residual(after)[:, c] for run in runs]) for kind, colour, after in kinds]
 
 
-def _means(runs: Sequence[ComparedRun], channel: str, key: str) -> Panel:
-    """Return the mean residual of a channel over an input, before and after."""
-    given, marks = [run.inputs[key] for run in runs], []
-    for kind, colour, residuals in _residuals(runs, CHANNELS.index(channel)):
-        marks.append(_points(kind, *binned_means(given, residuals), colour))
-    return _panel(channel, marks, INPUT_LABELS[key])
-
-
-def _points(label: str, at: Array, values: Array, halves: Array, colour: int) -> Points:
+def _points(label: str, at: Array, values: Array, halves: Array, colour: int) -> tree.Points:
     """Return values with their intervals; one that is not known has none."""
     halves = np.nan_to_num(halves)
-    return Points(label, at, values, values - halves, values + halves, colour)
-
-
-def _decibels(density: Array) -> Array:
-    decibels: Array = 10.0 * np.log10(np.maximum(density, LEAST_POWER))
-    return decibels
+    return tree.Points(label, at, values, values - halves, values + halves, colour)

@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -22,6 +23,9 @@ from pipelines.report.tree import Figure, Part, Report, Section
 ASSETS = Path(__file__).parent / "assets"
 DIGITS = 6
 """Significant digits of what a figure draws: more than can be seen."""
+
+MAX_POINTS = 2000
+"""More points of a line than this are more than a page can show."""
 
 MAX_SVG_BYTES = 300_000
 """A figure of a fragment that needs more as lines becomes points."""
@@ -104,9 +108,9 @@ def figure_data(figure: Figure) -> dict[str, Any]:
     """
     panels = [
         {
-            **_shortened(as_json(panel)),
+            **_shortened(vars(panel) | {"marks": ()}),
             "marks": [
-                {"kind": type(mark).__name__.lower(), **_shortened(as_json(mark))} for mark in panel.marks
+                {"kind": type(mark).__name__.lower(), **_shortened(mark._asdict())} for mark in panel.marks
             ],
         }
         for panel in figure.panels
@@ -115,14 +119,16 @@ def figure_data(figure: Figure) -> dict[str, Any]:
 
 
 def _shortened(value: Any) -> Any:
-    """Return what JSON holds of a figure, its numbers with no more digits than can be seen."""
+    """Return what JSON holds of a figure, with no more points and digits of numbers than can be seen."""
+    if isinstance(value, np.ndarray):
+        value = value[:: max(1, len(value) // MAX_POINTS)].tolist()
     if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}")
-    if isinstance(value, list):
+        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+    if isinstance(value, list | tuple):
         return [_shortened(each) for each in value]
     if isinstance(value, dict):
         return {key: _shortened(each) for key, each in value.items()}
-    return value
+    return as_json(value)
 
 
 @cache

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from pipelines.report import Progress, Result
 
 EXAMPLE = "terrain calibrate --data raw/ --robot agrimaro --out mine.yaml"
+RESULTS = ("pipelines.slip.robot", "pipelines.slip.odometry", "pipelines.slip.soil")
+"""Modules of the kinds, with their results."""
 
 LAW_NAMES = (
     "simulator",

@@ -9,29 +9,22 @@ from typing import Any
 import numpy as np
 
 from pipelines.report import (
-    Band,
     Figure,
-    Line,
     Mark,
-    Panel,
     Part,
-    Points,
     Progress,
     Report,
     Shown,
-    Strip,
     Text,
     described,
-    enumerated,
-    format_value,
-    interval,
-    plural,
     sections,
     table,
+    tree,
 )
 from pipelines.report.json_file import as_json
+from pipelines.report.numbers import enumerated, format_value, interval, plural
 from pipelines.slip.shown import file_name, first_rows, named
-from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of
+from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of, law_marks
 from terrain.control.learned_table import learned_table, run_row, terrain_row
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.errors import DataError
@@ -90,24 +83,14 @@ def learn_curves(
 
 
 def log_curves(result: LearnedCurves) -> str:
-    """Log table, rows and figures with MLflow; return the id of the run there.
-
-    Raises
-    ------
-    TerrainError
-        if the tracking folder cannot be written or the server cannot be reached.
-    """
+    """Log table, rows and figures with MLflow; return the id of the run there."""
     from pipelines.data.tracking import code_commit, log_run, mlflow_store
     from pipelines.report.drawing import figure_png
 
     assert result.table is not None
     params = {key: getattr(result, key) for key in ("robot", "filter", "dataset", "n_runs")}
-    tags = {
-        "data_digest": result.data_digest,
-        "commit": code_commit(),
-        "seed": str(result.seed),
-        "kind": "slip table",
-    }
+    tags = {"data_digest": result.data_digest, "seed": str(result.seed)}
+    tags |= {"commit": code_commit(), "kind": "slip table"}
     files = {
         result.table.name: result.table.read_bytes(),
         "learn_slip.json": {"terrains": as_json(result.terrains)},
@@ -165,13 +148,11 @@ def report(result: LearnedCurves) -> Report:
     """Return curve and targets a terrain, and why some are not learned."""
     rows = named(result.terrains)
     assumed = [row for row in rows if row["status"] is not TargetStatus.ESTIMATED]
-    learned = enumerated(
-        [
-            f"{format_value(row['targets']['traction']['slip_ratio'], SLIP)} on {row['terrain']}"
-            for row in rows
-            if row not in assumed
-        ]
-    )
+    learned = [
+        f"{format_value(row['targets']['traction']['slip_ratio'], SLIP)} on {row['terrain']}"
+        for row in rows
+        if row not in assumed
+    ]
     first, all_terrains = first_rows(rows, TERRAINS, f"target slip of {result.robot}")
     parts: list[Part] = [first]
     parts += [
@@ -197,7 +178,7 @@ def report(result: LearnedCurves) -> Report:
     return Report(
         f"Target slips of {result.robot}",
         f"Target slips of {result.robot} are learned on {len(rows) - len(assumed)} of {len(rows)} terrains, from "
-        f"{plural(result.n_runs, 'run')}{': in traction ' + learned if learned else ''}.",
+        f"{plural(result.n_runs, 'run')}{': in traction ' + enumerated(learned) if learned else ''}.",
         result.pictures.get("all_terrains"),
         parts,
         sections(
@@ -217,49 +198,43 @@ def curve_figures(learned: Sequence[LearnedTerrain], robot: str) -> dict[str, Fi
         "Bins of each run with one standard deviation, the law with its 90 % band over runs, the 90 % interval "
         "of the peak slip, the resistance, and the targets."
     )
-    panels = {entry.terrain: (curve_panel(entry), _headline(entry)) for entry in learned}
-    figures = {
-        terrain: Figure(f"{terrain}, {robot}: {headline}", (panel,), caption, x_label="slip ratio")
-        for terrain, (panel, headline) in panels.items()
-    }
+    figures, panels = {}, []
+    for entry in learned:
+        panel, headline = curve_panel(entry), _headline(entry)
+        panels.append(replace(panel, title=f"{entry.terrain}: {headline}"))
+        title = f"{entry.terrain}, {robot}: {headline}"
+        figures[entry.terrain] = Figure(title, (panel,), caption, x_label="slip ratio")
     if learned:
-        titled = [
-            replace(panel, title=f"{terrain}: {headline}") for terrain, (panel, headline) in panels.items()
-        ]
-        figures["all_terrains"] = Figure(f"slip curves of {robot}", titled, caption, x_label="slip ratio")
+        figures["all_terrains"] = Figure(f"slip curves of {robot}", panels, caption, x_label="slip ratio")
     return figures
 
 
-def curve_panel(entry: LearnedTerrain) -> Panel:
+def curve_panel(entry: LearnedTerrain) -> tree.Panel:
     """Return bins of the runs on one terrain, and its law with peak, resistance and targets."""
     marks: list[Mark] = []
-    shown = [0.0]
+    shown = [0.1, 0.0]
     if entry.runs_with_bins:
         slip, thrust, std = (
             np.concatenate([getattr(run.bins, name) for run in entry.runs_with_bins])
             for name in ("slip_ratio", "traction_ratio", "traction_std")
         )
-        marks.append(Points("bins of each run, ± 1 std", slip, thrust, thrust - std, thrust + std, 6))
+        marks.append(tree.Points("bins of each run, ± 1 std", slip, thrust, thrust - std, thrust + std, 6))
         shown += thrust.tolist()
     if (curve := entry.curve) is not None:
         slips, low, high = curve.band
-        beyond, peak = np.linspace(curve.slip_range[1], 1.0, 50), np.array([curve.peak.slip_ratio])
-        marks += [
-            Strip(((*curve.peak_interval, "peak slip, 90 %"),)),
-            Band("90 % over runs", slips, low, high, 0),
-            Line("law, within the observed slips", slips, curve.thrust_ratio(slips), 0),
-            Line("beyond", beyond, curve.thrust_ratio(beyond), 0, dashed=True),
-            Line("resistance", [0.0, 1.0], [curve.resistance_ratio] * 2, 4, dashed=True),
-            Points("peak of net traction, or 95 % of it", peak, curve.thrust_ratio(peak), colour=1),
-        ]
-        for state, colour in (("traction", 2), ("steady", 3)):
-            if entry.targets is not None:
-                target = np.array([entry.targets.of(state).slip_ratio])
-                marks.append(Points(f"target, {state}", target, curve.thrust_ratio(target), colour=colour))
-        shown += [curve.resistance_ratio, float(high.max())]
-    least, most = min(shown), min(max([0.1, *shown]), LARGEST_THRUST_RATIO)
+        law, ratio = curve.thrust_ratio, curve.resistance_ratio
+        points = [("peak of net traction, or 95 % of it", curve.peak.slip_ratio, 1)]
+        if (targets := entry.targets) is not None:
+            points.append(("target, traction", targets.of("traction").slip_ratio, 2))
+            points.append(("target, steady", targets.of("steady").slip_ratio, 3))
+        marks += law_marks(law, curve.slip_range, curve.peak_interval, ratio)
+        marks.append(tree.Band("90 % over runs", slips, low, high, 0))
+        for label, at, colour in points:
+            marks.append(tree.Points(label, np.array([at]), law(np.array([at])), colour=colour))
+        shown += [ratio, float(high.max())]
+    least, most = min(shown), min(max(shown), LARGEST_THRUST_RATIO)
     margins = (least - 0.08 * (most - least), most + 0.12 * (most - least))
-    return Panel(marks, "thrust over load", x_range=(-0.03, 1.0), y_range=margins)
+    return tree.Panel(marks, "thrust over load", x_range=(-0.03, 1.0), y_range=margins)
 
 
 def _headline(entry: LearnedTerrain) -> str:

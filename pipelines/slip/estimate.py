@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from terrain.robots import Robot
 
 EXAMPLE = "terrain estimate --data raw/ --filter vio15 --out runs/"
+RESULTS = ("pipelines.slip.filtered", "pipelines.slip.observed", "pipelines.slip.measured")
+"""Modules of the modes, with their results."""
 
 Filter = Literal[
     "encoder12",
@@ -94,11 +96,6 @@ class PoseSettings(BaseSettings):
             raise ValueError(f"--delay is {text!r}; 'auto' or seconds from -5 to 5 are required")
         return text
 
-    @property
-    def delay_s(self) -> float | None:
-        """The delay that is given; None where it is to be found."""
-        return None if self.delay == "auto" else float(self.delay)
-
 
 class EstimateOptions(PoseSettings, SlipModelSettings, NoiseSettings):
     """How slip is found."""
@@ -111,7 +108,7 @@ GROUPS: dict[str, type[BaseSettings]] = {
     "observers": SlipModelSettings,
     "--filter pose": PoseSettings,
 }
-"""Options of each mode, by what they are for."""
+"""Options of each of these modes, by what they are for."""
 
 
 class Settings(EstimateOptions, AlignedRunsSettings):
@@ -180,7 +177,7 @@ def estimate_runs(
     ConfigError
         if an option is not accepted, is one of another mode, or the filter does not fit a robot.
     DataError
-        if a log lacks what the filter takes.
+        if a log lacks what the filter takes, or there is no run of a name to tune or to predict on.
 
     Examples
     --------
@@ -248,12 +245,7 @@ def _estimated(
     """Estimate by the mode that the filter names."""
     from terrain.estimation.observers.choice import OBSERVERS
 
-    used, module = "filters", "filtered"
-    if options.filter == "pose":
-        used, module = "--filter pose", "measured"
-    elif options.filter in OBSERVERS:
-        used, module = "observers", "observed"
-    refuse_others(options, GROUPS, used, f"--filter {options.filter}")
-    mode = import_module(f"pipelines.slip.{module}")
-    result: TracksResult = mode.estimate_all(runs, robot, options, progress, keep)
+    number = 2 if options.filter == "pose" else int(options.filter in OBSERVERS)
+    refuse_others(options, GROUPS, list(GROUPS)[number], f"--filter {options.filter}")
+    result: TracksResult = import_module(RESULTS[number]).estimate_all(runs, robot, options, progress, keep)
     return result

@@ -5,40 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report import (
-    Figure,
-    Mark,
-    Panel,
-    Part,
-    Points,
-    Progress,
-    Report,
-    Shown,
-    Strip,
-    Text,
-    described,
-    format_value,
-    interval,
-    plural,
-    sections,
-)
-from pipelines.slip.shown import first_rows
+from pipelines.report import Figure, Mark, Part, Progress, Report, Shown, Text, described, tree
+from pipelines.report.numbers import format_value, interval, plural
 from pipelines.slip.tracks import (
     SLIP,
     TRUTH_COLOUR,
     Keep,
+    Tracked,
     TracksResult,
-    band,
     estimate_each,
     estimated,
-    line,
-    next_step,
-    spans,
+    tracks_report,
 )
+from terrain.control.drive_curves import spans
 from terrain.errors import ConfigError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import Estimate, estimate_run, tuning_of
@@ -73,15 +57,7 @@ def estimate_all(
     progress: Progress,
     keep: Keep | None,
 ) -> FilterResult:
-    """Filter runs, as :func:`pipelines.slip.estimate.estimate_runs`.
-
-    Raises
-    ------
-    ConfigError
-        if the filter does not fit a robot, or runs to tune on are named without the tuning ``likelihood``.
-    DataError
-        if there is no run of a name to tune on, or a log has no wheels.
-    """
+    """Filter runs, as :func:`pipelines.slip.estimate.estimate_runs`."""
     name, tuning = options.filter, tuning_of(options.filter, options.tuning)
     if options.tune_on is not None and tuning != "likelihood":
         raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {tuning!r}")
@@ -92,10 +68,11 @@ def estimate_all(
     def robot_of(run: RunLog) -> Robot:
         return robot or packaged_robot(run.robot)
 
-    def estimate(run: RunLog) -> Estimate:
-        return estimate_run(run, robot_of(run), name, tuning=tuning, tuned=noise)
+    def estimate(run: RunLog) -> Tracked:
+        found = estimate_run(run, robot_of(run), name, tuning=tuning, tuned=noise)
+        return Tracked(summarize(found), enriched(found), partial(figures_of, found))
 
-    found = estimate_each(runs, name, estimate, summarize, enriched, figures_of, progress, keep)
+    found = estimate_each(runs, name, estimate, progress, keep)
     apart = offsets_apart_s(runs, lambda run: robot_of(run).track_m) if name == "skid" else {}
     clocks = []
     if apart:
@@ -133,27 +110,19 @@ def report(result: FilterResult) -> Report:
     """Return slip, its truth where it is known, and how consistent the filter was."""
     blind = not all(row.slip_observable for row in result.runs)
     columns = [each for each in RUNS if blind or each.title != "observed"]
-    first, all_runs = first_rows(result.runs, columns, f"filter {result.filter}, {result.tuning} noise")
-    parts: list[Part] = [first, *(Text(sentence, "warning") for sentence in result.clocks)]
+    parts: list[Part] = [Text(sentence, "warning") for sentence in result.clocks]
     if blind:
         parts.append(Text(BLIND, "note"))
     if (tuned := result.tuned) is not None:
         scales = [f"{name} {scale:.3g} ({tuned.status[name]})" for name, scale in tuned.scales.items()]
         parts.append(Text(f"Process variances scaled on {', '.join(tuned.runs)}: {', '.join(scales)}."))
-    pictures = dict(result.pictures)
-    lead = next((name for name in pictures if name.endswith("_slip")), next(iter(pictures), ""))
-    return Report(
+    return tracks_report(
+        result,
         f"Motion and slip by {result.filter}",
         _answer(result),
-        pictures.pop(lead, None),
+        (result.runs, columns, f"filter {result.filter}, {result.tuning} noise"),
+        ("At rest, moving, stuck", [row.motion_text for row in result.runs if row.motion is not None]),
         parts,
-        sections(
-            all_runs,
-            ("At rest, moving, stuck", [row.motion_text for row in result.runs if row.motion is not None]),
-            ("Pictures", list(pictures.values())),
-            ("Not read", result.skipped),
-        ),
-        next_step(result.filter, result.out),
     )
 
 
@@ -197,13 +166,13 @@ def swerve_motion(estimate: Estimate) -> Figure:
     twist = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)[0]
     panels = []
     for i, (state, label, row) in enumerate(SWERVE_PANELS):
-        marks: list[Mark] = [line("encoders, forward kinematics", time_s, twist[:, i], 1)]
+        marks: list[Mark] = [tree.Line("encoders, forward kinematics", time_s, twist[:, i], 1)]
         if seen:
-            marks.append(line("camera, at its place", time_s, table.columns([row])[:, 0], 4))
+            marks.append(tree.Line("camera, at its place", time_s, table.columns([row])[:, 0], 4))
         if state == "yaw_rate_radps":
-            marks.append(line("gyro", time_s, table.columns(["gyro_z_radps"])[:, 0], 2))
+            marks.append(tree.Line("gyro", time_s, table.columns(["gyro_z_radps"])[:, 0], 2))
         true = None if estimate.truth is None else estimate.truth[:, track.states.index(state)]
-        panels.append(Panel(marks + _state(estimate, state, true), label))
+        panels.append(tree.Panel(marks + _state(estimate, state, true), label))
     innovations = estimate.innovations
     for row in [row for _, _, row in SWERVE_PANELS] if seen else ["gyro_z_radps"]:
         panels.append(_innovation_panel(estimate, row, *innovations.row(row)))
@@ -221,46 +190,45 @@ def _state(estimate: Estimate, state: str, true: Array | None = None) -> list[Ma
     return estimated(estimate.name, track.time_s, track.state(state), track.std(state), 2, true)
 
 
-def _innovation_panel(estimate: Estimate, row: str, value: Array, std: Array) -> Panel:
+def _innovation_panel(estimate: Estimate, row: str, value: Array, std: Array) -> tree.Panel:
     track = estimate.track
     sensor = next(k for k, (_, rows) in enumerate(estimate.model.sensors) if row in rows)
     gated = track.use[:, sensor] == GATED
     used = value[~gated & np.isfinite(value)]
     marks: list[Mark] = [
-        band("± 2 std expected", track.time_s, np.zeros_like(std), 2 * std, 6),
-        line("innovation", track.time_s, np.where(gated, np.nan, value), 0),
+        tree.Band("± 2 std expected", track.time_s, -2 * std, 2 * std, 6),
+        tree.Line("innovation", track.time_s, np.where(gated, np.nan, value), 0),
     ]
     if gated.any():
-        marks.append(Points("gated", track.time_s[gated], np.zeros(gated.sum()), colour=5))
+        marks.append(tree.Points("gated", track.time_s[gated], np.zeros(gated.sum()), colour=5))
     title, reach = f"innovation of {row}, variance none", None
     if used.size:
         title = f"innovation of {row}, variance {used.var():.1e}"
         reach = 1.2 * max(float(np.nanmax(2 * std)), float(np.percentile(np.abs(used), 99.5)))
-    return Panel(marks, "innovation", title, y_range=None if reach is None else (-reach, reach))
+    return tree.Panel(marks, "innovation", title, y_range=None if reach is None else (-reach, reach))
 
 
 def skid_motion(estimate: Estimate) -> Figure:
     """Show speed, yaw rate and effective track of a skid-steer robot, and when it was stuck."""
-    track, table, track_m = estimate.track, estimate.table, estimate.robot.track_m
+    table, track_m = estimate.table, estimate.robot.track_m
     time_s, wheels = table.time_s, table.columns(["wheel_left_mps", "wheel_right_mps"])
-    gyro = table.columns(["gyro_z_radps"])[:, 0]
-    stuck = stuck_intervals(track.time_s, np.asarray(estimate.motion))
-    strips = [Strip([(each.start_s, each.end_s, "stuck") for each in stuck])] if stuck else []
-    measured: tuple[tuple[str, str, list[Mark]], ...] = (
-        ("speed_mps", "speed [m/s]", [line("mean of the wheels", time_s, wheels.mean(axis=1), 1)]),
-        (
-            "yaw_rate_radps",
-            "yaw rate [rad/s]",
-            [
-                line(f"wheels over {track_m:g} m", time_s, np.diff(wheels, axis=1)[:, 0] / track_m, 1),
-                line("gyro", time_s, gyro, 2),
-            ],
-        ),
-        ("effective_track_m", "effective track [m]", []),
-    )
+    turn, gyro = np.diff(wheels, axis=1)[:, 0] / track_m, table.columns(["gyro_z_radps"])[:, 0]
+    stuck = stuck_intervals(estimate.track.time_s, np.asarray(estimate.motion))
+    strip = tree.Strip([(each.start_s, each.end_s, "stuck") for each in stuck])
+    measured: dict[tuple[str, str], list[Mark]] = {
+        ("speed_mps", "speed [m/s]"): [tree.Line("mean of the wheels", time_s, wheels.mean(axis=1), 1)],
+        ("yaw_rate_radps", "yaw rate [rad/s]"): [
+            tree.Line(f"wheels over {track_m:g} m", time_s, turn, 1),
+            tree.Line("gyro", time_s, gyro, 2),
+        ],
+        ("effective_track_m", "effective track [m]"): [],
+    }
     return Figure(
         f"{estimate.run.run_id}: motion without a speed reference",
-        [Panel([*marks, *_state(estimate, state), *strips], label) for state, label, marks in measured],
+        [
+            tree.Panel([*marks, *_state(estimate, state), strip], label)
+            for (state, label), marks in measured.items()
+        ],
         "The skid filter with two standard deviations, beside wheels and gyro.",
         x_label="time [s]",
     )
@@ -272,29 +240,26 @@ def slip_figure(estimate: Estimate) -> Figure:
     time_s, observed, ahead_mps = track.time_s, estimate.observable, track.state("speed_x_mps")
     shown = slip if observed else estimate.blind
     true = lagged_slip_at(estimate.run, robot, time_s) if "truth" in estimate.run.streams else None
-    rates = table.columns([f"wheel_{wheel}_radps" for wheel in slip.wheels])
-    above: list[Mark] = [line("speed over ground, estimated", time_s, ahead_mps, 6)]
+    speeds = robot.wheel_radius_m * table.columns([f"wheel_{wheel}_radps" for wheel in slip.wheels])
+    above: list[Mark] = [tree.Line("speed over ground, estimated", time_s, ahead_mps, 6)]
     below: list[Mark] = []
     for i, wheel in enumerate(slip.wheels):
-        circumference = line(
-            f"circumference, wheel {wheel}", table.time_s, rates[:, i] * robot.wheel_radius_m, i
-        )
-        above.append(circumference)
-        ratio = shown.slip_ratio[:, i]
+        above.append(tree.Line(f"circumference, wheel {wheel}", table.time_s, speeds[:, i], i))
+        ratio, half = shown.slip_ratio[:, i], 2 * slip.slip_std[:, i]
         if observed:
-            below.append(band(f"± 2 std, wheel {wheel}", time_s, ratio, 2 * slip.slip_std[:, i], i))
-        below.append(line(f"wheel {wheel}", time_s, ratio, i))
+            below.append(tree.Band(f"± 2 std, wheel {wheel}", time_s, ratio - half, ratio + half, i))
+        below.append(tree.Line(f"wheel {wheel}", time_s, ratio, i))
         if true is not None:
-            below.append(line(f"truth, wheel {wheel}", time_s, true[:, i], TRUTH_COLOUR, dashed=True))
-    below += spans(time_s, slip.stale, "stale: no speed reference")
+            below.append(tree.Line(f"truth, wheel {wheel}", time_s, true[:, i], TRUTH_COLOUR, dashed=True))
+    below.append(tree.Strip(spans(time_s, slip.stale, {1: "stale: no speed reference"})))
     if np.isfinite(mean := estimate.figures.steady_mean):
-        below.append(line(f"steady mean {mean:.3f}", time_s[[0, -1]], np.full(2, mean), 5, dashed=True))
+        below.append(tree.Line(f"steady mean {mean:.3f}", time_s[[0, -1]], [mean, mean], 5, dashed=True))
     y_range = (-0.6 if np.nanmin(np.append(ahead_mps, 0.0)) < -0.1 else -0.05, 0.6)
     return Figure(
         f"{estimate.run.run_id}: {'slip' if observed else 'slip is not observed'}, {estimate.name}",
         (
-            Panel(above, "speed [m/s]"),
-            Panel(below, "slip ratio" if observed else "blind figure, no slip", y_range=y_range),
+            tree.Panel(above, "speed [m/s]"),
+            tree.Panel(below, "slip ratio" if observed else "blind figure, no slip", y_range=y_range),
         ),
         "Slip of each wheel with two standard deviations; the truth is behind the same low-pass.",
         x_label="time [s]",

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from terrain.robots import Robot
 
 EXAMPLE = "terrain learn-slip --data pull/ --robot agrimaro --out table.yaml"
+RESULTS = ("pipelines.slip.curves", "pipelines.slip.steady")
+"""Modules of the kinds, with their results."""
 
 
 class Settings(RunsSettings):

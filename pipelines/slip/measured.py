@@ -10,23 +10,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from features.response import slip_cases
-from pipelines.report import (
-    Bars,
-    Figure,
-    Panel,
-    Part,
-    Points,
-    Progress,
-    Report,
-    Shown,
-    Text,
-    described,
-    enumerated,
-    format_value,
-    sections,
-    sentence,
-    table,
-)
+from pipelines.report import Figure, Part, Progress, Report, Shown, Text, described, sections, table, tree
+from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
 from terrain.measured_slip.delay import Delay
@@ -95,20 +80,13 @@ def estimate_all(
     """Measure the slip of runs of one robot, as :func:`pipelines.slip.estimate.estimate_runs`.
 
     ``keep`` gets each run with the stream ``slip``, over windows of :data:`SHORT_S`.
-
-    Raises
-    ------
-    ConfigError
-        if a robot is unknown, or rollers are asked for of one that has none.
-    DataError
-        if the runs are of several robots, none has a slip, or predictions are asked for and there is nothing
-        to predict from.
     """
     robot, seed = one_robot(runs, robot), options.seed
     if options.rollers:
         as_drive(OmniRobot, robot, NO_ROLLERS)
     asked: dict[str, Any] = {"window_s": options.window_s, "stride_s": options.stride_s, "seed": seed}
-    found = measure(runs, robot, **asked, delay_s=options.delay_s, progress=progress)
+    delay_s = None if options.delay == "auto" else float(options.delay)
+    found = measure(runs, robot, **asked, delay_s=delay_s, progress=progress)
     if not found.slips:
         raise DataError(f"none of {len(runs)} runs has a slip; the first for this: {found.failed[0]}")
     rng, by_terrain = np.random.default_rng(seed), found.by_terrain()
@@ -119,8 +97,12 @@ def estimate_all(
         predicted = predictions(cases, options.hold_out, seed, progress)
     rollers = rollers_of(found, robot, seed) if options.rollers else None
     if keep is not None:
-        _hand_over(found, robot, keep, progress)
-    title = f"Slip of {robot.name}"
+        for done, run in enumerate(found.runs, start=1):
+            late_s = found.delays[run.session].applied_s
+            over = {"window_s": SHORT_S, "stride_s": SHORT_STRIDE_S, "delay_s": late_s}
+            slip = measured_slip(run, robot, **over, whole=True).track.as_stream()
+            keep(replace(run, streams={**run.streams, "slip": slip}), dict)
+            progress("write runs", done, len(found.runs))
     return MeasuredSlipResult(
         robot=robot.name,
         **asked,
@@ -133,26 +115,8 @@ def estimate_all(
         distances=distances_of(found, robot, seed) if options.rollers else {},
         not_measured=tuple(found.failed),
         n_runs=len(runs),
-        pictures={
-            **_by_surface(title, options.window_s, surfaces, by_terrain),
-            "slip_by_motion": _by_motion(title, by_terrain),
-        },
+        pictures=_pictures(f"Slip of {robot.name}", options.window_s, surfaces, by_terrain),
     )
-
-
-def _hand_over(found: Measured, robot: Robot, keep: Keep, progress: Progress) -> None:
-    """Give runs on with their slip over short windows."""
-    for done, run in enumerate(found.runs, start=1):
-        slip = measured_slip(
-            run,
-            robot,
-            window_s=SHORT_S,
-            stride_s=SHORT_STRIDE_S,
-            delay_s=found.delays[run.session].applied_s,
-            whole=True,
-        )
-        keep(replace(run, streams={**run.streams, "slip": slip.track.as_stream()}), dict)
-        progress("write runs", done, len(found.runs))
 
 
 SURFACES = (
@@ -192,9 +156,8 @@ def report(result: MeasuredSlipResult) -> Report:
         for session, delay in result.delays.items()
     ]
     if result.predictions:
-        parts.append(
-            table(result.predictions, PREDICTIONS, "slip predicted from currents and wheel speeds alone")
-        )
+        about = "slip predicted from currents and wheel speeds alone"
+        parts.append(table(result.predictions, PREDICTIONS, about))
     if result.rollers is not None:
         parts += _roller_parts(result, result.rollers)
     spinning = [name for row in result.surfaces for name in row.spinning]
@@ -247,71 +210,63 @@ def _roller_parts(result: MeasuredSlipResult, found: RollerFindings) -> list[Par
         Shown("RMS of slip left, held out", found.held_out_rms.get, FINE),
         Shown("about the mean", found.plain_rms.get, FINE),
     )
-    note = (
-        "Friction of the rollers over the stiffness of traction, both in proportion to the load of a wheel."
-    )
+    note = "Friction of the rollers over the stiffness of traction, both in proportion to a wheel's load."
     sentences = list(found.sentences)
     for each in result.named:
-        known = (
-            "" if each.n_right is None else ", fitted" if each.group in found.roller_ratio else ", not fitted"
+        fitted = ", fitted" if each.group in found.roller_ratio else ", not fitted"
+        sentences.append(
+            f"{each.group or UNLABELLED}{fitted if each.n_right is not None else ''}: {each.text}."
         )
-        sentences.append(f"{each.group or UNLABELLED}{known}: {each.text}.")
     sentences += [f"{name}: {bound.sentence}" for name, bound in result.distances.items()]
     return [table(found.roller_ratio, columns, "what makes it slip", note), *map(Text, sentences)]
 
 
-def _by_surface(
+def _pictures(
     title: str, window_s: float, surfaces: Sequence[SurfaceSlip], by_terrain: Mapping[str, Measured]
 ) -> dict[str, Figure]:
-    """Return slip by surface, and a run a point."""
-    names = [row.terrain or UNLABELLED for row in surfaces]
+    """Return slip by surface, by run, and by the direction of travel or, of robots that only drive ahead, the turn."""
+    names = [terrain or UNLABELLED for terrain in by_terrain]
     low, high = np.array([row.interval for row in surfaces]).T
-    bars = Bars("median, 95 % over runs", names, np.array([row.slip_ratio for row in surfaces]), low, high)
-    points, rng = [], np.random.default_rng(0)
-    for place, (name, own) in enumerate(zip(names, by_terrain.values(), strict=True)):
-        known = [each.body_slip[each.known] for each in own.slips]
-        medians = np.array([np.median(each) for each in known if each.size])
-        if medians.size:
-            points.append(Points(name, medians, place + rng.uniform(-0.22, 0.22, medians.size)))
+    medians = np.array([row.slip_ratio for row in surfaces])
+    bars = tree.Bars("median, 95 % over runs", names, medians, low, high)
     label = f"slip ratio of the body over {window_s:g} s"
     figures = {
         "slip_by_surface": Figure(
             f"{title} by surface, measured from outside",
-            (Panel((bars,)),),
+            (tree.Panel((bars,)),),
             "The median over runs and its 95 % interval over runs.",
             x_label=label,
         )
     }
-    if points:
-        figures["slip_by_run"] = Figure(
-            f"{title}, a run a point",
-            (Panel(points, "surface"),),
-            "The median of each run; surfaces one above another.",
-            x_label=label,
-        )
-    return figures
-
-
-def _by_motion(title: str, by_terrain: Mapping[str, Measured]) -> Figure:
-    """Return slip by the direction of travel or, of robots that only drive ahead, the turn; a window a point."""
     rolled = np.concatenate([slip.rolled_twist for own in by_terrain.values() for slip in own.slips])
     with np.errstate(invalid="ignore"):
         sideways = np.nanmean(np.abs(rolled[:, 1]) > 0.1 * np.abs(rolled[:, 0])) > MIN_SIDEWAYS
-    marks = []
-    for terrain, own in by_terrain.items():
+    by_run, by_window, rng = [], [], np.random.default_rng(0)
+    for place, (name, own) in enumerate(zip(names, by_terrain.values(), strict=True)):
+        slips = [each.body_slip[each.known] for each in own.slips]
+        ratio, of_runs = np.concatenate(slips), np.array([np.median(each) for each in slips if each.size])
+        if not ratio.size:
+            continue
+        by_run.append(tree.Points(name, of_runs, place + rng.uniform(-0.22, 0.22, of_runs.size)))
         twist = np.concatenate([slip.rolled_twist[slip.known] for slip in own.slips])
-        ratio = np.concatenate([slip.body_slip[slip.known] for slip in own.slips])
         with np.errstate(invalid="ignore", divide="ignore"):
             turn = twist[:, 2] / np.abs(twist[:, 0])
         at = np.degrees(np.arctan2(twist[:, 1], twist[:, 0])) if sideways else turn
-        if ratio.size:
-            marks.append(Points(terrain or UNLABELLED, at, ratio))
+        by_window.append(tree.Points(name, at, ratio))
+    if by_run:
+        figures["slip_by_run"] = Figure(
+            f"{title}, a run a point",
+            (tree.Panel(by_run, "surface"),),
+            "The median of each run; surfaces one above another.",
+            x_label=label,
+        )
     reach, label = 3.0, "yaw rate of the wheels over their speed [rad/m]"
     if sideways:
         reach, label = 180.0, "direction of travel in the body's axes [degrees]"
-    return Figure(
+    figures["slip_by_motion"] = Figure(
         f"{title} by how it was driven, a window a point",
-        (Panel(marks, "slip ratio of the body", x_range=(-reach, reach)),),
+        (tree.Panel(by_window, "slip ratio of the body", x_range=(-reach, reach)),),
         "A window of steady motion a point.",
         x_label=label,
     )
+    return figures

@@ -5,38 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report import (
-    Figure,
-    Mark,
-    Panel,
-    Points,
-    Progress,
-    Report,
-    Shown,
-    described,
-    enumerated,
-    format_value,
-    interval,
-    plural,
-    sections,
-)
-from pipelines.slip.shown import first_rows
+from pipelines.report import Figure, Mark, Progress, Report, Shown, described, tree
+from pipelines.report.numbers import enumerated, format_value, interval, plural
 from pipelines.slip.tracks import (
     SLIP,
     TRUTH_COLOUR,
     Keep,
+    Tracked,
     TracksResult,
     estimate_each,
     estimated,
-    line,
-    next_step,
-    spans,
+    tracks_report,
 )
+from terrain.control.drive_curves import spans
 from terrain.errors import ConfigError
 from terrain.estimation.observers.choice import BY_MODEL
 from terrain.estimation.observers.estimate import ObserverEstimate, observe_run, with_estimates
@@ -69,25 +56,17 @@ def estimate_all(
     progress: Progress,
     keep: Keep | None,
 ) -> ObserverResult:
-    """Run an observer over runs, as :func:`pipelines.slip.estimate.estimate_runs`.
-
-    Raises
-    ------
-    ConfigError
-        if the observer does not fit a robot, or needs a slip model and has none.
-    DataError
-        if a log has no wheels.
-    """
+    """Run an observer over runs, as :func:`pipelines.slip.estimate.estimate_runs`."""
     name, file = options.filter, options.slip_model
     if file is not None and name not in (*BY_MODEL, "encoder-odometry"):
         raise ConfigError(f"filter {name!r} takes no slip model: leave --slip-model out")
 
-    def observe(run: RunLog) -> ObserverEstimate:
+    def observe(run: RunLog) -> Tracked:
         own = robot or packaged_robot(run.robot)
-        return observe_run(run, own, name, None if file is None else read_slip_model(file, own.name))
+        found = observe_run(run, own, name, None if file is None else read_slip_model(file, own.name))
+        return Tracked(summarize_observer(found), with_estimates(found), partial(figures_of, found))
 
-    found = estimate_each(runs, name, observe, summarize_observer, with_estimates, figures_of, progress, keep)
-    return ObserverResult(**found, slip_model=file)
+    return ObserverResult(**estimate_each(runs, name, observe, progress, keep), slip_model=file)
 
 
 SLIPS = (
@@ -110,20 +89,12 @@ def report(result: ObserverResult) -> Report:
         for name, slip in run.slip.items() or [("not estimated", None)]:
             rows.append({"name": name, "slip": slip, **of_run})
             of_run = {"run_id": ""}
-    first, all_rows = first_rows(rows, SLIPS, f"observer {result.filter}")
-    pictures = list(result.pictures.values())
-    return Report(
+    return tracks_report(
+        result,
         f"Slip by the observer {result.filter}",
         _answer(result),
-        pictures[0] if pictures else None,
-        [first],
-        sections(
-            all_rows,
-            ("Statuses", [row.status_text for row in result.runs]),
-            ("Pictures", pictures[1:]),
-            ("Not read", result.skipped),
-        ),
-        next_step(result.filter, result.out),
+        (rows, SLIPS, f"observer {result.filter}"),
+        ("Statuses", [row.status_text for row in result.runs]),
     )
 
 
@@ -156,22 +127,15 @@ def figures_of(found: ObserverEstimate) -> dict[str, Figure]:
 def slip_figure(found: ObserverEstimate) -> Figure:
     """Show each slip over time with a band of one standard deviation, and its truth where there is one."""
     track, time_s = found.track, found.track.time_s
-    settled = np.isin(track.status, (*SETTLED, ObserverStatus.STANDING))
-    away = spans(time_s, ~settled, "does not follow measurements")
+    away = ~np.isin(track.status, (*SETTLED, ObserverStatus.STANDING))
+    strip = tree.Strip(spans(time_s, away, {1: "does not follow measurements"}))
     panels = []
     for k, name in enumerate(track.slips):
         scale, unit = (np.degrees(1.0), "degrees") if name.endswith("_rad") else (1.0, "ratio")
-        slip, true = scale * track.slip[:, k], found.true(name)
-        marks = estimated(
-            found.observer.name,
-            time_s,
-            slip,
-            scale * track.slip_std[:, k],
-            1,
-            None if true is None else scale * true,
-        )
+        slip, std, true = scale * track.slip[:, k], scale * track.slip_std[:, k], found.true(name)
+        marks = estimated(found.observer.name, time_s, slip, std, 1, None if true is None else scale * true)
         label = f"{name.rpartition('_')[0].replace('_', ' ')} [{unit}]"
-        panels.append(Panel([*marks, *away], label, y_range=_range(time_s, slip)))
+        panels.append(tree.Panel([*marks, strip], label, y_range=_range(time_s, slip)))
     title = f"Slip of {found.run.run_id} by the observer {found.observer.name}"
     return Figure(title, panels, "With one standard deviation.", x_label="time [s]")
 
@@ -182,12 +146,13 @@ def path_figure(found: ObserverEstimate) -> Figure:
     marks: list[Mark] = []
     if "position_x_m" in found.observer.rows and "gnss" in found.run.streams:
         gnss = found.run.streams["gnss"]
-        marks.append(Points("fixes", gnss.channel("position_x_m"), gnss.channel("position_y_m"), colour=4))
-    marks.append(line(found.observer.name, own.real, own.imag, 0))
+        fixes = gnss.channel("position_x_m"), gnss.channel("position_y_m")
+        marks.append(tree.Points("fixes", *fixes, colour=4))
+    marks.append(tree.Line(found.observer.name, own.real, own.imag, 0))
     if true is not None:
-        marks.append(line("truth", true.real, true.imag, TRUTH_COLOUR, dashed=True))
+        marks.append(tree.Line("truth", true.real, true.imag, TRUTH_COLOUR, dashed=True))
     title = f"Path of {found.run.run_id} by the observer {found.observer.name}"
-    return Figure(title, (Panel(marks, "y [m]", equal=True),), x_label="x [m]")
+    return Figure(title, (tree.Panel(marks, "y [m]", equal=True),), x_label="x [m]")
 
 
 def _range(time_s: Array, slip: Array) -> tuple[float, float] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +20,11 @@ from pipelines.report import (
     Table,
     Text,
     described,
-    format_value,
     frame,
-    interval,
     sections,
     table,
 )
+from pipelines.report.numbers import format_value, interval
 from terrain.calibration.odometry import ParameterFound, judge_odometry
 from terrain.calibration.odometry_judge import KindScore, LegScores
 from terrain.errors import ConfigError
@@ -94,16 +94,11 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
         raise ConfigError(f"--lengths: {SHORTEST_S:g} to {LONGEST_S:g} seconds are accepted")
     if settings.out is not None:
         check_slip_model_file(settings.out)
-    windows = _windows(settings.data, robot)
-    found = judge_odometry(
-        runs,
-        windows,
-        robot,
-        settings.lengths,
-        settings.folds,
-        settings.seed,
-        lambda done, total: progress("odometry", done, total),
-    )
+    windows: Mapping[str, tuple[WindowPoses, ...]] = {}
+    if settings.data.is_dir() and any((path / FILE_NAME).is_file() for path in find_sessions(settings.data)):
+        windows = read_window_poses(settings.data, drive_robot(robot))
+    asked = settings.lengths, settings.folds, settings.seed
+    found = judge_odometry(runs, windows, robot, *asked, partial(progress, "odometry"))
     values = found._asdict()
     model, flat = values.pop("model"), values.pop("flat")
     if settings.out is not None:
@@ -164,10 +159,3 @@ def report(result: OdometryResult) -> Report:
 def _table(scores: LegScores, title: str) -> Table:
     size = f"{scores.n_legs} legs of {scores.n_runs} runs, {scores.path_m:.2g} m apart"
     return table(scores.kinds, KINDS, f"{title}: {size}")
-
-
-def _windows(folder: Path, robot: TrackedRobot) -> Mapping[str, tuple[WindowPoses, ...]]:
-    """Return the poses of the windows of DRIVE under a folder; none in another layout."""
-    if not folder.is_dir() or not any((path / FILE_NAME).is_file() for path in find_sessions(folder)):
-        return {}
-    return read_window_poses(folder, drive_robot(robot))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.data.datasets import load_runs
-from pipelines.report import Part, Progress, Report, Result, Shown, Text, described, frame, plural, sections
+from pipelines.report import Progress, Report, Result, Shown, Text, described, frame, plural, sections
 from pipelines.slip.shown import first_rows
 from terrain.calibration.description import described_with, description_yaml, findings_of, hard_grounds
 from terrain.calibration.finding import Finding
@@ -130,27 +131,20 @@ def report(result: CalibrationResult) -> Report:
     moved = sum(row.described is not None and not row.low <= row.described <= row.high for row in found)
     n_runs = plural(len(result.run_ids), "run")
     first, all_numbers = first_rows(found, NUMBERS, f"{result.robot}, from {n_runs}")
-    parts: list[Part] = [first]
-    if n_unknown := len(result.findings) - len(found):
-        parts.append(
-            Text(f"{n_unknown} numbers are not determined by these runs; the details say why.", "note")
-        )
-    notes: dict[bool, dict[str, list[str]]] = {
-        False: {},
-        True: {},
-    }  # each note, and the numbers it applies to
+    by_note: dict[tuple[bool, str], list[str]] = defaultdict(list)
     for row in result.findings:
         if row.note:
-            notes[row.determined].setdefault(row.note, []).append(row.parameter)
-    undetermined, assumed = (
-        [f"{', '.join(names)}: {note}" for note, names in notes[of_found].items()]
-        for of_found in (False, True)
-    )
+            by_note[row.determined, row.note].append(row.parameter)
+    notes: dict[bool, list[str]] = {False: [], True: []}
+    for (determined, note), names in by_note.items():
+        notes[determined].append(f"{', '.join(names)}: {note}")
+    n_unknown = len(result.findings) - len(found)
+    text = f"{n_unknown} numbers are not determined by these runs; the details say why."
     return Report(
         f"Calibration of {result.robot}",
         f"{len(found)} numbers of {result.robot} are determined by {n_runs}; {moved} of "
         "them were described outside their 95 % interval.",
-        parts=parts,
-        details=sections(all_numbers, ("Not determined", undetermined), ("Assumed", assumed)),
+        parts=[first, Text(text, "note")] if n_unknown else [first],
+        details=sections(all_numbers, ("Not determined", notes[False]), ("Assumed", notes[True])),
         next_step=f"terrain estimate --data DIR --filter FILTER --robot {result.out or 'FILE'} --out runs/",
     )

@@ -13,26 +13,22 @@ import numpy as np
 from pipelines.data.datasets import load_runs
 from pipelines.data.settings import load
 from pipelines.report import (
+    Column,
     Figure,
-    Line,
     Mark,
-    Panel,
     Part,
-    Points,
     Progress,
     Report,
     Result,
     Section,
-    Shown,
     Table,
     Text,
     described,
-    format_value,
     frame,
     sections,
-    table,
+    tree,
 )
-from pipelines.report.tree import value_at
+from pipelines.report.numbers import format_value
 from pipelines.slip.shown import write_figures
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
@@ -123,25 +119,17 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
         own, others = ([run for run in each if run.robot == robot] for each in (runs, further))
         if not own:
             continue
-        result, shown, predictions = compare_laws(
-            trials_of(own, wheel),
-            trials_of(others, wheel) if others else None,
-            wheel,
-            settings.laws,
-            settings.draws,
-            settings.seed,
-            progress,
-        )
+        checked = trials_of(others, wheel) if others else None
+        law = settings.laws, settings.draws, settings.seed
+        result, shown, predictions = compare_laws(trials_of(own, wheel), checked, wheel, *law, progress)
         if out is not None:
             result = _written(result, out, settings.dataset)
         results.append(result)
         for held, text in LEFT_OUT.items():
-            figure = held_out_figure(result, shown, predictions[held], held)
-            pictures[f"{wheel.name}, {text}"] = figure
+            pictures[f"{wheel.name}_{text}"] = held_out_figure(result, shown, predictions[held], held)
     files = [str(result.soil.file) for result in results if result.soil.file is not None]
     if settings.figures is not None:
-        named = {name.replace(", ", "_"): figure for name, figure in pictures.items()}
-        files += write_figures(named, settings.figures)
+        files += write_figures(pictures, settings.figures)
     return SoilResult(
         out=out,
         dataset=settings.dataset,
@@ -170,7 +158,7 @@ def report(result: SoilResult) -> Report:
     parts: list[Part] = []
     details: list[Section] = []
     for wheel in result.wheels:
-        figures = [each for name, each in result.pictures.items() if name.startswith(f"{wheel.wheel},")]
+        figures = [each for name, each in result.pictures.items() if name.startswith(f"{wheel.wheel}_")]
         parts += [_laws_table(wheel), Text(wheel.verdict)]
         details += sections((f"{wheel.wheel} wheel", [*_wheel_details(wheel), *figures]))
     answers = " and ".join(f"{each.laws[-1].slip.load.forces} ({each.wheel} wheel)" for each in result.wheels)
@@ -184,49 +172,34 @@ def report(result: SoilResult) -> Report:
     )
 
 
-def _errors(of: str, *titles: str) -> list[Shown]:
-    """Return columns of the errors of traction, side force and sinkage that a row has at a place."""
-    return [
-        Shown(titles[0], f"{of}.pull_ratio", ERROR),
-        Shown(titles[1], f"{of}.side_ratio", ERROR),
-        Shown(titles[2], lambda row: 1e3 * value_at(row, f"{of}.sinkage_m"), ".1f", "mm"),
-    ]
+ERRORS = (Column("traction", ERROR), Column("side force", ERROR), Column("sinkage", ".1f", "mm"))
+
+
+def _errors(misfit: Misfit) -> tuple[float, ...]:
+    return misfit.pull_ratio, misfit.side_ratio, 1e3 * misfit.sinkage_m
 
 
 def _laws_table(wheel: WheelResult) -> Table:
-    columns = (
-        Shown("law", "law"),
-        Shown("parameters", "n_parameters"),
-        Shown("given", "given"),
-        *_errors("slip", "slip out: traction", "side", "sinkage"),
-        *_errors("angle", "angle out: traction", "side", "sinkage"),
-    )
+    slip, angle = ([each._replace(title=f"{out} out: {each.title}") for each in ERRORS] for out in HELD_OUT)
     rows = [
-        {
-            "law": row.name,
-            "n_parameters": row.n_parameters,
-            "given": given,
-            "slip": getattr(row.slip, given),
-            "angle": getattr(row.angle, given),
-        }
+        (
+            row.name,
+            row.n_parameters,
+            given,
+            *_errors(getattr(row.slip, given)),
+            *_errors(getattr(row.angle, given)),
+        )
         for row in wheel.laws
         for given in GIVEN
         if math.isfinite(getattr(row.slip, given).pull_ratio)
     ]
-    surrogate = {"slip": wheel.surrogate_slip, "angle": wheel.surrogate_angle}
-    rows.append({"law": "(polynomial)", "n_parameters": None, "given": "load", **surrogate})
-    title = f"{wheel.wheel} wheel, {wheel.n_trials} trials: errors over the load"
-    return table(rows, columns, title, "Root mean squares over the measured load, with slip and angle given.")
-
-
-PARAMETERS = (
-    Shown("parameter", "name"),
-    Shown("value", "value"),
-    Shown("95 %", "interval"),
-    Shown("of the prior", "informed_ratio", ".2f"),
-    Shown("identified", "identified"),
-)
-PRIOR = '"Of the prior": standard deviation with the trials over that without; below 0.5 one is identified.'
+    polynomial = *_errors(wheel.surrogate_slip), *_errors(wheel.surrogate_angle)
+    return Table(
+        ("law", "parameters", "given", *slip, *angle),
+        [*rows, ("(polynomial)", None, "load", *polynomial)],
+        f"{wheel.wheel} wheel, {wheel.n_trials} trials: errors over the load",
+        "Root mean squares over the measured load, with slip and angle given.",
+    )
 
 
 def _wheel_details(wheel: WheelResult) -> list[Part]:
@@ -239,11 +212,6 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
             "angles left out": wheel.surrogate_angle,
         },
     }
-    columns = (
-        Shown("", "name"),
-        Shown("trials", "misfit.n_trials"),
-        *_errors("misfit", "traction", "side force", "sinkage"),
-    )
     soil, (low_m, high_m) = wheel.soil.misfit, wheel.sinkage_range_m
     return [
         Text(
@@ -251,12 +219,24 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
             f"{format_value(wheel.load_range_n, '.1f', 'N')}, sinkage {1e3 * low_m:.0f} to {1e3 * high_m:.0f} mm, "
             f"{wheel.deeper_than_axle} trials deeper than the axle; {wheel.coupling.text}."
         ),
-        table(wheel.parameters.values(), PARAMETERS, f"parameters of {wheel.law}", PRIOR),
+        Table(
+            ("parameter", "value", "95 %", Column("of the prior", ".2f"), "identified"),
+            [
+                (each.name, each.value, each.interval, each.informed_ratio, each.identified)
+                for each in wheel.parameters.values()
+            ],
+            f"parameters of {wheel.law}",
+            '"Of the prior": standard deviation with the trials over that without; below 0.5 one is identified.',
+        ),
         *(
-            table([{"name": name, "misfit": each} for name, each in rows.items()], columns, title)
+            Table(
+                ("", "trials", *ERRORS),
+                [(name, each.n_trials, *_errors(each)) for name, each in rows.items()],
+                title,
+            )
             for title, rows in misfits.items()
         ),
-        *(Text(sentence) for sentence in wheel.not_identified),
+        *map(Text, wheel.not_identified),
         Text(
             f"On trials that roll nearly straight the simulator's law is off by {soil.forces} (traction and side "
             f"force) and {format_value(1e3 * soil.sinkage_m, '.1f', 'mm')}."
@@ -276,32 +256,25 @@ def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, 
     """
     errors = getattr(wheel.laws[-1], held_out).load
     panels = []
-    for name, label in PANELS:
+    for name, y_label in PANELS:
         scale = 1e3 if name.endswith("_m") else 1.0
         measured, predicted = scale * getattr(trials, name), scale * getattr(prediction, name)
         marks: list[Mark] = []
         for number, angle in enumerate(np.unique(trials.angle_setting)):
-            rows = np.flatnonzero(trials.angle_setting == angle)
-            speeds = np.unique(trials.slip_setting[rows])
-            own = [rows[trials.slip_setting[rows] == speed] for speed in speeds]
-            slips = [float(trials.slip_ratio[each].mean()) for each in own]
-            means = [float(predicted[each].mean()) for each in own]
+            rows, colour = np.flatnonzero(trials.angle_setting == angle), number % 7
+            own = [rows[trials.slip_setting[rows] == speed] for speed in np.unique(trials.slip_setting[rows])]
+            slips, means = ([float(of[each].mean()) for each in own] for of in (trials.slip_ratio, predicted))
+            label = f"{angle:g} degrees"
             marks.append(
-                Points(
-                    f"{angle:g} degrees, measured", trials.slip_ratio[rows], measured[rows], colour=number % 7
-                )
+                tree.Points(f"{label}, measured", trials.slip_ratio[rows], measured[rows], colour=colour)
             )
-            marks.append(Line(f"{angle:g} degrees", slips, means, number % 7))
-        panels.append(Panel(tuple(marks), label))
+            marks.append(tree.Line(label, slips, means, colour))
+        panels.append(tree.Panel(marks, y_label))
     title = (
         f"{wheel.wheel} wheel, law {wheel.law}, {LEFT_OUT[held_out]}: traction off by "
         f"{format_value(errors.pull_ratio, ERROR)} and side force by {format_value(errors.side_ratio, ERROR)} of the "
         f"load (at most {format_value(BAR_RATIO, '.0%')} is aimed at), sinkage by "
         f"{format_value(1e3 * errors.sinkage_m, '.1f', 'mm')}"
     )
-    return Figure(
-        title,
-        tuple(panels),
-        "Points are measured, lines predicted; a colour a slip angle.",
-        x_label="slip ratio",
-    )
+    caption = "Points are measured, lines predicted; a colour a slip angle."
+    return Figure(title, panels, caption, x_label="slip ratio")

@@ -10,22 +10,18 @@ import numpy as np
 
 from pipelines.report import (
     Figure,
-    Line,
     Mark,
-    Panel,
     Part,
-    Points,
     Progress,
     Report,
     Shown,
     Text,
     described,
-    enumerated,
-    format_value,
-    plural,
     sections,
     table,
+    tree,
 )
+from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.slip.shown import named
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of
 from terrain.control.measured_table import learn_surfaces
@@ -130,13 +126,11 @@ def report(result: SteadyTargets) -> Report:
     """Return the operating point and the targets of each surface, and what a session costs another."""
     rows = named(result.surfaces)
     n_steady = sum(row["slip"].n_runs for row in rows)
-    slips = enumerated(
-        [
-            f"{format_value(row['slip'].slip_ratio, SLIP)} on {row['terrain']}"
-            for row in rows
-            if np.isfinite(row["slip"].slip_ratio)
-        ]
-    )
+    slips = [
+        f"{format_value(row['slip'].slip_ratio, SLIP)} on {row['terrain']}"
+        for row in rows
+        if np.isfinite(row["slip"].slip_ratio)
+    ]
     title = f"target slip of {result.robot}, measured from outside"
     parts: list[Part] = [table(rows, SURFACES, title, STEADY)]
     if result.transfers:
@@ -147,7 +141,7 @@ def report(result: SteadyTargets) -> Report:
     steady = f"{n_steady} of {result.n_runs} runs have steady motion"
     return Report(
         f"Target slips of {result.robot}, measured from outside",
-        f"In steady motion {result.robot} slips by {slips}; {steady}." if slips else f"{steady}.",
+        f"In steady motion {result.robot} slips by {enumerated(slips)}; {steady}." if slips else f"{steady}.",
         result.pictures.get("operating_points"),
         parts,
         sections(
@@ -172,16 +166,15 @@ def operating_figure(
     marks: list[Mark] = []
     for number, (terrain, height) in enumerate(zip(points, shown[label], strict=True)):
         slip = surfaces[terrain]["slip"]
-        marks.append(
-            Points(f"{terrain}, {slip.n_runs} runs", points[terrain].slip_ratio, height, colour=number % 7)
-        )
+        at, colour = points[terrain].slip_ratio, number % 7
+        marks.append(tree.Points(f"{terrain}, {slip.n_runs} runs", at, height, colour=colour))
         known = height[np.isfinite(height)]
         if known.size and np.isfinite(slip.interval).all():
-            ends, middle = list(slip.interval), float(np.median(known))
-            marks.append(Line(f"{terrain}, 95 %", ends, [middle, middle], number % 7))
+            middle = [float(np.median(known))] * 2
+            marks.append(tree.Line(f"{terrain}, 95 %", list(slip.interval), middle, colour))
     return Figure(
         f"Steady slip of {robot}, measured from outside",
-        (Panel(marks, label),),
+        (tree.Panel(marks, label),),
         "A run a point: its median slip in steady motion. Lines are the median of a surface over its 95 % "
         "interval over runs. Points of one surface differ in how the robot was driven and are no curve.",
         x_label="slip ratio of the body, median of a run",

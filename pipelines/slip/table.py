@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.report import Figure, Result, Shown, described, frame
+import numpy as np
+
+from pipelines.report import Figure, Mark, Result, Shown, described, frame, tree
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, write_slip_table
+from terrain.records import Array
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,6 +50,22 @@ class LearnedSlipTable(Result, SlipTable):
         """The command that drives by this table."""
         terrain = next((name for name in self.targets if name != self.fallback), "TERRAIN")
         return f"terrain drive --robot {self.robot} --terrain {terrain} --table {self.table or 'FILE'}"
+
+
+def law_marks(
+    thrust_ratio: Callable[[Array], Array],
+    slip_range: tuple[float, float],
+    peak_interval: tuple[float, float],
+    resistance_ratio: float,
+) -> list[Mark]:
+    """Return the law of thrust over load, within and beyond the observed slips, with its peak and the resistance."""
+    within, beyond = np.linspace(*slip_range, 60), np.linspace(slip_range[1], 1.0, 30)
+    return [
+        tree.Strip([(*peak_interval, "peak slip, 90 %")]),
+        tree.Line("law, within the observed slips", within, thrust_ratio(within), 0),
+        tree.Line("beyond", beyond, thrust_ratio(beyond), 0, dashed=True),
+        tree.Line("resistance", [0.0, 1.0], [resistance_ratio] * 2, 4, dashed=True),
+    ]
 
 
 def fields_of(slips: SlipTable) -> dict[str, Any]:

@@ -1,31 +1,36 @@
-"""What ``terrain estimate`` has in every mode: results, a pass over runs, and lines of estimates over time."""
+"""What ``terrain estimate`` has in every mode: its results, and of filters and observers a pass and a report."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-import numpy as np
-
-from pipelines.report import Band, Figure, Line, Mark, Progress, Result, Strip, described, frame
+from pipelines.report import (
+    Figure,
+    Mark,
+    Part,
+    Progress,
+    Report,
+    Result,
+    Shown,
+    described,
+    frame,
+    sections,
+    tree,
+)
+from pipelines.slip.shown import first_rows
 from terrain.records import Array, RunLog
 
 if TYPE_CHECKING:
     import pandas as pd
-
-Found = TypeVar("Found")
 
 Keep = Callable[[RunLog, Callable[[], Mapping[str, Figure]]], None]
 """Gets each run with its estimates, and what makes its pictures by name."""
 
 MAX_PICTURED = 3
 """Runs whose pictures a page has; ``--figures`` writes those of all."""
-
-MAX_POINTS = 2000
-"""More points a line than this are more than a picture can show."""
 
 TRUTH_COLOUR = 6
 """Grey, for what was true, of every estimate."""
@@ -48,13 +53,18 @@ class TracksResult(Result):
         return frame(getattr(self, self.rows))
 
 
+class Tracked(NamedTuple):
+    """Figures of a run, the run with its estimates, and what makes its pictures by name."""
+
+    summary: Any
+    run: RunLog
+    pictures: Callable[[], dict[str, Figure]]
+
+
 def estimate_each(
     runs: Sequence[RunLog],
     name: str,
-    estimate: Callable[[RunLog], Found],
-    summarize: Callable[[Found], Any],
-    with_tracks: Callable[[Found], RunLog],
-    figures_of: Callable[[Found], dict[str, Figure]],
+    estimate: Callable[[RunLog], Tracked],
     progress: Progress,
     keep: Keep | None,
 ) -> dict[str, Any]:
@@ -63,36 +73,42 @@ def estimate_each(
     pictures: dict[str, Figure] = {}
     for done, run in enumerate(runs, start=1):
         found = estimate(run)
-        rows.append(summarize(found))
+        rows.append(found.summary)
         if keep is not None:
-            keep(with_tracks(found), partial(figures_of, found))
-        pictures |= figures_of(found) if done <= MAX_PICTURED else {}
+            keep(found.run, found.pictures)
+        pictures |= found.pictures() if done <= MAX_PICTURED else {}
         progress(f"estimate {name}", done, len(runs))
     return {"filter": name, "runs": tuple(rows), "pictures": pictures}
 
 
-def next_step(filter_name: str, out: Path | None) -> str:
-    """Return what follows an estimate: learning on runs that were written, or writing them."""
-    writing = f"terrain estimate --data DIR --filter {filter_name} --out runs/"
-    return writing if out is None else f"terrain crossval --data {out}"
-
-
-def line(label: str, time_s: Array, values: Any, colour: int | None = None, *, dashed: bool = False) -> Line:
-    """Return a line of thinned points.
+def tracks_report(
+    result: Any,
+    title: str,
+    answer: str,
+    rows: tuple[Sequence[Any], Sequence[Shown], str],
+    texts: tuple[str, Sequence[str]],
+    parts: Sequence[Part] = (),
+) -> Report:
+    """Return the report of a filter or an observer, which leads with the slip of the first run that has one.
 
     Parameters
     ----------
-    label, colour, dashed : as :class:`pipelines.report.Line`
-    time_s, values : (n,)
+    result : with its ``filter``, ``out``, ``pictures`` and ``skipped``
+    title, answer, parts : of the report, ``parts`` after its table
+    rows : of its table, with its columns and its title
+    texts : a section of the details
     """
-    every = max(1, len(time_s) // MAX_POINTS)
-    return Line(label, time_s[::every], np.asarray(values)[::every], colour=colour, dashed=dashed)
-
-
-def band(label: str, time_s: Array, mean: Array, half: Array, colour: int | None = None) -> Band:
-    """Return the thinned band ``mean - half`` to ``mean + half``, all (n,)."""
-    every = max(1, len(time_s) // MAX_POINTS)
-    return Band(label, time_s[::every], (mean - half)[::every], (mean + half)[::every], colour=colour)
+    pictures, (first, all_rows) = dict(result.pictures), first_rows(*rows)
+    lead = next((name for name in pictures if name.endswith("_slip")), next(iter(pictures), ""))
+    writing = f"terrain estimate --data DIR --filter {result.filter} --out runs/"
+    return Report(
+        title,
+        answer,
+        pictures.pop(lead, None),
+        [first, *parts],
+        sections(all_rows, texts, ("Pictures", list(pictures.values())), ("Not read", result.skipped)),
+        writing if result.out is None else f"terrain crossval --data {result.out}",
+    )
 
 
 def estimated(
@@ -107,29 +123,7 @@ def estimated(
     n_std : standard deviations that the band reaches
     """
     marks: list[Mark] = [
-        band(f"± {n_std} std", time_s, mean, n_std * std, 0),
-        line(label, time_s, mean, 0),
+        tree.Band(f"± {n_std} std", time_s, mean - n_std * std, mean + n_std * std, 0),
+        tree.Line(label, time_s, mean, 0),
     ]
-    return marks if true is None else [*marks, line("truth", time_s, true, TRUTH_COLOUR, dashed=True)]
-
-
-def spans(time_s: Array, marked: Array, name: str) -> list[Strip]:
-    """Return a strip of the intervals in which instants are marked; none where no instant is.
-
-    Parameters
-    ----------
-    time_s : (n,)
-    marked : (n,) of booleans
-    name : of what the intervals show
-
-    Examples
-    --------
-    >>> spans(np.arange(5.0), np.array([False, True, True, False, True]), "stuck")
-    [Strip(spans=((1.0, 3.0, 'stuck'), (4.0, 4.0, 'stuck')))]
-    """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], marked, [False]]).astype(int)))
-    last = len(time_s) - 1
-    found = tuple(
-        (float(time_s[begin]), float(time_s[min(end, last)]), name) for begin, end in edges.reshape(-1, 2)
-    )
-    return [Strip(found)] if found else []
+    return marks if true is None else [*marks, tree.Line("truth", time_s, true, TRUTH_COLOUR, dashed=True)]

@@ -46,14 +46,16 @@ def channel_label(channel: str) -> str:
 
 
 def quantity_interval(value: Value) -> str:
-    r"""Return the 95 % interval of a value.
+    r"""Return the 95 % interval of a value; a unit that both ends have stands once.
 
     Examples
     --------
     >>> quantity_interval(Value("payload_ratio", 0.2, "ratio", 0.1, 0.3)).replace("\xa0", " ")
-    '10 % to 30 %'
+    '10 to 30 %'
     """
-    return f"{quantity(value.name, value.low)} to {quantity(value.name, value.high)}"
+    low, high = quantity(value.name, value.low), quantity(value.name, value.high)
+    number, _, unit = low.partition(NBSP)
+    return f"{number if unit == high.partition(NBSP)[2] else low} to {high}"
 
 
 def value_with_interval(value: Value) -> str:
@@ -62,7 +64,7 @@ def value_with_interval(value: Value) -> str:
     Examples
     --------
     >>> value_with_interval(Value("payload_ratio", 0.2, "ratio", 0.1, 0.3)).replace("\xa0", " ")
-    '20 % (10 % to 30 %)'
+    '20 % (10 to 30 %)'
     """
     return f"{quantity(value.name, value.value)} ({quantity_interval(value)})"
 

@@ -6,13 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.explain.figures import (
-    dependence_figure,
-    parts_figure,
-    run_figure,
-    spectra_figure,
-    strongest_figure,
-)
+from pipelines.explain.figures import dependence_figures, parts_figure, run_figure, spectra_figure
 from pipelines.report import NOT_KNOWN
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
@@ -83,7 +77,7 @@ def test_the_answer_is_the_cause_with_its_interval_and_the_gain(explained):
     result = explained(a_gain(), causes=(LEVER_ARM,))
     answer = result.report.answer.replace("\xa0", " ").replace("\N{MINUS SIGN}", "-")
     assert answer == (
-        "The simulation of a<b> lacks lever arm, 0.1 m (90 mm to 0.11 m) and -50 mm (-60 mm to -40 mm). On 2 "
+        "The simulation of a<b> lacks lever arm, 0.1 m (90 mm to 0.11 m) and -50 mm (-60 to -40 mm). On 2 "
         "held-out runs the extension removes 50.0 % (40.0 to 60.0 %) of the whitened squared residual."
     )
     text = text_of(result)
@@ -137,7 +131,7 @@ LEFT = Unexplained("current_a", "wheel 1 turn", 12.34, 0.2), Unexplained("speed_
             {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS},
             (
                 "One of payload or motor constant is present, and these runs cannot distinguish them.",
-                "20 % (10 % to 30 %) accelerations and slopes; speed ahead distinguishes it from motor constant",
+                "20 % (10 to 30 %) accelerations and slopes; speed ahead distinguishes it from motor constant",
             ),
         ),
         (
@@ -222,7 +216,8 @@ def test_figures_show_the_residual_before_and_after_with_the_noise_about_the_mea
     half = (np.asarray(band.high) - np.asarray(band.low)) / 2
     errors = [np.nanstd(np.asarray(each.y) - np.asarray(measured.y)) for each in (before, after)]
     assert errors[1] < np.nanmean(half) < errors[0]
-    for figure in (strongest_figure(runs, [name]), dependence_figure(runs, noise, name)):
+    strongest, (every,) = dependence_figures(runs, noise, [name])
+    for figure in (strongest, every):
         first, second = figure.panels[0].marks
         assert np.nanstd(second.y) < 0.5 * np.nanstd(first.y)
     channels = channels_of(runs)

@@ -192,7 +192,7 @@ def test_what_is_refused(data, tmp_path):
             "run straight_01 is one of robot 'agrimaro', and 'rover' is calibrated",
         ),
         ({"robot": None}, ConfigError, "--robot is missing: --what robot starts from one"),
-        ({"laws": "bekker"}, ConfigError, "--laws is for --what soil, not for --what robot"),
+        ({"laws": ("bekker",)}, ConfigError, "--laws is for --what soil, not for --what robot"),
         ({"figures": tmp_path}, ConfigError, "--figures is for --what soil"),
     ):
         with pytest.raises(error, match=sentence):

@@ -28,7 +28,7 @@ def turns(tmp_path_factory):
 
 
 def test_slip_that_is_known_gains_and_its_model_is_a_file(turns, tmp_path):
-    result = judged(turns, out=tmp_path / "slip.yaml", lengths="2,4")
+    result = judged(turns, out=tmp_path / "slip.yaml", lengths=(2.0, 4.0))
     assert [round(scores.length_s) for scores in result.scores] == [2, 4]
     assert result.n_runs == 6
     assert result.adaptive is None
@@ -56,8 +56,8 @@ def test_what_cannot_be_judged_is_refused_and_a_model_that_is_there_left_as_it_i
     (tmp_path / "slip.yaml").write_text("mine")
     for also, error, message in (
         ({"robot": "husky"}, ConfigError, "drive 'skid_steer' has no tracks"),
-        ({"lengths": "0"}, ConfigError, "--lengths: 0.2 to 3600 seconds"),
-        ({"lengths": "60"}, DataError, "no run has poses"),
+        ({"lengths": (0.0,)}, ConfigError, "--lengths: 0.2 to 3600 seconds"),
+        ({"lengths": (60.0,)}, DataError, "no run has poses"),
         ({"folds": 7}, DataError, "6 runs have legs, at least 7 are required"),
         ({"out": tmp_path / "slip.yaml"}, ConfigError, "is there already"),
     ):

@@ -90,8 +90,8 @@ def test_the_soil_is_one_that_the_simulator_takes(fitted):
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"laws": "mud"}, "--laws is 'mud'; choose among simulator, bekker"),
-        ({"laws": "inflow,simulator"}, "--laws ends in 'simulator'"),
+        ({"laws": ("mud",)}, "--laws is 'mud'; choose among simulator, bekker"),
+        ({"laws": ("inflow", "simulator")}, "--laws ends in 'simulator'"),
         ({"draws": 1}, "--draws is 1: input should be greater than or equal to 2"),
     ],
 )
