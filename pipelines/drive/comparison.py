@@ -16,22 +16,7 @@ from pipelines.drive.controllers import DriveInputs, drive_once, train_classifie
 from pipelines.drive.run_figures import run_figures
 from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
-from pipelines.report import (
-    Column,
-    Figure,
-    Pairs,
-    Part,
-    Progress,
-    Report,
-    Result,
-    Table,
-    Text,
-    described,
-    frame,
-    sections,
-    silent,
-    tree,
-)
+from pipelines.report import Column, Progress, Report, Result, Table, described, frame, sections, silent, tree
 from pipelines.report.numbers import MINUS, NBSP, NOT_KNOWN, format_value, interval, plural
 from pipelines.report.versions import versions
 from pipelines.slip.table import law_marks
@@ -234,10 +219,10 @@ def report(result: DriveResult) -> Report:
             f"table {result.table}"
         ),
         picture=_picture(result),
-        parts=[*map(Text, belief_notes(compared)), Table(columns, means)],
+        parts=[*map(tree.Text, belief_notes(compared)), Table(columns, means)],
         details=sections(
             ("Who differs, and by how much", _difference_parts(compared, pairs)),
-            ("Controllers", [Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
+            ("Controllers", [tree.Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
             ("All figures", _metric_parts(result)),
             ("The first seed, run by run", _run_parts(result)),
             ("The curves behind the targets", _curve_parts(result.slip_table)),
@@ -308,7 +293,7 @@ def _text(name: str, ramp_mps2: float | None) -> str:
     return f"{text} With path tracking." if TRACK in name else text
 
 
-def _picture(result: DriveResult) -> Figure | None:
+def _picture(result: DriveResult) -> tree.Figure | None:
     """Return the first metrics of all controllers as bars."""
     names, panels = list(result.controllers), []
     for key in result.compared.shown[:PICTURED]:
@@ -323,10 +308,10 @@ def _picture(result: DriveResult) -> Figure | None:
             f"Means over {n} seeds and their 95 % intervals. All controllers drive the same seeds, so that bars "
             "whose intervals overlap may still differ significantly, seed by seed."
         )
-    return Figure("What it costs, and what it brings", panels, caption) if panels else None
+    return tree.Figure("What it costs, and what it brings", panels, caption) if panels else None
 
 
-def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) -> list[Part]:
+def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) -> list[tree.Part]:
     found = {(pair, key): compared.difference(*pair, key) for pair in pairs for key in compared.shown}
     keys = [key for key in compared.shown if any(found[pair, key] is not None for pair in pairs)]
     rows = [
@@ -368,7 +353,7 @@ def signed_difference(difference: float, key: str) -> str:
     return ("+" if difference > 0.0 else MINUS) + text
 
 
-def _metric_parts(result: DriveResult) -> list[Part | str]:
+def _metric_parts(result: DriveResult) -> list[tree.Part | str]:
     """Return all metrics, those that are compared first, and the names of those that no controller has."""
     compared, rows, undefined = result.compared, [], []
     known = [key for metrics in result.controllers.values() for key in metrics]
@@ -387,8 +372,10 @@ def _metric_parts(result: DriveResult) -> list[Part | str]:
         note += " Controllers that do not use the terrain have no time to its target."
     if undefined:
         note += f" Not defined here: {', '.join(undefined)}."
-    of_scenario = [text] if (text := SITUATIONS.get(result.scenario)) else []
-    return [*of_scenario, Table(("metric", "key", *result.controllers), rows, note=note)]
+    return [
+        SITUATIONS.get(result.scenario, ""),
+        Table(("metric", "key", *result.controllers), rows, note=note),
+    ]
 
 
 def _metric_text(value: MeanInterval, n_seeds: int) -> str:
@@ -400,17 +387,17 @@ def _metric_text(value: MeanInterval, n_seeds: int) -> str:
     return f"{text} ({interval(*value.ci)})"
 
 
-def _run_parts(result: DriveResult) -> list[Part]:
+def _run_parts(result: DriveResult) -> list[tree.Part]:
     """Return what the drives of the first seed were like; nothing without their curves."""
     text = (
         "Above: desired and commanded speed, and the speed over ground. Below: the true slip, with the range "
         "of the wheels, its estimate, the target, and the target with its floor: at least the slip of steady "
         f"motion and a margin. Below {PEAK_ABOVE_MPS:g} m/s no slip is drawn. All drives have the same axes."
     )
-    return [Text(text), *run_figures(result.examples)] if result.examples else []
+    return [tree.Text(text), *run_figures(result.examples)] if result.examples else []
 
 
-def _curve_parts(table: SlipTable | None) -> list[Part]:
+def _curve_parts(table: SlipTable | None) -> list[tree.Part]:
     """Return the slip curves of a table, without measurements, which it does not hold."""
     if table is None or not table.curves:
         return []
@@ -425,15 +412,15 @@ def _curve_parts(table: SlipTable | None) -> list[Part]:
         "The law fitted to measured runs, and the targets on it; the thrust above the resistance is available to "
         "accelerate and to climb."
     )
-    return [Figure(f"Slip curves of the table {table.name}", panels, caption, x_label="slip ratio")]
+    return [tree.Figure(f"Slip curves of the table {table.name}", panels, caption, x_label="slip ratio")]
 
 
-def _provenance(result: DriveResult) -> list[Part | str]:
+def _provenance(result: DriveResult) -> list[tree.Part | str]:
     first, last = result.seeds[0], result.seeds[-1]
     return [
         "Robot and terrain are models: controllers are compared on them, and what a robot in a field would do is "
         "not predicted.",
-        Pairs(
+        tree.Pairs(
             [
                 ("seeds", f"{first} to {last}" if last > first else first),
                 ("delay from a sample to the wheel", result.delay_s, "", "s"),

@@ -18,23 +18,7 @@ import numpy as np
 from pipelines.drive.drive import ALL
 from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
-from pipelines.report import (
-    Column,
-    Figure,
-    Mark,
-    Pairs,
-    Progress,
-    Report,
-    Result,
-    Shown,
-    Table,
-    described,
-    frame,
-    sections,
-    silent,
-    table,
-    tree,
-)
+from pipelines.report import Column, Progress, Report, Result, Table, described, frame, sections, silent, tree
 from pipelines.report.numbers import NOT_KNOWN, plural
 from pipelines.report.versions import versions
 from terrain.control.fault_drives import (
@@ -104,7 +88,7 @@ class FaultsResult(Result):
     bars: Mapping[str, BarCount] = described("each bar over all rows")
     n_rows: int = described("drives with a fault")
     n_met: int = described("those of them that meet all bars")
-    drawn: tuple[Figure, ...] = ()
+    drawn: tuple[tree.Figure, ...] = ()
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the drives with a fault, a row each."""
@@ -220,7 +204,7 @@ def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
     return LivePilot(robot, slips, KnownTerrain(), settings)
 
 
-def fault_figure(case: FaultCase, driven: Driven, references: References) -> Figure:
+def fault_figure(case: FaultCase, driven: Driven, references: References) -> tree.Figure:
     """Return the figure of a drive with a fault: speeds, slip and status over time.
 
     Parameters
@@ -234,27 +218,27 @@ def fault_figure(case: FaultCase, driven: Driven, references: References) -> Fig
     acts = tree.Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])
     estimated = np.where(np.abs(driven.speed_mps) < FASTEST_MPS, driven.speed_mps, math.nan)
     shown_s = max(start_s - BEFORE_S, 0.0), last_s
-    speeds: list[Mark] = [
+    speeds: list[tree.Mark] = [
         acts,
         tree.Line("desired", time_s, drive.desired_mps, 6, dashed=True),
         tree.Line("commanded", time_s, drive.commanded_mps, 2),
         tree.Line("over ground, true", time_s, drive.speed_mps, 0),
         tree.Line("over ground, estimated", time_s, estimated, 1),
     ]
-    slips: list[Mark] = [
+    slips: list[tree.Mark] = [
         acts,
         tree.Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
         tree.Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
         tree.Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
         tree.Line("estimated", time_s, drive.slip_ratio, 1),
     ]
-    ok: list[Mark] = [acts, tree.Line("", time_s, drive.ok.astype(float), 2)]
+    ok: list[tree.Mark] = [acts, tree.Line("", time_s, drive.ok.astype(float), 2)]
     panels = (
         (speeds, "speed [m/s]", (-0.5, 2.0)),
         (slips, "slip ratio", (-1.1, 1.1)),
         (ok, "status is OK", None),
     )
-    return Figure(
+    return tree.Figure(
         f"{case.fault}, {duration_text(case.duration_s)}: {case.situation} on {case.terrain}, seed {case.seed}",
         [tree.Panel(marks, label, x_range=shown_s, y_range=y_range) for marks, label, y_range in panels],
         x_label="time [s]",
@@ -277,28 +261,28 @@ def _place(at: FaultCase | CleanDrive) -> str:
 
 
 CLEAN = (
-    *(Shown("", _place), Shown("seed", "seed"), Shown("error of slip", "slip_error_ratio")),
-    *(Shown("not OK", "not_ok_s", unit="s"), Shown("peak of slip", "slip_peak_ratio")),
-    *(Shown("plain's", "plain_slip_peak_ratio"), Shown("stop", "stop_m", unit="m")),
-    Shown("plain's", "plain_stop_m", unit="m"),
+    *(Column("", of=_place), Column("seed", of="seed"), Column("error of slip", of="slip_error_ratio")),
+    *(Column("not OK", of="not_ok_s", unit="s"), Column("peak of slip", of="slip_peak_ratio")),
+    *(Column("plain's", of="plain_slip_peak_ratio"), Column("stop", of="stop_m", unit="m")),
+    Column("plain's", of="plain_stop_m", unit="m"),
 )
 
 DRIVES = (
-    *(Shown("fault", "case.fault"), Shown("situation", lambda row: _place(row.case))),
-    *(Shown("seed", "case.seed"), Shown("for", lambda row: duration_text(row.case.duration_s))),
-    Shown("OK while acting, s", "figures.ok_total_s"),
-    Shown("longest, s", "figures.ok_longest_s"),
-    Shown("held back, s", "figures.not_ok_s"),
-    Shown("error of slip", "figures.slip_error_ratio"),
-    Shown("peak of slip", "figures.slip_peak_ratio"),
-    Shown("plain's", "figures.plain_slip_peak_ratio"),
-    Shown("stop, of plain's", "figures.stop_ratio"),
-    Shown("recovery, s", "figures.recovery_s"),
-    Shown("above desired, s", "figures.overspeed_s"),
-    Shown("exceptions", "figures.n_exceptions"),
-    Shown("not finite", "figures.n_not_finite"),
-    Shown("bars unmet", lambda row: _short(row.unmet) or MET),
-    Shown("sensors named", lambda row: _named([row])),
+    *(Column("fault", of="case.fault"), Column("situation", of=lambda row: _place(row.case))),
+    *(Column("seed", of="case.seed"), Column("for", of=lambda row: duration_text(row.case.duration_s))),
+    Column("OK while acting, s", of="figures.ok_total_s"),
+    Column("longest, s", of="figures.ok_longest_s"),
+    Column("held back, s", of="figures.not_ok_s"),
+    Column("error of slip", of="figures.slip_error_ratio"),
+    Column("peak of slip", of="figures.slip_peak_ratio"),
+    Column("plain's", of="figures.plain_slip_peak_ratio"),
+    Column("stop, of plain's", of="figures.stop_ratio"),
+    Column("recovery, s", of="figures.recovery_s"),
+    Column("above desired, s", of="figures.overspeed_s"),
+    Column("exceptions", of="figures.n_exceptions"),
+    Column("not finite", of="figures.n_not_finite"),
+    Column("bars unmet", of=lambda row: _short(row.unmet) or MET),
+    Column("sensors named", of=lambda row: _named([row])),
 )
 
 
@@ -347,16 +331,16 @@ def report(result: FaultsResult) -> Report:
             ),
             (
                 "Without a fault",
-                [table(result.clean, CLEAN, note="All figures count from when a fault would begin.")],
+                [Table(CLEAN, result.clean, note="All figures count from when a fault would begin.")],
             ),
             ("Some drives", result.drawn[1:]),
-            ("All drives", [table(result.rows, DRIVES)]),
+            ("All drives", [Table(DRIVES, result.rows)]),
             (
                 "Where these numbers come from",
                 [
                     "Robot and terrain are models. A fault changes what arrives at the controller; the sensors "
                     "and the motion are those of the drive without it, until the commands differ.",
-                    Pairs([("seeds", ", ".join(map(str, result.seeds))), ("versions", versions())]),
+                    tree.Pairs([("seeds", ", ".join(map(str, result.seeds))), ("versions", versions())]),
                 ],
             ),
         ),

@@ -11,19 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.drive.drive import PAGE_FILE
-from pipelines.report import (
-    Figure,
-    Mark,
-    Pairs,
-    Part,
-    Progress,
-    Report,
-    Result,
-    Section,
-    Text,
-    described,
-    tree,
-)
+from pipelines.report import Figure, Pairs, Part, Progress, Report, Result, Section, Text, described, tree
 from pipelines.report.numbers import format_counts, format_value
 from terrain.control.car_evaluation import FollowedDrive
 from terrain.control.car_following import SlipSource
@@ -205,7 +193,7 @@ def _lateral_figure(result: PathResult) -> Figure:
     drive = result.drive
     error, ends = drive.lateral_m - result.offset_m, drive.distance_m[[0, -1]]
     most = 1.1 * min(max(result.limit_m, float(np.abs(error).max())), SHOWN_M)
-    marks: list[Mark] = [
+    marks: list[tree.Mark] = [
         tree.Band("a tenth of the speed", ends, [-result.limit_m] * 2, [result.limit_m] * 2, 6),
         tree.Line("lateral error", drive.distance_m, error, 0),
     ]
@@ -245,7 +233,7 @@ def _observed(result: PathResult) -> Iterator[Part]:
     for j, wheel in enumerate(WHEELS):
         estimate, std = np.degrees(drive.slip_rad[:, j]), np.degrees(drive.slip_std_rad[:, j])
         most = 1.4 * max(2.0, float(np.abs(estimate[np.isfinite(estimate)]).max(initial=0.0)))
-        marks: list[Mark] = [
+        marks: list[tree.Mark] = [
             tree.Band("two standard deviations", drive.time_s, estimate - 2 * std, estimate + 2 * std, 0),
             tree.Line("estimate", drive.time_s, estimate, 0),
             tree.Line("true", drive.time_s, np.degrees(drive.slip_true_rad[:, j]), 6),
@@ -255,7 +243,7 @@ def _observed(result: PathResult) -> Iterator[Part]:
     if np.isfinite(drive.stiffness_npr).any():
         stiffness = []
         for j, wheel in enumerate(WHEELS):
-            both: list[Mark] = [
+            both: list[tree.Mark] = [
                 tree.Line("estimate", drive.time_s, drive.stiffness_npr[:, j] / 1e3, 0),
                 tree.Points(
                     "true secant, where excited", drive.time_s, drive.secant_npr[:, j] / 1e3, colour=6

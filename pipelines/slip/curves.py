@@ -8,19 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.report import (
-    Figure,
-    Mark,
-    Part,
-    Progress,
-    Report,
-    Shown,
-    Text,
-    described,
-    sections,
-    table,
-    tree,
-)
+from pipelines.report import Column, Figure, Part, Progress, Report, Table, Text, described, sections, tree
 from pipelines.report.json_file import as_json
 from pipelines.report.numbers import enumerated, format_value, interval, plural
 from pipelines.slip.shown import file_name, first_rows, named
@@ -115,32 +103,32 @@ def _metrics(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
 
 
 TERRAINS = (
-    Shown("terrain", "terrain"),
-    Shown("status", "status"),
-    Shown("runs", "n_runs"),
-    Shown("peak", "peak_slip", SLIP),
-    Shown("kind", "peak_status"),
-    Shown("90 %", "peak_slip_ci", SLIP),
+    Column("terrain", of="terrain"),
+    Column("status", of="status"),
+    Column("runs", of="n_runs"),
+    Column("peak", SLIP, of="peak_slip"),
+    Column("kind", of="peak_status"),
+    Column("90 %", SLIP, of="peak_slip_ci"),
     *TARGETS,
 )
 
 CURVES = (
-    Shown("terrain", "terrain"),
-    Shown("slips", "slip_range", ".2f"),
-    Shown("law", "law"),
-    Shown("resistance over load", "resistance_ratio", SLIP),
-    Shown("efficiency in traction", "traction_efficiency", ".2f"),
-    Shown("energy in traction", "energy_jpm.traction", ".0f", "J/m"),
+    Column("terrain", of="terrain"),
+    Column("slips", ".2f", of="slip_range"),
+    Column("law", of="law"),
+    Column("resistance over load", SLIP, of="resistance_ratio"),
+    Column("efficiency in traction", ".2f", of="traction_efficiency"),
+    Column("energy in traction", ".0f", "J/m", of="energy_jpm.traction"),
 )
 
 RUNS = (
-    Shown("run", "run_id", long=True),
-    Shown("terrain", "terrain"),
-    Shown("samples", "n_samples"),
-    Shown("bins", "n_bins"),
-    Shown("slips", "slip_range", SLIP),
-    Shown("mass", "mass_kg", ".1f", "kg"),
-    Shown("resistance over load", "resistance_ratio", SLIP),
+    Column("run", of="run_id", long=True),
+    Column("terrain", of="terrain"),
+    Column("samples", of="n_samples"),
+    Column("bins", of="n_bins"),
+    Column("slips", SLIP, of="slip_range"),
+    Column("mass", ".1f", "kg", of="mass_kg"),
+    Column("resistance over load", SLIP, of="resistance_ratio"),
 )
 
 
@@ -184,8 +172,8 @@ def report(result: LearnedCurves) -> Report:
         sections(
             all_terrains,
             ("How to read this", [reading]),
-            ("Curves", [table(rows, CURVES)]),
-            ("Runs", [table(result.runs, RUNS)]),
+            ("Curves", [Table(CURVES, rows)]),
+            ("Runs", [Table(RUNS, result.runs)]),
             ("Left out", result.skipped),
         ),
         result.next_step,
@@ -211,7 +199,7 @@ def curve_figures(learned: Sequence[LearnedTerrain], robot: str) -> dict[str, Fi
 
 def curve_panel(entry: LearnedTerrain) -> tree.Panel:
     """Return bins of the runs on one terrain, and its law with peak, resistance and targets."""
-    marks: list[Mark] = []
+    marks: list[tree.Mark] = []
     shown = [0.1, 0.0]
     if entry.runs_with_bins:
         slip, thrust, std = (

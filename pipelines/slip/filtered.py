@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report import Figure, Mark, Part, Progress, Report, Shown, Text, described, tree
+from pipelines.report import Column, Figure, Mark, Part, Progress, Report, Text, described, tree
 from pipelines.report.numbers import format_value, interval, plural
 from pipelines.slip.tracks import (
     SLIP,
@@ -86,17 +86,17 @@ def estimate_all(
 
 
 RUNS = (
-    Shown("run", "run_id", long=True),
-    Shown("slip", "slip_mean", SLIP),
-    Shown("observed", lambda row: "yes" if row.slip_observable else "blind"),
-    Shown("std", "slip_std", ".4f"),
-    Shown("true", "slip_true_mean", SLIP),
-    Shown("stale", "stale_s", ".1f", "s"),
-    Shown("NEES", "nees", ".2f"),
-    Shown("NIS camera", "nis.camera_speed", ".2f"),
-    Shown("speed RMSE", "speed_rmse_mps", ".4f", "m/s"),
-    Shown("dropped", "n_dropped"),
-    Shown("gated", "n_gated"),
+    Column("run", of="run_id", long=True),
+    Column("slip", SLIP, of="slip_mean"),
+    Column("observed", of=lambda row: "yes" if row.slip_observable else "blind"),
+    Column("std", ".4f", of="slip_std"),
+    Column("true", SLIP, of="slip_true_mean"),
+    Column("stale", ".1f", "s", of="stale_s"),
+    Column("NEES", ".2f", of="nees"),
+    Column("NIS camera", ".2f", of="nis.camera_speed"),
+    Column("speed RMSE", ".4f", "m/s", of="speed_rmse_mps"),
+    Column("dropped", of="n_dropped"),
+    Column("gated", of="n_gated"),
 )
 
 BLIND = (

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from features.response import slip_cases
-from pipelines.report import Figure, Part, Progress, Report, Shown, Text, described, sections, table, tree
+from pipelines.report import Column, Figure, Part, Progress, Report, Table, Text, described, sections, tree
 from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
@@ -120,29 +120,30 @@ def estimate_all(
 
 
 SURFACES = (
-    Shown("surface", lambda row: row.terrain or UNLABELLED),
-    Shown("runs", "n_runs"),
-    Shown("windows", "n_windows"),
-    Shown("slip", "slip_ratio", SLIP),
-    Shown("95 % over runs", "interval", SLIP),
-    Shown("quartiles of windows", "spread", SLIP),
-    Shown("std of a window", "std", SLIP),
-    Shown("held-out difference", "held_out", SLIP),
-    Shown("wheels", lambda row: " ".join(format_value(slip, "+.2f") for slip in row.wheel_slip)),
-    Shown("yaw rate over wheels'", "turn_ratio", ".2f"),
+    Column("surface", of=lambda row: row.terrain or UNLABELLED),
+    Column("runs", of="n_runs"),
+    Column("windows", of="n_windows"),
+    Column("slip", SLIP, of="slip_ratio"),
+    Column("95 % over runs", SLIP, of="interval"),
+    Column("quartiles of windows", SLIP, of="spread"),
+    Column("std of a window", SLIP, of="std"),
+    Column("held-out difference", SLIP, of="held_out"),
+    Column("wheels", of=lambda row: " ".join(format_value(slip, "+.2f") for slip in row.wheel_slip)),
+    Column("yaw rate over wheels'", ".2f", of="turn_ratio"),
 )
 
 PREDICTIONS = (
-    Shown("held out", "held_out"),
-    Shown("runs", "n_runs"),
-    Shown("windows", "n_windows"),
-    Shown("RMS error", "rms", FINE),
-    Shown("95 %", "rms_interval", SLIP),
-    Shown("bias", "bias", "+.4f"),
-    Shown("inside 95 %", "coverage", ".1%"),
-    Shown("width", "width", SLIP),
-    Shown(
-        "by terrain", lambda row: ", ".join(f"{k} {format_value(v, SLIP)}" for k, v in row.by_terrain.items())
+    Column("held out", of="held_out"),
+    Column("runs", of="n_runs"),
+    Column("windows", of="n_windows"),
+    Column("RMS error", FINE, of="rms"),
+    Column("95 %", SLIP, of="rms_interval"),
+    Column("bias", "+.4f", of="bias"),
+    Column("inside 95 %", ".1%", of="coverage"),
+    Column("width", SLIP, of="width"),
+    Column(
+        "by terrain",
+        of=lambda row: ", ".join(f"{k} {format_value(v, SLIP)}" for k, v in row.by_terrain.items()),
     ),
 )
 
@@ -150,14 +151,14 @@ PREDICTIONS = (
 def report(result: MeasuredSlipResult) -> Report:
     """Return slip by surface, delays, predictions, and which runs have no slip and why."""
     title = f"median slip over {result.window_s:g} s, by surface"
-    parts: list[Part] = [table(result.surfaces, SURFACES, title)]
+    parts: list[Part] = [Table(SURFACES, result.surfaces, title)]
     parts += [
         Text(f"Session {session}: {delay.sentence}" if session else sentence(delay.sentence))
         for session, delay in result.delays.items()
     ]
     if result.predictions:
         about = "slip predicted from currents and wheel speeds alone"
-        parts.append(table(result.predictions, PREDICTIONS, about))
+        parts.append(Table(PREDICTIONS, result.predictions, about))
     if result.rollers is not None:
         parts += _roller_parts(result, result.rollers)
     spinning = [name for row in result.surfaces for name in row.spinning]
@@ -204,11 +205,11 @@ def _answer(result: MeasuredSlipResult) -> str:
 def _roller_parts(result: MeasuredSlipResult, found: RollerFindings) -> list[Part]:
     """Return what of the slip is the robot's own, which surfaces rollers name, and where the wheels are."""
     columns = (
-        Shown("surface", str),
-        Shown("roller friction", found.roller_ratio.get, SLIP),
-        Shown("95 %", found.roller_interval.get, SLIP),
-        Shown("RMS of slip left, held out", found.held_out_rms.get, FINE),
-        Shown("about the mean", found.plain_rms.get, FINE),
+        Column("surface", of=str),
+        Column("roller friction", SLIP, of=found.roller_ratio.get),
+        Column("95 %", SLIP, of=found.roller_interval.get),
+        Column("RMS of slip left, held out", FINE, of=found.held_out_rms.get),
+        Column("about the mean", FINE, of=found.plain_rms.get),
     )
     note = "Friction of the rollers over the stiffness of traction, both in proportion to a wheel's load."
     sentences = list(found.sentences)
@@ -218,7 +219,7 @@ def _roller_parts(result: MeasuredSlipResult, found: RollerFindings) -> list[Par
             f"{each.group or UNLABELLED}{fitted if each.n_right is not None else ''}: {each.text}."
         )
     sentences += [f"{name}: {bound.sentence}" for name, bound in result.distances.items()]
-    return [table(found.roller_ratio, columns, "what makes it slip", note), *map(Text, sentences)]
+    return [Table(columns, list(found.roller_ratio), "what makes it slip", note), *map(Text, sentences)]
 
 
 def _pictures(

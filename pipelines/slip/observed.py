@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report import Figure, Mark, Progress, Report, Shown, described, tree
+from pipelines.report import Column, Figure, Mark, Progress, Report, described, tree
 from pipelines.report.numbers import enumerated, format_value, interval, plural
 from pipelines.slip.tracks import (
     SLIP,
@@ -70,14 +70,14 @@ def estimate_all(
 
 
 SLIPS = (
-    Shown("run", "run_id", long=True),
-    Shown("slip", "name"),
-    Shown("mean", "slip.mean", SLIP),
-    Shown("std", "slip.std", ".4f"),
-    Shown("true", "slip.true_mean", SLIP),
-    Shown("RMSE", "slip.rmse", ".4f"),
-    Shown("NEES", "slip.nees", ".2f"),
-    Shown("position RMSE", "position_m", ".3f", "m"),
+    Column("run", of="run_id", long=True),
+    Column("slip", of="name"),
+    Column("mean", SLIP, of="slip.mean"),
+    Column("std", ".4f", of="slip.std"),
+    Column("true", SLIP, of="slip.true_mean"),
+    Column("RMSE", ".4f", of="slip.rmse"),
+    Column("NEES", ".2f", of="slip.nees"),
+    Column("position RMSE", ".3f", "m", of="position_m"),
 )
 
 

@@ -11,19 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines.data.datasets import drive_robot
 from pipelines.data.settings import load
-from pipelines.report import (
-    Column,
-    Progress,
-    Report,
-    Result,
-    Shown,
-    Table,
-    Text,
-    described,
-    frame,
-    sections,
-    table,
-)
+from pipelines.report import Column, Progress, Report, Result, Table, Text, described, frame, sections
 from pipelines.report.numbers import format_value, interval
 from terrain.calibration.odometry import ParameterFound, judge_odometry
 from terrain.calibration.odometry_judge import KindScore, LegScores
@@ -119,15 +107,15 @@ def _gain(name: str) -> Callable[[KindScore], Any]:
 
 
 KINDS = (
-    Shown("odometry", "kind"),
-    Shown("RMSE", "rmse_m", RMSE, "m"),
-    Shown("95 %", "rmse_ci_m", RMSE),
-    Shown("median", "median_m", RMSE, "m"),
-    Shown("heading", lambda row: math.degrees(row.yaw_rmse_rad), ".1f", "degrees"),
-    Shown("below encoder", _gain("gain_encoder"), ".0%"),
-    Shown("95 %", _gain("gain_encoder_ci"), ".0%"),
-    Shown("below gyro", _gain("gain_gyro"), ".0%"),
-    Shown("95 %", _gain("gain_gyro_ci"), ".0%"),
+    Column("odometry", of="kind"),
+    Column("RMSE", RMSE, "m", of="rmse_m"),
+    Column("95 %", RMSE, of="rmse_ci_m"),
+    Column("median", RMSE, "m", of="median_m"),
+    Column("heading", ".1f", "degrees", of=lambda row: math.degrees(row.yaw_rmse_rad)),
+    Column("below encoder", ".0%", of=_gain("gain_encoder")),
+    Column("95 %", ".0%", of=_gain("gain_encoder_ci")),
+    Column("below gyro", ".0%", of=_gain("gain_gyro")),
+    Column("95 %", ".0%", of=_gain("gain_gyro_ci")),
 )
 
 
@@ -158,4 +146,4 @@ def report(result: OdometryResult) -> Report:
 
 def _table(scores: LegScores, title: str) -> Table:
     size = f"{scores.n_legs} legs of {scores.n_runs} runs, {scores.path_m:.2g} m apart"
-    return table(scores.kinds, KINDS, f"{title}: {size}")
+    return Table(KINDS, scores.kinds, f"{title}: {size}")

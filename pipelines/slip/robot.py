@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.data.datasets import load_runs
-from pipelines.report import Progress, Report, Result, Shown, Text, described, frame, plural, sections
+from pipelines.report import Column, Progress, Report, Result, Text, described, frame, plural, sections
 from pipelines.slip.shown import first_rows
 from terrain.calibration.description import described_with, description_yaml, findings_of, hard_grounds
 from terrain.calibration.finding import Finding
@@ -116,12 +116,12 @@ def _sample(finding: Finding) -> str:
 
 
 NUMBERS = (
-    Shown("number", "parameter"),
-    Shown("unit", "unit"),
-    Shown("was", "described", ".4g"),
-    Shown("is", "value", ".4g"),
-    Shown("95 %", lambda row: (row.low, row.high), ".4g"),
-    Shown("of", _sample),
+    Column("number", of="parameter"),
+    Column("unit", of="unit"),
+    Column("was", ".4g", of="described"),
+    Column("is", ".4g", of="value"),
+    Column("95 %", ".4g", of=lambda row: (row.low, row.high)),
+    Column("of", of=_sample),
 )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.report import Shown, Table, table
+from pipelines.report import Column, Table
 from terrain.files.atomic import atomic_write
 
 if TYPE_CHECKING:
@@ -22,13 +22,13 @@ def named(rows: Mapping[str, Mapping[str, Any]], key: str = "terrain") -> list[d
 
 
 def first_rows(
-    rows: Sequence[Any], columns: Sequence[Shown], title: str
+    rows: Sequence[Any], columns: Sequence[Column], title: str
 ) -> tuple[Table, tuple[str, list[Part]]]:
     """Return a table of the first records, and a section of the details with all, empty where there are no more."""
     n_more = len(rows) - SHOWN_ROWS
     note = f"{n_more} more are in the details." if n_more > 0 else ""
-    rest: list[Part] = [table(rows, columns)] if n_more > 0 else []
-    return table(rows[:SHOWN_ROWS], columns, title, note), ("All of them", rest)
+    rest: list[Part] = [Table(columns, rows)] if n_more > 0 else []
+    return Table(columns, rows[:SHOWN_ROWS], title, note), ("All of them", rest)
 
 
 def file_name(text: str, also: str = "") -> str:

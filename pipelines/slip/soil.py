@@ -12,22 +12,7 @@ import numpy as np
 
 from pipelines.data.datasets import load_runs
 from pipelines.data.settings import load
-from pipelines.report import (
-    Column,
-    Figure,
-    Mark,
-    Part,
-    Progress,
-    Report,
-    Result,
-    Section,
-    Table,
-    Text,
-    described,
-    frame,
-    sections,
-    tree,
-)
+from pipelines.report import Column, Progress, Report, Result, Table, Text, described, frame, sections, tree
 from pipelines.report.numbers import format_value
 from pipelines.slip.shown import write_figures
 from terrain.errors import ConfigError, DataError
@@ -65,7 +50,7 @@ class SoilResult(Result):
     wheels: tuple[WheelResult, ...] = described("one each")
     files: tuple[str, ...] = described("that were written")
     skipped: tuple[str, ...] = described("a sentence for each trial that was skipped")
-    pictures: Mapping[str, Figure] = field(default_factory=dict)
+    pictures: Mapping[str, tree.Figure] = field(default_factory=dict)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the errors of each law on what was left out, a row each; slip and load given."""
@@ -114,7 +99,7 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
             "give a folder with smooth.csv or grouser.csv"
         )
     results: list[WheelResult] = []
-    pictures: dict[str, Figure] = {}
+    pictures: dict[str, tree.Figure] = {}
     for robot, wheel in WHEELS.items():
         own, others = ([run for run in each if run.robot == robot] for each in (runs, further))
         if not own:
@@ -155,8 +140,8 @@ def _written(result: WheelResult, out: Path, dataset: str) -> WheelResult:
 
 def report(result: SoilResult) -> Report:
     """Return the laws of each wheel with their errors on what was left out, the parameters and the limits."""
-    parts: list[Part] = []
-    details: list[Section] = []
+    parts: list[tree.Part] = []
+    details: list[tree.Section] = []
     for wheel in result.wheels:
         figures = [each for name, each in result.pictures.items() if name.startswith(f"{wheel.wheel}_")]
         parts += [_laws_table(wheel), Text(wheel.verdict)]
@@ -202,7 +187,7 @@ def _laws_table(wheel: WheelResult) -> Table:
     )
 
 
-def _wheel_details(wheel: WheelResult) -> list[Part]:
+def _wheel_details(wheel: WheelResult) -> list[tree.Part]:
     misfits: dict[str, Mapping[Any, Misfit]] = {
         "by regime, slips left out": wheel.regimes,
         "by the wheel speed left out [mm/s]": wheel.by_slip,
@@ -244,7 +229,7 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
     ]
 
 
-def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> Figure:
+def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> tree.Figure:
     """Show traction, side force and sinkage over slip, a colour an angle: points measured, lines predicted.
 
     Parameters
@@ -259,7 +244,7 @@ def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, 
     for name, y_label in PANELS:
         scale = 1e3 if name.endswith("_m") else 1.0
         measured, predicted = scale * getattr(trials, name), scale * getattr(prediction, name)
-        marks: list[Mark] = []
+        marks: list[tree.Mark] = []
         for number, angle in enumerate(np.unique(trials.angle_setting)):
             rows, colour = np.flatnonzero(trials.angle_setting == angle), number % 7
             own = [rows[trials.slip_setting[rows] == speed] for speed in np.unique(trials.slip_setting[rows])]
@@ -277,4 +262,4 @@ def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, 
         f"{format_value(1e3 * errors.sinkage_m, '.1f', 'mm')}"
     )
     caption = "Points are measured, lines predicted; a colour a slip angle."
-    return Figure(title, panels, caption, x_label="slip ratio")
+    return tree.Figure(title, panels, caption, x_label="slip ratio")

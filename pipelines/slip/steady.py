@@ -8,19 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.report import (
-    Figure,
-    Mark,
-    Part,
-    Progress,
-    Report,
-    Shown,
-    Text,
-    described,
-    sections,
-    table,
-    tree,
-)
+from pipelines.report import Column, Figure, Part, Progress, Report, Table, Text, described, sections, tree
 from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.slip.shown import named
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of
@@ -90,25 +78,25 @@ def _assumed(row: Mapping[str, Any]) -> str:
 
 
 SURFACES = (
-    Shown("terrain", "terrain"),
-    Shown("runs", "slip.n_runs"),
-    Shown("slip", "slip.slip_ratio", SLIP),
-    Shown("95 %", "slip.interval", SLIP),
-    Shown("current", lambda row: row["current_a"][0], ".2f", "A"),
-    Shown("thrust over load", lambda row: row["thrust_ratio"][0], ".2f"),
+    Column("terrain", of="terrain"),
+    Column("runs", of="slip.n_runs"),
+    Column("slip", SLIP, of="slip.slip_ratio"),
+    Column("95 %", SLIP, of="slip.interval"),
+    Column("current", ".2f", "A", of=lambda row: row["current_a"][0]),
+    Column("thrust over load", ".2f", of=lambda row: row["thrust_ratio"][0]),
     *TARGETS,
-    Shown("assumed", _assumed),
+    Column("assumed", of=_assumed),
 )
 
 TRANSFERS = (
-    Shown("terrain", "terrain"),
-    Shown("learned in", lambda row: row.learned or "(none)"),
-    Shown("driven in", lambda row: row.driven or "(none)"),
-    Shown("runs", lambda row: f"{row.n_learned}, {row.n_driven}"),
-    Shown("target", "slip_learned", SLIP),
-    Shown("shown", "slip_driven", SLIP),
-    Shown("off by", "difference", TARGET),
-    Shown("95 %", "interval", TARGET),
+    Column("terrain", of="terrain"),
+    Column("learned in", of=lambda row: row.learned or "(none)"),
+    Column("driven in", of=lambda row: row.driven or "(none)"),
+    Column("runs", of=lambda row: f"{row.n_learned}, {row.n_driven}"),
+    Column("target", SLIP, of="slip_learned"),
+    Column("shown", SLIP, of="slip_driven"),
+    Column("off by", TARGET, of="difference"),
+    Column("95 %", TARGET, of="interval"),
 )
 
 STEADY = (
@@ -132,9 +120,9 @@ def report(result: SteadyTargets) -> Report:
         if np.isfinite(row["slip"].slip_ratio)
     ]
     title = f"target slip of {result.robot}, measured from outside"
-    parts: list[Part] = [table(rows, SURFACES, title, STEADY)]
+    parts: list[Part] = [Table(SURFACES, rows, title, STEADY)]
     if result.transfers:
-        parts.append(table(result.transfers, TRANSFERS, "a target of one session in another", INDEPENDENT))
+        parts.append(Table(TRANSFERS, result.transfers, "a target of one session in another", INDEPENDENT))
     if result.skipped:
         not_used = plural(len(result.skipped), "run")
         parts.append(Text(f"{not_used} not used; the first: {result.skipped[0]}", "note"))
@@ -163,7 +151,7 @@ def operating_figure(
         "surface": [np.full(each.slip_ratio.size, float(k)) for k, each in enumerate(points.values())],
     }
     label = next(name for name, values in shown.items() if np.isfinite(np.concatenate(values)).any())
-    marks: list[Mark] = []
+    marks: list[tree.Mark] = []
     for number, (terrain, height) in enumerate(zip(points, shown[label], strict=True)):
         slip = surfaces[terrain]["slip"]
         at, colour = points[terrain].slip_ratio, number % 7

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.report import Figure, Mark, Result, Shown, described, frame, tree
+from pipelines.report import Column, Figure, Mark, Result, described, frame, tree
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, write_slip_table
 from terrain.records import Array
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 SLIP, TARGET = ".3f", "+.3f"
 
-TARGETS = tuple(Shown(state, f"targets.{state}.slip_ratio", TARGET) for state in DRIVE_STATES)
+TARGETS = tuple(Column(state, TARGET, of=f"targets.{state}.slip_ratio") for state in DRIVE_STATES)
 """Columns of the target slips of a terrain."""
 
 

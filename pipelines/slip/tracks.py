@@ -7,19 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from pipelines.report import (
-    Figure,
-    Mark,
-    Part,
-    Progress,
-    Report,
-    Result,
-    Shown,
-    described,
-    frame,
-    sections,
-    tree,
-)
+from pipelines.report import Column, Figure, Part, Progress, Report, Result, described, frame, sections, tree
 from pipelines.slip.shown import first_rows
 from terrain.records import Array, RunLog
 
@@ -85,7 +73,7 @@ def tracks_report(
     result: Any,
     title: str,
     answer: str,
-    rows: tuple[Sequence[Any], Sequence[Shown], str],
+    rows: tuple[Sequence[Any], Sequence[Column], str],
     texts: tuple[str, Sequence[str]],
     parts: Sequence[Part] = (),
 ) -> Report:
@@ -113,7 +101,7 @@ def tracks_report(
 
 def estimated(
     label: str, time_s: Array, mean: Array, std: Array, n_std: int, true: Array | None = None
-) -> list[Mark]:
+) -> list[tree.Mark]:
     """Return an estimate over time, the band of its standard deviations, and what was true where that is known.
 
     Parameters
@@ -122,7 +110,7 @@ def estimated(
     time_s, mean, std, true : (n,)
     n_std : standard deviations that the band reaches
     """
-    marks: list[Mark] = [
+    marks: list[tree.Mark] = [
         tree.Band(f"± {n_std} std", time_s, mean - n_std * std, mean + n_std * std, 0),
         tree.Line(label, time_s, mean, 0),
     ]
