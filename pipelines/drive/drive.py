@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -202,22 +202,16 @@ class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
         """Refuse options that the mode would not use."""
         if self.faults and self.path is not None:
             raise ValueError("--faults and --path are two kinds of drives: give one of them")
+        compared = ComparisonSettings.model_fields
         if self.path is not None:
-            self._refuse(
-                (*ComparisonSettings.model_fields, "terrain", "table", "seeds", "n_jobs"), "without --path"
-            )
-        elif self.faults:
-            self._refuse((*ComparisonSettings.model_fields, "speed_mps"), "without --faults")
-        if not self.faults:
-            self._refuse(FaultSettings.model_fields, "with --faults NAME")
-        if self.path is None:
-            self._refuse(PathSettings.model_fields, "with --path FILE")
+            self.refuse((*compared, "terrain", "table", "seeds", "n_jobs"), "is accepted without --path")
+        else:
+            self.refuse(PathSettings.model_fields, "is accepted with --path FILE")
+        if self.faults:
+            self.refuse((*compared, "speed_mps"), "is accepted without --faults")
+        else:
+            self.refuse(FaultSettings.model_fields, "is accepted with --faults NAME")
         return self
-
-    def _refuse(self, names: Iterable[str], accepted: str) -> None:
-        for name in names:
-            if getattr(self, name) != type(self).model_fields[name].default:
-                raise ValueError(f"{type(self).model_fields[name].alias} is accepted {accepted}")
 
     @property
     def all_seeds(self) -> range:

@@ -8,6 +8,7 @@ Nothing heavy is imported here, nor by a module of settings: ``--help`` reads th
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable
 from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -65,6 +66,13 @@ class Settings(BaseModel):
     def with_(self, **changed: Any) -> Self:
         """Return the same settings with some changed, checked anew."""
         return type(self)(**dict(self) | changed)
+
+    def refuse(self, names: Iterable[str], why: str) -> None:
+        """Refuse settings that are given, as those of another mode of a command: ``ConfigError`` with the reason."""
+        for name in names:
+            field = type(self).model_fields[name]
+            if getattr(self, name) != field.default:
+                raise ConfigError(f"{field.alias} {why}")
 
 
 class JobsSettings(Settings):

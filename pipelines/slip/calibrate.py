@@ -11,7 +11,6 @@ from pydantic import field_validator
 from pipelines.data.settings import RunsSettings
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
-from pipelines.slip.modes import refuse_others
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -56,6 +55,7 @@ class SoilSettings(BaseSettings):
         None, "Folder of further trials, which the last law predicts and no fit has."
     )
     draws: int = setting(60, "Bootstrap samples behind the intervals.", ge=2, le=10_000)
+    figures: Path | None = setting(None, "Folder of pictures.")
 
     @field_validator("laws")
     @classmethod
@@ -80,16 +80,14 @@ class Settings(SoilSettings, OdometrySettings, RobotSettings, RunsSettings):
     out: Path | None = setting(
         None, "New YAML file of the robot or of the slip model; of a soil a folder with a file a wheel."
     )
-    figures: Path | None = setting(None, "Folder of pictures; of a soil.")
     seed: int = setting(0, "Of folds and bootstrap; a robot's calibration draws nothing.", ge=0)
 
 
 GROUPS: dict[str, type[BaseSettings]] = {
-    "--what robot": RobotSettings,
-    "--what odometry": OdometrySettings,
-    "--what soil": SoilSettings,
+    "robot": RobotSettings,
+    "odometry": OdometrySettings,
+    "soil": SoilSettings,
 }
-"""Options of each mode, by what they are for."""
 
 
 def run(settings: Settings, progress: Progress) -> Result:
@@ -99,17 +97,13 @@ def run(settings: Settings, progress: Progress) -> Result:
     ------
     ConfigError
         if an option is missing or for something else, or a file is there already.
-    LogError
-        if a run cannot be read.
-    DataError
-        if the runs do not show what is to be found.
     """
-    refuse_others(settings, GROUPS, f"--what {settings.what}", f"--what {settings.what}")
-    if settings.what == "soil" and settings.robot is not None:
-        raise ConfigError("--robot: a soil is found from trials that name their wheels; leave it out")
-    if settings.what != "soil" and settings.robot is None:
+    for what, group in GROUPS.items():
+        if what != settings.what:
+            settings.refuse(group.model_fields, f"is for --what {what}, not for --what {settings.what}")
+    if settings.what == "soil":
+        settings.refuse(("robot",), "is not for --what soil, whose trials name their wheels")
+    elif settings.robot is None:
         raise ConfigError(f"--robot is missing: --what {settings.what} starts from one")
-    if settings.what != "soil" and settings.figures is not None:
-        raise ConfigError(f"--figures is for --what soil, not for --what {settings.what}")
     result: Result = import_module(f"pipelines.slip.{settings.what}").calibrate(settings, progress)
     return result

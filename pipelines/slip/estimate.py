@@ -13,7 +13,6 @@ from pydantic import field_validator
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
-from pipelines.slip.modes import refuse_others
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -246,6 +245,8 @@ def _estimated(
     from terrain.estimation.observers.choice import OBSERVERS
 
     number = 2 if options.filter == "pose" else int(options.filter in OBSERVERS)
-    refuse_others(options, GROUPS, list(GROUPS)[number], f"--filter {options.filter}")
+    for each, (purpose, group) in enumerate(GROUPS.items()):
+        if each != number:
+            options.refuse(group.model_fields, f"is for {purpose}, not for --filter {options.filter}")
     result: TracksResult = import_module(RESULTS[number]).estimate_all(runs, robot, options, progress, keep)
     return result

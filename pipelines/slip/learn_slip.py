@@ -41,17 +41,15 @@ def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
         if a folder cannot be written.
     """
     from pipelines.data.settings import load
+    from pipelines.report.writing import check_file
     from pipelines.slip.curves import LearnedCurves, log_curves
     from pipelines.slip.shown import write_figures
-    from terrain.errors import ConfigError
     from terrain.files.atomic import ensure_writable
     from terrain.robots import SwerveRobot, load_robot
 
     robot = load_robot(settings.robot)
     runs, skipped = load(settings)
-    if settings.out.is_dir():
-        raise ConfigError(f"{settings.out}: is a folder; --out names the file of the table")
-    ensure_writable(settings.out.parent)
+    check_file(settings.out, "--out")
     if settings.figures is not None:
         ensure_writable(settings.figures)
     if isinstance(robot, SwerveRobot):

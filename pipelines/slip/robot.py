@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.data.datasets import load_runs
 from pipelines.report import Column, Progress, Report, Result, Text, described, frame, plural, sections
+from pipelines.report.writing import check_file
 from pipelines.slip.shown import first_rows
 from terrain.calibration.description import described_with, description_yaml, findings_of, hard_grounds
 from terrain.calibration.finding import Finding
 from terrain.calibration.noise import measurement_variances
 from terrain.errors import ConfigError, DataError
-from terrain.files.atomic import atomic_write, ensure_writable
+from terrain.files.atomic import atomic_write
 from terrain.robots import SwerveRobot, read_description, robot_from
 
 if TYPE_CHECKING:
@@ -68,7 +68,10 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
             f"robot {robot.name}: {file} is extended by effects; calibrate the description without them, "
             "then explain again"
         )
-    out = None if settings.out is None else _new_file(settings.out)
+    if (out := settings.out) is not None:
+        check_file(out, "--out", (".yaml", ".yml"))
+        if out.exists():
+            raise ConfigError(f"{out}: is there already, and is left as it is; choose another --out")
     runs = load_runs(
         settings.data,
         layout=settings.layout,
@@ -99,15 +102,6 @@ def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
         findings=tuple(findings),
         measurement_variances=variances,
     )
-
-
-def _new_file(out: Path) -> Path:
-    if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"{out}: a robot's description is a .yaml file")
-    if out.exists():
-        raise ConfigError(f"{out}: is there already, and is left as it is; choose another --out")
-    ensure_writable(out.absolute().parent)
-    return out
 
 
 def _sample(finding: Finding) -> str:

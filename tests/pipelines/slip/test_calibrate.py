@@ -179,7 +179,7 @@ def test_what_is_refused(data, tmp_path):
     other.write_text(_source_of_agrimaro().replace("name: agrimaro", "name: rover"))
     for options, error, sentence in (
         ({"out": taken}, ConfigError, "is there already, and is left as it is"),
-        ({"out": tmp_path / "robot.json"}, ConfigError, r"a robot's description is a \.yaml file"),
+        ({"out": tmp_path / "robot.json"}, ConfigError, "a name that ends in .yaml or .yml is required"),
         (
             {"out": tmp_path / "new.yaml"},
             DataError,

@@ -159,7 +159,7 @@ def test_a_faulty_run_is_left_out_on_request(runs):
 
 def test_paths_that_cannot_be_written_are_refused(folder, tmp_path):
     asked = Settings(data=folder, robot="agrimaro", out=tmp_path)
-    with pytest.raises(ConfigError, match="is a folder; --out names the file"):
+    with pytest.raises(ConfigError, match="is a folder; --out names a file"):
         run(asked, silent)
     (tmp_path / "file").write_text("")
     with pytest.raises(TerrainError, match="cannot be written"):

@@ -108,5 +108,5 @@ def test_runs_of_another_kind_and_a_file_as_folder_are_refused(make_run, tmp_pat
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match="is a file; --out names a folder"):
         run(settings.with_(out=tmp_path / "file"), silent)
-    with pytest.raises(ConfigError, match="--robot: a soil is found from trials"):
+    with pytest.raises(ConfigError, match="--robot is not for --what soil"):
         run(settings.with_(robot="husky"), silent)
