@@ -2,11 +2,9 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from pipelines.explain.classifier import classifier_gain
-from terrain.discrepancy.filter_gain import accuracy_change
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
@@ -36,15 +34,3 @@ def test_a_classifier_gains_where_the_extension_matters_and_gives_a_reason_where
         assert reason in refused.reason
     slow = [replace(run, streams={"imu": run.streams["imu"]}) for run in held]
     assert "wheel" in classifier_gain(slow, AGRIMARO, {}, effects, 0, runs_a_terrain=2).reason
-
-
-def test_the_interval_of_an_accuracy_is_over_runs():
-    rng = np.random.default_rng(0)
-    run_id = np.repeat([f"r{i}" for i in range(20)], 10)
-    before = rng.random(200) < 0.6
-    each = np.repeat(rng.random(20) < 0.5, 10)  # whole runs become correct
-    change = accuracy_change(before, before | each, run_id, 0).change_ci
-    gained = (before | each).mean() - before.mean()
-    assert change[0] < gained < change[1]
-    spread = np.array([(each & ~before)[run_id == name].mean() for name in np.unique(run_id)]).std()
-    assert change[1] - change[0] == pytest.approx(2 * 1.96 * spread / np.sqrt(20), rel=0.2)

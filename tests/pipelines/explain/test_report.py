@@ -16,10 +16,6 @@ from terrain.discrepancy.filter_gain import Change, Comparison
 from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
 from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.discrepancy.nameless import Learned, Nameless
-from terrain.discrepancy.next_drive import next_command
-from terrain.discrepancy.response_slopes import Slope
-from terrain.discrepancy.statements import Statement, notes_of
-from terrain.discrepancy.terrain_match import TerrainMatch
 from terrain.discrepancy.verdict import (
     Cause,
     Limit,
@@ -89,18 +85,6 @@ def test_the_answer_is_the_cause_with_its_interval_and_the_gain(explained):
     )
 
 
-def test_what_is_stated_and_faulty_comes_before_the_causes_and_the_rest_is_folded(explained):
-    stated = [
-        Statement("speed_x_mps", Slope(1.0, 0.1), (), 0.1, np.nan, "", f"speed ahead: it is {i}", i < 5)
-        for i in range(7)
-    ]
-    report = explained(None, stated, excluded_runs=(Excluded("r9", "its gyro stands still"),)).report
-    shown = " ".join(str(part) for part in report.parts)
-    assert [f"it is {i}" in shown for i in range(4)] == [True, True, True, False]
-    assert "Runs that were excluded as unfit: r9." in shown
-    assert "its gyro stands still" not in shown
-
-
 NAMELESS = Nameless(2, {"speed_x_mps": Learned(0.02, 0.01, 0.76, 0.75, -0.02)}, 0.76, 0.75)
 FILTER = Comparison("vio12", None, 2, {"speed_mps": Change(0.1, 0.05, (-0.06, -0.04))})
 CLASSIFIER = Comparison("svm", None, 2, {"accuracy": Change(0.8, 0.9, None)}, ("a",))
@@ -110,84 +94,59 @@ PAYLOAD = Varying("payload", "payload_ratio", "ratio", ("scrub",), 0.1, 0.14, 9.
 LEFT = Unexplained("current_a", "wheel 1 turn", 12.34, 0.2), Unexplained("speed_x_mps", "time", np.inf, 0)
 
 
-@pytest.mark.parametrize(
-    ("findings", "stated"),
-    [
-        ({"gain": a_gain(refused=True)}, ("no gain can be claimed", "no gain to claim")),
-        ({"gain": a_gain(refused=True, high=-0.05)}, (" worse ",)),
+FINDINGS = (
+    ({"gain": a_gain(refused=True)}, ("no gain can be claimed", "no gain to claim")),
+    ({"gain": a_gain(refused=True, high=-0.05)}, (" worse ",)),
+    (
+        {"gain": replace(a_gain(filter=FILTER, classifier=CLASSIFIER), nameless=NAMELESS)},
         (
-            {"gain": replace(a_gain(), nameless=NAMELESS)},
-            (
-                "speed ahead m/s 0.02 0.01 75.0 % 70.0 to 80.0 % 76.0 %",
-                "reference 76 %: little is left to find.",
-            ),
+            "speed ahead m/s 0.02 0.01 75.0 % 70.0 to 80.0 % 76.0 %",
+            "reference 76 %: little is left to find.",
+            "speed, root mean square m/s 0.1 0.05 -0.06 to -0.04",
+            f"accuracy 0.8 0.9 {NOT_KNOWN}",
         ),
+    ),
+    ({"gain": a_gain(filter=Comparison("vio12", "no camera", 2, {}))}, ("not measured: no camera",)),
+    (
+        {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS},
         (
-            {"gain": a_gain(filter=FILTER, classifier=CLASSIFIER)},
-            ("speed, root mean square m/s 0.1 0.05 -0.06 to -0.04", f"accuracy 0.8 0.9 {NOT_KNOWN}"),
+            "One of payload or motor constant is present, and these runs cannot distinguish them.",
+            "20 % (10 to 30 %) accelerations and slopes; speed ahead distinguishes it from motor constant",
         ),
-        ({"gain": a_gain(filter=Comparison("vio12", "no camera", 2, {}))}, ("not measured: no camera",)),
+    ),
+    (
+        {"not_excited": LIMITS[1:3], "unexplained": LEFT, "varying": (PAYLOAD,)},
         (
-            {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS},
-            (
-                "One of payload or motor constant is present, and these runs cannot distinguish them.",
-                "20 % (10 to 30 %) accelerations and slopes; speed ahead distinguishes it from motor constant",
-            ),
+            "depends on wheel 1 turn 12.3 20.0 %",
+            "Of 4 parameters that may be wrong, 2 could not have been detected.",
+            "A payload of any size would not have been detected.",
+            "A clock rate of any size that is likely (up to 2 %) would not have been detected.",
+            "An effective track off by under 4.8 % would not have been detected.",
+            "scrub The runs show nothing of it. 0.4",
+            "10 % on average, with a standard deviation of 14 %. Two groups: 0 % in 2 runs (a, b), and 30 % in 6 "
+            "runs (c, d, e, f, g, ...). These runs do not distinguish that from scrub.",
         ),
+    ),
+    (
+        {
+            "clocks": (Clock("r3", 0.0123, 0.001), Clock("r4", np.nan, np.inf)),
+            "excluded_runs": (Excluded("r<9>", "its gyro stands still"),),
+            "next_drive": NextDrive("climb", 6.0, "it parts them"),
+        },
         (
-            {"next_drive": NextDrive("climb", 6.0, "it parts them")},
-            ("Scenario climb, on a slope of 6°: it parts",),
+            f"r3 12.3 1.0 r4 {NOT_KNOWN}",
+            "excluded as unfit: r<9>.",
+            "r<9> its gyro stands still",
+            "Scenario climb, on a slope of 6°: it parts",
         ),
-        (
-            {"unexplained": LEFT},
-            ("cause, in sum of the currents and speed ahead.", "depends on wheel 1 turn 12.3 20.0 %"),
-        ),
-        (
-            {"not_excited": LIMITS[1:3]},
-            (
-                "Of 4 parameters that may be wrong, 2 could not have been detected.",
-                "A payload of any size would not have been detected.",
-                "A clock rate of any size that is likely (up to 2 %) would not have been detected.",
-                "A steering offset 1 under 3 mrad would not have been detected.",
-                "An effective track off by under 4.8 % would not have been detected.",
-                "scrub The runs show nothing of it. 0.4",
-            ),
-        ),
-        ({"excluded_runs": (Excluded("r<9>", "its gyro stands still"),)}, ("r<9> its gyro stands still",)),
-        (
-            {"clocks": (Clock("r3", 0.0123, 0.001), Clock("r4", np.nan, np.inf))},
-            (f"r3 12.3 1.0 r4 {NOT_KNOWN}",),
-        ),
-        (
-            {"varying": (PAYLOAD,)},
-            (
-                "10 % on average, with a standard deviation of 14 %.",
-                "Two groups: 0 % in 2 runs (a, b), and 30 % in 6 runs (c, d, e, f, g, ...).",
-                "These runs do not distinguish that from scrub.",
-            ),
-        ),
-    ],
+    ),
 )
+
+
+@pytest.mark.parametrize(("findings", "stated"), FINDINGS)
 def test_what_was_found_is_stated_with_its_numbers(explained, findings, stated):
     text = text_of(explained(**findings))
     assert [each for each in stated if each not in text] == []
-
-
-def test_the_next_drive_is_a_command_of_the_described_robot(explained):
-    diagnosis = explained(next_drive=NextDrive("climb", 6.0, "it parts them")).diagnosis
-    assert next_command(diagnosis, "my robot.yaml", HUSKY, ()) == (
-        "terrain simulate --robot 'my robot.yaml' --terrain grass --scenario climb --grade 6 --runs 8 "
-        "--out next_drive"
-    )
-
-
-def test_terrains_that_differ_or_are_bumpy_are_named(few):
-    apart = {"ice": Slope(0.4, 0.01), "snow": Slope(0.5, 0.01)}
-    first, second = notes_of(few.diagnosis, [TerrainMatch("gravel", "gravel", 0.25)], apart)
-    assert "25 % of the measured tilt" in first
-    assert "measured over simulated is 0.40 on ice and 0.50 on snow." in second
-    assert "Explain each by itself with --terrain ice or --terrain snow." in second
-    assert notes_of(few.diagnosis, [TerrainMatch("grass", "grass", 1.0)], {}) == ()
 
 
 def test_robots_on_tracks_have_sprockets(explained):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from terrain.discrepancy.filter_gain import accuracy_change
 from terrain.discrepancy.gain import gain
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import ConfigError, DataError
@@ -81,3 +82,15 @@ def test_a_gain_without_held_out_runs_or_of_another_robot_is_refused(longer):
         gain(simulation(), simulation(LONGER), [])
     with pytest.raises(ConfigError, match="'agrimaro', not of 'husky'"):
         gain(simulation(), Simulation(load_robot("agrimaro")), longer)
+
+
+def test_the_interval_of_an_accuracy_is_over_runs():
+    rng = np.random.default_rng(0)
+    run_id = np.repeat([f"r{i}" for i in range(20)], 10)
+    before = rng.random(200) < 0.6
+    each = np.repeat(rng.random(20) < 0.5, 10)  # whole runs become correct
+    change = accuracy_change(before, before | each, run_id, 0).change_ci
+    gained = (before | each).mean() - before.mean()
+    assert change[0] < gained < change[1]
+    spread = np.array([(each & ~before)[run_id == name].mean() for name in np.unique(run_id)]).std()
+    assert change[1] - change[0] == pytest.approx(2 * 1.96 * spread / np.sqrt(20), rel=0.2)

@@ -8,16 +8,25 @@ import pytest
 from terrain.discrepancy.channel_words import off_by
 from terrain.discrepancy.compared import ComparedRun, compare_runs
 from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
+from terrain.discrepancy.next_drive import next_command
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.response_slopes import Slope, slope_through_zero, slopes_of
 from terrain.discrepancy.robot_terms import in_robot_terms
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.statements import acting_causes, split_ruled_out, statements_of, terrains_apart
+from terrain.discrepancy.statements import (
+    acting_causes,
+    notes_of,
+    split_ruled_out,
+    statements_of,
+    terrains_apart,
+)
+from terrain.discrepancy.terrain_match import TerrainMatch
 from terrain.discrepancy.verdict import (
     Cause,
     Diagnosis,
     Limit,
+    NextDrive,
     RuledOut,
     Unexplained,
     Value,
@@ -249,3 +258,20 @@ def test_a_cause_acts_on_the_channels_that_it_changes():
     assert "yaw_rate_radps" in acting["effective_track"]
     assert "speed_y_mps" in acting["camera_yaw"]
     assert "yaw_rate_radps" not in acting["camera_yaw"]
+
+
+def test_terrains_that_differ_or_are_bumpy_are_named():
+    apart = {"ice": Slope(0.4, 0.01), "snow": Slope(0.5, 0.01)}
+    first, second = notes_of(a_diagnosis(), [TerrainMatch("gravel", "gravel", 0.25)], apart)
+    assert "25 % of the measured tilt" in first
+    assert "measured over simulated is 0.40 on ice and 0.50 on snow." in second
+    assert "Explain each by itself with --terrain ice or --terrain snow." in second
+    assert notes_of(a_diagnosis(), [TerrainMatch("grass", "grass", 1.0)], {}) == ()
+
+
+def test_the_next_drive_is_a_command_of_the_described_robot():
+    coming = a_diagnosis(next_drive=NextDrive("climb", 6.0, "it parts them"))
+    assert next_command(coming, "my robot.yaml", HUSKY, ()) == (
+        "terrain simulate --robot 'my robot.yaml' --terrain grass --scenario climb --grade 6 --runs 8 "
+        "--out next_drive"
+    )
