@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from pipelines.drive import controllers
-from pipelines.drive.comparison import (
-    DriveResult,
-    belief_notes,
-    compare,
-)
+from pipelines.drive.comparison import DriveResult, belief_notes, compare
 from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import run_figures
@@ -22,25 +18,17 @@ from pipelines.report.terminal import terminal_text
 from terrain.control.controllers import CONTROLLERS, make_controller
 from terrain.control.drive_comparison import Comparison, steepest_grade
 from terrain.control.drive_curves import DriveCurves
-from terrain.control.drive_evaluation import (
-    METRICS,
-    evaluate_drive,
-)
+from terrain.control.drive_evaluation import METRICS, evaluate_drive
 from terrain.control.drive_metrics import drive_history
 from terrain.control.pilot_settings import PilotStatus
 from terrain.control.power_state import DriveState
 from terrain.control.situations import SituationOptions, make_situation
-from terrain.control.slip_table import CurveEntry, SlipTable, load_slip_table
+from terrain.control.slip_table import load_slip_table
 from terrain.control.terrain_source import TerrainEstimate
 from terrain.robots import load_robot
 
 SHORT = Settings(
-    scenario="straight",
-    controllers=("plain", "target:0.15"),
-    seeds=2,
-    first_seed=300,
-    duration_s=6.0,
-    n_jobs=1,
+    scenario="straight", controllers=("plain",), seeds=2, first_seed=300, duration_s=6.0, n_jobs=1
 )
 ALL = SHORT.with_(controllers=("plain", "ramp", "thesis", "fallback", "true_terrain+track", "known:clay"))
 ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
@@ -246,13 +234,3 @@ def test_a_drive_shows_states_refusals_and_terrains():
     assert labels[0] - labels[1] >= {"target", "target with its floor"}
     assert (len(one.panels), len(other.panels)) == (4, 2)
     assert one.panels[1].y_range == other.panels[1].y_range
-
-
-def test_curves_are_drawn_where_the_table_has_any():
-    numbers = dict.fromkeys(CurveEntry.__dataclass_fields__, 0.1)
-    numbers |= {"law": "janosi", "parameters": {"limit_ratio": 0.5, "shear_ratio": 0.2}}
-    numbers |= {"peak_status": "peak", "peak_interval_ratio": (0.5, 0.6), "slip_range_ratio": (0.0, 0.7)}
-    table = SlipTable("t", "unknown", TABLE.targets, curves={"clay": CurveEntry(**numbers | {"n_runs": 5})})
-    results = [replace(a_result(), slip_table=each) for each in (table, TABLE)]
-    titles = [{section.title for section in result.report.details} for result in results]
-    assert titles[0] - titles[1] == {"The curves behind the targets"}

@@ -1,22 +1,56 @@
+"""Slip measured from outside, of runs whose slip is known, and the steady targets that are learned from it."""
+
 import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from pipelines.cli.main import app
 from pipelines.data.datasets import load_runs
 from pipelines.slip.estimate import estimate_runs
-from terrain.errors import ConfigError, DataError, LogError
+from pipelines.slip.learn_slip import learn_slip_table
+from terrain.control.measured_table import FEW_RUNS, NO_PEAK
+from terrain.control.slip_table import load_slip_table
+from terrain.errors import ConfigError, DataError
+from terrain.kinematics import omni
+from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.write import write_run
+from terrain.records import Label, RunLog, Stream, TargetStatus
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
 
+ROBOTINO = load_robot("robotino")
+LENGTH_S = 9.0
 SLIP = {"cork": 0.1, "moss": 0.4}
 CURRENT = {"cork": 0.4, "moss": 0.8}
 
 
+def omni_run(rng, run_id, terrain, direction, slip, current_a, session="", noise=(0.0, 0.0)):
+    """Return a run at 0.1 m/s in one direction, by its slip and currents, seen by a camera above."""
+    time_s = np.arange(0.0, LENGTH_S, 0.031)
+    twist = 0.1 * np.array([np.cos(direction), np.sin(direction), 0.0])
+    wheels = omni.inverse(ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad, twist)
+    flat = np.zeros((time_s.size, 3))
+    travelled = np.cumsum(0.1 * (1 - np.asarray(slip)) * np.ones(time_s.size)) * 0.031
+    pose = np.column_stack(
+        [travelled * np.cos(direction), travelled * np.sin(direction), np.zeros(time_s.size)]
+    )
+    pose += rng.normal(0.0, 0.0005, pose.shape)
+    current = flat + np.reshape(current_a, (-1, 1)) + rng.normal(0.0, noise[0], flat.shape)
+    rates = flat + ROBOTINO.logged_rates(wheels) + rng.normal(0.0, noise[1], flat.shape)
+    channels = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
+    commanded = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+    streams = {
+        "wheels": Stream(time_s, np.hstack([rates, current]), channels),
+        "pose": Stream(time_s, pose, ("position_x_m", "position_y_m", "yaw_rad")),
+        "commands": Stream(time_s, np.tile(twist, (time_s.size, 1)), commanded),
+    }
+    labels = (Label(0.0, LENGTH_S, terrain),) if terrain else ()
+    return with_wheel_speeds(RunLog(run_id, "robotino", streams, labels, session=session), ROBOTINO)
+
+
 @pytest.fixture(scope="module")
-def one_ground(omni_run):
+def one_ground():
     rng = np.random.default_rng(0)
     return [
         omni_run(rng, f"{name}_{i:02d}", name, i * 0.3, SLIP[name], CURRENT[name], noise=(0.05, 0.5))
@@ -26,7 +60,7 @@ def one_ground(omni_run):
 
 
 @pytest.fixture(scope="module")
-def two_grounds(omni_run):
+def two_grounds():
     """Runs without a label, half on each of two grounds."""
     rng, first = np.random.default_rng(1), np.arange(0.0, 9.0, 0.031) < 4.5
     slip, current = (np.where(first, both["cork"], both["moss"]) for both in (SLIP, CURRENT))
@@ -86,21 +120,125 @@ def test_what_cannot_be_measured_is_refused_in_one_sentence(one_ground):
             measured_slips(runs, **options)
 
 
-def test_the_command_writes_result_runs_and_pictures(tmp_path, one_ground):
-    for run in one_ground:
-        write_run(run, tmp_path / "one")
-    words = ["estimate", "--filter", "pose", "--data", str(tmp_path / "one"), "--out", str(tmp_path / "out")]
-    words += ["--json", str(tmp_path / "slip.json"), "--figures", str(tmp_path / "figures")]
-    found = CliRunner().invoke(app, words)
-    assert found.exception is None, found.output
-    assert "moss" in found.output
-    document = json.loads((tmp_path / "slip.json").read_text(encoding="utf-8"))
+def test_the_command_writes_result_runs_and_pictures(terrain, place, one_ground):
+    for run in one_ground[::4]:
+        write_run(run, place / "one")
+    words = ("estimate", "--filter", "pose", "--data", "one", "--out", "out", "--figures", "figures")
+    code, out, err = terrain(*words, "--json", "slip.json")
+    assert code == 0, err
+    assert "moss" in out
+    document = json.loads((place / "slip.json").read_text(encoding="utf-8"))
     assert document["surfaces"][1]["slip_ratio"] == pytest.approx(0.4, abs=0.01)
     assert document["figures"][0].endswith("slip_by_surface.png")
-    slip = load_runs(tmp_path / "out")[0].streams["slip"]
+    slip = load_runs(place / "out")[0].streams["slip"]
     assert slip.channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
     assert np.nanmedian(np.abs(slip.values)) == pytest.approx(0.1, abs=0.03)
-    assert isinstance(CliRunner().invoke(app, words).exception, LogError)
+    assert "is there already" in terrain(*words)[2]
+
+
+@pytest.fixture(scope="module")
+def runs():
+    rng = np.random.default_rng(0)
+    slips = rng.normal(0.3, 0.02, 12)
+    moss = [
+        omni_run(rng, f"moss_{name}_{i}", "moss", 0.3 * i, slip, 0.6, name)
+        for name, each in {"monday": slips, "friday": slips + 0.1}.items()
+        for i, slip in enumerate(each)
+    ]
+    return moss + [omni_run(rng, f"cork_{i}", "cork", 0.3 * i, 0.1, 0.6) for i in range(2)]
+
+
+@pytest.fixture(scope="module")
+def learned(runs):
+    return learn_slip_table(runs, ROBOTINO)
+
+
+def test_steady_slip_is_learned_and_what_was_not_driven_stays_assumed(tmp_path, learned):
+    table = load_slip_table(learned.save(tmp_path / "table.yaml"), robot="robotino")
+    moss, cork = table.targets["moss"], table.targets["cork"]
+    assert moss["steady"].status is TargetStatus.ESTIMATED
+    assert moss["steady"].slip_ratio == pytest.approx(0.35, abs=0.02)
+    assert 0.0 < moss["steady"].slip_std < 0.05
+    assert moss["steady"].n_runs == 24
+    assert moss["traction"].status is TargetStatus.UNESTIMATED
+    assert moss["traction"].slip_ratio >= moss["steady"].slip_ratio + 0.03
+    assert {target.status for target in cork.values()} == {TargetStatus.UNESTIMATED}
+    reasons = [learned.surfaces[name]["reason"] for name in ("moss", "cork")]
+    assert reasons == [NO_PEAK, FEW_RUNS]
+
+
+def test_the_thrust_of_a_point_is_that_of_its_current(learned):
+    motors = ROBOTINO.motors
+    torque = 0.6 * motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+    expected = (torque - motors.friction_nm) / ROBOTINO.wheel_radius_m / (ROBOTINO.mass_kg * 9.80665 / 3)
+    found = learned.surfaces["moss"]
+    assert found["current_a"][0] == pytest.approx(0.6)
+    assert found["thrust_ratio"][0] == pytest.approx(expected)
+
+
+def test_what_a_session_costs_another_is_the_difference_that_was_hidden(learned):
+    transfers = learned.transfers
+    assert [(each.learned, each.driven) for each in transfers] == [("friday", "monday"), ("monday", "friday")]
+    low, high = transfers[1].interval
+    assert low < 0.1 < high
+    assert high - low < 0.1
+    assert low < transfers[1].difference < high
+    assert transfers[1].difference == -transfers[0].difference
+    assert (transfers[1].n_learned, transfers[1].n_driven) == (12, 12)
+
+
+def test_a_session_of_few_runs_has_a_difference_without_an_interval(runs):
+    for each in learn_slip_table(runs[:14], ROBOTINO).transfers:  # two of the second session
+        assert abs(each.difference) > 0.05
+        assert np.isnan(each.interval).all()
+
+
+def without_currents(run):
+    wheels = run.streams["wheels"]
+    names = [name for name in wheels.channels if not name.startswith("current")]
+    values = np.column_stack([wheels.channel(name) for name in names])
+    return replace(run, streams={**run.streams, "wheels": Stream(wheels.time_s, values, names)})
+
+
+@pytest.mark.parametrize(("soil", "least"), [("dry_sand", 0.1), ("clay", 0.01)])
+def test_slip_of_a_simulated_skid_steer_robot_is_that_of_its_truth(soil, least):
+    husky = load_robot("husky")
+    driven = [simulate_run(husky, soil, "straight", 3, i, duration_s=12.0) for i in range(3)]
+    truths = [run.streams["truth"] for run in driven]
+    late = [truth.channel("slip_left_ratio")[truth.time_s > 6.0] for truth in truths]
+    truth = float(np.median(np.concatenate(late)))
+    for each, height in (
+        (driven, "thrust of a wheel over its load"),
+        (map(without_currents, driven), "surface"),
+    ):
+        table = learn_slip_table(each, husky)
+        (row,) = table.surfaces.values()
+        assert truth > least
+        assert row["slip"].slip_ratio == pytest.approx(truth, abs=3 * row["slip"].std)
+        assert row["slip"].std < 0.02
+        assert table.targets[soil]["steady"].slip_ratio == pytest.approx(row["slip"].slip_ratio, abs=1e-4)
+        assert table.pictures["operating_points"].panels[0].y_label == height
+        assert np.isfinite(row["current_a"][0]) == (height != "surface")
+
+
+def test_runs_that_are_not_used_are_named(runs):
+    streams = dict(runs[0].streams)
+    halves = (Label(0.0, 4.0, "moss"), Label(4.0, 8.0, "cork"))
+    others = [RunLog("bare", "robotino", streams), RunLog("both", "robotino", streams, halves)]
+    result = learn_slip_table([*runs, *others], ROBOTINO)
+    assert result.skipped == ("run bare: has no label", "run both: is on 2 terrains: moss, cork")
+    assert result.n_runs == len(runs)
+
+
+def test_runs_that_show_no_slip_are_refused(runs):
+    blind = replace(runs[0], run_id="a", streams={"wheels": runs[0].streams["wheels"]})
+    for given, robot, sentence in (
+        ([blind], ROBOTINO, "none of 1 runs has a slip; the first for this: run a: nothing"),
+        ([replace(runs[0], labels=())], ROBOTINO, "none of 1 runs has a label"),
+        (runs, load_robot("husky"), "of the robot 'robotino': a table is learned for one, 'husky'"),
+    ):
+        with pytest.raises(DataError, match=sentence):
+            learn_slip_table(given, robot)
 
 
 @pytest.mark.slow
@@ -113,3 +251,6 @@ def test_measured_runs_reach_what_is_stated(measured):
     for row in result.predictions:
         assert row.rms < 0.05
         assert 0.9 <= row.coverage <= 0.98
+    learned = learn_slip_table(runs, ROBOTINO).surfaces
+    slips = {name: row["slip"].slip_ratio for name, row in learned.items()}
+    assert slips == pytest.approx({"table": 0.10, "brown": 0.14, "gray": 0.29, "green": 0.50}, abs=0.03)
