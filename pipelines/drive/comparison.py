@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -17,7 +16,7 @@ from pipelines.drive.run_figures import run_figures
 from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report import Column, Progress, Report, Result, Table, described, frame, sections, silent, tree
-from pipelines.report.numbers import MINUS, NBSP, NOT_KNOWN, format_value, interval, plural
+from pipelines.report.numbers import NOT_KNOWN, format_value, interval, plural
 from pipelines.report.versions import versions
 from pipelines.slip.table import law_marks
 from terrain.control.comparison import Difference, MeanInterval
@@ -203,11 +202,8 @@ def report(result: DriveResult) -> Report:
     names, shown, compared = list(result.controllers), result.compared.shown, result.compared
     pairs = pairs_to_compare(names) if shown else []
     grade = f", {result.grade_deg:g}° uphill" if result.grade_deg else ""
-    terrain = result.terrain
-    if terrain == COURSE:
-        terrain = "all terrains"
-    elif terrain.endswith("ml"):
-        terrain = Path(terrain).stem
+    named = Path(result.terrain).stem if result.terrain.endswith("ml") else result.terrain
+    terrain = "all terrains" if named == COURSE else named
     labels = [metric_label(key) for key in shown]
     means = [(name, *(compared.value(name, key).mean for key in shown)) for name in names]
     columns = [Column("mean over seeds"), *(Column(label.text, unit=label.unit) for label in labels)]
@@ -342,15 +338,10 @@ def signed_difference(difference: float, key: str) -> str:
     Examples
     --------
     >>> signed_difference(-0.0804, "slip_peak"), signed_difference(1.25, "steepest_deg")
-    ('−8.0\xa0%', '+1.25°')
+    ('−8.0\xa0%', '+1.25\xa0°')
     """
-    if key in ABSOLUTE:
-        text = format_value(abs(difference), unit=metric_label(key).unit).replace(f"{NBSP}°", "°")
-    else:
-        text = format_value(abs(difference), ".1%")
-    if not re.search("[1-9]", text):
-        return text
-    return ("+" if difference > 0.0 else MINUS) + text
+    form, unit = ("+.3g", metric_label(key).unit) if key in ABSOLUTE else ("+.1%", "")
+    return format_value(difference, form, unit)
 
 
 def _metric_parts(result: DriveResult) -> list[tree.Part | str]:

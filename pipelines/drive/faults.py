@@ -96,31 +96,15 @@ class FaultsResult(Result):
 
 
 def run(settings: Settings, progress: Progress) -> FaultsResult:
-    """Drive each fault in each situation, and evaluate what the controller makes of it."""
-    robot = checked_robot(settings)
-    if settings.table is not None:
-        slips = load_slip_table(settings.table, robot.name)
-    else:
-        terrains = dict.fromkeys(place.terrain for place in _places(settings))
-        slips = simulated_table(robot, list(terrains), LEARNING_SEED, partial(progress, "learn targets"))
-    return drive_faults(settings, robot, slips, progress)
-
-
-def checked_robot(settings: Settings) -> Robot:
-    """Return the robot, once all that is named is known to exist.
+    """Drive each fault in each situation, once all that is named is known to exist.
 
     Raises
     ------
     ConfigError
         if a fault, a situation or a terrain is unknown, or the robot is no swerve robot with all sections.
-    TerrainError
-        if its description cannot be read.
     """
-    robot = as_drive(
-        SwerveRobot,
-        load_robot(settings.robot),
-        "robot {name}: drive {drive!r} has no pilot, only 'swerve' has",
-    )
+    refusal = "robot {name}: drive {drive!r} has no pilot, only 'swerve' has"
+    robot, places = as_drive(SwerveRobot, load_robot(settings.robot), refusal), _places(settings)
     robot.require(*robot.sections)
     chosen = {fault.name for fault in _chosen_faults(settings, robot)}
     drawn = {fault.name for fault in select_faults(fault_catalogue(robot), settings.draw)}
@@ -128,9 +112,14 @@ def checked_robot(settings: Settings) -> Robot:
         raise ConfigError(
             f"--draw has {min(drawn - chosen)!r}, which is not among the faults that are driven"
         )
-    for place in _places(settings):
+    for place in places:
         make_fault_situation(place.situation, robot, place.terrain, place.seed)
-    return robot
+    if settings.table is not None:
+        slips = load_slip_table(settings.table, robot.name)
+    else:
+        terrains = dict.fromkeys(place.terrain for place in places)
+        slips = simulated_table(robot, list(terrains), LEARNING_SEED, partial(progress, "learn targets"))
+    return drive_faults(settings, robot, slips, progress)
 
 
 def _chosen_faults(settings: Settings, robot: Robot) -> Sequence[SensorFault]:

@@ -53,14 +53,14 @@ class PathResult(Result):
     path: Path = described("file of the path")
     observer: str = described("that gave the sideslip")
     seed: int = described("of the noise")
-    length_m: float = described("of the path", "m")
+    length_m: float = described("length of the path", "m", form=".1f")
     n_points_merged: int = described("points of the file that lay too close to their neighbours")
     speed_mps: float = described("desired", "m/s")
     reached_end: bool = described("whether the robot came to the end")
-    duration_s: float = described("of the drive", "s")
+    duration_s: float = described("duration of the drive", "s", form=".1f")
     slowest_mps: float = described("slowest speed, start and standing excepted", "m/s")
-    lateral_max_m: float = described("largest error of the true position, to the desired offset", "m")
-    lateral_rms_m: float = described("its root mean square", "m")
+    lateral_max_m: float = described("largest lateral error, to the desired offset", "m", form=".3f")
+    lateral_rms_m: float = described("root mean square of the lateral error", "m", form=".3f")
     lateral_max_at_m: float = described("distance along the path of the largest error", "m")
     limit_m: float = described("a tenth of the speed, the bound of Deremetz et al.", "m")
     within_limit: bool = described("whether the largest error is below it and the end was reached")
@@ -68,7 +68,9 @@ class PathResult(Result):
     slip_error_rad: float = described(
         "root mean square error of the estimate; null without an observer", "rad"
     )
-    stiffness_error_ratio: float = described("median error of the cornering stiffness over the secant", "1")
+    stiffness_error_ratio: float = described(
+        "cornering stiffness, median error over the secant", "1", form=".1%"
+    )
     grip_ratio: float = described("largest side force over load as known at the end, with the preview", "1")
     grip_std: float = described("its standard deviation", "1")
     statuses: Mapping[str, Mapping[str, int]] = described(
@@ -150,14 +152,10 @@ def report(result: PathResult) -> Report:
     """Return whether the path was followed, its lateral error, and behind it what the observer gave."""
     degrees = 180.0 / math.pi
     figures: list[tuple[Any, ...]] = [
-        ("length of the path", result.length_m, ".1f", "m"),
-        ("duration", result.duration_s, ".1f", "s"),
-        ("slowest speed away from start and stops", result.slowest_mps, "", "m/s"),
-        ("lateral error, largest", result.lateral_max_m, ".3f", "m"),
-        ("lateral error, root mean square", result.lateral_rms_m, ".3f", "m"),
+        *result.pairs("length_m", "duration_s", "slowest_mps", "lateral_max_m", "lateral_rms_m"),
         ("true slip angle, largest", result.slip_max_rad * degrees, "", "°"),
         ("slip angle, error of the estimate", result.slip_error_rad * degrees, "", "°"),
-        ("cornering stiffness, median error", result.stiffness_error_ratio, ".1%"),
+        *result.pairs("stiffness_error_ratio"),
     ]
     if not math.isnan(result.grip_ratio):
         grip = f"{format_value(result.grip_ratio)} ± {format_value(result.grip_std)}"

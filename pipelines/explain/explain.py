@@ -94,7 +94,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
         raise ConfigError(f"{extended_file}: is there already and is not overwritten; choose another --out")
     ensure_writable(out)
     description = model or settings.robot
-    options = {name: getattr(settings, name) for name in ExplainOptions.model_fields}
+    options = settings.model_dump(include=set(ExplainOptions.model_fields))
     found = explain_runs(
         runs, tested, data=settings.dataset, description=description, progress=progress, **options
     )
@@ -158,7 +158,7 @@ def explain_runs(
     from terrain.discrepancy.next_drive import next_command
     from terrain.discrepancy.powertrain import powertrain_answer
     from terrain.discrepancy.robot_terms import in_robot_terms
-    from terrain.discrepancy.statements import statements_of, terrains_apart
+    from terrain.discrepancy.statements import notes_of, statements_of, terrains_apart
     from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain
     from terrain.effects import chosen_effects, showing
     from terrain.extension import region_of
@@ -200,6 +200,6 @@ def explain_runs(
         statements=statements_of(diagnosis, robot, diagnosed.compared, gained.gain, diagnosed.acting),
         terms={cause.name: in_robot_terms(cause.name, cause.values, robot) for cause in diagnosis.causes},
         next_command=next_command(diagnosis, description, robot, diagnosed.terrains),
-        terrains_apart=terrains_apart(diagnosis, diagnosed.compared),
+        notes=notes_of(diagnosis, diagnosed.terrains, terrains_apart(diagnosis, diagnosed.compared)),
         powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
     )

@@ -16,7 +16,6 @@ from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain_answer import PowertrainAnswer
-from terrain.discrepancy.response_slopes import Slope
 from terrain.discrepancy.robot_terms import quantity
 from terrain.discrepancy.sentences import (
     channel_label,
@@ -29,7 +28,7 @@ from terrain.discrepancy.sentences import (
     varying_text,
     verdict_text,
 )
-from terrain.discrepancy.statements import SESSION_COLUMNS, Statement, notes_of, session_rows, split_ruled_out
+from terrain.discrepancy.statements import SESSION_COLUMNS, Statement, session_rows, split_ruled_out
 from terrain.discrepancy.verdict import Diagnosis, Value
 from terrain.effects import effect_named
 from terrain.robots import Robot
@@ -66,7 +65,6 @@ class ExplainResult(Result):
     robot : as it was tested
     diagnosed : runs with their diagnosis, beside the simulation
     extended : the robot with the causes built in; None where none was named
-    terrains_apart : measured over simulated by label, where labels clearly differ
     extended_file : of the extended robot, if it was written
     n_pictures : most runs that are drawn; None for all
     """
@@ -74,7 +72,6 @@ class ExplainResult(Result):
     robot: Robot
     diagnosed: DiagnosedRuns
     extended: Robot | None
-    terrains_apart: Mapping[str, Slope]
     data: str = described("name of the data set")
     data_digest: str = described("digest of its runs")
     description: str = described("description of the robot as it was tested")
@@ -84,6 +81,7 @@ class ExplainResult(Result):
     gain: HeldOutGain = described("on the runs held out")
     statements: tuple[Statement, ...] = described("a sentence for each channel")
     terms: Mapping[str, str] = described("by cause, its value in quantities of the robot's description")
+    notes: tuple[str, ...] = described("what a reader has to know of the terrains and sessions")
     next_command: str | None = described("simulates the next drive; null where none is suggested")
     powertrain: PowertrainAnswer | None = described("from commanded to measured wheel speeds, where logged")
     model: str | None = described(
@@ -99,11 +97,6 @@ class ExplainResult(Result):
         """What the simulation gets wrong, with its evidence."""
         return self.diagnosed.diagnosis
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What a reader has to know of the terrains and sessions, in sentences."""
-        return notes_of(self.diagnosis, self.diagnosed.terrains, self.terrains_apart)
-
     def as_json(self) -> dict[str, Any]:
         """Return the described fields, those of the diagnosis, and what the runs were used for."""
         runs, extended = self.diagnosed, self.extended
@@ -111,7 +104,6 @@ class ExplainResult(Result):
             **self.diagnosis.as_json(),
             "built_in": runs.simulation.effects,
             "terrain_matches": runs.terrains,
-            "notes": self.notes,
             "used": [run.run_id for run in runs.used],
             "held_out": [run.run_id for run in runs.held_out],
             "extended": extended and {"file": self.extended_file, "effects": extended.effects},

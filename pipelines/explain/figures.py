@@ -157,8 +157,10 @@ def spectra_figure(
 
 def _residuals(runs: Sequence[ComparedRun], c: int) -> list[tuple[str, int, list[Array]]]:
     """Return the residuals of a channel before and, where anything was built in, after: label, colour, by run."""
-    kinds = [(BEFORE, VERMILION, False), (AFTER, BLUE, True)][: 1 if runs[0].after is None else 2]
-    return [(kind, colour, [run.residual(after)[:, c] for run in runs]) for kind, colour, after in kinds]
+    found = [(BEFORE, VERMILION, [run.residual(False)[:, c] for run in runs])]
+    if runs[0].after is not None:
+        found.append((AFTER, BLUE, [run.residual(True)[:, c] for run in runs]))
+    return found
 
 
 def _points(label: str, at: Array, values: Array, halves: Array, colour: int) -> tree.Points:

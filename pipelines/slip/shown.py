@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -54,11 +54,10 @@ def write_figures(figures: Mapping[str, Figure], folder: Path, *, svg: bool = Tr
 
     folder.mkdir(parents=True, exist_ok=True)
     files = []
+    writers: dict[str, Callable[[Figure], bytes | str]] = {".png": figure_png}
+    writers |= {".svg": figure_svg} if svg else {}
     for name, figure in figures.items():
-        contents: dict[str, bytes | str] = {".png": figure_png(figure)}
-        if svg:
-            contents[".svg"] = figure_svg(figure)
-        for ending, content in contents.items():
+        for ending, written in writers.items():
             files.append(folder / f"{file_name(name)}{ending}")
-            atomic_write(files[-1], content)
+            atomic_write(files[-1], written(figure))
     return tuple(str(file) for file in files)
