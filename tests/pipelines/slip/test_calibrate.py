@@ -59,18 +59,6 @@ def calibrated(tmp_path_factory):
     return folder / "runs", out, calibrate(folder / "runs", "agrimaro", out)
 
 
-@pytest.fixture
-def data(tmp_path):
-    """Return a function that writes runs and gives their folder."""
-
-    def write(*runs):
-        for each in runs:
-            write_run(each, tmp_path / "runs")
-        return tmp_path / "runs"
-
-    return write
-
-
 def test_the_hidden_truth_lies_in_the_intervals(calibrated):
     _, _, result = calibrated
     found = [finding for finding in result.findings if finding.determined]
@@ -129,16 +117,17 @@ def test_what_filters_are_given_is_right_afterwards(calibrated):
         errors.append(np.abs(np.nanmean(table.columns(steer) - true, axis=0)).max())
     assert errors[0] > 0.015
     assert errors[1] < 0.003
-    standing = driven("stand", 51)
-    table = measurement_table(standing, load_robot(out))
-    accel, gyro = (np.nanmean(table.columns([row])) for row in ("accel_x_mps2", "gyro_z_radps"))
-    sensors = NOMINAL.sensors  # what a power-on leaves, and the bench's own power-on
+    standing, sensors = measurement_table(driven("stand", 51), load_robot(out)), NOMINAL.sensors
+    accel, gyro = (np.nanmean(standing.columns([row])) for row in ("accel_x_mps2", "gyro_z_radps"))
+    # what a power-on leaves, and the bench's own power-on
     assert abs(accel) < 4 * np.hypot(sensors.accel_bias_std_mps2, 9.8 * sensors.tilt_std_rad)
     assert abs(gyro) < 4 * sensors.gyro_bias_std_radps
-    speeds = measurement_table(driven("straight", 52), load_robot(out))
-    cruise = speeds.columns(["wheel_1_radps", "wheel_2_radps", "wheel_3_radps"])[500:].mean()
-    camera = speeds.columns(["camera_speed_x_mps"])[500:].mean()
-    assert cruise * 0.2 == pytest.approx(camera, rel=0.01)
+    cruise = measurement_table(driven("straight", 52), load_robot(out))
+    rates, camera = (
+        cruise.columns([f"wheel_{i}_radps" for i in (1, 2, 3)]),
+        cruise.columns(["camera_speed_x_mps"]),
+    )
+    assert rates[500:].mean() * 0.2 == pytest.approx(camera[500:].mean(), rel=0.01)
 
 
 def test_a_calibrated_file_can_be_calibrated_again(calibrated, tmp_path):
@@ -151,15 +140,12 @@ def test_a_calibrated_file_can_be_calibrated_again(calibrated, tmp_path):
 
 
 @pytest.mark.parametrize("kept", ["stand alone", "no camera"])
-def test_runs_tell_what_they_can_and_why_not_the_rest(data, kept):
-    runs = [driven("stand", 1)]
-    if kept == "no camera":
-        runs.append(driven("complex", 1))
-        runs = [
-            replace(run, streams={name: each for name, each in run.streams.items() if name != "odometry"})
-            for run in runs
-        ]
-    result = calibrate(data(*runs), "agrimaro")
+def test_runs_tell_what_they_can_and_why_not_the_rest(tmp_path, kept):
+    for scenario in ("stand",) if kept == "stand alone" else ("stand", "complex"):
+        each = driven(scenario, 1)
+        blind = {name: stream for name, stream in each.streams.items() if name != "odometry"}
+        write_run(each if kept == "stand alone" else replace(each, streams=blind), tmp_path)
+    result = calibrate(tmp_path, "agrimaro")
     found = {finding.parameter: finding for finding in result.findings}
     assert result.out is None
     assert found["sensors.gyro_bias_z_radps"].determined
@@ -169,36 +155,29 @@ def test_runs_tell_what_they_can_and_why_not_the_rest(data, kept):
         assert why in found[parameter].note
 
 
-def test_what_is_refused(data, tmp_path):
-    folder, taken, other = (
-        data(driven("straight", 1, "grass", 8.0)),
-        tmp_path / "taken.yaml",
-        tmp_path / "rover.yaml",
-    )
+def test_what_is_refused(tmp_path):
+    write_run(driven("straight", 1, "grass", 8.0), tmp_path / "runs")
+    taken, other = tmp_path / "taken.yaml", tmp_path / "rover.yaml"
     taken.write_text("mine")
     other.write_text(_source_of_agrimaro().replace("name: agrimaro", "name: rover"))
+    new, of_another = (
+        tmp_path / "new.yaml",
+        "run straight_01 is one of robot 'agrimaro', and 'rover' is calibrated",
+    )
     for options, error, sentence in (
         ({"out": taken}, ConfigError, "is there already, and is left as it is"),
         ({"out": tmp_path / "robot.json"}, ConfigError, "a name that ends in .yaml or .yml is required"),
-        (
-            {"out": tmp_path / "new.yaml"},
-            DataError,
-            "nothing of robot agrimaro can be calibrated from this: no run",
-        ),
+        ({"out": new}, DataError, "nothing of robot agrimaro can be calibrated from this: no run"),
         ({"robot": "husky"}, DataError, "drive 'skid_steer' is not calibrated from logs"),
-        (
-            {"robot": str(other)},
-            DataError,
-            "run straight_01 is one of robot 'agrimaro', and 'rover' is calibrated",
-        ),
+        ({"robot": str(other)}, DataError, of_another),
         ({"robot": None}, ConfigError, "--robot is missing: --what robot starts from one"),
         ({"laws": ("bekker",)}, ConfigError, "--laws is for --what soil, not for --what robot"),
         ({"figures": tmp_path}, ConfigError, "--figures is for --what soil"),
     ):
         with pytest.raises(error, match=sentence):
-            run(Settings(**({"data": folder, "robot": "agrimaro"} | options)), silent)
+            run(Settings(**({"data": tmp_path / "runs", "robot": "agrimaro"} | options)), silent)
     assert taken.read_text() == "mine"
-    assert not (tmp_path / "new.yaml").exists()
+    assert not new.exists()
 
 
 def _source_of_agrimaro():

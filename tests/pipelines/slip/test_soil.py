@@ -87,26 +87,18 @@ def test_the_soil_is_one_that_the_simulator_takes(fitted):
     assert (text.count("assumed"), text.count("95 %")) == (5, 4)
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"laws": ("mud",)}, "--laws is 'mud'; choose among simulator, bekker"),
-        ({"laws": ("inflow", "simulator")}, "--laws ends in 'simulator'"),
-        ({"draws": 1}, "--draws is 1: input should be greater than or equal to 2"),
-    ],
-)
-def test_settings_that_are_not_accepted_are_one_sentence(changed, message, tmp_path):
-    with pytest.raises(ConfigError, match=message):
-        Settings(**({"data": tmp_path, "what": "soil"} | changed))
-
-
-def test_runs_of_another_kind_and_a_file_as_folder_are_refused(make_run, tmp_path):
+def test_what_is_refused(make_run, tmp_path):
     write_run(make_run(), tmp_path / "runs")
-    settings = Settings(data=tmp_path / "runs", what="soil", out=tmp_path / "out")
-    with pytest.raises(DataError, match="none of 1 runs is a trial of a wheel testbed"):
-        run(settings, silent)
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="is a file; --out names a folder"):
-        run(settings.with_(out=tmp_path / "file"), silent)
-    with pytest.raises(ConfigError, match="--robot is not for --what soil"):
-        run(settings.with_(robot="husky"), silent)
+    for changed, error, sentence in (
+        ({"laws": ("mud",)}, ConfigError, "--laws is 'mud'; choose among simulator, bekker"),
+        ({"laws": ("inflow", "simulator")}, ConfigError, "--laws ends in 'simulator'"),
+        ({"draws": 1}, ConfigError, "--draws is 1: input should be greater than or equal to 2"),
+        ({}, DataError, "none of 1 runs is a trial of a wheel testbed"),
+        ({"out": tmp_path / "file"}, ConfigError, "is a file; --out names a folder"),
+        ({"robot": "husky"}, ConfigError, "--robot is not for --what soil"),
+    ):
+        with pytest.raises(error, match=sentence):
+            run(
+                Settings(data=tmp_path / "runs", what="soil", **({"out": tmp_path / "out"} | changed)), silent
+            )
