@@ -15,8 +15,8 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
 from features.matrix import FeatureMatrix, of_signal_sets
-from terrain.errors import ConfigError, DataError
-from terrain.logs.schema import SIGNAL_SETS
+from terrain.errors import DataError
+from terrain.logs.schema import SIGNAL_SETS, check_signal_sets
 from terrain.records import Array, Windows
 
 
@@ -64,9 +64,7 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         DataError
             if the windows have no channel of the chosen sets.
         """
-        for name in (*self.signal_sets, *self.level_sets):
-            if name not in SIGNAL_SETS:
-                raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
+        check_signal_sets((*self.signal_sets, *self.level_sets))
         matrix = of_signal_sets(X, self.signal_sets, self.level_sets)
         self.layout_, self.length_s_, self.n_samples_, _ = matrix
         self.features_ = matrix.named(X[:0])[0]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections import Counter
@@ -180,6 +178,8 @@ def propose_labels(settings: Settings, model_uri: str) -> ProposalsResult:
     LogError, DataError
         if there is no run, or a run lacks what the model requires.
     """
+    import pandas as pd
+
     from pipelines.data.datasets import load_runs
     from pipelines.learn.model_file import read_model
     from pipelines.live.model import assess
@@ -200,13 +200,9 @@ def propose_labels(settings: Settings, model_uri: str) -> ProposalsResult:
         raise DataError(f"{settings.data}: no run holds a window that the model classifies")
     asked = questions(proposals, settings.ask)
     rest = [i for i in range(len(proposals)) if i not in set(asked)]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((*proposals[0]._fields, "ask", "answer"))
-    for rank, i in [*enumerate(asked, 1), *(("", i) for i in rest)]:
-        row = [f"{each:.6g}" if isinstance(each, float) else each for each in proposals[i]]
-        writer.writerow([*row, rank, ""])
-    atomic_write(settings.proposals, text.getvalue())
+    table = pd.DataFrame([proposals[i] for i in (*asked, *rest)])
+    table["ask"], table["answer"] = [*range(1, len(asked) + 1), *("" for _ in rest)], ""
+    atomic_write(settings.proposals, table.to_csv(index=False, float_format="%.6g"))
     taken = sum(proposals[i].taken_over(settings.accept) for i in rest)
     return ProposalsResult(settings.data, settings.proposals, len(runs), len(asked), taken, tuple(proposals))
 

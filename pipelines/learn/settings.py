@@ -10,7 +10,7 @@ from pydantic import AfterValidator, model_validator
 
 from pipelines.report.settings import JobsSettings, Settings, setting
 from terrain.errors import ConfigError
-from terrain.logs.schema import SIGNAL_SETS
+from terrain.logs.schema import SIGNAL_SETS, check_signal_sets
 
 if TYPE_CHECKING:
     from features.windows import WindowRule
@@ -41,16 +41,6 @@ RECIPE_TEXT = (
     "svm on features, cnn (network on samples), stack (both joined), best of these three, response of the "
     "wheels; MODULE:NAME of a scikit-learn classifier of your own. @SET,SET after it: signal sets."
 )
-
-
-def check_signal_sets(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Raise ``ConfigError`` where no signal set is named, or one that is not known."""
-    if not names:
-        raise ConfigError(f"no signal set is named; there are {','.join(SIGNAL_SETS)}")
-    for name in names:
-        if name not in SIGNAL_SETS:
-            raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
-    return names
 
 
 def check_recipe(text: str) -> str:

@@ -8,7 +8,7 @@ switched on and off.
 from __future__ import annotations
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.errors import LogError
+from terrain.errors import ConfigError, LogError
 
 SCHEMA_VERSION = 1
 
@@ -164,6 +164,17 @@ ESTIMATOR_CHANNELS: tuple[str, ...] = (
 
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
+
+
+def check_signal_sets(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Raise ``ConfigError`` where no signal set is named, or one that is not known."""
+    if not names:
+        raise ConfigError(f"no signal set is named; there are {', '.join(SIGNAL_SETS)}")
+    for name in names:
+        if name not in SIGNAL_SETS:
+            raise ConfigError(f"unknown signal set {name!r}; there are {', '.join(SIGNAL_SETS)}")
+    return names
+
 
 NO_FEATURES: tuple[str, ...] = (
     *("truth", "commands", "control", "odometry", "state", "lidar", "pose", "compass", "testbed"),

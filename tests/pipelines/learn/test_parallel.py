@@ -10,6 +10,7 @@ import time
 import warnings
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import distributed
 import numpy as np
@@ -75,6 +76,14 @@ def test_a_process_that_ends_is_one_sentence():
         list(parallel(os._exit, (), [(3,), (3,)], 2))
 
 
+def until(condition, timeout_s=60):
+    """Wait until a condition holds, and return whether it does."""
+    end_s = time.monotonic() + timeout_s
+    while not (holds := condition()) and time.monotonic() < end_s:
+        time.sleep(0.1)
+    return holds
+
+
 def is_over(process):
     with suppress(psutil.NoSuchProcess):
         return process.status() == psutil.STATUS_ZOMBIE
@@ -87,26 +96,21 @@ def test_no_process_is_left_where_the_command_is_ended(request_to_end):
         "import time; from pipelines.learn.parallel import parallel; print('begun', flush=True);"
         "list(parallel(time.sleep, (), [(0.0,), (0.0,), (300.0,), (300.0,)], 2))"
     )
-    command = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
+    words = [sys.executable, "-c", code]
+    command = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+
+    def started():
+        return psutil.Process(command.pid).children(recursive=True)
+
     try:
         assert command.stdout.readline() == "begun\n"
-        end_s = time.monotonic() + 60
-        while (
-            len(started := psutil.Process(command.pid).children(recursive=True)) < 3
-            and time.monotonic() < end_s
-        ):
-            time.sleep(0.1)
-        assert len(started) >= 3  # two that compute, one that keeps count of files
+        assert until(lambda: len(started()) >= 3)  # two that compute, one that keeps count of files
+        processes = started()
         time.sleep(2.0)
     finally:
         command.send_signal(request_to_end)
         command.communicate()
-    end_s = time.monotonic() + 20
-    while not all(map(is_over, started)) and time.monotonic() < end_s:
-        time.sleep(0.1)
-    assert all(map(is_over, started))
+    assert until(lambda: all(map(is_over, processes)), 20)
 
 
 @contextmanager
@@ -158,38 +162,33 @@ def test_a_cluster_without_workers_is_one_sentence(monkeypatch):
         computing(empty).__enter__()
 
 
-class Processes:
-    """A scheduler and workers in processes of their own, on loopback."""
-
-    def __init__(self):
-        self.port, self.started = open_port(host="127.0.0.1"), []
-        self.compute = f"dask:127.0.0.1:{self.port}"
-        self.scheduler = self.start("dask_scheduler", f"--port {self.port}")
-        end_s = time.monotonic() + 60
-        while time.monotonic() < end_s:
-            with suppress(OSError):
-                socket.create_connection(("127.0.0.1", self.port), timeout=1).close()
-                return
-            time.sleep(0.1)
-        raise AssertionError("the scheduler did not start")
-
-    def start(self, module, options):
-        words = [sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", "--no-dashboard"]
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
-        self.started.append(subprocess.Popen([*words, *options.split()], env=environment, **quiet))
-        return self.started[-1]
-
-    def add_worker(self, nanny="--no-nanny"):
-        return self.start("dask_worker", f"tcp://127.0.0.1:{self.port} --nthreads 1 {nanny}")
+def answers(port):
+    with suppress(OSError):
+        socket.create_connection(("127.0.0.1", port), timeout=1).close()
+        return True
+    return False
 
 
 @pytest.fixture
 def processes(tmp_path, monkeypatch):
+    """A scheduler in a process of its own, on loopback, and what starts workers of it."""
     monkeypatch.chdir(tmp_path)
-    running = Processes()
-    yield running
-    for process in running.started:
+    started, port = [], open_port(host="127.0.0.1")
+
+    def start(module, *options):
+        words = [sys.executable, "-m", f"distributed.cli.{module}", "--host", "127.0.0.1", "--no-dashboard"]
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        started.append(subprocess.Popen([*words, *options], env=environment, **quiet))
+        return started[-1]
+
+    def add_worker(nanny="--no-nanny"):
+        return start("dask_worker", f"tcp://127.0.0.1:{port}", "--nthreads", "1", nanny)
+
+    scheduler = start("dask_scheduler", "--port", str(port))
+    assert until(lambda: answers(port))
+    yield SimpleNamespace(compute=f"dask:127.0.0.1:{port}", scheduler=scheduler, add_worker=add_worker)
+    for process in started:
         process.kill()
         process.wait()
 
@@ -221,7 +220,7 @@ def test_a_killed_worker_costs_its_task_only(processes):
 def test_what_is_lost_is_one_sentence_in_a_bounded_time(
     processes, monkeypatch, lost, request_to_end, sentence
 ):
-    monkeypatch.setattr(cluster, "ANSWER_S", 2.0 if lost == "scheduler" else 0.5)
+    monkeypatch.setattr(cluster, "ANSWER_S", 2.0)
     monkeypatch.setattr(cluster, "NO_WORKER_S", 2.0)
     running = {"scheduler": processes.scheduler, "worker": processes.add_worker()}
     with computing(processes.compute):
