@@ -61,36 +61,29 @@ class Settings(BaseSettings):
     def _check(self) -> Self:
         begins, ends = self.from_s is not None, self.to_s is not None
         proposed = self.model is not None and (self.answers is not None or self.sets)
-        refusals = (
-            (proposed, "--model proposes labels: leave out --answers, --terrain and --remove"),
-            (
-                (self.answers is None) != (self.out is None),
-                "--answers FILE sets labels in the new folder --out DIR: give both",
+        refusals = {
+            "--model proposes labels: leave out --answers, --terrain and --remove": proposed,
+            "--answers FILE sets labels in the new folder --out DIR: give both": (
+                (self.answers is None) != (self.out is None)
             ),
-            (
-                (self.whole or begins or ends) and not self.sets,
-                "an interval needs --terrain NAME, or --remove",
+            "an interval needs --terrain NAME, or --remove": (
+                (self.whole or begins or ends) and not self.sets
             ),
-            (self.sets and self.run is None, "a label needs --run ID"),
-            (
-                self.remove and self.terrain,
-                "--terrain sets a label and --remove removes it: give one of the two",
+            "a label needs --run ID": self.sets and self.run is None,
+            "--terrain sets a label and --remove removes it: give one of the two": self.remove
+            and self.terrain,
+            f"--terrain is {self.terrain!r}: use letters, digits and ' ._+-'": (
+                self.terrain and not plain_name(self.terrain)
             ),
-            (
-                self.terrain and not plain_name(self.terrain),
-                f"--terrain is {self.terrain!r}: use letters, digits and ' ._+-'",
+            "a label needs --from and --to in s, or --all for the whole run": (
+                self.sets and self.whole == (begins and ends)
             ),
-            (
-                self.sets and self.whole == (begins and ends),
-                "a label needs --from and --to in s, or --all for the whole run",
+            "--all is the whole run: leave out --from and --to": self.whole and (begins or ends),
+            f"--from is {self.from_s} and --to {self.to_s}: the label ends before it starts": (
+                self.from_s is not None and self.to_s is not None and self.from_s >= self.to_s
             ),
-            (self.whole and (begins or ends), "--all is the whole run: leave out --from and --to"),
-            (
-                self.from_s is not None and self.to_s is not None and self.from_s >= self.to_s,
-                f"--from is {self.from_s} and --to {self.to_s}: the label ends before it starts",
-            ),
-        )
-        for applies, sentence in refusals:
+        }
+        for sentence, applies in refusals.items():
             if applies:
                 raise ConfigError(sentence)
         return self

@@ -398,39 +398,25 @@ def _notes(result: Predictions) -> list[tree.Part]:
     without = {row.terrain for row in result.windows if row.slip_entry != row.terrain == row.nearest}
     unestimated = any("unestimated" in row.status.values() for row in result.windows)
     accuracy = format_value(result.filtered_accuracy, PERCENT)
-    notes = (
-        (
-            result.training_runs,
-            "of runs that the model was trained on the accuracy is no measure of its skill",
+    notes = {
+        "of runs that the model was trained on the accuracy is no measure of its skill": result.training_runs,
+        f"{result.n_unknown} windows are like no terrain that was learned, as are 5 % of those of learned "
+        "ones: unknown, for which the table's fallback is used": result.n_unknown,
+        f"{result.n_unsupported} predictions are supported by no training run that drove like this": (
+            result.n_unsupported
         ),
-        (
-            result.n_unknown,
-            f"{result.n_unknown} windows are like no terrain that was learned, as are 5 % of those of learned "
-            "ones: unknown, for which the table's fallback is used",
+        f"filtered over time {accuracy} are right; what stays uncertain counts as wrong": (
+            result.filtered_accuracy is not None
         ),
-        (
-            result.n_unsupported,
-            f"{result.n_unsupported} predictions are supported by no training run that drove like this",
-        ),
-        (
-            result.filtered_accuracy is not None,
-            f"filtered over time {accuracy} are right; what stays uncertain counts as wrong",
-        ),
-        (
-            result.filtered,
-            f"{len(result.filtered)} runs had no estimates: filtered as on the robot, sample by sample",
-        ),
-        (
-            without,
-            f"no entry in the table of target slips for {', '.join(sorted(without))}: the fallback is used",
-        ),
-        (unestimated, f"target slips of the table {result.table_name!r} are unestimated: not measured"),
-        *(
-            (count, f"{count} windows are labelled {name}, which the model was not trained on: not judged")
+        f"{len(result.filtered)} runs had no estimates: filtered as on the robot, sample by sample": result.filtered,
+        f"no entry in the table of target slips for {', '.join(sorted(without))}: the fallback is used": without,
+        f"target slips of the table {result.table_name!r} are unestimated: not measured": unestimated,
+        **{
+            f"{count} windows are labelled {name}, which the model was not trained on: not judged": count
             for name, count in result.unknown_labels.items()
-        ),
-        (result.dropped, f"windows left out: {format_counts(result.dropped)}"),
-        (result.repaired, f"repaired: {format_counts(result.repaired)}"),
-        *((True, text) for text in result.skipped or ()),
-    )
-    return [tree.Text(text, "note") for applies, text in notes if applies]
+        },
+        f"windows left out: {format_counts(result.dropped)}": result.dropped,
+        f"repaired: {format_counts(result.repaired)}": result.repaired,
+        **dict.fromkeys(result.skipped or (), True),
+    }
+    return [tree.Text(text, "note") for text, applies in notes.items() if applies]
