@@ -10,34 +10,30 @@ import pytest
 from pipelines.data.datasets import load_runs
 from pipelines.learn.label import SOURCES_FILE, Settings, time_text
 from pipelines.learn.label import run as label
-from pipelines.live.classifying import WindowOutput
-from pipelines.live.recording import recorded
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files import atomic
 from terrain.logs.read import read_run
-from terrain.logs.recorded_windows import WINDOWS_FILE, windows_text
+from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from terrain.logs.write import write_run
 
-WINDOWS = ((0.0, "SNOW", 0.9), (1.0, "SNOW", 0.4), (2.0, "ICE", 0.49), (3.0, "", np.nan))
+WINDOWS = [
+    RecordedWindow(
+        start_s=start_s,
+        end_s=start_s + 1.0,
+        terrain=terrain,
+        probability=p,
+        probabilities={"SNOW": p, "ICE": 1 - p},
+        doubtful=not p >= 0.5,
+        refused="" if terrain else "NaN",
+    )
+    for start_s, terrain, p in ((0.0, "SNOW", 0.9), (1.0, "SNOW", 0.4), (2.0, "ICE", 0.49), (3.0, "", np.nan))
+]
 
 
 @pytest.fixture
 def folder(tmp_path, make_run):
     """Two runs of 4 s labelled SNOW; windows were recorded with the first."""
-    outputs = [
-        WindowOutput(
-            start_s,
-            start_s + 1.0,
-            terrain,
-            p,
-            np.array([p, 1 - p]),
-            ("SNOW", "ICE"),
-            "" if terrain else "NaN",
-        )
-        for start_s, terrain, p in WINDOWS
-    ]
-    windows = {WINDOWS_FILE: windows_text(recorded(output) for output in outputs)}
-    write_run(make_run("SNOW_01"), tmp_path / "runs", beside=windows)
+    write_run(make_run("SNOW_01"), tmp_path / "runs", beside={WINDOWS_FILE: windows_text(WINDOWS)})
     write_run(make_run("SNOW_02"), tmp_path / "runs")
     return tmp_path / "runs"
 
@@ -81,21 +77,15 @@ def test_a_label_replaces_what_was_there_and_keeps_all_else(folder):
     assert labels_of(folder, "SNOW_02") == [(0.0, 4.0, "SNOW")]
 
 
-def test_labels_are_removed_in_an_interval_or_of_a_run(folder):
+def test_labels_are_removed_in_an_interval_and_a_whole_run_is_labelled_to_its_last_sample(folder):
     labelled(folder, from_s=1.0, to_s=2.0, remove=True)
     assert labels_of(folder) == [(0.0, 1.0, "SNOW"), (2.0, 4.0, "SNOW")]
     assert [row.label for row in found(folder).windows] == [None, "SNOW", "SNOW"]
     assert found(folder).runs[0].n_without_label == 1
     labelled(folder, whole=True, terrain="")
     assert labels_of(folder) == []
-
-
-def test_a_whole_run_is_labelled_to_the_end_of_its_last_sample(folder):
-    labelled(folder, whole=True, remove=True)
     labelled(folder, whole=True, terrain="ICE")
-    ((start_s, end_s, terrain),) = labels_of(folder)
-    assert (start_s, terrain) == (0.0, "ICE")
-    assert end_s == pytest.approx(4.0)
+    assert labels_of(folder) == [(0.0, pytest.approx(4.0), "ICE")]
 
 
 NO_INTERVAL, NEW_FOLDER = (
