@@ -32,9 +32,6 @@ SUFFIXES = (".mcap", ".db3", ".bag")
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 SQLITE_MAGIC = b"SQLite format 3\0"
-ACCEPTED = "MCAP, SQLite of ROS 2 (.db3) and bags of ROS 1 (.bag, version 2.0) are read"
-
-ENCODINGS = "cdr, ros1, protobuf and json are read"
 
 _TYPE = re.compile(r"[A-Za-z]\w*/[a-z]+/[A-Za-z]\w*")
 
@@ -174,7 +171,10 @@ def _magic(path: Path) -> bytes:
         if begin.startswith(magic):
             return magic
     what = f"begins with {begin[:12]!r}" if begin else "is empty"
-    raise LogError(f"{short_name(path)}: {what}, which is no bag of a known type: {ACCEPTED}")
+    raise LogError(
+        f"{short_name(path)}: {what}, which is no bag of a known type: MCAP, SQLite of ROS 2 (.db3) and bags "
+        "of ROS 1 (.bag, version 2.0) are read"
+    )
 
 
 def _open_by_rosbags(path: Path, magic: bytes) -> Any:
@@ -267,22 +267,23 @@ def decoder_of(place: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
     at = f"{place}: topic {shown(topic.name)}"
     if topic.encoding == "json":
         return json.loads
-    if topic.encoding == "protobuf":
-        return _of_protobuf(at, topic)
-    if topic.encoding not in ("cdr", "ros1"):
-        raise LogError(f"{at} is encoded as {shown(topic.encoding)}; {ENCODINGS}")
-    return _of_ros(at, topic, distro)
+    if topic.encoding not in ("cdr", "ros1", "protobuf"):
+        raise LogError(f"{at} is encoded as {shown(topic.encoding)}; cdr, ros1, protobuf and json are read")
+    try:
+        return _of_protobuf(at, topic) if topic.encoding == "protobuf" else _of_ros(at, topic, distro)
+    except TerrainError:
+        raise
+    except RecursionError as error:
+        raise LogError(f"{at}: its definition holds itself, or is too deep") from error
+    except Exception as error:  # whatever a library makes of a damaged definition
+        raise LogError(f"{at}: its definition is damaged ({one_line(error)})") from error
 
 
 def _of_protobuf(at: str, topic: Topic) -> Callable[[bytes], Any]:
     decoders, records = library("mcap_protobuf.decoder"), library("mcap.records")
-    schema = records.Schema(
-        1, topic.definition.encode("latin-1", "replace"), topic.schema_encoding, topic.kind
-    )
-    try:
-        decoder: Callable[[bytes], Any] | None = decoders.DecoderFactory().decoder_for("protobuf", schema)
-    except Exception as error:  # whatever the library makes of a damaged definition
-        raise LogError(f"{at}: its definition is damaged ({one_line(error)})") from error
+    definition = topic.definition.encode("latin-1", "replace")
+    schema = records.Schema(1, definition, topic.schema_encoding, topic.kind)
+    decoder: Callable[[bytes], Any] | None = decoders.DecoderFactory().decoder_for("protobuf", schema)
     if decoder is None:
         raise LogError(f"{at} has a definition in {shown(topic.schema_encoding)}, 'protobuf' is read")
     return decoder
@@ -294,30 +295,23 @@ def _of_ros(at: str, topic: Topic, distro: str) -> Callable[[bytes], Any]:
         raise LogError(f"{at}: its definition is longer than {MAX_DEFINITION_CHARACTERS} characters")
     package, _, name = short_type(topic.kind).partition("/")
     kind = f"{package}/msg/{name}"
-    try:
-        if topic.schema_encoding in ("ros1msg", "ros2msg", "ros2idl") and topic.definition.strip():
-            types: dict[str, Any] = {}
-            if topic.schema_encoding == "ros2idl":
-                for part in topic.definition.split("=" * 80 + "\n"):
-                    idl = part.partition("\n")[2] if part.startswith("IDL:") else part
-                    types.update(typesys.get_types_from_idl(idl) if idl.strip() else {})
-            else:
-                types = dict(typesys.get_types_from_msg(topic.definition, kind))
-            _refuse_strange_types(at, types)
-            store = typesys.get_typestore(typesys.Stores.EMPTY)
-            store.register(types)
+    if topic.schema_encoding in ("ros1msg", "ros2msg", "ros2idl") and topic.definition.strip():
+        types: dict[str, Any] = {}
+        if topic.schema_encoding == "ros2idl":
+            for part in topic.definition.split("=" * 80 + "\n"):
+                idl = part.partition("\n")[2] if part.startswith("IDL:") else part
+                types.update(typesys.get_types_from_idl(idl) if idl.strip() else {})
         else:
-            releases = typesys.Stores
-            store = typesys.get_typestore(releases.__members__.get(distro, releases[DISTRO]))
-        if kind not in store.types:
-            raise LogError(f"{at} is of type {shown(topic.kind)}, which is not defined")
-        store.get_msgdef(kind)
-    except TerrainError:
-        raise
-    except RecursionError as error:
-        raise LogError(f"{at}: its definition holds itself, or is too deep") from error
-    except Exception as error:  # whatever the library makes of a damaged definition
-        raise LogError(f"{at}: its definition is damaged ({one_line(error)})") from error
+            types = dict(typesys.get_types_from_msg(topic.definition, kind))
+        _refuse_strange_types(at, types)
+        store = typesys.get_typestore(typesys.Stores.EMPTY)
+        store.register(types)
+    else:
+        releases = typesys.Stores
+        store = typesys.get_typestore(releases.__members__.get(distro, releases[DISTRO]))
+    if kind not in store.types:
+        raise LogError(f"{at} is of type {shown(topic.kind)}, which is not defined")
+    store.get_msgdef(kind)
     deserialize = store.deserialize_cdr if topic.encoding == "cdr" else store.deserialize_ros1
     return lambda content: deserialize(content, kind)
 

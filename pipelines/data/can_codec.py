@@ -53,33 +53,27 @@ BUS_OFF_BIT = 0x40
 COUNTER, CRC = "Counter", "Crc8"
 """Signals that any message may have: rises by one a sample; CRC-8 over identifier and data."""
 
-_AXES = ("X", "Y", "Z")
-
-
-def _named(channels: tuple[str, ...], *names: str) -> dict[str, str]:
-    return dict(zip(channels, names, strict=True))
-
-
 SIGNALS: Mapping[str, Mapping[str, str]] = {
-    "wheels": _named(
-        WHEELS_CHANNELS, *(f"{quantity}{i}" for quantity in ("MotorRate", "MotorCurrent") for i in (1, 2, 3))
-    ),
-    "steering": _named(STEERING_CHANNELS, *(f"SteeringAngle{i}" for i in (1, 2, 3))),
-    "imu": _named(
-        IMU_CHANNELS,
-        *(f"{quantity}{axis}" for quantity in ("Gyro", "Accel") for axis in _AXES),
-        *("Roll", "Pitch", "Yaw"),
-    ),
-    "odometry": _named(
-        CAMERA_CHANNELS,
-        *(f"CameraPosition{axis}" for axis in _AXES),
-        *(f"CameraQuaternion{axis}" for axis in (*_AXES, "W")),
-        *(f"CameraVelocity{axis}" for axis in _AXES),
-        *(f"CameraRate{axis}" for axis in _AXES),
-        "CameraConfidence",
-    ),
-    "twist": _named(TWIST, "DesiredSpeedX", "DesiredSpeedY", "DesiredYawRate"),
-    "corrections": {f"correction_{i}_radps": f"Correction{i}" for i in (1, 2, 3)},
+    stream: dict(zip(channels, names.split(), strict=True))
+    for stream, channels, names in (
+        (
+            "wheels",
+            WHEELS_CHANNELS,
+            "MotorRate1 MotorRate2 MotorRate3 MotorCurrent1 MotorCurrent2 MotorCurrent3",
+        ),
+        ("steering", STEERING_CHANNELS, "SteeringAngle1 SteeringAngle2 SteeringAngle3"),
+        ("imu", IMU_CHANNELS, "GyroX GyroY GyroZ AccelX AccelY AccelZ Roll Pitch Yaw"),
+        (
+            "odometry",
+            CAMERA_CHANNELS,
+            "CameraPositionX CameraPositionY CameraPositionZ "
+            "CameraQuaternionX CameraQuaternionY CameraQuaternionZ CameraQuaternionW "
+            "CameraVelocityX CameraVelocityY CameraVelocityZ CameraRateX CameraRateY CameraRateZ CameraConfidence",
+        ),
+        ("twist", TWIST, "DesiredSpeedX DesiredSpeedY DesiredYawRate"),
+        ("corrections", [f"correction_{i}_radps" for i in (1, 2, 3)], "Correction1 Correction2 Correction3"),
+    )
+} | {
     "status": {
         "terrain_code": "TerrainCode",
         "probability_ratio": "TerrainProbability",
@@ -88,7 +82,7 @@ SIGNALS: Mapping[str, Mapping[str, str]] = {
         "bridge_code": "BridgeState",
         "sensor_code": "SensorCode",
         "health_code": "SensorHealth",
-    },
+    }
 }
 """Signal of each channel, by stream."""
 

@@ -59,15 +59,7 @@ INCOMPLETE_S = 0.02
 
 
 class _Assembler:
-    """Samples of one stream.
-
-    Parameters
-    ----------
-    stream : its name
-    columns : that the DBC has
-    dropped : gets counts by kind
-    most : samples that are held
-    """
+    """Samples of one stream, of the columns that a DBC has; the oldest of more than ``most`` are dropped."""
 
     def __init__(self, stream: str, columns: frozenset[int], dropped: Counter[str], most: float) -> None:
         self._stream, self._needed, self._dropped, self._most = stream, columns, dropped, most
@@ -81,14 +73,14 @@ class _Assembler:
         self._done = array("d")  # of each sample its time and its row
 
     def take(self, time_s: float, part: Part) -> None:
-        """Take a part of a sample."""
         if part.counter is not None and part.counter == self._last:
             self._dropped[f"{self._stream}: repeated or late"] += 1
             return
         known = part.counter is not None and self._counter is not None
-        another = bool(self._there) and known and part.counter != self._counter
-        if another or not self._there.isdisjoint(part.columns):
-            if not another and known:
+        if self._there and known and part.counter != self._counter:
+            self.finish()
+        elif not self._there.isdisjoint(part.columns):
+            if known:
                 self._dropped[f"{self._stream}: repeated or late"] += 1
                 return
             self.finish()
@@ -224,15 +216,15 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
         first_s = frame.timestamp if first_s is None else first_s
         frame.timestamp -= first_s
         receiver.take(frame)
-    readings = receiver.readings(math.inf)
-    dropped = Counter(receiver.dropped)
+    readings, dropped = receiver.readings(math.inf), receiver.dropped
     faults = {kind: n for kind, n in dropped.items() if kind not in USUAL}
     if faults and not repair:
         kind, n = max(faults.items(), key=lambda fault: fault[1])
         raise LogError(f"{path}: {n} of kind {kind!r}; read it with --repair to leave them out")
-    repairs: Counter[str] | None = Counter() if repair else None
     streams = {
-        "commands" if name == "twist" else name: _stream(path, layout, name, reading, repairs)
+        "commands" if name == "twist" else name: _stream(
+            path, layout, name, reading, dropped if repair else None
+        )
         for name, reading in readings.items()
         if name in RECEIVED
     }
@@ -240,8 +232,7 @@ def read_run(path: Path, folder: Path, layout: Layout, robot: str, *, repair: bo
         raise LogError(f"{path}: has no frame of the messages of {layout.name}")
     place = path.relative_to(folder).with_suffix("").parts
     labels = (whole_run_label(streams, place[0]),) if len(place) > 1 else ()
-    counts = dropped + (repairs or Counter())
-    return RunLog("_".join(place), robot, streams, labels, source=str(path), dropped=counts)
+    return RunLog("_".join(place), robot, streams, labels, source=str(path), dropped=dropped)
 
 
 def _frames(path: Path) -> Iterator[Frame]:
@@ -258,10 +249,7 @@ def _frames(path: Path) -> Iterator[Frame]:
 
 def _stream(path: Path, layout: Layout, name: str, reading: Reading, repairs: Counter[str] | None) -> Stream:
     """Return a stream with the channels that the DBC has."""
-    there = layout.columns(name)
-    if name == "odometry":
-        there |= {QUATERNION[3]}
-    columns = sorted(there)
+    columns = sorted(layout.columns(name) | ({QUATERNION[3]} if name == "odometry" else set()))
     channels = channels_of(name)
     return checked_stream(
         f"{path}, {name}",

@@ -25,12 +25,7 @@ from terrain.records import Array, RunLog
 
 
 def messages_of_run(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iterator[Messages]:
-    """Yield the topics of a run: the run's own, then those of standard messages.
-
-    Parameters
-    ----------
-    run : with any streams
-    windows : that were recorded with it
+    """Yield the topics of a run and of windows that were recorded with it, then those of standard messages.
 
     Raises
     ------
@@ -47,13 +42,7 @@ def messages_of_run(run: RunLog, windows: Sequence[RecordedWindow] = ()) -> Iter
 
 
 def serialized(topic: StandardTopic, log_ns: Array) -> Messages:
-    """Return standard messages (CDR), one for each stamp, which their headers bear.
-
-    Raises
-    ------
-    ConfigError
-        if rosbags is not installed.
-    """
+    """Return standard messages (CDR), one for each stamp, which their headers bear."""
     typesys = library("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores[DISTRO])
     message = zero_message(store, topic.kind)
@@ -114,10 +103,8 @@ def write(place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: T
 
     Raises
     ------
-    DataError
-        if the run is longer than stamps can tell apart.
-    ConfigError
-        if mcap or rosbags is not installed.
+    ConfigError, DataError
+        as :func:`messages_of_run`.
     TerrainError
         if the place cannot be written.
     """

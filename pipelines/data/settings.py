@@ -62,14 +62,8 @@ class LoadedRuns(NamedTuple):
     skipped: list[str]
 
 
-def load(settings: RunsSettings, robot: str | None = None, *, align: bool = False) -> LoadedRuns:
-    """Return the runs, sorted by their id.
-
-    Parameters
-    ----------
-    settings : which runs, and how they are read
-    robot : of logs that do not name theirs; that of the settings by default, where they have one
-    align : bring the wheel stream onto the clock of the IMU; as the settings have it, where they do
+def load(settings: RunsSettings) -> LoadedRuns:
+    """Return the runs of the settings, sorted by their id.
 
     Raises
     ------
@@ -84,8 +78,8 @@ def load(settings: RunsSettings, robot: str | None = None, *, align: bool = Fals
         layout=settings.layout,
         mapping=settings.mapping,
         repair=settings.repair,
-        align=align or (isinstance(settings, AlignedRunsSettings) and settings.align),
-        robot=getattr(settings, "robot", None) if robot is None else robot,
+        align=isinstance(settings, AlignedRunsSettings) and settings.align,
+        robot=getattr(settings, "robot", None),
         on_skip=skipped.append,
     )
     if isinstance(settings, AlignedRunsSettings):

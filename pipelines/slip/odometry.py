@@ -75,7 +75,7 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
         if fewer runs than folds have poses.
     """
     assert settings.robot is not None
-    runs = load(settings, settings.robot).runs
+    runs = load(settings).runs
     refusal = "robot {name}: drive {drive!r} has no tracks; --what odometry is for 'tracked'"
     robot = as_drive(TrackedRobot, load_robot(settings.robot), refusal)
     if not all(SHORTEST_S <= length <= LONGEST_S for length in settings.lengths) or not settings.lengths:
