@@ -10,20 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pipelines import report as reports
 from pipelines.data.layouts import Target
 from pipelines.data.settings import MAPPING_TEXT, ROBOT_TEXT, RunsSettings, load
-from pipelines.report import (
-    Progress,
-    Report,
-    Result,
-    Section,
-    Table,
-    Text,
-    described,
-    format_counts,
-    plural,
-    silent,
-)
+from pipelines.report import Progress, Report, Result, Table, Text, described, plural, silent
 from pipelines.report.settings import setting
 from terrain.errors import LogError, TerrainError
 
@@ -176,7 +166,7 @@ def _recorded_windows(place: Path) -> dict[str, list[RecordedWindow]]:
 
 def report(result: ImportResult | ExportResult) -> Report:
     """Return how many runs were written where, what was left out, and what is odd about them."""
-    counts = f", {format_counts(result.dropped)}" if result.dropped else ""
+    counts = f", {reports.format_counts(result.dropped)}" if result.dropped else ""
     notes = [Text(f"skipped: {sentence}", kind="warning") for sentence in result.skipped]
     if isinstance(result, ExportResult):
         n = sum(result.topics.values())
@@ -185,7 +175,9 @@ def report(result: ImportResult | ExportResult) -> Report:
             answer=f"{plural(result.n_runs, 'run')}, {n} messages on {plural(len(result.topics), 'topic')}, "
             f"written to {result.out}{counts}",
             parts=tuple(notes),
-            details=(Section("Messages", (Table(("topic", "messages"), tuple(result.topics.items())),)),),
+            details=reports.sections(
+                ("Messages", [Table(("topic", "messages"), tuple(result.topics.items()))])
+            ),
             next_step=f"terrain convert {result.out} --out runs/",
         )
     from terrain.logs.merge import sentences

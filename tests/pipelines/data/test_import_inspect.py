@@ -3,17 +3,22 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.data.convert import Settings as ConvertSettings
-from pipelines.data.convert import run as convert
+from pipelines.data import convert, inspect
 from pipelines.data.datasets import load_runs
-from pipelines.data.inspect import Settings as InspectSettings
-from pipelines.data.inspect import run as inspect_runs
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text
-from terrain.errors import LogError, TerrainError
+from terrain.errors import TerrainError
 from terrain.logs.digest import data_digest
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
+
+
+def converted(data, out, **options):
+    return convert.run(convert.Settings(data=data, out=out, **options))
+
+
+def inspected(data):
+    return inspect.run(inspect.Settings(data=data))
 
 
 def tree(folder):
@@ -21,33 +26,34 @@ def tree(folder):
 
 
 def test_imported_runs_are_the_runs_that_were_read(borealtc_dir, tmp_path):
+    (borealtc_dir / "notes.mcap").write_text("no bag")  # beside files of another layout no matter
     steps = []
-    asked = ConvertSettings(data=borealtc_dir, out=tmp_path / "out")
-    report = as_json(convert(asked, progress=lambda *step: steps.append(step)))
+    asked = convert.Settings(data=borealtc_dir, out=tmp_path / "out")
+    result = convert.run(asked, progress=lambda *step: steps.append(step))
     assert steps == [("write runs", n, 3) for n in (1, 2, 3)]
-    assert report["run_ids"] == ["ICE_01", "SNOW_01", "SNOW_02"]
-    assert (report["labels"], report["dropped"], report["skipped"]) == ({"ICE": 1, "SNOW": 2}, {}, [])
-    assert (
-        report["digest"] == data_digest(load_runs(tmp_path / "out")) == data_digest(load_runs(borealtc_dir))
-    )
-    json.dumps(report, allow_nan=False)
+    assert result.run_ids == ("ICE_01", "SNOW_01", "SNOW_02")
+    assert (result.labels, result.dropped, result.skipped) == ({"ICE": 1, "SNOW": 2}, {}, ())
+    assert result.digest == data_digest(load_runs(tmp_path / "out")) == data_digest(load_runs(borealtc_dir))
 
 
 def test_what_cannot_be_read_or_written_is_one_sentence_and_touches_nothing(borealtc_dir, tmp_path, make_run):
     write_run(make_run("SNOW_02", seed=9), tmp_path / "taken")
+    (tmp_path / "mcap").mkdir()
+    (tmp_path / "mcap" / "SNOW_02.mcap").write_text("mine")
     (tmp_path / "file").write_text("an obstacle")
-    before = tree(tmp_path)
-    for out, fault in (
-        ("taken", "SNOW_02: is there already, and is left as it is"),
-        ("file/out", "cannot be written"),
+    for out, target, fault in (
+        ("taken", "runs", "SNOW_02: is there already, and is left as it is"),
+        ("mcap", "mcap", "SNOW_02.mcap: is there already"),
+        ("file/out", "runs", "cannot be written"),
+        ("out", "runs", r"SNOW/pro_02\.csv: column 'velL' is missing"),
     ):
+        if out == "out":
+            (borealtc_dir / "SNOW" / "pro_02.csv").write_text("time\n")
+        before = tree(tmp_path)
         with pytest.raises(TerrainError, match=fault) as error:
-            convert(ConvertSettings(data=borealtc_dir, out=tmp_path / out))
+            converted(borealtc_dir, tmp_path / out, to=target)
         assert "\n" not in str(error.value)
         assert tree(tmp_path) == before
-    (borealtc_dir / "SNOW" / "pro_02.csv").write_text("time\n")
-    with pytest.raises(LogError, match=r"SNOW/pro_02\.csv: column 'velL' is missing"):
-        convert(ConvertSettings(data=borealtc_dir, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -58,22 +64,20 @@ def test_a_run_whose_numbers_cannot_be_true_is_refused_and_counted_with_repair(t
     values[:, imu.channels.index("accel_z_mps2")] += 1e4
     streams = {**run.streams, "imu": Stream(imu.time_s, values, imu.channels)}
     write_run(RunLog(run.run_id, run.robot, streams, run.labels), tmp_path / "runs")
-    with pytest.raises(LogError, match=r"ICE_01: implausible .* with --repair"):
-        convert(ConvertSettings(data=tmp_path / "runs", out=tmp_path / "out"))
+    with pytest.raises(TerrainError, match=r"ICE_01: implausible .* with --repair"):
+        converted(tmp_path / "runs", tmp_path / "out")
     assert not (tmp_path / "out").exists()
-    report = convert(ConvertSettings(data=tmp_path / "runs", out=tmp_path / "out", repair=True))
-    assert any(kind.startswith("implausible ") for kind in report.dropped)
+    result = converted(tmp_path / "runs", tmp_path / "out", repair=True)
+    assert any(kind.startswith("implausible ") for kind in result.dropped)
 
 
 def test_repair_is_counted_and_the_counts_travel_with_the_runs(borealtc_dir, tmp_path, edit):
     edit(borealtc_dir / "SNOW" / "imu_01.csv", lambda lines: [*lines[:30], *lines[29:]])
     (borealtc_dir / "ICE" / "pro_01.csv").unlink()
-    report = convert(ConvertSettings(data=borealtc_dir, out=tmp_path / "out", repair=True))
-    assert report.run_ids == ("SNOW_01", "SNOW_02")
-    assert report.dropped == {"rows with a bad time": 1}
-    assert report.skipped == ("run skipped: ICE/pro_01.csv: is missing",)
-    inspected = inspect_runs(InspectSettings(data=tmp_path / "out"))
-    assert [run.dropped for run in inspected.runs] == [{"rows with a bad time": 1}, {}]
+    result = converted(borealtc_dir, tmp_path / "out", repair=True)
+    assert (result.run_ids, result.dropped) == (("SNOW_01", "SNOW_02"), {"rows with a bad time": 1})
+    assert result.skipped == ("run skipped: ICE/pro_01.csv: is missing",)
+    assert [run.dropped for run in inspected(tmp_path / "out").runs] == [{"rows with a bad time": 1}, {}]
 
 
 def test_inspect_shows_rates_gaps_stuck_channels_missing_values_and_the_clock(borealtc_dir, edit):
@@ -85,27 +89,25 @@ def test_inspect_shows_rates_gaps_stuck_channels_missing_values_and_the_clock(bo
         return [",".join(row) for row in rows[:60] + rows[70:]]
 
     edit(borealtc_dir / "SNOW" / "imu_01.csv", spoil)
-    report = as_json(inspect_runs(InspectSettings(data=borealtc_dir)))
+    report = as_json(inspected(borealtc_dir))
     json.dumps(report, allow_nan=False)
     run = next(run for run in report["runs"] if run["run_id"] == "SNOW_01")
     imu = run["streams"]["imu"]
     assert (imu["n"], imu["n_gaps"], imu["stuck"]) == (190, 1, ["accel_z_mps2"])
-    assert imu["rate_hz"] == pytest.approx(50.0)
-    assert imu["longest_gap_s"] == pytest.approx(11 / 50)
-    assert imu["longest_gap_at_s"] == pytest.approx(58 / 50)
+    figures = (imu["rate_hz"], imu["longest_gap_s"], imu["longest_gap_at_s"])
+    assert figures == pytest.approx((50.0, 11 / 50, 58 / 50))
     assert imu["n_nonfinite"]["gyro_x_radps"] == 1
     assert run["streams"]["wheels"]["stuck"] == []
-    assert run["clock"]["status"] == "not excited"
-    assert run["clock"]["offset_s"] is None
+    assert (run["clock"]["status"], run["clock"]["offset_s"]) == ("not excited", None)
 
 
 def test_runs_without_wheels_or_with_a_foreign_robot_are_inspected_too(tmp_path, make_run):
     run = make_run()
     write_run(RunLog("A", "husky", {"imu": run.streams["imu"]}), tmp_path)
     write_run(RunLog("B", "somebody's own", run.streams), tmp_path)
-    report = inspect_runs(InspectSettings(data=tmp_path))
-    assert [run.clock for run in report.runs] == [None, None]
-    assert report.runs[0].terrains == ()
-    assert list(report.to_pandas()["stream"]) == ["imu", *run.streams]
-    assert len(terminal_text(report.report).splitlines()) <= 25
-    assert np.isfinite(report.runs[1].streams["wheels"].rate_hz)
+    result = inspected(tmp_path)
+    assert [run.clock for run in result.runs] == [None, None]
+    assert result.runs[0].terrains == ()
+    assert list(result.to_pandas()["stream"]) == ["imu", *run.streams]
+    assert len(terminal_text(result.report).splitlines()) <= 25
+    assert np.isfinite(result.runs[1].streams["wheels"].rate_hz)
