@@ -38,6 +38,9 @@ MAX_DEPTH = 32
 MAX_NODES = 100_000
 """Values of a YAML file, those of an alias counted each time: reading as many takes some seconds."""
 
+MAX_PLACE_CHARACTERS = 200
+"""Keys down to a fault, as a message names them."""
+
 _MAX_WHOLE = 2**63
 _DEEP = f"is nested deeper than {MAX_DEPTH} levels"
 
@@ -204,6 +207,8 @@ def first_fault(error: ValidationError) -> str:
     """Return the first thing in a document that is not accepted, in one sentence."""
     fault: dict[str, Any] = dict(error.errors()[0])
     place = ".".join(str(part) for part in fault["loc"]) or "the file"
+    if not place.isprintable() or len(place) > MAX_PLACE_CHARACTERS:
+        place = shown(place)
     if fault["type"] == "extra_forbidden":
         return f"key {shown(place)} is unknown"
     if fault["type"] == "missing":

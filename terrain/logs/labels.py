@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
+from terrain.files.documents import read_json
 from terrain.logs.borealtc import whole_run_label
 from terrain.logs.read import read_run, read_run_head, run_folders
 from terrain.logs.schema import TIME_TOLERANCE_S
@@ -90,20 +91,21 @@ def set_label(
         if the file cannot be written; it is as it was then.
     """
     folder = folder_of(run_id, labelled_folders(data), data)
-    head = read_run_head(folder)
-    streams = read_run(folder, repair=True).streams.values()
+    run = read_run(folder, repair=True)
+    streams = run.streams.values()
     first_s = min(float(stream.time_s[0]) for stream in streams)
     last_s = max(float(stream.time_s[-1]) + 1.0 / stream.rate_hz for stream in streams)
     if start_s is None or end_s is None:  # labels may have been set beyond the samples
-        start_s = min([first_s, *(label.start_s for label in head.labels)])
-        end_s = max([last_s, *(label.end_s for label in head.labels)])
+        start_s = min([first_s, *(label.start_s for label in run.labels)])
+        end_s = max([last_s, *(label.end_s for label in run.labels)])
     elif start_s < first_s - SLACK_S or end_s > last_s + SLACK_S:
         raise ConfigError(
             f"run {run_id} is from {first_s:.6g} to {last_s:.6g} s: "
             f"{start_s:g} to {end_s:g} s is not within it"
         )
-    labels = relabelled(head.labels, start_s, end_s, terrain)
-    document = head.document | {"labels": [label._asdict() for label in labels]}
+    labels = relabelled(run.labels, start_s, end_s, terrain)
+    document = read_json(folder / "run.json", run_id, LogError)
+    document["labels"] = [label._asdict() for label in labels]
     atomic_write(folder / "run.json", json.dumps(document, indent=2, allow_nan=False) + "\n")
     return ChangedLabels(folder, start_s, end_s, labels)
 

@@ -143,6 +143,7 @@ def doubtful_windows(
     found: list[DoubtfulWindow] = []
     for folder in folders:
         head, windows = read_run_head(folder), read_windows(folder)
+        labels = head.checked_labels(short_name(folder / "run.json"))
         if windows is None:
             runs.append(RunWindows(head.run_id, None, 0, 0))
             continue
@@ -154,7 +155,7 @@ def doubtful_windows(
                 window.terrain,
                 window.probability,
                 window.refused,
-                label_over(head.labels, window.start_s, window.end_s),
+                label_over(labels, window.start_s, window.end_s),
             )
             for window in windows
             if window.doubtful

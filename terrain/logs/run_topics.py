@@ -24,9 +24,8 @@ from terrain.files.documents import first_fault, parse_json
 from terrain.files.names import shown
 from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
 from terrain.logs.labels import label_changes
-from terrain.logs.log_files import checked_names
-from terrain.logs.read import MAX_STREAMS, MAY_BE_UNKNOWN, read_labels
-from terrain.logs.samples import DEAD_CHANNEL, checked_stream, refuse_apart
+from terrain.logs.read import MAX_STREAMS, MAY_BE_UNKNOWN, LabelEntry, RunHead
+from terrain.logs.samples import DEAD_CHANNEL, checked_stream
 from terrain.logs.schema import unit_of
 from terrain.records import Array, Label, RunLog, Stream
 
@@ -133,19 +132,12 @@ def _accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]
     return found
 
 
-class RunDocument(BaseModel):
-    """What a message of :data:`RUN_TOPIC` states: fields of a :class:`Head`, and of each stream its topic."""
+class RunDocument(RunHead):
+    """What a message of :data:`RUN_TOPIC` states: what a run does, and of each stream its topic."""
 
     version: Literal[1] = 1
-    run_id: str
-    robot: str
-    session: str
-    filter: str
-    source: str
     live: bool = False
-    labels: list[dict[str, Any]]
     streams: Annotated[dict[str, StreamTopic], Field(min_length=1, max_length=MAX_STREAMS)]
-    dropped: dict[str, int]
 
 
 def run_document(
@@ -157,7 +149,7 @@ def run_document(
     """Return the text of a document."""
     document = RunDocument(
         **head._asdict(),
-        labels=[label._asdict() for label in labels],
+        labels=[LabelEntry(**label._asdict()) for label in labels],
         streams=dict(topics),
         dropped=dict(sorted((dropped or {}).items())),
     )
@@ -489,19 +481,8 @@ def run_of(
         streams = _overlapping(streams, dropped)
         if not streams:
             raise LogError(f"{place}: holds no stream of two samples or more")
-    refuse_apart(document.run_id, streams)
     dropped.update(faults.repairs or {})
-    run = RunLog(
-        document.run_id,
-        document.robot,
-        streams,
-        read_labels(place, document.labels),
-        source=document.source,
-        dropped=dict(dropped),
-        session=document.session,
-        filter=document.filter,
-    )
-    return checked_names(place, run)
+    return document.run(place, streams, dropped)
 
 
 def _recorded_stream(

@@ -53,8 +53,8 @@ def test_names_of_a_log_do_not_reach_the_terminal_as_they_are(refused, place):
         ({"run_id": "../../etc"}, "begins with a dot"),
         ({"session": "a\x1b[2Jb"}, "holds a control character"),
         ({"robot": "r" * 10**6}, "is longer than 128 characters"),
-        ({"streams": {"a\n\x1b[2J": 1}}, "is no JSON object"),
-        ({"labels": "x" * 10**6}, "a list is required"),
+        ({"streams": {"a\n\x1b[2J": 1}}, "is 1: input should be a valid dictionary"),
+        ({"labels": "x" * 10**6}, "input should be a valid list"),
     ):
         before = (place / "data" / "r" / "run.json").read_text()
         edit(place, **changed)

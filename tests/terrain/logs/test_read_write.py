@@ -116,8 +116,8 @@ def test_unfinished_writes_are_no_runs(tmp_path, make_run):
          "column 'gyro_w_radps' is missing"),
         (lambda d: d["labels"].append({"start_s": 1.0, "end_s": 2.0, "terrain": "ICE"}), "overlap at 1.0 s"),
         (lambda d: d["labels"][0].update(end_s=-1.0), "label 'SNOW' ends at -1.0 s and starts at 0.0 s"),
-        (lambda d: d["labels"][0].update(end_s="late"), "end_s is 'late', seconds are required"),
-        (lambda d: d.update(dropped={"rows": -1}), "counts by kind are required"),
+        (lambda d: d["labels"][0].update(end_s="late"), "labels.0.end_s is 'late': input should be a valid number"),
+        (lambda d: d.update(dropped={"rows": -1}), "dropped.rows is -1: input should be greater than or equal to 0"),
     ],
 )  # fmt: skip
 def test_a_wrong_run_json_is_refused_in_one_sentence(tmp_path, make_run, change, message):

@@ -60,7 +60,7 @@ def refusal(call, *given):
         (lambda d: d.update(streams=dict.fromkeys(map(str, range(65)), d["streams"]["imu"])),
          "the run has 65 streams, at most 64 are read"),
         (lambda d: d["labels"][0].update(start_s=10**300), "a whole number of more than 64 bits"),
-        (lambda d: d.update(labels={"x": "y" * 10**6}), "a list is required"),
+        (lambda d: d.update(labels={"x": "y" * 10**6}), "input should be a valid list"),
     ],
 )  # fmt: skip
 def test_names_of_a_log_are_names(folder, change, sentence):
