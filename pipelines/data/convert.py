@@ -112,14 +112,12 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
             refuse_implausible_runs(doubts)
         runs = [counted(run, verdicts[run.run_id]) for run in runs]
     windows = _recorded_windows(settings.data)
-    dropped: Counter[str] = Counter()
     counts: Counter[str] = Counter()
     written: list[Path] = []
     try:
         for each in runs:
             counts.update(write(places[each.run_id], each, windows.get(each.run_id, []), settings.to))
             written.append(places[each.run_id])
-            dropped.update(each.dropped)
             progress("write runs", len(written), len(runs))
         mapping = csv_mapping(runs) if settings.to == "csv" else None
         if mapping is not None and not (settings.out / "mapping.yaml").exists():
@@ -128,6 +126,7 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
         for place in written:
             shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
         raise
+    dropped = sum((Counter(each.dropped) for each in runs), Counter[str]())
     common: dict[str, Any] = {
         "out": settings.out,
         "n_runs": len(runs),
@@ -166,29 +165,25 @@ def _recorded_windows(place: Path) -> dict[str, list[RecordedWindow]]:
 
 def report(result: ImportResult | ExportResult) -> Report:
     """Return how many runs were written where, what was left out, and what is odd about them."""
-    counts = f", {reports.format_counts(result.dropped)}" if result.dropped else ""
-    notes = [Text(f"skipped: {sentence}", kind="warning") for sentence in result.skipped]
-    if isinstance(result, ExportResult):
-        n = sum(result.topics.values())
-        return Report(
-            title="Converted runs",
-            answer=f"{plural(result.n_runs, 'run')}, {n} messages on {plural(len(result.topics), 'topic')}, "
-            f"written to {result.out}{counts}",
-            parts=tuple(notes),
-            details=reports.sections(
-                ("Messages", [Table(("topic", "messages"), tuple(result.topics.items()))])
-            ),
-            next_step=f"terrain convert {result.out} --out runs/",
-        )
     from terrain.logs.merge import sentences
     from terrain.logs.plausibility import doubt_sentences
 
-    odd = (*doubt_sentences(result.doubts), *sentences(result.duplicates))
-    notes += [Text(sentence, kind="warning") for sentence in odd]
-    labels = tuple(result.labels.items())
+    runs = plural(result.n_runs, "run")
+    counts = f", {reports.format_counts(result.dropped)}" if result.dropped else ""
+    warnings = [f"skipped: {sentence}" for sentence in result.skipped]
+    if isinstance(result, ExportResult):
+        runs += f", {sum(result.topics.values())} messages on {plural(len(result.topics), 'topic')},"
+        table = Table(("topic", "messages"), tuple(result.topics.items()))
+        parts, details = [], reports.sections(("Messages", [table]))
+        next_step = f"terrain convert {result.out} --out runs/"
+    else:
+        warnings += [*doubt_sentences(result.doubts), *sentences(result.duplicates)]
+        parts = [Table(("terrain", "runs"), tuple(result.labels.items()))] if result.labels else []
+        details, next_step = (), f"terrain inspect {result.out}"
     return Report(
-        title="Converted runs",
-        answer=f"{plural(result.n_runs, 'run')} written to {result.out}{counts}",
-        parts=(*notes, *((Table(("terrain", "runs"), labels),) if labels else ())),
-        next_step=f"terrain inspect {result.out}",
+        "Converted runs",
+        f"{runs} written to {result.out}{counts}",
+        parts=(*(Text(each, kind="warning") for each in warnings), *parts),
+        details=details,
+        next_step=next_step,
     )

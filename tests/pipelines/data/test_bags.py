@@ -6,6 +6,7 @@ import struct
 
 import numpy as np
 import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
 from mcap.writer import CompressionType, IndexType
 from scipy.spatial.transform import Rotation
 
@@ -290,26 +291,20 @@ OF_SPEEDS = """streams:
 """
 
 
+PROTO = """name: "speeds.proto" package: "own" syntax: "proto3"
+message_type { name: "Stamp"
+  field { name: "seconds" number: 1 type: TYPE_INT64 } field { name: "nanos" number: 2 type: TYPE_INT32 } }
+message_type { name: "Place" field { name: "x" number: 1 type: TYPE_DOUBLE } }
+message_type { name: "Speeds"
+  field { name: "timestamp" number: 1 type: TYPE_MESSAGE type_name: ".own.Stamp" }
+  field { name: "speed" number: 2 type: TYPE_FLOAT label: LABEL_REPEATED }
+  field { name: "place" number: 3 type: TYPE_MESSAGE type_name: ".own.Place" } }
+"""
+
+
 def protobuf_speeds():
     """Return the class of a message with a time, speeds of wheels and a position within, and its file."""
-    from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
-
-    def field(number, name, kind, of="", label="LABEL_OPTIONAL"):
-        typed = {"typeName": of} if of else {}
-        return {"name": name, "number": number, "type": f"TYPE_{kind}", "label": label} | typed
-
-    messages = {
-        "Stamp": [field(1, "seconds", "INT64"), field(2, "nanos", "INT32")],
-        "Place": [field(1, "x", "DOUBLE")],
-        "Speeds": [
-            field(1, "timestamp", "MESSAGE", ".own.Stamp"),
-            field(2, "speed", "FLOAT", label="LABEL_REPEATED"),
-            field(3, "place", "MESSAGE", ".own.Place"),
-        ],
-    }
-    types = [{"name": name, "field": fields} for name, fields in messages.items()]
-    described = {"name": "speeds.proto", "package": "own", "syntax": "proto3", "messageType": types}
-    file = json_format.ParseDict(described, descriptor_pb2.FileDescriptorProto())
+    file = text_format.Parse(PROTO, descriptor_pb2.FileDescriptorProto())
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     kinds = message_factory.GetMessageClassesForFiles(["speeds.proto"], pool)
@@ -323,7 +318,7 @@ module own {{ module msg {{ struct Speeds {{ sequence<float> speed; own::msg::Pl
 module own {{ module msg {{ struct Place {{ double x; }}; }}; }};
 """
 MSG = f"float32[] speed\nPlace place\n{RULE}MSG: own/Place\nfloat64 x\n"
-SPEEDS, PROTO = protobuf_speeds()
+SPEEDS, PROTO_FILE = protobuf_speeds()
 
 
 def fields_of(number, **stamp):
@@ -335,7 +330,7 @@ def fields_of(number, **stamp):
     [
         (
             ("protobuf", "protobuf"),
-            PROTO,
+            PROTO_FILE,
             lambda i, s, ns: SPEEDS(**fields_of(i, seconds=s, nanos=ns)).SerializeToString(),
             0.02,
         ),
