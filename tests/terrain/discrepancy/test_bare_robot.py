@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from pipelines.data.datasets import load_runs
-from pipelines.data.simulate import Settings, run
-from pipelines.slip.estimate import estimate_runs
 from terrain.discrepancy.diagnosed_runs import diagnose_runs
 from terrain.discrepancy.signals import signals_of
 from terrain.effects import CHANNELS, effect_named, vector_of
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import estimate_run
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground, make_planar
 from terrain.simulation.planar.replay import replay
 from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.run import simulate_run
 
 TEXT = """name: mule
 drive: skid_steer
@@ -21,32 +21,28 @@ track_m: {value: 1.08, unit: m, source: me}
 wheelbase_m: {value: 0.9, unit: m, source: assumed}
 mass_kg: {value: 280.0, unit: kg, source: me}
 """
+WIDE = {"effective_track_ratio": 0.4}
 
 
 @pytest.fixture(scope="module")
-def robot_file(tmp_path_factory):
+def robot(tmp_path_factory):
     path = tmp_path_factory.mktemp("robot") / "mule.yaml"
     path.write_text(TEXT)
-    return path
+    return load_robot(path)
 
 
 @pytest.fixture(scope="module")
-def wide_runs(robot_file, tmp_path_factory):
+def wide_runs(robot):
     """Runs of a robot that turns as if its track were 40 % wider."""
-    given = {
-        "robot": str(robot_file),
-        "out": tmp_path_factory.mktemp("runs"),
-        "effect": ("effective_track=0.4",),
-    }
-    run(Settings(**given, terrain="asphalt", scenario="complex", runs=6, duration_s=40.0))
-    return load_runs(given["out"])
+    given = {"duration_s": 40.0, "effects": WIDE}
+    return [simulate_run(robot, "asphalt", "complex", 0, number, **given) for number in range(1, 7)]
 
 
-def test_a_simulated_run_has_no_currents_and_turns_as_its_geometry_says(robot_file):
+def test_a_simulated_run_has_no_currents_and_turns_as_its_geometry_says(robot):
     twist = np.zeros((501, 3))
     twist[50:, 0], twist[50:, 2] = 0.6, 0.4
     ground = Ground(slip_ratio=1e-9, rolling_ratio=0.0, scrub_ratio=0.0)
-    streams = simulate_planar(load_robot(robot_file), twist, 0, ground=ground).streams
+    streams = simulate_planar(robot, twist, 0, ground=ground).streams
     assert streams["wheels"].channels == ("speed_left_mps", "speed_right_mps")
     left, right = streams["wheels"].values[-1]
     assert right - left == pytest.approx(0.4 * 1.08, abs=1e-6)
@@ -55,22 +51,20 @@ def test_a_simulated_run_has_no_currents_and_turns_as_its_geometry_says(robot_fi
     assert all(np.isfinite(streams[name].values).all() for name in ("wheels", "imu", "odometry"))
 
 
-def test_the_log_replayed_is_what_was_measured(robot_file, wide_runs):
+def test_the_log_replayed_is_what_was_measured(robot, wide_runs):
     """Two routes: the simulation that wrote the log, and its replay from the wheel speeds logged."""
-    robot = load_robot(robot_file)
     signals = signals_of(wide_runs[0], robot)
-    p = vector_of({"effective_track_ratio": 0.4})
     logged = (signals.wheel_speed_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad)
     # copies: read-only arrays would be another signature, for which nothing else compiles
-    seen = replay(make_planar(robot, Ground()), p, signals.dt_s, *(values.copy() for values in logged))
+    copies = (values.copy() for values in logged)
+    seen = replay(make_planar(robot, Ground()), vector_of(WIDE), signals.dt_s, *copies)
     column = CHANNELS.index("yaw_rate_radps")
     error = (signals.measured - seen)[50:-50, column]
     assert np.std(error) < 0.03 < np.nanstd(signals.measured[:, column])
 
 
-def test_runs_are_explained_and_filtered_without_what_is_not_described(robot_file, wide_runs):
-    robot = load_robot(robot_file)
+def test_runs_are_explained_and_filtered_without_what_is_not_described(robot, wide_runs):
     library = [effect_named("effective_track"), effect_named("lever_arm")]
     (cause,) = diagnose_runs(wide_runs, robot, library, None, 0).diagnosis.causes
     assert (cause.name, cause.values[0].value) == ("effective_track", pytest.approx(0.4, abs=0.05))
-    assert len(estimate_runs(wide_runs, robot, "skid").runs) == len(wide_runs)
+    assert np.isfinite(enriched(estimate_run(wide_runs[0], robot, "skid")).streams["estimator"].values).all()
