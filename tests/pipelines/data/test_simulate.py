@@ -8,7 +8,6 @@ from terrain.errors import ConfigError, LogError
 from terrain.files.resources import data_folder
 from terrain.logs.read import find_runs, read_run
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
 
@@ -113,12 +112,6 @@ def test_what_is_not_accepted_is_refused_and_nothing_is_written(tmp_path, option
     with pytest.raises(ConfigError, match=message):
         simulate_runs(**given | options)
     assert not (tmp_path / "runs").exists()
-
-
-def test_a_load_that_tips_the_robot_over_is_refused():
-    heavy = Conditions(payload_kg=500.0, payload_m=(0.0, 0.7))
-    with pytest.raises(ConfigError, match="tips it over"):
-        simulate_run(ROBOT, "grass", "straight", 0, conditions=heavy)
 
 
 def test_a_run_that_is_there_is_left_alone_and_nothing_else_is_written(tmp_path):

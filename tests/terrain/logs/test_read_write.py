@@ -1,5 +1,6 @@
 import json
 import tempfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from terrain.errors import LogError, TerrainError
+from terrain.logs.digest import data_digest
 from terrain.logs.read import find_runs, read_run
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
@@ -143,3 +145,28 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, make_run):
         read_run(folder)
     with pytest.raises(LogError, match=r"nowhere/run\.json: is missing"):
         read_run(tmp_path / "nowhere")
+
+
+def test_the_digest_sees_content_and_nothing_else(make_run):
+    run, other = make_run(), make_run("SNOW_02", seed=1)
+    imu = run.streams["imu"]
+
+    def digest(stream=imu, **changes):
+        return data_digest(
+            [replace(run, streams={"wheels": run.streams["wheels"], "imu": stream}, **changes)]
+        )
+
+    values = imu.values.copy()
+    values[7, 2] = np.nextafter(values[7, 2], 9.0)
+    swapped = Stream(imu.time_s, imu.values[:, ::-1], imu.channels[::-1])
+    assert digest() == digest(source="elsewhere", dropped={"rows": 1}) == digest(swapped)
+    changed = [
+        digest(Stream(imu.time_s, values, imu.channels)),
+        digest(Stream(imu.time_s + 1e-9, imu.values, imu.channels)),
+        digest(Stream(imu.time_s, imu.values, imu.channels[::-1])),
+        digest(run_id="SNOW_09"),
+        digest(robot="jackal"),
+        digest(labels=(Label(0.0, 4.0, "ICE"),)),
+    ]
+    assert len({digest(), *changed}) == 7
+    assert data_digest([run, other]) == data_digest([other, run]) != digest()

@@ -6,7 +6,9 @@ import pytest
 from scipy.stats import chi2
 
 from terrain.errors import ConfigError
+from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
+from terrain.simulation.run import simulate_run
 
 
 @pytest.mark.parametrize(
@@ -28,6 +30,12 @@ from terrain.simulation.conditions import Conditions, Faults, draw_conditions, l
 def test_impossible_conditions_are_refused(changed, message):
     with pytest.raises(ConfigError, match=message):
         Conditions(**changed)
+
+
+def test_a_load_that_tips_the_robot_over_is_refused():
+    heavy = Conditions(payload_kg=500.0, payload_m=(0.0, 0.7))
+    with pytest.raises(ConfigError, match="tips it over"):
+        simulate_run(load_robot("agrimaro"), "grass", "straight", 0, conditions=heavy)
 
 
 @pytest.mark.parametrize("interval", [(3.0, 2.0), (2.0, 2.0), (math.nan, 2.0), (0.0, math.nan)])
