@@ -40,31 +40,9 @@ def message(kind, stamp_ns=None, **fields):
     return made
 
 
-def imu(stamp_ns, gyro, accel=(0.0, 0.0, 9.81), quaternion=(0.0, 0.0, 0.0, 1.0), unknown=False):
-    return message(
-        "sensor_msgs/msg/Imu",
-        stamp_ns,
-        angular_velocity=tuple(gyro),
-        linear_acceleration=tuple(accel),
-        orientation=tuple(quaternion),
-        orientation_covariance=np.array([-1.0 if unknown else 0.0, *np.zeros(8)]),
-    )
-
-
-def joints(stamp_ns, names, velocity, position=(), effort=()):
-    numbers = {"velocity": velocity, "position": position, "effort": effort}
-    arrays = {field: np.array(each, dtype=np.float64) for field, each in numbers.items()}
-    return message("sensor_msgs/msg/JointState", stamp_ns, name=list(names), **arrays)
-
-
-def twist(x, y, yaw_rate):
-    return message("geometry_msgs/msg/Twist", linear=(x, y, 0.0), angular=(0.0, 0.0, yaw_rate))
-
-
-def odometry(stamp_ns, position, quaternion, linear, angular):
-    pose = {"pose__pose__position": tuple(position), "pose__pose__orientation": tuple(quaternion)}
-    rates = {"twist__twist__linear": tuple(linear), "twist__twist__angular": tuple(angular)}
-    return message("nav_msgs/msg/Odometry", stamp_ns, **pose, **rates)
+def imu(stamp_ns, gyro, accel=(0.0, 0.0, 9.81)):
+    fields = {"angular_velocity": tuple(gyro), "linear_acceleration": tuple(accel)}
+    return message("sensor_msgs/msg/Imu", stamp_ns, orientation=(0.0, 0.0, 0.0, 1.0), **fields)
 
 
 def text(content):
@@ -142,11 +120,20 @@ def husky_rows(n=200, start_ns=START_NS, late_ns=2_000_000):
         rows.append(("/imu/data", stamp + late_ns, imu(stamp, rng.normal(size=3), rng.normal(size=3))))
         if i % 2:
             continue
-        names = ("front_left_wheel_joint", "front_right_wheel_joint", "rear_left_wheel_joint")
-        rows.append(("/joint_states", stamp + late_ns, joints(stamp, names, rng.normal(size=3), np.zeros(3))))
+        names = [f"{place}_wheel_joint" for place in ("front_left", "front_right", "rear_left")]
+        joints = {"name": names, "velocity": rng.normal(size=3), "position": np.zeros(3)}
         quaternion = rng.normal(size=4)
-        quaternion /= np.linalg.norm(quaternion)
-        moving = (rng.normal(size=3), quaternion, rng.normal(size=3), rng.normal(size=3))
-        rows.append(("/odometry/filtered", stamp + late_ns, odometry(stamp, *moving)))
-        rows.append(("/cmd_vel", stamp + late_ns, twist(*rng.normal(size=3))))
+        moving = {
+            "pose__pose__position": tuple(rng.normal(size=3)),
+            "pose__pose__orientation": tuple(quaternion / np.linalg.norm(quaternion)),
+            "twist__twist__linear": tuple(rng.normal(size=3)),
+            "twist__twist__angular": tuple(rng.normal(size=3)),
+        }
+        desired = {"linear": (*rng.normal(size=2), 0.0), "angular": (0.0, 0.0, rng.normal())}
+        for topic, each in (
+            ("/joint_states", message("sensor_msgs/msg/JointState", stamp, **joints)),
+            ("/odometry/filtered", message("nav_msgs/msg/Odometry", stamp, **moving)),
+            ("/cmd_vel", message("geometry_msgs/msg/Twist", **desired)),
+        ):
+            rows.append((topic, stamp + late_ns, each))
     return sorted(rows, key=lambda row: row[1])

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, text_format
 from mcap.writer import CompressionType, IndexType
-from scipy.spatial.transform import Rotation
 
 from pipelines.data.datasets import load_runs
-from terrain.errors import LogError
 from terrain.kinematics.camera import body_motion
 from terrain.logs.write import write_run
 from terrain.robots import Camera, load_robot
@@ -20,11 +18,8 @@ from .foreign_bags import (
     START_NS,
     husky_rows,
     imu,
-    joints,
-    message,
     refused,
     text,
-    twist,
     write_bag,
     write_mcap,
     write_messages,
@@ -108,171 +103,6 @@ def mapping_of(folder, lines):
     path = folder / "mapping.yaml"
     path.write_text(lines if "robot: " in lines else "robot: husky\n" + lines, encoding="utf-8")
     return path
-
-
-def read(folder, rows, lines, **options):
-    path = write_mcap(folder / "drive.mcap", rows)
-    (run,) = load_runs(path, mapping=mapping_of(folder, lines), **options)
-    return run
-
-
-IMU = "streams: {imu: {topic: /imu, kind: imu}}"
-
-
-def imu_rows(stamps, kinds=None):
-    kinds = kinds or [{}] * len(stamps)
-    rows = enumerate(zip(stamps, kinds, strict=True))
-    return [("/imu", START_NS + i, imu(stamp, (0.1 * i, 0.0, 1.0), **kind)) for i, (stamp, kind) in rows]
-
-
-def test_the_attitude_is_that_of_the_quaternion_and_an_unknown_one_is_no_channel_or_nan(tmp_path):
-    angles = np.random.default_rng(1).uniform(-1.5, 1.5, (20, 3))
-    known = [{"quaternion": tuple(each)} for each in Rotation.from_euler("ZYX", angles[:, ::-1]).as_quat()]
-    unknown, zero = {"unknown": True}, {"quaternion": (0.0,) * 4}
-    for kinds, n_known in (
-        (known, 20),
-        (known[:4] + [unknown] * 5 + [zero], 4),
-        ([unknown] * 9, 0),
-        ([zero] * 9, 0),
-    ):
-        rows = imu_rows([START_NS + i * 10**7 for i in range(len(kinds))], kinds)
-        stream = read(tmp_path, rows, IMU).streams["imu"]
-        assert len(stream.channels) == (9 if n_known else 6)
-        if n_known:
-            np.testing.assert_allclose(stream.values[:n_known, 6:], angles[:n_known], atol=1e-12)
-            assert np.isnan(stream.values[n_known:, 6:]).all()
-
-
-def test_stamps_are_refused_or_repaired_and_the_log_time_helps(tmp_path):
-    stamps = [START_NS + 10_000_000 * i for i in range(20)]
-    stamps[7], stamps[11] = stamps[9], stamps[10]
-    path, mapping = tmp_path / "drive.mcap", mapping_of(tmp_path, IMU)
-    for given, fault in (
-        ([START_NS, START_NS + 5, START_NS + 5], "time repeats at row 3"),
-        ([0, 0, 0], r"all headers are stamped 0; take the log times \(time: log\)"),
-        (stamps, r"stream imu: time goes back at row 9 \(0\.08 s after 0\.09 s\)"),
-    ):
-        refused(fault, write_mcap(path, imu_rows(given)), mapping=mapping)
-    run = read(tmp_path, imu_rows(stamps), IMU, repair=True)
-    assert (len(run.streams["imu"]), dict(run.dropped)) == (18, {"rows with a bad time": 2})
-    run = read(tmp_path, imu_rows(stamps), "time: log\n" + IMU)
-    np.testing.assert_array_equal(run.streams["imu"].time_s, np.arange(20) / 1e9)
-
-
-def test_messages_are_put_in_the_order_of_their_log_times_and_topics_of_one_frame_are_two_streams(tmp_path):
-    stamps = [START_NS + 10_000_000 * i for i in range(50)]
-    rows = imu_rows(stamps)
-    back = [("/back", t, imu(t, (9.0, 0.0, 0.0))) for t in stamps]
-    two = "streams: {imu: {topic: /imu, kind: imu}, back: {topic: /back, kind: imu}}"
-    run = read(tmp_path, rows[25:] + back + rows[:25], two)
-    assert run.streams["back"].channel("gyro_x_radps").tolist() == [9.0] * 50
-    np.testing.assert_allclose(run.streams["imu"].channel("gyro_x_radps"), 0.1 * np.arange(50))
-
-
-JOINTS = """\
-streams:
-  wheels:
-    topic: /joints
-    kind: joints
-    wheel_radius: {value: 200, unit: mm, source: measured}
-    channels:
-      speed_left_mps: {joint: left, field: velocity, scale: -1}
-      motor_2_radps: {joint: right, field: velocity, unit: rpm}
-      current_1_a: {joint: left, field: effort, unit: mA}
-      angle_1_rad: {joint: steer, field: position, unit: deg}
-"""
-
-
-def test_joints_are_found_by_name_in_any_order_and_in_several_messages(tmp_path):
-    names = {"left": (0.0, 2.0, 500.0), "right": (0.0, 60.0, 0.0), "steer": (90.0, 0.0, 0.0)}
-    orders = ["left right steer", "steer left right", "right gripper left", "gripper"]
-    rows = []
-    for i in range(40):
-        order, stamp = orders[i % 4].split(), START_NS + i * 10**7
-        position, velocity, effort = zip(*(names.get(name, (7.0, 7.0, 7.0)) for name in order), strict=True)
-        rows.append(("/joints", stamp, joints(stamp, order, velocity, position, effort)))
-    wheels = read(tmp_path, rows, JOINTS).streams["wheels"]
-    assert len(wheels) == 30
-    for channel, value in (("speed_left_mps", -0.4), ("motor_2_radps", 2 * np.pi), ("current_1_a", 0.5)):
-        assert wheels.channel(channel) == pytest.approx(np.full(30, value))
-    angle_rad = wheels.channel("angle_1_rad")
-    assert np.isnan(angle_rad).sum() == 10
-    assert np.nanmax(angle_rad) == pytest.approx(np.pi / 2)
-
-
-FIELDS = """\
-streams:
-  wheels:
-    topic: /a
-    {join}
-    channels:
-      speed_left_mps: {{field: linear.x, unit: km/h, offset: 3.6}}
-      speed_right_mps: {{topic: /b, field: linear.x, unit: m/s}}
-"""
-
-
-def test_topics_are_joined_by_equal_stamps_or_by_the_value_before(tmp_path):
-    rows = [("/a", START_NS + 10 * i, twist(3.6 * i, 0, 0)) for i in range(6)]
-    rows += [("/b", START_NS + 10 * i + (3 if i == 4 else 0), twist(i, 0, 0)) for i in range(1, 6)]
-    with pytest.raises(LogError, match="wheels: 3 messages of '/a' and '/b' lack one of equal stamp"):
-        read(tmp_path, rows, FIELDS.format(join=""))
-    run = read(tmp_path, rows, FIELDS.format(join=""), repair=True)
-    assert run.streams["wheels"].values == pytest.approx(np.array([[2, 1], [3, 2], [4, 3], [6, 5]]))
-    run = read(tmp_path, rows, FIELDS.format(join="join: previous"))
-    assert run.streams["wheels"].channel("speed_right_mps")[1:].tolist() == [1, 2, 3, 3, 5]
-    assert np.isnan(run.streams["wheels"].channel("speed_right_mps")[0])
-
-
-def test_terrains_of_a_topic_are_labels(tmp_path):
-    stamps = [START_NS + 10**9 * i for i in range(11)]
-    rows = [("/imu", stamp, each) for stamp, (_, _, each) in zip(stamps, imu_rows(stamps), strict=True)]
-    changes = [(2.5, "ICE"), (3.0, "ICE"), (5.0, "SNOW"), (7.0, ""), (8.0, "ICE")]
-    rows += [("/terrain_name", START_NS + int(t * 1e9), text(name)) for t, name in changes]
-    run = read(tmp_path, rows, "labels: /terrain_name\n" + IMU)
-    assert [*map(tuple, run.labels)] == [(2.5, 5.0, "ICE"), (5.0, 7.0, "SNOW"), (8.0, 11.0, "ICE")]
-    assert read(tmp_path, rows, "terrain: MUD\n" + IMU).terrains == ("MUD",)
-
-
-OF_TWIST = "streams: {a: {topic: /cmd_vel, channels: "
-OF_IMU = "streams: {a: {topic: /imu/data, channels: "
-OF_JOINTS = "streams: {a: {topic: /j, kind: joints, channels: "
-OF_WHEELS = (
-    "streams: {a: {topic: /joint_states, kind: joints, channels: {v_mps: {joint: b, field: velocity}}}}"
-)
-
-
-@pytest.mark.parametrize(
-    ("lines", "fault"),
-    [
-        ("streams: {imu: {topic: /gyro, kind: imu}}", r"no topic '/gyro' \(there are /cmd_vel "),
-        ("streams: {imu: {topic: /cmd_vel, kind: imu}}", "is of type geometry_msgs/msg/Twist, kind 'imu' is"),
-        (OF_TWIST + "{v_mps: {field: linear.w, unit: m/s}}}}", "no 'w' .it has x, y, z"),
-        (OF_TWIST + "{v_mps: {field: linear, unit: m/s}}}}", "a number is required"),
-        (OF_TWIST + "{v_mps: {field: linear.x.y, unit: m/s}}}}", "'x' has no fields"),
-        (OF_TWIST + "{v_mps: {field: 'linear[0]', unit: m/s}}}}", "is no array"),
-        (OF_IMU + "{v_mps: {field: 'orientation_covariance[9]', unit: m/s}}}}", "nothing finite"),
-        (OF_IMU + "{v_mps: {field: orientation_covariance, unit: m/s}}}}", "is an array: give an index"),
-        ("labels: /cmd_vel\n" + IMU.replace("/imu", "/imu/data"), "std_msgs/String is required"),
-        ("labels: /nothing\n" + IMU.replace("/imu", "/imu/data"), "labels: there is no topic '/nothing'"),
-        (OF_TWIST + "{v_mps: {field: linear.x, unit: furlong}}}}", "'furlong' is unknown"),
-        (OF_TWIST + "{v_mps: {field: linear.x, unit: rad}}}}", "does not suit it"),
-        (OF_TWIST + "{speed: {field: linear.x, unit: rad}}}}", "known unit"),
-        ("streams: {a: {topic: /a, kind: twist, channels: {v_mps: {field: a, unit: m/s}}}}", "of its own"),
-        ("streams: {a: {topic: /cmd_vel}}", "has no channels"),
-        ("streams: {a: {topic: /cmd_vel, kind: twist, colour: red}}", "key 'streams.a.colour' is unknown"),
-        ("streams: {a: {topic: /cmd_vel, kind: video}}", "streams.a.kind is 'video'"),
-        (OF_JOINTS + "{v_mps: {joint: b, field: speed}}}}", "none of velocity"),
-        (OF_JOINTS + "{v_a: {joint: b, field: effort}}}}", "does not suit"),
-        (OF_JOINTS + "{v_mps: {field: velocity}}}}", "'joint' is missing"),
-        ("terrain: MUD\nlabels: /a\n" + IMU, "both 'terrain' and 'labels'"),
-        ("streams: {}", "at least 1 item"),
-        (OF_WHEELS, "'/joint_states' has no message with any of the joints"),
-        ("robot: mine\n" + OF_WHEELS, "'wheel_radius' is missing, and the robot has no description"),
-    ],
-)
-def test_a_mistake_in_a_mapping_is_one_sentence(tmp_path, lines, fault):
-    path = write_mcap(tmp_path / "drive.mcap", husky_rows(20))
-    refused(fault, path, mapping=mapping_of(tmp_path, lines))
 
 
 def write_speeds(path, encodings, definition, contents, kind):
@@ -402,28 +232,6 @@ def test_a_measured_bag_of_ros_1_is_read(datasets_dir, tmp_path):
     assert np.hypot(*np.diff(pose.values[:, :2], axis=0).T).max() < 0.05
 
 
-def test_fixes_become_metres_and_poses_a_continuous_yaw(tmp_path):
-    """A receiver goes 0.0001 degrees north a step, 11.113 m, and loses its fix; a robot turns round three times."""
-    rows = []
-    for i in range(20):
-        stamp = START_NS + 10**8 * i
-        fix = {"latitude": 45.0 + 1e-4 * i, "longitude": 7.0, "altitude": 200.0 + i}
-        fix |= {"status__status": -(i == 5), "position_covariance": np.array([0.04, *np.zeros(8)])}
-        turned = tuple(Rotation.from_euler("z", i).as_quat())
-        pose = {"pose__position": (0.1 * i, 2.0, 0.0), "pose__orientation": turned}
-        rows.append(("/fix", stamp, message("sensor_msgs/msg/NavSatFix", stamp, **fix)))
-        rows.append(("/pose", stamp, message("geometry_msgs/msg/PoseStamped", stamp, **pose)))
-    run = read(tmp_path, rows, "streams: {gnss: {topic: /fix, kind: gnss}, pose: {topic: /pose, kind: pose}}")
-    gnss, pose = run.streams["gnss"], run.streams["pose"]
-    assert gnss.channels == ("position_x_m", "position_y_m", "position_z_m", "std_position_m")
-    assert np.isnan(gnss.values).any(axis=1).tolist() == [i == 5 for i in range(20)]
-    known = np.arange(20) != 5
-    np.testing.assert_allclose(gnss.channel("position_y_m")[known], 11.113 * np.arange(20)[known], atol=0.02)
-    np.testing.assert_allclose(gnss.channel("std_position_m")[known], 0.2)
-    np.testing.assert_allclose(pose.channel("yaw_rad"), np.arange(20), atol=1e-9)
-    np.testing.assert_allclose(pose.channel("position_x_m"), 0.1 * np.arange(20))
-
-
 def changed_store(bag, statement):
     with sqlite3.connect(bag / "bag.db3") as store:
         store.execute(statement)
@@ -438,7 +246,10 @@ def test_a_bag_without_definitions_is_read_by_those_of_its_release(tmp_path):
     check_husky(run, rows)
     assert run.run_id == "bag"
     changed_store(bag, "update topics set type = 'own_msgs/msg/Imu' where name = '/imu/data'")
-    own = mapping_of(tmp_path, OF_IMU + "{gyro_x_radps: {field: angular_velocity.x, unit: rad/s}}}}")
+    own = mapping_of(
+        tmp_path,
+        "streams: {a: {topic: /imu/data, channels: {gyro_x_radps: {field: angular_velocity.x, unit: rad/s}}}}",
+    )
     refused("'own_msgs/msg/Imu', which is not defined", bag, layout="bag", mapping=own)
 
 
