@@ -47,8 +47,12 @@ def find_runs(place: Path, mapping: str | Path | None, robot: Robot | None) -> l
     ConfigError
         if the mapping is not accepted.
     """
+    if place.is_file():  # one that the user names may be a link
+        place = place.resolve()
+    if not (paths := find_bags(place)):
+        return []
     read_mapping = None if mapping is None else load_mapping(mapping)
-    return [partial(read_run, path, place, read_mapping, robot) for path in find_bags(place)]
+    return [partial(read_run, path, place, read_mapping, robot) for path in paths]
 
 
 def read_run(

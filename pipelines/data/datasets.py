@@ -184,11 +184,16 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
     """Return the readers of a layout, which ``auto`` finds; none where there is no run."""
     if layout not in LAYOUTS:
         raise ConfigError(f"layout {layout!r} is unknown: choose one of {', '.join(LAYOUTS)}")
-    if layout == "bag" or (layout == "auto" and folder.is_file() and _holds_bags(folder)):
-        return _bags(folder, mapping, robot)
+    if not folder.exists():
+        raise LogError(f"{folder}: does not exist; {ACCEPTED}")
+    if layout == "bag" or (layout == "auto" and folder.is_file()):
+        from pipelines.data import bag_runs
+
+        bags = bag_runs.find_runs(folder, mapping, robot)
+        if bags or layout == "bag":
+            return bags
     if not folder.is_dir():
-        fault = "is no folder" if folder.exists() else "does not exist"
-        raise LogError(f"{folder}: {fault}; {ACCEPTED}")
+        raise LogError(f"{folder}: is no folder; {ACCEPTED}")
     if layout == "can":
         from pipelines.data import can_codec, can_logs
 
@@ -212,20 +217,20 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
         "testbed": testbed.find_runs,
     }
     if layout == "auto" and robotino.find_root(folder) is not None:
-        del finders[
-            "drive-recording"
-        ]  # files of a Robotino have their ending, and a camera's file above them
+        del finders["drive-recording"]  # files of a Robotino have its ending, and a camera's file above them
     found = {name: find(folder) for name, find in finders.items() if layout in ("auto", name)}
     names = [name for name, readers in found.items() if readers]
     if len(names) > 1:
         raise LogError(f"{folder}: mixes the layouts {' and '.join(names)}; choose one with --format")
-    if not names:
-        return _bags(folder, None, robot) if layout == "auto" and _holds_bags(folder) else []
+    if not names and layout == "auto":
+        from pipelines.data import bag_runs
+
+        return bag_runs.find_runs(folder, None, robot)
     if names == ["drive"]:
         return drive.find_runs(folder, drive_robot(robot))
     if names == ["drive-recording"]:
         return drive_recording.find_runs(folder, lambda name: drive_robot(robot_named(name, robot)))
-    return found[names[0]]
+    return found[names[0]] if names else []
 
 
 def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:
@@ -237,22 +242,6 @@ def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:
     read = by_mapping.load_mapping(mapping, check_stream)
     radius_m = bag_runs.wheel_radius_m(read.robot, robot)
     return by_mapping.find_runs(folder, read, partial(bag_runs.read_stream, radius_m=radius_m))
-
-
-def _holds_bags(place: Path) -> bool:
-    from pipelines.data.bag_files import find_bags
-
-    return bool(find_bags(place))
-
-
-def _bags(place: Path, mapping: str | Path | None, robot: Robot | None) -> Readers:
-    """Return the readers of bags."""
-    from pipelines.data import bag_runs
-
-    if not place.exists():
-        raise LogError(f"{place}: does not exist; {ACCEPTED}")
-    named = place.resolve() if place.is_file() else place  # a file that the user names may be a link
-    return bag_runs.find_runs(named, mapping, robot)
 
 
 def drive_robot(robot: Robot | None) -> DriveRobot:
