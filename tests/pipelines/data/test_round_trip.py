@@ -1,35 +1,24 @@
 """What was exported is imported as the same run, bit for bit; other libraries read the same numbers."""
 
 import json
-import string
 import sys
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from pipelines.data.bag_runs import find_runs
 from pipelines.data.convert import Settings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
-from pipelines.data.mcap_file import McapWriter
-from pipelines.data.run_writers import messages_of_run, write
-from terrain.errors import ConfigError, DataError, LogError
+from terrain.errors import ConfigError, LogError
 from terrain.logs.digest import data_digest
-from terrain.logs.read import read_run
 from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
-from terrain.logs.run_topics import Head, string_message
 from terrain.logs.write import write_run
-from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
-
-from .foreign_bags import refused
 
 TARGETS = ("mcap", "ros2", "ros2-mcap")
 
@@ -138,83 +127,6 @@ def test_standard_messages_of_an_export_are_a_run_by_a_mapping_too(raw, estimate
         for channel in again.streams[name].channels:
             sent = run.streams[name].channel(channel)
             np.testing.assert_allclose(again.streams[name].channel(channel), sent, atol=tolerance)
-
-
-numbers = st.floats(allow_nan=True, allow_infinity=True)
-words = st.text(string.ascii_letters + "_ üж.", min_size=1, max_size=12).filter(
-    lambda text: text.strip() and text[0] not in "._ " and text[-1] not in "_ "
-)
-
-
-@st.composite
-def runs(draw):
-    """Return a run with streams and channels of any names, as far as run folders accept them."""
-    streams = {}
-    start_s = draw(st.sampled_from([0.0, -3.5, 1.7e9, 1e12]))
-    for name in draw(st.lists(words, min_size=1, max_size=3, unique=True)):
-        channels = draw(st.lists(words, min_size=1, max_size=4, unique=True))
-        units = ("m", "radps", "ratio", "s")
-        channels = [f"{channel}_{unit}" for channel, unit in zip(channels, units, strict=False)]
-        n = draw(st.integers(2, 6))
-        steps = draw(st.lists(st.floats(1e-3, 2.0), min_size=n - 1, max_size=n - 1))
-        time_s = start_s + np.concatenate([[0.0], np.cumsum(steps)])
-        values = draw(st.lists(numbers, min_size=n * len(channels), max_size=n * len(channels)))
-        values = np.array(values).reshape(n, len(channels))
-        values[0] = 1.0
-        streams[name] = Stream(time_s, values, tuple(channels))
-    labels = (Label(start_s - 1, start_s + 1, "мокрая трава"), Label(start_s + 1, start_s + 9, "A"))
-    labels = draw(st.sampled_from([(), labels]))
-    dropped = draw(st.dictionaries(words, st.integers(0, 9), max_size=2))
-    return RunLog(draw(words), draw(words), streams, labels, "drawn", dropped, draw(words), draw(words))
-
-
-@given(runs())
-@settings(max_examples=100, deadline=None)
-def test_whatever_a_run_folder_keeps_a_bag_keeps(tmp_path_factory, run):
-    folder = tmp_path_factory.mktemp("drawn")
-    try:
-        by_folder = read_run(write_run(run, folder / "run"))
-    except LogError:
-        assume(False)  # names that no run folder accepts
-    path = folder / "run.mcap"
-    write(path, by_folder, [], "mcap")
-    (read,) = find_runs(path, None, None)
-    by_bag = read(repair=False)
-    assert data_digest([by_bag]) == data_digest([by_folder])
-    assert (by_bag.filter, dict(by_bag.dropped)) == (by_folder.filter, dict(by_folder.dropped))
-
-
-def test_a_run_that_is_too_long_for_stamps_is_refused(tmp_path):
-    stream = Stream([0.0, 3e9], [[1.0], [2.0]], ("gyro_z_radps",))
-    write_run(RunLog("long", "husky", {"imu": stream}), tmp_path / "raw")
-    with pytest.raises(DataError, match="stamps have"):
-        exported(tmp_path / "raw", tmp_path / "out")
-    assert not list((tmp_path / "out").glob("*"))
-
-
-@pytest.mark.parametrize(
-    ("old", "new"),
-    [
-        ('"version": 1', '"version": 9'),
-        ('"run_id"', '"run_ix"'),
-        ('"robot": "', '"robot": "/'),
-        ("terrain/imu", "terrain/imx"),
-        ('gyro_x_radps"', 'gyro_x_furlo"'),
-        ('"labels": [', '"labels": {'),
-    ],
-)
-def test_an_export_whose_document_is_changed_is_refused(raw, tmp_path, old, new):
-    run = load_runs(raw)[0]
-    with (tmp_path / "changed.mcap").open("wb") as file:
-        writer = McapWriter(file, Head("", ""))
-        for topic in messages_of_run(run):
-            for stamp_ns, message in zip(topic.log_ns.tolist(), topic.contents, strict=True):
-                if topic.topic == "/terrain/run":
-                    assert old in message[8:-1].decode()
-                    message = string_message(message[8:-1].decode().replace(old, new, 1))
-                writer.write(topic, stamp_ns, message)
-        writer.finish()
-    refused(None, tmp_path / "changed.mcap")
 
 
 @pytest.mark.parametrize("target", TARGETS)
