@@ -2,27 +2,23 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
-from fastapi import Body, FastAPI, HTTPException, Response, WebSocket
-from fastapi.responses import FileResponse, PlainTextResponse
+from fastapi import Body, FastAPI, Request, Response, WebSocket
+from fastapi.responses import FileResponse, JSONResponse, PlainTextResponse
 from fastapi.staticfiles import StaticFiles
 
 from pipelines import report
-from pipelines.learn.model_file import TerrainModel
 from pipelines.report.json_file import as_json
 from pipelines.serve.connection import Connection
 from pipelines.serve.guard import Guard
 from pipelines.serve.hub import Hub
 from pipelines.serve.wire import encode
 from terrain import __version__
-from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.errors import ConfigError, TerrainError
+from terrain.errors import TerrainError
 
 LARGEST_BODY = 262_144
 """Bytes of a request's body: a table of target slips, or the name of a model."""
@@ -45,23 +41,13 @@ ModelUri = Annotated[
 ]
 
 
-def make_app(
-    hub: Hub,
-    token: str,
-    load: Callable[[str], TerrainModel],
-    lifespan: Callable[[FastAPI], AbstractAsyncContextManager[None]],
-    *,
-    loopback: bool,
-) -> Guard:
+def make_app(hub: Hub, lifespan: Callable[[FastAPI], AbstractAsyncContextManager[None]]) -> Guard:
     """Return the application behind its guard.
 
     Parameters
     ----------
     hub : of the sessions
-    token : that is required; empty for none
-    load : returns a model by its URI; raises ``ModelError``
     lifespan : what begins before the first request, and ends after the last
-    loopback : whether only this machine is listened to
     """
     app = FastAPI(
         title="Terrain service",
@@ -72,7 +58,10 @@ def make_app(
         lifespan=lifespan,
         max_body_size=LARGEST_BODY,
     )
-    guard = Guard(app, token, OPEN, hub.metrics, loopback=loopback)
+
+    @app.exception_handler(TerrainError)
+    async def refused(request: Request, error: TerrainError) -> JSONResponse:
+        return JSONResponse({"detail": str(error)}, 409)
 
     for place, folder in FOLDERS.items():
         app.mount(place, StaticFiles(directory=folder))
@@ -83,7 +72,7 @@ def make_app(
 
     @app.websocket("/robots")
     async def robots(socket: WebSocket) -> None:
-        await Connection(socket, hub, guard).serve()
+        await Connection(socket, hub).serve()
 
     @app.get("/health")
     async def health() -> dict[str, str]:
@@ -121,35 +110,14 @@ def make_app(
         """Return the robots that are connected."""
         return [opened.content() for opened in hub.sessions.values()]
 
-    async def replaced(
-        read: Callable[[str], Any], text: str, changed: Callable[[Any], Any]
-    ) -> dict[str, Any]:
-        try:
-            found = await asyncio.to_thread(read, text)
-            async with hub.changing:
-                return hub.swap(*changed(found)).content()
-        except TerrainError as error:
-            raise HTTPException(409, str(error)) from None
-
     @app.put("/model")
     async def replace_model(uri: ModelUri) -> dict[str, Any]:
         """Serve another model: all robots at once, or none; no sample is lost."""
-        return await replaced(load, uri, lambda model: (model, uri, hub.served.table))
+        return (await hub.replace_model(uri)).content()
 
     @app.put("/table")
     async def replace_table(text: Annotated[str, Body(media_type="application/yaml")]) -> dict[str, Any]:
         """Serve another table of target slips, given as its YAML: all robots at once, or none."""
-        return await replaced(_table_of, text, lambda table: (hub.served.model, hub.served.model_name, table))
+        return (await hub.replace_table(text)).content()
 
-    return guard
-
-
-def _table_of(text: str) -> SlipTable:
-    """Return the table of a YAML text; ``ConfigError`` where it is none."""
-    with TemporaryDirectory() as folder:
-        file = Path(folder) / "table.yaml"
-        file.write_text(text, encoding="utf-8")
-        try:
-            return load_slip_table(file)
-        except ConfigError as error:
-            raise ConfigError(str(error).replace(str(file), "the table")) from None
+    return Guard(app, hub, OPEN)

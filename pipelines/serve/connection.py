@@ -22,7 +22,7 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from pipelines.live.chain import CommandStatus
 from pipelines.live.session import Hello, RobotSession, StepOutput
-from pipelines.serve.guard import LONGEST_TOKEN, Guard, bearer
+from pipelines.serve.guard import LONGEST_TOKEN, bearer
 from pipelines.serve.hub import Hub
 from pipelines.serve.wire import WireError, decode, encode
 from terrain.estimation.live.clocks import number
@@ -82,13 +82,12 @@ class Connection:
     ----------
     socket : not accepted yet
     hub : of the sessions
-    guard : knows the token that is required
     """
 
     _session: RobotSession
 
-    def __init__(self, socket: WebSocket, hub: Hub, guard: Guard) -> None:
-        self._socket, self._hub, self._guard = socket, hub, guard
+    def __init__(self, socket: WebSocket, hub: Hub) -> None:
+        self._socket, self._hub = socket, hub
         self._packed = False
         self._end: tuple[int, str] = (1000, "")
         self._budgets = Budgets(hub.limits.per_s)
@@ -113,15 +112,15 @@ class Connection:
 
     async def _admitted(self) -> bool:
         """Say whether the token is the required one: that of the header, or the first frame, undecoded."""
-        if self._guard.admits(bearer(self._socket.headers)):
+        if self._hub.admits(bearer(self._socket.headers)):
             return True
         first: str | bytes = ""
         with suppress(TimeoutError):
             async with asyncio.timeout(self._hub.limits.hello_s):
                 first = await self._received()
-        if isinstance(first, str) and len(first) <= LONGEST_TOKEN and self._guard.admits(first):
+        if isinstance(first, str) and len(first) <= LONGEST_TOKEN and self._hub.admits(first):
             return True
-        await self._guard.wrong_token()
+        await self._hub.wrong_token()
         await self._write(self._error("token", NO_TOKEN, fatal=True))
         self._end = (POLICY, "token")
         return False

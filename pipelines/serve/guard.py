@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-import hmac
 import ipaddress
 import os
 import socket
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -17,16 +16,15 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from pipelines.serve.metrics import Metrics
 from terrain.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pipelines.serve.hub import Hub
 
 SHORTEST_TOKEN = 16
 """Characters; a shorter one can be tried out."""
 
 LONGEST_TOKEN = 512
-
-WRONG_TOKEN_S = 1.0
-"""Before a token that is missing or another is answered: a thousand tries take a quarter of an hour."""
 
 REQUEST_S = 10.0
 """For a request to come whole, and for a response to be read."""
@@ -134,17 +132,13 @@ class Guard:
     Parameters
     ----------
     app : that is guarded
-    token : that is required; empty for none
+    hub : knows the token
     open_paths : that need no token: they tell nothing of robots
-    loopback : whether only this machine is listened to
-    metrics : gets the number of wrong tokens
     """
 
-    def __init__(
-        self, app: ASGIApp, token: str, open_paths: frozenset[str], metrics: Metrics, *, loopback: bool
-    ) -> None:
-        self._app, self._token, self._open, self._loopback = app, token, open_paths, loopback
-        self._metrics = metrics
+    def __init__(self, app: ASGIApp, hub: Hub, open_paths: frozenset[str]) -> None:
+        self._app, self._hub, self._open = app, hub, open_paths
+        self._loopback = is_loopback(hub.settings.host)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a request or a WebSocket."""
@@ -156,8 +150,8 @@ class Guard:
         app, given = self._app, bearer(headers)
         if reason := foreign(headers, loopback=self._loopback):
             app = PlainTextResponse(f"{reason}\n", 403)
-        elif ((is_http and scope["path"] not in self._open) or given) and not self.admits(given):
-            await self.wrong_token()
+        elif ((is_http and scope["path"] not in self._open) or given) and not self._hub.admits(given):
+            await self._hub.wrong_token()
             app = PlainTextResponse("a token is required (Authorization: Bearer)\n", 401)
 
         async def received() -> Message:
@@ -180,16 +174,6 @@ class Guard:
             await app(scope, receive, send)
         finally:
             connection.abort_in(FLUSH_S)
-
-    def admits(self, given: str) -> bool:
-        """Say whether a token is the required one, in a time that does not tell how much of it is right."""
-        required = self._token.encode()
-        return not required or hmac.compare_digest(required, given.encode("utf-8", "replace"))
-
-    async def wrong_token(self) -> None:
-        """Count a token that is missing or another, and let who gave it wait."""
-        self._metrics.wrong_tokens.inc()
-        await asyncio.sleep(WRONG_TOKEN_S)
 
 
 class Watched:

@@ -3,22 +3,38 @@
 from __future__ import annotations
 
 import asyncio
+import hmac
 from collections import OrderedDict
 from collections.abc import Callable
-from pathlib import Path
+from contextlib import suppress
+from tempfile import NamedTemporaryFile
 from time import monotonic
 from typing import Any, NamedTuple
 
-from pipelines.live.classifying import ClassifierThread
+import numpy as np
+
+from pipelines.learn.model_file import TerrainModel
+from pipelines.live.classifying import Classifier, ClassifierThread, classify_window
 from pipelines.live.model import LiveModel
+from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread
 from pipelines.live.session import Hello, RobotSession, Served
 from pipelines.live.state import LiveState, load_state, save_state
+from pipelines.serve.guard import required_token
 from pipelines.serve.metrics import Metrics
+from pipelines.serve.serve import Settings, loaded
 from pipelines.serve.wire import WireError
-from terrain.control.slip_table import SlipTable
+from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
-from terrain.robots import Robot, robot_named
+from terrain.estimation.live.estimator import CHANNELS
+from terrain.files.atomic import ensure_writable
+from terrain.records import Reading, Sample, Windows
+from terrain.robots import Robot, load_robot, robot_named
+
+WARM_STEPS = 30
+
+WRONG_TOKEN_S = 1.0
+"""Before a token that is missing or another is answered: a thousand tries take a quarter of an hour."""
 
 REMEMBERED = 1000
 """States of robots that have left, which are kept in memory for their return."""
@@ -60,40 +76,60 @@ LIMITS = Limits()
 
 
 class Hub:
-    """Sessions of robots on one model and table.
+    """Sessions of robots on one model and table, all of it loaded and checked, and its code run once.
 
     Parameters
     ----------
-    served : at first
-    given : a robot's description that the package does not have, or has otherwise
-    limits : of sessions and messages
-    states : folder of the states that outlive the service; None for memory only
-    recordings : folder of the files of sessions that ask to be recorded; None for no recording
+    settings : what is served, and to whom
 
     Attributes
     ----------
+    served : model and table
+    sessions : by their names
+    limits : of sessions and messages
     changing : held while a session begins, and while model or table are replaced
+    closing : whether the service ends
     trouble : what is not as it should be, by what it is of
+
+    Raises
+    ------
+    TerrainError
+        in one sentence, if anything does not fit: model, table, robot, token, folder.
     """
 
-    def __init__(
-        self,
-        served: Served,
-        given: Robot | None = None,
-        limits: Limits = LIMITS,
-        states: Path | None = None,
-        recordings: Path | None = None,
-    ) -> None:
-        self.served, self.limits, self.metrics = served, limits, Metrics()
-        self.metrics.served.set(served.number)
+    def __init__(self, settings: Settings) -> None:
+        if settings.model is None:
+            raise ConfigError("--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder")
+        self.settings, self._token = settings, required_token(settings.host, settings.token_file)
+        self._given = None if settings.robot is None else load_robot(settings.robot)
+        table = load_slip_table(settings.table, None if self._given is None else self._given.name)
+        for folder in (settings.state, settings.record):
+            if folder is not None:
+                ensure_writable(folder)
+                folder.mkdir(parents=True, exist_ok=True)
+        model = loaded(settings, settings.model)
+        assert model is not None
+        warm_up(model, self._given)
+        self.served = Served(1, model, settings.model, table)
+        self.limits, self.metrics = Limits(sessions=settings.max_sessions), Metrics()
+        self.metrics.served.set(1)
         self.sessions: dict[str, RobotSession] = {}
         self.changing = asyncio.Lock()
         self.closing = False
         self.trouble: dict[str, str] = {}
-        self._given, self._folder = given, states
-        self._thread = ClassifierThread()
-        self._recording = None if recordings is None else (recordings, RecordingThread())
         self._left: OrderedDict[str, LiveState] = OrderedDict()
+        self._recorder = None if settings.record is None else RecordingThread()
+        self._thread = ClassifierThread()
+
+    def admits(self, token: str) -> bool:
+        """Say whether a token is the required one, in a time that does not tell how much of it is right."""
+        required = self._token.encode()
+        return not required or hmac.compare_digest(required, token.encode("utf-8", "replace"))
+
+    async def wrong_token(self) -> None:
+        """Count a token that is missing or another, and let who gave it wait."""
+        self.metrics.wrong_tokens.inc()
+        await asyncio.sleep(WRONG_TOKEN_S)
 
     def robot(self, name: str) -> Robot | None:
         """Return the description of a robot by its name, never by a path; None where it has none."""
@@ -128,8 +164,8 @@ class Hub:
                 raise WireError("too-many", f"{self.limits.sessions} sessions are open, no more are accepted")
             try:
                 opened = await asyncio.to_thread(self._begin, hello, leave)
-                if hello.record and self._recording is not None:
-                    opened.record(*self._recording)
+                if hello.record and self._recorder is not None and self.settings.record is not None:
+                    opened.record(self.settings.record, self._recorder)
             except (ConfigError, DataError, LogError) as error:
                 raise WireError("refused", str(error)) from None
             self.sessions[hello.session] = opened
@@ -140,9 +176,9 @@ class Hub:
     def _begin(self, hello: Hello, leave: Callable[[str, str], None]) -> RobotSession:
         opened = RobotSession(hello, self.served, self.robot(hello.robot), self._thread, leave)
         state = self._left.get(hello.session)
-        if state is None and self._folder is not None:
+        if state is None and self.settings.state is not None:
             try:
-                state = load_state(self._folder / f"{hello.session}.json")
+                state = load_state(self.settings.state / f"{hello.session}.json")
             except DataError as error:  # a damaged state is none
                 self.trouble[f"state of {hello.session}"] = str(error)
         if state is not None:
@@ -179,6 +215,18 @@ class Hub:
             "session": shown,
         }
 
+    async def replace_model(self, name: str) -> Served:
+        """Serve another model, as :meth:`swap` does."""
+        model = await asyncio.to_thread(loaded, self.settings, name)
+        async with self.changing:
+            return self.swap(model, name, self.served.table)
+
+    async def replace_table(self, text: str) -> Served:
+        """Serve another table of target slips, given as its YAML, as :meth:`swap` does."""
+        table = await asyncio.to_thread(_table_of, text)
+        async with self.changing:
+            return self.swap(self.served.model, self.served.model_name, table)
+
     def swap(self, model: LiveModel | None, model_name: str, table: SlipTable) -> Served:
         """Serve another model and table: all sessions at once, or none; called with ``changing`` held.
 
@@ -205,12 +253,12 @@ class Hub:
 
     def save_states(self, states: dict[str, LiveState]) -> None:
         """Write states to the folder, if there is one; one that cannot be written is named in ``trouble``."""
-        if self._folder is None:
+        if self.settings.state is None:
             return
         failed = ""
         for name, state in states.items():
             try:
-                save_state(self._folder / f"{name}.json", state)
+                save_state(self.settings.state / f"{name}.json", state)
             except TerrainError as error:
                 failed = str(error)
         if failed:
@@ -221,5 +269,51 @@ class Hub:
     def stop(self) -> None:
         """End the threads; recordings are written."""
         self._thread.stop()
-        if self._recording is not None:
-            self._recording[1].stop()
+        if self._recorder is not None:
+            self._recorder.stop()
+
+
+def _table_of(text: str) -> SlipTable:
+    """Return the table of a YAML text; ``ConfigError`` where it is none."""
+    with NamedTemporaryFile("w", encoding="utf-8", suffix=".yaml") as file:
+        file.write(text)
+        file.flush()
+        try:
+            return load_slip_table(file.name)
+        except ConfigError as error:
+            raise ConfigError(str(error).replace(file.name, "the table")) from None
+
+
+def warm_up(model: TerrainModel, robot: Robot | None) -> None:
+    """Run all code once, so that the first robot does not wait for it.
+
+    Raises
+    ------
+    DataError
+        if the model cannot classify the robot's windows: it needs channels that neither the robot's sensors nor
+        its filter give, or was trained on other robots.
+    """
+    source = Classifier(model, robot) if robot is not None and robot.drive == "swerve" else None
+    if source is None and robot is not None and model.info.robots and robot.name not in model.info.robots:
+        raise DataError(
+            f"the model was trained on runs of {', '.join(model.info.robots)}, not of {robot.name}"
+        )
+    rng = np.random.default_rng(0)
+    layout, rule = model.layout, model.rule
+    values = {
+        stream: rng.normal(size=(1, len(names), layout.n_samples(stream, rule.length_s)))
+        for stream, names in layout.channels.items()
+    }
+    nothing = np.array([""], dtype=object)
+    window = Windows(values, layout.channels, layout.rate_hz, rule.length_s, np.zeros(1), nothing, nothing)
+    classify_window(model, window)
+    if robot is None or source is None:
+        return
+    with suppress(ConfigError, DataError):  # it has no pilot
+        pilot = LivePilot(robot, source=source)
+        for time_s in 0.02 * np.arange(WARM_STEPS):
+            readings = {
+                stream: Reading(np.array([time_s]), rng.normal(size=(1, len(names))))
+                for stream, names in CHANNELS.items()
+            }
+            pilot.step(Sample(time_s, np.array([0.5, 0.0, 0.0]), readings))

@@ -1,4 +1,4 @@
-"""The service: all that is checked before a robot may come, then the server until it has to end."""
+"""The server: its port, its event loop, and its end, of which robots are told."""
 
 from __future__ import annotations
 
@@ -13,31 +13,19 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager, suppress
 from typing import Any
 
-import numpy as np
 import uvicorn
 
-from pipelines.learn.model_file import TerrainModel, read_model
-from pipelines.live.classifying import Classifier, classify_window
-from pipelines.live.pilot import LivePilot
-from pipelines.live.session import Served
-from pipelines.live.windows import filtered
 from pipelines.serve.app import make_app
-from pipelines.serve.guard import Watched, is_loopback, required_token
-from pipelines.serve.hub import Hub, Limits
+from pipelines.serve.guard import Watched
+from pipelines.serve.hub import Hub
 from pipelines.serve.serve import Settings
-from terrain.control.slip_table import load_slip_table
-from terrain.errors import ConfigError, DataError, TerrainError
-from terrain.estimation.live.estimator import CHANNELS
-from terrain.files.atomic import ensure_writable
-from terrain.records import Reading, Sample, Windows
-from terrain.robots import Robot, load_robot
+from terrain.errors import ConfigError, TerrainError
 
 SAVE_EVERY_S = 5.0
 LARGEST_MESSAGE = 1_048_576
 """Bytes of a message that is not even read: the connection is closed (code 1009)."""
 
 PING_S = 10.0
-WARM_STEPS = 30
 
 LEAVING_S = 3.5
 """That robots have to read that the service ends."""
@@ -61,27 +49,14 @@ class Service:
     Raises
     ------
     TerrainError
-        in one sentence, if anything does not fit: model, table, robot, token, folder, port.
+        in one sentence, if anything does not fit: what :class:`~pipelines.serve.hub.Hub` needs, or the port.
     """
 
     def __init__(self, settings: Settings) -> None:
-        if settings.model is None:
-            raise ConfigError("--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder")
-        token = required_token(settings.host, settings.token_file)
-        robot = None if settings.robot is None else load_robot(settings.robot)
-        table = load_slip_table(settings.table, None if robot is None else robot.name)
-        for folder in (settings.state, settings.record):
-            if folder is not None:
-                ensure_writable(folder)
-                folder.mkdir(parents=True, exist_ok=True)
         with ExitStack() as cleanup:
             self._socket = cleanup.enter_context(_listen(settings.host, settings.port))
-            self._stride_s = settings.filter_stride_s
-            model = self._load(settings.model)
-            served, limits = Served(1, model, settings.model, table), Limits(sessions=settings.max_sessions)
-            self.hub = Hub(served, robot, limits, settings.state, settings.record)
+            self.hub = Hub(settings)
             cleanup.callback(self.hub.stop)
-            warm_up(model, robot)
             self._cleanup = cleanup.pop_all()
         host, port = self._socket.getsockname()[:2]
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
@@ -90,7 +65,7 @@ class Service:
         self._announce: Callable[[str], None] = lambda url: None
         self._server = uvicorn.Server(
             uvicorn.Config(
-                make_app(self.hub, token, self._load, self._lifespan, loopback=is_loopback(host)),
+                make_app(self.hub, self._lifespan),
                 log_level="critical",
                 access_log=False,
                 loop="asyncio",
@@ -105,9 +80,6 @@ class Service:
                 server_header=False,
             )
         )
-
-    def _load(self, name: str) -> TerrainModel:
-        return filtered(read_model(name), self._stride_s)
 
     def close(self) -> None:
         """Give the port back, and end the threads."""
@@ -186,38 +158,3 @@ def _listen(host: str, port: int) -> socket.socket:
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error)
         raise TerrainError(f"port {port} of {host} cannot be listened on ({reason})") from None
-
-
-def warm_up(model: TerrainModel, robot: Robot | None) -> None:
-    """Run all code once, so that the first robot does not wait for it.
-
-    Raises
-    ------
-    DataError
-        if the model cannot classify the robot's windows: it needs channels that neither the robot's sensors nor
-        its filter give, or was trained on other robots.
-    """
-    source = Classifier(model, robot) if robot is not None and robot.drive == "swerve" else None
-    if source is None and robot is not None and model.info.robots and robot.name not in model.info.robots:
-        raise DataError(
-            f"the model was trained on runs of {', '.join(model.info.robots)}, not of {robot.name}"
-        )
-    rng = np.random.default_rng(0)
-    layout, rule = model.info.layout, model.info.rule
-    values = {
-        stream: rng.normal(size=(1, len(names), layout.n_samples(stream, rule.length_s)))
-        for stream, names in layout.channels.items()
-    }
-    nothing = np.array([""], dtype=object)
-    window = Windows(values, layout.channels, layout.rate_hz, rule.length_s, np.zeros(1), nothing, nothing)
-    classify_window(model, window)
-    if robot is None or source is None:
-        return
-    with suppress(ConfigError, DataError):  # it has no pilot
-        pilot = LivePilot(robot, source=source)
-        for time_s in 0.02 * np.arange(WARM_STEPS):
-            readings = {
-                stream: Reading(np.array([time_s]), rng.normal(size=(1, len(names))))
-                for stream, names in CHANNELS.items()
-            }
-            pilot.step(Sample(time_s, np.array([0.5, 0.0, 0.0]), readings))

@@ -14,10 +14,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from pipelines.live.session import Served
 from pipelines.serve.client import ServiceError, TerrainClient
 from pipelines.serve.connection import read_hello
 from pipelines.serve.hub import Hub
+from pipelines.serve.serve import Settings
 from terrain.control.slip_table import load_slip_table
 
 from .strangers import CHANNELS, ask, until
@@ -124,9 +124,9 @@ def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, h
 
 @pytest.mark.parametrize("leaves", [True, False])
 def test_a_session_that_is_beginning_leaves_nothing_behind_or_gets_the_model_that_replaces(
-    mower_model, hello, monkeypatch, tmp_path, leaves
+    model_folder, mower_model, hello, monkeypatch, tmp_path, leaves
 ):
-    hub = Hub(Served(1, mower_model, "one", load_slip_table()), recordings=tmp_path)
+    hub = Hub(Settings(model=str(model_folder), record=tmp_path))
     begun, go_on, begin = threading.Event(), threading.Event(), hub._begin
 
     def slowly(*request):

@@ -85,7 +85,7 @@ def test_after_a_refused_start_the_port_is_free_and_no_thread_is_left(
         )
     before = threading.active_count()
     with monkeypatch.context() as patch:
-        patch.setattr("pipelines.serve.service.warm_up", fails)
+        patch.setattr("pipelines.serve.hub.warm_up", fails)
         assert refusal(port=port, record=tmp_path / "runs") == "the code does not run"
     assert threading.active_count() == before
     found = run(Settings(model=str(model_folder), port=port, check=True))

@@ -43,7 +43,7 @@ def resident_bytes():
 def guarded(running, model_folder, monkeypatch):
     """A service that requires a token, and whose wrong tokens wait for a fifth of a second."""
     monkeypatch.setenv("TERRAIN_TOKEN", TOKEN)
-    monkeypatch.setattr(guard, "WRONG_TOKEN_S", 0.2)
+    monkeypatch.setattr("pipelines.serve.hub.WRONG_TOKEN_S", 0.2)
     with running(model=str(model_folder)) as service:
         yield service
 
