@@ -13,21 +13,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    FiniteFloat,
-    PlainSerializer,
-    TypeAdapter,
-    ValidationError,
-)
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from terrain.control.switching import UNKNOWN
 from terrain.errors import DataError
 from terrain.files.atomic import atomic_write
+from terrain.files.regular import read_regular
+from terrain.logs.recorded_windows import Number
 
 BIASES_FRESH_S = 600.0
 """A bias older than that is estimated anew: with temperature it moves further than its walk says."""
@@ -39,14 +32,6 @@ CLOCK_SLACK_S = 1.0
 """A state may seem so far from the future: clocks are adjusted."""
 
 LARGEST_FILE = 65536
-
-
-Number = Annotated[
-    float,
-    BeforeValidator(lambda value: math.nan if value is None else value),
-    PlainSerializer(lambda value: value if math.isfinite(value) else None),
-]
-"""A number; what is not finite is written as null."""
 
 
 class Bias(NamedTuple):
@@ -164,15 +149,9 @@ def load_state(path: Path) -> LiveState | None:
     DataError
         if it cannot be read or is damaged.
     """
-    try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE + 1)
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be opened ({error.strerror})") from error
-    if len(content) > LARGEST_FILE:
-        raise DataError(f"{path}: is no saved state, it is larger than {LARGEST_FILE} bytes")
+    content = read_regular(path, str(path), DataError, LARGEST_FILE)
     try:
         return from_text(content.decode("utf-8"))
     except (DataError, UnicodeDecodeError) as error:

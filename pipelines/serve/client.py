@@ -92,10 +92,8 @@ class TerrainClient:
                 raise ServiceError(code, error.response.body.decode(errors="replace").strip()) from None
             except (OSError, TimeoutError, InvalidURI, InvalidHandshake, ValueError) as error:
                 raise ServiceError("unreachable", f"{url}: cannot be reached ({error})") from None
-            hello = {"type": "hello", "protocol": 2, "session": session, "robot": robot}
-            self._send(
-                hello | {"streams": dict(streams), "control": control, "rate_hz": rate_hz, "record": record}
-            )
+            hello = {"type": "hello", "protocol": 2, "session": session, "robot": robot, "control": control}
+            self._send(hello | {"streams": dict(streams), "rate_hz": rate_hz, "record": record})
             try:
                 self.welcome = decode(self._socket.recv(TIMEOUT_S))
             except (ConnectionClosed, TimeoutError) as error:
@@ -165,13 +163,10 @@ class TerrainClient:
         ServiceError
             if none comes in time (code ``timeout``), or the connection has ended.
         """
-        end_s = monotonic() + timeout_s
         with self._came:
-            while not self._steps:
-                if self._closed is not None:
-                    raise self._closed
-                if not self._came.wait(end_s - monotonic()):
-                    raise ServiceError("timeout", "the service gave no step in time")
+            self._came.wait_for(lambda: self._steps or self._closed, timeout_s)
+            if not self._steps:
+                raise self._closed or ServiceError("timeout", "the service gave no step in time")
             return self._steps.pop()[1]
 
     def close(self) -> None:

@@ -7,6 +7,8 @@ from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, Proc
 STEP_BUCKETS_S = (25e-6, 50e-6, 100e-6, 200e-6, 300e-6, 500e-6, 1e-3, 2e-3, 5e-3, 10e-3, 50e-3)
 LATENCY_BUCKETS_S = (0.5e-3, 1e-3, 2e-3, 5e-3, 10e-3, 20e-3, 50e-3, 0.1, 0.2, 0.5, 1.0)
 
+TOTALS = ("opened_sessions", "messages", "rows", "steps", "errors", "wrong_tokens")
+
 
 class Metrics:
     """The figures of one service, apart from those of any other in the process, and of the process."""
@@ -44,19 +46,11 @@ class Metrics:
 
     def totals(self) -> dict[str, int]:
         """Return what was counted so far of sessions, messages, rows, steps, errors and wrong tokens."""
-        counters = {
-            "sessions": self.opened,
-            "messages": self.messages,
-            "rows": self.rows,
-            "steps": self.steps,
+        found = {
+            family.name: sum(int(one.value) for one in family.samples if one.name.endswith("_total"))
+            for family in self._registry.collect()
         }
-        counters |= {"errors": self.errors, "wrong_tokens": self.wrong_tokens}
-        return {
-            name: sum(
-                int(one.value) for family in each.collect() for one in family.samples if "_total" in one.name
-            )
-            for name, each in counters.items()
-        }
+        return {name.removeprefix("opened_"): found[f"terrain_{name}"] for name in TOTALS}
 
     def text(self) -> bytes:
         """Return all figures in Prometheus' text form."""

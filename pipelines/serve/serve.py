@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import field_validator, model_validator
 
 from pipelines.data.settings import ReadSettings
-from pipelines.report import Pairs, Progress, Report, Result, Section, described, enumerated, plural, silent
+from pipelines.report import Pairs, Progress, Report, Result, described, enumerated, plural, sections, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 
@@ -181,24 +181,18 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
 
 def report(result: ServiceResult) -> Report:
     """Return what a service serves, and what it did until its end."""
-    model = (
-        ("classes", enumerated(result.classes)),
-        ("table of target slips", result.table),
-        ("trained on", enumerated(result.robots)),
-        ("checked against", result.robot),
-        ("filter", result.filter or None),
-    )
-    needs = tuple(
+    model = Pairs(result.pairs("classes", "table", "robots", "robot", "filter"))
+    needs = [
         (f"{stream}, {result.rate_hz[stream]:g} Hz", enumerated(names))
         for stream, names in result.channels.items()
-    )
-    details = (Section("Channels that the model needs", (Pairs(needs),)),)
+    ]
+    details = sections(("Channels that the model needs", [Pairs(needs)]))
     if result.served is None:
         answer = f"{result.model} can be served: {enumerated(result.classes)}."
         next_step = f"terrain serve --model {result.model}"
-        return Report("Service", answer, parts=(Pairs(model),), details=details, next_step=next_step)
+        return Report("Service", answer, parts=(model,), details=details, next_step=next_step)
     done = result.served
     answer = f"{plural(done['sessions'], 'session')} of robots served with {result.model}."
-    counts = Pairs(tuple((name.replace("_", " "), n) for name, n in done.items()))
+    counts = Pairs([(name.replace("_", " "), n) for name, n in done.items()])
     next_step = "terrain convert RECORDINGS --out RUNS makes runs of what was recorded"
-    return Report("Service", answer, parts=(counts, Pairs(model)), details=details, next_step=next_step)
+    return Report("Service", answer, parts=(counts, model), details=details, next_step=next_step)

@@ -162,5 +162,5 @@ def test_a_file_is_read_back_or_refused_in_one_sentence_with_its_name(tmp_path):
             load_state(path)
     with pytest.raises(DataError, match="should be greater than 0"):
         from_text(negative)
-    with pytest.raises(DataError, match="cannot be opened"):
+    with pytest.raises(DataError, match="is a folder"):
         load_state(tmp_path)
