@@ -7,12 +7,17 @@ from functools import cache
 import numpy as np
 import pytest
 
+from pipelines.drive.faults import fault_loop
 from pipelines.live.pilot import LivePilot
+from terrain.control.fault_drives import FaultCase, Place, drive_case, drive_references, evaluate_case
+from terrain.control.fault_evaluation import LIMITS
 from terrain.control.pid import Gains
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.pilot_settings import CONTROLLERS, PilotSettings, PilotStatus
 from terrain.control.situations import SituationOptions, make_situation, simulate_situation
-from terrain.control.slip_table import load_slip_table
-from terrain.control.terrain_source import KnownTerrain
+from terrain.control.slick import braking_by_slip
+from terrain.control.slip_table import CurveEntry, load_slip_table
+from terrain.control.switching import OutputStatus
+from terrain.control.terrain_source import KnownTerrain, TerrainEstimate, TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.control.traction_settings import SETTINGS
 from terrain.errors import ConfigError
@@ -22,6 +27,7 @@ from terrain.records import Reading, Sample
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
+from terrain.slip_learning.laws import LAW_PARAMETERS
 
 ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
 DT_S = 0.02
@@ -38,25 +44,10 @@ def recorded():
     return list(replay(simulate_run(ROBOT, "grass", "straight", 7, duration_s=16.0)))
 
 
-def everywhere(make):
-    """The same reading of every sensor."""
-    widths = {"wheels": 6, "steering": 3, "imu": 9, "odometry": 16}
-    return {name: make(width) for name, width in widths.items()}
-
-
-WRONG = {
-    "nothing": {},
-    "NaN": everywhere(lambda width: Reading(np.array([NAN]), np.full((1, width), NAN))),
-    "too wide": everywhere(lambda width: Reading(np.array([8.0]), np.zeros((1, width + 3)))),
-    "None": everywhere(lambda width: Reading(None, None)),
-}
-
-
-@pytest.mark.parametrize("wrong", WRONG)
-def test_without_readings_it_reports_so_and_fades_to_the_desired_speed(wrong):
+def test_without_readings_it_reports_so_and_fades_to_the_desired_speed():
     live, reference, twist = pilot(), pilot("plain"), np.array([0.6, 0.2, 0.1])
     for k in range(200):
-        command = live.step(Sample(k * DT_S, twist, WRONG[wrong]))
+        command = live.step(Sample(k * DT_S, twist, {"imu": Reading(None, None)}))
         plain = reference.step(Sample(k * DT_S, twist, {}))
         assert k <= 100 or command.status["status_code"] != TractionStatus.OK
     assert command.wheel_radps == pytest.approx(plain.wheel_radps)
@@ -145,3 +136,149 @@ def test_a_lost_camera_is_named_within_a_third_of_a_second_until_it_is_back():
     assert control.channel("stale_s")[lost].max() == pytest.approx(5.0, abs=0.1)
     assert np.isnan(control.channel("slip_ratio")[time_s > 2.0]).sum() == 0
     assert np.ptp(control.channel("driven_mps")[gone]) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("probability", "output", "believed"),
+    [(0.45, OutputStatus.BELOW_THRESHOLD, False), (0.9, OutputStatus.ACCEPTED, True)],
+)
+def test_a_classifier_whose_probability_never_suffices_is_reported(probability, output, believed):
+    source = TerrainSource()
+    source.update = lambda sample, _: [TerrainEstimate(sample.time_s, "grass", probability)]
+    live = LivePilot(ROBOT, TABLE, source)
+    statuses = [live.step(Sample(k / 50, np.zeros(3), {})).status for k in range(100)]
+    assert {status["output_code"] for status in statuses} == {output}
+    assert (statuses[-1]["terrain_code"] >= 0) is believed
+
+
+# Sensors that fail in the closed loop: plain commands are no better
+
+
+def slick_table():
+    """A table with the curve that is learned on ``wet_floor``, whose thrust falls beyond its peak."""
+    named = dict(zip(LAW_PARAMETERS["magic"], (16.50, 1.431, 0.262, -0.903), strict=True))
+    numbers = (0.09, (0.078, 0.102), "peak", (0.0, 0.6), 0.012, 0.004, 0.002, 0.08, None, 0.9, 168.0, -203.0)
+    curves = {"wet_floor": CurveEntry("magic", named, *numbers, 17.9, 8)}
+    targets = {state: target._replace(terrain="wet_floor") for state, target in TABLE.lookup("").items()}
+    return replace(TABLE, targets={**TABLE.targets, "wet_floor": targets}, curves=curves)
+
+
+SLICK = slick_table()
+LOOP = fault_loop(ROBOT, SLICK)
+STOP, START, STEADY = (
+    Place(*place, 400) for place in (("stop", "wet_floor"), ("start", "grass"), ("steady", "grass"))
+)
+
+
+@cache
+def references(place):
+    return drive_references(LOOP, place)
+
+
+@cache
+def row(fault, place, duration_s=3.0):
+    return evaluate_case(LOOP, FaultCase(fault, duration_s, *place), references(place))
+
+
+def test_without_a_fault_braking_by_slip_stops_sooner_than_locked_wheels():
+    assert braking_by_slip(SLICK.curves["wet_floor"]) is not None
+    clean, plain, _ = references(STOP)
+    assert clean.stop_m < 0.95 * plain.stop_m
+
+
+LOSSES = ("loss_all", "loss_wheels", "freeze_wheels", "freeze_camera_speed", "freeze_pitch")
+STEPS = ("step_camera_speed", "step_camera_speed_down", "step_pitch")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("duration_s", [3.0, math.inf])
+@pytest.mark.parametrize("fault", [*LOSSES, *STEPS])
+def test_a_fault_at_the_brake_on_slick_ground_ends_the_braking_by_slip(fault, duration_s):
+    found = row(fault, STOP, duration_s).figures
+    assert found.stop_ratio <= LIMITS.stop_ratio
+    assert found.overspeed_s <= LIMITS.overspeed_s
+    assert found.ok_total_s <= LIMITS.ok_s
+    assert (found.n_exceptions, found.n_not_finite) == (0, 0)
+
+
+@pytest.mark.parametrize("place", [START, STEADY])
+@pytest.mark.parametrize(
+    ("fault", "ok_ratio", "error_ratio"),
+    [
+        ("behind_odometry", 0.95, 0.05),
+        ("late_150ms_odometry", 0.8, 0.09),  # what a start on grass changes slip by in that time
+        *((f"clock_{way}_all", 0.95, 0.05) for way in ("back", "forward")),
+    ],
+)
+def test_stamps_or_samples_that_are_late_or_of_a_clock_that_was_set_cost_little(
+    fault, ok_ratio, error_ratio, place
+):
+    found = row(fault, place).figures
+    assert found.ok_total_s >= ok_ratio * 2.98
+    assert found.slip_error_ratio <= error_ratio
+    assert found.slip_peak_ratio <= found.plain_slip_peak_ratio
+
+
+@pytest.mark.parametrize("place", [START, STEADY])
+def test_lost_wheels_are_named_and_nothing_winds_up_meanwhile(place):
+    found, (clean, _, start_s) = row("loss_wheels", place), references(place)
+    assert found.figures.ok_total_s <= LIMITS.ok_s
+    assert found.figures.recovery_s <= LIMITS.recovery_s
+    wheels = {"wheel_1", "wheel_2", "wheel_3"}
+    assert {sensor for sensor in found.blamed if sensor.startswith("wheel")} == wheels
+    drive = drive_case(LOOP, FaultCase("loss_wheels", 3.0, *place)).drive
+    after = drive.time_s > start_s + 3.0
+    peak, clean_peak = (np.nanmax(np.abs(d.true_slip_ratio[after])) for d in (drive, clean))
+    assert peak <= clean_peak + 0.03
+
+
+# Whatever arrives: no exception, no command that is not finite
+
+
+class Hostile:
+    """An object that fails wherever it is touched."""
+
+    def __array__(self, *args, **kwargs):
+        raise RuntimeError("not an array")
+
+    def __float__(self):
+        raise RuntimeError("not a number")
+
+
+def odd(rng, time_s, width):
+    """One of many things that are no stamps or values, or are."""
+    k = int(rng.integers(0, 4))
+    things = (
+        time_s + rng.choice([0.0, 3600.0, -3600.0, 1e300]) + 0.005 * np.arange(k),
+        rng.standard_normal((k, width + int(rng.integers(0, 2)))),
+        10.0 ** rng.uniform(-300, 300, (k, width)),
+        np.full((k, width), rng.choice([np.nan, np.inf, -np.inf])),
+        *(np.zeros((k, width, 2)), np.zeros((k, width), complex), np.full((k, width), None)),
+        *([["much"] * width] * k, [[0.0], [0.0, 1.0]], None, 10**400, Hostile(), "wheels", {"a": 1}),
+    )
+    return things[int(rng.integers(len(things)))]
+
+
+@pytest.mark.parametrize("controller", CONTROLLERS)
+def test_2500_odd_samples_of_each_controller_neither_raise_nor_command_nonsense(controller, survey):
+    rng, sound = np.random.default_rng(7), list(replay(survey))
+    live = pilot(controller, track=controller == "traction")
+    with np.errstate(all="ignore"):
+        for k in range(2500):
+            sample = sound[k % len(sound)]
+            time_s, readings = sample.time_s, dict(sample.readings)
+            for name, width in {"wheels": 6, "steering": 3, "imu": 9, "odometry": 14}.items():
+                if rng.random() < 0.4:
+                    readings[name] = Reading(odd(rng, time_s, width), odd(rng, time_s, width))
+            twist, stamp_s, others = (
+                rng.choice([NAN, math.inf, 9.0], 3),
+                odd(rng, time_s, 1),
+                odd(rng, 9.0, 3),
+            )
+            parts = ((time_s, sample.twist), (time_s, twist), (stamp_s, sample.twist))[k % 3]
+            command = live.step(Sample(*parts, readings if k % 20 else others, odd(rng, time_s, 1)))
+            assert tuple(command.status) == PilotStatus._fields
+            for figures in (command.wheel_radps, command.steer_rad, command.twist):
+                assert figures.shape == (3,)
+                assert np.isfinite(figures).all()
+        assert np.isfinite(live.step(odd(rng, time_s, 1)).wheel_radps).all()
