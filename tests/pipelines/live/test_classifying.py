@@ -170,20 +170,21 @@ def take(robot, start_s):
 
 def begun(thread, name="m"):
     robot = Classifier(stub_model(name), None, thread)
-    wait_until(lambda: not robot._waiting and robot._due_s == 0.0)
+    until(lambda: not robot._waiting and robot._due_s == 0.0)
     return robot
 
 
-def wait_until(done):
-    end_s = time.monotonic() + 10.0
-    while not done() and time.monotonic() < end_s:
-        time.sleep(0.001)
-    assert done()
+def until(fact, timeout_s=10.0):
+    """Wait for something to become true."""
+    end_s = time.monotonic() + timeout_s
+    while not fact():
+        assert time.monotonic() < end_s, "it did not become true"
+        time.sleep(0.005)
 
 
 def outputs(robot, n):
     """The outputs of a robot, once there are n."""
-    wait_until(lambda: len(robot._finished) >= n)
+    until(lambda: len(robot._finished) >= n)
     return list(robot._finished)
 
 
@@ -206,7 +207,7 @@ def test_of_too_many_steps_the_oldest_are_left_out_and_counted(gate):
     event, thread = gate
     robot = begun(thread)
     take(robot, 0.0)
-    wait_until(lambda: not robot._waiting)  # the thread is at the first
+    until(lambda: not robot._waiting)  # the thread is at the first
     n = MAX_WAITING + 6
     for k in range(1, n):
         take(robot, float(k))
@@ -251,7 +252,7 @@ def test_on_a_thread_a_robot_gets_the_windows_that_it_would_get_at_once(mower_mo
     for sample in replay(run):
         desired += at_once.update(sample.readings)
         found += beside.update(sample.readings)
-    wait_until(lambda: found.extend(beside.update({})) or len(found) >= len(desired))
+    until(lambda: found.extend(beside.update({})) or len(found) >= len(desired))
     assert [one[:4] for one in found] == [one[:4] for one in desired]
     assert beside.belief.terrain == "b"
     thread.stop()

@@ -140,18 +140,14 @@ def test_after_a_clock_was_set_windows_begin_anew(mower_model, two_drives, far_s
 
 
 BROKEN = [
-    None,
-    "text",
-    {},
-    {"imu": None},
-    {"imu": (1.0, 2.0)},
-    {"imu": Reading(np.array([1.0]), np.zeros((2, 1)))},
-    {"imu": Reading(np.array([1.0]), np.zeros((1, 5)))},
-    {"imu": Reading(np.array([np.nan]), np.array([[np.inf]]))},
-    {"imu": Reading(np.array(["a"]), np.array([["b"]]))},
-    {"imu": Reading(np.array([10**400], dtype=object), np.array([[1.0]]))},
-    {"wheels": Reading(np.array([]), np.zeros((0, 1)))},
-    {3: Reading(np.array([1.0]), np.zeros((1, 1)))},
+    *(None, "text", {}, {"imu": None}, {"imu": (1.0, 2.0)}, {3: Reading(np.array([1.0]), np.zeros((1, 1)))}),
+    *(
+        {"imu": Reading(np.array(stamps), np.array(values))}
+        for stamps, values in (
+            *(([1.0], [[0.0], [0.0]]), ([1.0], [[0.0] * 5]), ([np.nan], [[np.inf]]), ([], np.zeros((0, 1)))),
+            *((["a"], [["b"]]), ([10**400], [[1.0]])),
+        )
+    ),
 ]
 
 
@@ -196,29 +192,36 @@ def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives):
 
 
 def test_what_does_not_fit_is_refused_at_once(mower_model, swerve_model, grass):
-    with pytest.raises(DataError, match="requires 'accel_z_mps2' of the stream 'imu'"):
-        Observer(mower_model, channels={"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps",)})
-    measured = {name: swerve_model.info.channels[name] for name in ("imu", "wheels")}
-    with pytest.raises(DataError, match=r"requires .* of the stream 'estimator', which is neither"):
-        Observer(swerve_model, channels=measured)
-    for stream, channel in (("imu", "accel_q_mps2"), ("gnss", "speed_x_mps"), ("estimator", "speed_z_mps")):
-        channels, rates = dict(swerve_model.info.channels), {**swerve_model.info.rate_hz, stream: 50.0}
-        channels[stream] = (*channels.get(stream, ()), channel)
-        other = swerve_model._replace(info=replace(swerve_model.info, channels=channels, rate_hz=rates))
-        lacks = f"the model requires '{channel}' of the stream '{stream}', which is neither measured nor estimated"
-        with pytest.raises(DataError, match=lacks):
-            Classifier(other, AGRIMARO)
-    table = replace(TABLE, robot="warthog")
-    with pytest.raises(ConfigError, match="is of the robot 'warthog', not of 'agrimaro'"):
-        Observer(swerve_model, table, AGRIMARO, channels_of(grass))
-    other = swerve_model._replace(info=replace(swerve_model.info, filter="skid"))
-    with pytest.raises(DataError, match="filter 'skid', which robot agrimaro does not run live"):
-        Observer(other, robot=AGRIMARO, channels=channels_of(grass))
+    info, channels = swerve_model.info, channels_of(grass)
+    imu, wheels = {"imu": ("gyro_z_radps",)}, {"wheels": ("speed_left_mps",)}
+    measured = {name: info.channels[name] for name in ("imu", "wheels")}
     another = simulate_run(AGRIMARO, "grass", "survey", 5, 8, duration_s=25.0)
-    with pytest.raises(DataError, match="estimates of slip14 and vio15"):
-        fitted_model(
-            [
-                enriched(estimate_run(*each))
-                for each in ((grass, AGRIMARO, "vio15"), (another, AGRIMARO, "slip14"))
-            ]
-        )
+    filtered = ((grass, AGRIMARO, "vio15"), (another, AGRIMARO, "slip14"))
+    refusals = (
+        (lambda: Observer(mower_model, channels=imu | wheels), "requires 'accel_z_mps2' of the stream 'imu'"),
+        (lambda: Observer(swerve_model, channels=measured), "of the stream 'estimator', which is neither"),
+        (
+            lambda: Observer(swerve_model, replace(TABLE, robot="warthog"), AGRIMARO, channels),
+            "is of the robot 'warthog', not of 'agrimaro'",
+        ),
+        (
+            lambda: Observer(
+                swerve_model._replace(info=replace(info, filter="skid")), None, AGRIMARO, channels
+            ),
+            "filter 'skid', which robot agrimaro does not run live",
+        ),
+        (
+            lambda: fitted_model([enriched(estimate_run(*each)) for each in filtered]),
+            "estimates of slip14 and vio15",
+        ),
+    )
+    for make, sentence in refusals:
+        with pytest.raises((ConfigError, DataError), match=sentence):
+            make()
+    for stream, channel in (("imu", "accel_q_mps2"), ("gnss", "speed_x_mps"), ("estimator", "speed_z_mps")):
+        more = {**info.channels, stream: (*info.channels.get(stream, ()), channel)}
+        other = replace(info, channels=more, rate_hz={**info.rate_hz, stream: 50.0})
+        with pytest.raises(
+            DataError, match=f"'{channel}' of the stream '{stream}', which is neither measured"
+        ):
+            Classifier(swerve_model._replace(info=other), AGRIMARO)

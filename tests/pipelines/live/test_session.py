@@ -199,14 +199,10 @@ def test_a_step_that_fails_commands_to_stand(samples, monkeypatch, fault, status
     assert session.step(NOW_S + 3.1).status is CommandStatus.OK
 
 
-names = st.one_of(st.sampled_from(["imu", "wheels", "odometry"]), st.text(max_size=3))
-leaves = st.one_of(
-    st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=3), st.binary(max_size=3)
-)
+leaves = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3) | st.binary(max_size=3)
+names = st.sampled_from(["imu", "wheels", "odometry"]) | st.text(max_size=3)
 anything = st.recursive(
-    leaves,
-    lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(names, inner, max_size=4)),
-    max_leaves=12,
+    leaves, lambda part: st.lists(part, max_size=4) | st.dictionaries(names, part, max_size=4), max_leaves=12
 )
 
 

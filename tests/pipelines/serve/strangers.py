@@ -17,12 +17,12 @@ HANDSHAKE = (
 )
 
 
-def until(fact, timeout_s=5.0):
+def until(fact, timeout_s=10.0):
     """Wait for something to become true."""
     end_s = time.monotonic() + timeout_s
     while not fact():
         assert time.monotonic() < end_s, "it did not become true"
-        time.sleep(0.01)
+        time.sleep(0.005)
 
 
 def ask(robot, content, *, packed=False):
