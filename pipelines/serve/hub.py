@@ -299,7 +299,7 @@ def warm_up(model: TerrainModel, robot: Robot | None) -> None:
             f"the model was trained on runs of {', '.join(model.info.robots)}, not of {robot.name}"
         )
     rng = np.random.default_rng(0)
-    layout, rule = model.layout, model.rule
+    layout, rule = model.info.layout, model.info.rule
     values = {
         stream: rng.normal(size=(1, len(names), layout.n_samples(stream, rule.length_s)))
         for stream, names in layout.channels.items()
