@@ -22,8 +22,9 @@ from starlette.websockets import WebSocketDisconnect, WebSocketState
 
 from pipelines.live.chain import CommandStatus
 from pipelines.live.session import Hello, RobotSession, StepOutput
-from pipelines.serve.guard import LONGEST_TOKEN, bearer
+from pipelines.serve.guard import bearer
 from pipelines.serve.hub import Hub
+from pipelines.serve.serve import LONGEST_TOKEN
 from pipelines.serve.wire import WireError, decode, encode
 from terrain.estimation.live.clocks import number
 from terrain.files.documents import first_fault

@@ -1,14 +1,11 @@
-"""Who may speak to the service: tokens, origins, and connections that stall."""
+"""Who may speak to the service: foreign pages and strangers may not, and connections that stall are ended."""
 
 from __future__ import annotations
 
 import asyncio
-import ipaddress
-import os
 import socket
 from collections.abc import Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -16,15 +13,8 @@ from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from terrain.errors import ConfigError
-
-if TYPE_CHECKING:
-    from pipelines.serve.hub import Hub
-
-SHORTEST_TOKEN = 16
-"""Characters; a shorter one can be tried out."""
-
-LONGEST_TOKEN = 512
+from pipelines.serve.hub import Hub
+from pipelines.serve.serve import is_loopback
 
 REQUEST_S = 10.0
 """For a request to come whole, and for a response to be read."""
@@ -44,48 +34,6 @@ SECURITY = {
     "Cache-Control": "no-store",
     "Connection": "close",  # one request a connection: that it comes whole is timed from its beginning
 }
-
-
-def is_loopback(host: str) -> bool:
-    """Say whether a host to listen on is reached from this machine only.
-
-    Examples
-    --------
-    >>> is_loopback("127.0.0.1"), is_loopback("localhost"), is_loopback("0.0.0.0"), is_loopback("robot.local")
-    (True, True, False, False)
-    """
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
-
-
-def required_token(host: str, file: Path | None) -> str:
-    """Return the token that a file or ``TERRAIN_TOKEN`` holds; empty for none.
-
-    Raises
-    ------
-    ConfigError
-        if it cannot be read, is too short or too long, or is missing where other machines are listened to.
-    """
-    try:
-        held = os.environ.get("TERRAIN_TOKEN", "") if file is None else file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "no text"
-        raise ConfigError(f"{file}: cannot be read ({reason})") from None
-    token = held.strip()
-    if file is not None and not token:
-        raise ConfigError(f"{file}: holds no token")
-    if token and not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN:
-        raise ConfigError(
-            f"the token has {len(token)} characters, {SHORTEST_TOKEN} to {LONGEST_TOKEN} are accepted "
-            "(python -c 'import secrets; print(secrets.token_urlsafe())' makes one)"
-        )
-    if not token and not is_loopback(host):
-        raise ConfigError(f"--host {host} is reached from other machines: a token is required (--token-file)")
-    return token
 
 
 def bearer(headers: Mapping[str, str]) -> str:

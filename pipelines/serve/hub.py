@@ -20,9 +20,8 @@ from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread
 from pipelines.live.session import Hello, RobotSession, Served
 from pipelines.live.state import LiveState, load_state, save_state
-from pipelines.serve.guard import required_token
 from pipelines.serve.metrics import Metrics
-from pipelines.serve.serve import Settings, loaded
+from pipelines.serve.serve import Settings, loaded, required_token
 from pipelines.serve.wire import WireError
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
@@ -100,7 +99,7 @@ class Hub:
     def __init__(self, settings: Settings) -> None:
         if settings.model is None:
             raise ConfigError("--model is missing: models:/NAME@champion, models:/NAME/3, or a model folder")
-        self.settings, self._token = settings, required_token(settings.host, settings.token_file)
+        self.settings, self._token = settings, required_token(settings)
         self._given = None if settings.robot is None else load_robot(settings.robot)
         table = load_slip_table(settings.table, None if self._given is None else self._given.name)
         for folder in (settings.state, settings.record):

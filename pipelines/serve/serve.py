@@ -6,7 +6,9 @@ bus instead, with ``--replay`` over a log.
 
 from __future__ import annotations
 
+import ipaddress
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -19,6 +21,7 @@ from pipelines.data.settings import ReadSettings
 from pipelines.report import Pairs, Progress, Report, Result, described, enumerated, plural, sections, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipelines.learn.model_file import TerrainModel
@@ -29,6 +32,11 @@ RESULTS = ("pipelines.serve.can_bus", "pipelines.serve.replay")
 """Modes beside the service, each with a result and a report of its own."""
 
 AS_FAST_AS_IT_GOES = "max"
+
+SHORTEST_TOKEN = 16
+"""Characters; a shorter one can be tried out."""
+
+LONGEST_TOKEN = 512
 
 
 class ServedSettings(BaseSettings):
@@ -131,6 +139,51 @@ class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
                 if name != mode and getattr(self, field) != about.get_default():
                     raise ValueError(f"{about.alias} is an option of {name}, not of {mode}")
         return self
+
+
+def is_loopback(host: str) -> bool:
+    """Say whether a host to listen on is reached from this machine only.
+
+    Examples
+    --------
+    >>> is_loopback("127.0.0.1"), is_loopback("localhost"), is_loopback("0.0.0.0"), is_loopback("robot.local")
+    (True, True, False, False)
+    """
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def required_token(settings: ServiceSettings) -> str:
+    """Return the token that a file or ``TERRAIN_TOKEN`` holds; empty for none.
+
+    Raises
+    ------
+    ConfigError
+        if it cannot be read, is too short or too long, or is missing where other machines are listened to.
+    """
+    file = settings.token_file
+    try:
+        held = os.environ.get("TERRAIN_TOKEN", "") if file is None else file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "no text"
+        raise ConfigError(f"{file}: cannot be read ({reason})") from None
+    token = held.strip()
+    if file is not None and not token:
+        raise ConfigError(f"{file}: holds no token")
+    if token and not SHORTEST_TOKEN <= len(token) <= LONGEST_TOKEN:
+        raise ConfigError(
+            f"the token has {len(token)} characters, {SHORTEST_TOKEN} to {LONGEST_TOKEN} are accepted "
+            "(python -c 'import secrets; print(secrets.token_urlsafe())' makes one)"
+        )
+    if not token and not is_loopback(settings.host):
+        raise ConfigError(
+            f"--host {settings.host} is reached from other machines: a token is required (--token-file)"
+        )
+    return token
 
 
 @dataclass(frozen=True, repr=False)

@@ -1,4 +1,4 @@
-"""The server: its port, its event loop, and its end, of which robots are told."""
+"""The server: its port, its event loop, and its end, which it announces to the robots."""
 
 from __future__ import annotations
 

@@ -207,7 +207,7 @@ def test_a_fault_at_the_brake_on_slick_ground_ends_the_braking_by_slip(fault, du
     [
         ("behind_odometry", 0.95, 0.05),
         ("late_150ms_odometry", 0.8, 0.09),  # what a start on grass changes slip by in that time
-        *((f"clock_{way}_all", 0.95, 0.05) for way in ("back", "forward")),
+        *((f"clock_{which}_all", 0.95, 0.05) for which in ("back", "forward")),
     ],
 )
 def test_stamps_or_samples_that_are_late_or_of_a_clock_that_was_set_cost_little(
