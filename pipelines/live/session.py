@@ -276,10 +276,6 @@ class RobotSession:
         self._known_s = state.saved_s
         self.restored = self.chain.restore(state, time())
 
-    def check(self, served: Served) -> None:
-        """Raise what :meth:`swap` would."""
-        self.chain.check(served.model, served.table)
-
     def swap(self, served: Served) -> None:
         """Go on with another model and table, between two steps; no sample is lost.
 

@@ -237,7 +237,7 @@ class Hub:
         served = Served(self.served.number + 1, model, model_name, table)
         for name, opened in self.sessions.items():
             try:
-                opened.check(served)
+                opened.chain.check(model, table)
             except (ConfigError, DataError) as error:
                 raise DataError(f"session {name!r}: {error}") from None
         for opened in self.sessions.values():

@@ -2,12 +2,12 @@
 
 import json
 import socket
-import struct
 import time
 from contextlib import contextmanager
 from urllib.parse import urlsplit
 
 import msgpack
+from websockets.frames import Frame, Opcode
 
 CHANNELS = {"imu": ["accel_z_mps2"], "wheels": ["speed_left_mps"]}
 
@@ -33,17 +33,9 @@ def ask(robot, content, *, packed=False):
     return msgpack.unpackb(answer) if isinstance(answer, bytes) else json.loads(answer)
 
 
-def frame(payload, opcode=1, fin=True):
-    """A masked frame as a client sends it."""
-    length = len(payload)
-    head = bytes([opcode | (0x80 if fin else 0)])
-    if length < 126:
-        head += bytes([0x80 | length])
-    elif length < 65536:
-        head += b"\xfe" + struct.pack("!H", length)
-    else:
-        head += b"\xff" + struct.pack("!Q", length)
-    return head + b"\x00" * 4 + payload
+def frame(payload, fin=True):
+    """A frame as a client sends it."""
+    return Frame(Opcode.TEXT, payload, fin).serialize(mask=True)
 
 
 @contextmanager

@@ -155,23 +155,9 @@ def test_serve_replays_all_runs_of_a_folder_and_prints_changes(logs, husky_folde
 
 @pytest.mark.slow
 def test_a_signal_ends_the_command_with_a_summary(logs, husky_folder, tmp_path):
-    words = [
-        "serve",
-        "--replay",
-        logs,
-        "--speed",
-        "1",
-        "--model",
-        husky_folder,
-        "--json",
-        tmp_path / "out.json",
-    ]
-    process = subprocess.Popen(
-        [sys.executable, "-u", "-m", "pipelines.cli", *map(str, words)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    words = f"serve --replay {logs} --speed 1 --model {husky_folder} --json {tmp_path}/out.json".split()
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    process = subprocess.Popen([sys.executable, "-u", "-m", "pipelines.cli", *words], **pipes)
     assert "believed" in process.stdout.readline()
     process.send_signal(signal.SIGINT)  # once, and whatever is compiled just then
     out, _ = process.communicate(timeout=60.0)
