@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from pipelines.learn.model_file import TerrainModel
 from pipelines.live.classifying import Classifier
+from pipelines.live.model import TerrainModel
 from pipelines.live.pilot import LivePilot
 from pipelines.report import Progress, silent
 from terrain.control.controllers import Controller, Source

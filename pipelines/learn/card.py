@@ -23,13 +23,13 @@ from pipelines.learn.model_file import (
     MODEL_FILE,
     ONNX_FILE,
     TRAINING_FILE,
-    ModelInfo,
     drawn_window,
     read_files,
     read_model,
     seal,
 )
 from pipelines.learn.training_data import TrainedRun
+from pipelines.live.model import ModelInfo, assess
 from pipelines.report import (
     NOT_KNOWN,
     Pairs,
@@ -189,7 +189,6 @@ def read_training(folder: Path) -> tuple[ModelInfo, TrainingRecord | None]:
 
 def write_training(folder: Path, name: str, record: TrainingRecord) -> None:
     """Write how a model was trained, and its card, beside the model; the time of one window is measured here."""
-    from pipelines.live.model import assess
     from pipelines.report.markdown import markdown_text
     from terrain.classify.network_onnx import time_of_onnx
 

@@ -15,8 +15,9 @@ from features.motion import window_motion
 from features.protocols import Samples
 from features.recipes import make_recipe
 from features.windows import WindowRule
-from pipelines.learn.model_file import MANIFEST_FILE, TerrainModel, model_info, read_model, write_model
+from pipelines.learn.model_file import MANIFEST_FILE, model_info, read_model, write_model
 from pipelines.learn.training_data import with_limits
+from pipelines.live.model import TerrainModel
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from features.protocols import Samples
     from features.recipes import WindowPipeline
-    from pipelines.learn.model_file import TerrainModel
+    from pipelines.live.model import TerrainModel
     from terrain.classify.paired import Comparison, Difference
     from terrain.records import RunLog
 

@@ -15,22 +15,21 @@ import sys
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from features.samples import is_centred
-from features.windows import Layout, SteadyMotion, WindowRule
+from features.windows import Layout, WindowRule
+from pipelines.live.model import ModelInfo, TerrainModel
 from terrain import __version__
 from terrain.classify.network_numbers import check_network
 from terrain.classify.network_onnx import network_onnx, numbers_of_onnx
 from terrain.classify.novelty_numbers import NoveltyNumbers, check_novelty
 from terrain.classify.support import SupportTable, check_support
-from terrain.classify.terrain_filter import TerrainFilter
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_document, parse_json
@@ -87,63 +86,6 @@ TRUSTED_TYPES: tuple[str, ...] = (
 """Types beyond those that skops trusts itself which a model of this package may hold."""
 
 
-@dataclass(frozen=True, slots=True)
-class ModelInfo:
-    """How the training windows of a model were cut, as those of a new log must be, and where they came from.
-
-    Parameters
-    ----------
-    classes : in the order of the probabilities
-    window_s, stride_s, steady : the rule of the windows
-    channels, rate_hz : by stream, which a log must have
-    run_digests : of each training run
-    recipe, signal_sets, seed : what was trained
-    data_digest, dataset : of the training runs
-    commit, package_version : of the code
-    robots : whose runs the training runs were, by name
-    filter : that made the streams ``estimator`` and ``slip``; empty where the model uses neither
-    class_ratio : share of each class among the training windows
-    run_accuracy : of the windows of each training run when it was held out, by its digest
-    conformal : threshold of the sets of classes; None where there is none
-    """
-
-    classes: tuple[str, ...]
-    window_s: float
-    stride_s: float | None
-    steady: SteadyMotion | None
-    channels: Mapping[str, tuple[str, ...]]
-    rate_hz: Mapping[str, float]
-    run_digests: tuple[str, ...]
-    recipe: str = ""
-    signal_sets: tuple[str, ...] = ()
-    seed: int = 0
-    data_digest: str = ""
-    dataset: str = ""
-    commit: str = ""
-    package_version: str = ""
-    robots: tuple[str, ...] = ()
-    filter: str = ""
-    class_ratio: Mapping[str, float] = field(default_factory=dict)
-    run_accuracy: Mapping[str, float] = field(default_factory=dict)
-    conformal: float | None = None
-
-    @property
-    def layout(self) -> Layout:
-        """Channels and rates that a log must have."""
-        return Layout(self.channels, self.rate_hz)
-
-    @property
-    def rule(self) -> WindowRule:
-        """How windows must be cut."""
-        return WindowRule(self.window_s, self.stride_s, self.steady)
-
-    @property
-    def windows(self) -> str:
-        """How windows must be cut, in words."""
-        motion = "all motion" if self.steady is None else "steady motion"
-        return f"{self.window_s:g} s every {self.rule.step_s:g} s, {motion}"
-
-
 def model_info(layout: Layout, rule: WindowRule, terrain: Array, **known: Any) -> ModelInfo:
     """Return what a model is that was trained on windows of the terrains (n,); what else is known by name."""
     classes, counts = np.unique(terrain.astype(str), return_counts=True)
@@ -168,20 +110,6 @@ class Manifest(BaseModel):
     version: int
     files: dict[str, str]
     info: ModelInfo
-
-
-class TerrainModel(NamedTuple):
-    """A fitted recipe, and how its training windows were cut.
-
-    ``recipe`` has ``predict_proba(windows)`` and ``classes_``.  ``novelty`` and ``support`` are None of
-    training runs that give none; ``over_time`` is the filter of its outputs, where they are to be filtered.
-    """
-
-    recipe: WindowPipeline
-    info: ModelInfo
-    novelty: NoveltyNumbers | None = None
-    support: SupportTable | None = None
-    over_time: TerrainFilter | None = None
 
 
 def write_model(folder: Path, model: TerrainModel) -> None:

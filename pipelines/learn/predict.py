@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from pipelines.learn.ground_changes import ChangesResult
-    from pipelines.learn.model_file import TerrainModel
+    from pipelines.live.model import TerrainModel
     from terrain.control.slip_table import SlipTable
     from terrain.records import RunLog, SlipTarget, Windows
     from terrain.robots import Robot

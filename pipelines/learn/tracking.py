@@ -18,7 +18,7 @@ from terrain.errors import ModelError
 
 if TYPE_CHECKING:
     from pipelines.learn.champion import Bench
-    from pipelines.learn.model_file import ModelInfo
+    from pipelines.live.model import ModelInfo
 
 CHAMPION = "champion"
 METRICS = ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece")

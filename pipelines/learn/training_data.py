@@ -14,9 +14,10 @@ from features.motion import Motion, window_motion
 from features.protocols import Samples, samples_of
 from features.recipes import WindowPipeline, feature_matrix
 from features.windows import Layout
-from pipelines.learn.model_file import ModelInfo, TerrainModel, model_info
+from pipelines.learn.model_file import model_info
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
+from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.limits import learn_limits
 from terrain.errors import DataError
 from terrain.estimation.live.choice import ESTIMATED

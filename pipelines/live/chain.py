@@ -13,7 +13,7 @@ from enum import StrEnum
 from typing import NamedTuple
 
 from pipelines.live.classifying import WindowOutput
-from pipelines.live.model import LiveModel
+from pipelines.live.model import TerrainModel
 from pipelines.live.state import Bias, LiveState, restorable
 from terrain.control.pilot_settings import check_table
 from terrain.control.slip_table import SlipTable
@@ -117,12 +117,12 @@ class Chain:
         """Take a sample."""
         raise NotImplementedError
 
-    def check(self, model: LiveModel | None, table: SlipTable) -> None:
+    def check(self, model: TerrainModel | None, table: SlipTable) -> None:
         """Raise what :meth:`replace` would."""
         self._check_table(table)
         self.source.check(model)
 
-    def replace(self, model: LiveModel | None, table: SlipTable) -> None:
+    def replace(self, model: TerrainModel | None, table: SlipTable) -> None:
         """Go on with another model and table, between two samples: none is lost, and the filter runs on.
 
         Where both models take the same windows, the one that is being cut is the first of the new model;

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from features.stream import WindowFeed
-from pipelines.live.model import LiveModel, WindowsInfo, assess
+from pipelines.live.model import ModelInfo, TerrainModel, assess
 from pipelines.live.windows import feed_of, live_filter, needs_filter
 from terrain.classify.terrain_filter import LiveTerrainFilter
 from terrain.control.switching import UNKNOWN
@@ -71,7 +71,7 @@ class WindowOutput(NamedTuple):
         return not self.refused and not self.terrain
 
 
-def classify_window(model: LiveModel, window: Windows) -> WindowOutput:
+def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
     """Return the output of a model for one window; one that it refuses gives none, and raises nothing."""
     classes = model.info.classes
     start_s = float(window.start_s[0])
@@ -123,7 +123,7 @@ class ClassifierThread:
     >>> thread.stop()
     """
 
-    def __init__(self, classify: Callable[[LiveModel, Windows], WindowOutput] = classify_window) -> None:
+    def __init__(self, classify: Callable[[TerrainModel, Windows], WindowOutput] = classify_window) -> None:
         self.classify = classify
         self.failures: Counter[str] = Counter()
         self._pool = ThreadPoolExecutor(1, "classifier")
@@ -155,7 +155,7 @@ class ClassifierThread:
 class _Part(NamedTuple):
     """A model, and what cuts its windows."""
 
-    model: LiveModel
+    model: TerrainModel
     feed: WindowFeed
 
 
@@ -190,13 +190,13 @@ class Classifier(TerrainSource):
 
     def __init__(
         self,
-        model: LiveModel | None,
+        model: TerrainModel | None,
         robot: Robot | None,
         thread: ClassifierThread | None = None,
         channels: Mapping[str, Sequence[str]] = CHANNELS,
         filter_name: str = PILOT_FILTER,
     ) -> None:
-        self.model: LiveModel | None = None
+        self.model: TerrainModel | None = None
         self.failed: Counter[str] = Counter()
         self._channels, self._filter_name, self._thread = channels, filter_name, thread
         self._robot = None if robot is None else correct_live(robot)[0]
@@ -216,7 +216,7 @@ class Classifier(TerrainSource):
             counts["steps: overrun"] = self._n_overrun
         return counts | {f"window: refused, {why}": n for why, n in self.failed.items()}
 
-    def _feed_of(self, model: LiveModel) -> WindowFeed:
+    def _feed_of(self, model: TerrainModel) -> WindowFeed:
         """Return what cuts the windows of a model; ``DataError`` where it does not suit what runs here."""
         feed = feed_of(model.info, self._channels, self._robot)
         if needs_filter(model.info, self._channels) and (
@@ -228,14 +228,14 @@ class Classifier(TerrainSource):
             )
         return feed
 
-    def check(self, model: LiveModel | None) -> None:
+    def check(self, model: TerrainModel | None) -> None:
         """Raise ``DataError`` where a model cannot replace this one, or is none."""
         if model is not None and not self._suits(model.info):
             self._feed_of(model)
         if model is None and self.model is not None:
             raise DataError("a model cannot be replaced by none")
 
-    def swap(self, model: LiveModel | None) -> None:
+    def swap(self, model: TerrainModel | None) -> None:
         """Go on with another model, between two samples; ``DataError`` as :meth:`check`.
 
         Where both take the same windows, the one that is being cut is the first of the new model; otherwise
@@ -250,14 +250,14 @@ class Classifier(TerrainSource):
         if self.model is not None:
             self._begin(self.model, self._feed_of(self.model))
 
-    def _suits(self, info: WindowsInfo) -> bool:
+    def _suits(self, info: ModelInfo) -> bool:
         """Say whether another model takes the same windows."""
         return self.model is not None and all(
             getattr(info, name) == getattr(self.model.info, name)
             for name in ("channels", "rate_hz", "rule", "filter")
         )
 
-    def _begin(self, model: LiveModel, feed: WindowFeed) -> None:
+    def _begin(self, model: TerrainModel, feed: WindowFeed) -> None:
         self.model, self._feed = model, feed
         self._over_time = None if model.over_time is None else LiveTerrainFilter(model.over_time)
         self.settled = self._over_time is not None

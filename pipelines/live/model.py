@@ -1,4 +1,4 @@
-"""What the live chain takes of a trained model, and what such a model says of windows.
+"""A trained model, and what it says of windows.
 
 A window is *unknown* where it is less like all learned terrains than nearly all known windows are
 (:mod:`terrain.classify.novelty_numbers`), and *unsupported* where few training runs drove the predicted
@@ -9,12 +9,13 @@ terrain like this (:mod:`terrain.classify.support`).  Of windows of known terrai
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from features.motion import window_motion
-from features.windows import Layout, WindowRule
+from features.windows import Layout, SteadyMotion, WindowRule
 from terrain.classify.conformal import conformal_sets
 from terrain.classify.novelty_numbers import NoveltyNumbers, novelty_scores
 from terrain.classify.support import SupportTable, support_of
@@ -22,44 +23,76 @@ from terrain.classify.terrain_filter import TerrainFilter
 from terrain.records import Array, Windows
 
 
-class WindowsInfo(Protocol):
-    """How the windows of a model are cut, and what its classes are."""
+@dataclass(frozen=True, slots=True)
+class ModelInfo:
+    """How the training windows of a model were cut, as those of a new log must be, and where they came from.
+
+    Parameters
+    ----------
+    classes : in the order of the probabilities
+    window_s, stride_s, steady : the rule of the windows
+    channels, rate_hz : by stream, which a log must have
+    run_digests : of each training run
+    recipe, signal_sets, seed : what was trained
+    data_digest, dataset : of the training runs
+    commit, package_version : of the code
+    robots : whose runs the training runs were, by name
+    filter : that made the streams ``estimator`` and ``slip``; empty where the model uses neither
+    class_ratio : share of each class among the training windows
+    run_accuracy : of the windows of each training run when it was held out, by its digest
+    conformal : threshold of the sets of classes; None where there is none
+    """
+
+    classes: tuple[str, ...]
+    window_s: float
+    stride_s: float | None
+    steady: SteadyMotion | None
+    channels: Mapping[str, tuple[str, ...]]
+    rate_hz: Mapping[str, float]
+    run_digests: tuple[str, ...]
+    recipe: str = ""
+    signal_sets: tuple[str, ...] = ()
+    seed: int = 0
+    data_digest: str = ""
+    dataset: str = ""
+    commit: str = ""
+    package_version: str = ""
+    robots: tuple[str, ...] = ()
+    filter: str = ""
+    class_ratio: Mapping[str, float] = field(default_factory=dict)
+    run_accuracy: Mapping[str, float] = field(default_factory=dict)
+    conformal: float | None = None
 
     @property
-    def classes(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def window_s(self) -> float: ...  # noqa: D102
-    @property
-    def channels(self) -> Mapping[str, tuple[str, ...]]: ...  # noqa: D102
-    @property
-    def rate_hz(self) -> Mapping[str, float]: ...  # noqa: D102
-    @property
-    def filter(self) -> str: ...  # noqa: D102
-    @property
-    def robots(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def class_ratio(self) -> Mapping[str, float]: ...  # noqa: D102
-    @property
-    def conformal(self) -> float | None: ...  # noqa: D102
-    @property
-    def layout(self) -> Layout: ...  # noqa: D102
-    @property
-    def rule(self) -> WindowRule: ...  # noqa: D102
-
-
-class LiveModel(Protocol):
-    """A trained model; ``recipe`` has ``predict_proba(windows)``, ``classes_`` and ``matrix`` of features."""
+    def layout(self) -> Layout:
+        """Channels and rates that a log must have."""
+        return Layout(self.channels, self.rate_hz)
 
     @property
-    def recipe(self) -> Any: ...  # noqa: D102
+    def rule(self) -> WindowRule:
+        """How windows must be cut."""
+        return WindowRule(self.window_s, self.stride_s, self.steady)
+
     @property
-    def info(self) -> WindowsInfo: ...  # noqa: D102
-    @property
-    def novelty(self) -> NoveltyNumbers | None: ...  # noqa: D102
-    @property
-    def support(self) -> SupportTable | None: ...  # noqa: D102
-    @property
-    def over_time(self) -> TerrainFilter | None: ...  # noqa: D102
+    def windows(self) -> str:
+        """How windows must be cut, in words."""
+        motion = "all motion" if self.steady is None else "steady motion"
+        return f"{self.window_s:g} s every {self.rule.step_s:g} s, {motion}"
+
+
+class TerrainModel(NamedTuple):
+    """A fitted recipe, and how its training windows were cut.
+
+    ``recipe`` has ``predict_proba(windows)``, ``classes_`` and ``matrix`` of features.  ``novelty`` and ``support``
+    are None of training runs that give none; ``over_time`` is the filter of its outputs, where they are to be
+    filtered.
+    """
+
+    recipe: Any
+    info: ModelInfo
+    novelty: NoveltyNumbers | None = None
+    support: SupportTable | None = None
+    over_time: TerrainFilter | None = None
 
 
 class Assessed(NamedTuple):
@@ -81,7 +114,7 @@ class Assessed(NamedTuple):
     supported: Array
 
 
-def assess(model: LiveModel, windows: Windows) -> Assessed:
+def assess(model: TerrainModel, windows: Windows) -> Assessed:
     """Return what a model says of windows.
 
     Raises
@@ -111,7 +144,7 @@ def assess(model: LiveModel, windows: Windows) -> Assessed:
     )
 
 
-def class_sets(model: LiveModel, probability: Array) -> list[tuple[str, ...]] | None:
+def class_sets(model: TerrainModel, probability: Array) -> list[tuple[str, ...]] | None:
     """Return the classes of each window that hold the true one in 90 % of windows; None if not calibrated.
 
     Parameters

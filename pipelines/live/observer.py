@@ -10,7 +10,7 @@ import numpy as np
 
 from pipelines.live.chain import Chain, Step
 from pipelines.live.classifying import Classifier, ClassifierThread, WindowOutput
-from pipelines.live.model import LiveModel
+from pipelines.live.model import TerrainModel
 from pipelines.live.windows import live_estimator
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import SWITCHING, SwitchSettings, TerrainBelief, check_switching, drive_on
@@ -59,7 +59,7 @@ class Observer(Chain):
 
     def __init__(
         self,
-        model: LiveModel | Any,
+        model: TerrainModel | Any,
         table: SlipTable | None = None,
         robot: Robot | None = None,
         channels: Mapping[str, Sequence[str]] | None = None,
@@ -76,7 +76,7 @@ class Observer(Chain):
         self._set_up(model, channels or model.info.channels)
         self._speed_mps, self._speed_s, self._now_s = math.inf, -math.inf, math.nan
 
-    def _set_up(self, model: LiveModel, channels: Mapping[str, Sequence[str]]) -> None:
+    def _set_up(self, model: TerrainModel, channels: Mapping[str, Sequence[str]]) -> None:
         """Take samples with these columns from now on."""
         self.channels = {stream: tuple(names) for stream, names in channels.items()}
         self._filter, corrected = None, self._robot
@@ -87,7 +87,7 @@ class Observer(Chain):
         self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
 
     @property
-    def model(self) -> LiveModel:
+    def model(self) -> TerrainModel:
         """The model that classifies."""
         assert self.source.model is not None
         return self.source.model

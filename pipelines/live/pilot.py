@@ -18,7 +18,7 @@ import numpy as np
 
 from pipelines.live.chain import Chain, CommandStatus, Step
 from pipelines.live.classifying import PILOT_FILTER
-from pipelines.live.model import LiveModel
+from pipelines.live.model import TerrainModel
 from pipelines.live.state import LiveState
 from terrain.control.pilot_settings import DEFAULT_SETTINGS, OPEN_LOOP, PilotSettings, check_pilot
 from terrain.control.robot_control import RobotControl
@@ -97,7 +97,7 @@ class LivePilot(Chain):
         self._awaits_steering = "steering" in channels
         self._time_s, self._standing_rad = math.nan, self.control.steer_rad
 
-    def replace(self, model: LiveModel | None, table: SlipTable) -> None:
+    def replace(self, model: TerrainModel | None, table: SlipTable) -> None:
         """Go on with another model and table, as every chain."""
         super().replace(model, table)
         self.control.use(table)

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 
 from pipelines.live.chain import Chain, CommandStatus
 from pipelines.live.classifying import Classifier, ClassifierThread, WindowOutput
-from pipelines.live.model import LiveModel
+from pipelines.live.model import TerrainModel
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread, SessionRecorder
@@ -58,7 +58,7 @@ class Served(NamedTuple):
     """
 
     number: int
-    model: LiveModel | None
+    model: TerrainModel | None
     model_name: str
     table: SlipTable
 
@@ -422,7 +422,7 @@ def _window_content(window: WindowOutput) -> dict[str, Any]:
 def chain_of(
     robot: Robot | None,
     channels: Mapping[str, Sequence[str]],
-    model: LiveModel | None,
+    model: TerrainModel | None,
     table: SlipTable,
     pilot: PilotSettings | None = None,
     thread: ClassifierThread | None = None,

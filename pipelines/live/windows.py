@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from features.windows import (
     label_windows,
     span_of,
 )
-from pipelines.live.model import LiveModel, WindowsInfo
+from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.terrain_filter import TerrainFilter, check_filter
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.choice import (
@@ -35,18 +34,16 @@ from terrain.logs.replay import SENSORS, replay
 from terrain.records import RunLog
 from terrain.robots import Robot, robot_named
 
-Model = TypeVar("Model", bound=LiveModel)
-
 STRIDE_S = 0.25
 """From window to window of a model whose outputs are filtered over time, in place of a dwell."""
 
 
-def needs_filter(info: WindowsInfo, streams: Container[str]) -> bool:
+def needs_filter(info: ModelInfo, streams: Container[str]) -> bool:
     """Say whether a model needs a stream that only a filter gives, and that is not among some streams."""
     return any(stream in info.channels and stream not in streams for stream in ESTIMATED)
 
 
-def live_filter(info: WindowsInfo, robot: Robot) -> str:
+def live_filter(info: ModelInfo, robot: Robot) -> str:
     """Return the filter that gives what a model was trained on.
 
     Raises
@@ -65,7 +62,7 @@ def live_filter(info: WindowsInfo, robot: Robot) -> str:
 
 
 def live_estimator(
-    info: WindowsInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
+    info: ModelInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
 ) -> tuple[Filter | None, Robot]:
     """Return the filter whose estimates a model needs, or None, and the robot as filters take it.
 
@@ -83,7 +80,7 @@ def live_estimator(
     return make_live_filter(live_filter(info, driven), driven, known, info.rate_hz, correction), driven
 
 
-def feed_of(info: WindowsInfo, channels: Mapping[str, Sequence[str]], robot: Robot | None) -> WindowFeed:
+def feed_of(info: ModelInfo, channels: Mapping[str, Sequence[str]], robot: Robot | None) -> WindowFeed:
     """Return what cuts the windows of a model from samples as they come.
 
     Parameters
@@ -104,7 +101,7 @@ def feed_of(info: WindowsInfo, channels: Mapping[str, Sequence[str]], robot: Rob
 
 
 def windows_of_log(
-    run: RunLog, info: WindowsInfo, robot: Robot | None = None, *, skip_short: bool = False
+    run: RunLog, info: ModelInfo, robot: Robot | None = None, *, skip_short: bool = False
 ) -> WindowCut:
     """Return the windows of a log that a model takes; of one without estimates, as the live observer cuts them.
 
@@ -166,13 +163,13 @@ def windows_of_log(
     return WindowCut(labelled, Counter(reasons))
 
 
-def filter_of(info: WindowsInfo) -> TerrainFilter:
+def filter_of(info: ModelInfo) -> TerrainFilter:
     """Return the filter of a model: shares of its classes in training, equal ones where it has none."""
     prior = tuple(float(info.class_ratio.get(name, 1.0 / len(info.classes))) for name in info.classes)
     return check_filter(TerrainFilter(prior))
 
 
-def filtered(model: Model, stride_s: float | None = STRIDE_S) -> Model:
+def filtered(model: TerrainModel, stride_s: float | None = STRIDE_S) -> TerrainModel:
     """Return a model whose windows begin every ``stride_s`` and are filtered; the model itself for None.
 
     Raises
@@ -187,6 +184,5 @@ def filtered(model: Model, stride_s: float | None = STRIDE_S) -> Model:
             f"filter stride is {stride_s:g} s: above zero and at most a window, {model.info.window_s:g} s, "
             "is required"
         )
-    changed: Any = model
-    info = replace(changed.info, stride_s=stride_s)
-    return cast(Model, changed._replace(info=info, over_time=filter_of(model.info)))
+    info = replace(model.info, stride_s=stride_s)
+    return model._replace(info=info, over_time=filter_of(model.info))

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pipelines.learn.model_file import TerrainModel
 from pipelines.live.classifying import Classifier, ClassifierThread, classify_window
-from pipelines.live.model import LiveModel
+from pipelines.live.model import TerrainModel
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread
 from pipelines.live.session import Hello, RobotSession, Served
@@ -226,7 +225,7 @@ class Hub:
         async with self.changing:
             return self.swap(self.served.model, self.served.model_name, table)
 
-    def swap(self, model: LiveModel | None, model_name: str, table: SlipTable) -> Served:
+    def swap(self, model: TerrainModel | None, model_name: str, table: SlipTable) -> Served:
         """Serve another model and table: all sessions at once, or none; called with ``changing`` held.
 
         Raises

@@ -17,7 +17,7 @@ from pipelines import report as reports
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.settings import ReadSettings, load
 from pipelines.live.chain import Chain
-from pipelines.live.model import LiveModel
+from pipelines.live.model import TerrainModel
 from pipelines.live.session import chain_of
 from pipelines.live.windows import needs_filter
 from pipelines.report import Progress, Result, described, format_value, silent
@@ -182,7 +182,9 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     )
 
 
-def chain_of_run(run: RunLog, model: LiveModel | None, table: SlipTable, robot: Robot | None = None) -> Chain:
+def chain_of_run(
+    run: RunLog, model: TerrainModel | None, table: SlipTable, robot: Robot | None = None
+) -> Chain:
     """Return the live chain of a run's robot.
 
     Parameters

@@ -24,7 +24,7 @@ from pipelines.report.settings import setting
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pipelines.learn.model_file import TerrainModel
+    from pipelines.live.model import TerrainModel
 
 EXAMPLE = "terrain serve --model models:/field@champion --robot agrimaro --state states/"
 

@@ -11,8 +11,9 @@ import pytest
 
 from pipelines.cli import main as cli
 from pipelines.data.can_codec import QUATERNION, RECEIVED, SIGNALS, encode
-from pipelines.learn.model_file import TerrainModel, read_model
+from pipelines.learn.model_file import read_model
 from pipelines.learn.training_data import data_of_runs, fitted_model
+from pipelines.live.model import TerrainModel
 from terrain.angles import wrapped
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run

@@ -12,7 +12,7 @@ from pipelines.drive.comparison import DriveResult, belief_notes, compare
 from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import run_figures
-from pipelines.learn.model_file import TerrainModel
+from pipelines.live.model import TerrainModel
 from pipelines.report import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.control.controllers import CONTROLLERS, make_controller
