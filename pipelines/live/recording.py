@@ -29,7 +29,7 @@ from terrain.errors import LogError
 from terrain.files.names import plain_name
 from terrain.logs.recorded_windows import RecordedWindow
 from terrain.logs.replay import TWIST
-from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, Head, RunRecorder
+from terrain.logs.run_topics import DECIDED, LATEST_S, WINDOW_TOPIC, Head, RunRecorder
 from terrain.logs.samples import BAD_TIME
 from terrain.logs.schema import unit_of
 from terrain.logs.write import run_folder
@@ -57,9 +57,6 @@ RECORDING, FINISHED, NOTHING_KEPT = "recording", "finished", "finished: nothing 
 
 WINDOW = "a window"
 """Takes the place of a stream's name for outputs of the model."""
-
-_DECIDED = ("commands", "control")
-"""Streams that a controller writes."""
 
 
 class SessionRecorder:
@@ -116,9 +113,8 @@ class SessionRecorder:
         self._waiting: list[tuple[str, Array | WindowOutput]] = []
         self._dropped: Counter[str] = Counter()
         self._n_waiting = 0
-        self._file: BinaryIO | None = None  # that is written, its run, and the streams it has
+        self._file: BinaryIO | None = None  # that is written, and its run
         self._run: RunRecorder
-        self._registered: set[str] = set()
         self._origin_s = np.nan
         self._ended = ""  # why no more is taken; empty while it is
         self.settled = threading.Event()
@@ -217,10 +213,7 @@ class SessionRecorder:
         file = self._file or self._begin()
         for name, rows in blocks.items():
             if len(rows):
-                if name not in self._registered:
-                    self._run.register(name, self._channels[name])
-                    self._registered.add(name)
-                self._run.append(name, rows[:, 0], rows[:, 1:])
+                self._run.append(name, self._channels[name], rows[:, 0], rows[:, 1:])
         for output in windows:
             if 0.0 <= output.end_s - self._origin_s < LATEST_S:
                 self._run.append_text(WINDOW_TOPIC, output.end_s, recorded(output).model_dump_json())
@@ -253,7 +246,7 @@ class SessionRecorder:
                 file = self._file = path.open("xb")
                 break
         head = self._head._replace(run_id=name, session=first or name)
-        self._run, self._registered = RunRecorder(McapWriter(file, head), head, self._origin_s), set()
+        self._run = RunRecorder(McapWriter(file, head), head, self._origin_s)
         self.files.append(path)
         return file
 
@@ -274,7 +267,7 @@ def recorded(output: WindowOutput) -> RecordedWindow:
 
 def _check_channels(channels: Mapping[str, Sequence[str]]) -> None:
     for name, each in channels.items():
-        if not plain_name(name) or name in _DECIDED:
+        if not plain_name(name) or name in DECIDED:
             raise LogError(f"stream {name!r} cannot be recorded as a sensor's")
         if not each or len(set(each)) < len(each) or "time_s" in each:
             raise LogError(f"stream {name!r}: channels {', '.join(each)!r} are no list of different names")

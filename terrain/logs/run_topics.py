@@ -342,8 +342,7 @@ class RunRecorder:
     ...     def flush(self) -> None: ...
     ...     def finish(self) -> None: ...
     >>> recorder = RunRecorder(Shown(), Head("drive_1", "husky", live=True))
-    >>> recorder.register("imu", ("gyro_z_radps",))
-    >>> recorder.append("imu", [0.0, 0.01], [[0.1], [0.2]])
+    >>> recorder.append("imu", ("gyro_z_radps",), [0.0, 0.01], [[0.1], [0.2]])
     /terrain/run 0 271
     /terrain/imu 0 36
     /terrain/imu 10000000 36
@@ -354,16 +353,18 @@ class RunRecorder:
         self._topics: dict[str, StreamTopic] = {}
         self._is_described, self._last_ns = False, 0
 
-    def register(self, stream: str, channels: Sequence[str]) -> None:
-        """Announce a stream; streams may come later than samples of others."""
-        taken = [each.topic for each in self._topics.values()]
-        self._topics[stream] = stream_topic(stream, channels, taken)
-        self._is_described = False
-
     def append(
-        self, stream: str, time_s: Array | Sequence[float], values: Array | Sequence[Sequence[float]]
+        self,
+        stream: str,
+        channels: Sequence[str],
+        time_s: Array | Sequence[float],
+        values: Array | Sequence[Sequence[float]],
     ) -> None:
-        """Append samples (n,) and (n, c) of a stream that is registered."""
+        """Append samples (n,) and (n, c) of a stream; one may come later than samples of others."""
+        if stream not in self._topics:
+            taken = [each.topic for each in self._topics.values()]
+            self._topics[stream] = stream_topic(stream, channels, taken)
+            self._is_described = False
         messages = stream_messages(self._topics[stream], time_s, values, self._origin_s)
         if not self._is_described and len(messages.log_ns):
             self._describe(int(messages.log_ns[0]))

@@ -323,6 +323,21 @@ def test_a_killed_process_loses_at_most_two_seconds(tmp_path):
     assert killed_s - imu.time_s[-1] < 2.0
 
 
+def test_a_file_that_ends_anywhere_gives_all_chunks_that_are_whole(recorder, tmp_path):
+    sizes = []
+    for k in range(4):
+        recorder.readings(sample(k / 5, n=10))
+        until(lambda: not recorder._waiting)
+        time.sleep(0.1)
+        sizes.append(recorder.files[0].stat().st_size)
+    whole, torn = recorder.close(10.0)[0].read_bytes(), tmp_path / "torn.mcap"
+    for cut in sorted({*np.linspace(sizes[0], len(whole), 15).astype(int).tolist(), *sizes}):
+        torn.write_bytes(whole[:cut])
+        stamps = read(torn).streams["imu"].time_s
+        assert len(stamps) >= 10 * sum(size <= cut for size in sizes)
+        np.testing.assert_allclose(stamps, np.arange(40)[: len(stamps)] / 50, atol=1e-9)
+
+
 def test_stop_ends_what_was_not_closed(tmp_path):
     writer = RecordingThread(flush_s=60.0)
     recorder = recorded(SessionRecorder(tmp_path, "field", "husky", CHANNELS, writer=writer))
