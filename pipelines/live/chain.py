@@ -126,14 +126,8 @@ class Chain:
         """Go on with another model and table, between two samples: none is lost, and the filter runs on.
 
         Where both models take the same windows, the one that is being cut is the first of the new model;
-        otherwise its windows begin with the next sample.
-
-        Raises
-        ------
-        ConfigError
-            if the table is another robot's.
-        DataError
-            if the model needs a channel that is neither measured nor estimated, another filter, or is none.
+        otherwise its windows begin with the next sample.  ``ConfigError`` where the table is another robot's,
+        ``DataError`` where the model does not suit what is measured and estimated, or is none.
         """
         self.check(model, table)
         self.source.swap(model)

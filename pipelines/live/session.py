@@ -277,13 +277,7 @@ class RobotSession:
         self.restored = self.chain.restore(state, time())
 
     def swap(self, served: Served) -> None:
-        """Go on with another model and table, between two steps; no sample is lost.
-
-        Raises
-        ------
-        ConfigError, DataError
-            as when a session begins.
-        """
+        """Go on with another model and table, between two steps; no sample is lost, what is raised changes nothing."""
         self.chain.replace(served.model, served.table)
         self.served = served
 
@@ -427,15 +421,7 @@ def chain_of(
     pilot: PilotSettings | None = None,
     thread: ClassifierThread | None = None,
 ) -> Chain:
-    """Return what the samples of a robot go through: a pilot of these settings, without them an observer.
-
-    Raises
-    ------
-    ConfigError
-        if the robot has no pilot, or the table is another robot's.
-    DataError
-        if the model needs channels that the robot does not send, or there is neither model nor pilot.
-    """
+    """Return what the samples of a robot go through: a pilot of these settings, without them an observer."""
     if pilot is not None and robot is not None:
         return LivePilot(robot, table, Classifier(model, robot, thread), pilot, channels=channels)
     if model is None:

@@ -18,7 +18,6 @@ from pydantic.dataclasses import dataclass
 
 from terrain.control.switching import UNKNOWN
 from terrain.errors import DataError
-from terrain.files.atomic import atomic_write
 from terrain.files.regular import read_regular
 from terrain.logs.recorded_windows import Number
 
@@ -134,11 +133,6 @@ def from_text(text: str) -> LiveState:
     if _sha256(document.state) != document.sha256:
         raise DataError("saved state: is damaged (its checksum is another)")
     return document.state
-
-
-def save_state(path: Path, state: LiveState) -> None:
-    """Write a state, whole or not at all; ``TerrainError`` where it cannot be written."""
-    atomic_write(path, to_text(state))
 
 
 def load_state(path: Path) -> LiveState | None:

@@ -136,7 +136,7 @@ class Link:
     def on_error(self, error: Exception) -> None:
         """Note that the bus failed, in the thread of the notifier; it is closed by the next :meth:`frames`."""
         if not self._failed.is_set():
-            self._count("receive", error)
+            self.errors[f"receive: {one_line(error, 80)}"] += 1
             self._failed.set()
         time.sleep(RECEIVE_S)
 
@@ -151,7 +151,7 @@ class Link:
             try:
                 self._open()
             except Exception as error:  # each interface has errors of its own
-                self._count("open", error)
+                self.errors[f"open: {one_line(error, 80)}"] += 1
                 self._retry_s = now_s + REOPEN_S
         return [self._read.popleft() for _ in range(min(len(self._read), MAX_READ))]
 
@@ -163,7 +163,7 @@ class Link:
             try:
                 self._notifier.bus.send(frame, timeout=0)
             except Exception as error:
-                self._count("send", error)
+                self.errors[f"send: {one_line(error, 80)}"] += 1
                 return False
             self.n_out += 1
         return True
@@ -175,9 +175,6 @@ class Link:
             notifier.stop()
             with contextlib.suppress(Exception):  # a bus that failed may refuse
                 notifier.bus.shutdown()
-
-    def _count(self, what: str, error: Exception) -> None:
-        self.errors[f"{what}: {one_line(error, 80)}"] += 1
 
 
 class Bridge:
@@ -367,13 +364,7 @@ class BridgeResult(Result):
 
 
 def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
-    """Run a pilot on a bus until it is interrupted, or for the time of the settings.
-
-    Raises
-    ------
-    TerrainError
-        if robot, table, model or DBC are not accepted, or the bus cannot be opened.
-    """
+    """Run a pilot on a bus until it is interrupted, or for the time of the settings."""
     interface, channel = bus_of(settings.can or "")
     layout = load_layout(settings.dbc, REQUIRED)
     robot = as_drive(

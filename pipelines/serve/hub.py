@@ -18,14 +18,14 @@ from pipelines.live.model import TerrainModel
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread
 from pipelines.live.session import Hello, RobotSession, Served
-from pipelines.live.state import LiveState, load_state, save_state
+from pipelines.live.state import LiveState, load_state, to_text
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.serve import Settings, loaded, required_token
 from pipelines.serve.wire import WireError
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
 from terrain.estimation.live.estimator import CHANNELS
-from terrain.files.atomic import ensure_writable
+from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import Reading, Sample, Windows
 from terrain.robots import Robot, load_robot, robot_named
 
@@ -256,7 +256,7 @@ class Hub:
         failed = ""
         for name, state in states.items():
             try:
-                save_state(self.settings.state / f"{name}.json", state)
+                atomic_write(self.settings.state / f"{name}.json", to_text(state))
             except TerrainError as error:
                 failed = str(error)
         if failed:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Any
+
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
 
 STEP_BUCKETS_S = (25e-6, 50e-6, 100e-6, 200e-6, 300e-6, 500e-6, 1e-3, 2e-3, 5e-3, 10e-3, 50e-3)
@@ -16,29 +19,22 @@ class Metrics:
     def __init__(self) -> None:
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
-
-        def counter(name: str, text: str, *labels: str) -> Counter:
-            return Counter(f"terrain_{name}", text, labels, registry=self._registry)
-
-        def gauge(name: str, text: str) -> Gauge:
-            return Gauge(f"terrain_{name}", text, registry=self._registry)
-
-        def histogram(name: str, text: str, buckets: tuple[float, ...] = LATENCY_BUCKETS_S) -> Histogram:
-            return Histogram(f"terrain_{name}", text, buckets=buckets, registry=self._registry)
-
+        common: dict[str, Any] = {"namespace": "terrain", "registry": self._registry}
+        counter, gauge = partial(Counter, **common), partial(Gauge, **common)
+        histogram = partial(Histogram, buckets=LATENCY_BUCKETS_S, **common)
         self.messages = counter("messages", "Messages of robots.")
         self.rows = counter("rows", "Rows of samples taken.")
         self.wrong_tokens = counter("wrong_tokens", "Tokens that were missing, or another.")
-        self.errors = counter("errors", "Errors sent, by code.", "code")
+        self.errors = counter("errors", "Errors sent, by code.", ["code"])
         self.steps = counter("steps", "Steps of sessions.")
         self.late_ticks = counter("late_ticks", "Steps that were left out, as the one before came late.")
-        self.stopped = counter("stopped_commands", "Commands to stand, by reason.", "reason")
-        self.windows = counter("windows", "Windows classified, by terrain.", "terrain")
+        self.stopped = counter("stopped_commands", "Commands to stand, by reason.", ["reason"])
+        self.windows = counter("windows", "Windows classified, by terrain.", ["terrain"])
         self.unsent = counter("unsent_steps", "Steps that a newer one replaced before they were read.")
         self.opened = counter("opened_sessions", "Sessions that were opened.")
         self.sessions = gauge("sessions", "Robots connected.")
         self.served = gauge("served_number", "Number of model and table.")
-        self.step_s = histogram("step_seconds", "One step.", STEP_BUCKETS_S)
+        self.step_s = histogram("step_seconds", "One step.", buckets=STEP_BUCKETS_S)
         self.window_s = histogram("window_seconds", "Features and classifier of one window.")
         self.latency_s = histogram(
             "latency_seconds", "From the arrival of the newest sample to the end of the step."

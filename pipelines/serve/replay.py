@@ -150,11 +150,6 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     """Replay all runs of a log, one after the other; Ctrl-C and SIGTERM end it with what was found until then.
 
     A line is printed for each window at which the classified or the believed terrain changes.
-
-    Raises
-    ------
-    ConfigError, DataError, LogError, ModelError
-        if the log, the model or the table cannot be read, or do not fit each other.
     """
     assert settings.replay is not None
     table, model = load_slip_table(settings.table), loaded(settings, settings.model)

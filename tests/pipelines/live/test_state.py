@@ -17,7 +17,6 @@ from pipelines.live.state import (
     from_text,
     load_state,
     restorable,
-    save_state,
     to_text,
 )
 from terrain.control.pilot_settings import PilotSettings
@@ -152,7 +151,7 @@ def test_a_state_with_one_wrong_letter_anywhere_is_refused_or_read_as_it_was():
 def test_a_file_is_read_back_or_refused_in_one_sentence_with_its_name(tmp_path):
     path = tmp_path / "robot.json"
     assert load_state(path) is None
-    save_state(path, STATE)
+    path.write_text(to_text(STATE))
     assert load_state(path) == STATE
     negative = to_text(STATE).replace("0.001", "-0.001")
     odd = ["", "[]", "null", "[" * 60_000, "\x00", "1" * 5000, "\udcff", " " * 100_000, negative]
