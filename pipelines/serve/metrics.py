@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -20,8 +21,9 @@ class Metrics:
         self._registry = CollectorRegistry()
         ProcessCollector(registry=self._registry)
         common: dict[str, Any] = {"namespace": "terrain", "registry": self._registry}
-        counter, gauge = partial(Counter, **common), partial(Gauge, **common)
-        histogram = partial(Histogram, buckets=LATENCY_BUCKETS_S, **common)
+        counter: Callable[..., Counter] = partial(Counter, **common)
+        gauge: Callable[..., Gauge] = partial(Gauge, **common)
+        histogram: Callable[..., Histogram] = partial(Histogram, buckets=LATENCY_BUCKETS_S, **common)
         self.messages = counter("messages", "Messages of robots.")
         self.rows = counter("rows", "Rows of samples taken.")
         self.wrong_tokens = counter("wrong_tokens", "Tokens that were missing, or another.")
