@@ -285,9 +285,12 @@ def test_a_swap_that_does_not_suit_is_refused_and_changes_nothing(mower_model, s
     ],
 )
 def test_a_request_that_cannot_be_served_is_refused_in_one_sentence(robot, channels, control, fault):
-    request = Hello(session="one", robot="r", streams=channels, control=control)
     with pytest.raises((ConfigError, DataError), match=fault):
-        RobotSession(request, Served(1, None, "", TABLE), robot)
+        RobotSession(
+            Hello(session="one", robot="r", streams=channels, control=control),
+            Served(1, None, "", TABLE),
+            robot,
+        )
 
 
 def test_streams_that_stop_are_lost_and_come_back_and_a_silent_robots_terrain_becomes_unknown(

@@ -119,7 +119,6 @@ STALE = {
     "wheels": BridgeState.STALE_WHEELS,
     "steering": BridgeState.STEERING,
 }
-NEVER = STALE | {"twist": BridgeState.NO_TWIST, "wheels": BridgeState.NO_WHEELS}
 
 
 @pytest.mark.parametrize(
@@ -167,7 +166,8 @@ def test_a_stream_that_ends_stops_corrections_in_time_and_one_that_returns_start
 
 
 def test_a_stream_that_never_came_is_named(frames):
-    for stream, state in NEVER.items():
+    never = STALE | {"twist": BridgeState.NO_TWIST, "wheels": BridgeState.NO_WHEELS}
+    for stream, state in never.items():
         rows = ticks(bridged(), [frame for frame in frames if not of(stream)(frame)], 1.0)
         assert states(rows, 0.05, 1.0) == {state}
 
@@ -192,8 +192,7 @@ def test_the_clock_of_the_bus_may_be_any_and_one_that_is_set_is_followed(frames,
 @pytest.mark.parametrize(
     ("radps", "status", "state"),
     [
-        (math.nan, CommandStatus.OK, BridgeState.NOT_FINITE),
-        (math.inf, CommandStatus.OK, BridgeState.NOT_FINITE),
+        *((radps, CommandStatus.OK, BridgeState.NOT_FINITE) for radps in (math.nan, math.inf)),
         (0.0, CommandStatus.NOT_FINITE, BridgeState.NOT_FINITE),
         (0.0, CommandStatus.FAILED, BridgeState.STEP_FAILED),
     ],
@@ -202,11 +201,9 @@ def test_a_chain_that_fails_leaves_corrections_of_zero(frames, radps, status, st
     """From its 100th step on."""
 
     def changed(step, n):
-        if n < 100:
-            return step
-        command = step.command._replace(wheel_radps=np.array([0.0, radps, 0.0]))
-        failure = "a step failed" if status is CommandStatus.FAILED else ""
-        return step._replace(command=command, status=status, failure=failure)
+        failed = step.command._replace(wheel_radps=np.array([0.0, radps, 0.0]))
+        why = "a step failed" if status is CommandStatus.FAILED else ""
+        return step if n < 100 else step._replace(command=failed, status=status, failure=why)
 
     bridge = bridged(Slower(changed))
     rows = ticks(bridge, frames, 3.0)

@@ -22,42 +22,33 @@ from terrain.control.slip_table import load_slip_table
 
 from .strangers import CHANNELS, ask, until
 
-SERVE = "from pipelines.cli.main import main; main()"
 N_ROBOTS = 8
 
 
 @contextmanager
 def process(model_folder, states):
     """``terrain serve`` in a process of its own; gives it, and its address."""
-    command = [sys.executable, "-c", SERVE, "serve", "--model", str(model_folder), "--port", "0"]
+    words = f"serve --model {model_folder} --port 0 --state {states}".split()
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
     environment.pop("TERRAIN_TOKEN", None)
-    pipe = subprocess.PIPE
-    serving = subprocess.Popen(
-        [*command, "--state", str(states)], stdout=pipe, stderr=pipe, text=True, env=environment
-    )
-    try:
-        line = serving.stdout.readline()
-        yield serving, "ws" + line[line.index("http") + 4 :].split()[0]
-    finally:
-        if serving.poll() is None:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": environment}
+    with subprocess.Popen([sys.executable, "-m", "pipelines.cli", *words], **pipes) as serving:
+        try:
+            line = serving.stdout.readline()
+            yield serving, "ws" + line[line.index("http") + 4 :].split()[0]
+        finally:
             serving.kill()
-        serving.wait(10)
-        serving.stdout.close()
-        serving.stderr.close()
 
 
 def stream(url, k, messages, run, terrains, reasons):
     """Drive until the connection ends; keep the terrain, and why it ended."""
     try:
         with TerrainClient(url, f"robot-{k}", "mower", CHANNELS, rate_hz=0) as robot:
-            for n in itertools.count():
+            for begin_s in itertools.count(0.0, 12.0):
                 for message in messages(run, 10.0):
-                    streams = {
-                        name: ([stamp + 12.0 * n for stamp in stamps], rows)
-                        for name, (stamps, rows) in message["streams"].items()
-                    }
-                    robot.send(streams, step=True, time_s=message["time_s"] + 12.0 * n)
+                    streams = message["streams"].items()
+                    later = {name: ([s + begin_s for s in stamps], rows) for name, (stamps, rows) in streams}
+                    robot.send(later, step=True, time_s=message["time_s"] + begin_s)
                     terrains[k] = robot.step()["observation"]["terrain"]
                     time.sleep(0.002)
     except ServiceError as error:

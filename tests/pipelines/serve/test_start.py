@@ -116,8 +116,8 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
         ({"replay": "runs", "duration_s": 1.0}, "--duration is an option of --can, not of --replay"),
         ({"speed": "4"}, "--speed is an option of --replay, not of the WebSocket service"),
         *(
-            ({"replay": "runs", "speed": speed}, "--speed is")
-            for speed in ("0", "-1", "inf", "nan", "fast", "")
+            ({"replay": "runs", "speed": text}, "--speed is")
+            for text in ("0", "-1", "inf", "nan", "fast", "")
         ),
     ],
 )
