@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipelines.learn.model_file import drawn_window
 from pipelines.live.classifying import Classifier, ClassifierThread, classify_window
 from pipelines.live.model import TerrainModel
 from pipelines.live.pilot import LivePilot
@@ -26,7 +27,7 @@ from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.files.atomic import atomic_write, ensure_writable
-from terrain.records import Reading, Sample, Windows
+from terrain.records import Reading, Sample
 from terrain.robots import Robot, load_robot, robot_named
 
 WARM_STEPS = 30
@@ -291,22 +292,13 @@ def warm_up(model: TerrainModel, robot: Robot | None) -> None:
         if the model cannot classify the robot's windows: it needs channels that neither the robot's sensors nor
         its filter give, or was trained on other robots.
     """
-    source = Classifier(model, robot) if robot is not None and robot.drive == "swerve" else None
-    if source is None and robot is not None and model.info.robots and robot.name not in model.info.robots:
-        raise DataError(
-            f"the model was trained on runs of {', '.join(model.info.robots)}, not of {robot.name}"
-        )
-    rng = np.random.default_rng(0)
-    layout, rule = model.info.layout, model.info.rule
-    values = {
-        stream: rng.normal(size=(1, len(names), layout.n_samples(stream, rule.length_s)))
-        for stream, names in layout.channels.items()
-    }
-    nothing = np.array([""], dtype=object)
-    window = Windows(values, layout.channels, layout.rate_hz, rule.length_s, np.zeros(1), nothing, nothing)
-    classify_window(model, window)
-    if robot is None or source is None:
+    classify_window(model, drawn_window(model.info))
+    if robot is None or robot.drive != "swerve":
+        if robot is not None and model.info.robots and robot.name not in model.info.robots:
+            trained = ", ".join(model.info.robots)
+            raise DataError(f"the model was trained on runs of {trained}, not of {robot.name}")
         return
+    source, rng = Classifier(model, robot), np.random.default_rng(0)
     with suppress(ConfigError, DataError):  # it has no pilot
         pilot = LivePilot(robot, source=source)
         for time_s in 0.02 * np.arange(WARM_STEPS):
