@@ -13,11 +13,10 @@ from terrain.control.fault_drives import FaultCase, Place, drive_case, drive_ref
 from terrain.control.fault_evaluation import LIMITS
 from terrain.control.pid import Gains
 from terrain.control.pilot_settings import CONTROLLERS, PilotSettings, PilotStatus
-from terrain.control.situations import SituationOptions, make_situation, simulate_situation
 from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.switching import OutputStatus
-from terrain.control.terrain_source import KnownTerrain, TerrainEstimate, TerrainSource
+from terrain.control.terrain_source import TerrainEstimate, TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.control.traction_settings import SETTINGS
 from terrain.errors import ConfigError
@@ -25,7 +24,6 @@ from terrain.estimation.live.health import SENSORS, Health
 from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
 from terrain.slip_learning.laws import LAW_PARAMETERS
 
@@ -94,19 +92,6 @@ def test_invalid_settings_are_refused_in_one_sentence(robot, table, settings, me
     assert "\n" not in str(refused.value)
 
 
-def test_a_known_terrain_moves_the_target_at_its_rate():
-    live = LivePilot(ROBOT, TABLE, KnownTerrain())
-    targets, names = [], []
-    for k in range(200):
-        command = live.step(Sample(k * DT_S, np.zeros(3), {}, "grass" if k < 20 else "tiles"))
-        targets.append(command.status["target_ratio"])
-        names.append(live.terrains[int(command.status["terrain_code"])])
-    assert names == ["grass"] * 20 + ["tiles"] * 180
-    assert targets[0] == TABLE.lookup("grass")["traction"].slip_ratio
-    assert targets[-1] == TABLE.lookup("tiles")["traction"].slip_ratio
-    assert np.abs(np.diff(targets)).max() == pytest.approx(0.1 * DT_S)
-
-
 def test_a_wheel_that_does_not_follow_its_command_disagrees_and_is_not_called_lost():
     live = pilot()
     for sample in recorded():
@@ -118,24 +103,6 @@ def test_a_wheel_that_does_not_follow_its_command_disagrees_and_is_not_called_lo
         live.step(sample._replace(readings=readings))
     assert live.health["wheel_2"] == "disagrees"
     assert live.estimate.health[SENSORS.index("wheel_2")] == Health.LOST
-
-
-def test_a_lost_camera_is_named_within_a_third_of_a_second_until_it_is_back():
-    faults = Faults(((4.0, 9.0),))
-    where = make_situation("straight", ROBOT, "grass", 200, SituationOptions(duration_s=14.0))
-    live = LivePilot(ROBOT, TABLE, KnownTerrain())
-    run = simulate_situation(ROBOT, where._replace(faults=faults), live.step, 0.05)
-    control = run.streams["control"]
-    time_s, why = control.time_s, control.channel("status_code")
-    gone, lost = (time_s > 4.3) & (time_s < 9.0), (time_s > 4.0) & (time_s < 9.0)
-    assert set(why[(time_s > 2.0) & (time_s < 4.1)]) == {TractionStatus.OK}
-    assert set(why[gone]) == {TractionStatus.UNSOUND}
-    assert set(why[time_s > 9.5]) == {TractionStatus.OK}
-    assert {SENSORS[int(place)] for place in control.channel("sensor_code")[gone]} == {"camera_speed"}
-    assert set(control.channel("health_code")[gone]) == {Health.LOST}
-    assert control.channel("stale_s")[lost].max() == pytest.approx(5.0, abs=0.1)
-    assert np.isnan(control.channel("slip_ratio")[time_s > 2.0]).sum() == 0
-    assert np.ptp(control.channel("driven_mps")[gone]) < 0.01
 
 
 @pytest.mark.parametrize(
