@@ -29,11 +29,6 @@ class Output(Settings):
     details: bool = setting(False, "Print the details, too.")
 
 
-def separated(text: str) -> list[str]:
-    """Return several values that are given in one text, by commas."""
-    return [part.strip() for part in text.split(",") if part.strip()]
-
-
 class OneFile(click.Command):
     """A command of the table, whose settings, run and report are in one module."""
 
@@ -84,14 +79,7 @@ def _parameter(name: str, field: FieldInfo) -> click.Parameter:
     if field.annotation is bool:
         names = f"{shown}/--no-{shown.removeprefix('--')}" if field.default else shown
         return click.Option([names, name], is_flag=True, default=None, type=bool)
-    kind = separated if _is_tuple(field) and not extra["repeated"] else str
-    return click.Option([shown, name], multiple=extra["repeated"], type=kind)
-
-
-def _is_tuple(field: FieldInfo) -> bool:
-    return any(
-        typing.get_origin(kind) is tuple for kind in (field.annotation, *typing.get_args(field.annotation))
-    )
+    return click.Option([shown, name], multiple=extra["repeated"])
 
 
 def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]:

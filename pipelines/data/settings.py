@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipelines.data.layouts import Layout
-from pipelines.report.settings import Settings, setting
+from pipelines.report.settings import Names, Settings, setting
 from terrain.errors import ConfigError
 from terrain.files.names import listed, shown
 
@@ -50,8 +50,8 @@ class AlignedRunsSettings(RunsSettings):
     """The runs of a command that can choose among them, and bring their two loggers onto one clock."""
 
     robot: str | None = setting(None, ROBOT_TEXT)
-    only: tuple[str, ...] = setting((), "Ids of the runs to use, by commas; all by default.")
-    without: tuple[str, ...] = setting((), "Ids of runs to leave out, by commas.")
+    only: Names = setting((), "Ids of the runs to use, by commas; all by default.")
+    without: Names = setting((), "Ids of runs to leave out, by commas.")
     align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")
 
 

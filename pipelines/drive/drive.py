@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from pipelines.report.settings import JobsSettings, setting
+from pipelines.report.settings import ByCommas, JobsSettings, Names, setting
 from pipelines.report.settings import Settings as BaseSettings
 from terrain.control.controllers import CONTROLLERS, KINDS, uses_classifier
 
@@ -63,7 +63,7 @@ class ComparisonSettings(BaseSettings):
         "starts, straight, slope (the steepest; else level), brake, circle, crab; course and mixed on the "
         "terrain 'course'; or any of simulate.",
     )
-    controllers: tuple[str, ...] = setting(
+    controllers: Names = setting(
         CONTROLLERS,
         "By commas: plain, ramp, thesis; the traction controller on the target of fallback, classified, "
         "true_terrain, known:NAME (of that terrain) or target:SLIP; the thesis' PID on the targets of "
@@ -83,7 +83,7 @@ class ComparisonSettings(BaseSettings):
     duration_s: float | None = setting(None, "Length of a drive in s.", option="--duration")
     accel_mps2: float = setting(1.0, "Rise of the desired speed in m/s^2; inf for a step.", option="--accel")
     grade_deg: float = setting(0.0, "Slope in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0)
-    radius_factors: tuple[Ratio, Ratio, Ratio] | None = setting(
+    radius_factors: Annotated[tuple[Ratio, Ratio, Ratio], ByCommas] | None = setting(
         None,
         "True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default.",
         option="--radius",
@@ -130,17 +130,13 @@ class ComparisonSettings(BaseSettings):
 class FaultSettings(BaseSettings):
     """Sensor faults in the closed loop (--faults)."""
 
-    faults: tuple[str, ...] = setting(
-        (), "Drive through these faults: names or kinds of them, by commas, or 'all'."
-    )
-    situations: tuple[str, ...] = setting(SITUATIONS, f"By commas: {', '.join(SITUATIONS)}.")
-    stop_terrains: tuple[str, ...] = setting(
-        ("wet_floor",), "Soils of stop, by commas.", option="--stop-terrain"
-    )
-    durations_s: tuple[float, ...] = setting(
+    faults: Names = setting((), "Drive through these faults: names or kinds of them, by commas, or 'all'.")
+    situations: Names = setting(SITUATIONS, f"By commas: {', '.join(SITUATIONS)}.")
+    stop_terrains: Names = setting(("wet_floor",), "Soils of stop, by commas.", option="--stop-terrain")
+    durations_s: Annotated[tuple[float, ...], ByCommas] = setting(
         (3.0, math.inf), "For how long a fault acts in s, by commas; inf for good.", option="--durations"
     )
-    draw: tuple[str, ...] = setting(
+    draw: Names = setting(
         (), "Faults whose drives are drawn, by commas; by default, with --out, the worst of each kind."
     )
 
@@ -180,7 +176,9 @@ class PathSettings(BaseSettings):
     )
     grip: float = setting(0.7, "Largest side force over load.", gt=0.0, le=1.5)
     offset: float = setting(0.0, "Desired distance to the left of the path in m.", ge=-100.0, le=100.0)
-    stop: tuple[float, ...] = setting((), "Distances in m at which to stop for 3 s, by commas.")
+    stop: Annotated[tuple[float, ...], ByCommas] = setting(
+        (), "Distances in m at which to stop for 3 s, by commas."
+    )
     point_std: float = setting(
         0.0, "Standard deviation of the points in m: 0.02 for points of an RTK receiver.", ge=0.0, le=10.0
     )

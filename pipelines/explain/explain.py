@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from pydantic import field_validator
 
 from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ PAGE_FILE, EXTENDED_FILE, NEXT_FILE = "report.html", "extended.yaml", "next_driv
 class ExplainOptions(BaseSettings):
     """What may be named, of which runs, and how the gain is measured."""
 
-    effects: tuple[str, ...] | None = setting(None, "Effects that may be named, by commas; all by default.")
+    effects: Names | None = setting(None, "Effects that may be named, by commas; all by default.")
     terrain: str | None = setting(None, "Use only runs of this label.")
     hold_out: int | None = setting(
         None, "Runs held out to measure the gain; a quarter of six or more by default.", ge=0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, model_validator
 
-from pipelines.report.settings import JobsSettings, Settings, setting
+from pipelines.report.settings import JobsSettings, Names, Settings, setting
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS, check_signal_sets
 
@@ -78,7 +78,7 @@ class WindowSettings(Settings):
     window_s: float | None = setting(None, "Window length in s (2; 1.7 under 'published').", "--window")
     stride_s: float | None = setting(None, "From window to window in s; one length by default.", "--stride")
     steady: bool = setting(True, "Keep windows of steady motion only.")
-    signal_sets: Annotated[tuple[str, ...], AfterValidator(check_signal_sets)] = setting(
+    signal_sets: Annotated[Names, AfterValidator(check_signal_sets)] = setting(
         SIGNAL_SETS,
         "Signal sets to use, by commas; leave one out to see what it is worth.",
         option="--signals",

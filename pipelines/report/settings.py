@@ -9,11 +9,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from terrain.errors import ConfigError
+
+
+def separated(given: Any) -> Any:
+    """Return the values of one text, which commas separate; what is no text as it is."""
+    if not isinstance(given, str):
+        return given
+    return [part.strip() for part in given.split(",") if part.strip()]
+
+
+ByCommas = BeforeValidator(separated)
+"""Of a tuple: it may be given as one text."""
+
+Names = Annotated[tuple[str, ...], ByCommas]
+"""Texts, by commas."""
 
 
 def setting(default: Any, text: str, option: str | None = None, repeated: bool = False, **bounds: Any) -> Any:
@@ -25,7 +39,7 @@ def setting(default: Any, text: str, option: str | None = None, repeated: bool =
     text : its help
     option : how it is given on the command line, as ``--window``; ``--name-of-the-field`` by default; without
         dashes an argument that is given by its place, as ``FOLDER``; empty for a field without one
-    repeated : of a tuple: each value has an option of its own; otherwise they are one text, by commas
+    repeated : of a tuple: each value has an option of its own
     bounds : of a number, as pydantic names them: ``ge``, ``gt``, ``le``, ``lt``
     """
     return Field(default, description=text, alias=option, json_schema_extra={"repeated": repeated}, **bounds)
@@ -42,8 +56,9 @@ class Settings(BaseModel):
     --------
     >>> class Shown(Settings):
     ...     seed: int = setting(0, "Of all that is drawn.", ge=0)
-    >>> Shown.model_fields["seed"].alias
-    '--seed'
+    ...     names: Names = setting(("a",), "By commas.")
+    >>> Shown(names="b, c").names, Shown.model_fields["names"].alias
+    (('b', 'c'), '--names')
     >>> Shown(seed=-1)
     Traceback (most recent call last):
     terrain.errors.ConfigError: --seed is -1: input should be greater than or equal to 0

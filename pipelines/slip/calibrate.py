@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import field_validator
 
 from pipelines.data.settings import RunsSettings
+from pipelines.report.settings import ByCommas, Names, setting
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ LAW_NAMES = (
 class RobotSettings(BaseSettings):
     """The ground of a robot's runs (--what robot)."""
 
-    hard: tuple[str, ...] | None = setting(
+    hard: Names | None = setting(
         None, "Labels of hard ground, by commas; those that slip next to nothing by default."
     )
 
@@ -39,7 +39,7 @@ class RobotSettings(BaseSettings):
 class OdometrySettings(BaseSettings):
     """Odometry of a tracked robot (--what odometry)."""
 
-    lengths: tuple[float, ...] = setting(
+    lengths: Annotated[tuple[float, ...], ByCommas] = setting(
         (2.0, 6.0), "Seconds after which poses are compared, by commas; windows of DRIVE have their own."
     )
     folds: int = setting(5, "Folds of whole runs.", ge=2)
@@ -48,9 +48,7 @@ class OdometrySettings(BaseSettings):
 class SoilSettings(BaseSettings):
     """Soil of a wheel testbed (--what soil)."""
 
-    laws: tuple[str, ...] = setting(
-        LAW_NAMES, "Laws to compare, by commas; the last one is reported in full."
-    )
+    laws: Names = setting(LAW_NAMES, "Laws to compare, by commas; the last one is reported in full.")
     check: Path | None = setting(
         None, "Folder of further trials, which the last law predicts and no fit has."
     )

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal
 from pydantic import field_validator
 
 from pipelines.data.settings import AlignedRunsSettings
+from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -54,9 +54,7 @@ class NoiseSettings(BaseSettings):
     """Noise of filters."""
 
     tuning: Tuning | None = setting(None, "Noise; the thesis' own for vio12, else physical.")
-    tune_on: tuple[str, ...] | None = setting(
-        None, "Runs, by commas, for the tuning 'likelihood'; the first three."
-    )
+    tune_on: Names | None = setting(None, "Runs, by commas, for the tuning 'likelihood'; the first three.")
 
 
 class SlipModelSettings(BaseSettings):
@@ -78,7 +76,7 @@ class PoseSettings(BaseSettings):
         "auto", "Delay of the outside measurement in s; 'auto' finds it, a session at a time."
     )
     predict: bool = setting(False, "Predict slip from currents and wheel speeds, on held-out runs.")
-    hold_out: tuple[str, ...] = setting(
+    hold_out: Names = setting(
         (), "Sessions that predictions never train on, by commas; runs without a label never are."
     )
     rollers: bool = setting(False, "Of omni robots: rollers' friction by surface, load of the wheels.")

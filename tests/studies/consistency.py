@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from pipelines.report import Progress, Report, Result, Table, described, format_value, silent
-from pipelines.report.settings import JobsSettings, setting
+from pipelines.report.settings import JobsSettings, Names, setting
 from terrain.control.comparison import MeanInterval, mean_interval
 from terrain.estimation.coverage import nees_by_group, slip_coverage
 from terrain.estimation.estimate import estimate_run
@@ -130,8 +130,8 @@ class Settings(JobsSettings):
     seed: int = setting(0, "Of all runs.", ge=0)
     robot: str = setting("agrimaro", "Swerve robot.")
     filter_name: str = setting(FILTER, "Filter.", "--filter")
-    scenarios: tuple[str, ...] = setting(SCENARIOS, "By commas.")
-    terrains: tuple[str, ...] = setting(tuple(soil_names()), "By commas.")
+    scenarios: Names = setting(SCENARIOS, "By commas.")
+    terrains: Names = setting(tuple(soil_names()), "By commas.")
     camera_lost_s: float = setting(
         0.0, "Time in s without a camera, from the middle of each run.", "--camera-lost", ge=0.0
     )

@@ -19,8 +19,8 @@ from typing import NamedTuple
 import yaml
 
 from pipelines.report import Column, Progress, Report, Result, Table, described, silent
+from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
 from terrain.errors import ConfigError
 
 EXAMPLE = "python tests/studies mutants --only nan-as-zero"
@@ -52,7 +52,7 @@ class Mutant(NamedTuple):
 class Settings(BaseSettings):
     """Which mutants are put into which tree."""
 
-    only: tuple[str, ...] = setting((), "These mutants alone, by commas.")
+    only: Names = setting((), "These mutants alone, by commas.")
     file: Path = setting(FILE, "List of mutants.")
     tree: Path = setting(REPOSITORY, "Working tree that is copied.")
 

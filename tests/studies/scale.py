@@ -14,15 +14,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event, Thread
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import field_validator
 from scipy.signal import lfilter
 
 from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
+from pipelines.report.settings import ByCommas, setting
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
@@ -48,7 +48,7 @@ class Settings(BaseSettings):
     """How many runs are generated, and how many processes compute their features."""
 
     runs: int = setting(10_000, "Runs of the largest size; 10 % and 30 % of them are measured too.", ge=10)
-    workers: tuple[int, ...] = setting((1, 2), "Processes at once, by commas.")
+    workers: Annotated[tuple[int, ...], ByCommas] = setting((1, 2), "Processes at once, by commas.")
     seed: int = setting(0, "Of the runs.", ge=0)
     scratch: Path | None = setting(
         None, "Existing folder for the generated runs, 70 kB each; that of temporary files by default."

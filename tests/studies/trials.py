@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import field_validator
 
 from pipelines.report import Column, Progress, Report, Result, Table, Text, described, silent
-from pipelines.report.settings import JobsSettings, setting
+from pipelines.report.settings import JobsSettings, Names, setting
 from terrain.discrepancy.preparation import MIN_RUNS
 from terrain.discrepancy.trials.hidden_effects import Case, cases_of
 from terrain.discrepancy.trials.rows import Row
@@ -34,7 +34,7 @@ class Settings(JobsSettings):
         ge=1,
     )
     seed: int = setting(0, "Of all that is drawn.", ge=0)
-    rows: tuple[str, ...] = setting(tuple(row.value for row in Row), "Kinds of trials, by commas.")
+    rows: Names = setting(tuple(row.value for row in Row), "Kinds of trials, by commas.")
     runs: int = setting(8, "Runs of each trial; 80 of 6 s in rows short and known.")
 
     @field_validator("rows")

@@ -10,8 +10,8 @@ import pytest
 from pipelines.cli import main as cli
 from pipelines.cli.table import COMMANDS, FORMER, Command
 from pipelines.report import Report, Result, Section, Text, described
+from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
 from terrain.errors import ConfigError, DataError
 
 EXAMPLE = "terrain draw --folder a"
@@ -30,7 +30,7 @@ class Settings(Folding):
     protocol: Literal["grouped", "published"] = setting("grouped", "Which.")
     window_s: float | None = setting(None, "Length.", option="--window", gt=0)
     figures: bool = setting(True, "Draw.")
-    signal_sets: tuple[str, ...] = setting(("imu", "currents"), "By commas.", option="--signals")
+    signal_sets: Names = setting(("imu", "currents"), "By commas.", option="--signals")
     effect: tuple[str, ...] = setting((), "May be given again.", repeated=True)
     inner: int = setting(3, "Not on the command line.", option="")
 

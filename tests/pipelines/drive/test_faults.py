@@ -32,11 +32,7 @@ SLIPS = load_slip_table()
 LOOP = fault_loop(ROBOT, SLIPS)
 TABLE = Path(__file__).resolve().parents[3] / "data" / "target_slip" / "default.yaml"
 FEW = Settings(
-    faults=("loss_odometry", "duplicates_imu"),
-    situations=("steady",),
-    durations_s=(3.0, math.inf),
-    first_seed=400,
-    n_jobs=1,
+    faults="loss_odometry,duplicates_imu", situations="steady", durations_s="3,inf", first_seed=400, n_jobs=1
 )
 
 
