@@ -1,6 +1,7 @@
 """The command line on good and bad data: what is refused in one sentence, and what the commands write."""
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -11,8 +12,16 @@ import pytest
 from pipelines.cli.table import COMMANDS
 from pipelines.learn.model_file import MODEL_FILE
 from pipelines.report import format_value
+from terrain.files.resources import data_folder
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
+
+DEEP = "[" * 100_000
+LAUGHS = "0: &a0 [x, x]\n" + "".join(f"{i}: &a{i} [{f'*a{i - 1}, ' * 9}]\n" for i in range(1, 9))
+MAPPING = """robot: husky
+streams:
+  imu: {file: "{run}.csv", time: {column: t, unit: s}, channels: {gyro_z_radps: {column: wz, unit: furlong}}}
+"""
 
 
 def keep(runs, place):
@@ -21,127 +30,130 @@ def keep(runs, place):
     return place / "data"
 
 
-SPOILT_FILES = {
-    "missing column": (
-        lambda lines: [line.rpartition(",")[0] for line in lines],
-        "imu_01.csv: column 'az' is missing",
-    ),
-    "time goes back": (
-        lambda lines: [*lines[:9], "0.01" + lines[9][lines[9].index(",") :], *lines[10:]],
-        "imu_01.csv: time goes back at row 10 (0.01 s after 0.14 s)",
-    ),
-    "dead channel": (
-        lambda lines: [lines[0], *(line.rpartition(",")[0] + ",nan" for line in lines[1:])],
-        "imu_01.csv: channel accel_z_mps2 (column az) has nothing finite in its 200 rows",
-    ),
-    "streams apart": (
-        lambda lines: [
-            lines[0],
-            *(str(900 + i / 50) + line[line.index(",") :] for i, line in enumerate(lines[1:])),
-        ],
-        "SNOW_01: the streams do not overlap in time",
-    ),
-}
-
-
-@pytest.mark.parametrize("fault", SPOILT_FILES)
-def test_a_spoilt_log_is_one_sentence(refused, borealtc_dir, place, edit, fault):
-    change, sentence = SPOILT_FILES[fault]
-    shutil.copytree(borealtc_dir, place / "logs")
-    edit(place / "logs" / "SNOW" / "imu_01.csv", change)
-    refused(sentence, "convert", "logs", "--out", "out")
-    if fault == "missing column":
-        refused(sentence, "crossval", "--data", "logs", "--json", "report.json")
-
-
-def test_two_runs_with_one_id_are_one_sentence(refused, place, make_run):
-    data = keep([make_run("SNOW_01")], place)
-    shutil.copytree(data / "SNOW_01", data / "copy")
-    refused("2 runs have the id 'SNOW_01'", "inspect", data)
-
-
-def test_a_unit_that_is_unknown_is_one_sentence(refused, place):
-    (place / "map.yaml").write_text(
-        "robot: husky\nstreams:\n  imu:\n    file: '{run}.csv'\n    time: {column: t, unit: s}\n"
-        "    channels:\n      gyro_z_radps: {column: wz, unit: furlong}\n"
-    )
-    (place / "a.csv").write_text("t,wz\n0,1\n0.1,2\n")
-    refused("furlong", "inspect", place, "--format", "csv", "--mapping", "map.yaml")
-
-
-def test_data_that_cannot_answer_are_one_sentence(refused, place, drive, drive_all):
-    keep(drive_all(("GRASS",), 5, duration_s=6.0), place)
-    quick = ("--data", place / "data", "--jobs", 1)
-    for command in (("crossval",), ("train", "--name", "m")):
-        refused("all windows are 'GRASS': a classifier needs at least two classes", *command, *quick)
-    keep([drive("GRASS_9", "GRASS", 0, duration_s=1.2)], place)
-    refused("run GRASS_9 lasts 1.20 s, shorter than a window of 2 s", "crossval", *quick)
-    refused("window length_s is 0.0; it must be positive and finite", "crossval", *quick, "--window", 0)
-    refused("no signal set is named", "crossval", *quick, "--signals", ",")
-    refused("unknown signal set 'sonar'", "crossval", *quick, "--signals", "imu,sonar")
-
-
-def test_a_folder_without_runs_is_one_sentence(refused, place):
-    refused("nowhere: does not exist; accepted are", "inspect", place / "nowhere")
+@pytest.fixture
+def files(place, drive):
+    """The folder to work in, with a run in ``data`` and files that are none of what commands read."""
+    keep([drive("r", "GRASS", 0, duration_s=4.0)], place)
     (place / "empty").mkdir()
-    for command in (("crossval",), ("train", "--name", "m"), ("predict", "--model", "m")):
-        refused("empty: holds no run; accepted are", *command, "--data", place / "empty")
+    written = {"file": "an obstacle", "laughs.yaml": LAUGHS, "map.yaml": MAPPING, "evil.yaml": "secret: 1\n"}
+    written |= {"a.csv": "t,wz\n0,1\n0.1,2\n", "mine.yaml": "name: mine\ndrive: swerve\nwheels: 3\n"}
+    for name, text in written.items():
+        (place / name).write_text(text)
+    return place
 
 
-def test_a_model_that_cannot_be_trusted_is_one_sentence(refused, place, drive, tracked):
-    data = keep([drive("r", "GRASS", 0)], place)
-    model = shutil.copytree(tracked[0] / "model", place / "model")
-    ask = ("predict", "--data", data, "--model")
-    refused("neither a folder nor a model URI", *ask, "nothing")
-    content = bytearray((model / MODEL_FILE).read_bytes())
-    content[len(content) // 2] ^= 4
-    (model / MODEL_FILE).write_bytes(content)
-    refused("model.skops: is damaged (SHA-256", *ask, model)
-
-
-def test_an_output_that_cannot_be_written_is_reported_before_the_work(refused, place, drive_all, monkeypatch):
-    data = keep(drive_all(n_runs=2, duration_s=4.0), place)
-    (place / "file").write_text("an obstacle")
-    (place / "mlruns").write_text("an obstacle")
-    monkeypatch.setattr("pipelines.learn.evaluate.evaluate", lambda *_: pytest.fail("the work was begun"))
-    cannot = "cannot be written"
-    refused(cannot, "convert", data, "--out", place / "file" / "out")
-    refused(cannot, "crossval", "--data", data, "--json", place / "file" / "report.json")
-    refused("is a folder; --json names a file", "crossval", "--data", data, "--json", data)
-    refused(cannot, "train", "--data", data, "--name", "m")
-    refused(cannot, "quickstart", "--data", data, "--out", place / "file" / "out")
-    refused(cannot, "predict", "--data", data, "--model", "m", "--json", place / "file" / "p.json")
+SIMULATE, STRAIGHT = "simulate --out runs", "--terrain grass --scenario straight"
+LAUGHED = "those of aliases counted each time"
+ESTIMATE, PREDICT = "estimate --data data --filter", "predict --data data --model"
 
 
 @pytest.mark.parametrize(
     ("sentence", "words"),
     [
-        ("soil 'lava' is unknown", "--robot agrimaro --terrain lava"),
-        ("scenario 'loop' is unknown", "--robot agrimaro --scenario loop"),
-        ("go together", "--robot agrimaro --terrain course"),
-        ("too short for 'straight'", "--robot agrimaro --duration 2"),
-        ("--grade is 60", "--robot agrimaro --grade 60"),
-        ("--camera-lost is '9'; START:END", "--robot agrimaro --camera-lost 9"),
-        ("--camera-lost is '9:4'; START:END", "--robot agrimaro --camera-lost 9:4"),
-        ("scenario 'crab' is not for robot husky", "--robot husky --scenario crab"),
-        ("effect 'magic' is unknown", "--robot husky --effect magic=1"),
-        ("key 'wheels' is unknown", "--robot mine.yaml"),
+        ("furlong", "inspect . --format csv --mapping map.yaml"),
+        ("nowhere: does not exist; accepted are", "inspect nowhere"),
+        ("empty: holds no run; accepted are", "train --name m --data empty"),
+        ("all windows are 'GRASS': a classifier needs at least two classes", "crossval --data data"),
+        ("run r lasts 4.00 s, shorter than a window of 5 s", "crossval --data data --window 5"),
+        ("window length_s is 0.0; it must be positive and finite", "crossval --data data --window 0"),
+        ("no signal set is named", "crossval --data data --signals ,"),
+        ("unknown signal set 'sonar'", "crossval --data data --signals imu,sonar"),
+        ("neither a folder nor a model URI", f"{PREDICT} nothing"),
+        ("soil 'lava' is unknown", f"{SIMULATE} --robot agrimaro --scenario straight --terrain lava"),
+        ("scenario 'loop' is unknown", f"{SIMULATE} --robot agrimaro --terrain grass --scenario loop"),
+        ("too short for 'straight'", f"{SIMULATE} {STRAIGHT} --robot agrimaro --duration 2"),
+        ("--camera-lost is '9:4'; START:END", f"{SIMULATE} {STRAIGHT} --robot agrimaro --camera-lost 9:4"),
+        ("effect 'magic' is unknown", f"{SIMULATE} {STRAIGHT} --robot husky --effect magic=1"),
+        ("key 'wheels' is unknown", f"{SIMULATE} {STRAIGHT} --robot mine.yaml"),
+        ("filter 'vio15' is not for robot husky", f"{ESTIMATE} vio15"),
+        ("is there already", f"{ESTIMATE} skid --out data"),
+        ("is one of robot 'husky'", "calibrate --data data --robot agrimaro"),
+        (LAUGHED, f"{SIMULATE} --robot agrimaro --scenario straight --terrain laughs.yaml"),
+        (LAUGHED, f"{ESTIMATE} skid --robot laughs.yaml"),
+        (LAUGHED, "inspect data --format csv --mapping laughs.yaml"),
+        (LAUGHED, "drive --robot agrimaro --terrain grass --table laughs.yaml"),
+        ("cannot be written", "convert data --out file/out"),
+        ("cannot be written", "crossval --data data --json file/report.json"),
+        ("is a folder; --json names a file", "crossval --data data --json data"),
+        ("cannot be written", "quickstart --data data --out file/out"),
+        ("cannot be written", f"{PREDICT} m --json file/p.json"),
     ],
-)
-def test_what_cannot_be_simulated_is_one_sentence(refused, place, sentence, words):
-    (place / "mine.yaml").write_text("name: mine\ndrive: swerve\nwheels: 3\n")
-    given = words.split()
-    for option, value in (("--terrain", "grass"), ("--scenario", "straight"), ("--out", "runs")):
-        given += [option, value] if option not in given else []
-    refused(sentence, "simulate", *given)
+)  # fmt: skip
+def test_a_mistake_is_one_sentence(refused, files, sentence, words):
+    refused(sentence, *words.split())
 
 
-def test_what_cannot_be_estimated_is_one_sentence(refused, place, drive):
-    data = keep([drive("r", "GRASS", 0, 4.0)], place)
-    refused("filter 'vio15' is not for robot husky", "estimate", "--data", data, "--filter", "vio15")
-    refused("is there already", "estimate", "--data", data, "--filter", "skid", "--out", data)
-    refused("husky", "calibrate", "--data", data, "--robot", "husky")
-    refused("is one of robot 'husky'", "calibrate", "--data", data, "--robot", "agrimaro")
+def edit_run(folder, **changed):
+    file = folder / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changed))
+
+
+def link_out(folder):
+    shutil.move(folder / "imu.parquet", folder.parents[1])
+    (folder / "imu.parquet").symlink_to(folder.parents[1] / "imu.parquet")
+
+
+def pipe(folder):
+    (folder / "run.json").unlink()
+    os.mkfifo(folder / "run.json")
+
+
+def cut_short(folder):
+    (folder / "imu.parquet").write_bytes((folder / "imu.parquet").read_bytes()[:-20])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (lambda folder: shutil.copytree(folder, folder.parent / "copy"), "2 runs have the id 'r'"),
+        (lambda folder: (folder / "run.json").write_text(DEEP), "is nested deeper than 32 levels"),
+        (lambda folder: (folder / "run.json").write_bytes(b"\xff\xfe{\x00"), "is no JSON"),
+        (lambda folder: edit_run(folder, run_id="../../etc"), "begins with a dot"),
+        (lambda folder: edit_run(folder, session="a\x1b[2Jb"), "holds a control character"),
+        (lambda folder: edit_run(folder, robot="r" * 10**6), "is longer than 128 characters"),
+        (lambda folder: edit_run(folder, robot="../evil"), "is no plain name"),
+        (lambda folder: edit_run(folder, robot="evil.yaml"), "robot 'evil.yaml' is unknown: a log names one of"),
+        (link_out, "is a link that leads out of"),
+        (pipe, "is a pipe, a socket or a device"),
+        (cut_short, "is no whole Parquet file"),
+    ],
+)  # fmt: skip
+def test_a_run_of_a_stranger_is_one_sentence(refused, files, spoil, sentence):
+    spoil(files / "data" / "r")
+    refused(sentence, "estimate", "--data", "data", "--filter", "skid")
+
+
+def test_a_column_that_is_missing_is_one_sentence(refused, borealtc_dir, place, edit):
+    shutil.copytree(borealtc_dir, place / "logs")
+    edit(place / "logs" / "SNOW" / "imu_01.csv", lambda lines: [line.rpartition(",")[0] for line in lines])
+    refused("imu_01.csv: column 'az' is missing", "convert", "logs", "--out", "out")
+    refused("imu_01.csv: column 'az' is missing", "crossval", "--data", "logs", "--json", "report.json")
+
+
+def test_a_store_that_cannot_be_written_is_reported_before_the_work(refused, place, drive_all):
+    data = keep(drive_all(n_runs=2, duration_s=4.0), place)
+    (place / "mlruns").write_text("an obstacle")
+    refused("cannot be written", "train", "--data", data, "--name", "m")
+
+
+def test_a_model_of_a_stranger_is_one_sentence(refused, files, tracked):
+    model = shutil.copytree(tracked[0] / "model", files / "model")
+    whole = (model / MODEL_FILE).read_bytes()
+    (model / MODEL_FILE).write_bytes(whole[:-4] + bytes([whole[-4] ^ 4]) + whole[-3:])
+    refused("model.skops: is damaged (SHA-256", *PREDICT.split(), model)
+    (model / MODEL_FILE).unlink()
+    (model / MODEL_FILE).symlink_to("../file")
+    refused("model.skops: is a link that leads out of", *PREDICT.split(), model)
+    (model / "terrain_model.json").write_text(DEEP)
+    refused("is nested deeper than 32 levels", *PREDICT.split(), model)
+
+
+def test_a_robot_that_the_user_gives_may_be_a_file(files, terrain):
+    text = (data_folder("robots") / "husky.yaml").read_text().replace("name: husky", "name: mule")
+    (files / "mule.yaml").write_text(text)
+    edit_run(files / "data" / "r", robot="mule")
+    code, out, _ = terrain(*ESTIMATE.split(), "skid", "--robot", "mule.yaml")
+    assert (code, "skid" in out) == (0, True)
 
 
 def test_from_simulated_logs_to_slip_on_the_command_line(terrain, place):
