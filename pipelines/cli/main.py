@@ -7,6 +7,8 @@ import sys
 import warnings
 from collections.abc import Callable
 from difflib import get_close_matches
+from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 import click
@@ -51,18 +53,15 @@ class Terrain(click.Group):
 
     def format_help(self, context: click.Context, formatter: click.HelpFormatter) -> None:
         """Write all commands on one screen, by group."""
-        formatter.write("Usage: terrain COMMAND [OPTIONS]\n\n")
-        formatter.write("Terrain classification and slip learning for off-road robots.\n")
         formatter.write(
+            "Usage: terrain COMMAND [OPTIONS]\n\n"
+            "Terrain classification and slip learning for off-road robots.\n"
             "terrain COMMAND -h begins with an example; every command takes --json, --report, --details.\n"
         )
-        groups: dict[str, list[tuple[str, str]]] = {}
-        for each in COMMANDS:
-            groups.setdefault(each.group, []).append((each.name, each.text))
-        for group, rows in groups.items():
+        for group, commands in groupby(COMMANDS, attrgetter("group")):
             formatter.write(f"\n{group}\n")
-            for name, text in rows:
-                formatter.write(f"  {name:<12}{text}\n")
+            for each in commands:
+                formatter.write(f"  {each.name:<12}{each.text}\n")
 
 
 app = click.version_option(__version__, prog_name="terrain")(Terrain(context_settings=HELP))

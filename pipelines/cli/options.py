@@ -40,7 +40,7 @@ class OneFile(click.Command):
 
     def _execute(self, **options: Any) -> Result:
         from pipelines.report.json_file import write_json
-        from pipelines.report.terminal import output_console, print_report, progress_bar
+        from pipelines.report.terminal import print_report, progress_bar
         from pipelines.report.writing import ENDINGS, check_file
 
         # what is not given is None, or () of an option that may be repeated
@@ -54,7 +54,7 @@ class OneFile(click.Command):
         with progress_bar() as progress:
             result: Result = self.module.run(settings, progress)
         report = result.report
-        print_report(report, output_console(), details=output.details)
+        print_report(report, details=output.details)
         if output.json_file is not None:
             write_json(output.json_file, result)
         if output.report_file is not None:

@@ -44,14 +44,11 @@ def progress_bar() -> Iterator[Progress]:
             bars.stop()
 
 
-def output_console() -> Console:
-    """Return the console that results are printed on."""
+def print_report(report: Report, console: Console | None = None, *, details: bool = False) -> None:
+    """Print a report: its answer, what is decided by, and with ``details`` all of it; on stdout by default."""
     # names come from the user's files: brackets in them are no markup
-    return Console(soft_wrap=True, markup=False, width=None if sys.stdout.isatty() else WIDTH_OF_A_FILE)
-
-
-def print_report(report: Report, console: Console, *, details: bool = False) -> None:
-    """Print a report: its answer, what is decided by, and with ``details`` all of it."""
+    width = None if sys.stdout.isatty() else WIDTH_OF_A_FILE
+    console = console or Console(soft_wrap=True, markup=False, width=width)
     for part in _screen(report, details):
         console.print(part, highlight=False)
 
@@ -76,8 +73,7 @@ def _screen(report: Report, details: bool) -> Iterator[RenderableType]:
         yield RichText(report.lead, style="dim")
     yield from _parts(report.parts)
     if details:
-        for section in report.details:
-            yield from _parts([section])
+        yield from _parts(report.details)
     elif report.details:
         yield RichText(f"--details adds: {'; '.join(each.title for each in report.details)}", style="dim")
     if report.next_step:
