@@ -113,17 +113,6 @@ class WindowPrediction(NamedTuple):
     terrain_set: tuple[str, ...] | None = None
 
 
-class TargetSlipRow(NamedTuple):
-    """Target slips of a terrain, and the entry of the table that they come from."""
-
-    traction: float
-    braking: float
-    steady: float
-    entry: str
-    status: str
-    source: str
-
-
 @dataclass(frozen=True, repr=False)
 class Predictions(Result):
     """Predictions of a model for every window that its own rule keeps."""
@@ -144,7 +133,9 @@ class Predictions(Result):
     n_unknown_labels: int = described("their number")
     dropped: Mapping[str, int] = described("windows left out, by reason")
     table_name: str = described("table of target slips")
-    table: Mapping[str, TargetSlipRow] = described("target slips by terrain")
+    table: Mapping[str, Mapping[str, Any]] = described(
+        "target slips by terrain and drive state, and the entry of the table that they come from"
+    )
     filtered: tuple[str, ...] = described(
         "runs that the live chain filtered, as they had no estimates", default=()
     )
@@ -326,13 +317,12 @@ def _predict_windows(windows: Windows, model: TerrainModel, table: SlipTable) ->
     return rows
 
 
-def _table_row(targets: Mapping[str, SlipTarget]) -> TargetSlipRow:
-    return TargetSlipRow(
-        **{state: targets[state].slip_ratio for state in DRIVE_STATES},
-        entry=targets["traction"].terrain,
-        status=", ".join(dict.fromkeys(targets[state].status for state in DRIVE_STATES)),
-        source="; ".join(dict.fromkeys(targets[state].source for state in DRIVE_STATES)),
-    )
+def _table_row(targets: Mapping[str, SlipTarget]) -> dict[str, Any]:
+    return {state: targets[state].slip_ratio for state in DRIVE_STATES} | {
+        "entry": targets["traction"].terrain,
+        "status": ", ".join(dict.fromkeys(targets[state].status for state in DRIVE_STATES)),
+        "source": "; ".join(dict.fromkeys(targets[state].source for state in DRIVE_STATES)),
+    }
 
 
 def report(result: Predictions) -> tree.Report:
