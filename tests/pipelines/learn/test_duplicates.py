@@ -25,7 +25,7 @@ def copy_of(run, run_id, offset_s=0.0, decimals=4):
     return replace(run, run_id=run_id, streams=streams, labels=labels)
 
 
-@pytest.mark.parametrize("protocol", ["grouped", "leave-one-run-out", "published"])
+@pytest.mark.parametrize("protocol", ["grouped", "published"])
 def test_copies_are_refused_by_name_with_what_to_do(runs, settings, protocol):
     copies = [copy_of(run, f"again_{i}", 50.0) for i, run in enumerate(runs[:5])]
     with pytest.raises(DataError) as refusal:

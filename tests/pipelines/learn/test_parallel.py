@@ -53,17 +53,10 @@ def test_results_of_two_processes_come_in_the_order_of_their_tasks():
 
 
 def test_local_results_come_in_order_while_tasks_are_still_made():
-    made = []
-
-    def numbers():
-        for number in range(40):
-            made.append(number)
-            yield (number,)
-
-    results = parallel(pow, (2,), numbers(), 1)
-    assert next(results) == 1
-    assert len(made) < 40
-    assert list(results) == [2**k for k in range(1, 40)]
+    numbers = ((number,) for number in range(40))
+    results = parallel(pow, (2,), numbers, 1)
+    assert (next(results), next(numbers)) == (1, (1,))
+    assert list(results) == [2**k for k in range(2, 40)]
 
 
 def test_no_scheduler_is_one_sentence():
@@ -147,7 +140,6 @@ def test_errors_of_a_task_keep_their_sentence(threads_cluster):
 
 def test_other_software_on_a_worker_is_refused(threads_cluster, monkeypatch):
     other = software() | {"numpy": "1.0"}
-    monkeypatch.setattr(cluster, "software", software)
     monkeypatch.setattr(cluster, "difference", lambda _, there: difference(other, there))
     with pytest.raises(TerrainError, match=r"worker tcp://.* has numpy .* where 1\.0 is needed"):
         computing(threads_cluster).__enter__()
