@@ -76,11 +76,19 @@ class FeatureMatrix(NamedTuple):
             raise DataError(
                 f"windows last {X.length_s:g} s; the features were learned on {self.length_s:g} s"
             )
+        missing = [
+            f"{stream}.{name}"
+            for stream, names in self.layout.channels.items()
+            for name in names
+            if name not in X.channels.get(stream, ())
+        ]
+        if missing:
+            raise DataError(
+                f"the windows lack {', '.join(missing)}: they have {_listed(X.channels)}; the features were "
+                f"learned on {_listed(self.layout.channels)}"
+            )
         values = {}
         for stream, names in self.layout.channels.items():
-            missing = [name for name in names if name not in X.channels.get(stream, ())]
-            if missing:
-                raise DataError(f"stream {stream!r} lacks channel {missing[0]!r}, which the features need")
             rate_hz = X.rate_hz[stream]
             if abs(rate_hz / self.layout.rate_hz[stream] - 1) > MAX_RATE_DEVIATION:
                 raise DataError(
@@ -128,6 +136,12 @@ class FeatureMatrix(NamedTuple):
             table = np.concatenate([table, channel_spectra(values, rate_hz)], axis=2)
         described, kept = _described(stream, tuple(names), tuple(columns), frozenset(self.level_sets))
         return list(described), table[:, kept]
+
+
+def _listed(channels: Mapping[str, tuple[str, ...]]) -> str:
+    return (
+        "; ".join(f"{stream} with {', '.join(names)}" for stream, names in channels.items()) or "no channel"
+    )
 
 
 def _of_length(values: Array, n: int, stream: str) -> Array:

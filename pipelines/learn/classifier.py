@@ -117,9 +117,7 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
     def predict_proba(self, X: Windows) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``; errors as :meth:`predict`."""
         check_is_fitted(self, "model_")
-        windows = _windows(X)
-        check_windows(self.model_, windows)
-        return np.asarray(self.model_.recipe.predict_proba(windows))
+        return np.asarray(self.model_.recipe.predict_proba(_windows(X)))
 
     def predictions(self, X: Windows) -> pd.DataFrame:
         """Return a row a window: run, start, terrain, and the probability of each terrain."""
@@ -181,31 +179,3 @@ def _overlap(windows: Windows) -> int:
     steps_s = np.diff(windows.start_s)[same]
     steps_s = steps_s[steps_s > 0]
     return int(np.ceil(windows.length_s / steps_s.min() - 1e-9)) if len(steps_s) else 1
-
-
-def check_windows(model: TerrainModel, windows: Windows) -> None:
-    """Refuse windows of other channels, in one sentence that says what was found and what is accepted.
-
-    Raises
-    ------
-    DataError
-        if a channel is missing; lengths and rates are compared where features are computed.
-    """
-    needed, there = model.info.channels, windows.channels
-    lacking = [
-        f"{stream}.{name}"
-        for stream, names in needed.items()
-        for name in names
-        if name not in there.get(stream, ())
-    ]
-    if lacking:
-        raise DataError(
-            f"the windows lack {', '.join(lacking)}: they have {_listed(there)}; the model was trained on "
-            f"{_listed(needed)}"
-        )
-
-
-def _listed(channels: Any) -> str:
-    return (
-        "; ".join(f"{stream} with {', '.join(names)}" for stream, names in channels.items()) or "no channel"
-    )

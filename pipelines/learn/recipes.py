@@ -31,7 +31,7 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     if ":" in name or settings.feature:
         options["functions"] = [load_named(each) for each in settings.feature]
     if settings.params is not None and name not in WITHOUT_SVM:
-        from pipelines.learn.params import read_params
+        from pipelines.learn.search import read_params
 
         options["candidates"] = (Candidate(*read_params(settings.params)),)
     return make_recipe(

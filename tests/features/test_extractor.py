@@ -158,10 +158,10 @@ def test_windows_of_another_kind_are_refused():
     windows = draw_windows()
     extractor = FeatureExtractor().fit(windows)
     cases = {
-        "stream 'wheels' lacks channel 'current_left_a', which the features need": without(
+        "the windows lack wheels.current_left_a: they have imu with ": without(
             windows, "wheels", "current_left_a"
         ),
-        "stream 'slip' lacks channel 'slip_left_ratio'": draw_windows(streams=("imu", "wheels", "estimator")),
+        "the windows lack slip.slip_left_ratio, ": draw_windows(streams=("imu", "wheels", "estimator")),
         "stream 'imu' runs at 50 Hz; the features were learned at 100 Hz": draw_windows(
             rate_hz=RATE_HZ | {"imu": 50.0}
         ),

@@ -70,7 +70,7 @@ def test_what_does_not_fit_is_one_sentence(fitted, windows, tmp_path):
             lambda: fitted.predict(fewer),
             DataError,
             r"the windows lack imu\.gyro_x_radps, wheels\.speed_left_mps: they have imu with gyro_y_radps.*; "
-            r"the model was trained on imu with gyro_x_radps",
+            r"the features were learned on imu with gyro_x_radps",
         ),
         (lambda: fitted.predict(np.zeros((3, 4))), DataError, "windows are needed, as terrain.cut_windows"),
         (lambda: TerrainClassifier().fit(windows, ["a"]), DataError, "1 terrains for 144 windows"),
