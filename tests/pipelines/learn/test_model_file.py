@@ -38,8 +38,7 @@ def put(model_dir):
     return put
 
 
-def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, runs):
-    model = read_model(model_dir)
+def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, runs, model):
     windows = cut_windows(runs, model.info.rule).windows
     live = make_recipe("svm").fit(windows, windows.terrain.astype(str))
     assert np.array_equal(model.recipe.predict_proba(windows), live.predict_proba(windows))
@@ -57,26 +56,32 @@ def test_one_flipped_bit_anywhere_is_seen(model_dir, place):
         read_model(model_dir)
 
 
+def archive(members):
+    """Return an archive of contents by name."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
+        for name, content in members.items():
+            target.writestr(name, content)
+    return packed.getvalue()
+
+
+def members_of(content):
+    with zipfile.ZipFile(io.BytesIO(content)) as source:
+        return {name: source.read(name) for name in source.namelist()}
+
+
 def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir, put):
     """Of the archive, and of what lies in it, which its own checksums then do not cover."""
     whole = (model_dir / MODEL_FILE).read_bytes()
-    with zipfile.ZipFile(model_dir / MODEL_FILE) as source:
-        members = {name: source.read(name) for name in source.namelist()}
+    members = members_of(whole)
     small = sorted(members, key=lambda name: len(members[name]))[:40]
     rng, refusals = np.random.default_rng(3), []
-    for number in range(40):
-        inside = number % 2 == 1
+    for inside in 20 * [False, True]:
         hit = small[rng.integers(len(small))]
         content = bytearray(members[hit] if inside else whole[: rng.integers(len(whole))])
         for place in rng.integers(min(len(content), 128) if inside else max(len(content), 1), size=3):
             content[place : place + 1] = bytes([rng.integers(256)])
-        if inside:
-            packed = io.BytesIO()
-            with zipfile.ZipFile(packed, "w") as target:
-                for name, member in members.items():
-                    target.writestr(name, bytes(content) if name == hit else member)
-            content = packed.getvalue()
-        put(bytes(content))
+        put(archive(members | {hit: bytes(content)}) if inside else bytes(content))
         try:
             read_model(model_dir)
         except ModelError as error:
@@ -85,8 +90,27 @@ def test_damage_that_the_checksum_covers_up_ends_in_one_sentence(model_dir, put)
     assert all(sentence.isprintable() for sentence in refusals)
 
 
-def whole(recipe):
-    return skops_io.dumps(WindowPipeline(recipe))
+OTHER = LogisticRegression().fit([[0.0], [1.0]], [0, 1])
+CALLED = "called"
+
+
+class Bomb:
+    """Leaves a mark when it is unpickled."""
+
+    def __reduce__(self):
+        return os.mkdir, (CALLED,)
+
+
+def pickled_array():
+    """Return a model file with an array of objects, which is a pickle in a file of its own."""
+    objects = io.BytesIO()
+    np.save(objects, np.array([Bomb()], dtype=object), allow_pickle=True)
+    members = members_of(skops_io.dumps(np.arange(3.0)))
+    return archive({name: objects.getvalue() if name.endswith(".npy") else members[name] for name in members})
+
+
+def recipe(first):
+    return skops_io.dumps(WindowPipeline([("first", first), ("last", OTHER)]))
 
 
 @pytest.mark.parametrize(
@@ -95,18 +119,15 @@ def whole(recipe):
         (lambda: skops_io.dumps(OTHER), "holds a LogisticRegression, not a recipe of this package"),
         (lambda: skops_io.dumps({"recipe": 3, "novelty": OTHER}), "holds a int, not a recipe"),
         (lambda: skops_io.dumps(make_recipe("svm")), "holds a recipe that was never fitted"),
+        (lambda: recipe(StandardScaler()), "holds a recipe that was never fitted"),
         (
-            lambda: whole([("scale", StandardScaler()), ("last", OTHER)]),
-            "holds a recipe that was never fitted",
-        ),
-        (
-            lambda: whole(
-                [("make", FunctionTransformer(os.mkdir, kw_args={"path": "called"})), ("last", OTHER)]
-            ),
+            lambda: recipe(FunctionTransformer(os.mkdir, kw_args={"path": CALLED})),
             r"holds posix\.mkdir, a type that models of this package do not hold",
         ),
-        (lambda: archive(b" " * (1 << 20), 17), "unpacks to"),
-        (lambda: archive(b"[" * 100_000, 1), "cannot be loaded"),
+        (lambda: pickle.dumps(Bomb()), "cannot be loaded"),
+        (pickled_array, "cannot be loaded"),
+        (lambda: archive({f"{number}.bin": b" " * (1 << 20) for number in range(17)}), "unpacks to"),
+        (lambda: archive({"schema.json": b"[" * 100_000}), "cannot be loaded"),
     ],
 )
 def test_what_is_no_model_of_this_package_is_named_and_never_called(
@@ -117,60 +138,9 @@ def test_what_is_no_model_of_this_package_is_named_and_never_called(
     put(content())
     with pytest.raises(ModelError, match=sentence):
         read_model(model_dir)
-    assert not (tmp_path / "called").exists()
-
-
-OTHER = LogisticRegression().fit([[0.0], [1.0]], [0, 1])
-
-
-def archive(content, n):
-    """Return an archive of a schema and further members of the same content."""
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
-        for number in range(n):
-            target.writestr(f"{number}.bin" if number else "schema.json", content)
-    return packed.getvalue()
-
-
-class Bomb:
-    """Leaves a mark when it is unpickled."""
-
-    def __init__(self, marker):
-        self.marker = marker
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.marker),)
-
-
-def test_nothing_is_ever_unpickled(model_dir, put, tmp_path):
-    marker = tmp_path / "unpickled"
-    bomb = pickle.dumps(Bomb(marker))
-    put(bomb)
-    with pytest.raises(ModelError, match="cannot be loaded"):
-        read_model(model_dir)
-    # Arrays inside a model file are files of their own, and one of objects is a pickle.
-    objects = io.BytesIO()
-    np.save(objects, np.array([Bomb(marker)], dtype=object), allow_pickle=True)
-    changed = io.BytesIO()
-    put(whole := skops_io.dumps(np.arange(3.0)))
-    with zipfile.ZipFile(io.BytesIO(whole)) as source, zipfile.ZipFile(changed, "w") as target:
-        for name in source.namelist():
-            target.writestr(name, objects.getvalue() if name.endswith(".npy") else source.read(name))
-    put(changed.getvalue())
-    with pytest.raises(ModelError, match="cannot be loaded"):
-        read_model(model_dir)
-    assert not marker.exists()
-    pickle.loads(bomb)
-    assert marker.is_dir()  # the test can fail
-
-
-@pytest.mark.parametrize("missing", [MODEL_FILE, MANIFEST_FILE])
-def test_a_folder_that_lacks_a_file_holds_no_model(model_dir, missing):
-    (model_dir / missing).unlink()
-    with pytest.raises(
-        ModelError, match=r"holds no model of this package \(model\.skops and terrain_model\.json\)"
-    ):
-        read_model(model_dir)
+    assert not (tmp_path / CALLED).exists()
+    pickle.loads(pickle.dumps(Bomb()))
+    assert (tmp_path / CALLED).exists()  # the test can fail
 
 
 def changed(document, **info):
@@ -211,8 +181,11 @@ def test_a_manifest_of_a_stranger_is_one_sentence(model_dir, change, fault):
 
 
 @pytest.mark.parametrize("name", [MODEL_FILE, MANIFEST_FILE])
-def test_a_link_out_of_the_model_folder_is_refused(model_dir, tmp_path, name):
+def test_a_file_that_is_missing_or_a_link_out_of_the_folder_is_refused(model_dir, tmp_path, name):
     (model_dir / name).rename(tmp_path / name)
+    lacks = r"holds no model of this package \(model\.skops and terrain_model\.json\)"
+    with pytest.raises(ModelError, match=lacks):
+        read_model(model_dir)
     (model_dir / name).symlink_to(tmp_path / name)
     with pytest.raises(ModelError, match="is a link that leads out of"):
         read_model(model_dir)
@@ -222,13 +195,12 @@ def test_a_link_out_of_the_model_folder_is_refused(model_dir, tmp_path, name):
     read_model(tmp_path / "link")
 
 
-def test_an_estimator_of_ones_own_is_refused_before_it_is_stored(model_dir, tmp_path):
-    model = read_model(model_dir)
-    recipe = WindowPipeline([*model.recipe.steps[:-1], ("classifier", Foreign())])
-    with pytest.raises(ModelError, match="Foreign cannot be stored: a model file holds only types"):
-        write_model(tmp_path, model._replace(recipe=recipe))
-    assert not list(tmp_path.glob("*.*"))
-
-
 class Foreign(LogisticRegression):
     """Of no library."""
+
+
+def test_an_estimator_of_ones_own_is_refused_before_it_is_stored(model, tmp_path):
+    own = WindowPipeline([*model.recipe.steps[:-1], ("classifier", Foreign())])
+    with pytest.raises(ModelError, match="Foreign cannot be stored: a model file holds only types"):
+        write_model(tmp_path, model._replace(recipe=own))
+    assert not list(tmp_path.glob("*.*"))

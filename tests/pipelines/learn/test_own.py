@@ -32,6 +32,11 @@ number = 3
 """
 
 
+@pytest.fixture(scope="module")
+def windows(runs):
+    return cut_windows(runs, WindowRule()).windows
+
+
 @pytest.fixture
 def in_folder(tmp_path, monkeypatch):
     (tmp_path / "my_terrain.py").write_text(OWN, encoding="utf-8")
@@ -101,8 +106,7 @@ class Names(Margins):
         (Names(), "predict", "each prediction counts as certain"),
     ],
 )
-def test_probabilities_of_any_classifier_are_said_to_be_what_they_are(runs, estimator, outputs, note):
-    windows = cut_windows(runs, WindowRule()).windows
+def test_probabilities_of_any_classifier_are_said_to_be_what_they_are(windows, estimator, outputs, note):
     assert OwnClassifier(estimator).outputs == outputs
     found = cross_validate(estimator, windows, repeats=1, n_jobs=1)
     assert found.accuracy > 0.45
@@ -112,8 +116,7 @@ def test_probabilities_of_any_classifier_are_said_to_be_what_they_are(runs, esti
         assert 0.0 <= found.ece < 0.35
 
 
-def test_estimators_and_recipes_stand_side_by_side_and_learn_from_the_same_windows(runs):
-    windows = cut_windows(runs, WindowRule()).windows
+def test_estimators_and_recipes_stand_side_by_side_and_learn_from_the_same_windows(windows):
     found = cross_validate([LogisticRegression(max_iter=500), "svm"], windows, repeats=1, n_jobs=1)
     assert [each.recipe for each in found.contenders] == ["LogisticRegression", "svm"]
     (pair,) = found.differences
@@ -121,8 +124,7 @@ def test_estimators_and_recipes_stand_side_by_side_and_learn_from_the_same_windo
     assert cross_validate("svm", windows, repeats=1, n_jobs=1).accuracy == pair.accuracy.b
 
 
-def test_held_out_outputs_are_of_whole_runs(runs):
-    windows = cut_windows(runs, WindowRule()).windows
+def test_held_out_outputs_are_of_whole_runs(windows):
     recipe = make_recipe(LogisticRegression(max_iter=500))
     features, y = feature_matrix(recipe, windows), windows.terrain.astype(str)
     fitted = recipe[-1].fit(features, y, groups=windows.run_id)
