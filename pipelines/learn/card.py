@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from pipelines.learn.evaluation import CrossvalResult
+from pipelines.learn.evaluation import PERCENT, CrossvalResult
 from pipelines.learn.model_file import (
     CARD_FILE,
     MODEL_FILE,
@@ -32,15 +32,16 @@ from pipelines.learn.training_data import TrainedRun
 from pipelines.live.model import ModelInfo, assess
 from pipelines.report import (
     NOT_KNOWN,
+    Column,
     Pairs,
     Report,
     Result,
     Section,
+    Table,
     Text,
     described,
     enumerated,
     format_value,
-    plural,
     sentence,
 )
 from terrain.classify.breakaway import Breakaway
@@ -115,22 +116,12 @@ _RECORDS = (
 TrainingRecord.model_rebuild(_types_namespace={kind.__name__: kind for kind in _RECORDS})
 
 
-@dataclass(frozen=True, repr=False)
-class ModelResult(Result):
+@dataclass(frozen=True, repr=False, kw_only=True)
+class ModelResult(ModelInfo, Result):
     """What a model states of itself."""
 
     model: str = described("as it was asked for")
-    recipe: str = described("what was trained")
-    classes: tuple[str, ...] = described("terrains, in the order of the probabilities")
-    window_s: float = described("length of a window", "s")
     windows: str = described("how they are cut")
-    channels: Mapping[str, tuple[str, ...]] = described("channels that a log must have, by stream")
-    rate_hz: Mapping[str, float] = described("their rates", "Hz")
-    robots: tuple[str, ...] = described("robots whose runs it was trained on")
-    filter: str = described("filter whose estimates it uses; empty where it uses none")
-    dataset: str = described("name of the training data")
-    data_digest: str = described("digest of the training runs")
-    commit: str = described("of the code")
     n_training_runs: int = described("runs that it was trained on")
     finds_unknown: bool = described("whether a window may be called unknown")
     counts_support: bool = described("whether it counts training runs near a window's motion")
@@ -155,11 +146,11 @@ def model_result(folder: Path, name: str) -> ModelResult:
     """
     model = read_model(folder)
     info, record = read_training(folder)
-    fields = "recipe classes window_s windows channels rate_hz robots filter dataset data_digest commit"
     files = [file for file in (folder / MODEL_FILE, folder / ONNX_FILE) if file.is_file()]
     return ModelResult(
+        **vars(info),
         model=name,
-        **{field: getattr(info, field) for field in fields.split()},
+        windows=info.cut_words,
         n_training_runs=len(info.run_digests),
         finds_unknown=model.novelty is not None,
         counts_support=model.support is not None,
@@ -187,7 +178,7 @@ def read_training(folder: Path) -> tuple[ModelInfo, TrainingRecord | None]:
         raise ModelError(f"{folder / TRAINING_FILE}: is no record of a training ({text})") from None
 
 
-def write_training(folder: Path, name: str, record: TrainingRecord) -> None:
+def write_training(folder: Path, name: str, record: TrainingRecord) -> ModelResult:
     """Write how a model was trained, and its card, beside the model; the time of one window is measured here."""
     from pipelines.report.markdown import markdown_text
     from terrain.classify.network_onnx import time_of_onnx
@@ -208,8 +199,10 @@ def write_training(folder: Path, name: str, record: TrainingRecord) -> None:
     record = record.model_copy(update=timed)
     atomic_write(folder / TRAINING_FILE, record.model_dump_json(indent=1) + "\n")
     seal(folder, model.info)
-    atomic_write(folder / CARD_FILE, markdown_text(model_result(folder, name).report))
+    result = model_result(folder, name)
+    atomic_write(folder / CARD_FILE, markdown_text(result.report))
     seal(folder, model.info)
+    return result
 
 
 def limits_of(
@@ -274,19 +267,22 @@ def report(result: ModelResult) -> Report:
         "What it needs and gives",
     )
     title, next_step = f"Model {result.model}", f"terrain predict --data runs/ --model {result.model}"
-    lead = (
-        f"recipe {result.recipe}, windows of {result.window_s:g} s, "
-        f"{plural(result.n_training_runs, 'training run')}"
-    )
     training = result.training
     if training is None:
+        lead = f"recipe {result.recipe}, windows of {result.window_s:g} s"
         answer = f"A model for {enumerated(result.classes)} that was not evaluated when it was stored."
         return Report(title, answer, parts=[uses], lead=lead, next_step=next_step)
     evaluated, limits = training.evaluation.report, [Text(text) for text in training.limits]
+    chosen = ", ".join(f"{name} {format_value(value)}" for name, value in training.chosen.items())
+    worth = Table(
+        ("channel", Column("drop", PERCENT), Column("std over folds", PERCENT)),
+        training.importance,
+        note="By how much balanced accuracy on held-out runs drops when it is shuffled.",
+    )
     timed = f"median of {N_TIMED}, on the machine that trained it"
     made = Pairs(
         [
-            ("chosen", chosen_words(training.chosen) or NOT_KNOWN),
+            ("chosen", chosen or NOT_KNOWN),
             ("data", f"{result.dataset} ({result.data_digest[:12]})"),
             ("windows", result.windows),
             (f"time of one window, {timed}", training.latency_ms, ".2f", "ms"),
@@ -301,7 +297,7 @@ def report(result: ModelResult) -> Report:
     return Report(
         title=title,
         answer=evaluated.answer,
-        lead=lead,
+        lead=evaluated.lead,
         picture=evaluated.picture,
         parts=[*evaluated.parts[:1], Section("Not for", limits[:3])],
         details=[
@@ -309,12 +305,8 @@ def report(result: ModelResult) -> Report:
             Section("Notes", evaluated.parts[1:]),
             Section("Needs", [uses]),
             Section("Made", [made]),
+            Section("Channels", [worth]),
             *evaluated.details,
         ],
         next_step=next_step,
     )
-
-
-def chosen_words(chosen: Mapping[str, Any]) -> str:
-    """Return hyper-parameters in words."""
-    return ", ".join(f"{name} {format_value(value)}" for name, value in chosen.items())

@@ -77,7 +77,7 @@ def scope_of(info: ModelInfo) -> dict[str, str]:
     return {
         "robots": ", ".join(sorted(info.robots)),
         "classes": ", ".join(sorted(info.classes)),
-        "windows": info.windows,
+        "windows": info.cut_words,
         "channels": digest,
     }
 

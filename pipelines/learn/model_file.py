@@ -96,6 +96,7 @@ def model_info(layout: Layout, rule: WindowRule, terrain: Array, **known: Any) -
         steady=rule.steady,
         channels={stream: tuple(names) for stream, names in layout.channels.items()},
         rate_hz=dict(layout.rate_hz),
+        run_accuracy={},
         package_version=__version__,
         class_ratio=dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True)),
         **known,

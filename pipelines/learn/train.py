@@ -19,27 +19,14 @@ from pipelines.data.settings import AlignedRunsSettings, load
 from pipelines.learn.parallel import ComputeSettings
 from pipelines.learn.settings import FEATURE_RECIPE, RecipeSettings
 from pipelines.learn.tracking import Registered
-from pipelines.report import (
-    Column,
-    Pairs,
-    Part,
-    Progress,
-    Report,
-    Section,
-    Table,
-    Text,
-    described,
-    format_value,
-    interval,
-    plural,
-    silent,
-)
+from pipelines.report import Progress, Report, Section, Text, described, format_value, plural, silent
 from pipelines.report.settings import setting
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from pipelines.learn.card import ModelResult
     from pipelines.learn.champion import Bench
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.search import SearchResult
@@ -105,7 +92,10 @@ class Settings(TrainingSettings, AlignedRunsSettings, ComputeSettings):
 
 @dataclass(frozen=True, repr=False)
 class TrainResult(Registered):
-    """A trained and registered model, and the evaluation that it is judged by."""
+    """A trained and registered model, and the evaluation that it is judged by.
+
+    ``ui``, what shows the store, and ``card`` are shown and not in JSON.
+    """
 
     dataset: str = described("name of the data")
     data_digest: str = described("digest of the runs")
@@ -116,16 +106,14 @@ class TrainResult(Registered):
     crossval: CrossvalResult = described("evaluation on held-out runs")
     skipped: tuple[str, ...] | None = described("runs that a repairing reader had to skip", default=None)
     search: SearchResult | None = described("of hyper-parameters; None without one", default=None)
-    ui: str = described("what shows the store; not in JSON", default="")
+    ui: str = ""
+    card: ModelResult | None = None
 
     def as_json(self) -> Any:
-        """Return all fields but those that are not known."""
+        """Return all described fields but those that are not known."""
         shown = replace(self, crossval=replace(self.crossval, dataset=None, data_digest=None, skipped=None))
-        return {
-            name: value
-            for name, value in Registered.as_json(shown).items()
-            if name != "ui" and not (name in ("skipped", "search") and value is None)
-        }
+        written = Registered.as_json(shown).items()
+        return {name: value for name, value in written if value is not None}
 
     def to_pandas(self) -> pd.DataFrame:
         """Return precision, recall and F1 of each terrain on held-out runs."""
@@ -260,7 +248,7 @@ def train(
     with TemporaryDirectory() as place:
         folder = settings.out or Path(place)
         write_model(folder, model._replace(info=info))
-        write_training(folder, settings.name, record)
+        card = write_training(folder, settings.name, record)
         registered = _registered(settings, folder, Bench(data, held_out, settings.seed), pictures)
     return TrainResult(
         **vars(registered),
@@ -273,6 +261,7 @@ def train(
         crossval=evaluation,
         search=searched,
         ui=ui_line(),
+        card=card,
     )
 
 
@@ -350,49 +339,26 @@ def _evaluated(
 
 
 def report(result: TrainResult | RegisterResult) -> Report:
-    """Return where the model is, how good it is on held-out runs, and what its channels are worth."""
+    """Return where the model is, and its card: how good it is on held-out runs, and what it is not for."""
     verdict = "champion" if result.alias_moved else "not champion"
     registered = f"{result.model_uri} is registered, {verdict}: {result.alias_reason}"
     if isinstance(result, RegisterResult):
-        return Report(
-            f"Model of {result.folder}",
-            f"{registered}.",
-            next_step=f"terrain inspect {result.model_uri}",
-        )
-    from pipelines.learn.card import chosen_words
-
-    evaluated = result.crossval.report
-    accuracy = format_value(result.crossval.accuracy, PERCENT)
-    parts: list[Part] = [
-        Pairs([("hyper-parameters", chosen_words(result.chosen) or "none")]),
-        Text(f"tracked, to be seen by: {result.ui}"),
-    ]
+        next_step = f"terrain inspect {result.model_uri}"
+        return Report(f"Model of {result.folder}", f"{registered}.", next_step=next_step)
+    assert result.card is not None
+    card, parts = result.card.report, [Text(f"tracked, to be seen by: {result.ui}")]
     if result.search is not None:
-        parts.append(
-            Pairs([("searched", result.search.trials), ("use them", f"--params {result.search.params_file}")])
-        )
-    return Report(
+        n_trials, file = result.search.trials, result.search.params_file
+        parts.append(Text(f"hyper-parameters of {n_trials} trials, to be used again by --params {file}"))
+    return replace(
+        card,
         title=f"Training on {result.dataset}",
-        answer=(
-            f"{registered}; {accuracy} of windows of held-out runs classified correctly "
-            f"({interval(*result.crossval.accuracy_ci, PERCENT)}, 95 % over runs)."
-        ),
-        lead=evaluated.lead,
-        picture=evaluated.picture,
-        parts=[*evaluated.parts[:1], *parts, *(Text(text, "note") for text in result.crossval.notes[:3])],
-        details=[
-            Section(
-                "Channels",
-                [
-                    Table(
-                        ("channel", Column("drop", PERCENT), Column("std over folds", PERCENT)),
-                        result.importance,
-                        note="By how much balanced accuracy on held-out runs drops when it is shuffled.",
-                    )
-                ],
-            ),
-            Section("Notes", evaluated.parts[1:]),
-            *evaluated.details,
+        answer=f"{registered}; {card.answer}",
+        parts=[
+            *card.parts[:1],
+            *parts,
+            *(Text(text, "note") for text in result.crossval.notes[:3]),
         ],
+        details=[Section("Limits", card.parts[1:]), *card.details],
         next_step=f"terrain predict --data runs/ --model {result.model_uri}",
     )

@@ -9,13 +9,14 @@ terrain like this (:mod:`terrain.classify.support`).  Of windows of known terrai
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
+from pipelines.report import described
 from terrain.classify.conformal import conformal_sets
 from terrain.classify.novelty_numbers import NoveltyNumbers, novelty_scores
 from terrain.classify.support import SupportTable, support_of
@@ -23,45 +24,31 @@ from terrain.classify.terrain_filter import TerrainFilter
 from terrain.records import Array, Windows
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ModelInfo:
-    """How the training windows of a model were cut, as those of a new log must be, and where they came from.
+    """How the training windows of a model were cut, as those of a new log must be, and where they came from."""
 
-    Parameters
-    ----------
-    classes : in the order of the probabilities
-    window_s, stride_s, steady : the rule of the windows
-    channels, rate_hz : by stream, which a log must have
-    run_digests : of each training run
-    recipe, signal_sets, seed : what was trained
-    data_digest, dataset : of the training runs
-    commit, package_version : of the code
-    robots : whose runs the training runs were, by name
-    filter : that made the streams ``estimator`` and ``slip``; empty where the model uses neither
-    class_ratio : share of each class among the training windows
-    run_accuracy : of the windows of each training run when it was held out, by its digest
-    conformal : threshold of the sets of classes; None where there is none
-    """
-
-    classes: tuple[str, ...]
-    window_s: float
-    stride_s: float | None
-    steady: SteadyMotion | None
-    channels: Mapping[str, tuple[str, ...]]
-    rate_hz: Mapping[str, float]
-    run_digests: tuple[str, ...]
-    recipe: str = ""
-    signal_sets: tuple[str, ...] = ()
-    seed: int = 0
-    data_digest: str = ""
-    dataset: str = ""
-    commit: str = ""
-    package_version: str = ""
-    robots: tuple[str, ...] = ()
-    filter: str = ""
-    class_ratio: Mapping[str, float] = field(default_factory=dict)
-    run_accuracy: Mapping[str, float] = field(default_factory=dict)
-    conformal: float | None = None
+    classes: tuple[str, ...] = described("terrains, in the order of the probabilities")
+    class_ratio: Mapping[str, float] = described("share of each terrain among the training windows")
+    window_s: float = described("length of a window", "s")
+    stride_s: float | None = described("from window to window; one length where it is none", "s")
+    steady: SteadyMotion | None = described("limits of steady motion; None where all windows are kept")
+    channels: Mapping[str, tuple[str, ...]] = described("channels that a log must have, by stream")
+    rate_hz: Mapping[str, float] = described("their rates", "Hz")
+    run_digests: tuple[str, ...] = described("digest of each training run")
+    run_accuracy: Mapping[str, float] = described(
+        "accuracy on each training run when it was held out, by its digest", "1"
+    )
+    package_version: str = described("of the package that trained it")
+    recipe: str = described("what was trained")
+    signal_sets: tuple[str, ...] = described("whose channels the features use")
+    seed: int = described("deals runs into folds")
+    data_digest: str = described("digest of the training runs", default="")
+    dataset: str = described("name of the training data", default="")
+    commit: str = described("of the code", default="")
+    robots: tuple[str, ...] = described("robots whose runs it was trained on", default=())
+    filter: str = described("filter whose estimates it uses; empty where it uses none", default="")
+    conformal: float | None = described("threshold of the sets of terrains, None without", default=None)
 
     @property
     def layout(self) -> Layout:
@@ -74,7 +61,7 @@ class ModelInfo:
         return WindowRule(self.window_s, self.stride_s, self.steady)
 
     @property
-    def windows(self) -> str:
+    def cut_words(self) -> str:
         """How windows must be cut, in words."""
         motion = "all motion" if self.steady is None else "steady motion"
         return f"{self.window_s:g} s every {self.rule.step_s:g} s, {motion}"
