@@ -1,16 +1,21 @@
-"""Recipes by the options of a command, and what a text names in a module of one's own."""
+"""Recipes by the options of a command, hyper-parameters of a file, and what a text names in a module of one's own."""
 
 from __future__ import annotations
 
 import importlib
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NamedTuple
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from features.recipes import WindowPipeline, make_recipe
 from pipelines.learn.settings import FEATURE_RECIPE, WITHOUT_SVM, LearnSettings
 from terrain.classify.svm import Candidate
 from terrain.errors import ConfigError
+from terrain.files.documents import MAX_JSON_BYTES, parse_document
+from terrain.files.names import printable
+from terrain.files.regular import read_regular
 
 
 def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipeline:
@@ -31,8 +36,6 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     if ":" in name or settings.feature:
         options["functions"] = [load_named(each) for each in settings.feature]
     if settings.params is not None and name not in WITHOUT_SVM:
-        from pipelines.learn.search import read_params
-
         options["candidates"] = (Candidate(*read_params(settings.params)),)
     return make_recipe(
         load_named(name) if ":" in name else name,
@@ -41,6 +44,38 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
         seed=settings.seed,
         **options,
     )
+
+
+class SvmParams(NamedTuple):
+    """Hyper-parameters of the SVM, as :class:`terrain.classify.svm.Candidate`."""
+
+    C: Annotated[float, Field(gt=0.0, le=1e6)]
+    gamma: Annotated[float, Field(gt=0.0, le=1e3)]
+    percentile: Annotated[float, Field(gt=0.0, le=100.0)]
+
+
+class BestFile(BaseModel):
+    """What ``--params`` reads of the file of a search."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    version: Literal[1]
+    params: SvmParams
+
+
+def read_params(file: Path) -> SvmParams:
+    """Return the hyper-parameters of a file that a search wrote.
+
+    Raises
+    ------
+    ConfigError
+        if it is no such file, of another version, or has an unknown or impossible hyper-parameter.
+    """
+    content = read_regular(file, str(file), ConfigError, MAX_JSON_BYTES)
+    try:
+        return parse_document(content, BestFile).params
+    except ValueError as error:
+        raise ConfigError(f"{file}: is no result of a search ({printable(str(error))[:200]})") from None
 
 
 def load_named(text: str) -> Any:

@@ -12,15 +12,14 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
+from pydantic import TypeAdapter
 
+from pipelines.learn.recipes import SvmParams
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
-from terrain.files.documents import MAX_JSON_BYTES, parse_document
 from terrain.files.names import printable
-from terrain.files.regular import read_regular
 
 if TYPE_CHECKING:
     from pipelines.learn.training_data import TrainingData
@@ -39,38 +38,6 @@ N_INNER_FOLDS = 5
 BEST_FILE, TRIALS_FILE, STUDY_FILE = "best.json", "trials.jsonl", "search.json"
 VERSION = 1
 N_DRAWS = 1000
-
-
-class SvmParams(NamedTuple):
-    """Hyper-parameters of the SVM, as :class:`terrain.classify.svm.Candidate`."""
-
-    C: Annotated[float, Field(gt=0.0, le=1e6)]
-    gamma: Annotated[float, Field(gt=0.0, le=1e3)]
-    percentile: Annotated[float, Field(gt=0.0, le=100.0)]
-
-
-class BestFile(BaseModel):
-    """What ``--params`` reads of the file of a search."""
-
-    model_config = ConfigDict(extra="ignore")
-
-    version: Literal[1]
-    params: SvmParams
-
-
-def read_params(file: Path) -> SvmParams:
-    """Return the hyper-parameters of a file that a search wrote.
-
-    Raises
-    ------
-    ConfigError
-        if it is no such file, of another version, or has an unknown or impossible hyper-parameter.
-    """
-    content = read_regular(file, str(file), ConfigError, MAX_JSON_BYTES)
-    try:
-        return parse_document(content, BestFile).params
-    except ValueError as error:
-        raise ConfigError(f"{file}: is no result of a search ({printable(str(error))[:200]})") from None
 
 
 class Trial(NamedTuple):

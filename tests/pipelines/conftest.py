@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from features.windows import cut_windows
 from pipelines.cli import main as cli
 from pipelines.data.can_codec import QUATERNION, RECEIVED, SIGNALS, encode
 from pipelines.learn.model_file import read_model
@@ -70,6 +71,12 @@ def refused(terrain, place):
 def files_of(folder):
     """Return what lies under a folder, with the content of files."""
     return {path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))}
+
+
+@pytest.fixture(scope="session")
+def windows(runs):
+    """The windows of ``runs`` by the default rule."""
+    return cut_windows(runs).windows
 
 
 @pytest.fixture(scope="session")

@@ -5,12 +5,11 @@ import os
 import weakref
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from features.motion import Motion, window_motion
+from features.motion import window_motion
 from features.protocols import samples_of
 from features.recipes import feature_matrix
 from pipelines.data.datasets import load_runs, run_loaders
@@ -19,7 +18,7 @@ from pipelines.learn.cache import cached_data
 from pipelines.learn.crossval import EvaluationSettings, Settings
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
-from pipelines.learn.training_data import TrainingData, data_of_runs, same_features
+from pipelines.learn.training_data import data_of_runs, same_features
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.digest import joint_digest
 from terrain.logs.write import write_run
@@ -38,23 +37,17 @@ def runs_dir(tmp_path, make_run):
     return tmp_path / "runs"
 
 
-class Cached(NamedTuple):
-    """What a cache gives, and how many runs it had to compute."""
-
-    data: TrainingData
-    skipped: list
-    n_computed: int
-
-
 @pytest.fixture
 def cached(runs_dir, tmp_path):
-    """Return a function that reads the runs through a cache."""
+    """Return a function that reads the runs through a cache: data, skipped runs, and how many were computed."""
 
     def cached(settings=SETTINGS, folder="cache", recipe="svm", **options):
-        left = []
-        loaders = run_loaders(runs_dir, **options)
-        progress = lambda task, done, total: left.append(total - done) if task == "features" else None  # noqa: E731
-        return Cached(*cached_data(loaders, settings, tmp_path / folder, progress, recipe), left[0])
+        left, loaders = [], run_loaders(runs_dir, **options)
+
+        def progress(task, done, total):
+            left.extend([total - done] if task == "features" else [])
+
+        return *cached_data(loaders, settings, tmp_path / folder, progress, recipe), left[0]
 
     return cached
 
@@ -67,22 +60,21 @@ def test_cached_features_are_those_of_the_runs_bit_for_bit(runs_dir, cached):
     samples = samples_of(load_runs(runs_dir), SETTINGS.rule)
     features, motion = feature_matrix(recipe_of(SETTINGS), samples.windows), window_motion(samples.windows)
     for n_computed in (8, 0):
-        found = cached()
-        assert found.n_computed == n_computed
-        assert found.data.features.tobytes() == features.tobytes()
+        found, _, n = cached()
+        assert n == n_computed
+        assert found.features.tobytes() == features.tobytes()
         for name in ("start_s", "run_id", "terrain"):
-            there, here = getattr(found.data.samples.windows, name), getattr(samples.windows, name)
-            assert there.tolist() == here.tolist()
-        for name in Motion._fields:
-            assert getattr(found.data.motion, name).tobytes() == getattr(motion, name).tobytes()
-    assert cached(SETTINGS.with_(window_s=1.0)).n_computed == 8  # beside the first
-    assert cached().n_computed == 0
+            assert getattr(found.samples.windows, name).tolist() == getattr(samples.windows, name).tolist()
+        for there, here in zip(found.motion, motion, strict=True):
+            assert there.tobytes() == here.tobytes()
+    assert cached(SETTINGS.with_(window_s=1.0))[2] == 8  # beside the first
+    assert cached()[2] == 0
 
 
 @pytest.mark.parametrize("recipe", ["svm", "svm@imu"])
 def test_what_is_trained_is_the_same_from_two_processes(runs_dir, cached, recipe):
     asked = RecipeSettings(**SETTINGS.with_(n_jobs=2).shared(), recipe=recipe)
-    there, here = cached(asked, recipe=recipe).data, data_of_runs(load_runs(runs_dir), asked)
+    there, here = cached(asked, recipe=recipe)[0], data_of_runs(load_runs(runs_dir), asked)
     assert there.runs == here.runs
     fitted = [
         each.recipe[-1].fit(each.rows, each.samples.terrain, here.samples.run_id) for each in (there, here)
@@ -93,7 +85,7 @@ def test_what_is_trained_is_the_same_from_two_processes(runs_dir, cached, recipe
 
 
 def test_an_interrupted_cache_goes_on_and_ends_the_same(cached, tmp_path, monkeypatch):
-    whole, usual, done = cached(folder="whole"), cache._store_run, []
+    whole, usual, done = cached(folder="whole")[0], cache._store_run, []
 
     def interrupted(*given):
         if len(done) == 3:
@@ -104,14 +96,14 @@ def test_an_interrupted_cache_goes_on_and_ends_the_same(cached, tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         cached()
     monkeypatch.setattr(cache, "_store_run", usual)
-    found = cached()
-    assert found.n_computed == 5
-    assert found.data.features.tobytes() == whole.data.features.tobytes()
+    found, _, n_computed = cached()
+    assert n_computed == 5
+    assert found.features.tobytes() == whole.features.tobytes()
     assert files_of(tmp_path / "cache") == files_of(tmp_path / "whole")
 
 
 def test_a_damaged_file_is_made_again(cached, tmp_path):
-    whole, before = cached(), files_of(tmp_path / "cache")
+    whole, before = cached()[0], files_of(tmp_path / "cache")
     for damage in ("cut", "flip", "empty", "gone"):
         for kind in ("features", "runs"):
             file = sorted((tmp_path / "cache" / kind).iterdir())[3]
@@ -119,9 +111,9 @@ def test_a_damaged_file_is_made_again(cached, tmp_path):
             content[len(content) // 2] ^= 1
             cut = {"cut": bytes(content[:-9]), "flip": bytes(content), "empty": b"", "gone": None}[damage]
             file.unlink() if cut is None else file.write_bytes(cut)
-        found = cached()
-        assert found.n_computed == 1
-        assert found.data.features.tobytes() == whole.data.features.tobytes()
+        found, _, n_computed = cached()
+        assert n_computed == 1
+        assert found.features.tobytes() == whole.features.tobytes()
         assert files_of(tmp_path / "cache") == before
 
 
@@ -165,9 +157,9 @@ def test_runs_with_the_same_measurements_are_named_until_one_is_left_out(runs_di
             cached()
         assert len(str(refusal.value).splitlines()) == 1
     asked = partial(Settings, data=runs_dir, **OPTIONS)
-    found = cached(asked(without=("again",)))
-    assert found.data.digest == joint_digest([run.digest for run in found.data.runs])
-    assert len(found.data.runs) == 8
+    found = cached(asked(without=("again",)))[0]
+    assert found.digest == joint_digest([run.digest for run in found.runs])
+    assert len(found.runs) == 8
     with pytest.raises(ConfigError, match="--only: there is no run 'LAVA'"):
         cached(asked(only=("LAVA",)))
 
@@ -176,9 +168,9 @@ def test_what_cannot_be_read_is_refused_or_skipped(runs_dir, cached, tmp_path):
     (runs_dir / "ICE_1" / "run.json").write_text("{")
     with pytest.raises(LogError, match=r"ICE_1"):
         cached()
-    found = cached(repair=True)
-    assert len(found.data.runs) == 7
-    assert found.skipped[0].startswith("run skipped: ")
+    found, skipped, _ = cached(repair=True)
+    assert len(found.runs) == 7
+    assert skipped[0].startswith("run skipped: ")
     (tmp_path / "file").write_text("mine")
     with pytest.raises(ConfigError, match=r"--cache .*file: is no folder"):
         cached(folder="file")

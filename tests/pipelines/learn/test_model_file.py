@@ -13,7 +13,7 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from skops import io as skops_io
 
 from features.recipes import WindowPipeline, make_recipe
-from features.windows import SteadyMotion, WindowRule, cut_windows
+from features.windows import SteadyMotion, WindowRule
 from pipelines.learn.model_file import (
     MANIFEST_FILE,
     MODEL_FILE,
@@ -38,8 +38,7 @@ def put(model_dir):
     return put
 
 
-def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, runs, model):
-    windows = cut_windows(runs, model.info.rule).windows
+def test_a_saved_model_predicts_the_same_to_the_last_bit(model_dir, windows, model):
     live = make_recipe("svm").fit(windows, windows.terrain.astype(str))
     assert np.array_equal(model.recipe.predict_proba(windows), live.predict_proba(windows))
     assert model.recipe.classes_.tolist() == list(model.info.classes) == ["ASPHALT", "GRASS", "GRAVEL"]

@@ -11,15 +11,9 @@ import pytest
 from skops import io
 
 from features.recipes import feature_matrix, make_recipe
-from features.windows import WindowRule, cut_windows
 from pipelines.learn.model_file import MODEL_FILE, ONNX_FILE, TRUSTED_TYPES, read_model, seal, write_model
 from terrain.classify.network_onnx import network_onnx, time_of_onnx
 from terrain.errors import ConfigError, ModelError
-
-
-@pytest.fixture(scope="module")
-def windows(runs):
-    return cut_windows(runs, WindowRule()).windows
 
 
 def quick(name):
@@ -88,20 +82,13 @@ def test_onnx_computes_the_network(folder, fitted, windows):
         session.run(None, {stream: values[:, 1:] for stream, values in inputs.items()})
 
 
-@with_network
-def test_a_damaged_onnx_file_is_refused_in_one_sentence(folder):
-    file = folder / ONNX_FILE
-    content = bytearray(file.read_bytes())
-    content[len(content) // 2] ^= 1
-    file.write_bytes(content)
-    with pytest.raises(ModelError, match=r"network\.onnx: is damaged"):
-        read_model(folder)
-
-
 @pytest.mark.parametrize("fitted", ["cnn"], indirect=True)
 def test_numbers_of_a_network_that_a_checksum_covers_up_end_in_one_sentence(folder):
     file, info = folder / ONNX_FILE, read_model(folder).info
     whole = file.read_bytes()
+    file.write_bytes(whole[:-1])
+    with pytest.raises(ModelError, match=r"network\.onnx: is damaged"):
+        read_model(folder)
     names = [
         each.name for each in onnx.load_from_string(whole).graph.initializer if not each.name[1:].isdigit()
     ]

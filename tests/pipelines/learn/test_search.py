@@ -6,7 +6,8 @@ import sys
 import numpy as np
 import pytest
 
-from pipelines.learn.search import STUDY_FILE, TRIALS_FILE, read_params, search
+from pipelines.learn.recipes import read_params
+from pipelines.learn.search import STUDY_FILE, TRIALS_FILE, search
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_runs
 from pipelines.report import silent
