@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -48,11 +49,10 @@ class TrainedRun(NamedTuple):
 
 def trained_runs(runs: Iterable[tuple[str, str, str, str]], samples: Samples) -> tuple[TrainedRun, ...]:
     """Return what is kept of runs, given by their first four fields, in a model trained on their windows."""
-    found = []
-    for run in runs:
-        terrain = samples.terrain[samples.run_id == run[0]]
-        found.append(TrainedRun(*run, ", ".join(np.unique(terrain).tolist()), len(terrain)))
-    return tuple(found)
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    for run_id, terrain in zip(samples.run_id.tolist(), samples.terrain.tolist(), strict=True):
+        counts[run_id][terrain] += 1
+    return tuple(TrainedRun(*run, ", ".join(sorted(counts[run[0]])), counts[run[0]].total()) for run in runs)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
