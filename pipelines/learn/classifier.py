@@ -17,7 +17,6 @@ from features.recipes import make_recipe
 from features.windows import WindowRule
 from pipelines.learn.model_file import MANIFEST_FILE, model_info, read_model, write_model
 from pipelines.learn.training_data import with_limits
-from pipelines.live.model import TerrainModel
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
