@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines import report as reports
-from pipelines.data.layouts import Target
-from pipelines.data.settings import MAPPING_TEXT, ROBOT_TEXT, RunsSettings, load
+from pipelines.data.datasets import load, verdict
+from pipelines.data.settings import MAPPING_TEXT, ROBOT_TEXT, RunsSettings, Target
 from pipelines.report import Progress, Report, Result, Table, Text, described, plural, silent
 from pipelines.report.settings import setting
 from terrain.errors import LogError, TerrainError
@@ -89,7 +89,6 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
     TerrainError
         if ``out`` cannot be written.
     """
-    from pipelines.data.datasets import verdict
     from pipelines.data.run_writers import target_place, write
     from terrain.files.atomic import atomic_write
     from terrain.logs.digest import data_digest

@@ -9,15 +9,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipelines.data.layouts import ACCEPTED, LAYOUTS
+from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
 from terrain.errors import ConfigError, LogError
-from terrain.logs.spelling import one_spelling
-from terrain.records import RunLog
 
 if TYPE_CHECKING:
     from terrain.logs.checks import Check
     from terrain.logs.drive import DriveRobot
+    from terrain.records import RunLog
     from terrain.robots import Robot
+
+    Readers = list[Callable[..., RunLog]]
+    """One a run; called with ``repair=``."""
 
 CAN_ROBOT = "agrimaro"
 """Robot of a log of a CAN bus where none is named."""
@@ -25,14 +27,20 @@ CAN_ROBOT = "agrimaro"
 DRIVE_ROBOT = "husky"
 """Robot of a log of DRIVE where none is named: that of the log that was published with the paper."""
 
-Readers = list[Callable[..., RunLog]]
-"""One a run; called with ``repair=``."""
+ACCEPTED = (
+    "accepted are run folders (run.json), the BorealTC layout (<CLASS>/imu_N.csv and pro_N.csv), "
+    "the DRIVE layout (samples.csv.gz, or folders of sessions with one each), its whole recordings "
+    "(<robot>_<terrain>/*.csv.gz), the Robotino layout (camera_params.json over folders of .csv.gz), "
+    "the wheel testbed's (smooth.csv, grouser.csv), MCAP files and ROS 2 bags, and "
+    "any CSV with a mapping file"
+)
+"""What a refusal lists."""
 
 _log = logging.getLogger(__name__)
 
 
 class RunLoader(NamedTuple):
-    """Reads one run of a data set as :func:`load_runs` gives it; it can be sent to another process.
+    """Reads one run of a data set as :func:`load` gives it; it can be sent to another process.
 
     Parameters
     ----------
@@ -75,15 +83,19 @@ class RunLoader(NamedTuple):
         return None if self.repair or self.align else self.run_folder
 
 
+class LoadedRuns(NamedTuple):
+    """Runs, and a sentence for each run that a repairing read had to skip."""
+
+    runs: list[RunLog]
+    skipped: list[str]
+
+
 def load_runs(
     folder: str | Path,
     *,
-    layout: str = "auto",
-    mapping: str | Path | None = None,
-    repair: bool = False,
-    align: bool = False,
     robot: str | Path | None = None,
     on_skip: Callable[[str], None] = _log.warning,
+    **reading: Any,
 ) -> list[RunLog]:
     """Return the runs that lie under a folder, sorted by their id.
 
@@ -92,14 +104,29 @@ def load_runs(
     folder : a run folder, a folder of run folders, a folder in the BorealTC or the DRIVE layout (a session,
         or folders of sessions), or the folder that the files of ``mapping`` or bags are found under; or an
         MCAP file
-    layout : one of :data:`~pipelines.data.layouts.LAYOUTS`; ``auto`` looks
+    robot : the robot of logs that do not name theirs, by name or its YAML file; of those of DRIVE
+        :data:`DRIVE_ROBOT` by default
+    on_skip : called with a sentence for each run that is skipped when repairing; logs a warning by default
+    layout : one of :data:`~pipelines.data.settings.Layout`; ``auto`` looks, as by default
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
         their DBC, by default AgriMaRo's; of bags their topics (``terrain.logs.topic_mapping``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
-    robot : the robot of logs that do not name theirs, by name or its YAML file; of those of DRIVE
-        :data:`DRIVE_ROBOT` by default
-    on_skip : called with a sentence for each run that is skipped when repairing; logs a warning by default
+
+    Raises
+    ------
+    LogError, ConfigError, DataError
+        as :func:`load`.
+    """
+    name = None if robot is None else str(robot)
+    runs, skipped = load(AlignedRunsSettings(data=Path(folder), robot=name, **reading))
+    for sentence in skipped:
+        on_skip(sentence)
+    return runs
+
+
+def load(settings: RunsSettings) -> LoadedRuns:
+    """Return the runs of the settings, sorted by their id.
 
     Raises
     ------
@@ -107,56 +134,55 @@ def load_runs(
         if nothing readable is there, a run cannot be read, two runs have one id, layouts are mixed, or a
         terrain has two spellings.
     ConfigError
-        if the layout is unknown, the mapping is not accepted, or a robot is unknown (to align, or to turn
-        motor rates into wheel speeds).
+        if the mapping is not accepted, or a robot is unknown (to align, or to turn motor rates into wheel
+        speeds).
     DataError
         if a run that is to be aligned has no gyro or no wheel speeds.
     """
+    from terrain.logs.spelling import one_spelling
+
+    folder, repair = settings.data, settings.repair
     runs: list[RunLog] = []
-    skipped: list[str] = []
+    faults: list[str] = []
     places: dict[str, list[str]] = {}
-    for load in run_loaders(folder, layout=layout, mapping=mapping, repair=repair, align=align, robot=robot):
+    for loader in run_loaders(settings):
         try:
-            run = load()
+            run = loader()
         except LogError as error:
             if not repair:
                 raise
-            on_skip(f"run skipped: {error}")
-            skipped.append(str(error))
+            faults.append(str(error))
             continue
         runs.append(run)
-        places.setdefault(run.run_id, []).append(str(load.run_folder or run.source))
+        places.setdefault(run.run_id, []).append(str(loader.run_folder or run.source))
     if not runs:
-        raise LogError(f"{folder}: not one run could be read, the first for this: {skipped[0]}")
+        raise LogError(f"{folder}: not one run could be read, the first for this: {faults[0]}")
     for run_id, found in places.items():
         if len(found) > 1:
             raise LogError(f"{folder}: {len(found)} runs have the id {run_id!r} ({' and '.join(found)})")
-    return sorted(one_spelling(str(folder), runs, repair=repair), key=lambda run: run.run_id)
+    runs = sorted(one_spelling(str(folder), runs, repair=repair), key=lambda run: run.run_id)
+    if isinstance(settings, AlignedRunsSettings):
+        runs = chosen_runs(runs, settings)
+    return LoadedRuns(runs, [f"run skipped: {fault}" for fault in faults])
 
 
-def run_loaders(
-    folder: str | Path,
-    *,
-    layout: str = "auto",
-    mapping: str | Path | None = None,
-    repair: bool = False,
-    align: bool = False,
-    robot: str | Path | None = None,
-) -> list[RunLoader]:
-    """Return what reads each run under a folder, without reading any; parameters as :func:`load_runs`.
+def run_loaders(settings: RunsSettings) -> list[RunLoader]:
+    """Return what reads each run of the settings, without reading any.
 
     Raises
     ------
     LogError, ConfigError
-        as :func:`load_runs`, where no run is found or a setting is not accepted.
+        as :func:`load`, where no run is found or a setting is not accepted.
     """
     from terrain.robots import load_robot
 
-    given = None if robot is None else load_robot(robot)
-    readers = _readers(Path(folder), layout, mapping, given)
+    name: str | None = getattr(settings, "robot", None)
+    robot = None if name is None else load_robot(name)
+    readers = _readers(settings.data, settings.layout, settings.mapping, robot)
     if not readers:
-        raise LogError(f"{folder}: holds no run; {ACCEPTED}")
-    return [RunLoader(read, repair, align, given) for read in readers]
+        raise LogError(f"{settings.data}: holds no run; {ACCEPTED}")
+    align = isinstance(settings, AlignedRunsSettings) and settings.align
+    return [RunLoader(read, settings.repair, align, robot) for read in readers]
 
 
 def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
@@ -182,8 +208,6 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
 
 def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot | None) -> Readers:
     """Return the readers of a layout, which ``auto`` finds; none where there is no run."""
-    if layout not in LAYOUTS:
-        raise ConfigError(f"layout {layout!r} is unknown: choose one of {', '.join(LAYOUTS)}")
     if not folder.exists():
         raise LogError(f"{folder}: does not exist; {ACCEPTED}")
     if layout == "bag" or (layout == "auto" and folder.is_file()):

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines import report as reports
-from pipelines.data.settings import ROBOT_TEXT, RunsSettings, load
+from pipelines.data.datasets import load, verdict
+from pipelines.data.settings import ROBOT_TEXT, RunsSettings
 from pipelines.report import Column, Progress, Report, Result, Table, Text, described, plural, silent
 from pipelines.report.settings import setting
 
@@ -107,7 +108,6 @@ def run(settings: Settings, progress: Progress = silent) -> Inspection:
 
 def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
     from features.breaks import odd_stretches
-    from pipelines.data.datasets import verdict
     from terrain.errors import ConfigError, DataError
     from terrain.logs.clock import estimate_clock
     from terrain.logs.quality import stream_quality

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.data.layouts import Target
 from pipelines.data.mcap_file import McapWriter, library
+from pipelines.data.settings import Target
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.kinematics.standard_messages import StandardTopic, standard_topic
 from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text

@@ -1,18 +1,26 @@
-"""Settings of the commands on runs: which are read, in which layout, with which faults, or simulated."""
+"""Settings of the commands on runs: which are read, in which layout, with which faults."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, Literal
 
-from pipelines.data.layouts import Layout
 from pipelines.report.settings import Names, Settings, setting
 from terrain.errors import ConfigError
 from terrain.files.names import listed, shown
 
-if TYPE_CHECKING:
-    from terrain.records import RunLog
+Layout = Literal[
+    "auto", "runs", "borealtc", "csv", "drive", "drive-recording", "robotino", "testbed", "can", "bag"
+]
+"""``auto``: found out; ``runs``: run folders as this package writes them; ``csv``: any CSV, by a mapping
+file; ``drive``: the files ``samples.csv.gz`` of DRIVE, one a session; ``drive-recording``: its whole
+recordings; ``robotino``: files of three motors and a camera above; ``testbed``: ``smooth.csv`` and
+``grouser.csv`` of a wheel in a box of sand, a trial a row; ``can``: logs of a CAN bus, by a DBC; ``bag``: MCAP
+files and bags of ROS, by a mapping or by the types of their topics."""
+
+Target = Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"]
+"""``runs``: run folders; ``mcap``: a file a run; ``ros2``, ``ros2-mcap``: a bag a run; ``csv``: tables a run."""
 
 ROBOT_TEXT = (
     "Robot of logs that do not name theirs (DRIVE, CAN, bags), by name or its YAML file; of DRIVE the husky."
@@ -53,38 +61,6 @@ class AlignedRunsSettings(RunsSettings):
     only: Names = setting((), "Ids of the runs to use, by commas; all by default.")
     without: Names = setting((), "Ids of runs to leave out, by commas.")
     align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")
-
-
-class LoadedRuns(NamedTuple):
-    """Runs, and a sentence for each run that a repairing read had to skip."""
-
-    runs: list[RunLog]
-    skipped: list[str]
-
-
-def load(settings: RunsSettings) -> LoadedRuns:
-    """Return the runs of the settings, sorted by their id.
-
-    Raises
-    ------
-    LogError, ConfigError, DataError
-        as :func:`pipelines.data.datasets.load_runs`.
-    """
-    from pipelines.data.datasets import load_runs
-
-    skipped: list[str] = []
-    runs = load_runs(
-        settings.data,
-        layout=settings.layout,
-        mapping=settings.mapping,
-        repair=settings.repair,
-        align=isinstance(settings, AlignedRunsSettings) and settings.align,
-        robot=getattr(settings, "robot", None),
-        on_skip=skipped.append,
-    )
-    if isinstance(settings, AlignedRunsSettings):
-        runs = chosen_runs(runs, settings)
-    return LoadedRuns(runs, skipped)
 
 
 def chosen_runs(runs: Sequence[Any], settings: AlignedRunsSettings) -> list[Any]:

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import field_validator
 
-from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.data.datasets import load
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
 from terrain.errors import ConfigError

@@ -76,15 +76,8 @@ def _pair(channels: tuple[str, ...], period_s: float) -> Stream:
 
 
 def loaders_of(source: AlignedRunsSettings) -> list[RunLoader]:
-    """Return what reads each run of a command, without reading any."""
-    return run_loaders(
-        source.data.resolve(),
-        layout=source.layout,
-        mapping=source.mapping,
-        repair=source.repair,
-        align=source.align,
-        robot=source.robot,
-    )
+    """Return what reads each run of a command, also in another process, without reading any."""
+    return run_loaders(source.with_(data=source.data.resolve()))
 
 
 def cached_data(

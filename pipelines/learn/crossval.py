@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import model_validator
 
-from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.data.datasets import load
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import ComputeSettings, computing
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings

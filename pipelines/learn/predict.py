@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from pydantic import model_validator
 
-from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.data.datasets import load
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report import Progress, Result, described, format_counts, format_value, plural, silent, tree
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting

@@ -14,8 +14,9 @@ import numpy as np
 
 from features.windows import label_windows
 from pipelines import report as reports
+from pipelines.data.datasets import load
 from pipelines.data.inspect import Settings as InspectSettings
-from pipelines.data.settings import ReadSettings, load
+from pipelines.data.settings import ReadSettings
 from pipelines.live.chain import Chain
 from pipelines.live.model import TerrainModel
 from pipelines.live.session import chain_of

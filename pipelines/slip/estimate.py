@@ -201,7 +201,7 @@ def run(settings: Settings, progress: Progress) -> TracksResult:
     LogError
         if a run is in ``out`` already; nothing is written then.
     """
-    from pipelines.data.settings import load
+    from pipelines.data.datasets import load
     from pipelines.slip.shown import write_figures
     from terrain.errors import LogError
     from terrain.files.atomic import ensure_writable

@@ -40,7 +40,7 @@ def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
     TerrainError
         if a folder cannot be written.
     """
-    from pipelines.data.settings import load
+    from pipelines.data.datasets import load
     from pipelines.report.writing import check_file
     from pipelines.slip.curves import LearnedCurves, log_curves
     from pipelines.slip.shown import write_figures

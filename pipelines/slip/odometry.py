@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.data.datasets import drive_robot
-from pipelines.data.settings import load
+from pipelines.data.datasets import drive_robot, load
 from pipelines.report import Column, Progress, Report, Result, Table, Text, described, frame, sections
 from pipelines.report.numbers import format_value, interval
 from terrain.calibration.odometry import ParameterFound, judge_odometry

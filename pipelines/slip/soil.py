@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.data.datasets import load_runs
-from pipelines.data.settings import load
+from pipelines.data.datasets import load, load_runs
 from pipelines.report import Column, Progress, Report, Result, Table, Text, described, frame, sections, tree
 from pipelines.report.numbers import format_value
 from pipelines.slip.shown import write_figures

@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 
 from pipelines.cli.quickstart import Settings, run
-from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.data.datasets import load
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn.model_file import read_model
 from pipelines.report.json_file import as_json
 from pipelines.report.terminal import terminal_text

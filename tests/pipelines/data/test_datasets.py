@@ -38,7 +38,7 @@ def test_what_holds_no_run_and_options_that_do_not_go_together_are_refused(tmp_p
         refused("nowhere: does not exist; accepted are", tmp_path / "nowhere", layout=layout)
     (tmp_path / "file.csv").touch()
     refused("file.csv: is no folder", tmp_path / "file.csv")
-    refused("layout 'rosbag' is unknown: choose one of auto, runs", tmp_path, layout="rosbag")
+    refused("--format is 'rosbag': input should be 'auto', 'runs'", tmp_path, layout="rosbag")
     refused("the layout 'csv' needs a mapping file", tmp_path, layout="csv")
     of_csv = {"layout": "runs", "mapping": tmp_path / "map.yaml"}
     refused("a mapping file is for CSV files, not for the layout 'runs'", tmp_path, **of_csv)

@@ -13,6 +13,7 @@ from features.motion import window_motion
 from features.protocols import samples_of
 from features.recipes import feature_matrix
 from pipelines.data.datasets import load_runs, run_loaders
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn import cache
 from pipelines.learn.cache import cached_data
 from pipelines.learn.crossval import EvaluationSettings, Settings
@@ -42,7 +43,7 @@ def cached(runs_dir, tmp_path):
     """Return a function that reads the runs through a cache: data, skipped runs, and how many were computed."""
 
     def cached(settings=SETTINGS, folder="cache", recipe="svm", **options):
-        left, loaders = [], run_loaders(runs_dir, **options)
+        left, loaders = [], run_loaders(AlignedRunsSettings(data=runs_dir, **options))
 
         def progress(task, done, total):
             left.extend([total - done] if task == "features" else [])

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from pipelines.data.datasets import load_runs
-from pipelines.data.settings import AlignedRunsSettings, load
+from pipelines.data.datasets import load, load_runs
+from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report import silent
 from pipelines.slip.estimate import Settings, estimate_runs, run
 from terrain.errors import ConfigError, DataError, LogError
