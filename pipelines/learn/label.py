@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -21,7 +21,7 @@ from terrain.files.names import plain_name, shown
 if TYPE_CHECKING:
     from terrain.classify.proposals import LabelSource, Proposal
     from terrain.logs.recorded_windows import DoubtfulWindow, RunWindows
-    from terrain.records import Label
+    from terrain.records import Label, RunLog
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
 
@@ -153,9 +153,9 @@ def run(
     from terrain.logs.recorded_windows import doubtful_windows
 
     if settings.model is not None:
-        return propose_labels(settings, settings.model)
+        return _propose(settings, settings.model)
     if settings.answers is not None and settings.out is not None:
-        return write_labels(settings, settings.answers, settings.out)
+        return _write_labels(settings, settings.answers, settings.out)
     if settings.sets and settings.run is not None:
         terrain = "" if settings.remove else settings.terrain or ""
         changed = set_label(settings.data, settings.run, terrain, settings.from_s, settings.to_s)
@@ -163,14 +163,8 @@ def run(
     return DoubtfulResult(settings.data, *doubtful_windows(settings.data, settings.run))
 
 
-def propose_labels(settings: Settings, model_uri: str) -> ProposalsResult:
-    """Write the proposals of a model for the runs of a folder as CSV with empty answers, the questions first.
-
-    Raises
-    ------
-    LogError, DataError
-        if there is no run, or a run lacks what the model requires.
-    """
+def _propose(settings: Settings, model_uri: str) -> ProposalsResult:
+    """Write the proposals of a model for the runs of a folder as CSV with empty answers, the questions first."""
     import pandas as pd
 
     from pipelines.data.datasets import load_runs
@@ -200,38 +194,23 @@ def propose_labels(settings: Settings, model_uri: str) -> ProposalsResult:
     return ProposalsResult(settings.data, settings.proposals, len(runs), len(asked), taken, tuple(proposals))
 
 
-def write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
-    """Write the runs of a folder to another one, with the labels that were answered or taken over.
+def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
+    """Write the runs of a folder to a new one, with the labels that were answered or taken over.
 
     A person's answer stands above a label that a run has, and that above a proposal of the model.
-
-    Parameters
-    ----------
-    settings : whose folder of runs was proposed for, and which proposals are taken over
-    answers : table of proposals with answers
-    out : folder that is made; refused where it is there
-
-    Raises
-    ------
-    LogError, ConfigError
-        as :func:`read_answers`; also if no label would be added.
     """
     from pipelines.data.datasets import load_runs
     from terrain.classify.proposals import LabelSource, label_of, with_label
     from terrain.files.atomic import atomic_folder
-    from terrain.logs.borealtc import whole_run_label
     from terrain.logs.write import write_run
     from terrain.records import Label
 
     if out.exists():
         raise ConfigError(f"{out}: exists already; the runs are written to a folder of their own")
     runs = load_runs(settings.data)
-    spans_s = {run.run_id: whole_run_label(run.streams, "")[:2] for run in runs}
-    terrains = sorted({label.terrain for run in runs for label in run.labels})
-    rows = read_answers(answers, spans_s, terrains, new_class=settings.new_class)
     labels = {run.run_id: [LabelSource(*label, "measured", None) for label in run.labels] for run in runs}
     left_open = 0
-    for proposal, answer in rows:
+    for proposal, answer in _checked_answers(answers, runs, new_class=settings.new_class):
         added = label_of(proposal, answer, settings.accept)
         if added is None:
             left_open += not answer
@@ -254,29 +233,14 @@ def write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult:
     return AnswersResult(out, len(runs), dict(sorted(counts.items())), left_open, written)
 
 
-def read_answers(
-    file: Path, spans_s: Mapping[str, tuple[float, float]], terrains: Sequence[str], *, new_class: bool
-) -> list[tuple[Proposal, str]]:
-    """Return the proposals of a table with their answers; an empty one leaves a proposal to its confidence.
-
-    Parameters
-    ----------
-    file : as :func:`propose_labels` writes it
-    spans_s : first and last time of each run that may be named
-    terrains : that may be answered beside those that are proposed
-    new_class : whether others may be answered, too
-
-    Raises
-    ------
-    LogError
-        if it is no such table.
-    ConfigError
-        if it names a run that is not there, stretches that overlap or lie outside of their run, or a terrain
-        that is not known.
-    """
+def _checked_answers(file: Path, runs: Sequence[RunLog], *, new_class: bool) -> list[tuple[Proposal, str]]:
+    """Return the proposals of a table with their answers; an empty one leaves a proposal to its confidence."""
     from terrain.classify.proposals import NONE, YES
+    from terrain.logs.borealtc import whole_run_label
 
-    rows = _answer_rows(file)
+    rows = _answers(file)
+    spans_s = {run.run_id: whole_run_label(run.streams, "")[:2] for run in runs}
+    terrains = {label.terrain for run in runs for label in run.labels}
     known = {*terrains, *(proposal.terrain for proposal, _ in rows), YES, NONE, ""}
     until_s: dict[str, float] = {}
     for (run_id, start_s, end_s, *_), answer in sorted(rows, key=lambda row: row[0][:2]):
@@ -299,7 +263,7 @@ def read_answers(
     return rows
 
 
-def _answer_rows(file: Path) -> list[tuple[Proposal, str]]:
+def _answers(file: Path) -> list[tuple[Proposal, str]]:
     from terrain.classify.proposals import Proposal
     from terrain.files.documents import first_fault
     from terrain.logs.csv_table import text_rows
