@@ -163,7 +163,7 @@ class Connection:
                     raise WireError(
                         "too-large", f"the first message has {len(message)} bytes, {LARGE} are accepted"
                     )
-                self._session = await self._hub.open(read_hello(decode(message)), self.leave)
+                self._session = await self._hub.open(_hello_of(decode(message)), self.leave)
                 return True
             except WireError as error:
                 final = error.code == "closing"
@@ -312,23 +312,8 @@ class Connection:
         self._changed.set()
 
 
-def read_hello(content: dict[str, Any]) -> Hello:
-    """Return a hello.
-
-    Raises
-    ------
-    WireError
-        if it is none, or something in it is not accepted; the sentence names the first thing that is not.
-
-    Examples
-    --------
-    >>> hello = {"type": "hello", "session": "r7", "robot": "husky", "streams": {"imu": ["gyro_z_radps"]}}
-    >>> read_hello(hello).rate_hz
-    10.0
-    >>> read_hello({"type": "samples"})
-    Traceback (most recent call last):
-    pipelines.serve.wire.WireError: the first message is of the type 'samples', a hello is required
-    """
+def _hello_of(content: dict[str, Any]) -> Hello:
+    """Return a hello; the first thing that is not accepted is named in a ``WireError``."""
     if content.get("type") != "hello":
         kind = str(content.get("type"))[:40]
         raise WireError("hello-first", f"the first message is of the type {kind!r}, a hello is required")

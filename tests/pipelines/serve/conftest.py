@@ -2,10 +2,9 @@
 
 import json
 import threading
-import urllib.error
-import urllib.request
 from contextlib import contextmanager
 
+import httpx
 import pytest
 from websockets.sync.client import connect
 
@@ -36,19 +35,14 @@ class Running:
     def socket(self, place="/robots", **options):
         return connect(self.ws + place, compression=None, max_size=None, open_timeout=30, **options)
 
-    def get(self, place, method="GET", body=None, headers=()):
+    def get(self, place, method="GET", **options):
         """Status and text of an answer."""
-        request = urllib.request.Request(self.http + place, body, dict(headers), method=method)
-        try:
-            with urllib.request.urlopen(request, timeout=30) as answer:
-                return answer.status, answer.read().decode()
-        except urllib.error.HTTPError as error:
-            with error:
-                return error.code, error.read().decode()
+        answer = httpx.request(method, self.http + place, timeout=30, **options)
+        return answer.status_code, answer.text
 
     def put(self, place, content, kind="application/json"):
-        body = (content if isinstance(content, str) else json.dumps(content)).encode()
-        return self.get(place, "PUT", body, {"Content-Type": kind})
+        body = content if isinstance(content, str) else json.dumps(content)
+        return self.get(place, "PUT", content=body, headers={"Content-Type": kind})
 
 
 @contextmanager

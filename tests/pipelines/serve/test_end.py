@@ -14,8 +14,8 @@ from contextlib import contextmanager
 
 import pytest
 
+from pipelines.live.session import Hello
 from pipelines.serve.client import ServiceError, TerrainClient
-from pipelines.serve.connection import read_hello
 from pipelines.serve.hub import Hub
 from pipelines.serve.serve import Settings
 from terrain.control.slip_table import load_slip_table
@@ -132,7 +132,9 @@ def test_a_session_that_is_beginning_leaves_nothing_behind_or_gets_the_model_tha
             hub.swap(mower_model, "two", load_slip_table())
 
     async def changes():
-        opening = asyncio.create_task(hub.open(read_hello(hello("new", record=True)), lambda *_: None))
+        opening = asyncio.create_task(
+            hub.open(Hello.model_validate(hello("new", record=True)), lambda *_: None)
+        )
         await asyncio.to_thread(begun.wait, 20.0)
         replacing = asyncio.create_task(replace())
         await asyncio.sleep(0.01)

@@ -175,7 +175,7 @@ def test_before_its_token_nothing_of_a_client_is_decoded_and_wrong_tokens_wait_a
     for headers, place, method in (
         (BEARER, "/state", "GET"), ({}, "/state", "GET"), (another, "/model", "GET"), (another, "/model", "PUT"),
     ):  # fmt: skip
-        status, text = guarded.get(place, method, b"{}" if method == "PUT" else None, headers)
+        status, text = guarded.get(place, method, content="{}", headers=headers)
         assert (status == 401) == ("a token is required" in text) == (headers is not BEARER)
     assert decoded == []
     assert guarded.hub.metrics.totals()["wrong_tokens"] == 10
