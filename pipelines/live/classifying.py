@@ -14,7 +14,7 @@ import numpy as np
 
 from features.stream import WindowFeed
 from pipelines.live.model import ModelInfo, TerrainModel, assess
-from pipelines.live.windows import feed_of, live_filter, needs_filter
+from pipelines.live.windows import feed_of
 from terrain.classify.terrain_filter import LiveTerrainFilter
 from terrain.control.switching import UNKNOWN
 from terrain.control.terrain_source import TerrainEstimate, TerrainSource
@@ -218,15 +218,7 @@ class Classifier(TerrainSource):
 
     def _feed_of(self, model: TerrainModel) -> WindowFeed:
         """Return what cuts the windows of a model; ``DataError`` where it does not suit what runs here."""
-        feed = feed_of(model.info, self._channels, self._robot)
-        if needs_filter(model.info, self._channels) and (
-            self._robot is None or live_filter(model.info, self._robot) != self._filter_name
-        ):
-            raise DataError(
-                f"the model was trained on estimates of the filter {model.info.filter!r}; "
-                f"{self._filter_name or 'none'!r} runs here"
-            )
-        return feed
+        return feed_of(model.info, self._channels, self._robot, self._filter_name)
 
     def check(self, model: TerrainModel | None) -> None:
         """Raise ``DataError`` where a model cannot replace this one, or is none."""

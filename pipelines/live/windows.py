@@ -80,7 +80,9 @@ def live_estimator(
     return make_live_filter(live_filter(info, driven), driven, known, info.rate_hz, correction), driven
 
 
-def feed_of(info: ModelInfo, channels: Mapping[str, Sequence[str]], robot: Robot | None) -> WindowFeed:
+def feed_of(
+    info: ModelInfo, channels: Mapping[str, Sequence[str]], robot: Robot | None, filter_name: str
+) -> WindowFeed:
     """Return what cuts the windows of a model from samples as they come.
 
     Parameters
@@ -88,16 +90,24 @@ def feed_of(info: ModelInfo, channels: Mapping[str, Sequence[str]], robot: Robot
     info : of the model
     channels : of each stream that is measured, in the order of the columns of its readings
     robot : corrected; may be missing where every channel of the model is measured
+    filter_name : filter that runs here; empty for none
 
     Raises
     ------
     DataError
         if the model needs a channel that is neither measured nor estimated, or another filter.
     """
-    estimated = {}
-    if robot is not None and robot.drive in LIVE_FILTERS and needs_filter(info, channels):
-        estimated = estimated_channels(live_filter(info, robot), robot)
-    return WindowFeed(info.rule, info.layout, channels, estimated, robot)
+    estimated, name = {}, filter_name
+    if needs_filter(info, channels) and robot is not None and robot.drive in LIVE_FILTERS:
+        name = live_filter(info, robot)
+        estimated = estimated_channels(name, robot)
+    feed = WindowFeed(info.rule, info.layout, channels, estimated, robot)
+    if name != filter_name:
+        raise DataError(
+            f"the model was trained on estimates of the filter {info.filter!r}; "
+            f"{filter_name or 'none'!r} runs here"
+        )
+    return feed
 
 
 def windows_of_log(
@@ -129,7 +139,7 @@ def windows_of_log(
     channels = {name: stream.channels for name, stream in streams.items()}
     try:
         estimator, corrected = live_estimator(info, robot, channels)
-        feed = feed_of(info, channels, corrected)
+        feed = feed_of(info, channels, corrected, "" if estimator is None else estimator.name)
     except (ConfigError, DataError) as error:
         raise DataError(f"run {run.run_id}: {error}") from error
     measured = {
