@@ -232,8 +232,7 @@ def report(result: QuickstartResult) -> Report:
         details=[
             *slip,
             *([Section("A run in detail", result.figures)] if result.figures else []),
-            Section("Evaluation", [*evaluation.parts, *evaluation.details]),
-            Section("Training", [*training.parts, *training.details]),
+            Section("Evaluation and training", [*training.parts, *training.details]),
             Section("Predictions", [*predicted.parts, *predicted.details]),
             Section("Step by step", [Text("\n".join(result.commands), "code")]),
         ],
