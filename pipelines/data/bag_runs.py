@@ -41,11 +41,6 @@ def find_runs(place: Path, mapping: str | Path | None, robot: Robot | None) -> l
         folder's name as its terrain
     mapping : YAML file (:mod:`terrain.logs.topic_mapping`); by the types of the topics by default
     robot : of all runs that do not name theirs; that of the mapping by default
-
-    Raises
-    ------
-    ConfigError
-        if the mapping is not accepted.
     """
     if place.is_file():  # one that the user names may be a link
         place = place.resolve()
@@ -74,7 +69,6 @@ def read_run(
     ConfigError
         if the mapping does not fit the messages, or no robot is named.
     """
-    faults = Faults(Counter() if repair else None)
     bag, place = open_bag(path), short_name(path)
     topics = topics_of(bag)
     exported = topics.get(RUN_TOPIC)
@@ -86,6 +80,7 @@ def read_run(
     name = robot.name if robot is not None else mapping.robot
     if not name:
         raise ConfigError(f"{place}: a bag does not name its robot: give it by --robot or in the mapping")
+    faults = Faults(Counter() if repair else None)
     found = _mapped(bag, mapping, topics, wheel_radius_m(name, robot), faults)
     start_ns, streams = found.streams()
     parts = _parts(path, folder)
@@ -117,11 +112,6 @@ def read_stream(
     described_stream : its keys, as in a mapping of topics
     repairs : counts by kind of what is dropped; None refuses
     radius_m : of the robot's wheels; None where unknown
-
-    Raises
-    ------
-    LogError, ConfigError
-        as :func:`read_run`.
     """
     stream = check_stream(f"stream {name}", described_stream)
     mapping = TopicMapping(streams={name: stream})

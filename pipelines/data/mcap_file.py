@@ -50,11 +50,6 @@ class McapWriter:
     ----------
     file : opened for writing
     head : of the run; tools that list a file's metadata show it
-
-    Raises
-    ------
-    ConfigError
-        if mcap is not installed.
     """
 
     def __init__(self, file: BinaryIO, head: Head) -> None:
@@ -87,15 +82,7 @@ class McapWriter:
 
 
 def mcap_topics(path: Path) -> list[Topic]:
-    """Return the topics of a file: those that its end lists, else all that a walk through it finds.
-
-    Raises
-    ------
-    LogError
-        if the file cannot be read.
-    ConfigError
-        if mcap is not installed.
-    """
+    """Return the topics of a file: those that its end lists, else all that a walk through it finds."""
     records, reader = library("mcap.records"), library("mcap.reader")
     try:
         with path.open("rb") as file:
@@ -124,13 +111,7 @@ def _topic(channel: Any, schemas: Mapping[int, Any]) -> Topic:
 
 
 def mcap_messages(path: Path, names: frozenset[str], faults: Faults) -> Iterator[tuple[str, int, bytes]]:
-    """Yield topic, log time in ns and content of the messages of some topics, in the order of the file.
-
-    Raises
-    ------
-    LogError
-        if the file is damaged, unless faults are counted.
-    """
+    """Yield topic, log time in ns and content of the messages of some topics, in the order of the file."""
     from mcap.records import Channel, Message
 
     channels: dict[int, str] = {}
