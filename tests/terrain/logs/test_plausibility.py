@@ -257,7 +257,7 @@ def test_values_beyond_any_quantity_are_refused_or_repaired_by_one_rule(tmp_path
 def test_inspect_has_every_check_and_its_figure(tmp_path):
     write_run(changed("imu", GYRO), tmp_path / "data")
     [run] = inspect_runs(InspectSettings(data=tmp_path / "data")).runs
-    [check] = [c for c in run.as_json()["plausibility"] if c.check == "yaw rate"]
+    [check] = [c for c in run.plausibility if c.check == "yaw rate"]
     assert check.level == "implausible"
     assert check.measured == pytest.approx(0.5 / DEGREE, rel=0.1)
 
