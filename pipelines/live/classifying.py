@@ -73,21 +73,18 @@ class WindowOutput(NamedTuple):
 
 def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
     """Return the output of a model for one window; one that it refuses gives none, and raises nothing."""
-    classes = model.info.classes
-    start_s = float(window.start_s[0])
-    started_s, refused = perf_counter(), ""
+    start_s, classes, started_s = float(window.start_s[0]), model.info.classes, perf_counter()
+    end_s = start_s + window.length_s
     try:
         assessed = assess(model, window)
         probabilities = assessed.probability[0]
         if not np.isfinite(probabilities).all():
-            refused = "a probability is not finite"
+            raise DataError("a probability is not finite")
     except Exception as error:  # whatever broken samples lead a recipe to, it must not stop the loop
-        refused = str(error) or type(error).__name__
-    took_s = perf_counter() - started_s
-    end_s = start_s + window.length_s
-    if refused:
-        nothing = np.full(len(classes), math.nan)
+        refused, nothing = str(error) or type(error).__name__, np.full(len(classes), math.nan)
+        took_s = perf_counter() - started_s
         return WindowOutput(start_s, end_s, "", math.nan, nothing, classes, refused, took_s)
+    took_s = perf_counter() - started_s
     best = int(probabilities.argmax())
     nearest, supported = str(model.recipe.classes_[best]), assessed.supported[0]
     return WindowOutput(
@@ -280,14 +277,12 @@ class Classifier(TerrainSource):
 
     def _leave_out(self) -> None:
         """Remove the oldest step that waits; a model that waits before it is taken first."""
-        try:
+        with suppress(IndexError):  # the thread has just taken it
             oldest = self._waiting.popleft()
             if isinstance(oldest, _Part):
                 self._waiting.appendleft(oldest)
             else:
                 self._n_overrun += 1
-        except IndexError:  # the thread has just taken it
-            pass
 
     def _work(self) -> None:
         """Cut and classify what waits."""

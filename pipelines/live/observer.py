@@ -118,17 +118,13 @@ class Observer(Chain):
             estimates = self._filter.step(samples)
             if estimates:
                 self.estimate = estimates[-1]
-        if self._clocks.was_set(samples):
-            self._begin_again()
+        if self._clocks.was_set(samples):  # what was believed stays, and its outputs begin anew
+            self.source.restart()
+            self.belief = TerrainBelief(self.belief.terrain, self.belief.probability)
+            self._speed_s, self._now_s = -math.inf, math.nan
         self._drive_on(samples, now_s)
         self._believe(Sample(now_s, _NO_TWIST, samples), estimates)
         return self.source.outputs
-
-    def _begin_again(self) -> None:
-        """Cut windows from here on; what was believed stays, and its outputs begin anew."""
-        self.source.restart()
-        self.belief = TerrainBelief(self.belief.terrain, self.belief.probability)
-        self._speed_s, self._now_s = -math.inf, math.nan
 
     def _drive_on(self, samples: Mapping[str, Reading], now_s: float) -> None:
         """Let the belief age by the time in which the wheels turned, or were not seen to stand."""
