@@ -16,7 +16,7 @@ from features.sequences import following
 from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import counted, parallel
 from pipelines.learn.recipes import recipe_of
-from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings
+from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings, RecipeSettings
 from pipelines.report import Progress, format_counts, format_value, interval, silent
 from terrain.classify.breakaway import breakaways
 from terrain.classify.folds import Fold, single_run_classes
@@ -85,7 +85,7 @@ def evaluate_recipe(
     recipe: WindowPipeline,
     name: str,
     samples: Samples,
-    settings: EvaluationSettings,
+    settings: EvaluationSettings | RecipeSettings,
     progress: Progress = silent,
     cached: tuple[Array, Motion | None] | None = None,
     ask: Callable[[Examples, Fold], Callable[[Any], Any] | None] | None = None,
@@ -164,7 +164,7 @@ def evaluation_of(held_out: HeldOut, samples: Samples, seed: int, **fields: Any)
 
 
 def _of_svm(
-    recipe: WindowPipeline, features: Array, samples: Samples, settings: EvaluationSettings
+    recipe: WindowPipeline, features: Array, samples: Samples, settings: EvaluationSettings | RecipeSettings
 ) -> tuple[Any, Array]:
     """Return the classifier and the features of the checks: those of a recipe by the SVM, else the SVM's own."""
     if not isinstance(recipe[-1], GroupedSVC):
@@ -178,7 +178,7 @@ def _extras(
     features: Array,
     samples: Samples,
     held_out: HeldOut,
-    settings: EvaluationSettings,
+    settings: EvaluationSettings | RecipeSettings,
     progress: Progress,
 ) -> dict[str, Any]:
     """Return the checks beside the figures, by field."""
@@ -225,7 +225,7 @@ def _leave_terrain_out(
     recipe: WindowPipeline,
     features: Array,
     samples: Samples,
-    settings: EvaluationSettings,
+    settings: EvaluationSettings | RecipeSettings,
     progress: Progress,
 ) -> dict[str, Any]:
     """Return how well a terrain that was left out of training is found to be unknown, by field."""
@@ -238,7 +238,9 @@ def _leave_terrain_out(
     return unknown_figures(scores, terrain, run_id, samples.windows.start_s, seed)._asdict()
 
 
-def _notes(samples: Samples, recipe: WindowPipeline, settings: EvaluationSettings) -> Iterator[str]:
+def _notes(
+    samples: Samples, recipe: WindowPipeline, settings: EvaluationSettings | RecipeSettings
+) -> Iterator[str]:
     """Yield in sentences what a reader of the figures must know."""
     protocol, classifier = settings.protocol, recipe[-1]
     for group in samples.merged:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, model_validator
 
@@ -127,14 +127,14 @@ class LearnSettings(WindowSettings, JobsSettings):
                 raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
         return self
 
-    def shared(self) -> dict[str, Any]:
-        """Return the fields that evaluation and training have in common, by name."""
-        return {name: getattr(self, name) for name in LearnSettings.model_fields}
-
 
 class RecipeSettings(LearnSettings):
     """One recipe."""
 
+    protocol: ClassVar[str] = (
+        "grouped"  # what is trained is judged by whole runs held out, without further checks
+    )
+    extras: ClassVar[bool] = False
     recipe: Annotated[str, AfterValidator(check_recipe)] = setting(FEATURE_RECIPE, RECIPE_TEXT)
 
 

@@ -318,7 +318,6 @@ def _evaluated(
     One set of fits gives all three: channels are judged by those of the first repeat.
     """
     from pipelines.learn.evaluate import evaluate_recipe
-    from pipelines.learn.settings import EvaluationSettings
     from terrain.classify.importance import ChannelDrops, channel_importance, channel_of
 
     channels = [channel_of(str(name)) for name in data.recipe[0].get_feature_names_out()]
@@ -329,11 +328,11 @@ def _evaluated(
         tested = examples.features[fold.test], examples.terrain[fold.test]
         return ChannelDrops(*tested, channels, settings.seed, fold.number)
 
-    repeats = settings.repeats or (1 if settings.recipe.partition("@")[0] in NETWORKS else None)
-    shared = settings.shared() | {"recipe": (settings.recipe,), "extras": False, "repeats": repeats}
-    asked, computed = EvaluationSettings(**shared), (data.rows, data.motion)
+    if settings.repeats is None and settings.recipe.partition("@")[0] in NETWORKS:
+        settings = settings.with_(repeats=1)
+    computed = data.rows, data.motion
     evaluation, held_out = evaluate_recipe(
-        data.recipe, settings.recipe, data.samples, asked, progress, computed, ask
+        data.recipe, settings.recipe, data.samples, settings, progress, computed, ask
     )
     drops = [each.found for each in held_out.results if each.found is not None]
     return evaluation, channel_importance(channels, drops), held_out.fitted

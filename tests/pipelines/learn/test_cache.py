@@ -74,7 +74,7 @@ def test_cached_features_are_those_of_the_runs_bit_for_bit(runs_dir, cached):
 
 @pytest.mark.parametrize("recipe", ["svm", "svm@imu"])
 def test_what_is_trained_is_the_same_from_two_processes(runs_dir, cached, recipe):
-    asked = RecipeSettings(**SETTINGS.with_(n_jobs=2).shared(), recipe=recipe)
+    asked = RecipeSettings(steady=False, n_jobs=2, recipe=recipe)
     there, here = cached(asked, recipe=recipe)[0], data_of_runs(load_runs(runs_dir), asked)
     assert there.runs == here.runs
     fitted = [
