@@ -27,13 +27,14 @@ from terrain import errors
 from terrain.errors import ConfigError, one_line
 from terrain.files.resources import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.logs.mapping import check_unit
 from terrain.logs.replay import TWIST
 from terrain.logs.schema import (
     IMU_CHANNELS,
     STEERING_CHANNELS,
-    UNIT_OFFSETS,
     UNIT_SCALES,
     WHEELS_CHANNELS,
+    canonical_unit,
     unit_of,
 )
 
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
 DEFAULT_DBC = "agrimaro.dbc"
 MAX_BYTES = 8
 UNITLESS = ("", "-", "1")
-"""Units of a code; the empty one also of a ratio."""
+"""Units of a code."""
 
 library = partial(errors.library, need="CAN needs the packages python-can and cantools", extra="can")
 
@@ -298,18 +299,12 @@ def _signal_plan(path: Path, signal: Any, column: int, channel: str) -> SignalPl
 
 
 def _factor(path: Path, signal: Any, channel: str) -> float:
-    """Return the factor from a signal's unit to that of its channel."""
+    """Return the factor from a signal's unit to that of its channel; a DBC has its own offsets."""
     given, required = signal.unit or "", unit_of(channel)
-    if required == "code" or (required == "ratio" and given == ""):
-        if given in UNITLESS:
-            return 1.0
-    elif given not in UNIT_OFFSETS and UNIT_SCALES.get(given, ("",))[0] == required:
-        return UNIT_SCALES[given][1]  # a DBC has its own offsets
-    fitting = [repr(unit) for unit, (word, _) in UNIT_SCALES.items() if word == required] or ["none"]
-    raise ConfigError(
-        f"{path}: the signal {signal.name!r} has the unit {given!r}, which does not fit {channel}; "
-        f"accepted: {', '.join(fitting)}"
-    )
+    if (required == "code" and given in UNITLESS) or (required == "ratio" and not given):
+        return 1.0
+    check_unit(f"{path}: the signal {signal.name!r} of {channel}", given, required)
+    return UNIT_SCALES[canonical_unit(given)][1]
 
 
 def _message_plan(message: Any, stream: str, signals: tuple[SignalPlan, ...]) -> MessagePlan:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines import report as reports
 from pipelines.data.datasets import load, verdict
-from pipelines.data.settings import MAPPING_TEXT, ROBOT_TEXT, RunsSettings, Target
+from pipelines.data.settings import MAPPING_TEXT, RunsSettings, Target
 from pipelines.report import Progress, Report, Result, Table, Text, described, plural, silent
 from pipelines.report.settings import setting
 from terrain.errors import LogError, TerrainError
@@ -29,7 +29,6 @@ class Settings(RunsSettings):
     """What is read, and what is written."""
 
     data: Path = setting(..., "Folder to read, or a file of MCAP or a bag.", option="FOLDER")
-    robot: str | None = setting(None, ROBOT_TEXT)
     mapping: Path | None = setting(None, MAPPING_TEXT)
     out: Path = setting(..., "Folder of the new runs; what is there is left as it is.")
     to: Target = setting(

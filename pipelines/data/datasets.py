@@ -176,8 +176,7 @@ def run_loaders(settings: RunsSettings) -> list[RunLoader]:
     """
     from terrain.robots import load_robot
 
-    name: str | None = getattr(settings, "robot", None)
-    robot = None if name is None else load_robot(name)
+    robot = None if settings.robot is None else load_robot(settings.robot)
     readers = _readers(settings.data, settings.layout, settings.mapping, robot)
     if not readers:
         raise LogError(f"{settings.data}: holds no run; {ACCEPTED}")

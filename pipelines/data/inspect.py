@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines import report as reports
 from pipelines.data.datasets import load, verdict
-from pipelines.data.settings import ROBOT_TEXT, RunsSettings
+from pipelines.data.settings import RunsSettings
 from pipelines.report import Column, Progress, Report, Result, Table, Text, described, plural, silent
 from pipelines.report.settings import setting
 
@@ -33,7 +33,6 @@ class Settings(RunsSettings):
     """What is inspected."""
 
     data: Path = setting(..., "Folder to read, or an MCAP file.", option="FOLDER")
-    robot: str | None = setting(None, ROBOT_TEXT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,10 +22,6 @@ files and bags of ROS, by a mapping or by the types of their topics."""
 Target = Literal["runs", "mcap", "ros2", "ros2-mcap", "csv"]
 """``runs``: run folders; ``mcap``: a file a run; ``ros2``, ``ros2-mcap``: a bag a run; ``csv``: tables a run."""
 
-ROBOT_TEXT = (
-    "Robot of logs that do not name theirs (DRIVE, CAN, bags), by name or its YAML file; of DRIVE the husky."
-)
-
 MAPPING_TEXT = (
     "YAML file that describes CSV, .mat and .xlsx files by the keys robot, run_id, terrain, streams; of a stream "
     "file, time, channels, position, delimiter, decimal, sheet, skip_rows, header_rows; of time and channels "
@@ -47,6 +43,10 @@ class RunsSettings(ReadSettings):
     """The runs that a command works on."""
 
     data: Path = setting(..., "Folder of runs in any readable layout, or an MCAP file.")
+    robot: str | None = setting(
+        None,
+        "Robot of logs that do not name theirs (DRIVE, CAN, bags), by name or its YAML file; of DRIVE the husky.",
+    )
 
     @property
     def dataset(self) -> str:
@@ -57,7 +57,6 @@ class RunsSettings(ReadSettings):
 class AlignedRunsSettings(RunsSettings):
     """The runs of a command that can choose among them, and bring their two loggers onto one clock."""
 
-    robot: str | None = setting(None, ROBOT_TEXT)
     only: Names = setting((), "Ids of the runs to use, by commas; all by default.")
     without: Names = setting((), "Ids of runs to leave out, by commas.")
     align: bool = setting(False, "Bring the wheel stream onto the IMU's clock where both see the turns.")

@@ -232,8 +232,8 @@ MOTORS = 'SG_ MotorRate1 : 0|18@1- (0.002,0) [-262.142|262.142] "rad/s"'
     ("old", "new", "sentence"),
     [
         (" SG_ MotorRate1 ", " SG_ Speed1 ", "lacks the signal 'MotorRate1'"),
-        (MOTORS, MOTORS.replace('"rad/s"', '"m/s"'), "unit 'm/s', which does not fit motor_1_radps"),
-        (MOTORS, MOTORS.replace('"rad/s"', '""'), "unit '', which does not fit motor_1_radps"),
+        (MOTORS, MOTORS.replace('"rad/s"', '"m/s"'), "of motor_1_radps: unit 'm/s' does not suit it"),
+        (MOTORS, MOTORS.replace('"rad/s"', '""'), "of motor_1_radps: unit '' is unknown"),
         (MOTORS, MOTORS.replace("(0.002,0)", "(0,0)"), "scale"),
         (MOTORS, MOTORS.replace("[-262.142|262.142]", "[300|400]"), "no value between its bounds"),
         (" SG_ CameraConfidence ", " SG_ MotorRate1 ", "'MotorRate1' is in the messages"),
