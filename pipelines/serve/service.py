@@ -54,9 +54,9 @@ class Service:
 
     def __init__(self, settings: Settings) -> None:
         with ExitStack() as cleanup:
-            self._socket = cleanup.enter_context(_listen(settings.host, settings.port))
             self.hub = Hub(settings)
             cleanup.callback(self.hub.stop)
+            self._socket = cleanup.enter_context(_listen(settings.host, settings.port))
             self._cleanup = cleanup.pop_all()
         host, port = self._socket.getsockname()[:2]
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
