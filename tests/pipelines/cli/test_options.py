@@ -147,13 +147,3 @@ def test_unknown_settings_are_refused_and_settings_do_not_change():
     with pytest.raises(ConfigError, match="--seed is -2"):
         settings.with_(seed=-2)
     assert Settings.model_fields["window_s"].alias == "--window"
-
-
-def test_every_command_has_what_a_command_needs():
-    from importlib import import_module
-
-    for command in COMMANDS:
-        module = import_module(command.module)
-        assert module.EXAMPLE.startswith(f"terrain {command.name}")
-        assert issubclass(module.Settings, BaseSettings)
-        assert callable(module.run)
