@@ -14,10 +14,10 @@ from types import ModuleType
 
 from pipelines.cli.options import described_options
 from pipelines.cli.table import COMMANDS
-from pipelines.report import Column, Table
 from pipelines.report.markdown import markdown_table
 from pipelines.report.results import Result
 from pipelines.report.settings import Settings
+from pipelines.report.tree import Column, Table
 
 PAGE = Path(__file__).with_name("commands.md")
 

@@ -28,7 +28,8 @@ from terrain.files.documents import read_yaml
 from terrain.files.resources import data_folder
 
 if TYPE_CHECKING:
-    from pipelines.report import Figure, Report
+    from pipelines.report.figure import Figure
+    from pipelines.report.tree import Report
 
 SAME = 1e-9
 """Relative difference up to which two numbers are equal but for rounding."""
@@ -195,7 +196,7 @@ class _Texts(string.Formatter):
     def convert_field(self, value: Any, conversion: Any) -> Any:
         if conversion != "n":
             return super().convert_field(value, conversion)
-        from pipelines.report import format_value
+        from pipelines.report.numbers import format_value
 
         return format_value(value)
 
@@ -346,7 +347,8 @@ def _entries(described: Any, place: str = "") -> Iterable[tuple[str, dict[str, A
 
 def report_of(result: Reproduction) -> Report:
     """Return the report: the counts, the paper's figures beside the simulation's, then the reasons."""
-    from pipelines.report import Column, Report, Section, Table, Text, format_value
+    from pipelines.report.numbers import format_value
+    from pipelines.report.tree import Column, Report, Section, Table, Text
 
     columns = (Column("measured", long=True), Column("in the paper", long=True), "in simulation", "verdict")
     tables, reasons = [], []
@@ -392,10 +394,10 @@ def report_of(result: Reproduction) -> Report:
 
 
 def _shown(row: Row) -> str:
-    from pipelines.report import format_value, interval
+    from pipelines.report.numbers import format_value
 
     unit = "" if row.unit == "ratio" else row.unit
-    spread = "" if row.spread is None else f" ({interval(*row.spread)})"
+    spread = "" if row.spread is None else f" ({format_value(row.spread)})"
     return f"{format_value(row.simulated)}{f' {unit}' if unit else ''}{spread}"
 
 

@@ -13,7 +13,7 @@ from sklearn.model_selection import StratifiedKFold
 
 from features.extractor import FeatureExtractor
 from features.windows import cut_windows, join_windows
-from pipelines.report import Band, Figure, Line, Panel
+from pipelines.report.figure import Band, Figure, Line, Panel
 from terrain.classify.folds import split_runs
 from terrain.classify.metrics import run_bootstrap
 from terrain.classify.stiffness import StiffnessLevel, cost_matrix, least_cost_class

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from claims import Finding, Numbers, Trial
 
-from pipelines.report import Band, Figure, Line, Panel, Points
+from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.control.car_evaluation import FollowedDrive, followed_drive
 from terrain.control.car_following import CarFollower, SlipSource
 from terrain.control.car_scenarios import GRIP_RATIO, STOP, Course, slope_course, stop_course
@@ -320,7 +320,7 @@ def sideslip_figure(drive: FollowedDrive, title: str) -> Figure:
 def stiffness_figure(shown: Drives, title: str) -> Figure:
     """Draw the cornering stiffness of both axles over time, and the secant of the truth where excited."""
 
-    def marks(name: str, drive: FollowedDrive, j: int) -> tuple[Line, Points]:
+    def marks(name: str, drive: FollowedDrive, j: int) -> tuple[Mark, Mark]:
         estimate: Array = drive.stiffness_npr[:, j] / 1e3
         return (
             Line(name, drive.time_s, estimate),

@@ -11,7 +11,7 @@ from claims import Finding, Numbers, Trial
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from pipelines.report import Figure, Line, Panel, Points
+from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.tracked_speed import track_speed_params, track_speed_step
@@ -181,7 +181,7 @@ def rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def side_by_side(title: str, y_label: str, panels: Sequence[Sequence[Line | Points]]) -> Figure:
+def side_by_side(title: str, y_label: str, panels: Sequence[Sequence[Mark | Mark]]) -> Figure:
     """Return a figure over time of both motions."""
     return Figure(title, tuple(Panel(tuple(marks), y_label) for marks in panels), x_label="time [s]")
 
@@ -258,7 +258,7 @@ def two_motions(trial: Trial) -> Finding:
 _SIDES = ((0, "left"), (1, "right"))
 
 
-def _residuals(run: ObservedRun) -> list[Line]:
+def _residuals(run: ObservedRun) -> list[Mark]:
     fixed = np.isfinite(run.rows[:, 2:5]).all(axis=1)
     error = run.rows[fixed, 2:5] - run.track.mean[fixed, :3]
     error[:, 2] = wrapped(error[:, 2])
@@ -266,7 +266,7 @@ def _residuals(run: ObservedRun) -> list[Line]:
     return [Line(name, run.time_s[fixed], error[:, k]) for k, name in enumerate(names)]
 
 
-def _efficiencies(true_s: Array, true: Array, estimate: Array, time_s: Array) -> list[Line]:
+def _efficiencies(true_s: Array, true: Array, estimate: Array, time_s: Array) -> list[Mark]:
     marks = [Line(f"{side}, true", true_s, true[:, k], 6, dashed=True) for k, side in _SIDES]
     return [*marks, Line("left", time_s, estimate[:, 0], 0), Line("right", time_s, estimate[:, 1], 5)]
 

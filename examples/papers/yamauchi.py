@@ -17,7 +17,7 @@ import numpy as np
 from claims import Finding, Numbers, Trial
 from scipy import stats
 
-from pipelines.report import Figure, Line, Panel, Points
+from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.calibration.clustered_fit import fit_runs
 from terrain.calibration.slip_model import SlipIdentification, identify_slip_model
@@ -254,7 +254,7 @@ def straight_slip(trial: Trial) -> Finding:
         "scatter": Numbers(float(climb.std[np.argmax(slopes_deg == LINEAR_DEG)])),
     }
 
-    def points(label: str, curve: OnSlopes, colour: int) -> Points:
+    def points(label: str, curve: OnSlopes, colour: int) -> Mark:
         return Points(label, slopes_deg, curve.mean, curve.mean - curve.std, curve.mean + curve.std, colour)
 
     fitted = "line, 0° to 20°"

@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-from pipelines.report import Column, Report, Table, enumerated, plural
+from pipelines.report.numbers import enumerated, plural
+from pipelines.report.tree import Column, Report, Table
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipelines.data import inspect as runs
-from pipelines.report import Progress, Result, silent
+from pipelines.report.results import Progress, Result, silent
 from pipelines.report.settings import setting
 
 EXAMPLE = runs.EXAMPLE

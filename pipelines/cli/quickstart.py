@@ -15,21 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines.report import (
-    Column,
-    Figure,
-    Progress,
-    Report,
-    Result,
-    Section,
-    Table,
-    Text,
-    described,
-    enumerated,
-    format_value,
-    silent,
-)
+from pipelines.report.figure import Figure
+from pipelines.report.numbers import enumerated, format_value
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, setting
+from pipelines.report.tree import Column, Report, Section, Table, Text
 from terrain.errors import DataError
 
 if TYPE_CHECKING:

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines import report as reports
 from pipelines.data.datasets import load, verdict
 from pipelines.data.settings import MAPPING_TEXT, RunsSettings, Target
-from pipelines.report import Progress, Report, Result, Table, Text, described, plural, silent
+from pipelines.report.numbers import format_counts, plural
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import setting
+from pipelines.report.tree import Report, Table, Text, sections
 from terrain.errors import LogError, TerrainError
 
 if TYPE_CHECKING:
@@ -167,12 +168,12 @@ def report(result: ImportResult | ExportResult) -> Report:
     from terrain.logs.plausibility import doubt_sentences
 
     runs = plural(result.n_runs, "run")
-    counts = f", {reports.format_counts(result.dropped)}" if result.dropped else ""
+    counts = f", {format_counts(result.dropped)}" if result.dropped else ""
     warnings = [f"skipped: {sentence}" for sentence in result.skipped]
     if isinstance(result, ExportResult):
         runs += f", {sum(result.topics.values())} messages on {plural(len(result.topics), 'topic')},"
         table = Table(("topic", "messages"), tuple(result.topics.items()))
-        parts, details = [], reports.sections(("Messages", [table]))
+        parts, details = [], sections(("Messages", [table]))
         next_step = f"terrain convert {result.out} --out runs/"
     else:
         warnings += [*doubt_sentences(result.doubts), *sentences(result.duplicates)]

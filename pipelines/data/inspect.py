@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipelines import report as reports
 from pipelines.data.datasets import load, verdict
 from pipelines.data.settings import RunsSettings
-from pipelines.report import Column, Progress, Report, Result, Table, Text, described, plural, silent
+from pipelines.report.numbers import format_counts, format_value, plural
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import setting
+from pipelines.report.tree import Column, Report, Table, Text, sections
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -136,14 +137,12 @@ def report(result: Inspection) -> Report:
     rows = [_row(each, name) for each in result.runs for name in each.streams]
     notable = sorted(rows, key=lambda row: (not (row[4] or row[6] or row[7]), row[0]))
     dropped = [
-        f"{each.run_id}: dropped {reports.format_counts(each.dropped)}"
-        for each in result.runs
-        if each.dropped
+        f"{each.run_id}: dropped {format_counts(each.dropped)}" for each in result.runs if each.dropped
     ]
     clocks = [(each.run_id, _clock_text(each.clock)) for each in result.runs if "wheels" in each.streams]
     return Report(
         "Inspection of runs",
-        f"{plural(result.n_runs, 'run')}: {found} found; plausibility {reports.format_counts(levels)}.",
+        f"{plural(result.n_runs, 'run')}: {found} found; plausibility {format_counts(levels)}.",
         lead=f"digest {result.digest[:12]}",
         parts=[
             *(Text(each, "warning") for each in faults[:6]),
@@ -151,7 +150,7 @@ def report(result: Inspection) -> Report:
                 COLUMNS, notable[:MAX_ROWS], note="" if len(rows) <= MAX_ROWS else f"of {len(rows)} streams"
             ),
         ],
-        details=reports.sections(
+        details=sections(
             ("All faults", faults),
             ("Stretches unlike the rest of their run", odd),
             ("Streams", [Table(COLUMNS, rows)]),
@@ -183,9 +182,7 @@ def _clock_text(clock: ClockEstimate | None) -> str:
         return "no gyro, no speeds of a left and a right wheel, or an unknown robot"
     if math.isnan(clock.offset_s):
         return str(clock.status)
-    text = (
-        f"{clock.status}: offset {reports.format_value(clock.offset_s, '+.3f')} ± {clock.offset_std_s:.3f} s"
-    )
+    text = f"{clock.status}: offset {format_value(clock.offset_s, '+.3f')} ± {clock.offset_std_s:.3f} s"
     if not math.isnan(clock.rate):
-        text += f", rate {reports.format_value(100 * clock.rate, '+.2f')} ± {100 * clock.rate_std:.2f} %"
+        text += f", rate {format_value(100 * clock.rate, '+.2f')} ± {100 * clock.rate_std:.2f} %"
     return text

@@ -6,9 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipelines.report import Progress, Report, Result, described, plural, silent
+from pipelines.report.numbers import plural
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from pipelines.report.tree import Report
 from terrain.errors import ConfigError, LogError
 
 EXAMPLE = "terrain simulate --robot husky --terrain grass --scenario survey --runs 8 --out runs/"

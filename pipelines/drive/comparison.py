@@ -15,8 +15,10 @@ from pipelines.drive.controllers import DriveInputs, drive_once, train_classifie
 from pipelines.drive.run_figures import run_figures
 from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
-from pipelines.report import Column, Progress, Report, Result, Table, described, frame, sections, silent, tree
-from pipelines.report.numbers import NOT_KNOWN, format_value, interval, plural
+from pipelines.report.figure import Bars, Figure, Panel, Points
+from pipelines.report.numbers import NOT_KNOWN, format_value, plural
+from pipelines.report.results import Progress, Result, described, frame, silent
+from pipelines.report.tree import Column, Pairs, Part, Report, Table, Text, sections
 from pipelines.report.versions import versions
 from pipelines.slip.table import law_marks
 from terrain.control.comparison import Difference, MeanInterval
@@ -215,10 +217,10 @@ def report(result: DriveResult) -> Report:
             f"table {result.table}"
         ),
         picture=_picture(result),
-        parts=[*map(tree.Text, belief_notes(compared)), Table(columns, means)],
+        parts=[*map(Text, belief_notes(compared)), Table(columns, means)],
         details=sections(
             ("Who differs, and by how much", _difference_parts(compared, pairs)),
-            ("Controllers", [tree.Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
+            ("Controllers", [Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
             ("All figures", _metric_parts(result)),
             ("The first seed, run by run", _run_parts(result)),
             ("The curves behind the targets", _curve_parts(result.slip_table)),
@@ -289,14 +291,14 @@ def _text(name: str, ramp_mps2: float | None) -> str:
     return f"{text} With path tracking." if TRACK in name else text
 
 
-def _picture(result: DriveResult) -> tree.Figure | None:
+def _picture(result: DriveResult) -> Figure | None:
     """Return the first metrics of all controllers as bars."""
     names, panels = list(result.controllers), []
     for key in result.compared.shown[:PICTURED]:
         values = [result.compared.value(name, key) for name in names]
         means = [math.nan if value.mean is None else value.mean for value in values]
         low, high = zip(*(value.ci or (math.nan, math.nan) for value in values), strict=True)
-        panels.append(tree.Panel([tree.Bars(metric_label(key).with_unit, names, means, low, high)]))
+        panels.append(Panel([Bars(metric_label(key).with_unit, names, means, low, high)]))
     n = len(result.seeds)
     caption = "One seed, which gives no interval."
     if n > 1:
@@ -304,10 +306,10 @@ def _picture(result: DriveResult) -> tree.Figure | None:
             f"Means over {n} seeds and their 95 % intervals. All controllers drive the same seeds, so that bars "
             "whose intervals overlap may still differ significantly, seed by seed."
         )
-    return tree.Figure("What it costs, and what it brings", panels, caption) if panels else None
+    return Figure("What it costs, and what it brings", panels, caption) if panels else None
 
 
-def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) -> list[tree.Part]:
+def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) -> list[Part]:
     found = {(pair, key): compared.difference(*pair, key) for pair in pairs for key in compared.shown}
     keys = [key for key in compared.shown if any(found[pair, key] is not None for pair in pairs)]
     rows = [
@@ -344,7 +346,7 @@ def signed_difference(difference: float, key: str) -> str:
     return format_value(difference, form, unit)
 
 
-def _metric_parts(result: DriveResult) -> list[tree.Part | str]:
+def _metric_parts(result: DriveResult) -> list[Part | str]:
     """Return all metrics, those that are compared first, and the names of those that no controller has."""
     compared, rows, undefined = result.compared, [], []
     known = [key for metrics in result.controllers.values() for key in metrics]
@@ -375,20 +377,20 @@ def _metric_text(value: MeanInterval, n_seeds: int) -> str:
     text = format_value(value.mean) + (f", n {value.n}" if value.n != n_seeds else "")
     if value.ci is None or not value.ci[1] > value.ci[0]:
         return text
-    return f"{text} ({interval(*value.ci)})"
+    return f"{text} ({format_value(value.ci)})"
 
 
-def _run_parts(result: DriveResult) -> list[tree.Part]:
+def _run_parts(result: DriveResult) -> list[Part]:
     """Return what the drives of the first seed were like; nothing without their curves."""
     text = (
         "Above: desired and commanded speed, and the speed over ground. Below: the true slip, with the range "
         "of the wheels, its estimate, the target, and the target with its floor: at least the slip of steady "
         f"motion and a margin. Below {PEAK_ABOVE_MPS:g} m/s no slip is drawn. All drives have the same axes."
     )
-    return [tree.Text(text), *run_figures(result.examples)] if result.examples else []
+    return [Text(text), *run_figures(result.examples)] if result.examples else []
 
 
-def _curve_parts(table: SlipTable | None) -> list[tree.Part]:
+def _curve_parts(table: SlipTable | None) -> list[Part]:
     """Return the slip curves of a table, without measurements, which it does not hold."""
     if table is None or not table.curves:
         return []
@@ -396,22 +398,22 @@ def _curve_parts(table: SlipTable | None) -> list[tree.Part]:
     for terrain, curve in table.curves.items():
         law, ranges = curve.thrust_ratio, (curve.slip_range_ratio, curve.peak_interval_ratio)
         targets = np.array([table.targets[terrain][state].slip_ratio for state in ("traction", "steady")])
-        points = tree.Points("targets of traction and steady motion", targets, law(targets), colour=2)
+        points = Points("targets of traction and steady motion", targets, law(targets), colour=2)
         marks = [*law_marks(law, *ranges, curve.resistance_ratio), points]
-        panels.append(tree.Panel(marks, "thrust over load", f"{terrain}: {curve.law}, {curve.n_runs} runs"))
+        panels.append(Panel(marks, "thrust over load", f"{terrain}: {curve.law}, {curve.n_runs} runs"))
     caption = (
         "The law fitted to measured runs, and the targets on it; the thrust above the resistance is available to "
         "accelerate and to climb."
     )
-    return [tree.Figure(f"Slip curves of the table {table.name}", panels, caption, x_label="slip ratio")]
+    return [Figure(f"Slip curves of the table {table.name}", panels, caption, x_label="slip ratio")]
 
 
-def _provenance(result: DriveResult) -> list[tree.Part | str]:
+def _provenance(result: DriveResult) -> list[Part | str]:
     first, last = result.seeds[0], result.seeds[-1]
     return [
         "Robot and terrain are models: controllers are compared on them, and what a robot in a field would do is "
         "not predicted.",
-        tree.Pairs(
+        Pairs(
             [
                 ("seeds", f"{first} to {last}" if last > first else first),
                 ("delay from a sample to the wheel", result.delay_s, "", "s"),

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pipelines.live.classifying import Classifier
 from pipelines.live.model import TerrainModel
 from pipelines.live.pilot import LivePilot
-from pipelines.report import Progress, silent
+from pipelines.report.results import Progress, silent
 from terrain.control.controllers import Controller, Source
 from terrain.control.situations import Situation, simulate_situation
 from terrain.control.slip_table import SlipTable

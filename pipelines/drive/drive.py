@@ -15,7 +15,7 @@ from pipelines.report.settings import Settings as BaseSettings
 from terrain.control.controllers import CONTROLLERS, KINDS, uses_classifier
 
 if TYPE_CHECKING:
-    from pipelines.report import Progress, Result
+    from pipelines.report.results import Progress, Result
 
 EXAMPLE = "terrain drive --scenario starts --terrain grass --table table.yaml --out drives/"
 RESULTS = ("pipelines.drive.comparison", "pipelines.drive.faults", "pipelines.drive.path")

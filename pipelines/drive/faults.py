@@ -18,8 +18,10 @@ import numpy as np
 from pipelines.drive.drive import ALL
 from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
-from pipelines.report import Column, Progress, Report, Result, Table, described, frame, sections, silent, tree
+from pipelines.report.figure import Figure, Line, Mark, Panel, Strip
 from pipelines.report.numbers import NOT_KNOWN, plural
+from pipelines.report.results import Progress, Result, described, frame, silent
+from pipelines.report.tree import Column, Pairs, Report, Table, sections
 from pipelines.report.versions import versions
 from terrain.control.fault_drives import (
     CleanDrive,
@@ -88,7 +90,7 @@ class FaultsResult(Result):
     bars: Mapping[str, BarCount] = described("each bar over all rows")
     n_rows: int = described("drives with a fault")
     n_met: int = described("those of them that meet all bars")
-    drawn: tuple[tree.Figure, ...] = ()
+    drawn: tuple[Figure, ...] = ()
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the drives with a fault, a row each."""
@@ -193,7 +195,7 @@ def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
     return LivePilot(robot, slips, KnownTerrain(), settings)
 
 
-def fault_figure(case: FaultCase, driven: Driven, references: References) -> tree.Figure:
+def fault_figure(case: FaultCase, driven: Driven, references: References) -> Figure:
     """Return the figure of a drive with a fault: speeds, slip and status over time.
 
     Parameters
@@ -204,32 +206,32 @@ def fault_figure(case: FaultCase, driven: Driven, references: References) -> tre
     """
     drive, plain, start_s = driven.drive, references.plain, references.start_s
     time_s, last_s = drive.time_s, float(drive.time_s[-1])
-    acts = tree.Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])
+    acts = Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])
     estimated = np.where(np.abs(driven.speed_mps) < FASTEST_MPS, driven.speed_mps, math.nan)
     shown_s = max(start_s - BEFORE_S, 0.0), last_s
-    speeds: list[tree.Mark] = [
+    speeds: list[Mark] = [
         acts,
-        tree.Line("desired", time_s, drive.desired_mps, 6, dashed=True),
-        tree.Line("commanded", time_s, drive.commanded_mps, 2),
-        tree.Line("over ground, true", time_s, drive.speed_mps, 0),
-        tree.Line("over ground, estimated", time_s, estimated, 1),
+        Line("desired", time_s, drive.desired_mps, 6, dashed=True),
+        Line("commanded", time_s, drive.commanded_mps, 2),
+        Line("over ground, true", time_s, drive.speed_mps, 0),
+        Line("over ground, estimated", time_s, estimated, 1),
     ]
-    slips: list[tree.Mark] = [
+    slips: list[Mark] = [
         acts,
-        tree.Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
-        tree.Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
-        tree.Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
-        tree.Line("estimated", time_s, drive.slip_ratio, 1),
+        Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
+        Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
+        Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
+        Line("estimated", time_s, drive.slip_ratio, 1),
     ]
-    ok: list[tree.Mark] = [acts, tree.Line("", time_s, drive.ok.astype(float), 2)]
+    ok: list[Mark] = [acts, Line("", time_s, drive.ok.astype(float), 2)]
     panels = (
         (speeds, "speed [m/s]", (-0.5, 2.0)),
         (slips, "slip ratio", (-1.1, 1.1)),
         (ok, "status is OK", None),
     )
-    return tree.Figure(
+    return Figure(
         f"{case.fault}, {duration_text(case.duration_s)}: {case.situation} on {case.terrain}, seed {case.seed}",
-        [tree.Panel(marks, label, x_range=shown_s, y_range=y_range) for marks, label, y_range in panels],
+        [Panel(marks, label, x_range=shown_s, y_range=y_range) for marks, label, y_range in panels],
         x_label="time [s]",
     )
 
@@ -329,7 +331,7 @@ def report(result: FaultsResult) -> Report:
                 [
                     "Robot and terrain are models. A fault changes what arrives at the controller; the sensors "
                     "and the motion are those of the drive without it, until the commands differ.",
-                    tree.Pairs([("seeds", ", ".join(map(str, result.seeds))), ("versions", versions())]),
+                    Pairs([("seeds", ", ".join(map(str, result.seeds))), ("versions", versions())]),
                 ],
             ),
         ),

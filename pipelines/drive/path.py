@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.drive.drive import PAGE_FILE
-from pipelines.report import Figure, Pairs, Part, Progress, Report, Result, Section, Text, described, tree
+from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_counts, format_value
+from pipelines.report.results import Progress, Result, described
+from pipelines.report.tree import Pairs, Part, Report, Section, Text
 from terrain.control.car_evaluation import FollowedDrive
 from terrain.control.car_following import SlipSource
 from terrain.control.path_drive import (
@@ -191,13 +193,13 @@ def _lateral_figure(result: PathResult) -> Figure:
     drive = result.drive
     error, ends = drive.lateral_m - result.offset_m, drive.distance_m[[0, -1]]
     most = 1.1 * min(max(result.limit_m, float(np.abs(error).max())), SHOWN_M)
-    marks: list[tree.Mark] = [
-        tree.Band("a tenth of the speed", ends, [-result.limit_m] * 2, [result.limit_m] * 2, 6),
-        tree.Line("lateral error", drive.distance_m, error, 0),
+    marks: list[Mark] = [
+        Band("a tenth of the speed", ends, [-result.limit_m] * 2, [result.limit_m] * 2, 6),
+        Line("lateral error", drive.distance_m, error, 0),
     ]
     return Figure(
         "Lateral error along the path",
-        [tree.Panel(marks, "lateral error [m]", y_range=(-most, most))],
+        [Panel(marks, "lateral error [m]", y_range=(-most, most))],
         "Of the true position, to the desired offset; positive to the left.",
         x_label="distance along the path [m]",
     )
@@ -206,19 +208,17 @@ def _lateral_figure(result: PathResult) -> Figure:
 def _map(result: PathResult) -> Iterator[Part]:
     rows, drive = result.reference.rows, result.drive
     marks = [
-        tree.Line("path", rows[:, X], rows[:, Y], 6, dashed=True),
-        tree.Line("rear axle", drive.position_m[:, 0], drive.position_m[:, 1], 0),
+        Line("path", rows[:, X], rows[:, Y], 6, dashed=True),
+        Line("rear axle", drive.position_m[:, 0], drive.position_m[:, 1], 0),
     ]
     yield Figure(
-        "The path, and where the rear axle was", [tree.Panel(marks, "y [m]", x_label="x [m]", equal=True)]
+        "The path, and where the rear axle was", [Panel(marks, "y [m]", x_label="x [m]", equal=True)]
     )
     yield Figure(
         "Speed of the rear axle, and angle of the front wheel",
         [
-            tree.Panel([tree.Line("speed", drive.distance_m, drive.speed_mps)], "speed [m/s]"),
-            tree.Panel(
-                [tree.Line("steering", drive.distance_m, np.degrees(drive.steer_rad))], "steering [°]"
-            ),
+            Panel([Line("speed", drive.distance_m, drive.speed_mps)], "speed [m/s]"),
+            Panel([Line("steering", drive.distance_m, np.degrees(drive.steer_rad))], "steering [°]"),
         ],
         x_label="distance along the path [m]",
     )
@@ -231,22 +231,20 @@ def _observed(result: PathResult) -> Iterator[Part]:
     for j, wheel in enumerate(WHEELS):
         estimate, std = np.degrees(drive.slip_rad[:, j]), np.degrees(drive.slip_std_rad[:, j])
         most = 1.4 * max(2.0, float(np.abs(estimate[np.isfinite(estimate)]).max(initial=0.0)))
-        marks: list[tree.Mark] = [
-            tree.Band("two standard deviations", drive.time_s, estimate - 2 * std, estimate + 2 * std, 0),
-            tree.Line("estimate", drive.time_s, estimate, 0),
-            tree.Line("true", drive.time_s, np.degrees(drive.slip_true_rad[:, j]), 6),
+        marks: list[Mark] = [
+            Band("two standard deviations", drive.time_s, estimate - 2 * std, estimate + 2 * std, 0),
+            Line("estimate", drive.time_s, estimate, 0),
+            Line("true", drive.time_s, np.degrees(drive.slip_true_rad[:, j]), 6),
         ]
-        panels.append(tree.Panel(marks, f"slip angle, {wheel} [°]", y_range=(-most, most)))
+        panels.append(Panel(marks, f"slip angle, {wheel} [°]", y_range=(-most, most)))
     yield Figure("Sideslip", panels, "At rest there is no true one.", x_label="time [s]")
     if np.isfinite(drive.stiffness_npr).any():
         stiffness = []
         for j, wheel in enumerate(WHEELS):
-            both: list[tree.Mark] = [
-                tree.Line("estimate", drive.time_s, drive.stiffness_npr[:, j] / 1e3, 0),
-                tree.Points(
-                    "true secant, where excited", drive.time_s, drive.secant_npr[:, j] / 1e3, colour=6
-                ),
+            both: list[Mark] = [
+                Line("estimate", drive.time_s, drive.stiffness_npr[:, j] / 1e3, 0),
+                Points("true secant, where excited", drive.time_s, drive.secant_npr[:, j] / 1e3, colour=6),
             ]
-            stiffness.append(tree.Panel(both, f"{wheel} [kN/rad]", y_range=(0.0, 32.0)))
+            stiffness.append(Panel(both, f"{wheel} [kN/rad]", y_range=(0.0, 32.0)))
         caption = "Cornering stiffness of the axles, and -F/b of the simulated tyres."
         yield Figure("Cornering stiffness", stiffness, caption, x_label="time [s]")

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from pipelines.report import Figure, Mark, tree
+from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Strip
 from terrain.control.drive_curves import DriveCurves, spans
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS
 from terrain.control.power_state import DriveState
@@ -41,29 +41,29 @@ def _run_figure(
 ) -> Figure:
     control = drive.control
     moves: list[Mark] = [
-        tree.Strip(
+        Strip(
             spans(
                 drive.control_s,
                 control["drive_state_code"],
                 {int(DriveState.TRACTION): "traction: speed rises", int(DriveState.BRAKING): "braking"},
             )
         ),
-        tree.Line("desired, fastest wheel", drive.control_s, control["desired_mps"], GREY, dashed=True),
-        tree.Line("commanded, fastest wheel", drive.control_s, control["driven_mps"], VERMILION),
-        tree.Line("true, over ground", drive.true_s, drive.true_mps, BLUE),
+        Line("desired, fastest wheel", drive.control_s, control["desired_mps"], GREY, dashed=True),
+        Line("commanded, fastest wheel", drive.control_s, control["driven_mps"], VERMILION),
+        Line("true, over ground", drive.true_s, drive.true_mps, BLUE),
     ]
     slip: list[Mark] = [
-        tree.Band("true, least to largest wheel", drive.true_s, drive.slip_least, drive.slip_largest, BLUE),
-        tree.Line("true, mean of the wheels", drive.true_s, drive.slip, BLUE),
+        Band("true, least to largest wheel", drive.true_s, drive.slip_least, drive.slip_largest, BLUE),
+        Line("true, mean of the wheels", drive.true_s, drive.slip, BLUE),
     ]
     if not drive.is_open_loop:
         slip += _control_marks(drive)
     panels = [
-        tree.Panel(moves, "speed [m/s]", y_range=speeds_mps),
-        tree.Panel(slip, "slip ratio", y_range=slips),
+        Panel(moves, "speed [m/s]", y_range=speeds_mps),
+        Panel(slip, "slip ratio", y_range=slips),
     ]
     for kind, strip in drive.terrains.items():
-        panels.append(tree.Panel([tree.Strip(strip)], f"{kind} terrain"))
+        panels.append(Panel([Strip(strip)], f"{kind} terrain"))
     return Figure(name, panels, x_label="time [s]")
 
 
@@ -73,7 +73,7 @@ def _control_marks(drive: DriveCurves) -> list[Mark]:
     moving = np.interp(time_s, drive.true_s, drive.true_mps) >= PEAK_ABOVE_MPS
     estimated = np.where(moving, control["slip_ratio"], np.nan)
     refused = {int(each): f"no correction: {each.label}" for each in TractionStatus if each}
-    marks: list[Mark] = [tree.Strip(spans(time_s, control["status_code"], refused))]
+    marks: list[Mark] = [Strip(spans(time_s, control["status_code"], refused))]
     for label, values, colour, dashed in (
         ("estimated, largest wheel", estimated, ORANGE, False),
         ("target", control["target_ratio"], GREEN, False),
@@ -81,5 +81,5 @@ def _control_marks(drive: DriveCurves) -> list[Mark]:
         ("slip of steady motion", control["balance_ratio"], PINK, True),
     ):
         if np.isfinite(values).any():
-            marks.append(tree.Line(label, time_s, values, colour, dashed))
+            marks.append(Line(label, time_s, values, colour, dashed))
     return marks

@@ -11,7 +11,8 @@ from features.labelled import labelled
 from features.windows import cut_windows, layout_of, shared_layout
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
-from pipelines.report import Progress, plural, silent
+from pipelines.report.numbers import plural
+from pipelines.report.results import Progress, silent
 from terrain.discrepancy.filter_gain import Comparison, accuracy_change
 from terrain.errors import TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds

@@ -17,7 +17,7 @@ from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipelines.explain.explanation import ExplainResult
-    from pipelines.report import Progress
+    from pipelines.report.results import Progress
     from terrain.records import RunLog
     from terrain.robots import Robot
 
@@ -153,7 +153,7 @@ def explain_runs(
         if the runs are of another robot, too few, or cannot be compared with the simulation.
     """
     from pipelines.explain.explanation import ExplainResult
-    from pipelines.report import silent
+    from pipelines.report.results import silent
     from terrain.discrepancy.diagnosed_runs import diagnose_runs, held_out_gain
     from terrain.discrepancy.extend import extended_effects
     from terrain.discrepancy.next_drive import next_command

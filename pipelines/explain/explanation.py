@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.explain import figures
-from pipelines.report import Column, Pairs, Part, Report, Result, Section, Table, Text, described
 from pipelines.report.json_file import as_json
 from pipelines.report.numbers import enumerated, format_value, sentence
+from pipelines.report.results import Result, described
+from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 from pipelines.report.versions import versions
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs

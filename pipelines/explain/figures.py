@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipelines.report import Figure, Mark, tree
+from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.discrepancy.channel_words import CHANNEL_WORDS, INPUT_LABELS
 from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, spread_of, strongest_input
 from terrain.discrepancy.noise import Noise
@@ -46,13 +46,13 @@ def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figur
         c = CHANNELS.index(name)
         measured, band = run.measured[:, c], bands[:, c]
         marks: list[Mark] = [
-            tree.Band("noise, 95 %", run.time_s, measured - band, measured + band, GREY),
-            tree.Line(MEASURED, run.time_s, measured, GREY),
-            tree.Line(BEFORE, run.time_s, run.before[:, c], VERMILION),
+            Band("noise, 95 %", run.time_s, measured - band, measured + band, GREY),
+            Line(MEASURED, run.time_s, measured, GREY),
+            Line(BEFORE, run.time_s, run.before[:, c], VERMILION),
         ]
         if run.after is not None:
-            marks.append(tree.Line(AFTER, run.time_s, run.after[:, c], BLUE))
-        panels.append(tree.Panel(marks, AXIS.format(*CHANNEL_WORDS[name])))
+            marks.append(Line(AFTER, run.time_s, run.after[:, c], BLUE))
+        panels.append(Panel(marks, AXIS.format(*CHANNEL_WORDS[name])))
     held_out = ", held out of the diagnosis" if run.held_out else ""
     title = f"{run.run_id}{f', {run.terrain}' if run.terrain else ''}{held_out}"
     caption = (
@@ -89,7 +89,7 @@ def dependence_figures(
                 marks = [
                     _points(kind, *binned_means(given, left), colour) for kind, colour, left in residuals
                 ]
-                panels[key] = tree.Panel(marks, axis, x_label=INPUT_LABELS[key])
+                panels[key] = Panel(marks, axis, x_label=INPUT_LABELS[key])
         strongest.append(panels[most])
         at, sizes = np.arange(1.0, len(runs) + 1), [noise.size(run.pace_mps)[:, c] for run in runs]
         marks = [
@@ -101,7 +101,7 @@ def dependence_figures(
             "not include differences from run to run. Turn: wheel speed right minus left, or last minus first "
             "wheel."
         )
-        panels["run"] = tree.Panel(marks, axis, x_label="run")
+        panels["run"] = Panel(marks, axis, x_label="run")
         every.append(Figure(channel_label(name), list(panels.values()), caption))
     caption = (
         "Measured minus simulated: means over bins of the input on which the residual depends most, with 95 % "
@@ -118,8 +118,8 @@ def parts_figure(parts: Sequence[PartValues]) -> Figure:
         values, halves = np.array([(part.value, part.half) for part in each.parts]).T
         low, high = np.full(2, each.value.low), np.full(2, each.value.high)
         title = f"{each.value.name}: {quantity(each.value.name, each.value.value)}"
-        band = tree.Band("all runs, 95 %", ends, low, high, GREY)
-        panels.append(tree.Panel([band, _points("a part", at, values, halves, BLUE)], each.value.unit, title))
+        band = Band("all runs, 95 %", ends, low, high, GREY)
+        panels.append(Panel([band, _points("a part", at, values, halves, BLUE)], each.value.unit, title))
     names = "; ".join([f"{i}: {part.name}" for i, part in enumerate(parts[0].parts, start=1)])
     caption = (
         "The value of each cause fitted to a part of the data: thirds of each run's time, and halves of the "
@@ -144,10 +144,10 @@ def spectra_figure(
         shape = noise_spectrum(noise.filters[c], frequency_hz, rate_hz)
         curves.append(("noise", frequency_hz, power * shape, GREY))
         marks = [
-            tree.Line(kind, at_hz, 10.0 * np.log10(np.maximum(density, LEAST_POWER)), colour, kind == "noise")
+            Line(kind, at_hz, 10.0 * np.log10(np.maximum(density, LEAST_POWER)), colour, kind == "noise")
             for kind, at_hz, density, colour in curves
         ]
-        panels.append(tree.Panel(marks, f"dB of ({unit})²/Hz", channel_label(name), log_x=True))
+        panels.append(Panel(marks, f"dB of ({unit})²/Hz", channel_label(name), log_x=True))
     caption = (
         "Spectrum of measured minus simulated, mean over runs. A line above that of the noise is more than "
         f"noise. Beyond the cut-off of the low-pass, {cutoff_hz:.2g} Hz, nothing is compared."
@@ -163,7 +163,7 @@ def _residuals(runs: Sequence[ComparedRun], c: int) -> list[tuple[str, int, list
     return found
 
 
-def _points(label: str, at: Array, values: Array, halves: Array, colour: int) -> tree.Points:
+def _points(label: str, at: Array, values: Array, halves: Array, colour: int) -> Mark:
     """Return values with their intervals; one that is not known has none."""
     halves = np.nan_to_num(halves)
-    return tree.Points(label, at, values, values - halves, values + halves, colour)
+    return Points(label, at, values, values - halves, values + halves, colour)

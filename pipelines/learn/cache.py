@@ -29,8 +29,9 @@ from pipelines.learn.parallel import counted, parallel
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
 from pipelines.learn.training_data import TrainingData, trained_runs
-from pipelines.report import Progress, format_counts, silent
 from pipelines.report.json_file import as_json
+from pipelines.report.numbers import format_counts
+from pipelines.report.results import Progress, silent
 from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable

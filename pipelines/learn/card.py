@@ -30,20 +30,9 @@ from pipelines.learn.model_file import (
 )
 from pipelines.learn.training_data import TrainedRun
 from pipelines.live.model import ModelInfo, assess
-from pipelines.report import (
-    NOT_KNOWN,
-    Column,
-    Pairs,
-    Report,
-    Result,
-    Section,
-    Table,
-    Text,
-    described,
-    enumerated,
-    format_value,
-    sentence,
-)
+from pipelines.report.numbers import NOT_KNOWN, enumerated, format_value, sentence
+from pipelines.report.results import Result, described
+from pipelines.report.tree import Column, Pairs, Report, Section, Table, Text
 from terrain.classify.breakaway import Breakaway
 from terrain.classify.confidence import CoverageFigures, ReliabilityBin
 from terrain.classify.conformal_figures import ConformalFigures

@@ -17,19 +17,9 @@ from pipelines.learn.evaluation import (
     recall_table,
 )
 from pipelines.learn.settings import EvaluationSettings
-from pipelines.report import (
-    Column,
-    Part,
-    Progress,
-    Report,
-    Result,
-    Section,
-    Table,
-    described,
-    enumerated,
-    format_value,
-    plural,
-)
+from pipelines.report.numbers import enumerated, format_value, plural
+from pipelines.report.results import Progress, Result, described
+from pipelines.report.tree import Column, Part, Report, Section, Table
 from terrain.errors import DataError
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import ComputeSettings, computing
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings
-from pipelines.report import Progress, silent
+from pipelines.report.results import Progress, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from terrain.errors import ConfigError, DataError

@@ -17,7 +17,8 @@ from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import counted, parallel
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings, RecipeSettings
-from pipelines.report import Progress, format_counts, format_value, interval, silent
+from pipelines.report.numbers import format_counts, format_value
+from pipelines.report.results import Progress, silent
 from terrain.classify.breakaway import breakaways
 from terrain.classify.folds import Fold, single_run_classes
 from terrain.classify.held_out import Examples, HeldOut, fit_fold, held_out_figures, itself, set_figures
@@ -285,7 +286,7 @@ def weaknesses(accuracy_ci: tuple[float, float], chance: float) -> tuple[str, ..
     found = []
     if not low > chance:
         found.append(
-            f"the accuracy (95 % over runs: {interval(low, high, '.1%')}) is not above chance, "
+            f"the accuracy (95 % over runs: {format_value((low, high), '.1%')}) is not above chance, "
             f"{format_value(chance, '.1%')} (always the most frequent class)"
         )
     if not high - low <= WIDE_INTERVAL:

@@ -7,26 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from pipelines.report import (
-    Bars,
-    Column,
-    Figure,
-    Line,
-    Mark,
-    Pairs,
-    Panel,
-    Part,
-    Points,
-    Report,
-    Result,
-    Section,
-    Table,
-    Text,
-    described,
-    format_value,
-    interval,
-    plural,
-)
+from pipelines.report.figure import Bars, Figure, Line, Mark, Panel, Points
+from pipelines.report.numbers import format_value, plural
+from pipelines.report.results import Result, described
+from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -168,7 +152,7 @@ def report(result: CrossvalResult) -> Report:
         title=f"Evaluation on held-out runs of {dataset}",
         answer=(
             f"{format_value(result.accuracy, PERCENT)} of windows classified correctly, "
-            f"{held_out_words(result.protocol)} ({interval(*result.accuracy_ci, PERCENT)}, 95 % over runs)."
+            f"{held_out_words(result.protocol)} ({format_value(result.accuracy_ci, PERCENT)}, 95 % over runs)."
         ),
         lead=(
             f"{dataset}, recipe {result.recipe}: {plural(result.n_windows, 'window')} of {result.window_s:g} s "

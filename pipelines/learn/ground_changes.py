@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipelines.learn.parallel import counted
-from pipelines.report import Progress, Result, described, format_value, plural, silent, tree
+from pipelines.report.numbers import format_value, plural
+from pipelines.report.results import Progress, Result, described, silent
+from pipelines.report.tree import Column, Report, Table, Text, sections
 from terrain.measured_slip.ground_changes import WatchedRun, quiet_detector, watch
 from terrain.measured_slip.measure import one_robot
 from terrain.records import RunLog
@@ -90,7 +92,7 @@ def find_changes(
     )
 
 
-def report(result: ChangesResult) -> tree.Report:
+def report(result: ChangesResult) -> Report:
     """Return the alarms of each run, and how many changes were found how fast."""
     n_alarms, n_runs = sum(len(run.changes) for run in result.runs), len(result.runs)
     answer = f"{plural(n_alarms, 'change')} of the ground in {plural(n_runs, 'run')} of {result.robot}"
@@ -108,17 +110,17 @@ def report(result: ChangesResult) -> tree.Report:
             "have an alarm"
         )
     columns = (
-        tree.Shown("run", "run_id"),
-        tree.Shown(
-            "alarms", lambda run: ", ".join(f"{c.alarm_s:.2f}" for c in run.changes) or "none", "", "s"
+        Column("run", of="run_id"),
+        Column(
+            "alarms", "", "s", of=lambda run: ", ".join(f"{c.alarm_s:.2f}" for c in run.changes) or "none"
         ),
-        tree.Shown("slip measured from outside", _slip_words),
-        tree.Shown("changes at", "step.time_s", ".2f", "s"),
-        tree.Shown("delay", "delay_s", "+.2f", "s"),
-        tree.Shown("early", "n_early"),
+        Column("slip measured from outside", of=_slip_words),
+        Column("changes at", ".2f", "s", of="step.time_s"),
+        Column("delay", "+.2f", "s", of="delay_s"),
+        Column("early", of="n_early"),
     )
     more = f"{n_runs - MAX_ROWS} runs more: --details" if n_runs > MAX_ROWS else ""
-    return tree.Report(
+    return Report(
         title=f"Changes of the ground under {result.robot}",
         answer=f"{answer}.",
         lead=(
@@ -126,10 +128,10 @@ def report(result: ChangesResult) -> tree.Report:
             f"{format_value(result.false_alarm_ratio, '.1%')} of {result.n_calibration_runs} runs on one ground"
         ),
         parts=[
-            tree.table(result.runs[:MAX_ROWS], columns, note=more),
-            *(tree.Text(text, "note") for text in (*notes, *result.skipped)),
+            Table(columns, result.runs[:MAX_ROWS], note=more),
+            *(Text(text, "note") for text in (*notes, *result.skipped)),
         ],
-        details=tree.sections(("All runs", [tree.table(result.runs, columns)] if more else [])),
+        details=sections(("All runs", [Table(columns, result.runs)] if more else [])),
         next_step="terrain label runs/ --run ID --from S --to S --terrain NAME",
     )
 

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Self
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError, model_validator
 
-from pipelines.report import Progress, Result, described, enumerated, plural, silent, tree
+from pipelines.report.numbers import enumerated, plural
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from pipelines.report.tree import Column, Report, Section, Table, Text
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.names import plain_name, shown
 
@@ -292,7 +294,7 @@ def time_text(time_s: float) -> str:
     return f"{time_s + 0.0:.6f}".rstrip("0").rstrip(".")
 
 
-def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResult) -> tree.Report:
+def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResult) -> Report:
     """Return what is doubtful, was changed, is asked or was written."""
     if isinstance(result, LabelResult):
         return _label_report(result)
@@ -300,7 +302,7 @@ def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResul
         return _proposals_report(result)
     if isinstance(result, AnswersResult):
         counts = enumerated([f"{n} by {source}" for source, n in result.n_labels.items()])
-        return tree.Report(
+        return Report(
             title="Labels",
             answer=f"{plural(result.n_runs, 'run')} in {result.out}: labels {counts}; "
             f"{result.n_left_open} stretches without one",
@@ -310,43 +312,43 @@ def report(result: DoubtfulResult | LabelResult | ProposalsResult | AnswersResul
 
 
 INTERVAL = (
-    tree.Shown("from s", lambda row: time_text(row.start_s)),
-    tree.Shown("to s", lambda row: time_text(row.end_s)),
+    Column("from s", of=lambda row: time_text(row.start_s)),
+    Column("to s", of=lambda row: time_text(row.end_s)),
 )
 
 
-def _doubtful_report(result: DoubtfulResult) -> tree.Report:
+def _doubtful_report(result: DoubtfulResult) -> Report:
     columns = (
-        tree.Shown("run", "run_id"),
+        Column("run", of="run_id"),
         *INTERVAL,
-        tree.Shown(
+        Column(
             "classified",
-            lambda row: row.terrain or (f"refused: {row.refused}" if row.refused else "unknown"),
+            of=lambda row: row.terrain or (f"refused: {row.refused}" if row.refused else "unknown"),
         ),
-        tree.Shown("probability", "probability", ".2f"),
-        tree.Shown("label", "label"),
+        Column("probability", ".2f", of="probability"),
+        Column("label", of="label"),
     )
     of_run = (
-        tree.Shown("run", "run_id"),
-        tree.Shown("windows", "n_windows"),
-        tree.Shown("low confidence", "n_doubtful"),
-        tree.Shown("without label", "n_without_label"),
+        Column("run", of="run_id"),
+        Column("windows", of="n_windows"),
+        Column("low confidence", of="n_doubtful"),
+        Column("without label", of="n_without_label"),
     )
     n_windows = sum(run.n_windows or 0 for run in result.runs)
-    return tree.Report(
+    return Report(
         title="Windows of low confidence",
         answer=f"{len(result.windows)} of {plural(n_windows, 'recorded window')} are of low confidence, "
         f"{sum(run.n_without_label for run in result.runs)} of them without a label",
-        parts=(tree.table(result.windows, columns),) if result.windows else (),
-        details=(tree.Section("By run", (tree.table(result.runs, of_run),)),),
+        parts=(Table(columns, result.windows),) if result.windows else (),
+        details=(Section("By run", (Table(of_run, result.runs),)),),
         next_step=f"terrain label {result.data} --run ID --from S --to S --terrain NAME",
     )
 
 
-def _label_report(result: LabelResult) -> tree.Report:
+def _label_report(result: LabelResult) -> Report:
     done = f"labelled {result.terrain}" if result.terrain else "without a label"
-    labels = tree.table(result.labels, (*INTERVAL, tree.Shown("terrain", "terrain")))
-    return tree.Report(
+    labels = Table((*INTERVAL, Column("terrain", of="terrain")), result.labels)
+    return Report(
         title="Labels",
         answer=f"{result.run_id}: {time_text(result.start_s)} to {time_text(result.end_s)} s {done}",
         parts=(labels,) if result.labels else (),
@@ -354,28 +356,28 @@ def _label_report(result: LabelResult) -> tree.Report:
     )
 
 
-def _proposals_report(result: ProposalsResult) -> tree.Report:
+def _proposals_report(result: ProposalsResult) -> Report:
     from terrain.classify.proposals import questions
 
     columns = (
-        tree.Shown("run", "run_id"),
-        tree.Shown("from s", "start_s", ".1f"),
-        tree.Shown("to s", "end_s", ".1f"),
-        tree.Shown("proposed", "terrain"),
-        tree.Shown("confidence", "confidence", ".2f"),
-        tree.Shown("supported", "supported_ratio", ".1%"),
-        tree.Shown("unknown", "unknown_ratio", ".1%"),
+        Column("run", of="run_id"),
+        Column("from s", ".1f", of="start_s"),
+        Column("to s", ".1f", of="end_s"),
+        Column("proposed", of="terrain"),
+        Column("confidence", ".2f", of="confidence"),
+        Column("supported", ".1%", of="supported_ratio"),
+        Column("unknown", ".1%", of="unknown_ratio"),
     )
     asked = [result.proposals[i] for i in questions(result.proposals, result.n_asked)]
-    table = tree.table(asked, columns, title="worth an answer, the first the most")
+    table = Table(columns, asked, title="worth an answer, the first the most")
     rest = len(result.proposals) - result.n_asked
-    return tree.Report(
+    return Report(
         title="Proposed labels",
         answer=f"{plural(len(result.proposals), 'proposal')} for {plural(result.n_runs, 'run')} in {result.file}: "
         f"{plural(result.n_asked, 'question')}; of the other {rest}, {result.n_taken_over} need no answer",
         parts=(
             *((table,) if asked else ()),
-            tree.Text("answer with a terrain, 'yes' or 'none' in the column answer", kind="note"),
+            Text("answer with a terrain, 'yes' or 'none' in the column answer", kind="note"),
         ),
         next_step=f"terrain label {result.data} --answers {result.file} --out NEW",
     )

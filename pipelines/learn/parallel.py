@@ -26,7 +26,7 @@ from urllib.parse import urlsplit
 
 from pydantic import model_validator
 
-from pipelines.report import Progress
+from pipelines.report.results import Progress
 from pipelines.report.settings import Settings, setting
 from pipelines.report.versions import difference, software
 from terrain.errors import ConfigError, TerrainError

@@ -18,9 +18,12 @@ from pydantic import model_validator
 
 from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
-from pipelines.report import Progress, Result, described, format_counts, format_value, plural, silent, tree
+from pipelines.report.figure import Figure, Panel, Strip
+from pipelines.report.numbers import format_counts, format_value, plural
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from pipelines.report.tree import Column, Part, Report, Section, Table, Text
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -326,7 +329,7 @@ def _table_row(targets: Mapping[str, SlipTarget]) -> dict[str, Any]:
     }
 
 
-def report(result: Predictions) -> tree.Report:
+def report(result: Predictions) -> Report:
     """Return the terrains along the runs, how far they are right, and what is not certain of them."""
     stretches = [list(rows) for _, rows in groupby(result.windows, lambda row: (row.run_id, row.terrain))]
     counts = Counter(row.terrain for row in result.windows)
@@ -341,33 +344,33 @@ def report(result: Predictions) -> tree.Report:
             found += f", {len(result.training_runs)} runs of which trained the model"
     more = len(stretches) - MAX_ROWS
     note = f"{more} stretches more; --out FILE.csv has every window" if more > 0 else ""
-    return tree.Report(
+    return Report(
         title=f"Terrain of {result.dataset or 'runs'}",
         answer=f"{found}.",
         lead=f"model {result.model or 'given'}, target slips of the table {result.table_name!r}",
         picture=_picture(stretches),
-        parts=[tree.table(stretches[:MAX_ROWS], STRETCH_COLUMNS, note=note), *_notes(result)],
-        details=[tree.Section("All stretches", [tree.table(stretches, STRETCH_COLUMNS)])],
+        parts=[Table(STRETCH_COLUMNS, stretches[:MAX_ROWS], note=note), *_notes(result)],
+        details=[Section("All stretches", [Table(STRETCH_COLUMNS, stretches)])],
         next_step=f"terrain serve --model {result.model} --robot ROBOT" if result.model else "",
     )
 
 
-def _target_column(state: str) -> tree.Shown:
-    return tree.Shown(f"slip, {state}", lambda rows: rows[0].target_slip[state], "+.2f")
+def _target_column(state: str) -> Column:
+    return Column(f"slip, {state}", "+.2f", of=lambda rows: rows[0].target_slip[state])
 
 
 STRETCH_COLUMNS = (
-    tree.Shown("run", lambda rows: rows[0].run_id),
-    tree.Shown("from", lambda rows: rows[0].start_s, ".1f", "s"),
-    tree.Shown("windows", len),
-    tree.Shown("terrain", lambda rows: rows[0].terrain),
-    tree.Shown("probability", lambda rows: fmean(row.probability for row in rows), ".2f"),
+    Column("run", of=lambda rows: rows[0].run_id),
+    Column("from", ".1f", "s", of=lambda rows: rows[0].start_s),
+    Column("windows", of=len),
+    Column("terrain", of=lambda rows: rows[0].terrain),
+    Column("probability", ".2f", of=lambda rows: fmean(row.probability for row in rows)),
     *map(_target_column, DRIVE_STATES),
 )
 """Of windows of a run that follow each other and are of one terrain."""
 
 
-def _picture(stretches: Sequence[Sequence[WindowPrediction]]) -> tree.Figure | None:
+def _picture(stretches: Sequence[Sequence[WindowPrediction]]) -> Figure | None:
     """Return a strip of terrains for each of the first runs."""
     panels: dict[str, list[tuple[float, float, str]]] = {}
     for rows in stretches:
@@ -377,15 +380,15 @@ def _picture(stretches: Sequence[Sequence[WindowPrediction]]) -> tree.Figure | N
     if not panels:
         return None
     more = f" The first {MAX_STRIPS} of {len(panels)} runs." if len(panels) > MAX_STRIPS else ""
-    return tree.Figure(
+    return Figure(
         "Predicted terrain along the runs",
-        [tree.Panel([tree.Strip(spans)], title=name) for name, spans in list(panels.items())[:MAX_STRIPS]],
+        [Panel([Strip(spans)], title=name) for name, spans in list(panels.items())[:MAX_STRIPS]],
         caption=f"Colours are terrains.{more}",
         x_label="time [s]",
     )
 
 
-def _notes(result: Predictions) -> list[tree.Part]:
+def _notes(result: Predictions) -> list[Part]:
     without = {row.terrain for row in result.windows if row.slip_entry != row.terrain == row.nearest}
     unestimated = any("unestimated" in row.status.values() for row in result.windows)
     accuracy = format_value(result.filtered_accuracy, PERCENT)
@@ -410,4 +413,4 @@ def _notes(result: Predictions) -> list[tree.Part]:
         f"repaired: {format_counts(result.repaired)}": result.repaired,
         **dict.fromkeys(result.skipped or (), True),
     }
-    return [tree.Text(text, "note") for text, applies in notes.items() if applies]
+    return [Text(text, "note") for text, applies in notes.items() if applies]

@@ -23,7 +23,7 @@ from terrain.files.names import printable
 
 if TYPE_CHECKING:
     from pipelines.learn.training_data import TrainingData
-    from pipelines.report import Progress
+    from pipelines.report.results import Progress
     from terrain.classify.folds import Fold
     from terrain.classify.held_out import Examples
     from terrain.classify.paired import Difference

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from pipelines.data.tracking import log_run, mlflow_store
-from pipelines.report import Result, described
+from pipelines.report.results import Result, described
 from terrain.errors import ModelError
 
 if TYPE_CHECKING:

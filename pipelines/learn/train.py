@@ -20,8 +20,10 @@ from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn.parallel import ComputeSettings
 from pipelines.learn.settings import FEATURE_RECIPE, RecipeSettings
 from pipelines.learn.tracking import Registered
-from pipelines.report import Progress, Report, Section, Text, described, format_value, plural, silent
+from pipelines.report.numbers import format_value, plural
+from pipelines.report.results import Progress, described, silent
 from pipelines.report.settings import setting
+from pipelines.report.tree import Report, Section, Text
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import numpy as np
 
 from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
-from pipelines.report import described
+from pipelines.report.results import described
 from terrain.classify.conformal import conformal_sets
 from terrain.classify.novelty_numbers import NoveltyNumbers, novelty_scores
 from terrain.classify.support import SupportTable, support_of

@@ -10,6 +10,7 @@ import io
 import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import matplotlib.style
 import numpy as np
@@ -18,8 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Drawn
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
+from pipelines.report.figure import Figure, Mark, Panel
 from pipelines.report.numbers import plain_line
-from pipelines.report.tree import Band, Bars, Figure, Line, Panel, Points, Strip
 
 PNG_DPI = 160
 WIDTH_IN, PANEL_HEIGHT_IN, BAR_HEIGHT_IN, HEAD_IN = 8.4, 2.3, 0.26, 0.9
@@ -107,30 +108,31 @@ def draw(figure: Figure) -> Drawn:
 
 
 def _height_in(panel: Panel) -> float:
-    bars = [mark for mark in panel.marks if isinstance(mark, Bars)]
+    bars = [mark for mark in panel.marks if mark.kind == "bars"]
     if bars:
-        return 0.6 + BAR_HEIGHT_IN * len(bars[0].categories) * max(1.0, 0.7 * len(bars))
-    if all(isinstance(mark, Strip) for mark in panel.marks):
+        return 0.6 + BAR_HEIGHT_IN * len(bars[0].x) * max(1.0, 0.7 * len(bars))
+    if all(mark.kind == "strip" for mark in panel.marks):
         return STRIP_HEIGHT_IN
     return 4.5 if panel.equal else PANEL_HEIGHT_IN
 
 
 def strip_names(figure: Figure) -> list[str]:
     """Return the names of all intervals of a figure, each of which has one colour in all panels."""
-    marks = [mark for panel in figure.panels for mark in panel.marks if isinstance(mark, Strip)]
-    return list(dict.fromkeys(name for mark in marks for _, _, name in mark.spans))
+    marks = [mark for panel in figure.panels for mark in panel.marks if mark.kind == "strip"]
+    return list(dict.fromkeys(name for mark in marks for _, _, name in mark.x))
 
 
 def _draw_panel(axes: Axes, panel: Panel, names: list[str]) -> None:
-    bars = [mark for mark in panel.marks if isinstance(mark, Bars)]
-    others = [mark for mark in panel.marks if not isinstance(mark, Bars)]
-    for number, mark in enumerate(others):
-        if isinstance(mark, Strip):
+    n_bars = sum(mark.kind == "bars" for mark in panel.marks)
+    for number, mark in enumerate(panel.marks):
+        colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
+        style: dict[str, Any] = {"color": colour, "label": plain_line(mark.label) or "_nolegend_"}
+        if mark.kind == "strip":
             _draw_strip(axes, mark, names, thin=len(panel.marks) == 1)
+        elif mark.kind == "bars":
+            _draw_bars(axes, mark, number, n_bars, style)
         else:
-            _draw_mark(axes, mark, number)
-    for number, bar in enumerate(bars):
-        _draw_bars(axes, bar, number, len(bars))
+            _draw_over_x(axes, mark, style)
     axes.set(xlabel=panel.x_label, ylabel=panel.y_label)
     if panel.title:
         axes.set_title(plain_line(panel.title), loc="left")
@@ -142,58 +144,51 @@ def _draw_panel(axes: Axes, panel: Panel, names: list[str]) -> None:
         axes.set_xscale("log")
     if panel.equal:
         axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(axis="x" if bars else "both")
+    axes.grid(axis="x" if n_bars else "both")
     handles, labels = axes.get_legend_handles_labels()
     if len(labels) > 1 or (labels and not panel.y_label):
-        style = {"ncols": 4, "fontsize": 8, "frameon": False, "borderpad": 0}
+        legend = {"ncols": 4, "fontsize": 8, "frameon": False, "borderpad": 0}
         above = (0.0, 1.1 if panel.title else 1.0)
-        axes.legend(handles, labels, loc="lower left", bbox_to_anchor=above, **style)
+        axes.legend(handles, labels, loc="lower left", bbox_to_anchor=above, **legend)
 
 
-def _draw_strip(axes: Axes, mark: Strip, names: list[str], thin: bool) -> None:
+def _draw_strip(axes: Axes, mark: Mark, names: list[str], thin: bool) -> None:
     """Draw intervals in the colours of their names; where nothing else is drawn, without a vertical axis."""
-    alpha = 0.75 if thin else 0.18
-    present = [name for _, _, name in mark.spans]
-    for start, end, name in mark.spans:
-        axes.axvspan(start, end, color=COLOURS[names.index(name) % len(COLOURS)], alpha=alpha, lw=0)
-    for name in dict.fromkeys(present):
-        colour = COLOURS[names.index(name) % len(COLOURS)]
-        axes.fill_between([], [], color=colour, alpha=alpha, lw=0, label=plain_line(name))
+    labelled: set[str] = set()
+    for start, end, name in mark.x:
+        style: dict[str, Any] = {
+            "color": COLOURS[names.index(name) % len(COLOURS)],
+            "alpha": 0.75 if thin else 0.18,
+            "lw": 0,
+        }
+        axes.axvspan(start, end, **style)
+        if name not in labelled:
+            labelled.add(name)
+            axes.fill_between([], [], label=plain_line(name), **style)
     if thin:
         axes.set_yticks([])
 
 
-def _draw_mark(axes: Axes, mark: Line | Band | Points, number: int) -> None:
-    colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
-    label = plain_line(mark.label) or "_nolegend_"
-    x = np.asarray(mark.x, float)
-    if isinstance(mark, Line):
-        axes.plot(
-            x, np.asarray(mark.y, float), color=colour, lw=1.2, ls="--" if mark.dashed else "-", label=label
-        )
-    elif isinstance(mark, Band):
-        low, high = np.asarray(mark.low, float), np.asarray(mark.high, float)
-        axes.fill_between(x, low, high, color=colour, alpha=0.2, lw=0, label=label)
+def _draw_over_x(axes: Axes, mark: Mark, style: dict[str, Any]) -> None:
+    x, y, low, high = (np.asarray(each, float) for each in (mark.x, mark.y, mark.low, mark.high))
+    if mark.kind == "line":
+        axes.plot(x, y, lw=1.2, ls="--" if mark.dashed else "-", **style)
+    elif mark.kind == "band":
+        axes.fill_between(x, low, high, alpha=0.2, lw=0, **style)
     else:
-        y = np.asarray(mark.y, float)
-        axes.plot(x, y, "o", ms=3.5, color=colour, label=label)
+        axes.plot(x, y, "o", ms=3.5, **style)
         if mark.low is not None:
-            axes.vlines(x, np.asarray(mark.low, float), np.asarray(mark.high, float), color=colour, lw=1.0)
+            axes.vlines(x, low, high, color=style["color"], lw=1.0)
 
 
-def _draw_bars(axes: Axes, mark: Bars, number: int, n_bars: int) -> None:
-    height = 0.8 / n_bars
-    y = np.arange(len(mark.categories)) + (number - 0.5 * (n_bars - 1)) * height
-    values = np.asarray(mark.values, float)
-    colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
-    axes.barh(
-        y, values, height=0.9 * height, color=colour, alpha=0.85, label=plain_line(mark.label) or "_nolegend_"
-    )
+def _draw_bars(axes: Axes, mark: Mark, number: int, n_bars: int, style: dict[str, Any]) -> None:
+    height, places = 0.8 / n_bars, np.arange(len(mark.x))
+    at = places + (number - 0.5 * (n_bars - 1)) * height
+    axes.barh(at, np.asarray(mark.y, float), height=0.9 * height, alpha=0.85, **style)
     if mark.low is not None:
-        axes.hlines(y, np.asarray(mark.low, float), np.asarray(mark.high, float), color=INK, lw=1.0)
-    names = [shorten(plain_line(name), LONGEST_NAME) for name in mark.categories]
-    axes.set_yticks(np.arange(len(names)), names)
-    axes.set_ylim(len(mark.categories) - 0.4, -0.6)
+        axes.hlines(at, np.asarray(mark.low, float), np.asarray(mark.high, float), color=INK, lw=1.0)
+    axes.set_yticks(places, [shorten(plain_line(name), LONGEST_NAME) for name in mark.x])
+    axes.set_ylim(len(places) - 0.4, -0.6)
 
 
 def shorten(text: str, width: int) -> str:

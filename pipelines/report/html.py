@@ -17,8 +17,9 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from pipelines.report.figure import Figure
 from pipelines.report.json_file import as_json
-from pipelines.report.tree import Figure, Part, Report, Section
+from pipelines.report.tree import Part, Report, Section
 
 ASSETS = Path(__file__).parent / "assets"
 DIGITS = 6
@@ -101,21 +102,13 @@ def figure_data(figure: Figure) -> dict[str, Any]:
 
     Examples
     --------
-    >>> from pipelines.report import Line, Panel
+    >>> from pipelines.report.figure import Line, Panel
     >>> figure = Figure("Speed", [Panel([Line("measured", [0, 1], [0.5, math.nan])], "m/s")])
     >>> figure_data(figure)["panels"][0]["marks"][0]["y"]
     [0.5, None]
     """
-    panels = [
-        {
-            **_shortened(vars(panel) | {"marks": ()}),
-            "marks": [
-                {"kind": type(mark).__name__.lower(), **_shortened(mark._asdict())} for mark in panel.marks
-            ],
-        }
-        for panel in figure.panels
-    ]
-    return {"title": figure.title, "x_label": figure.x_label, "panels": panels}
+    data: dict[str, Any] = _shortened(as_json(figure))
+    return data
 
 
 def _shortened(value: Any) -> Any:

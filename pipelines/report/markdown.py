@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
+from pipelines.report.figure import Figure
 from pipelines.report.numbers import plain_line
-from pipelines.report.tree import Figure, Pairs, Part, Report, Section, Table, Text
+from pipelines.report.tree import Pairs, Part, Report, Section, Table, Text
 
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~&!])")
 _ADDRESS = re.compile(r"(https?|ftp)(?=://)", re.IGNORECASE)

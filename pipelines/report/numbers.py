@@ -48,17 +48,6 @@ def format_value(value: Any, form: str = "", unit: str = "") -> str:
     return " to ".join(texts) + (f"{NBSP}{ending}" if ending else "")
 
 
-def interval(low: float | None, high: float | None, form: str = "", unit: str = "") -> str:
-    r"""Return an interval; a mark where an end is not known.
-
-    Examples
-    --------
-    >>> interval(0.1, 0.25, ".2f", "m"), interval(float("nan"), 1.0)
-    ('0.10 to 0.25\xa0m', '–')
-    """
-    return format_value((low, high), form, unit)
-
-
 def _bare(value: Any, form: str) -> str:
     """Return a value without its unit."""
     if value is None:

@@ -2,19 +2,20 @@
 
 A report leads with its answer: one sentence and at most one picture; then what a user decides by; then
 details, which are folded.  Cells and values are numbers, not texts: their column or pair says how they are
-written, so that screen and page show one number in one form.  A figure describes what is drawn, not how.
+written, so that screen and page show one number in one form.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias
 
+from pipelines.report.figure import Figure
 from pipelines.report.numbers import format_value
 from pipelines.report.writing import ENDINGS, check_file
 from terrain.files.atomic import atomic_write
@@ -74,7 +75,7 @@ class Table:
     """
 
     columns: Sequence[Column | str]
-    rows: Sequence[Any]
+    rows: Collection[Any]
     title: str = ""
     note: str = ""
 
@@ -91,22 +92,6 @@ class Table:
             texts = [format_value(value, column.form) for value in values]
             found.append(Written(column, heading, right, values, texts))
         return found
-
-
-class Shown(NamedTuple):
-    """A column of a table of records."""
-
-    title: str
-    of: str | Callable[[Any], Any]
-    form: str = ""
-    unit: str = ""
-    long: bool = False
-
-
-def table(rows: Iterable[Any], columns: Sequence[Shown], title: str = "", note: str = "") -> Table:
-    """Return a table of records."""
-    made = [Column(each.title, each.form, each.unit, each.of, long=each.long) for each in columns]
-    return Table(made, tuple(rows), title, note)
 
 
 def value_at(record: Any, place: str | int | Callable[[Any], Any]) -> Any:
@@ -133,91 +118,6 @@ class Pairs:
     def cells(self) -> list[tuple[str, str]]:
         """The names, and the values as they are written."""
         return [(str(row[0]), format_value(*row[1:])) for row in self.rows]
-
-
-class Line(NamedTuple):
-    """A line through points ``x, y`` (n,); NaN is a gap."""
-
-    label: str
-    x: Any
-    y: Any
-    colour: int | None = None
-    dashed: bool = False
-
-
-class Band(NamedTuple):
-    """The area between ``low`` and ``high`` (n,) over ``x`` (n,)."""
-
-    label: str
-    x: Any
-    low: Any
-    high: Any
-    colour: int | None = None
-
-
-class Points(NamedTuple):
-    """Points ``x, y`` (n,), with bars from ``low`` to ``high`` (n,) where these are given."""
-
-    label: str
-    x: Any
-    y: Any
-    low: Any = None
-    high: Any = None
-    colour: int | None = None
-
-
-class Bars(NamedTuple):
-    """A horizontal bar for each category, with an interval where one is given; several are grouped."""
-
-    label: str
-    categories: Sequence[str]
-    values: Any
-    low: Any = None
-    high: Any = None
-    colour: int | None = None
-
-
-class Strip(NamedTuple):
-    """Coloured intervals ``(start, end, name)`` along x; one name has one colour."""
-
-    spans: Sequence[tuple[float, float, str]]
-
-
-Mark: TypeAlias = Line | Band | Points | Bars | Strip
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Axes with marks; ``equal`` where both axes have one scale, as of a path."""
-
-    marks: Sequence[Mark]
-    y_label: str = ""
-    title: str = ""
-    x_label: str = ""
-    x_range: tuple[float, float] | None = None
-    y_range: tuple[float, float] | None = None
-    equal: bool = False
-    log_x: bool = False
-
-
-@dataclass(frozen=True)
-class Figure:
-    """Panels below one another.
-
-    Parameters
-    ----------
-    title : above
-    panels : from the top
-    caption : below: what is to be seen
-    alt : in the place of a picture that cannot be seen; the caption by default
-    x_label : of the last panel
-    """
-
-    title: str
-    panels: Sequence[Panel]
-    caption: str = ""
-    alt: str = ""
-    x_label: str = ""
 
 
 @dataclass(frozen=True)

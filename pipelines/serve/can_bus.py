@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines import report as reports
 from pipelines.data.can_codec import (
     OPTIONAL,
     RECEIVED,
@@ -33,8 +32,10 @@ from pipelines.data.can_logs import Receiver
 from pipelines.live.chain import Chain, CommandStatus
 from pipelines.live.classifying import ClassifierThread
 from pipelines.live.session import chain_of
-from pipelines.report import Progress, Result, described, format_value, silent
+from pipelines.report.numbers import format_value
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.stopping import stopping
+from pipelines.report.tree import Column, Pairs, Report, Table, sections
 from pipelines.serve.serve import Settings, loaded
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
@@ -415,7 +416,7 @@ def bus_of(text: str) -> tuple[str, str]:
     return (interface, channel) if colon else ("socketcan", text)
 
 
-def report(result: BridgeResult) -> reports.Report:
+def report(result: BridgeResult) -> Report:
     """Return what a bridge did: frames, states and latencies, then what was not used, by kind."""
     answer = (
         f"Corrections were the controller's in {result.states.get('ACTIVE', 0)} of {sum(result.states.values())} "
@@ -428,13 +429,13 @@ def report(result: BridgeResult) -> reports.Report:
     ]
     pairs = result.pairs("frames_in", "frames_used", "frames_out", "ticks_missed")
     for name, found in (("wheels to correction", result.wheels_to_correction), ("control step", result.step)):
-        span = reports.interval(found["median_ms"], found["p99_ms"], ".2f", "ms")
+        span = format_value((found["median_ms"], found["p99_ms"]), ".2f", "ms")
         pairs.append((f"{name}, median to p99", span))
-    columns = ("kind", reports.Column("name", long=True), "number")
-    return reports.Report(
+    columns = ("kind", Column("name", long=True), "number")
+    return Report(
         "CAN bus",
         answer,
-        parts=(reports.Pairs(pairs), reports.Table(columns, rows)) if rows else (reports.Pairs(pairs),),
-        details=reports.sections(("Setup", [reports.Pairs(result.pairs("robot", "dbc"))])),
+        parts=(Pairs(pairs), Table(columns, rows)) if rows else (Pairs(pairs),),
+        details=sections(("Setup", [Pairs(result.pairs("robot", "dbc"))])),
         next_step="terrain serve --can BUS --json FILE keeps these figures",
     )

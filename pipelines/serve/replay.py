@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from features.windows import label_windows
-from pipelines import report as reports
 from pipelines.data.datasets import load
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.settings import ReadSettings
@@ -21,8 +20,11 @@ from pipelines.live.chain import Chain
 from pipelines.live.model import TerrainModel
 from pipelines.live.session import chain_of
 from pipelines.live.windows import needs_filter
-from pipelines.report import Progress, Result, described, format_value, silent
+from pipelines.report.figure import Figure, Panel, Strip
+from pipelines.report.numbers import format_counts, format_value, plural
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.stopping import stopping
+from pipelines.report.tree import Column, Report, Table, Text, sections
 from pipelines.serve.serve import Settings, loaded
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
@@ -283,7 +285,7 @@ def replay_run(
     )
 
 
-def report(result: ReplayResult) -> reports.Report:
+def report(result: ReplayResult) -> Report:
     """Return what was found in the runs and how fast, a row a run, and what the chains did not use."""
     accuracy = (
         f", {format_value(result.accuracy, PERCENT)} of {result.n_judged} with a label classified rightly"
@@ -291,26 +293,24 @@ def report(result: ReplayResult) -> reports.Report:
         else ""
     )
     panels = [
-        reports.Panel(
-            [reports.Strip([(w.start_s, w.end_s, w.believed or UNKNOWN) for w in run.windows])],
+        Panel(
+            [Strip([(w.start_s, w.end_s, w.believed or UNKNOWN) for w in run.windows])],
             title=run.run_id,
         )
         for run in result.runs[:MAX_STRIPS]
         if run.windows
     ]
-    unused = [
-        f"{run.run_id}: not used {reports.format_counts(run.dropped)}" for run in result.runs if run.dropped
-    ]
-    notes = [reports.Text(f"skipped: {sentence}", "warning") for sentence in result.skipped]
+    unused = [f"{run.run_id}: not used {format_counts(run.dropped)}" for run in result.runs if run.dropped]
+    notes = [Text(f"skipped: {sentence}", "warning") for sentence in result.skipped]
     if result.interrupted:
-        notes.insert(0, reports.Text("stopped before the end", "note"))
-    return reports.Report(
+        notes.insert(0, Text("stopped before the end", "note"))
+    return Report(
         "Replay of a log",
-        f"{reports.plural(result.n_windows, 'window')} in {format_value(result.duration_s, '.1f', 's')} of driving"
+        f"{plural(result.n_windows, 'window')} in {format_value(result.duration_s, '.1f', 's')} of driving"
         f"{accuracy}; {format_value(result.times_real_time, '.0f')} times real time.",
-        picture=reports.Figure("Terrain that was believed", panels, x_label="time in s") if panels else None,
-        parts=[reports.table(result.runs, COLUMNS), *notes],
-        details=reports.sections(("Not used", unused or ("nothing",))),
+        picture=Figure("Terrain that was believed", panels, x_label="time in s") if panels else None,
+        parts=[Table(COLUMNS, result.runs), *notes],
+        details=sections(("Not used", unused or ("nothing",))),
         lead=f"model {result.model or 'none'}, table {result.table_name}",
         next_step=f"terrain serve --model {result.model}" if result.model else "terrain train --data RUNS",
     )
@@ -321,11 +321,11 @@ def _fractions(found: Mapping[str, float]) -> str:
 
 
 COLUMNS = (
-    reports.Shown("run", "run_id"),
-    reports.Shown("length", "duration_s", ".1f", "s"),
-    reports.Shown("windows", "n_windows"),
-    reports.Shown("accuracy", "accuracy", PERCENT),
-    reports.Shown("times real time", "times_real_time", ".0f"),
-    reports.Shown("terrain", lambda run: _fractions(run.terrains)),
-    reports.Shown("believed", lambda run: _fractions(run.believed)),
+    Column("run", of="run_id"),
+    Column("length", ".1f", "s", of="duration_s"),
+    Column("windows", of="n_windows"),
+    Column("accuracy", PERCENT, of="accuracy"),
+    Column("times real time", ".0f", of="times_real_time"),
+    Column("terrain", of=lambda run: _fractions(run.terrains)),
+    Column("believed", of=lambda run: _fractions(run.believed)),
 )

@@ -18,9 +18,11 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 from pydantic import field_validator, model_validator
 
 from pipelines.data.settings import ReadSettings
-from pipelines.report import Pairs, Progress, Report, Result, described, enumerated, plural, sections, silent
+from pipelines.report.numbers import enumerated, plural
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from pipelines.report.tree import Pairs, Report, sections
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:

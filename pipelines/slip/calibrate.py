@@ -14,7 +14,7 @@ from pipelines.report.settings import Settings as BaseSettings
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
-    from pipelines.report import Progress, Result
+    from pipelines.report.results import Progress, Result
 
 EXAMPLE = "terrain calibrate --data raw/ --robot agrimaro --out mine.yaml"
 RESULTS = ("pipelines.slip.robot", "pipelines.slip.odometry", "pipelines.slip.soil")

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.report import Column, Figure, Part, Progress, Report, Table, Text, described, sections, tree
+from pipelines.report.figure import Band, Figure, Mark, Panel, Points
 from pipelines.report.json_file import as_json
-from pipelines.report.numbers import enumerated, format_value, interval, plural
+from pipelines.report.numbers import enumerated, format_value, plural
+from pipelines.report.results import Progress, described
+from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.shown import file_name, first_rows, named
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of, law_marks
 from terrain.control.learned_table import learned_table, run_row, terrain_row
@@ -197,16 +199,16 @@ def curve_figures(learned: Sequence[LearnedTerrain], robot: str) -> dict[str, Fi
     return figures
 
 
-def curve_panel(entry: LearnedTerrain) -> tree.Panel:
+def curve_panel(entry: LearnedTerrain) -> Panel:
     """Return bins of the runs on one terrain, and its law with peak, resistance and targets."""
-    marks: list[tree.Mark] = []
+    marks: list[Mark] = []
     shown = [0.1, 0.0]
     if entry.runs_with_bins:
         slip, thrust, std = (
             np.concatenate([getattr(run.bins, name) for run in entry.runs_with_bins])
             for name in ("slip_ratio", "traction_ratio", "traction_std")
         )
-        marks.append(tree.Points("bins of each run, ± 1 std", slip, thrust, thrust - std, thrust + std, 6))
+        marks.append(Points("bins of each run, ± 1 std", slip, thrust, thrust - std, thrust + std, 6))
         shown += thrust.tolist()
     if (curve := entry.curve) is not None:
         slips, low, high = curve.band
@@ -216,13 +218,13 @@ def curve_panel(entry: LearnedTerrain) -> tree.Panel:
             points.append(("target, traction", targets.of("traction").slip_ratio, 2))
             points.append(("target, steady", targets.of("steady").slip_ratio, 3))
         marks += law_marks(law, curve.slip_range, curve.peak_interval, ratio)
-        marks.append(tree.Band("90 % over runs", slips, low, high, 0))
+        marks.append(Band("90 % over runs", slips, low, high, 0))
         for label, at, colour in points:
-            marks.append(tree.Points(label, np.array([at]), law(np.array([at])), colour=colour))
+            marks.append(Points(label, np.array([at]), law(np.array([at])), colour=colour))
         shown += [ratio, float(high.max())]
     least, most = min(shown), min(max(shown), LARGEST_THRUST_RATIO)
     margins = (least - 0.08 * (most - least), most + 0.12 * (most - least))
-    return tree.Panel(marks, "thrust over load", x_range=(-0.03, 1.0), y_range=margins)
+    return Panel(marks, "thrust over load", x_range=(-0.03, 1.0), y_range=margins)
 
 
 def _headline(entry: LearnedTerrain) -> str:
@@ -232,5 +234,5 @@ def _headline(entry: LearnedTerrain) -> str:
     tail = f", {entry.reason}" if entry.reason else ""
     return (
         f"{LAW_NAMES[curve.law]}, {kind} at {format_value(curve.peak.slip_ratio, SLIP)} "
-        f"({interval(*curve.peak_interval, SLIP)}), {curve.n_runs} runs{tail}"
+        f"({format_value(curve.peak_interval, SLIP)}), {curve.n_runs} runs{tail}"
     )

@@ -17,7 +17,9 @@ from pipelines.report.settings import Settings as BaseSettings
 if TYPE_CHECKING:
     import pandas as pd
 
-    from pipelines.report import Figure, Progress, Report
+    from pipelines.report.figure import Figure
+    from pipelines.report.results import Progress
+    from pipelines.report.tree import Report
     from pipelines.slip.tracks import Keep, TracksResult
     from terrain.records import RunLog
     from terrain.robots import Robot
@@ -185,7 +187,7 @@ def estimate_runs(
     >>> sorted(set(tracks.runs[0].streams) - set(run.streams))
     ['estimator', 'slip', 'state']
     """
-    from pipelines.report import silent
+    from pipelines.report.results import silent
 
     kept: list[RunLog] = []
     asked = EstimateOptions(filter=filter, **options)

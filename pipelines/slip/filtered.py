@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report import Column, Figure, Mark, Part, Progress, Report, Text, described, tree
-from pipelines.report.numbers import format_value, interval, plural
+from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points, Strip
+from pipelines.report.numbers import format_value, plural
+from pipelines.report.results import Progress, described
+from pipelines.report.tree import Column, Part, Report, Text
 from pipelines.slip.tracks import (
     SLIP,
     TRUTH_COLOUR,
@@ -131,7 +133,9 @@ def _answer(result: FilterResult) -> str:
     known = [row for row in result.runs if row.slip_observable and math.isfinite(row.slip_mean)]
     if known:
         means, std = [row.slip_mean for row in known], max(row.slip_std for row in known)
-        slip = format_value(means[0], SLIP) if len(means) == 1 else interval(min(means), max(means), SLIP)
+        slip = (
+            format_value(means[0], SLIP) if len(means) == 1 else format_value((min(means), max(means)), SLIP)
+        )
         deviation = format_value(std, ".4f")
         return f"Slip in steady motion is {slip} in {n}, with a standard deviation of at most {deviation}."
     if any(row.motion is not None for row in result.runs):
@@ -166,13 +170,13 @@ def swerve_motion(estimate: Estimate) -> Figure:
     twist = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)[0]
     panels = []
     for i, (state, label, row) in enumerate(SWERVE_PANELS):
-        marks: list[Mark] = [tree.Line("encoders, forward kinematics", time_s, twist[:, i], 1)]
+        marks: list[Mark] = [Line("encoders, forward kinematics", time_s, twist[:, i], 1)]
         if seen:
-            marks.append(tree.Line("camera, at its place", time_s, table.columns([row])[:, 0], 4))
+            marks.append(Line("camera, at its place", time_s, table.columns([row])[:, 0], 4))
         if state == "yaw_rate_radps":
-            marks.append(tree.Line("gyro", time_s, table.columns(["gyro_z_radps"])[:, 0], 2))
+            marks.append(Line("gyro", time_s, table.columns(["gyro_z_radps"])[:, 0], 2))
         true = None if estimate.truth is None else estimate.truth[:, track.states.index(state)]
-        panels.append(tree.Panel(marks + _state(estimate, state, true), label))
+        panels.append(Panel(marks + _state(estimate, state, true), label))
     innovations = estimate.innovations
     for row in [row for _, _, row in SWERVE_PANELS] if seen else ["gyro_z_radps"]:
         panels.append(_innovation_panel(estimate, row, *innovations.row(row)))
@@ -190,22 +194,22 @@ def _state(estimate: Estimate, state: str, true: Array | None = None) -> list[Ma
     return estimated(estimate.name, track.time_s, track.state(state), track.std(state), 2, true)
 
 
-def _innovation_panel(estimate: Estimate, row: str, value: Array, std: Array) -> tree.Panel:
+def _innovation_panel(estimate: Estimate, row: str, value: Array, std: Array) -> Panel:
     track = estimate.track
     sensor = next(k for k, (_, rows) in enumerate(estimate.model.sensors) if row in rows)
     gated = track.use[:, sensor] == GATED
     used = value[~gated & np.isfinite(value)]
     marks: list[Mark] = [
-        tree.Band("± 2 std expected", track.time_s, -2 * std, 2 * std, 6),
-        tree.Line("innovation", track.time_s, np.where(gated, np.nan, value), 0),
+        Band("± 2 std expected", track.time_s, -2 * std, 2 * std, 6),
+        Line("innovation", track.time_s, np.where(gated, np.nan, value), 0),
     ]
     if gated.any():
-        marks.append(tree.Points("gated", track.time_s[gated], np.zeros(gated.sum()), colour=5))
+        marks.append(Points("gated", track.time_s[gated], np.zeros(gated.sum()), colour=5))
     title, reach = f"innovation of {row}, variance none", None
     if used.size:
         title = f"innovation of {row}, variance {used.var():.1e}"
         reach = 1.2 * max(float(np.nanmax(2 * std)), float(np.percentile(np.abs(used), 99.5)))
-    return tree.Panel(marks, "innovation", title, y_range=None if reach is None else (-reach, reach))
+    return Panel(marks, "innovation", title, y_range=None if reach is None else (-reach, reach))
 
 
 def skid_motion(estimate: Estimate) -> Figure:
@@ -214,19 +218,19 @@ def skid_motion(estimate: Estimate) -> Figure:
     time_s, wheels = table.time_s, table.columns(["wheel_left_mps", "wheel_right_mps"])
     turn, gyro = np.diff(wheels, axis=1)[:, 0] / track_m, table.columns(["gyro_z_radps"])[:, 0]
     stuck = stuck_intervals(estimate.track.time_s, np.asarray(estimate.motion))
-    strip = tree.Strip([(each.start_s, each.end_s, "stuck") for each in stuck])
+    strip = Strip([(each.start_s, each.end_s, "stuck") for each in stuck])
     measured: dict[tuple[str, str], list[Mark]] = {
-        ("speed_mps", "speed [m/s]"): [tree.Line("mean of the wheels", time_s, wheels.mean(axis=1), 1)],
+        ("speed_mps", "speed [m/s]"): [Line("mean of the wheels", time_s, wheels.mean(axis=1), 1)],
         ("yaw_rate_radps", "yaw rate [rad/s]"): [
-            tree.Line(f"wheels over {track_m:g} m", time_s, turn, 1),
-            tree.Line("gyro", time_s, gyro, 2),
+            Line(f"wheels over {track_m:g} m", time_s, turn, 1),
+            Line("gyro", time_s, gyro, 2),
         ],
         ("effective_track_m", "effective track [m]"): [],
     }
     return Figure(
         f"{estimate.run.run_id}: motion without a speed reference",
         [
-            tree.Panel([*marks, *_state(estimate, state), strip], label)
+            Panel([*marks, *_state(estimate, state), strip], label)
             for (state, label), marks in measured.items()
         ],
         "The skid filter with two standard deviations, beside wheels and gyro.",
@@ -241,25 +245,25 @@ def slip_figure(estimate: Estimate) -> Figure:
     shown = slip if observed else estimate.blind
     true = lagged_slip_at(estimate.run, robot, time_s) if "truth" in estimate.run.streams else None
     speeds = robot.wheel_radius_m * table.columns([f"wheel_{wheel}_radps" for wheel in slip.wheels])
-    above: list[Mark] = [tree.Line("speed over ground, estimated", time_s, ahead_mps, 6)]
+    above: list[Mark] = [Line("speed over ground, estimated", time_s, ahead_mps, 6)]
     below: list[Mark] = []
     for i, wheel in enumerate(slip.wheels):
-        above.append(tree.Line(f"circumference, wheel {wheel}", table.time_s, speeds[:, i], i))
+        above.append(Line(f"circumference, wheel {wheel}", table.time_s, speeds[:, i], i))
         ratio, half = shown.slip_ratio[:, i], 2 * slip.slip_std[:, i]
         if observed:
-            below.append(tree.Band(f"± 2 std, wheel {wheel}", time_s, ratio - half, ratio + half, i))
-        below.append(tree.Line(f"wheel {wheel}", time_s, ratio, i))
+            below.append(Band(f"± 2 std, wheel {wheel}", time_s, ratio - half, ratio + half, i))
+        below.append(Line(f"wheel {wheel}", time_s, ratio, i))
         if true is not None:
-            below.append(tree.Line(f"truth, wheel {wheel}", time_s, true[:, i], TRUTH_COLOUR, dashed=True))
-    below.append(tree.Strip(spans(time_s, slip.stale, {1: "stale: no speed reference"})))
+            below.append(Line(f"truth, wheel {wheel}", time_s, true[:, i], TRUTH_COLOUR, dashed=True))
+    below.append(Strip(spans(time_s, slip.stale, {1: "stale: no speed reference"})))
     if np.isfinite(mean := estimate.figures.steady_mean):
-        below.append(tree.Line(f"steady mean {mean:.3f}", time_s[[0, -1]], [mean, mean], 5, dashed=True))
+        below.append(Line(f"steady mean {mean:.3f}", time_s[[0, -1]], [mean, mean], 5, dashed=True))
     y_range = (-0.6 if np.nanmin(np.append(ahead_mps, 0.0)) < -0.1 else -0.05, 0.6)
     return Figure(
         f"{estimate.run.run_id}: {'slip' if observed else 'slip is not observed'}, {estimate.name}",
         (
-            tree.Panel(above, "speed [m/s]"),
-            tree.Panel(below, "slip ratio" if observed else "blind figure, no slip", y_range=y_range),
+            Panel(above, "speed [m/s]"),
+            Panel(below, "slip ratio" if observed else "blind figure, no slip", y_range=y_range),
         ),
         "Slip of each wheel with two standard deviations; the truth is behind the same low-pass.",
         x_label="time [s]",

@@ -11,7 +11,7 @@ from pipelines.data.settings import RunsSettings
 from pipelines.report.settings import setting
 
 if TYPE_CHECKING:
-    from pipelines.report import Progress
+    from pipelines.report.results import Progress
     from pipelines.slip.table import LearnedSlipTable
     from terrain.records import RunLog
     from terrain.robots import Robot
@@ -101,7 +101,7 @@ def learn_slip_table(
     DataError
         if no run has a label, one is another robot's or lacks currents or attitude, or none has a slip.
     """
-    from pipelines.report import silent
+    from pipelines.report.results import silent
     from pipelines.slip.curves import learn_curves
     from pipelines.slip.steady import learn_steady
     from terrain.robots import SwerveRobot

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from features.response import slip_cases
-from pipelines.report import Column, Figure, Part, Progress, Report, Table, Text, described, sections, tree
+from pipelines.report.figure import Bars, Figure, Panel, Points
 from pipelines.report.numbers import enumerated, format_value, sentence
+from pipelines.report.results import Progress, described
+from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
 from terrain.measured_slip.delay import Delay
@@ -229,12 +231,12 @@ def _pictures(
     names = [terrain or UNLABELLED for terrain in by_terrain]
     low, high = np.array([row.interval for row in surfaces]).T
     medians = np.array([row.slip_ratio for row in surfaces])
-    bars = tree.Bars("median, 95 % over runs", names, medians, low, high)
+    bars = Bars("median, 95 % over runs", names, medians, low, high)
     label = f"slip ratio of the body over {window_s:g} s"
     figures = {
         "slip_by_surface": Figure(
             f"{title} by surface, measured from outside",
-            (tree.Panel((bars,)),),
+            (Panel((bars,)),),
             "The median over runs and its 95 % interval over runs.",
             x_label=label,
         )
@@ -248,16 +250,16 @@ def _pictures(
         ratio, of_runs = np.concatenate(slips), np.array([np.median(each) for each in slips if each.size])
         if not ratio.size:
             continue
-        by_run.append(tree.Points(name, of_runs, place + rng.uniform(-0.22, 0.22, of_runs.size)))
+        by_run.append(Points(name, of_runs, place + rng.uniform(-0.22, 0.22, of_runs.size)))
         twist = np.concatenate([slip.rolled_twist[slip.known] for slip in own.slips])
         with np.errstate(invalid="ignore", divide="ignore"):
             turn = twist[:, 2] / np.abs(twist[:, 0])
         at = np.degrees(np.arctan2(twist[:, 1], twist[:, 0])) if sideways else turn
-        by_window.append(tree.Points(name, at, ratio))
+        by_window.append(Points(name, at, ratio))
     if by_run:
         figures["slip_by_run"] = Figure(
             f"{title}, a run a point",
-            (tree.Panel(by_run, "surface"),),
+            (Panel(by_run, "surface"),),
             "The median of each run; surfaces one above another.",
             x_label=label,
         )
@@ -266,7 +268,7 @@ def _pictures(
         reach, label = 180.0, "direction of travel in the body's axes [degrees]"
     figures["slip_by_motion"] = Figure(
         f"{title} by how it was driven, a window a point",
-        (tree.Panel(by_window, "slip ratio of the body", x_range=(-reach, reach)),),
+        (Panel(by_window, "slip ratio of the body", x_range=(-reach, reach)),),
         "A window of steady motion a point.",
         x_label=label,
     )

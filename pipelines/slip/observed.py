@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report import Column, Figure, Mark, Progress, Report, described, tree
-from pipelines.report.numbers import enumerated, format_value, interval, plural
+from pipelines.report.figure import Figure, Line, Mark, Panel, Points, Strip
+from pipelines.report.numbers import enumerated, format_value, plural
+from pipelines.report.results import Progress, described
+from pipelines.report.tree import Column, Report
 from pipelines.slip.tracks import (
     SLIP,
     TRUTH_COLOUR,
@@ -104,7 +106,9 @@ def _answer(result: ObserverResult) -> str:
     for row in result.runs:
         for name, slip in row.slip.items():
             means.setdefault(name, []).extend([slip.mean] if math.isfinite(slip.mean) else [])
-    known = [f"{name} is {interval(min(each), max(each), SLIP)}" for name, each in means.items() if each]
+    known = [
+        f"{name} is {format_value((min(each), max(each)), SLIP)}" for name, each in means.items() if each
+    ]
     if known:
         return f"In the means of {n}, {enumerated(known)}."
     errors = [row.position_rmse_m for row in result.runs if math.isfinite(row.position_rmse_m)]
@@ -128,14 +132,14 @@ def slip_figure(found: ObserverEstimate) -> Figure:
     """Show each slip over time with a band of one standard deviation, and its truth where there is one."""
     track, time_s = found.track, found.track.time_s
     away = ~np.isin(track.status, (*SETTLED, ObserverStatus.STANDING))
-    strip = tree.Strip(spans(time_s, away, {1: "does not follow measurements"}))
+    strip = Strip(spans(time_s, away, {1: "does not follow measurements"}))
     panels = []
     for k, name in enumerate(track.slips):
         scale, unit = (np.degrees(1.0), "degrees") if name.endswith("_rad") else (1.0, "ratio")
         slip, std, true = scale * track.slip[:, k], scale * track.slip_std[:, k], found.true(name)
         marks = estimated(found.observer.name, time_s, slip, std, 1, None if true is None else scale * true)
         label = f"{name.rpartition('_')[0].replace('_', ' ')} [{unit}]"
-        panels.append(tree.Panel([*marks, strip], label, y_range=_range(time_s, slip)))
+        panels.append(Panel([*marks, strip], label, y_range=_range(time_s, slip)))
     title = f"Slip of {found.run.run_id} by the observer {found.observer.name}"
     return Figure(title, panels, "With one standard deviation.", x_label="time [s]")
 
@@ -147,12 +151,12 @@ def path_figure(found: ObserverEstimate) -> Figure:
     if "position_x_m" in found.observer.rows and "gnss" in found.run.streams:
         gnss = found.run.streams["gnss"]
         fixes = gnss.channel("position_x_m"), gnss.channel("position_y_m")
-        marks.append(tree.Points("fixes", *fixes, colour=4))
-    marks.append(tree.Line(found.observer.name, own.real, own.imag, 0))
+        marks.append(Points("fixes", *fixes, colour=4))
+    marks.append(Line(found.observer.name, own.real, own.imag, 0))
     if true is not None:
-        marks.append(tree.Line("truth", true.real, true.imag, TRUTH_COLOUR, dashed=True))
+        marks.append(Line("truth", true.real, true.imag, TRUTH_COLOUR, dashed=True))
     title = f"Path of {found.run.run_id} by the observer {found.observer.name}"
-    return Figure(title, (tree.Panel(marks, "y [m]", equal=True),), x_label="x [m]")
+    return Figure(title, (Panel(marks, "y [m]", equal=True),), x_label="x [m]")
 
 
 def _range(time_s: Array, slip: Array) -> tuple[float, float] | None:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipelines.data.datasets import drive_robot, load
-from pipelines.report import Column, Progress, Report, Result, Table, Text, described, frame, sections
-from pipelines.report.numbers import format_value, interval
+from pipelines.report.numbers import format_value
+from pipelines.report.results import Progress, Result, described, frame
+from pipelines.report.tree import Column, Report, Table, Text, sections
 from terrain.calibration.odometry import ParameterFound, judge_odometry
 from terrain.calibration.odometry_judge import KindScore, LegScores
 from terrain.errors import ConfigError
@@ -136,7 +137,7 @@ def report(result: OdometryResult) -> Report:
     return Report(
         f"Odometry of {result.robot}",
         f"After {longest.length_s:.2g} s the position is off by {format_value(best.rmse_m, RMSE, 'm')} "
-        f"({interval(*best.rmse_ci_m, RMSE)}) by {best.kind} odometry, on runs held out.",
+        f"({format_value(best.rmse_ci_m, RMSE)}) by {best.kind} odometry, on runs held out.",
         parts=[tables[len(result.scores) - 1], Text(mount), *(Text(note, "note") for note in result.notes)],
         details=sections(("All lengths", tables), ("Slip model of all runs", [Table(columns, parameters)])),
         next_step=f"terrain estimate --data DIR --filter slip-odometry --slip-model {result.written or 'FILE'}",

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from pipelines.data.datasets import load_runs
-from pipelines.report import Column, Progress, Report, Result, Text, described, frame, plural, sections
+from pipelines.report.numbers import plural
+from pipelines.report.results import Progress, Result, described, frame
+from pipelines.report.tree import Column, Report, Text, sections
 from pipelines.report.writing import check_file
 from pipelines.slip.shown import first_rows
 from terrain.calibration.description import described_with, description_yaml, findings_of, hard_grounds

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.data.datasets import load, load_runs
-from pipelines.report import Column, Progress, Report, Result, Table, Text, described, frame, sections, tree
+from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_value
+from pipelines.report.results import Progress, Result, described, frame
+from pipelines.report.tree import Column, Part, Report, Section, Table, Text, sections
 from pipelines.slip.shown import write_figures
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write, ensure_writable
@@ -49,7 +51,7 @@ class SoilResult(Result):
     wheels: tuple[WheelResult, ...] = described("one each")
     files: tuple[str, ...] = described("that were written")
     skipped: tuple[str, ...] = described("a sentence for each trial that was skipped")
-    pictures: Mapping[str, tree.Figure] = field(default_factory=dict)
+    pictures: Mapping[str, Figure] = field(default_factory=dict)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the errors of each law on what was left out, a row each; slip and load given."""
@@ -98,7 +100,7 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
             "give a folder with smooth.csv or grouser.csv"
         )
     results: list[WheelResult] = []
-    pictures: dict[str, tree.Figure] = {}
+    pictures: dict[str, Figure] = {}
     for robot, wheel in WHEELS.items():
         own, others = ([run for run in each if run.robot == robot] for each in (runs, further))
         if not own:
@@ -139,8 +141,8 @@ def _written(result: WheelResult, out: Path, dataset: str) -> WheelResult:
 
 def report(result: SoilResult) -> Report:
     """Return the laws of each wheel with their errors on what was left out, the parameters and the limits."""
-    parts: list[tree.Part] = []
-    details: list[tree.Section] = []
+    parts: list[Part] = []
+    details: list[Section] = []
     for wheel in result.wheels:
         figures = [each for name, each in result.pictures.items() if name.startswith(f"{wheel.wheel}_")]
         parts += [_laws_table(wheel), Text(wheel.verdict)]
@@ -186,7 +188,7 @@ def _laws_table(wheel: WheelResult) -> Table:
     )
 
 
-def _wheel_details(wheel: WheelResult) -> list[tree.Part]:
+def _wheel_details(wheel: WheelResult) -> list[Part]:
     misfits: dict[str, Mapping[Any, Misfit]] = {
         "by regime, slips left out": wheel.regimes,
         "by the wheel speed left out [mm/s]": wheel.by_slip,
@@ -228,7 +230,7 @@ def _wheel_details(wheel: WheelResult) -> list[tree.Part]:
     ]
 
 
-def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> tree.Figure:
+def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> Figure:
     """Show traction, side force and sinkage over slip, a colour an angle: points measured, lines predicted.
 
     Parameters
@@ -243,17 +245,15 @@ def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, 
     for name, y_label in PANELS:
         scale = 1e3 if name.endswith("_m") else 1.0
         measured, predicted = scale * getattr(trials, name), scale * getattr(prediction, name)
-        marks: list[tree.Mark] = []
+        marks: list[Mark] = []
         for number, angle in enumerate(np.unique(trials.angle_setting)):
             rows, colour = np.flatnonzero(trials.angle_setting == angle), number % 7
             own = [rows[trials.slip_setting[rows] == speed] for speed in np.unique(trials.slip_setting[rows])]
             slips, means = ([float(of[each].mean()) for each in own] for of in (trials.slip_ratio, predicted))
             label = f"{angle:g} degrees"
-            marks.append(
-                tree.Points(f"{label}, measured", trials.slip_ratio[rows], measured[rows], colour=colour)
-            )
-            marks.append(tree.Line(label, slips, means, colour))
-        panels.append(tree.Panel(marks, y_label))
+            marks.append(Points(f"{label}, measured", trials.slip_ratio[rows], measured[rows], colour=colour))
+            marks.append(Line(label, slips, means, colour))
+        panels.append(Panel(marks, y_label))
     title = (
         f"{wheel.wheel} wheel, law {wheel.law}, {LEFT_OUT[held_out]}: traction off by "
         f"{format_value(errors.pull_ratio, ERROR)} and side force by {format_value(errors.side_ratio, ERROR)} of the "
@@ -261,4 +261,4 @@ def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, 
         f"{format_value(1e3 * errors.sinkage_m, '.1f', 'mm')}"
     )
     caption = "Points are measured, lines predicted; a colour a slip angle."
-    return tree.Figure(title, panels, caption, x_label="slip ratio")
+    return Figure(title, panels, caption, x_label="slip ratio")

@@ -8,8 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.report import Column, Figure, Part, Progress, Report, Table, Text, described, sections, tree
+from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import enumerated, format_value, plural
+from pipelines.report.results import Progress, described
+from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.shown import named
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of
 from terrain.control.measured_table import learn_surfaces
@@ -151,18 +153,18 @@ def operating_figure(
         "surface": [np.full(each.slip_ratio.size, float(k)) for k, each in enumerate(points.values())],
     }
     label = next(name for name, values in shown.items() if np.isfinite(np.concatenate(values)).any())
-    marks: list[tree.Mark] = []
+    marks: list[Mark] = []
     for number, (terrain, height) in enumerate(zip(points, shown[label], strict=True)):
         slip = surfaces[terrain]["slip"]
         at, colour = points[terrain].slip_ratio, number % 7
-        marks.append(tree.Points(f"{terrain}, {slip.n_runs} runs", at, height, colour=colour))
+        marks.append(Points(f"{terrain}, {slip.n_runs} runs", at, height, colour=colour))
         known = height[np.isfinite(height)]
         if known.size and np.isfinite(slip.interval).all():
             middle = [float(np.median(known))] * 2
-            marks.append(tree.Line(f"{terrain}, 95 %", list(slip.interval), middle, colour))
+            marks.append(Line(f"{terrain}, 95 %", list(slip.interval), middle, colour))
     return Figure(
         f"Steady slip of {robot}, measured from outside",
-        (tree.Panel(marks, label),),
+        (Panel(marks, label),),
         "A run a point: its median slip in steady motion. Lines are the median of a surface over its 95 % "
         "interval over runs. Points of one surface differ in how the robot was driven and are no curve.",
         x_label="slip ratio of the body, median of a run",

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.report import Column, Figure, Mark, Result, described, frame, tree
+from pipelines.report.figure import Figure, Line, Mark, Strip
+from pipelines.report.results import Result, described, frame
+from pipelines.report.tree import Column
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, write_slip_table
 from terrain.records import Array
 
@@ -61,10 +63,10 @@ def law_marks(
     """Return the law of thrust over load, within and beyond the observed slips, with its peak and the resistance."""
     within, beyond = np.linspace(*slip_range, 60), np.linspace(slip_range[1], 1.0, 30)
     return [
-        tree.Strip([(*peak_interval, "peak slip, 90 %")]),
-        tree.Line("law, within the observed slips", within, thrust_ratio(within), 0),
-        tree.Line("beyond", beyond, thrust_ratio(beyond), 0, dashed=True),
-        tree.Line("resistance", [0.0, 1.0], [resistance_ratio] * 2, 4, dashed=True),
+        Strip([(*peak_interval, "peak slip, 90 %")]),
+        Line("law, within the observed slips", within, thrust_ratio(within), 0),
+        Line("beyond", beyond, thrust_ratio(beyond), 0, dashed=True),
+        Line("resistance", [0.0, 1.0], [resistance_ratio] * 2, 4, dashed=True),
     ]
 
 

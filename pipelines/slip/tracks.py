@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from pipelines.report import Column, Figure, Part, Progress, Report, Result, described, frame, sections, tree
+from pipelines.report.figure import Band, Figure, Line, Mark
+from pipelines.report.results import Progress, Result, described, frame
+from pipelines.report.tree import Column, Part, Report, sections
 from pipelines.slip.shown import first_rows
 from terrain.records import Array, RunLog
 
@@ -101,7 +103,7 @@ def tracks_report(
 
 def estimated(
     label: str, time_s: Array, mean: Array, std: Array, n_std: int, true: Array | None = None
-) -> list[tree.Mark]:
+) -> list[Mark]:
     """Return an estimate over time, the band of its standard deviations, and what was true where that is known.
 
     Parameters
@@ -110,8 +112,8 @@ def estimated(
     time_s, mean, std, true : (n,)
     n_std : standard deviations that the band reaches
     """
-    marks: list[tree.Mark] = [
-        tree.Band(f"± {n_std} std", time_s, mean - n_std * std, mean + n_std * std, 0),
-        tree.Line(label, time_s, mean, 0),
+    marks: list[Mark] = [
+        Band(f"± {n_std} std", time_s, mean - n_std * std, mean + n_std * std, 0),
+        Line(label, time_s, mean, 0),
     ]
-    return marks if true is None else [*marks, tree.Line("truth", time_s, true, TRUTH_COLOUR, dashed=True)]
+    return marks if true is None else [*marks, Line("truth", time_s, true, TRUTH_COLOUR, dashed=True)]

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from pipelines.report import Progress, Report, Result, Table, described, format_value, silent
+from pipelines.report.numbers import format_value
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
+from pipelines.report.tree import Report, Table
 from terrain.control.comparison import MeanInterval, mean_interval
 from terrain.estimation.coverage import nees_by_group, slip_coverage
 from terrain.estimation.estimate import estimate_run

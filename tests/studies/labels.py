@@ -22,8 +22,9 @@ from pipelines.data.datasets import load_runs
 from pipelines.learn.parallel import parallel
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import LearnSettings
-from pipelines.report import Column, Progress, Report, Result, Table, described, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, setting
+from pipelines.report.tree import Column, Report, Table
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import Examples
 from terrain.classify.paired import Difference, Outcome, compare_outcomes

@@ -17,9 +17,10 @@ from features.windows import cut_windows
 from pipelines.learn.model_file import read_model
 from pipelines.live.classifying import Classifier, ClassifierThread, classify_window
 from pipelines.live.pilot import LivePilot
-from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from pipelines.report.tree import Column, Pairs, Report, Table
 from studies.service import (
     ROBOT,
     Packed,

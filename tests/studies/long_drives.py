@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, setting
+from pipelines.report.tree import Column, Pairs, Report, Table
 from studies.consistency import GROUPS
 from terrain.angles import wrapped
 from terrain.errors import ConfigError

@@ -18,9 +18,10 @@ from typing import NamedTuple
 
 import yaml
 
-from pipelines.report import Column, Progress, Report, Result, Table, described, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.tree import Column, Report, Table
 from terrain.errors import ConfigError
 
 EXAMPLE = "python tests/studies mutants --only nan-as-zero"

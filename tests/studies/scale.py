@@ -20,9 +20,10 @@ import numpy as np
 from pydantic import field_validator
 from scipy.signal import lfilter
 
-from pipelines.report import Column, Pairs, Progress, Report, Result, Table, described, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import ByCommas, setting
 from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.tree import Column, Pairs, Report, Table
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream

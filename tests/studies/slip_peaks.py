@@ -15,9 +15,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import betaincinv
 
-from pipelines.report import Column, Progress, Report, Result, Table, described, interval, silent
+from pipelines.report.numbers import format_value
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from pipelines.report.tree import Column, Report, Table
 from terrain.constants import GRAVITY_MPS2
 from terrain.records import TargetStatus
 from terrain.robots import Robot, load_robot
@@ -214,7 +216,7 @@ def report(result: PeaksResult) -> Report:
     return Report(
         "Interval of a learned slip peak",
         f"{result.all.coverage * result.all.n:.0f} of {result.n_learned} true peaks lie in the interval of the learned "
-        f"one ({interval(low, high, '.3f')}); {result.n_cases - result.n_learned} of {result.n_cases} were "
+        f"one ({format_value((low, high), '.3f')}); {result.n_cases - result.n_learned} of {result.n_cases} were "
         "not learned.",
         parts=(Table(columns, rows),),
     )

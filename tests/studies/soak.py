@@ -20,9 +20,10 @@ import numpy as np
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
 
-from pipelines.report import Progress, Report, Result, Table, Text, described, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
+from pipelines.report.tree import Report, Table, Text
 from studies.service import (
     ROBOT,
     ServiceProcess,

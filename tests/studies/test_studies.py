@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from pipelines.report import Report, Result
+from pipelines.report.results import Result
+from pipelines.report.tree import Report
 from studies import figures, labels, long_drives, mutants, scale, slip_peaks, trials
 from studies.__main__ import STUDIES, main
 from terrain.discrepancy.trials.rows import Row

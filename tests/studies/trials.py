@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import field_validator
 
-from pipelines.report import Column, Progress, Report, Result, Table, Text, described, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
+from pipelines.report.tree import Column, Report, Table, Text
 from terrain.discrepancy.preparation import MIN_RUNS
 from terrain.discrepancy.trials.hidden_effects import Case, cases_of
 from terrain.discrepancy.trials.rows import Row

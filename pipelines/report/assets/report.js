@@ -12,7 +12,7 @@
   const isStrip = (mark) => mark.kind === "strip";
   const isThin = (panel) => panel.marks.every(isStrip);
   const namesOf = (panels) => [...new Set(panels.flatMap((panel) => panel.marks.filter(isStrip)
-    .flatMap((mark) => mark.spans.map((span) => span[2]))))];
+    .flatMap((mark) => mark.x.map((span) => span[2]))))];
 
   // what is drawn of one panel: series that uPlot draws itself, and marks that are drawn over its axes; a name of
   // intervals has one colour in a figure, and panels of nothing else all have the same names: one legend serves them
@@ -23,8 +23,8 @@
     for (const mark of panel.marks) {
       if (isStrip(mark)) {
         names.forEach((name, i) => {
-          const spans = mark.spans.filter((span) => span[2] === name);
-          if (spans.length || shared.includes(name)) drawn.push({ kind: "strip", label: name, colour: i, number: i, spans, thin });
+          const spans = mark.x.filter((span) => span[2] === name);
+          if (spans.length || shared.includes(name)) drawn.push({ kind: "strip", label: name, colour: i, number: i, x: spans, thin });
         });
         continue;
       }
@@ -48,9 +48,9 @@
   function ranges(panel, categories) {
     const flat = panel.marks;
     if (categories)
-      return { x: panel.x_range || extent([[0], ...flat.flatMap((m) => [m.values, m.low, m.high])], 0.03),
+      return { x: panel.x_range || extent([[0], ...flat.flatMap((m) => [m.y, m.low, m.high])], 0.03),
         y: [-0.6, categories.length - 0.4] };
-    const x = flat.flatMap((m) => isStrip(m) ? [m.spans.flatMap((s) => [s[0], s[1]])] : [m.x]);
+    const x = flat.flatMap((m) => isStrip(m) ? [m.x.flatMap((s) => [s[0], s[1]])] : [m.x]);
     const y = flat.flatMap((m) => isStrip(m) ? [] : [m.y, m.low, m.high]);
     return { x: panel.x_range || extent(x, panel.equal ? 0.04 : 0), y: panel.y_range || extent(y, 0.05) };
   }
@@ -61,7 +61,7 @@
     ctx.strokeStyle = colour; ctx.lineWidth = 1.3 * dpr; ctx.setLineDash([]);
     if (isStrip(mark)) {
       ctx.fillStyle = faded(colour, mark.thin ? 0.75 : 0.18);
-      for (const [start, end] of mark.spans) ctx.fillRect(px(start), u.bbox.top, px(end) - px(start), u.bbox.height);
+      for (const [start, end] of mark.x) ctx.fillRect(px(start), u.bbox.top, px(end) - px(start), u.bbox.height);
     } else if (mark.kind === "band") {
       ctx.fillStyle = faded(colour, 0.22);
       let i = 0;
@@ -97,7 +97,7 @@
       });
     } else if (mark.kind === "bars") {
       const height = Math.abs(py(1) - py(0)) * 0.8 / vertical.count, start = px(Math.max(0, u.scales.x.min));
-      mark.values.forEach((value, i) => {
+      mark.y.forEach((value, i) => {
         if (value === null) return;
         const y = py(i) + (vertical.order.get(mark) - 0.5 * (vertical.count - 1)) * height;
         ctx.fillStyle = faded(colour, 0.85);
@@ -112,7 +112,7 @@
 
   function plot(holder, figure, panel, group, last) {
     const thin = isThin(panel), { own, drawn } = taken(panel, figure, thin), bars = drawn.filter((mark) => mark.kind === "bars");
-    const categories = bars.length ? bars[0].categories : null, width = holder.clientWidth;
+    const categories = bars.length ? bars[0].x : null, width = holder.clientWidth;
     const vertical = { count: bars.length, order: new Map(bars.map((mark, i) => [mark, i])) };
     const height = categories ? 46 + Math.max(1, 0.7 * bars.length) * 24 * categories.length
       : panel.equal ? Math.min(460, width) : thin ? 58 + (panel.x_label || (last && figure.x_label) ? 18 : 0) : 230;

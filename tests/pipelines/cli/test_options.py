@@ -9,9 +9,10 @@ import pytest
 
 from pipelines.cli import main as cli
 from pipelines.cli.table import COMMANDS, FORMER, Command
-from pipelines.report import Report, Result, Section, Text, described
+from pipelines.report.results import Result, described
 from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.tree import Report, Section, Text
 from terrain.errors import ConfigError, DataError
 
 EXAMPLE = "terrain draw --folder a"

@@ -3,7 +3,7 @@ import pytest
 
 from pipelines.data.simulate import Settings
 from pipelines.data.simulate import run as simulate_with
-from pipelines.report import silent
+from pipelines.report.results import silent
 from terrain.errors import ConfigError, LogError
 from terrain.files.resources import data_folder
 from terrain.logs.read import find_runs, read_run

@@ -13,7 +13,7 @@ from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import run_figures
 from pipelines.live.model import TerrainModel
-from pipelines.report import NOT_KNOWN
+from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.control.controllers import CONTROLLERS, make_controller
 from terrain.control.drive_comparison import Comparison, steepest_grade
@@ -199,7 +199,7 @@ def test_the_report_names_every_controller_and_metric():
     assert "no more than 0.658 m/s²" in text
     assert "without error. With path tracking." in text
     assert len(terminal_text(result.report).splitlines()) <= 25
-    assert [panel.marks[0].categories for panel in result.report.picture.panels] == [list(names)] * 3
+    assert [panel.marks[0].x for panel in result.report.picture.panels] == [list(names)] * 3
     frame = result.to_pandas()
     assert (len(frame), set(frame["controller"])) == (4 * len(names), set(names))
 
@@ -228,8 +228,8 @@ def test_a_drive_shows_states_refusals_and_terrains():
     own = DriveCurves(time_s, **true, control_s=time_s, control=status, aimed=np.full(100, 0.2),
                       is_open_loop=False, terrains=strips)  # fmt: skip
     one, other = run_figures({"true_terrain": own, "plain": own._replace(is_open_loop=True, terrains={})})
-    assert one.panels[0].marks[0].spans == [(0.0, 1.0, "traction: speed rises"), (1.5, 1.98, "braking")]
-    assert one.panels[1].marks[2].spans == [(1.0, 1.02, "no correction: stale")]
+    assert one.panels[0].marks[0].x == [(0.0, 1.0, "traction: speed rises"), (1.5, 1.98, "braking")]
+    assert one.panels[1].marks[2].x == [(1.0, 1.02, "no correction: stale")]
     labels = [{getattr(mark, "label", "") for mark in figure.panels[1].marks} for figure in (one, other)]
     assert labels[0] - labels[1] >= {"target", "target with its floor"}
     assert (len(one.panels), len(other.panels)) == (4, 2)

@@ -120,7 +120,7 @@ def test_the_report_counts_what_is_met_and_names_what_is_not(few):
     references = drive_references(LOOP, Place(*drawn[0][2:]))
     figure = fault_figure(drawn[0], drive_case(LOOP, drawn[0]), references)
     assert figure.title == "duplicates_imu, for good: steady on grass, seed 400"
-    assert figure.panels[0].marks[0].spans[0][0] == references.start_s
+    assert figure.panels[0].marks[0].x[0][0] == references.start_s
 
 
 def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pipelines.explain.figures import dependence_figures, parts_figure, run_figure, spectra_figure
-from pipelines.report import NOT_KNOWN
 from pipelines.report.json_file import as_json
+from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.discrepancy.compared import channels_of
 from terrain.discrepancy.diagnosed_runs import HeldOutGain

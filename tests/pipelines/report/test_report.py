@@ -13,29 +13,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipelines.report import (
-    Band,
-    Bars,
-    Column,
-    Figure,
-    Line,
-    Pairs,
-    Panel,
-    Points,
-    Report,
-    Result,
-    Section,
-    Strip,
-    Table,
-    Text,
-    described,
-    format_value,
-)
 from pipelines.report.drawing import figure_png, figure_svg
+from pipelines.report.figure import Band, Bars, Figure, Line, Panel, Points, Strip
 from pipelines.report.html import figure_data, html_page
 from pipelines.report.markdown import markdown_text
+from pipelines.report.numbers import format_value
+from pipelines.report.results import Result, described
 from pipelines.report.terminal import terminal_text
-from pipelines.report.tree import figures_of
+from pipelines.report.tree import Column, Pairs, Report, Section, Table, Text, figures_of
 from terrain.errors import ConfigError
 
 EVIL = '<script>alert(1)</script> & "quoted" | \x1b[31mred'

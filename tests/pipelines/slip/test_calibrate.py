@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipelines.report import silent
+from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.measurements.batch import measurement_table

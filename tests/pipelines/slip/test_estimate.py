@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.data.datasets import load, load_runs
 from pipelines.data.settings import AlignedRunsSettings
-from pipelines.report import silent
+from pipelines.report.results import silent
 from pipelines.slip.estimate import Settings, estimate_runs, run
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.estimate import estimate_run

@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from pipelines.cli.main import app
-from pipelines.report import silent
+from pipelines.report.results import silent
 from pipelines.slip.learn_slip import Settings, learn_slip_table, run
 from pipelines.slip.shown import write_figures
 from terrain.control.learned_table import FALLBACK

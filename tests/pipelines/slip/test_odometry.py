@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipelines.report import silent
+from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.observers.slip_model_file import read_slip_model

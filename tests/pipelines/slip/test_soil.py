@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from pipelines.cli.main import app
-from pipelines.report import silent
+from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
 from terrain.errors import ConfigError, DataError
 from terrain.logs.write import write_run

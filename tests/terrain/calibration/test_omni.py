@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.report import silent
+from pipelines.report.results import silent
 from pipelines.slip import calibrate
 from terrain.calibration.omni import COM_X, COM_Y, DISTANCE, FRICTION, RADIUS, identify_omni, motor_friction
 from terrain.errors import DataError

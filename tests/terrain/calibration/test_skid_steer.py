@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
-from pipelines.report import silent
+from pipelines.report.results import silent
 from pipelines.slip import calibrate
 from terrain.calibration.skid_steer import (
     LIDAR_DELAY,

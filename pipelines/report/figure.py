@@ -1,0 +1,86 @@
+"""A figure as it is described: panels with marks, and not how these are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+
+class Mark(NamedTuple):
+    """What is drawn in a panel, in a colour of the palette by its number, or the next one."""
+
+    kind: Literal["line", "points", "band", "bars", "strip"]
+    label: str
+    x: Any
+    y: Any = None
+    low: Any = None
+    high: Any = None
+    colour: int | None = None
+    dashed: bool = False
+
+
+def Line(label: str, x: Any, y: Any, colour: int | None = None, dashed: bool = False) -> Mark:
+    """Return a line through points ``x, y`` (n,); NaN is a gap."""
+    return Mark("line", label, x, y, colour=colour, dashed=dashed)
+
+
+def Band(label: str, x: Any, low: Any, high: Any, colour: int | None = None) -> Mark:
+    """Return the area between ``low`` and ``high`` (n,) over ``x`` (n,)."""
+    return Mark("band", label, x, low=low, high=high, colour=colour)
+
+
+def Points(label: str, x: Any, y: Any, low: Any = None, high: Any = None, colour: int | None = None) -> Mark:
+    """Return points ``x, y`` (n,), with bars from ``low`` to ``high`` (n,) where these are given."""
+    return Mark("points", label, x, y, low, high, colour)
+
+
+def Bars(
+    label: str,
+    categories: Sequence[str],
+    values: Any,
+    low: Any = None,
+    high: Any = None,
+    colour: int | None = None,
+) -> Mark:
+    """Return a horizontal bar for each category, with an interval where one is given; several are grouped."""
+    return Mark("bars", label, categories, values, low, high, colour)
+
+
+def Strip(spans: Sequence[tuple[float, float, str]]) -> Mark:
+    """Return coloured intervals ``(start, end, name)`` along x; one name has one colour."""
+    return Mark("strip", "", spans)
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Axes with marks; ``equal`` where both axes have one scale, as of a path."""
+
+    marks: Sequence[Mark]
+    y_label: str = ""
+    title: str = ""
+    x_label: str = ""
+    x_range: tuple[float, float] | None = None
+    y_range: tuple[float, float] | None = None
+    equal: bool = False
+    log_x: bool = False
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Panels below one another.
+
+    Parameters
+    ----------
+    title : above
+    panels : from the top
+    caption : below: what is to be seen
+    alt : in the place of a picture that cannot be seen; the caption by default
+    x_label : of the last panel
+    """
+
+    title: str
+    panels: Sequence[Panel]
+    caption: str = ""
+    alt: str = ""
+    x_label: str = ""
