@@ -174,12 +174,8 @@ class Receiver:
 
     def readings(self, now_s: float) -> dict[str, Reading]:
         """Return the samples since the last call, by stream; of incomplete ones those that are old enough."""
-        found = {}
-        for name, assembler in self._streams.items():
-            reading = assembler.reading(now_s - INCOMPLETE_S)
-            if reading is not None:
-                found[name] = reading
-        return found
+        readings = {name: each.reading(now_s - INCOMPLETE_S) for name, each in self._streams.items()}
+        return {name: reading for name, reading in readings.items() if reading is not None}
 
 
 def find_runs(folder: Path, layout: Layout, robot: str) -> list[Callable[..., RunLog]]:

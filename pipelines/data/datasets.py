@@ -200,9 +200,11 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
         known = robot_named(run.robot, robot)
     except ConfigError:
         return judge(run)
-    if not known.describes("motors"):
-        return judge(run, Scale(known.track_m))
-    return judge(run, Scale(known.track_m, known.motors.speed_max_radps * known.wheel_radius_m))
+    return judge(run, Scale(known.track_m, _wheel_rate_max_radps(known) * known.wheel_radius_m))
+
+
+def _wheel_rate_max_radps(robot: Robot) -> float:
+    return robot.motors.speed_max_radps if robot.describes("motors") else math.inf
 
 
 def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot | None) -> Readers:
@@ -278,5 +280,4 @@ def drive_robot(robot: Robot | None) -> DriveRobot:
         "robot {name}: drive {drive!r} does not fit logs of DRIVE, which have a left and a right "
         "wheel speed, as 'skid_steer' has",
     )
-    fastest = robot.motors.speed_max_radps if robot.describes("motors") else math.inf
-    return DriveRobot(robot.name, robot.wheel_radius_m, fastest)
+    return DriveRobot(robot.name, robot.wheel_radius_m, _wheel_rate_max_radps(robot))
