@@ -130,14 +130,13 @@ class Part(NamedTuple):
     ----------
     stream : that the sample belongs to
     counter : of the sample; None where the message has none
-    columns, values : of the stream, SI; NaN where nothing was measured
+    values : by column of the stream, SI; NaN where nothing was measured
     n_out_of_range : values beyond the bounds of their signal, which are NaN too
     """
 
     stream: str
     counter: int | None
-    columns: tuple[int, ...]
-    values: tuple[float, ...]
+    values: Mapping[int, float]
     n_out_of_range: int = 0
 
 
@@ -342,7 +341,7 @@ def decode(layout: Layout, frame: Frame) -> Part | Drop:
     >>> layout = load_layout()
     >>> frame, = encode(layout, "steering", [0.1, -0.2, math.nan], counter=7)
     >>> decode(layout, frame)
-    Part(stream='steering', counter=7, columns=(0, 1, 2), values=(0.09999, -0.20001, nan), n_out_of_range=0)
+    Part(stream='steering', counter=7, values={0: 0.09999, 1: -0.20001, 2: nan}, n_out_of_range=0)
     >>> frame.data = frame.data[:5]
     >>> decode(layout, frame)
     <Drop.LENGTH: 'wrong length'>
@@ -366,20 +365,17 @@ def decode(layout: Layout, frame: Frame) -> Part | Drop:
         counter = int(decoded[COUNTER]) if plan.counter_bits else None
     except Exception:  # whatever a DBC makes of bytes, as of a multiplexer that it does not describe
         return Drop.UNREADABLE
-    columns, values, n_out = [], [], 0
+    values, n_out = dict[int, float](), 0
     for signal in plan.signals:
         value = decoded.get(signal.name)  # of a multiplexed message only some are there
         if value is None:
             continue
-        columns.append(signal.column)
-        if value == signal.absent or math.isnan(value):
-            values.append(math.nan)
-        elif signal.low <= value <= signal.high:
-            values.append(round(signal.factor * value, 12))
-        else:
+        values[signal.column] = math.nan
+        if signal.low <= value <= signal.high and value != signal.absent:
+            values[signal.column] = round(signal.factor * value, 12)
+        elif value != signal.absent and not math.isnan(value):
             n_out += 1
-            values.append(math.nan)
-    return Part(plan.stream, counter, tuple(columns), tuple(values), n_out)
+    return Part(plan.stream, counter, values, n_out)
 
 
 def encode(

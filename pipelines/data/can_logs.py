@@ -65,8 +65,7 @@ class _Assembler:
         self._stream, self._needed, self._dropped, self._most = stream, columns, dropped, most
         self._width = len(channels_of(stream))
         self._adds_real_part = stream == "odometry" and QUATERNION[3] not in columns
-        self._row = [math.nan] * self._width
-        self._there: set[int] = set()
+        self._row: dict[int, float] = {}
         self._counter: int | None = None
         self._last: int | None = None
         self._time_s = math.nan
@@ -77,39 +76,37 @@ class _Assembler:
             self._dropped[f"{self._stream}: repeated or late"] += 1
             return
         known = part.counter is not None and self._counter is not None
-        if self._there and known and part.counter != self._counter:
+        if self._row and known and part.counter != self._counter:
             self.finish()
-        elif not self._there.isdisjoint(part.columns):
+        elif not self._row.keys().isdisjoint(part.values):
             if known:
                 self._dropped[f"{self._stream}: repeated or late"] += 1
                 return
             self.finish()
-        if not self._there:
+        if not self._row:
             self._time_s = time_s
         if part.counter is not None:
             self._counter = part.counter
-        for column, value in zip(part.columns, part.values, strict=True):
-            self._row[column] = value
-        self._there.update(part.columns)
+        self._row |= part.values
         if part.n_out_of_range:
             self._dropped[f"{self._stream}: out of range"] += part.n_out_of_range
-        if self._there >= self._needed:
+        if self._row.keys() >= self._needed:
             self.finish()
 
     def finish(self) -> None:
         """End the sample, complete or not."""
-        if not self._there:
+        if not self._row:
             return
-        if not self._there >= self._needed:
+        if not self._row.keys() >= self._needed:
             self._dropped[f"{self._stream}: part missing"] += 1
         if self._adds_real_part:
-            square = sum(self._row[column] ** 2 for column in QUATERNION[:3])
+            square = sum(self._row.get(column, math.nan) ** 2 for column in QUATERNION[:3])
             self._row[QUATERNION[3]] = math.sqrt(max(1.0 - square, 0.0)) if square <= LONGEST else math.nan
         if len(self._done) >= self._most * (1 + self._width):
             del self._done[: 1 + self._width]
             self._dropped[f"{self._stream}: queue full"] += 1
-        self._done.extend((self._time_s, *self._row))
-        self._row, self._there = [math.nan] * self._width, set()
+        self._done.extend((self._time_s, *(self._row.get(i, math.nan) for i in range(self._width))))
+        self._row = {}
         self._last, self._counter = self._counter, None
 
     def reading(self, before_s: float) -> Reading | None:

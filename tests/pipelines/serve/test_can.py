@@ -96,7 +96,7 @@ def ticks(bridge, frames, until_s, read_at=lambda frame: frame.timestamp):
             place += 1
         sent = [decode(LAYOUT, frame) for frame in bridge.tick(tick_s)]
         bridge.sent(tick_s)
-        added, state = np.array(sent[0].values), BridgeState(int(sent[1].values[4]))
+        added, state = np.array([*sent[0].values.values()]), BridgeState(int(sent[1].values[4]))
         assert np.isfinite(added).all()
         assert sent[0].counter == sent[1].counter == k % 256
         assert state == ACTIVE or not added.any(), "a correction without what it is built on"
@@ -294,7 +294,7 @@ def test_corrections_are_sent_at_the_rate_and_zero_in_the_end(rate_hz):
     states = [last_state(sent) for _, sent in link.sent if sent.arbitration_id == 0x102]
     assert set(states[5:-1]) == {ACTIVE}
     assert states[-1] == BridgeState.STOPPED
-    assert decode(LAYOUT, link.sent[-2][1]).values == (0.0, 0.0, 0.0)
+    assert decode(LAYOUT, link.sent[-2][1]).values == {0: 0.0, 1: 0.0, 2: 0.0}
     assert (link.n_closed, bridge.ticks_missed) == (1, 0)
 
 
@@ -447,7 +447,7 @@ class RobotSide:
         for frame in self.bridge.tick(sample.time_s):
             self.other.send(frame)
         theory = self._kinematics.step(sample)
-        added, _ = (decode(LAYOUT, self.bus.recv(0)).values for _ in range(2))
+        added, _ = ([*decode(LAYOUT, self.bus.recv(0)).values.values()] for _ in range(2))
         self.added.append(added)
         return Command(theory.wheel_radps + np.array(added), theory.steer_rad, theory.twist, {})
 
