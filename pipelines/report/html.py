@@ -13,7 +13,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
@@ -41,11 +40,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals |= {
-        "sections": _sections,
-        "kind_of": lambda part: type(part).__name__,
-        "shade": _shade,
-    }
+    environment.globals |= {"sections": _sections, "shade": _shade}
     return environment
 
 
@@ -66,7 +61,7 @@ def html_page(report: Report) -> str:
         return holder.format(figure.alt or figure.caption or figure.title, len(figures) - 1)
 
     body = _body(report, picture)
-    data = json.dumps([figure_data(each) for each in figures], separators=(",", ":"), allow_nan=False)
+    data = json.dumps(figure_data(figures), separators=(",", ":"), allow_nan=False)
     page = _environment().get_template("page.html.j2")
     return page.render(
         title=report.title,
@@ -97,31 +92,23 @@ def _body(report: Report, picture: Callable[[Figure], Markup]) -> Markup:
     return body
 
 
-def figure_data(figure: Figure) -> dict[str, Any]:
-    """Return what the page's script draws of a figure; what is not finite is None.
+def figure_data(figures: Sequence[Figure]) -> Any:
+    """Return what the page's script draws: what is not finite is None, and no more points and digits than are seen.
 
     Examples
     --------
     >>> from pipelines.report.figure import Line, Panel
-    >>> figure = Figure("Speed", [Panel([Line("measured", [0, 1], [0.5, math.nan])], "m/s")])
-    >>> figure_data(figure)["panels"][0]["marks"][0]["y"]
-    [0.5, None]
+    >>> figure = Figure("Speed", [Panel([Line("measured", [0, 1], [0.123456789, math.nan])], "m/s")])
+    >>> figure_data([figure])[0]["panels"][0]["marks"][0]["y"]
+    [0.123457, None]
     """
-    data: dict[str, Any] = _shortened(as_json(figure))
-    return data
-
-
-def _shortened(value: Any) -> Any:
-    """Return what JSON holds of a figure, with no more points and digits of numbers than can be seen."""
-    if isinstance(value, np.ndarray):
-        value = value[:: max(1, len(value) // MAX_POINTS)].tolist()
-    if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
-    if isinstance(value, list | tuple):
-        return [_shortened(each) for each in value]
-    if isinstance(value, dict):
-        return {key: _shortened(each) for key, each in value.items()}
-    return as_json(value)
+    data = as_json(figures)
+    for mark in (mark for figure in data for panel in figure["panels"] for mark in panel["marks"]):
+        if mark["kind"] in ("line", "points", "band"):
+            every = max(1, len(mark["x"]) // MAX_POINTS)
+            mark.update({key: mark[key][::every] for key in ("x", "y", "low", "high") if mark[key]})
+    exact = json.dumps(data, allow_nan=False)
+    return json.loads(exact, parse_float=lambda text: float(f"{float(text):.{DIGITS}g}"))
 
 
 @cache

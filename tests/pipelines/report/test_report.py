@@ -96,7 +96,7 @@ def test_a_page_escapes_all_and_fetches_nothing():
     assert not re.findall(r"(?:src|href)=[\"']?https?:", page)
     assert page.count("<details>") == len(REPORT.details)
     data = json.loads(re.search(r'id="figures">(.*?)</script>', page, re.DOTALL)[1])
-    assert data == [figure_data(YAW), figure_data(RECALL)]
+    assert data == figure_data([YAW, RECALL])
     assert "<script" not in html_page(Report("a", "b"))
 
 
@@ -120,7 +120,7 @@ def test_figures_are_in_the_order_in_which_they_are_read():
 
 
 def test_what_a_figure_draws_is_finite_and_short():
-    marks = figure_data(YAW)["panels"][0]["marks"]
+    marks = figure_data([YAW])[0]["panels"][0]["marks"]
     assert [mark["kind"] for mark in marks] == ["strip", "band", "line", "line", "points"]
     assert marks[2]["y"] == [0.1, None, 0.3, 0.123457]
     assert marks[1]["low"] == [0.0, 0.0, None, 1.0]
