@@ -20,7 +20,8 @@ from terrain.files.names import shown
 from terrain.files.regular import MEBIBYTE
 from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
 from terrain.logs.log_files import short_name
-from terrain.logs.run_topics import Head, Messages
+from terrain.logs.read import RunHead
+from terrain.logs.run_topics import Messages
 
 if TYPE_CHECKING:
     from mcap.records import Chunk
@@ -52,12 +53,12 @@ class McapWriter:
     head : of the run; tools that list a file's metadata show it
     """
 
-    def __init__(self, file: BinaryIO, head: Head) -> None:
+    def __init__(self, file: BinaryIO, head: RunHead) -> None:
         mcap = library("mcap.writer")
         self._file = file
         self._writer = mcap.Writer(file, compression=mcap.CompressionType.ZSTD)
         self._writer.start(profile="ros2", library=LIBRARY)
-        texts = {name: value for name, value in head._asdict().items() if isinstance(value, str)}
+        texts = {name: value for name, value in head if isinstance(value, str)}
         self._writer.add_metadata("terrain_run", texts)
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str], int] = {}

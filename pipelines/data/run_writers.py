@@ -17,8 +17,9 @@ from pipelines.data.mcap_file import McapWriter, library
 from pipelines.data.settings import Target
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.kinematics.standard_messages import StandardTopic, standard_topic
+from terrain.logs.read import RunHead
 from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
-from terrain.logs.run_topics import Messages, head_of, origin_of, run_messages, stamps_ns
+from terrain.logs.run_topics import Messages, origin_of, run_messages, stamps_ns
 from terrain.logs.topic_mapping import DISTRO
 from terrain.logs.write import run_folder, write_csv, write_run
 from terrain.records import Array, RunLog
@@ -116,7 +117,7 @@ def write(place: Path, run: RunLog, windows: Sequence[RecordedWindow], target: T
     topics = list(messages_of_run(run, windows))
     if target == "mcap":
         with atomic_file(place) as file:
-            writer = McapWriter(file, head_of(run))
+            writer = McapWriter(file, RunHead.of(run))
             for log_ns, topic, content in _in_order(topics):
                 writer.write(topic, log_ns, content)
             writer.finish()

@@ -27,9 +27,10 @@ from pipelines.data.mcap_file import McapWriter
 from terrain.control.switching import SWITCHING
 from terrain.errors import LogError
 from terrain.files.names import plain_name
+from terrain.logs.read import RunHead
 from terrain.logs.recorded_windows import RecordedWindow
 from terrain.logs.replay import TWIST
-from terrain.logs.run_topics import DECIDED, LATEST_S, WINDOW_TOPIC, Head, RunRecorder
+from terrain.logs.run_topics import DECIDED, LATEST_S, WINDOW_TOPIC, RunRecorder
 from terrain.logs.samples import BAD_TIME
 from terrain.logs.schema import unit_of
 from terrain.logs.write import run_folder
@@ -108,7 +109,7 @@ class SessionRecorder:
         self._channels["commands"] = commanded
         self._n_wheels = len(wheels)
         self._folder, self._part_bytes, self._writer = Path(folder), part_bytes, writer
-        self._head = Head(run_id, robot, run_id, source="recorded live", live=True)
+        self._head = RunHead(run_id=run_id, robot=robot, session=run_id, source="recorded live", labels=[])
         self._lock = threading.Lock()
         self._waiting: list[tuple[str, Array | WindowOutput]] = []
         self._dropped: Counter[str] = Counter()
@@ -245,7 +246,7 @@ class SessionRecorder:
             with suppress(FileExistsError):
                 file = self._file = path.open("xb")
                 break
-        head = self._head._replace(run_id=name, session=first or name)
+        head = self._head.model_copy(update={"run_id": name, "session": first or name})
         self._run = RunRecorder(McapWriter(file, head), head, self._origin_s)
         self.files.append(path)
         return file
@@ -304,7 +305,8 @@ class RecordingThread:
     """
 
     def __init__(self, flush_s: float = FLUSH_S) -> None:
-        McapWriter(BytesIO(), Head("", ""))  # imports now what would hold up the sessions later
+        # imports now what would hold up the sessions later
+        McapWriter(BytesIO(), RunHead(run_id="", robot="", source="", labels=[]))
         self._flush_s, self._stopped = flush_s, False
         self._recordings: list[SessionRecorder] = []
         self._woken = threading.Event()

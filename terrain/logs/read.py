@@ -100,6 +100,19 @@ class RunHead(BaseModel):
     labels: list[LabelEntry]
     dropped: dict[str, Annotated[int, Field(ge=0)]] = {}
 
+    @classmethod
+    def of(cls, run: RunLog) -> RunHead:
+        """Return what a run states of itself."""
+        return cls(
+            run_id=run.run_id,
+            robot=run.robot,
+            session=run.session,
+            filter=run.filter,
+            source=run.source,
+            labels=[LabelEntry(**label._asdict()) for label in run.labels],
+            dropped=dict(sorted(run.dropped.items())),
+        )
+
     def checked_labels(self, place: str) -> tuple[Label, ...]:
         """Return the terrain intervals; ``LogError`` where one ends before it starts, or two overlap."""
         labels = [Label(entry.start_s, entry.end_s, entry.terrain) for entry in self.labels]

@@ -85,17 +85,6 @@ class Messages(NamedTuple):
     contents: list[bytes]
 
 
-class Head(NamedTuple):
-    """What a run states of itself beside its streams; ``live`` of one that was recorded as it came."""
-
-    run_id: str
-    robot: str
-    session: str = ""
-    filter: str = ""
-    source: str = ""
-    live: bool = False
-
-
 def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[str] = ()) -> StreamTopic:
     """Return the topic of a stream; names that ROS does not accept are replaced.
 
@@ -133,26 +122,19 @@ def _accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]
 
 
 class RunDocument(RunHead):
-    """What a message of :data:`RUN_TOPIC` states: what a run does, and of each stream its topic."""
+    """What a message of :data:`RUN_TOPIC` states: what a run does, and of each stream its topic.
+
+    ``live`` is that of a run that was recorded as it came.
+    """
 
     version: Literal[1] = 1
     live: bool = False
     streams: Annotated[dict[str, StreamTopic], Field(min_length=1, max_length=MAX_STREAMS)]
 
 
-def run_document(
-    head: Head,
-    topics: Mapping[str, StreamTopic],
-    labels: Iterable[Label] = (),
-    dropped: Mapping[str, int] | None = None,
-) -> str:
+def run_document(head: RunHead, topics: Mapping[str, StreamTopic], *, live: bool = False) -> str:
     """Return the text of a document."""
-    document = RunDocument(
-        **head._asdict(),
-        labels=[LabelEntry(**label._asdict()) for label in labels],
-        streams=dict(topics),
-        dropped=dict(sorted((dropped or {}).items())),
-    )
+    document = RunDocument(**dict(head), live=live, streams=dict(topics))
     return json.dumps(document.model_dump(by_alias=True), allow_nan=False)
 
 
@@ -251,11 +233,6 @@ def stream_messages(
     return Messages(topic.topic, topic.kind, topic.definition, log_ns, contents)
 
 
-def head_of(run: RunLog) -> Head:
-    """Return what a run states of itself."""
-    return Head(run.run_id, run.robot, run.session, run.filter, run.source)
-
-
 def origin_of(run: RunLog) -> float:
     """Return the time of a run that is stamped 0: 0, where stamps allow it.
 
@@ -291,7 +268,7 @@ def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iter
     topics: dict[str, StreamTopic] = {}
     for name, stream in run.streams.items():
         topics[name] = stream_topic(name, stream.channels, [each.topic for each in topics.values()])
-    document = run_document(head_of(run), topics, run.labels, run.dropped)
+    document = run_document(RunHead.of(run), topics)
     yield text_messages(RUN_TOPIC, [start_s], [document], origin_s)
     changes = label_changes(run.labels)
     for topic, texts in ((LABEL_TOPIC, changes), (WINDOW_TOPIC, windows)):
@@ -341,14 +318,14 @@ class RunRecorder:
     ...         print(of.topic, log_ns, len(content))
     ...     def flush(self) -> None: ...
     ...     def finish(self) -> None: ...
-    >>> recorder = RunRecorder(Shown(), Head("drive_1", "husky", live=True))
+    >>> recorder = RunRecorder(Shown(), RunHead(run_id="drive_1", robot="husky", source="", labels=[]))
     >>> recorder.append("imu", ("gyro_z_radps",), [0.0, 0.01], [[0.1], [0.2]])
     /terrain/run 0 271
     /terrain/imu 0 36
     /terrain/imu 10000000 36
     """
 
-    def __init__(self, writer: Writer, head: Head, origin_s: float = 0.0) -> None:
+    def __init__(self, writer: Writer, head: RunHead, origin_s: float = 0.0) -> None:
         self._writer, self._head, self._origin_s = writer, head, origin_s
         self._topics: dict[str, StreamTopic] = {}
         self._is_described, self._last_ns = False, 0
@@ -374,10 +351,8 @@ class RunRecorder:
         """Append a text, as of :data:`WINDOW_TOPIC`."""
         self._write(text_messages(topic, [time_s], [text], self._origin_s))
 
-    def _describe(
-        self, log_ns: int, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None
-    ) -> None:
-        text = run_document(self._head, self._topics, labels, dropped)
+    def _describe(self, log_ns: int) -> None:
+        text = run_document(self._head, self._topics, live=True)
         stamps_ns, contents = np.array([log_ns]), [string_message(text)]
         self._write(Messages(RUN_TOPIC, STRING, STRING_TEXT, stamps_ns, contents))
         self._is_described = True
@@ -399,7 +374,10 @@ class RunRecorder:
         labels : of the run
         dropped : counts by kind of what was not recorded
         """
-        self._describe(self._last_ns, labels, dropped)
+        entries = [LabelEntry(**label._asdict()) for label in labels]
+        counts = dict(sorted((dropped or {}).items()))
+        self._head = self._head.model_copy(update={"labels": entries, "dropped": counts})
+        self._describe(self._last_ns)
         self._writer.finish()
 
 

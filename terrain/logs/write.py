@@ -11,6 +11,7 @@ from terrain.errors import LogError
 from terrain.files.atomic import atomic_folder
 from terrain.files.names import plain_name, shown
 from terrain.logs.log_files import checked_names
+from terrain.logs.read import RunFile, RunHead, StreamFile
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
 from terrain.records import RunLog, Stream
 
@@ -66,30 +67,19 @@ def write_run(
     if target.exists() and not (replace and (target / "run.json").is_file()):
         kind = "a run folder" if (target / "run.json").is_file() else "something else"
         raise LogError(f"{target}: {kind} is there already, and is left as it is")
-    head = {
-        "schema_version": SCHEMA_VERSION,
-        "run_id": run.run_id,
-        "robot": run.robot,
-        **({"session": run.session} if run.session else {}),
-        **({"filter": run.filter} if run.filter else {}),
-        "source": run.source,
-        "labels": [label._asdict() for label in run.labels],
-        "streams": {
-            name: {
-                "file": _file_name(name),
-                "channels": {channel: unit_of(channel) for channel in stream.channels},
-            }
-            for name, stream in run.streams.items()
-        },
-        "dropped": dict(sorted(run.dropped.items())),
+    streams = {
+        name: StreamFile(file=_file_name(name), channels={each: unit_of(each) for each in stream.channels})
+        for name, stream in run.streams.items()
     }
+    head = RunFile(**dict(RunHead.of(run)), schema_version=SCHEMA_VERSION, streams=streams)
     with atomic_folder(target) as unfinished:
         for name, stream in run.streams.items():
             _write_parquet(stream, unfinished / _file_name(name))
         for file, text in beside.items():
             (unfinished / file).write_text(text, encoding="utf-8")
         (unfinished / "run.json").write_text(
-            json.dumps(head, indent=2, allow_nan=False) + "\n", encoding="utf-8"
+            json.dumps(head.model_dump(exclude_defaults=True), indent=2, allow_nan=False) + "\n",
+            encoding="utf-8",
         )
     return target
 
