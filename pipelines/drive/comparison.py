@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report.figure import Bars, Figure, Panel, Points
 from pipelines.report.numbers import NOT_KNOWN, format_value, plural
-from pipelines.report.results import Progress, Result, described, frame, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Pairs, Part, Report, Table, Text, sections
 from pipelines.report.versions import versions
 from pipelines.slip.table import law_marks
@@ -49,8 +49,6 @@ from terrain.records import RunLog
 from terrain.robots import load_robot
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from pipelines.drive.drive import Settings
 
 PICTURED = 3
@@ -78,9 +76,9 @@ class DriveResult(Result):
     examples: Mapping[str, DriveCurves] = field(default_factory=dict)
     slip_table: SlipTable | None = None
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return the metrics, a row for each controller and seed."""
-        return frame(
+        return (
             {"controller": name, "seed": seed, **metrics}
             for name, rows in self.rows.items()
             for seed, metrics in zip(self.seeds, rows, strict=True)

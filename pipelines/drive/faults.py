@@ -20,7 +20,7 @@ from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report.figure import Figure, Line, Mark, Panel, Strip
 from pipelines.report.numbers import NOT_KNOWN, plural
-from pipelines.report.results import Progress, Result, described, frame, silent
+from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Pairs, Report, Table, sections
 from pipelines.report.versions import versions
 from terrain.control.fault_drives import (
@@ -49,8 +49,6 @@ from terrain.simulation.faults.catalogue import fault_catalogue, select_faults
 from terrain.simulation.faults.fault import SensorFault
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from pipelines.drive.drive import Settings
 
 DELAY_S = PilotSettings().delay_s
@@ -92,9 +90,9 @@ class FaultsResult(Result):
     n_met: int = described("those of them that meet all bars")
     drawn: tuple[Figure, ...] = ()
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return the drives with a fault, a row each."""
-        return frame(self.rows)
+        return self.rows
 
 
 def run(settings: Settings, progress: Progress) -> FaultsResult:

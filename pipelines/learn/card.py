@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -52,8 +52,6 @@ from terrain.files.documents import parse_document
 from terrain.files.names import printable
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from features.motion import Motion
     from terrain.records import Windows
 
@@ -118,11 +116,9 @@ class ModelResult(ModelInfo, Result):
     files: Mapping[str, int] = described("size of each file in bytes")
     training: TrainingRecord | None = described("how it was trained; None of one that was not evaluated")
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return a row a terrain."""
-        import pandas as pd
-
-        return pd.DataFrame() if self.training is None else self.training.evaluation.to_pandas()
+        return () if self.training is None else self.training.evaluation.records()
 
 
 def model_result(folder: Path, name: str) -> ModelResult:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -23,8 +23,6 @@ from pipelines.report.tree import Column, Part, Report, Section, Table
 from terrain.errors import DataError
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from features.protocols import Samples
     from features.recipes import WindowPipeline
     from pipelines.live.model import TerrainModel
@@ -47,11 +45,9 @@ class ComparisonResult(Result):
     data_digest: str = described("digest of the runs", default="")
     data: str = described("where the data lie", default="")
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return a row of figures for each contender."""
-        import pandas as pd
-
-        return pd.concat([Result.to_pandas(each) for each in self.contenders], ignore_index=True)
+        return (row for each in self.contenders for row in Result.records(each))
 
 
 def side_by_side(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -13,8 +13,6 @@ from pipelines.report.results import Result, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from terrain.classify.breakaway import Breakaway
     from terrain.classify.confidence import CoverageFigures, ReliabilityBin
     from terrain.classify.conformal_figures import ConformalFigures
@@ -131,11 +129,9 @@ class CrossvalResult(Result):
         written = super().as_json().items()
         return {name: value for name, value in written if name in always or getattr(self, name) is not None}
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return precision, recall, F1 and windows of each terrain."""
-        import pandas as pd
-
-        return pd.DataFrame([{"terrain": name, **row._asdict()} for name, row in self.per_class.items()])
+        return ({"terrain": name, **row._asdict()} for name, row in self.per_class.items())
 
 
 def report(result: CrossvalResult) -> Report:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from terrain.measured_slip.ground_changes import WatchedRun, quiet_detector, wat
 from terrain.measured_slip.measure import one_robot
 from terrain.records import RunLog
 from terrain.robots import load_robot
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 MAX_ROWS = 12
 
@@ -40,12 +37,9 @@ class ChangesResult(Result):
     n_alarms_without_step: int = described("those among them with an alarm")
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read", default=())
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return a row a change."""
-        import pandas as pd
-
-        changes = [{"run_id": run.run_id, **each._asdict()} for run in self.runs for each in run.changes]
-        return pd.DataFrame(changes)
+        return ({"run_id": run.run_id, **each._asdict()} for run in self.runs for each in run.changes)
 
 
 def find_changes(

@@ -7,7 +7,7 @@ the tracking server had stopped.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -27,8 +27,6 @@ from pipelines.report.tree import Report, Section, Text
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from pipelines.learn.card import ModelResult
     from pipelines.learn.champion import Bench
     from pipelines.learn.evaluation import CrossvalResult
@@ -118,9 +116,9 @@ class TrainResult(Registered):
         written = Registered.as_json(shown).items()
         return {name: value for name, value in written if value is not None}
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return precision, recall and F1 of each terrain on held-out runs."""
-        return self.crossval.to_pandas()
+        return self.crossval.records()
 
 
 @dataclass(frozen=True, repr=False)

@@ -78,12 +78,18 @@ class Result:
             rows.append((about["description"], value, about["form"], unit))
         return rows
 
+    def records(self) -> Iterable[Any]:
+        """Return the rows of :meth:`to_pandas`; one of the fields that are numbers or texts where none are natural."""
+        plain = (bool, int, float, str)
+        return [{name: each for name, each in vars(self).items() if isinstance(each, plain)}]
+
     def to_pandas(self) -> pd.DataFrame:
-        """Return the fields that are numbers, texts or intervals as a table of one row."""
+        """Return a table, the fields of its rows as ``--json`` has them."""
         import pandas as pd
 
-        plain = (bool, int, float, str)
-        return pd.DataFrame([{name: each for name, each in vars(self).items() if isinstance(each, plain)}])
+        from pipelines.report.json_file import as_json
+
+        return pd.DataFrame([as_json(record) for record in self.records()])
 
     @classmethod
     def about(cls) -> dict[str, Mapping[str, str]]:
@@ -112,12 +118,3 @@ class Result:
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
         cls.__repr__ = Result.__repr__  # type: ignore[method-assign]  # dataclass keeps what is defined
-
-
-def frame(records: Iterable[Any]) -> pd.DataFrame:
-    """Return records as a table, their fields as columns, as ``--json`` has them."""
-    import pandas as pd
-
-    from pipelines.report.json_file import as_json
-
-    return pd.DataFrame([as_json(record) for record in records])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines.data.datasets import drive_robot, load
 from pipelines.report.numbers import format_value
-from pipelines.report.results import Progress, Result, described, frame
+from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Report, Table, Text, sections
 from terrain.calibration.odometry import ParameterFound, judge_odometry
 from terrain.calibration.odometry_judge import KindScore, LegScores
@@ -22,8 +22,6 @@ from terrain.logs.drive_poses import WindowPoses, read_window_poses
 from terrain.robots import TrackedRobot, as_drive, load_robot
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from pipelines.slip.calibrate import Settings
 
 SHORTEST_S, LONGEST_S = 0.2, 3600.0
@@ -53,9 +51,9 @@ class OdometryResult(Result):
     written: Path | None = described("file of the slip model")
     notes: tuple[str, ...] = described("what is missing, in words")
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return a row a kind of odometry and length of legs."""
-        return frame(
+        return (
             {"length_s": scores.length_s, **asdict(kind)} for scores in self.scores for kind in scores.kinds
         )
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipelines.data.datasets import load_runs
 from pipelines.report.numbers import plural
-from pipelines.report.results import Progress, Result, described, frame
+from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Report, Text, sections
 from pipelines.report.writing import check_file
 from pipelines.slip.shown import first_rows
@@ -21,8 +21,6 @@ from terrain.files.atomic import atomic_write
 from terrain.robots import SwerveRobot, read_description, robot_from
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from pipelines.slip.calibrate import Settings
 
 
@@ -37,9 +35,9 @@ class CalibrationResult(Result):
     findings: tuple[Finding, ...] = described("one a number")
     measurement_variances: Mapping[str, float] = described("of the calibrated robot by the filters' rows")
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return a row a number, with its interval."""
-        return frame(self.findings)
+        return self.findings
 
 
 def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:

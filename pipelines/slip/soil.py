@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ import numpy as np
 from pipelines.data.datasets import load, load_runs
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_value
-from pipelines.report.results import Progress, Result, described, frame
+from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Part, Report, Section, Table, Text, sections
 from pipelines.slip.shown import write_figures
 from terrain.errors import ConfigError, DataError
@@ -27,8 +27,6 @@ from terrain.soil_identification.soil_file import soil_yaml
 from terrain.soil_identification.trials import WHEELS, Trials, trials_of
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from pipelines.slip.calibrate import Settings
 
 ERROR = ".1%"
@@ -53,9 +51,9 @@ class SoilResult(Result):
     skipped: tuple[str, ...] = described("a sentence for each trial that was skipped")
     pictures: Mapping[str, Figure] = field(default_factory=dict)
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return the errors of each law on what was left out, a row each; slip and load given."""
-        return frame(
+        return (
             {"wheel": wheel.wheel, "law": row.name, "held_out": held, **getattr(row, held).load._asdict()}
             for wheel in self.wheels
             for row in wheel.laws

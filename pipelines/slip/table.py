@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from pipelines.report.figure import Figure, Line, Mark, Strip
-from pipelines.report.results import Result, described, frame
+from pipelines.report.results import Result, described
 from pipelines.report.tree import Column
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, write_slip_table
 from terrain.records import Array
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 SLIP, TARGET = ".3f", "+.3f"
 
@@ -43,9 +40,9 @@ class LearnedSlipTable(Result, SlipTable):
         write_slip_table(self, path)
         return Path(path)
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return a row a terrain and drive state."""
-        return frame(target for by_state in self.targets.values() for target in by_state.values())
+        return (target for by_state in self.targets.values() for target in by_state.values())
 
     @property
     def next_step(self) -> str:

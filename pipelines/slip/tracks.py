@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from pipelines.report.figure import Band, Figure, Line, Mark
-from pipelines.report.results import Progress, Result, described, frame
+from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Part, Report, sections
 from pipelines.slip.shown import first_rows
 from terrain.records import Array, RunLog
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 Keep = Callable[[RunLog, Callable[[], Mapping[str, Figure]]], None]
 """Gets each run with its estimates, and what makes its pictures by name."""
@@ -38,9 +35,9 @@ class TracksResult(Result):
     skipped: tuple[str, ...] = described("a sentence for each run that a repairing read left out", default=())
     pictures: Mapping[str, Figure] = field(default_factory=dict)
 
-    def to_pandas(self) -> pd.DataFrame:
+    def records(self) -> Iterable[Any]:
         """Return a row a run or a surface."""
-        return frame(getattr(self, self.rows))
+        return tuple(getattr(self, self.rows))
 
 
 class Tracked(NamedTuple):
