@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Iterator
-from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import matplotlib.style
@@ -29,60 +28,28 @@ TITLE_LETTERS_AN_INCH = 11
 LONGEST_NAME = 40
 """Letters of a category; of a longer name the middle is left out."""
 
-INK, FAINT_INK, GRID = "#1f2933", "#66717d", "#dde2e7"
+INK = "#1f2933"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7", "#56b4e9", "#8c8c8c")
 """Okabe and Ito (2008), without black and yellow, and grey: distinguishable for colour-blind readers, too."""
 
-STYLE = {
-    "font.family": ["DejaVu Sans"],
-    "font.size": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.labelsize": 9.0,
-    "axes.labelcolor": INK,
-    "axes.edgecolor": FAINT_INK,
-    "axes.linewidth": 0.8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "text.color": INK,
-    "text.parse_math": False,
-    "text.hinting": "none",
-    "xtick.color": FAINT_INK,
-    "ytick.color": FAINT_INK,
-    "xtick.labelcolor": INK,
-    "ytick.labelcolor": INK,
-    "grid.color": GRID,
-    "grid.linewidth": 0.8,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-    "svg.fonttype": "path",
-    "svg.hashsalt": "terrain",
-    "path.simplify": False,
-}
-"""Names of runs are drawn as they are: a dollar sign in one starts no formula.  Without hinting a text is
-as wide in one resolution as in another, so that a layout made for one fits the other."""
+STYLE = Path(__file__).parent / "assets" / "report.mplstyle"
 
 
 def figure_png(figure: Figure, dpi: int = PNG_DPI) -> bytes:
     """Return a figure as PNG: the same bytes for the same figure, with no date and no version inside."""
-    with _styled():
-        file = io.BytesIO()
-        draw(figure).savefig(file, format="png", dpi=dpi, metadata={"Software": None})
-    return file.getvalue()
+    return _saved(figure, format="png", dpi=dpi, metadata={"Software": None})
 
 
 def figure_svg(figure: Figure) -> str:
     """Return a figure as SVG: the same text for the same figure; letters are drawn, no font is needed."""
-    with _styled():
-        file = io.BytesIO()
-        draw(figure).savefig(file, format="svg", metadata={"Date": None, "Creator": None})
-    return file.getvalue().decode()
+    return _saved(figure, format="svg", metadata={"Date": None, "Creator": None}).decode()
 
 
-@contextmanager
-def _styled() -> Iterator[None]:
+def _saved(figure: Figure, **options: Any) -> bytes:
     with matplotlib.style.context(["default", STYLE]):
-        yield
+        file = io.BytesIO()
+        draw(figure).savefig(file, **options)
+    return file.getvalue()
 
 
 def draw(figure: Figure) -> Drawn:

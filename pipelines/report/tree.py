@@ -7,7 +7,6 @@ written, so that screen and page show one number in one form.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -210,11 +209,12 @@ def _written(report: Report, writer: str) -> str:
 
 def figures_of(report: Report) -> list[Figure]:
     """Return all figures of a report, in their order."""
-    found, waiting = [], deque([report.picture, *report.parts, *report.details])
+    found: list[Figure] = []
+    waiting: list[Part | None] = [report.picture, *report.parts, *report.details]
     while waiting:
-        part = waiting.popleft()
+        part = waiting.pop(0)
         if isinstance(part, Figure):
             found.append(part)
         elif isinstance(part, Section):
-            waiting.extendleft(reversed(part.parts))
+            waiting[:0] = part.parts
     return found
