@@ -72,14 +72,14 @@ def write_run(
         for name, stream in run.streams.items()
     }
     head = RunFile(**dict(RunHead.of(run)), schema_version=SCHEMA_VERSION, streams=streams)
+    document = head.model_dump(exclude={name for name in ("session", "filter") if not getattr(run, name)})
     with atomic_folder(target) as unfinished:
         for name, stream in run.streams.items():
             _write_parquet(stream, unfinished / _file_name(name))
         for file, text in beside.items():
             (unfinished / file).write_text(text, encoding="utf-8")
         (unfinished / "run.json").write_text(
-            json.dumps(head.model_dump(exclude_defaults=True), indent=2, allow_nan=False) + "\n",
-            encoding="utf-8",
+            json.dumps(document, indent=2, allow_nan=False) + "\n", encoding="utf-8"
         )
     return target
 
