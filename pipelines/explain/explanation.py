@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ from terrain.discrepancy.sentences import (
     verdict_text,
 )
 from terrain.discrepancy.statements import SESSION_COLUMNS, Statement, session_rows, split_ruled_out
-from terrain.discrepancy.verdict import Diagnosis, Value
+from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import effect_named
 from terrain.robots import Robot
 
@@ -113,14 +113,11 @@ class ExplainResult(Result):
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the parameters of the named causes, a row each."""
-        import pandas as pd
-
-        rows = [
+        return frame(
             {"cause": cause.name, **value._asdict(), "held_out_gain": cause.gain, "z": cause.z}
             for cause in self.diagnosis.causes
             for value in cause.values  # noqa: PD011
-        ]
-        return pd.DataFrame(rows, columns=["cause", *Value._fields, "held_out_gain", "z"])
+        )
 
 
 def report(result: ExplainResult) -> Report:
@@ -138,12 +135,16 @@ def report(result: ExplainResult) -> Report:
         title=f"What the simulation of {diagnosis.robot} gets wrong",
         answer=f"{verdict_text(diagnosis)} {gain_text(result.gain.gain, result.gain.reason)}",
         picture=picture,
-        parts=list(_decisive_parts(result)),
+        parts=[*_decisive_parts(result)],
         details=[section for section in _details(result) if section.parts],
         lead=" · ".join(filter(None, lead)),
     )
     worded: Report = in_words_of(result.robot.drive, written)
     return replace(worded, next_step=result.next_command or "")
+
+
+def _ids(runs: Iterable[Any]) -> str:
+    return enumerated([run.run_id for run in runs])
 
 
 def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
@@ -152,12 +153,26 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
     for fault in diagnosis.faults:
         yield Text(f"Fault of the logs, repaired before anything was compared: {fault.sentence}", "warning")
     if diagnosis.excluded_runs:
-        excluded = ", ".join(run.run_id for run in diagnosis.excluded_runs)
-        yield Text(f"Runs that were excluded as unfit: {excluded}.", "warning")
-    for statement in [each for each in result.statements if each.found][:STATED]:
-        yield Text(sentence(statement.text))
-    if diagnosis.causes:
-        yield _causes(result)
+        yield Text(f"Runs that were excluded as unfit: {_ids(diagnosis.excluded_runs)}.", "warning")
+    for statement in result.statements[:STATED]:  # what states something comes first
+        if statement.found:
+            yield Text(sentence(statement.text))
+    causes: list[tuple[Any, ...]] = []
+    notes = ["Values are added to what the description has already."]
+    for cause in diagnosis.causes:
+        label, beside = effect_label(cause.name), (cause.gain, cause.z, result.terms.get(cause.name, ""))
+        for value in cause.values:  # noqa: PD011
+            causes.append((label, quantity(value.name, value.value), quantity_interval(value), *beside))
+        if cause.aliases:
+            notes.append(
+                f"No log distinguishes {label} from {enumerated([*map(effect_label, cause.aliases)])}."
+            )
+        if cause.caveat and all(each.name != cause.name for each in diagnosis.varying):
+            notes.append(f"{label}: {cause.caveat}.")
+    if causes:
+        gain, terms = Column("held-out gain", PERCENT), Column("the robot has", long=True)
+        heads = ("cause", "value", "95 %", gain, Column("z", Z), terms)
+        yield Table(heads, causes, note=" ".join(notes))
     for names in diagnosis.ambiguous_sets:
         yield _rivals(names, diagnosis)
     for each in diagnosis.varying:
@@ -173,25 +188,6 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         yield Text(skipped, "warning")
     if result.extended_file is not None:
         yield Pairs([("extended robot", str(result.extended_file))])
-
-
-def _causes(result: ExplainResult) -> Table:
-    rows: list[tuple[Any, ...]] = []
-    notes = ["Values are added to what the description has already."]
-    varying = [each.name for each in result.diagnosis.varying]
-    for cause in result.diagnosis.causes:
-        label = effect_label(cause.name)
-        beside: tuple[Any, ...] = (cause.gain, cause.z, result.terms.get(cause.name, ""))
-        for place, value in enumerate(cause.values):
-            numbers = quantity(value.name, value.value), quantity_interval(value)
-            rows.append(("", *numbers, None, None, "") if place else (label, *numbers, *beside))
-        if cause.aliases:
-            aliases = enumerated([effect_label(alias) for alias in cause.aliases])
-            notes.append(f"No log distinguishes {label} from {aliases}.")
-        if cause.caveat and cause.name not in varying:
-            notes.append(f"{label}: {cause.caveat}.")
-    gain, terms = Column("held-out gain", PERCENT), Column("the robot has", long=True)
-    return Table(("cause", "value", "95 %", gain, Column("z", Z), terms), rows, note=" ".join(notes))
 
 
 def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:
@@ -212,33 +208,29 @@ def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:
 def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
     """Yield by channel what an extension and a black-box reference gain, and what it is for a filter or classifier."""
     gain, learned = found.gain, {} if found.nameless is None else found.nameless.channels
-    if gain is None:
-        if learned:
-            columns = ("channel", "unit", "rms", Column("square less by a black-box reference", PERCENT))
-            rows = [(*CHANNEL_WORDS[name], each.rms_before, each.ratio) for name, each in learned.items()]
-            yield Table(columns, rows)
-        return
-    gains: list[tuple[Any, ...]] = []
-    for name, own in gain.channels.items():
-        ratio, low, high = own.reduction
-        remark = "" if not own.reduction.refused else "worse" if high < 0.0 else "no gain to claim"
-        sizes, black_box = (own.rms_before, own.rms_after), learned[name].ratio if name in learned else None
-        gains.append((*CHANNEL_WORDS[name], *sizes, ratio, (low, high), remark, black_box))
-    excluded = enumerated([run.run_id for run in gain.excluded])
-    note = (
-        f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "
-        "channels whitened, with differences from run to run removed. The black-box reference is a Bayesian "
-        "linear regression of the residual on the simulation's inputs, their products and rates, fitted to "
-        f"the runs behind the diagnosis and judged on the same {len(gain.run_ids)} held-out runs."
-    )
-    yield Table(
-        (
-            *("channel", "unit", "rms before", "after", Column("square less by", PERCENT)),
-            *(Column("95 %", PERCENT), "", Column("by a black-box reference", PERCENT)),
-        ),
-        gains,
-        note=f"{note} Excluded as unfit: {excluded}." if excluded else note,
-    )
+    rows: list[tuple[Any, ...]] = []
+    for name in learned if gain is None else gain.channels:
+        own, reached = None if gain is None else gain.channels[name], learned.get(name)
+        cells: tuple[Any, ...] = (reached and reached.rms_before, *[None] * 3, "")
+        if own is not None:
+            ratio, low, high = own.reduction
+            remark = "" if not own.reduction.refused else "worse" if high < 0.0 else "no gain to claim"
+            cells = own.rms_before, own.rms_after, ratio, (low, high), remark
+        rows.append((*CHANNEL_WORDS[name], *cells, reached and reached.ratio))
+    note = ""
+    if gain is not None:
+        note = (
+            f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "
+            "channels whitened, with differences from run to run removed. The black-box reference is a Bayesian "
+            "linear regression of the residual on the simulation's inputs, their products and rates, fitted to "
+            f"the runs behind the diagnosis and judged on the same {len(gain.run_ids)} held-out runs."
+        )
+        if gain.excluded:
+            note += f" Excluded as unfit: {_ids(gain.excluded)}."
+    if rows:
+        less, black_box = Column("square less by", PERCENT), Column("by a black-box reference", PERCENT)
+        heads = ("channel", "unit", "rms before", "after", less, Column("95 %", PERCENT), "", black_box)
+        yield Table(heads, rows, note=note)
     for kind, words in COMPARISON_TITLES.items():
         if (compared := found.comparisons.get(kind)) is None:
             continue
@@ -246,38 +238,44 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
         if compared.reason:
             yield Text(f"{title}: not measured: {compared.reason}.")
         elif compared.errors:
-            changes = [
-                (*ERROR_LABELS[key], each.before, each.after, each.change_ci)
-                for key, each in compared.errors.items()
-            ]
+            changes = [(*ERROR_LABELS[key], *change) for key, change in compared.errors.items()]
             yield Table(("figure", "unit", "before", "after", "change, 95 %"), changes, title)
 
 
 def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
     """Yield the effects that were withdrawn, what is left unexplained, and the effects that are ruled out."""
     withdrawn, ruled_out = split_ruled_out(diagnosis)
-    if withdrawn:
+    alike = {each.name: f"resembles {effect_label(each.name)}, which was withdrawn" for each in withdrawn}
+    for effects, title, note in (
+        (
+            withdrawn,
+            "withdrawn",
+            "These reduce the residual, and something speaks against each as its cause.",
+        ),
+        (ruled_out, "ruled out", "These runs would have shown them."),
+    ):
         rows: list[tuple[Any, ...]] = []
-        for each in withdrawn:
+        for each in effects:
             values = " and ".join(map(value_with_interval, each.values))
             rows.append((effect_label(each.name), values, sentence(each.reason), each.z))
-        note = "These effects reduce the residual, and something speaks against each as its cause."
-        yield Table(("withdrawn", "value it would have", WHY, Column("z", Z)), rows, note=note)
+        if rows:
+            yield Table((title, "value it would have", WHY, Column("z", Z)), rows, note=note)
     if diagnosis.unexplained:
-        alike = {each.name: f"resembles {effect_label(each.name)}, which was withdrawn" for each in withdrawn}
-        unexplained = []
-        for left in diagnosis.unexplained:
-            how = alike.get(left.input, f"depends on {left.input}")
-            unexplained.append((channel_label(left.channel), how, left.z, left.ratio or None))
+        unexplained = [
+            (
+                channel_label(left.channel),
+                alike.get(left.input, f"depends on {left.input}"),
+                left.z,
+                left.ratio or None,
+            )
+            for left in diagnosis.unexplained
+        ]
         note = (
             "Beside all causes the residual of the channel depends on the input, and no effect of the library "
             "explains it. The input is the clearest of some thirty that were tried."
         )
         part = Column("part of its squared residual", PERCENT)
         yield Table(("unexplained", "its residual", Column("z", Z), part), unexplained, note=note)
-    if ruled_out:
-        excluded = [(effect_label(each.name), sentence(each.reason), each.z) for each in ruled_out]
-        yield Table(("ruled out: these runs would have shown it", WHY, Column("z", Z)), excluded)
 
 
 def _details(result: ExplainResult) -> Iterator[Section]:
@@ -285,8 +283,8 @@ def _details(result: ExplainResult) -> Iterator[Section]:
     diagnosis, runs = result.diagnosis, result.diagnosed
     statements = [tuple(each.text.split(": ", 1)) for each in result.statements]
     yield Section("Channel by channel", [Pairs(statements)])
-    yield Section("Gain on held-out runs, channel by channel", list(_gain_parts(result.gain)))
-    yield Section("What was withdrawn, and what is unexplained", list(_open_parts(diagnosis)))
+    yield Section("Gain on held-out runs, channel by channel", [*_gain_parts(result.gain)])
+    yield Section("What was withdrawn, and what is unexplained", [*_open_parts(diagnosis)])
     if (powertrain := result.powertrain) is not None:
         given = (
             "The simulation is given the measured wheel speeds, so that this is no part of the residuals. "
@@ -298,30 +296,25 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         slope = f", on a slope of {coming.grade_deg:g}°" if coming.grade_deg else ""
         why = f"Scenario {coming.scenario}{slope}: {coming.reason}. In simulation first:"
         yield Section("What to drive next", [Text(why), Text(result.next_command or "", "code")])
-    yield Section("What the residuals depend on", list(_dependence_parts(runs)))
+    yield Section("What the residuals depend on", [*_dependence_parts(runs)])
     whole: Sequence[ComparedRun] = [*runs.compared, *result.gain.judged]
     if result.n_pictures is not None:
         whole = telling_runs(whole, runs.noise, result.n_pictures)
     drawn = [figures.run_figure(run, runs.noise, channels_of([run])) for run in whole]
     yield Section("Whole runs", drawn)
-    missed = [limit.name for limit in diagnosis.not_excited]
-    limits: list[Part] = []
-    for is_missed, title in ((True, "not excited by the driving"), (False, "detection limit")):
-        listed = [limit for limit in diagnosis.limits if (limit.name in missed) is is_missed]
-        if listed:
-            texts = [(limit_text(limit, is_missed), limit.needs) for limit in listed]
-            limits.append(Table((Column(title, long=True), NEEDS), texts))
+    limits = [(limit_text(limit, True), False, limit.needs) for limit in diagnosis.not_excited]
+    excited = [limit for limit in diagnosis.limits if limit not in diagnosis.not_excited]
+    limits += [(limit_text(limit, False), True, limit.needs) for limit in excited]
     meaning = "Not detected does not mean absent: at its limit an effect is found nine times in ten."
-    yield Section("What would not have been detected", [*limits, Text(meaning, "note")])
+    heads = Column("detection limit", long=True), "excited by the driving", NEEDS
+    yield Section("What would not have been detected", [Table(heads, limits, note=meaning)])
     health: list[Part] = []
     if diagnosis.excluded_runs:
         health.append(Table(("excluded run", WHY), diagnosis.excluded_runs))
     if diagnosis.clocks:
-        behind = Column("IMU and camera behind the wheels", ".1f", "ms")
-        clocks = [(each.run_id, 1e3 * each.offset_s, 1e3 * each.std_s) for each in diagnosis.clocks]
-        health.append(
-            Table(("clock of the run", behind, behind._replace(title="standard deviation")), clocks)
-        )
+        late = Column("IMU and camera behind the wheels", ".4f", "s", of="offset_s")
+        std = Column("standard deviation", ".4f", "s", of="std_s")
+        health.append(Table((Column("clock of the run", of="run_id"), late, std), diagnosis.clocks))
     yield Section("Health of the logs", health)
     built_in = [f"{name} {format_value(value)}" for name, value in runs.simulation.effects.items()]
     provenance: list[tuple[Any, ...]] = [
@@ -330,8 +323,8 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         ("effects built in already", ", ".join(built_in) or "none"),
         ("terrain", "; ".join([match.text for match in runs.terrains])),
         ("effects that may be named", f"{len(result.effects)}: {enumerated(result.effects)}"),
-        ("runs behind the diagnosis", enumerated([run.run_id for run in runs.used])),
-        ("runs held out, drawn by the seed", enumerated([run.run_id for run in runs.held_out]) or "none"),
+        ("runs behind the diagnosis", _ids(runs.used)),
+        ("runs held out, drawn by the seed", _ids(runs.held_out) or "none"),
         ("seed", result.seed),
         ("versions", versions()),
     ]
@@ -350,23 +343,21 @@ def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
         yield Table(SESSION_COLUMNS, rows, "By session", note)
     if runs.parts:
         yield figures.parts_figure(runs.parts)
-    rows_of_residuals = [
-        (*CHANNEL_WORDS[name], before.rms, before.noise, before.systematic, after.rms, after.systematic)
-        for name, before in diagnosis.residual_before.items()
-        for after in (diagnosis.residual_after[name],)
-    ]
+    residuals = []
+    for name, before in diagnosis.residual_before.items():
+        after = diagnosis.residual_after[name]
+        residuals.append((*CHANNEL_WORDS[name], *before, after.rms, after.systematic))
     systematic = Column("systematic", PERCENT, shade=True)
     yield Table(
         ("channel", "unit", "rms", "noise", systematic, "rms with the causes", systematic),
-        rows_of_residuals,
+        residuals,
         "How much of it is systematic",
         "The part of the squared residual that is not noise. Noise is what is left when every effect of the "
         "library is freed, and levels and what depends on speed and turn are taken off. Differences from run "
         "to run, as of the tyre pressure, count as systematic.",
     )
     if compared:
-        channels = channels_of(compared)
-        strongest, every = figures.dependence_figures(compared, runs.noise, channels)
+        strongest, every = figures.dependence_figures(compared, runs.noise)
         yield strongest
-        yield figures.spectra_figure(compared, runs.noise, runs.low_pass.cutoff_hz, channels)
+        yield figures.spectra_figure(compared, runs.noise, runs.low_pass.cutoff_hz)
         yield Section("Every input", every)

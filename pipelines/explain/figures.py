@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.discrepancy.channel_words import CHANNEL_WORDS, INPUT_LABELS
-from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, spread_of, strongest_input
+from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, channels_of, spread_of, strongest_input
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.parts import PartValues
 from terrain.discrepancy.residual_statistics import binned_means, noise_spectrum, run_means, spectrum
@@ -62,40 +62,29 @@ def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figur
     return Figure(title, panels, caption, x_label="time in the run [s]")
 
 
-def dependence_figures(
-    runs: Sequence[ComparedRun], noise: Noise, channels: Sequence[str]
-) -> tuple[Figure, list[Figure]]:
+def dependence_figures(runs: Sequence[ComparedRun], noise: Noise) -> tuple[Figure, list[Figure]]:
     """Return the mean residual of each channel over the input on which it depends most, and over every one.
 
-    Parameters
-    ----------
-    runs : compared
-    noise : of the fit runs
-    channels : names
-
-    Returns
-    -------
-    strongest : a panel a channel
-    every : a figure a channel: panels of every input that varies, of time and of run
+    The first figure has a panel a channel; of the others each is of a channel, with panels of every input that
+    varies, of time and of run.
     """
     strongest, every = [], []
-    for name in channels:
+    for name in channels_of(runs):
         c, axis = CHANNELS.index(name), AXIS.format(*CHANNEL_WORDS[name])
-        residuals, most = _residuals(runs, c), strongest_input(runs, name)
+        residuals, most = [*_residuals(runs, c)], strongest_input(runs, name)
         panels = {}
         for key in runs[0].inputs:
-            given = [run.inputs[key] for run in runs]
             if key == most or spread_of(runs, key) > MIN_SPREAD:
+                given = [run.inputs[key] for run in runs]
                 marks = [
-                    _points(kind, *binned_means(given, left), colour) for kind, colour, left in residuals
+                    _points(kind, colour, *binned_means(given, left)) for kind, colour, left in residuals
                 ]
                 panels[key] = Panel(marks, axis, x_label=INPUT_LABELS[key])
         strongest.append(panels[most])
         at, sizes = np.arange(1.0, len(runs) + 1), [noise.size(run.pace_mps)[:, c] for run in runs]
-        marks = [
-            _points(kind, at, *run_means(left, sizes, noise.filters[c]), colour)
-            for kind, colour, left in residuals
-        ]
+        marks = []
+        for kind, colour, left in residuals:
+            marks.append(_points(kind, colour, at, *run_means(left, sizes, noise.filters[c])))
         caption = (
             "Measured minus simulated. Intervals are over runs; those of single runs come from the noise, and do "
             "not include differences from run to run. Turn: wheel speed right minus left, or last minus first "
@@ -118,8 +107,8 @@ def parts_figure(parts: Sequence[PartValues]) -> Figure:
         values, halves = np.array([(part.value, part.half) for part in each.parts]).T
         low, high = np.full(2, each.value.low), np.full(2, each.value.high)
         title = f"{each.value.name}: {quantity(each.value.name, each.value.value)}"
-        band = Band("all runs, 95 %", ends, low, high, GREY)
-        panels.append(Panel([band, _points("a part", at, values, halves, BLUE)], each.value.unit, title))
+        band = tree.Band("all runs, 95 %", ends, low, high, GREY)
+        panels.append(tree.Panel([band, _points("a part", BLUE, at, values, halves)], each.value.unit, title))
     names = "; ".join([f"{i}: {part.name}" for i, part in enumerate(parts[0].parts, start=1)])
     caption = (
         "The value of each cause fitted to a part of the data: thirds of each run's time, and halves of the "
@@ -128,17 +117,14 @@ def parts_figure(parts: Sequence[PartValues]) -> Figure:
     return Figure("Whether the values are one number", panels, caption, x_label="part of the data")
 
 
-def spectra_figure(
-    runs: Sequence[ComparedRun], noise: Noise, cutoff_hz: float, channels: Sequence[str]
-) -> Figure:
+def spectra_figure(runs: Sequence[ComparedRun], noise: Noise, cutoff_hz: float) -> Figure:
     """Return the spectrum of each channel's residual before and after, and that of the noise, in decibels."""
     rate_hz = 1.0 / float(np.median(np.diff(runs[0].time_s)))
     panels = []
-    for name in channels:
-        c, unit = CHANNELS.index(name), CHANNEL_WORDS[name][1]
-        curves = [
-            (kind, *spectrum(residuals, rate_hz), colour) for kind, colour, residuals in _residuals(runs, c)
-        ]
+    for name in channels_of(runs):
+        c, unit, curves = CHANNELS.index(name), CHANNEL_WORDS[name][1], []
+        for kind, colour, left in _residuals(runs, c):
+            curves.append((kind, *spectrum(left, rate_hz), colour))
         power = float(np.concatenate([noise.size(run.pace_mps)[:, c] ** 2 for run in runs]).mean())
         frequency_hz = np.geomspace(curves[0][1][0], rate_hz / 2, 100)
         shape = noise_spectrum(noise.filters[c], frequency_hz, rate_hz)
@@ -155,15 +141,14 @@ def spectra_figure(
     return Figure("At which frequencies", panels, caption, x_label="frequency [Hz]")
 
 
-def _residuals(runs: Sequence[ComparedRun], c: int) -> list[tuple[str, int, list[Array]]]:
-    """Return the residuals of a channel before and, where anything was built in, after: label, colour, by run."""
-    found = [(BEFORE, VERMILION, [run.residual(False)[:, c] for run in runs])]
-    if runs[0].after is not None:
-        found.append((AFTER, BLUE, [run.residual(True)[:, c] for run in runs]))
-    return found
+def _residuals(runs: Sequence[ComparedRun], c: int) -> Iterator[tuple[str, int, list[Array]]]:
+    """Yield the residuals of a channel before and, where anything was built in, after: label, colour, by run."""
+    for label, colour, extended in ((BEFORE, VERMILION, False), (AFTER, BLUE, True)):
+        if not extended or runs[0].after is not None:
+            yield label, colour, [run.residual(extended)[:, c] for run in runs]
 
 
-def _points(label: str, at: Array, values: Array, halves: Array, colour: int) -> Mark:
+def _points(label: str, colour: int, at: Array, values: Array, halves: Array) -> tree.Points:
     """Return values with their intervals; one that is not known has none."""
     halves = np.nan_to_num(halves)
     return Points(label, at, values, values - halves, values + halves, colour)

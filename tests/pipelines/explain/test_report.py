@@ -134,7 +134,7 @@ FINDINGS = (
             "next_drive": NextDrive("climb", 6.0, "it parts them"),
         },
         (
-            f"r3 12.3 1.0 r4 {NOT_KNOWN}",
+            f"r3 0.0123 0.0010 r4 {NOT_KNOWN}",
             "excluded as unfit: r<9>.",
             "r<9> its gyro stands still",
             "Scenario climb, on a slope of 6°: it parts",
@@ -175,13 +175,13 @@ def test_figures_show_the_residual_before_and_after_with_the_noise_about_the_mea
     half = (np.asarray(band.high) - np.asarray(band.low)) / 2
     errors = [np.nanstd(np.asarray(each.y) - np.asarray(measured.y)) for each in (before, after)]
     assert errors[1] < np.nanmean(half) < errors[0]
-    strongest, (every,) = dependence_figures(runs, noise, [name])
-    for figure in (strongest, every):
-        first, second = figure.panels[0].marks
+    strongest, every = dependence_figures(runs, noise)
+    place = channels_of(runs).index(name)
+    for panel in (strongest.panels[place], every[place].panels[0]):
+        first, second = panel.marks
         assert np.nanstd(second.y) < 0.5 * np.nanstd(first.y)
-    channels = channels_of(runs)
-    figure = spectra_figure(runs, noise, 2.5, channels)
-    levels = {each.label: np.median(each.y) for each in figure.panels[channels.index(name)].marks}
+    spectra = spectra_figure(runs, noise, 2.5)
+    levels = {each.label: np.median(each.y) for each in spectra.panels[place].marks}
     assert levels["noise"] == pytest.approx(levels["with the causes built in"], abs=5.0)
     band, points = parts_figure(few.diagnosed.parts).panels[0].marks
     (value,) = few.diagnosis.causes[0].values
