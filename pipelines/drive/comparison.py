@@ -96,12 +96,12 @@ def run(settings: Settings, progress: Progress) -> DriveResult:
     plant = None if settings.plant is None else load_robot(settings.plant)
     inputs = DriveInputs(robot, load_slip_table(settings.table, robot.name), plant=plant)
     check_drive(settings, inputs)
-    if settings.needs_model and settings.model is None:
-        inputs = replace(inputs, model=train_classifier(robot, settings.first_seed, progress))
-    elif settings.model is not None:
+    if settings.needs_model:
         from pipelines.learn.model_file import read_model
 
-        inputs = replace(inputs, model=read_model(settings.model))
+        given = settings.model
+        model = read_model(given) if given else train_classifier(robot, settings.first_seed, progress)
+        inputs = replace(inputs, model=model)
     return compare(settings, inputs, progress)
 
 
@@ -234,18 +234,12 @@ def belief_notes(compared: Comparison) -> tuple[str, ...]:
     for name in filter(compared.is_hardly_believed, compared.rows):
         believed = compared.value(name, "believed_ratio").mean or 0.0
         how = f"in {100.0 * believed:.1f} % of the driving time only" if believed else "at no time"
-        outputs = ", ".join(
-            f"{format_value(mean)} {text}"
-            for key, text in (
-                ("n_accepted", "accepted"),
-                ("n_below_threshold", "below the threshold"),
-                ("n_refused", "refused"),
-            )
-            if (mean := compared.value(name, key).mean) is not None
-        )
+        kinds = ("accepted", "below_threshold", "refused")
+        outputs = [f"{format_value(compared.value(name, f'n_{kind}').mean)} {kind}" for kind in kinds]
         notes.append(
-            f"{name} knew the terrain {how} (outputs of its classifier in a drive: {outputs or 'unknown'}): "
-            "it drove on the targets of the table's fallback, and no difference to another controller is a "
+            f"{name} knew the terrain {how} (outputs of its classifier in a drive: "
+            f"{', '.join(outputs).replace('_', ' the ')}): it drove on the targets of the table's fallback, "
+            "and no difference to another controller is a "
             "gain of the classifier."
         )
     return tuple(notes)
@@ -271,7 +265,7 @@ def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]]) -> str:
         if found is None:
             continue
         if math.isnan(found.low) or found.is_significant:
-            significant.append(f"{metric_label(key).text} {signed_difference(found.mean, key)}")
+            significant.append(f"{metric_label(key).text} {format_value(found.mean, *_signed(key))}")
         else:
             alike.append(metric_label(key).text)
     parts = [", ".join(significant)] if significant else []
@@ -325,23 +319,15 @@ def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) ->
 def _difference_text(found: Difference | None, key: str) -> str:
     if found is None:
         return NOT_KNOWN
-    mean = signed_difference(found.mean, key)
+    mean = format_value(found.mean, *_signed(key))
     if math.isnan(found.low):
         return mean
-    star = " *" if found.is_significant else ""
-    return f"{mean} ({signed_difference(found.low, key)} to {signed_difference(found.high, key)}){star}"
+    return f"{mean} ({interval(found.low, found.high, *_signed(key))}){' *' if found.is_significant else ''}"
 
 
-def signed_difference(difference: float, key: str) -> str:
-    r"""Return a difference with its sign: as a percentage, or in the metric's unit.
-
-    Examples
-    --------
-    >>> signed_difference(-0.0804, "slip_peak"), signed_difference(1.25, "steepest_deg")
-    ('−8.0\xa0%', '+1.25\xa0°')
-    """
-    form, unit = ("+.3g", metric_label(key).unit) if key in ABSOLUTE else ("+.1%", "")
-    return format_value(difference, form, unit)
+def _signed(key: str) -> tuple[str, str]:
+    """Return format and unit of a difference: a percentage, or in the metric's unit."""
+    return ("+.3g", metric_label(key).unit) if key in ABSOLUTE else ("+.1%", "")
 
 
 def _metric_parts(result: DriveResult) -> list[Part | str]:
@@ -406,19 +392,10 @@ def _curve_parts(table: SlipTable | None) -> list[Part]:
     return [Figure(f"Slip curves of the table {table.name}", panels, caption, x_label="slip ratio")]
 
 
-def _provenance(result: DriveResult) -> list[Part | str]:
-    first, last = result.seeds[0], result.seeds[-1]
+def _provenance(result: DriveResult) -> list[tree.Part | str]:
+    described_by = result.pairs("terrain", "table", "delay_s", "grade_deg", "ramp_mps2")
     return [
         "Robot and terrain are models: controllers are compared on them, and what a robot in a field would do is "
         "not predicted.",
-        Pairs(
-            [
-                ("seeds", f"{first} to {last}" if last > first else first),
-                ("delay from a sample to the wheel", result.delay_s, "", "s"),
-                ("table", result.table),
-                ("ramp", result.ramp_mps2, "", "m/s²"),
-                ("grade", result.grade_deg, "", "°"),
-                ("versions", versions()),
-            ]
-        ),
+        tree.Pairs([("seeds", (result.seeds[0], result.seeds[-1])), *described_by, ("versions", versions())]),
     ]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from pipelines.report.settings import ByCommas, JobsSettings, Names, setting
 from pipelines.report.settings import Settings as BaseSettings
@@ -29,7 +28,7 @@ SlipSourceName = Literal["none", "dynamic", "kinematic", "multi", "multi-grip"]
 ALL = "all"
 """``--faults`` that names every fault."""
 
-Ratio = Annotated[float, Field(ge=0.5, le=2.0)]
+Numbers = Annotated[tuple[float, ...], ByCommas]
 
 
 class DrivenSettings(JobsSettings):
@@ -83,7 +82,7 @@ class ComparisonSettings(BaseSettings):
     duration_s: float | None = setting(None, "Length of a drive in s.", option="--duration")
     accel_mps2: float = setting(1.0, "Rise of the desired speed in m/s^2; inf for a step.", option="--accel")
     grade_deg: float = setting(0.0, "Slope in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0)
-    radius_factors: Annotated[tuple[Ratio, Ratio, Ratio], ByCommas] | None = setting(
+    radius_factors: Numbers | None = setting(
         None,
         "True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default.",
         option="--radius",
@@ -91,26 +90,13 @@ class ComparisonSettings(BaseSettings):
     leg_backlash_rad: float = setting(0.0, "Backlash of the third leg in rad.", option="--leg-backlash")
     plant: str | None = setting(None, "Robot as it really is, where it differs from --robot.")
 
-    @field_validator("controllers")
+    @field_validator("radius_factors")
     @classmethod
-    def _named_once(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        if not names:
-            raise ValueError("no controller is named")
-        repeated = {name for name in names if names.count(name) > 1}
-        if repeated:
-            raise ValueError(f"controllers name {min(repeated)!r} twice")
-        return names
-
-    @field_validator("radius_factors", mode="wrap")
-    @classmethod
-    def _three_ratios(cls, given: object, check: Callable[[object], object]) -> object:
-        try:
-            return check(given)
-        except ValidationError:
-            text = ",".join(map(str, given)) if isinstance(given, tuple) else given
-            raise ValueError(
-                f"--radius is {text!r}; three ratios from 0.5 to 2 are required, as in 1,1.02,1"
-            ) from None
+    def _three_ratios(cls, ratios: tuple[float, ...] | None) -> tuple[float, ...] | None:
+        if ratios is not None and (len(ratios) != 3 or not all(0.5 <= each <= 2.0 for each in ratios)):
+            text = ",".join(map(str, ratios))
+            raise ValueError(f"--radius is {text}; three ratios from 0.5 to 2 are required, as in 1,1.02,1")
+        return ratios
 
     @model_validator(mode="after")
     def _consistent(self) -> ComparisonSettings:
@@ -133,29 +119,12 @@ class FaultSettings(BaseSettings):
     faults: Names = setting((), "Drive through these faults: names or kinds of them, by commas, or 'all'.")
     situations: Names = setting(SITUATIONS, f"By commas: {', '.join(SITUATIONS)}.")
     stop_terrains: Names = setting(("wet_floor",), "Soils of stop, by commas.", option="--stop-terrain")
-    durations_s: Annotated[tuple[float, ...], ByCommas] = setting(
+    durations_s: Annotated[tuple[Annotated[float, Field(gt=0.0)], ...], ByCommas] = setting(
         (3.0, math.inf), "For how long a fault acts in s, by commas; inf for good.", option="--durations"
     )
     draw: Names = setting(
         (), "Faults whose drives are drawn, by commas; by default, with --out, the worst of each kind."
     )
-
-    @field_validator("situations", "stop_terrains", "durations_s")
-    @classmethod
-    def _each_once(cls, given: tuple[object, ...]) -> tuple[object, ...]:
-        if not given:
-            raise ValueError("situations, terrains and durations: one of each at least is required")
-        if len(set(given)) < len(given):
-            raise ValueError(f"{', '.join(map(str, given))}: one is named twice")
-        return given
-
-    @field_validator("durations_s")
-    @classmethod
-    def _possible_durations(cls, durations_s: tuple[float, ...]) -> tuple[float, ...]:
-        for duration_s in durations_s:
-            if not duration_s > 0.0:
-                raise ValueError(f"--durations has {duration_s:g}; times above 0 s are accepted, or inf")
-        return durations_s
 
 
 class PathSettings(BaseSettings):
@@ -176,9 +145,7 @@ class PathSettings(BaseSettings):
     )
     grip: float = setting(0.7, "Largest side force over load.", gt=0.0, le=1.5)
     offset: float = setting(0.0, "Desired distance to the left of the path in m.", ge=-100.0, le=100.0)
-    stop: Annotated[tuple[float, ...], ByCommas] = setting(
-        (), "Distances in m at which to stop for 3 s, by commas."
-    )
+    stop: Numbers = setting((), "Distances in m at which to stop for 3 s, by commas.")
     point_std: float = setting(
         0.0, "Standard deviation of the points in m: 0.02 for points of an RTK receiver.", ge=0.0, le=10.0
     )
@@ -186,14 +153,21 @@ class PathSettings(BaseSettings):
     @field_validator("stop")
     @classmethod
     def _rising_stops(cls, stops: tuple[float, ...]) -> tuple[float, ...]:
-        ordered = all(a < b for a, b in zip((0.0, *stops), stops, strict=False))
-        if not ordered or not all(map(math.isfinite, stops)):
+        if not all(a < b < math.inf for a, b in zip((0.0, *stops), stops, strict=False)):
             raise ValueError(f"--stop is {','.join(map(str, stops))}; rising distances above 0 are accepted")
         return stops
 
 
 class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
     """What is driven: a comparison of controllers, sensor faults, or a path."""
+
+    @field_validator("controllers", "situations", "stop_terrains", "durations_s")
+    @classmethod
+    def _each_once(cls, given: tuple[object, ...], info: ValidationInfo) -> tuple[object, ...]:
+        if not given or len(set(given)) < len(given):
+            option, text = cls.model_fields[str(info.field_name)].alias, ",".join(map(str, given))
+            raise ValueError(f"{option} is {text or 'empty'}; one at least is required, and none twice")
+        return given
 
     @model_validator(mode="after")
     def _one_mode(self) -> Settings:

@@ -140,14 +140,7 @@ def _places(settings: Settings) -> list[Place]:
 def drive_faults(
     settings: Settings, robot: Robot, slips: SlipTable, progress: Progress = silent
 ) -> FaultsResult:
-    """Drive each fault in each situation with a robot and its table, and evaluate the drives.
-
-    Parameters
-    ----------
-    settings : what is driven
-    robot, slips : that is driven, and its target slips
-    progress : of the drives
-    """
+    """Drive each fault of the settings in each situation with a robot and its table, and evaluate the drives."""
     chosen, places, loop = _chosen_faults(settings, robot), _places(settings), fault_loop(robot, slips)
 
     def computed(task: str, function: Callable[..., Any], tasks: Sequence[Sequence[Any]]) -> list[Any]:
@@ -193,55 +186,36 @@ def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
     return LivePilot(robot, slips, KnownTerrain(), settings)
 
 
-def fault_figure(case: FaultCase, driven: Driven, references: References) -> Figure:
-    """Return the figure of a drive with a fault: speeds, slip and status over time.
-
-    Parameters
-    ----------
-    case : what was driven
-    driven : with the fault
-    references : of the same place
-    """
+def fault_figure(case: FaultCase, driven: Driven, references: References) -> tree.Figure:
+    """Return the figure of a drive with a fault beside those of the same place: speeds, slip, status over time."""
     drive, plain, start_s = driven.drive, references.plain, references.start_s
     time_s, last_s = drive.time_s, float(drive.time_s[-1])
     acts = Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])
     estimated = np.where(np.abs(driven.speed_mps) < FASTEST_MPS, driven.speed_mps, math.nan)
     shown_s = max(start_s - BEFORE_S, 0.0), last_s
-    speeds: list[Mark] = [
-        acts,
-        Line("desired", time_s, drive.desired_mps, 6, dashed=True),
-        Line("commanded", time_s, drive.commanded_mps, 2),
-        Line("over ground, true", time_s, drive.speed_mps, 0),
-        Line("over ground, estimated", time_s, estimated, 1),
-    ]
-    slips: list[Mark] = [
-        acts,
-        Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
-        Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
-        Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
-        Line("estimated", time_s, drive.slip_ratio, 1),
-    ]
-    ok: list[Mark] = [acts, Line("", time_s, drive.ok.astype(float), 2)]
+    speeds = (
+        tree.Line("desired", time_s, drive.desired_mps, 6, dashed=True),
+        tree.Line("commanded", time_s, drive.commanded_mps, 2),
+        tree.Line("over ground, true", time_s, drive.speed_mps, 0),
+        tree.Line("over ground, estimated", time_s, estimated, 1),
+    )
+    slips = (
+        tree.Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
+        tree.Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
+        tree.Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
+        tree.Line("estimated", time_s, drive.slip_ratio, 1),
+    )
     panels = (
-        (speeds, "speed [m/s]", (-0.5, 2.0)),
-        (slips, "slip ratio", (-1.1, 1.1)),
-        (ok, "status is OK", None),
+        tree.Panel((acts, *speeds), "speed [m/s]", x_range=shown_s, y_range=(-0.5, 2.0)),
+        tree.Panel((acts, *slips), "slip ratio", x_range=shown_s, y_range=(-1.1, 1.1)),
+        tree.Panel((acts, tree.Line("", time_s, drive.ok.astype(float), 2)), "status is OK", x_range=shown_s),
     )
-    return Figure(
-        f"{case.fault}, {duration_text(case.duration_s)}: {case.situation} on {case.terrain}, seed {case.seed}",
-        [Panel(marks, label, x_range=shown_s, y_range=y_range) for marks, label, y_range in panels],
-        x_label="time [s]",
-    )
+    title = f"{case.fault}, {duration_text(case.duration_s)}: {_place(case)}, seed {case.seed}"
+    return tree.Figure(title, panels, x_label="time [s]")
 
 
 def duration_text(duration_s: float) -> str:
-    """Return a duration as it is shown.
-
-    Examples
-    --------
-    >>> duration_text(3.0), duration_text(math.inf)
-    ('3 s', 'for good')
-    """
+    """Return a duration as it is shown, as ``3 s``."""
     return f"{duration_s:g} s" if math.isfinite(duration_s) else "for good"
 
 
@@ -350,12 +324,9 @@ def _short(names: Iterable[str]) -> str:
 
 
 def _named(rows: Sequence[FaultRow]) -> str:
-    """Return the sensors that were named in any row, those with the same statuses together."""
+    """Return the sensors that were named in any row, each with its statuses."""
     named: dict[str, set[str]] = defaultdict(set)
     for row in rows:
         for sensor, statuses in (row.blamed or {}).items():
             named[sensor].update(statuses.split(", "))
-    together: dict[str, list[str]] = defaultdict(list)
-    for sensor in sorted(named):
-        together[", ".join(sorted(named[sensor]))].append(sensor)
-    return "; ".join(f"{', '.join(sensors)}: {statuses}" for statuses, sensors in together.items())
+    return "; ".join(f"{sensor}: {', '.join(sorted(named[sensor]))}" for sensor in sorted(named))

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 SPEED_MPS = 3.0
 """Unless another is given."""
 
+DISTANCE = "distance along the path [m]"
+
 SHOWN_M = 1.5
 """Lateral errors beyond this leave the figure."""
 
@@ -92,11 +94,6 @@ class PathResult(Result):
 def run(settings: Settings, progress: Progress) -> PathResult:
     """Follow the path of the settings in simulation; with ``out`` write the table ``drive.csv`` of the drive.
 
-    Parameters
-    ----------
-    settings : of the command, with a path
-    progress : called when the drive is over
-
     Raises
     ------
     ConfigError
@@ -105,11 +102,8 @@ def run(settings: Settings, progress: Progress) -> PathResult:
         if the path cannot be read, or the folder not be written.
     """
     assert settings.path is not None
-    robot = as_drive(
-        BicycleRobot,
-        load_robot(settings.robot),
-        "robot {name}: drive {drive!r} cannot follow a path, only 'bicycle' can",
-    )
+    refusal = "robot {name}: drive {drive!r} cannot follow a path, only 'bicycle' can"
+    robot = as_drive(BicycleRobot, load_robot(settings.robot), refusal)
     speed_mps = SPEED_MPS if settings.speed_mps is None else settings.speed_mps
     if speed_mps > robot.speed_max_mps:
         raise ConfigError(
@@ -201,7 +195,7 @@ def _lateral_figure(result: PathResult) -> Figure:
         "Lateral error along the path",
         [Panel(marks, "lateral error [m]", y_range=(-most, most))],
         "Of the true position, to the desired offset; positive to the left.",
-        x_label="distance along the path [m]",
+        x_label=DISTANCE,
     )
 
 
@@ -211,17 +205,13 @@ def _map(result: PathResult) -> Iterator[Part]:
         Line("path", rows[:, X], rows[:, Y], 6, dashed=True),
         Line("rear axle", drive.position_m[:, 0], drive.position_m[:, 1], 0),
     ]
-    yield Figure(
-        "The path, and where the rear axle was", [Panel(marks, "y [m]", x_label="x [m]", equal=True)]
-    )
-    yield Figure(
-        "Speed of the rear axle, and angle of the front wheel",
-        [
-            Panel([Line("speed", drive.distance_m, drive.speed_mps)], "speed [m/s]"),
-            Panel([Line("steering", drive.distance_m, np.degrees(drive.steer_rad))], "steering [°]"),
-        ],
-        x_label="distance along the path [m]",
-    )
+    seen = tree.Panel(marks, "y [m]", x_label="x [m]", equal=True)
+    yield Figure("The path, and where the rear axle was", [seen])
+    speed = tree.Line("speed", drive.distance_m, drive.speed_mps)
+    steering = tree.Line("steering", drive.distance_m, np.degrees(drive.steer_rad))
+    panels = tree.Panel([speed], "speed [m/s]"), tree.Panel([steering], "steering [°]")
+    title = "Speed of the rear axle, and angle of the front wheel"
+    yield Figure(title, panels, x_label=DISTANCE)
 
 
 def _observed(result: PathResult) -> Iterator[Part]:
@@ -240,11 +230,11 @@ def _observed(result: PathResult) -> Iterator[Part]:
     yield Figure("Sideslip", panels, "At rest there is no true one.", x_label="time [s]")
     if np.isfinite(drive.stiffness_npr).any():
         stiffness = []
-        for j, wheel in enumerate(WHEELS):
-            both: list[Mark] = [
-                Line("estimate", drive.time_s, drive.stiffness_npr[:, j] / 1e3, 0),
-                Points("true secant, where excited", drive.time_s, drive.secant_npr[:, j] / 1e3, colour=6),
-            ]
-            stiffness.append(Panel(both, f"{wheel} [kN/rad]", y_range=(0.0, 32.0)))
+        for wheel, found, true in zip(
+            WHEELS, drive.stiffness_npr.T / 1e3, drive.secant_npr.T / 1e3, strict=True
+        ):
+            secant = tree.Points("true secant, where excited", drive.time_s, true, colour=6)
+            both = tree.Line("estimate", drive.time_s, found, 0), secant
+            stiffness.append(tree.Panel(both, f"{wheel} [kN/rad]", y_range=(0.0, 32.0)))
         caption = "Cornering stiffness of the axles, and -F/b of the simulated tyres."
         yield Figure("Cornering stiffness", stiffness, caption, x_label="time [s]")

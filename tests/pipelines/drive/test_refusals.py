@@ -12,8 +12,8 @@ from terrain.errors import ConfigError
 from terrain.robots import load_robot
 
 COMPARISON = [
-    ("no controller", "--controllers ,"),
-    ("twice", "--controllers plain,plain"),
+    ("--controllers is empty; one at least is required", "--controllers ,"),
+    ("--controllers is plain,plain; one at least is required, and none twice", "--controllers plain,plain"),
     ("'oracle' is unknown", "--controllers oracle"),
     (f"'best' is unknown: use {', '.join(CONTROLLERS)}", "--controllers best"),
     ("'thesis:fallback' is unknown", "--controllers thesis:fallback"),
@@ -44,10 +44,9 @@ FAULTS = [
     ("situation 'go' is unknown: use start, stop, steady", "--faults all --situations go"),
     ("soil 'moon' is unknown", "--faults all --terrain moon"),
     ("soil 'moon' is unknown", "--faults all --stop-terrain moon"),
-    ("--durations has 0; times above 0 s", "--faults all --durations 0"),
+    ("--durations is 0: input should be greater than 0", "--faults all --durations 0"),
     ("--durations is 'long'", "--faults all --durations long"),
-    ("one of each at least is required", "--faults all --situations ,"),
-    ("start, start: one is named twice", "--faults all --situations start,start"),
+    ("--situations is empty; one at least", "--faults all --situations ,"),
     ("only 'swerve' has", "--faults all --robot husky"),
 ]
 PATH = [
