@@ -61,10 +61,6 @@ class OdometryResult(Result):
 def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
     """Fit kinds of odometry to folds of runs and judge them on the others; write the slip model of all.
 
-    Parameters
-    ----------
-    settings : of ``terrain calibrate``: runs with poses, or commands of DRIVE; lengths, folds; a tracked robot
-
     Raises
     ------
     ConfigError

@@ -41,12 +41,7 @@ class CalibrationResult(Result):
 
 
 def calibrate(settings: Settings, progress: Progress) -> CalibrationResult:
-    """Calibrate a robot's description from its runs, and write it.
-
-    Parameters
-    ----------
-    settings : of ``terrain calibrate``; nothing is written without ``out``
-    progress : gets that it is done
+    """Calibrate a robot's description from its runs, and write it; without ``out`` nothing is written.
 
     Raises
     ------
@@ -125,13 +120,11 @@ def report(result: CalibrationResult) -> Report:
     moved = sum(row.described is not None and not row.low <= row.described <= row.high for row in found)
     n_runs = plural(len(result.run_ids), "run")
     first, all_numbers = first_rows(found, NUMBERS, f"{result.robot}, from {n_runs}")
-    by_note: dict[tuple[bool, str], list[str]] = defaultdict(list)
+    notes: dict[bool, dict[str, list[str]]] = {False: defaultdict(list), True: defaultdict(list)}
     for row in result.findings:
         if row.note:
-            by_note[row.determined, row.note].append(row.parameter)
-    notes: dict[bool, list[str]] = {False: [], True: []}
-    for (determined, note), names in by_note.items():
-        notes[determined].append(f"{', '.join(names)}: {note}")
+            notes[row.determined][row.note].append(row.parameter)
+    unknown, assumed = ([f"{', '.join(each[note])}: {note}" for note in each] for each in notes.values())
     n_unknown = len(result.findings) - len(found)
     text = f"{n_unknown} numbers are not determined by these runs; the details say why."
     return Report(
@@ -139,6 +132,6 @@ def report(result: CalibrationResult) -> Report:
         f"{len(found)} numbers of {result.robot} are determined by {n_runs}; {moved} of "
         "them were described outside their 95 % interval.",
         parts=[first, Text(text, "note")] if n_unknown else [first],
-        details=sections(all_numbers, ("Not determined", notes[False]), ("Assumed", notes[True])),
+        details=sections(all_numbers, ("Not determined", unknown), ("Assumed", assumed)),
         next_step=f"terrain estimate --data DIR --filter FILTER --robot {result.out or 'FILE'} --out runs/",
     )

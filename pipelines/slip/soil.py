@@ -64,11 +64,6 @@ class SoilResult(Result):
 def calibrate(settings: Settings, progress: Progress) -> SoilResult:
     """Compare laws on held-out slips and angles, wheel by wheel, and write soils and pictures.
 
-    Parameters
-    ----------
-    settings : of ``terrain calibrate``: trials of the wheel testbed
-    progress : gets the fits that are done
-
     Raises
     ------
     ConfigError
@@ -156,31 +151,43 @@ def report(result: SoilResult) -> Report:
     )
 
 
-ERRORS = (Column("traction", ERROR), Column("side force", ERROR), Column("sinkage", ".1f", "mm"))
+def _errors(place: str, out: str = "") -> tuple[Column, ...]:
+    """Return columns of the errors that records have at a place, headed by what was left out."""
+    return (
+        Column(f"{out}traction", ERROR, of=f"{place}.pull_ratio"),
+        Column(f"{out}side force", ERROR, of=f"{place}.side_ratio"),
+        Column(f"{out}sinkage", ".4f", "m", of=f"{place}.sinkage_m"),
+    )
 
 
-def _errors(misfit: Misfit) -> tuple[float, ...]:
-    return misfit.pull_ratio, misfit.side_ratio, 1e3 * misfit.sinkage_m
+LAWS = (
+    *(Column("law", of="name"), Column("parameters", of="n_parameters"), Column("given", of="given")),
+    *(column for out in HELD_OUT for column in _errors(out, f"{out} out: ")),
+)
+
+PARAMETERS = (
+    *(Column("parameter", of="name"), Column("value", of="value"), Column("95 %", of="interval")),
+    *(Column("of the prior", ".2f", of="informed_ratio"), Column("identified", of="identified")),
+)
+
+MISFITS = (Column("", of="name"), Column("trials", of="misfit.n_trials"), *_errors("misfit"))
 
 
 def _laws_table(wheel: WheelResult) -> Table:
-    slip, angle = ([each._replace(title=f"{out} out: {each.title}") for each in ERRORS] for out in HELD_OUT)
-    rows = [
-        (
-            row.name,
-            row.n_parameters,
-            given,
-            *_errors(getattr(row.slip, given)),
-            *_errors(getattr(row.angle, given)),
-        )
-        for row in wheel.laws
+    rows: list[dict[str, Any]] = [
+        {
+            **law._asdict(),
+            "given": given,
+            **{out: getattr(getattr(law, out), given) for out in HELD_OUT},
+        }
+        for law in wheel.laws
         for given in GIVEN
-        if math.isfinite(getattr(row.slip, given).pull_ratio)
+        if math.isfinite(getattr(law.slip, given).pull_ratio)
     ]
-    polynomial = *_errors(wheel.surrogate_slip), *_errors(wheel.surrogate_angle)
+    polynomial = {"slip": wheel.surrogate_slip, "angle": wheel.surrogate_angle}
     return Table(
-        ("law", "parameters", "given", *slip, *angle),
-        [*rows, ("(polynomial)", None, "load", *polynomial)],
+        LAWS,
+        [*rows, {"name": "(polynomial of slip and angle)", "given": "load", **polynomial}],
         f"{wheel.wheel} wheel, {wheel.n_trials} trials: errors over the load",
         "Root mean squares over the measured load, with slip and angle given.",
     )
@@ -191,33 +198,20 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
         "by regime, slips left out": wheel.regimes,
         "by the wheel speed left out [mm/s]": wheel.by_slip,
         "by the slip angle left out [degrees]": wheel.by_angle,
-        "polynomial of slip and angle, no mechanics": {
-            "slips left out": wheel.surrogate_slip,
-            "angles left out": wheel.surrogate_angle,
-        },
     }
     soil, (low_m, high_m) = wheel.soil.misfit, wheel.sinkage_range_m
+    prior = (
+        '"Of the prior": standard deviation with the trials over that without; below 0.5 one is identified.'
+    )
     return [
         Text(
             f"{wheel.n_trials} trials at {wheel.n_settings} settings, load "
             f"{format_value(wheel.load_range_n, '.1f', 'N')}, sinkage {1e3 * low_m:.0f} to {1e3 * high_m:.0f} mm, "
             f"{wheel.deeper_than_axle} trials deeper than the axle; {wheel.coupling.text}."
         ),
-        Table(
-            ("parameter", "value", "95 %", Column("of the prior", ".2f"), "identified"),
-            [
-                (each.name, each.value, each.interval, each.informed_ratio, each.identified)
-                for each in wheel.parameters.values()
-            ],
-            f"parameters of {wheel.law}",
-            '"Of the prior": standard deviation with the trials over that without; below 0.5 one is identified.',
-        ),
+        Table(PARAMETERS, [*wheel.parameters.values()], f"parameters of {wheel.law}", prior),
         *(
-            Table(
-                ("", "trials", *ERRORS),
-                [(name, each.n_trials, *_errors(each)) for name, each in rows.items()],
-                title,
-            )
+            Table(MISFITS, [{"name": name, "misfit": each} for name, each in rows.items()], title)
             for title, rows in misfits.items()
         ),
         *map(Text, wheel.not_identified),
@@ -228,17 +222,8 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
     ]
 
 
-def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> Figure:
-    """Show traction, side force and sinkage over slip, a colour an angle: points measured, lines predicted.
-
-    Parameters
-    ----------
-    wheel : whose last law predicts
-    trials : single ones
-    prediction : of the trials
-    held_out : ``slip`` or ``angle``
-    """
-    errors = getattr(wheel.laws[-1], held_out).load
+def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> tree.Figure:
+    """Show traction, side force and sinkage of single trials over slip, as measured and by the last law."""
     panels = []
     for name, y_label in PANELS:
         scale = 1e3 if name.endswith("_m") else 1.0
@@ -249,14 +234,11 @@ def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, 
             own = [rows[trials.slip_setting[rows] == speed] for speed in np.unique(trials.slip_setting[rows])]
             slips, means = ([float(of[each].mean()) for each in own] for of in (trials.slip_ratio, predicted))
             label = f"{angle:g} degrees"
-            marks.append(Points(f"{label}, measured", trials.slip_ratio[rows], measured[rows], colour=colour))
-            marks.append(Line(label, slips, means, colour))
-        panels.append(Panel(marks, y_label))
-    title = (
-        f"{wheel.wheel} wheel, law {wheel.law}, {LEFT_OUT[held_out]}: traction off by "
-        f"{format_value(errors.pull_ratio, ERROR)} and side force by {format_value(errors.side_ratio, ERROR)} of the "
-        f"load (at most {format_value(BAR_RATIO, '.0%')} is aimed at), sinkage by "
-        f"{format_value(1e3 * errors.sinkage_m, '.1f', 'mm')}"
-    )
+            marks.append(
+                tree.Points(f"{label}, measured", trials.slip_ratio[rows], measured[rows], colour=colour)
+            )
+            marks.append(tree.Line(label, slips, means, colour))
+        panels.append(tree.Panel(marks, y_label))
+    title = f"{wheel.wheel} wheel, law {wheel.law}, {LEFT_OUT[held_out]}"
     caption = "Points are measured, lines predicted; a colour a slip angle."
     return Figure(title, panels, caption, x_label="slip ratio")
