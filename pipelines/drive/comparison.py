@@ -322,7 +322,7 @@ def _difference_text(found: Difference | None, key: str) -> str:
     mean = format_value(found.mean, *_signed(key))
     if math.isnan(found.low):
         return mean
-    return f"{mean} ({interval(found.low, found.high, *_signed(key))}){' *' if found.is_significant else ''}"
+    return f"{mean} ({format_value((found.low, found.high), *_signed(key))}){' *' if found.is_significant else ''}"
 
 
 def _signed(key: str) -> tuple[str, str]:
@@ -392,10 +392,10 @@ def _curve_parts(table: SlipTable | None) -> list[Part]:
     return [Figure(f"Slip curves of the table {table.name}", panels, caption, x_label="slip ratio")]
 
 
-def _provenance(result: DriveResult) -> list[tree.Part | str]:
+def _provenance(result: DriveResult) -> list[Part | str]:
     described_by = result.pairs("terrain", "table", "delay_s", "grade_deg", "ramp_mps2")
     return [
         "Robot and terrain are models: controllers are compared on them, and what a robot in a field would do is "
         "not predicted.",
-        tree.Pairs([("seeds", (result.seeds[0], result.seeds[-1])), *described_by, ("versions", versions())]),
+        Pairs([("seeds", (result.seeds[0], result.seeds[-1])), *described_by, ("versions", versions())]),
     ]

@@ -18,7 +18,7 @@ import numpy as np
 from pipelines.drive.drive import ALL
 from pipelines.learn.parallel import counted, parallel
 from pipelines.live.pilot import LivePilot
-from pipelines.report.figure import Figure, Line, Mark, Panel, Strip
+from pipelines.report.figure import Figure, Line, Panel, Strip
 from pipelines.report.numbers import NOT_KNOWN, plural
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Pairs, Report, Table, sections
@@ -186,7 +186,7 @@ def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
     return LivePilot(robot, slips, KnownTerrain(), settings)
 
 
-def fault_figure(case: FaultCase, driven: Driven, references: References) -> tree.Figure:
+def fault_figure(case: FaultCase, driven: Driven, references: References) -> Figure:
     """Return the figure of a drive with a fault beside those of the same place: speeds, slip, status over time."""
     drive, plain, start_s = driven.drive, references.plain, references.start_s
     time_s, last_s = drive.time_s, float(drive.time_s[-1])
@@ -194,24 +194,24 @@ def fault_figure(case: FaultCase, driven: Driven, references: References) -> tre
     estimated = np.where(np.abs(driven.speed_mps) < FASTEST_MPS, driven.speed_mps, math.nan)
     shown_s = max(start_s - BEFORE_S, 0.0), last_s
     speeds = (
-        tree.Line("desired", time_s, drive.desired_mps, 6, dashed=True),
-        tree.Line("commanded", time_s, drive.commanded_mps, 2),
-        tree.Line("over ground, true", time_s, drive.speed_mps, 0),
-        tree.Line("over ground, estimated", time_s, estimated, 1),
+        Line("desired", time_s, drive.desired_mps, 6, dashed=True),
+        Line("commanded", time_s, drive.commanded_mps, 2),
+        Line("over ground, true", time_s, drive.speed_mps, 0),
+        Line("over ground, estimated", time_s, estimated, 1),
     )
     slips = (
-        tree.Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
-        tree.Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
-        tree.Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
-        tree.Line("estimated", time_s, drive.slip_ratio, 1),
+        Line("true, plain commands", plain.time_s, plain.body_slip_ratio, 6, dashed=True),
+        Line("true, of the robot", time_s, drive.body_slip_ratio, 3),
+        Line("true, largest of the wheels", time_s, drive.true_slip_ratio, 0),
+        Line("estimated", time_s, drive.slip_ratio, 1),
     )
     panels = (
-        tree.Panel((acts, *speeds), "speed [m/s]", x_range=shown_s, y_range=(-0.5, 2.0)),
-        tree.Panel((acts, *slips), "slip ratio", x_range=shown_s, y_range=(-1.1, 1.1)),
-        tree.Panel((acts, tree.Line("", time_s, drive.ok.astype(float), 2)), "status is OK", x_range=shown_s),
+        Panel((acts, *speeds), "speed [m/s]", x_range=shown_s, y_range=(-0.5, 2.0)),
+        Panel((acts, *slips), "slip ratio", x_range=shown_s, y_range=(-1.1, 1.1)),
+        Panel((acts, Line("", time_s, drive.ok.astype(float), 2)), "status is OK", x_range=shown_s),
     )
     title = f"{case.fault}, {duration_text(case.duration_s)}: {_place(case)}, seed {case.seed}"
-    return tree.Figure(title, panels, x_label="time [s]")
+    return Figure(title, panels, x_label="time [s]")
 
 
 def duration_text(duration_s: float) -> str:

@@ -205,11 +205,11 @@ def _map(result: PathResult) -> Iterator[Part]:
         Line("path", rows[:, X], rows[:, Y], 6, dashed=True),
         Line("rear axle", drive.position_m[:, 0], drive.position_m[:, 1], 0),
     ]
-    seen = tree.Panel(marks, "y [m]", x_label="x [m]", equal=True)
+    seen = Panel(marks, "y [m]", x_label="x [m]", equal=True)
     yield Figure("The path, and where the rear axle was", [seen])
-    speed = tree.Line("speed", drive.distance_m, drive.speed_mps)
-    steering = tree.Line("steering", drive.distance_m, np.degrees(drive.steer_rad))
-    panels = tree.Panel([speed], "speed [m/s]"), tree.Panel([steering], "steering [°]")
+    speed = Line("speed", drive.distance_m, drive.speed_mps)
+    steering = Line("steering", drive.distance_m, np.degrees(drive.steer_rad))
+    panels = Panel([speed], "speed [m/s]"), Panel([steering], "steering [°]")
     title = "Speed of the rear axle, and angle of the front wheel"
     yield Figure(title, panels, x_label=DISTANCE)
 
@@ -233,8 +233,8 @@ def _observed(result: PathResult) -> Iterator[Part]:
         for wheel, found, true in zip(
             WHEELS, drive.stiffness_npr.T / 1e3, drive.secant_npr.T / 1e3, strict=True
         ):
-            secant = tree.Points("true secant, where excited", drive.time_s, true, colour=6)
-            both = tree.Line("estimate", drive.time_s, found, 0), secant
-            stiffness.append(tree.Panel(both, f"{wheel} [kN/rad]", y_range=(0.0, 32.0)))
+            secant = Points("true secant, where excited", drive.time_s, true, colour=6)
+            both = Line("estimate", drive.time_s, found, 0), secant
+            stiffness.append(Panel(both, f"{wheel} [kN/rad]", y_range=(0.0, 32.0)))
         caption = "Cornering stiffness of the axles, and -F/b of the simulated tyres."
         yield Figure("Cornering stiffness", stiffness, caption, x_label="time [s]")

@@ -107,8 +107,8 @@ def parts_figure(parts: Sequence[PartValues]) -> Figure:
         values, halves = np.array([(part.value, part.half) for part in each.parts]).T
         low, high = np.full(2, each.value.low), np.full(2, each.value.high)
         title = f"{each.value.name}: {quantity(each.value.name, each.value.value)}"
-        band = tree.Band("all runs, 95 %", ends, low, high, GREY)
-        panels.append(tree.Panel([band, _points("a part", BLUE, at, values, halves)], each.value.unit, title))
+        band = Band("all runs, 95 %", ends, low, high, GREY)
+        panels.append(Panel([band, _points("a part", BLUE, at, values, halves)], each.value.unit, title))
     names = "; ".join([f"{i}: {part.name}" for i, part in enumerate(parts[0].parts, start=1)])
     caption = (
         "The value of each cause fitted to a part of the data: thirds of each run's time, and halves of the "
@@ -148,7 +148,7 @@ def _residuals(runs: Sequence[ComparedRun], c: int) -> Iterator[tuple[str, int, 
             yield label, colour, [run.residual(extended)[:, c] for run in runs]
 
 
-def _points(label: str, colour: int, at: Array, values: Array, halves: Array) -> tree.Points:
+def _points(label: str, colour: int, at: Array, values: Array, halves: Array) -> Mark:
     """Return values with their intervals; one that is not known has none."""
     halves = np.nan_to_num(halves)
     return Points(label, at, values, values - halves, values + halves, colour)

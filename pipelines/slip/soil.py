@@ -222,7 +222,7 @@ def _wheel_details(wheel: WheelResult) -> list[Part]:
     ]
 
 
-def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> tree.Figure:
+def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, held_out: str) -> Figure:
     """Show traction, side force and sinkage of single trials over slip, as measured and by the last law."""
     panels = []
     for name, y_label in PANELS:
@@ -234,11 +234,9 @@ def held_out_figure(wheel: WheelResult, trials: Trials, prediction: Prediction, 
             own = [rows[trials.slip_setting[rows] == speed] for speed in np.unique(trials.slip_setting[rows])]
             slips, means = ([float(of[each].mean()) for each in own] for of in (trials.slip_ratio, predicted))
             label = f"{angle:g} degrees"
-            marks.append(
-                tree.Points(f"{label}, measured", trials.slip_ratio[rows], measured[rows], colour=colour)
-            )
-            marks.append(tree.Line(label, slips, means, colour))
-        panels.append(tree.Panel(marks, y_label))
+            marks.append(Points(f"{label}, measured", trials.slip_ratio[rows], measured[rows], colour=colour))
+            marks.append(Line(label, slips, means, colour))
+        panels.append(Panel(marks, y_label))
     title = f"{wheel.wheel} wheel, law {wheel.law}, {LEFT_OUT[held_out]}"
     caption = "Points are measured, lines predicted; a colour a slip angle."
     return Figure(title, panels, caption, x_label="slip ratio")
