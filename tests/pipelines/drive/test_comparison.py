@@ -11,18 +11,14 @@ from pipelines.drive import controllers
 from pipelines.drive.comparison import DriveResult, belief_notes, compare
 from pipelines.drive.controllers import DriveInputs, drive_once
 from pipelines.drive.drive import Settings
-from pipelines.drive.run_figures import run_figures
 from pipelines.live.model import TerrainModel
 from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.control.controllers import CONTROLLERS, make_controller
-from terrain.control.drive_comparison import Comparison, steepest_grade
-from terrain.control.drive_curves import DriveCurves
+from terrain.control.drive_comparison import Comparison
 from terrain.control.drive_evaluation import METRICS, evaluate_drive
 from terrain.control.drive_metrics import drive_history
-from terrain.control.pilot_settings import PilotStatus
-from terrain.control.power_state import DriveState
-from terrain.control.situations import SituationOptions, make_situation
+from terrain.control.situations import make_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.control.terrain_source import TerrainEstimate
 from terrain.robots import load_robot
@@ -89,16 +85,6 @@ def test_sliding_back_is_negative_distance():
     assert metrics["immobilised"].mean >= 1
 
 
-def test_the_steepest_grade_is_found():
-    plain = make_controller("plain", TABLE, 0.05)
-
-    def drive(grade_deg):
-        options = SituationOptions(duration_s=8.0, grade_deg=grade_deg)
-        return drive_once(INPUTS, plain, make_situation("slope", ROBOT, "dry_sand", 302, options))
-
-    assert 8.0 < steepest_grade(drive) < 20.0
-
-
 class Scripted:
     """A source that gives one output every 2 s, and refuses a window in between."""
 
@@ -163,74 +149,36 @@ def test_no_gain_is_credited_to_a_classifier_that_was_never_believed(monkeypatch
     assert "thesis compared with plain" in result.report.answer
 
 
-SPREAD = np.array([-0.06, 0.04, -0.04, 0.06])
-"""Of a metric over the four seeds."""
-
-
-def a_result(names=("plain", "ramp", "true_terrain"), values=None, n_seeds=4, **more):
-    """A result whose metrics have the mean 1, 2, ... in the order of the controllers.
-
-    Parameters
-    ----------
-    values : by controller and metric, the values of the seeds in place of those
-    """
-    rows = {}
-    for place, name in enumerate(names):
-        metrics = dict.fromkeys(METRICS, 1.0 + place + SPREAD) | {"distance_5s_m": 3.0 - 0.1 * place + SPREAD}
-        metrics |= (values or {}).get(name, {})
-        seeds = zip(*metrics.values(), strict=True)
-        rows[name] = tuple(dict(zip(metrics, row, strict=True)) for row in seeds)[:n_seeds]
-    about = {"scenario": "starts", "terrain": "grass", "robot": "agrimaro", "table": "default"} | more
-    about |= {"delay_s": 0.05, "grade_deg": 0.0, "ramp_mps2": 0.6582, "seeds": tuple(range(n_seeds))}
-    return DriveResult(**about, controllers=Comparison(about["scenario"], rows).means, rows=rows)
-
-
-def text_of(result):
-    text = terminal_text(result.report, details=True, width=600)
-    return " ".join(text.replace("\N{MINUS SIGN}", "-").replace("\xa0", " ").split())
-
-
-def test_the_report_names_every_controller_and_metric():
+def test_the_report_names_every_controller_and_metric_and_what_is_not_known():
+    """The means are 1, 2, ... in the order of the controllers, and of few seeds where so many have the metric."""
     names = (*CONTROLLERS, "known:clay", "target:0.2", "true_terrain+track")
-    result = a_result(names)
-    text = text_of(result)
-    assert all(f" {name} " in text for name in (*names, *METRICS))
+    rows = {}
+    for place, name in enumerate(names, start=1):
+        metrics = dict.fromkeys(METRICS, place + np.array([-0.06, 0.04, -0.04, 0.06]))
+        metrics["lock_s"], metrics["adapt_s"] = np.full(4, math.nan), [math.nan, math.nan, 0.25, math.nan]
+        rows[name] = tuple(
+            dict(zip(metrics, row, strict=True)) for row in zip(*metrics.values(), strict=True)
+        )
+    about = {
+        "scenario": "course",
+        "terrain": "grass",
+        "robot": "agrimaro",
+        "table": "default",
+        "delay_s": 0.05,
+    }
+    about |= {"grade_deg": 0.0, "ramp_mps2": 0.6582, "seeds": (0, 1, 2, 3)}
+    result = DriveResult(**about, controllers=Comparison("course", rows).means, rows=rows)
+    text = terminal_text(result.report, details=True, width=600)
+    text = " ".join(text.replace("\N{MINUS SIGN}", "-").replace("\xa0", " ").split())
+    assert all(f" {name} " in text for name in names)
+    assert all(key in text for key in METRICS)
     assert "largest slip slip_peak 1 (0.906 to 1.09) 2 (1.91 to 2.09)" in text
     assert "no more than 0.658 m/s²" in text
-    assert "without error. With path tracking." in text
+    assert f" adapt_s {NOT_KNOWN} " in text
+    assert " 0.25, n 1 " in text
+    assert "Not defined here: longest lock of a wheel (lock_s)" in text
     assert len(terminal_text(result.report).splitlines()) <= 25
     assert [panel.marks[0].x for panel in result.report.picture.panels] == [list(names)] * 3
-    frame = result.to_pandas()
-    assert (len(frame), set(frame["controller"])) == (4 * len(names), set(names))
-
-
-def test_unknown_values_are_a_dash_and_values_of_few_seeds_state_it():
-    nan, few = np.full(4, math.nan), np.array([math.nan, math.nan, 0.25, math.nan])
-    values = {name: {"slip_peak": nan, "lock_s": nan} for name in ("plain", "ramp")}
-    values["true_terrain"] = {"slip_peak": few, "lock_s": nan}
-    text = text_of(a_result(values=values))
-    assert f"slip_peak {NOT_KNOWN} {NOT_KNOWN} 0.25, n 1" in text
-    assert "Not defined here: longest lock of a wheel (lock_s)" in text
-    one = a_result(n_seeds=1)
+    assert (len(result.to_pandas()), set(result.to_pandas()["controller"])) == (4 * len(names), set(names))
+    one = replace(result, seeds=(0,), rows={name: each[:1] for name, each in rows.items()})
     assert "one seed, which gives no interval" in one.report.answer
-    assert " *" not in text_of(one)
-
-
-def test_a_drive_shows_states_refusals_and_terrains():
-    """2 s at 0.8 m/s: limited in the first, one refusal at its end, braking in the last half second."""
-    time_s = np.arange(100) / 50
-    true = dict.fromkeys(("true_mps", "slip", "slip_least", "slip_largest"), np.full(100, 0.8))
-    status = dict.fromkeys(PilotStatus._fields, np.full(100, 0.2)) | {"desired_mps": np.ones(100)}
-    states = [float(DriveState.TRACTION), float(DriveState.STEADY), float(DriveState.BRAKING)]
-    status["drive_state_code"] = np.repeat(states, [50, 25, 25])
-    status["status_code"] = np.where(np.arange(100) == 50, 2.0, 0.0)
-    strips = {"true": [(0.0, 1.0, "grass"), (1.0, 2.0, "clay")], "classified": [(1.0, 2.0, "clay")]}
-    own = DriveCurves(time_s, **true, control_s=time_s, control=status, aimed=np.full(100, 0.2),
-                      is_open_loop=False, terrains=strips)  # fmt: skip
-    one, other = run_figures({"true_terrain": own, "plain": own._replace(is_open_loop=True, terrains={})})
-    assert one.panels[0].marks[0].x == [(0.0, 1.0, "traction: speed rises"), (1.5, 1.98, "braking")]
-    assert one.panels[1].marks[2].x == [(1.0, 1.02, "no correction: stale")]
-    labels = [{getattr(mark, "label", "") for mark in figure.panels[1].marks} for figure in (one, other)]
-    assert labels[0] - labels[1] >= {"target", "target with its floor"}
-    assert (len(one.panels), len(other.panels)) == (4, 2)
-    assert one.panels[1].y_range == other.panels[1].y_range

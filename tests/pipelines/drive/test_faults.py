@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +29,6 @@ from terrain.robots import load_robot
 ROBOT = load_robot("agrimaro")
 SLIPS = load_slip_table()
 LOOP = fault_loop(ROBOT, SLIPS)
-TABLE = Path(__file__).resolve().parents[3] / "data" / "target_slip" / "default.yaml"
 FEW = Settings(
     faults="loss_odometry,duplicates_imu", situations="steady", durations_s="3,inf", first_seed=400, n_jobs=1
 )
@@ -139,26 +137,3 @@ def test_an_exception_of_the_pilot_shows_in_its_row(monkeypatch):
     assert row.exception == "ZeroDivisionError: nothing to divide"
     assert row.bars["finite"] is False
     assert row.figures.recovery_s <= 0.02
-
-
-@pytest.mark.slow
-def test_the_command_writes_table_json_and_page(terrain, place):
-    code, out, err = terrain(
-        *("drive", "--faults", "loss_wheels,late_30ms_imu", "--situations", "stop,start", "--durations", "3"),
-        *("--seed", 403, "--seeds", 2, "--table", TABLE, "--jobs", 1, "--json", "faults.json"),
-        *("--out", "page", "--draw", "loss_wheels"),
-    )
-    assert code == 0, err
-    assert "drives with a sensor fault meet all bars" in out
-    document = json.loads((place / "faults.json").read_text())
-    assert document["n_rows"] == len(document["rows"]) == 8
-    row = document["rows"][0]
-    assert (row["fault"], row["situation"], row["terrain"]) == ("loss_wheels", "stop", "wet_floor")
-    assert row["is_met"] is all(met is not False for met in row["bars"].values())
-    assert document["n_met"] == sum(row["is_met"] for row in document["rows"])
-    assert row["stop_ratio"] > 1.0
-    assert document["clean"][0]["stop_m"] < document["clean"][0]["plain_stop_m"]  # by slip control
-    assert document["seeds"] == [403, 404]
-    page = (place / "page" / "report.html").read_text()
-    assert page.count("<figure") == 2
-    assert "no sample arrives" in page

@@ -9,13 +9,14 @@ from pipelines.slip.calibrate import Settings, run
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.measurements.batch import measurement_table
 from terrain.logs.write import write_run
-from terrain.robots import load_robot
+from terrain.robots import description_file, load_robot
 from terrain.simulation.bench import six_positions_log
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 NOMINAL = load_robot("agrimaro")
+SOURCE = description_file("agrimaro").read_text(encoding="utf-8")
 HIDDEN = NOMINAL.with_parts(
     steering=replace(NOMINAL.steering, zero_1_rad=0.03, zero_2_rad=-0.02, zero_3_rad=0.015),
     motors=replace(NOMINAL.motors, reduction_ratio=9.4),
@@ -81,26 +82,21 @@ def test_the_file_is_a_description_that_people_can_read(calibrated):
     _, out, result = calibrated
     robot = load_robot(out)
     text = out.read_text(encoding="utf-8")
-    described, before = yaml.safe_load(text), yaml.safe_load(_source_of_agrimaro())
+    described, before = yaml.safe_load(text), yaml.safe_load(SOURCE)
     assert robot.name == "agrimaro"
     assert text.startswith("# Calibrated from 8 runs;")
     found = {finding.parameter: finding for finding in result.findings if finding.determined}
-    for section, entries in described.items():
-        if not isinstance(entries, dict) or "value" in entries:
-            assert entries == before[section]
+    for name, finding in found.items():
+        section, _, number = name.partition(".")
+        if not number:
             continue
-        for name, entry in entries.items():
-            assert f"  {name}: {{value: " in text  # one line a number
-            finding = found.get(f"{section}.{name}")
-            if finding is None:
-                assert entry == before[section][name]
-                continue
-            assert entry["source"].startswith(f"terrain calibrate, {len(finding.runs)} run")
-            width = finding.high - finding.low
-            assert entry["value"] == pytest.approx(finding.value, abs=0.01 * width)
-            assert entry["interval"] == pytest.approx([finding.low, finding.high], abs=0.01 * width)
-    assert described["sensors"]["accel_scale_x_ratio"]["source"] == "terrain calibrate, 1 run: bench"
-    assert described["sensors"]["motor_std_radps"] == before["sensors"]["motor_std_radps"]  # a Hall sensor
+        assert f"  {number}: {{value: " in text  # one line a number
+        entry, _ = described[section].pop(number), before[section].pop(number)
+        assert entry["source"].startswith(f"terrain calibrate, {len(finding.runs)} run")
+        width = finding.high - finding.low
+        assert entry["value"] == pytest.approx(finding.value, abs=0.01 * width)
+        assert entry["interval"] == pytest.approx([finding.low, finding.high], abs=0.01 * width)
+    assert described == before
 
 
 def test_what_filters_are_given_is_right_afterwards(calibrated):
@@ -123,10 +119,8 @@ def test_what_filters_are_given_is_right_afterwards(calibrated):
     assert abs(accel) < 4 * np.hypot(sensors.accel_bias_std_mps2, 9.8 * sensors.tilt_std_rad)
     assert abs(gyro) < 4 * sensors.gyro_bias_std_radps
     cruise = measurement_table(driven("straight", 52), load_robot(out))
-    rates, camera = (
-        cruise.columns([f"wheel_{i}_radps" for i in (1, 2, 3)]),
-        cruise.columns(["camera_speed_x_mps"]),
-    )
+    rates = cruise.columns([f"wheel_{i}_radps" for i in (1, 2, 3)])
+    camera = cruise.columns(["camera_speed_x_mps"])
     assert rates[500:].mean() * 0.2 == pytest.approx(camera[500:].mean(), rel=0.01)
 
 
@@ -159,11 +153,8 @@ def test_what_is_refused(tmp_path):
     write_run(driven("straight", 1, "grass", 8.0), tmp_path / "runs")
     taken, other = tmp_path / "taken.yaml", tmp_path / "rover.yaml"
     taken.write_text("mine")
-    other.write_text(_source_of_agrimaro().replace("name: agrimaro", "name: rover"))
-    new, of_another = (
-        tmp_path / "new.yaml",
-        "run straight_01 is one of robot 'agrimaro', and 'rover' is calibrated",
-    )
+    other.write_text(SOURCE.replace("name: agrimaro", "name: rover"))
+    new, of_another = tmp_path / "new.yaml", "is one of robot 'agrimaro', and 'rover' is calibrated"
     for options, error, sentence in (
         ({"out": taken}, ConfigError, "is there already, and is left as it is"),
         ({"out": tmp_path / "robot.json"}, ConfigError, "a name that ends in .yaml or .yml is required"),
@@ -178,9 +169,3 @@ def test_what_is_refused(tmp_path):
             run(Settings(**({"data": tmp_path / "runs", "robot": "agrimaro"} | options)), silent)
     assert taken.read_text() == "mine"
     assert not new.exists()
-
-
-def _source_of_agrimaro():
-    from terrain.files.resources import data_folder
-
-    return (data_folder("robots") / "agrimaro.yaml").read_text(encoding="utf-8")

@@ -62,17 +62,14 @@ def test_runs_are_written_with_their_tracks_and_pictures(straight, tmp_path):
     assert found.streams["slip"].channels == ("slip_1_ratio", "slip_2_ratio", "slip_3_ratio")
     assert found.streams["estimator"].channels[0] == "speed_x_mps"
     state = found.streams["state"]
-    assert {"slip_speed_1_mps", "std_slip_1_ratio", "stale_ratio", "nis_camera_speed_ratio"} <= set(
-        state.channels
-    )
+    seen = {"slip_speed_1_mps", "std_slip_1_ratio", "stale_ratio", "nis_camera_speed_ratio"}
+    assert seen <= set(state.channels)
     assert (state.channel("std_speed_x_mps") > 0).all()
     assert all(signal_set_of("state", channel) is None for channel in state.channels)
     assert {"speed_1_mps", "current_1_a", "motor_1_radps"} <= set(found.streams["wheels"].channels)
     assert found.labels == straight.labels
-    assert sorted(file.name for file in (tmp_path / "figures").iterdir()) == [
-        f"{straight.run_id}_motion.png",
-        f"{straight.run_id}_slip.png",
-    ]
+    pictures = sorted(file.name for file in (tmp_path / "figures").iterdir())
+    assert pictures == [f"{straight.run_id}_{kind}.png" for kind in ("motion", "slip")]
     with pytest.raises(LogError, match="is there already"):
         run(settings, silent)
     page = result.report.save(tmp_path / "page.html").read_text()
