@@ -148,11 +148,11 @@ def _simulated(
     settings: Settings, progress: Progress
 ) -> tuple[list[RunLog], tuple[TerrainSlip, ...], tuple[Figure, ...]]:
     """Return the runs, and what is known of them because they were simulated."""
-    from pipelines.slip.filtered import slip_figure, swerve_motion
+    from pipelines.slip.filtered import motion_figure, slip_figure
     from terrain.estimation.labelled import labelled_runs
 
     runs, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
-    return runs, slip, (slip_figure(example), swerve_motion(example))
+    return runs, slip, (slip_figure(example), motion_figure(example))
 
 
 def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) -> tuple[str, ...]:

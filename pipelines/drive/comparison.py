@@ -42,7 +42,6 @@ from terrain.control.drive_comparison import (
 )
 from terrain.control.drive_curves import DriveCurves
 from terrain.control.drive_evaluation import metric_label
-from terrain.control.drive_metrics import PEAK_ABOVE_MPS
 from terrain.control.situations import COURSE, SITUATIONS, SLOPE, Situation, SituationOptions, make_situation
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.records import RunLog
@@ -220,7 +219,7 @@ def report(result: DriveResult) -> Report:
             ("Who differs, and by how much", _difference_parts(compared, pairs)),
             ("Controllers", [Pairs([(name, _text(name, result.ramp_mps2)) for name in names])]),
             ("All figures", _metric_parts(result)),
-            ("The first seed, run by run", _run_parts(result)),
+            ("The first seed, run by run", run_figures(result.examples)),
             ("The curves behind the targets", _curve_parts(result.slip_table)),
             ("Where these numbers come from", _provenance(result)),
         ),
@@ -362,16 +361,6 @@ def _metric_text(value: MeanInterval, n_seeds: int) -> str:
     if value.ci is None or not value.ci[1] > value.ci[0]:
         return text
     return f"{text} ({format_value(value.ci)})"
-
-
-def _run_parts(result: DriveResult) -> list[Part]:
-    """Return what the drives of the first seed were like; nothing without their curves."""
-    text = (
-        "Above: desired and commanded speed, and the speed over ground. Below: the true slip, with the range "
-        "of the wheels, its estimate, the target, and the target with its floor: at least the slip of steady "
-        f"motion and a margin. Below {PEAK_ABOVE_MPS:g} m/s no slip is drawn. All drives have the same axes."
-    )
-    return [Text(text), *run_figures(result.examples)] if result.examples else []
 
 
 def _curve_parts(table: SlipTable | None) -> list[Part]:

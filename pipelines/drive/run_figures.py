@@ -12,16 +12,19 @@ from terrain.control.drive_metrics import PEAK_ABOVE_MPS
 from terrain.control.power_state import DriveState
 from terrain.control.traction import TractionStatus
 
+CAPTION = (
+    "Above: desired and commanded speed, and the speed over ground. Below: the true slip, with the range of the "
+    "wheels, its estimate, the target, and the target with its floor: at least the slip of steady motion and a "
+    f"margin. Below {PEAK_ABOVE_MPS:g} m/s no slip is drawn. All drives have the same axes."
+)
+
+STATES = {int(DriveState.TRACTION): "traction: speed rises", int(DriveState.BRAKING): "braking"}
+
 BLUE, VERMILION, GREEN, ORANGE, PINK, _, GREY = range(7)
 
 
 def run_figures(examples: Mapping[str, DriveCurves]) -> list[Figure]:
-    """Return a figure of each drive, all with the same axes.
-
-    Parameters
-    ----------
-    examples : a drive of each controller by its name
-    """
+    """Return a figure of each drive, by its controller, all with the same axes."""
     if not examples:
         return []
     fastest = max(
@@ -41,13 +44,7 @@ def _run_figure(
 ) -> Figure:
     control = drive.control
     moves: list[Mark] = [
-        Strip(
-            spans(
-                drive.control_s,
-                control["drive_state_code"],
-                {int(DriveState.TRACTION): "traction: speed rises", int(DriveState.BRAKING): "braking"},
-            )
-        ),
+        Strip(spans(drive.control_s, control["drive_state_code"], STATES)),
         Line("desired, fastest wheel", drive.control_s, control["desired_mps"], GREY, dashed=True),
         Line("commanded, fastest wheel", drive.control_s, control["driven_mps"], VERMILION),
         Line("true, over ground", drive.true_s, drive.true_mps, BLUE),
@@ -55,16 +52,15 @@ def _run_figure(
     slip: list[Mark] = [
         Band("true, least to largest wheel", drive.true_s, drive.slip_least, drive.slip_largest, BLUE),
         Line("true, mean of the wheels", drive.true_s, drive.slip, BLUE),
+        *([] if drive.is_open_loop else _control_marks(drive)),
     ]
-    if not drive.is_open_loop:
-        slip += _control_marks(drive)
     panels = [
         Panel(moves, "speed [m/s]", y_range=speeds_mps),
         Panel(slip, "slip ratio", y_range=slips),
     ]
     for kind, strip in drive.terrains.items():
         panels.append(Panel([Strip(strip)], f"{kind} terrain"))
-    return Figure(name, panels, x_label="time [s]")
+    return Figure(name, panels, CAPTION, x_label="time [s]")
 
 
 def _control_marks(drive: DriveCurves) -> list[Mark]:

@@ -101,6 +101,9 @@ RUNS = (
     Column("gated", of="n_gated"),
 )
 
+SEEING = ("vio12", "vio15")
+"""Filters that have a camera."""
+
 BLIND = (
     "Blind: this filter takes no measurement of the speed over ground, so the figure is the wheels against "
     "themselves, and the slip in the tracks is NaN; where logs have poses or a lidar twist, --filter pose "
@@ -145,53 +148,71 @@ def _answer(result: FilterResult) -> str:
     return f"Motion of {n} is estimated; slip is not known in steady motion."
 
 
-SWERVE_PANELS = (
-    # state, label, row of the camera that sees it
-    ("speed_x_mps", "longitudinal speed [m/s]", "camera_speed_x_mps"),
-    ("speed_y_mps", "lateral speed [m/s]", "camera_speed_y_mps"),
-    ("yaw_rate_radps", "yaw rate [rad/s]", "camera_yaw_rate_radps"),
-)
+LABELS = {
+    "speed_mps": "speed [m/s]",
+    "speed_x_mps": "longitudinal speed [m/s]",
+    "speed_y_mps": "lateral speed [m/s]",
+    "yaw_rate_radps": "yaw rate [rad/s]",
+    "effective_track_m": "effective track [m]",
+}
+"""States that are drawn, of the filters that have them."""
 
 
 def figures_of(estimate: Estimate) -> dict[str, Figure]:
     """Return ``<run>_motion`` and, where there is slip to show, ``<run>_slip``."""
-    run_id = estimate.run.run_id
-    if estimate.name == "skid":
-        return {f"{run_id}_motion": skid_motion(estimate)}
-    return {f"{run_id}_motion": swerve_motion(estimate), f"{run_id}_slip": slip_figure(estimate)}
+    run_id, motion = estimate.run.run_id, motion_figure(estimate)
+    slip = {} if estimate.name == "skid" else {f"{run_id}_slip": slip_figure(estimate)}
+    return {f"{run_id}_motion": motion, **slip}
 
 
-def swerve_motion(estimate: Estimate) -> Figure:
-    """Show speeds and yaw rate as estimated, as sensors measured them and as they were; below, innovations."""
-    track, table = estimate.track, estimate.table
-    seen, robot, time_s = estimate.name in ("vio12", "vio15"), estimate.robot, table.time_s
-    rates = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
-    steer = table.columns([f"steer_{wheel}_rad" for wheel in robot.wheels])
-    twist = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)[0]
+def motion_figure(estimate: Estimate) -> Figure:
+    """Show motion as estimated, as sensors measured it and as it was, when a robot was stuck, and innovations."""
+    track, table, name, stuck = estimate.track, estimate.table, estimate.name, []
+    if name == "skid":
+        intervals = stuck_intervals(track.time_s, np.asarray(estimate.motion))
+        stuck = [Strip([(each.start_s, each.end_s, "stuck") for each in intervals])]
     panels = []
-    for i, (state, label, row) in enumerate(SWERVE_PANELS):
-        marks: list[Mark] = [Line("encoders, forward kinematics", time_s, twist[:, i], 1)]
-        if seen:
-            marks.append(Line("camera, at its place", time_s, table.columns([row])[:, 0], 4))
-        if state == "yaw_rate_radps":
-            marks.append(Line("gyro", time_s, table.columns(["gyro_z_radps"])[:, 0], 2))
+    for state, sensors in _measured(estimate).items():
+        marks = [Line(sensor, table.time_s, sensors[sensor], i) for i, sensor in enumerate(sensors, start=1)]
         true = None if estimate.truth is None else estimate.truth[:, track.states.index(state)]
-        panels.append(Panel(marks + _state(estimate, state, true), label))
-    innovations = estimate.innovations
-    for row in [row for _, _, row in SWERVE_PANELS] if seen else ["gyro_z_radps"]:
-        panels.append(_innovation_panel(estimate, row, *innovations.row(row)))
+        known = true if true is not None and np.isfinite(true).any() else None
+        marks += estimated(name, track.time_s, track.state(state), track.std(state), 2, known)
+        panels.append(Panel([*marks, *stuck], LABELS[state]))
+    rows = ["gyro_z_radps"] if name != "skid" else []
+    if name in SEEING:
+        rows = [f"camera_{state}" for state in LABELS if state in track.states]
+    panels += [_innovation_panel(estimate, row, *estimate.innovations.row(row)) for row in rows]
     return Figure(
-        f"{estimate.run.run_id}: motion by {estimate.name}",
+        f"{estimate.run.run_id}: motion by {name}",
         panels,
         "Estimates with two standard deviations beside the sensors; the truth behind the same low-pass. "
-        "Innovations beside the two standard deviations that the filter expected of them.",
+        "Innovations, where there are any, beside the two standard deviations that the filter expected of them.",
         x_label="time [s]",
     )
 
 
-def _state(estimate: Estimate, state: str, true: Array | None = None) -> list[Mark]:
-    track = estimate.track
-    return estimated(estimate.name, track.time_s, track.state(state), track.std(state), 2, true)
+def _measured(estimate: Estimate) -> dict[str, dict[str, Array]]:
+    """Return by state what the sensors say of it (n,)."""
+    table, robot = estimate.table, estimate.robot
+    gyro = {"gyro": table.columns(["gyro_z_radps"])[:, 0]}
+    if estimate.name == "skid":
+        left, right = table.columns(["wheel_left_mps", "wheel_right_mps"]).T
+        turn = {f"wheels over {robot.track_m:g} m": (right - left) / robot.track_m, **gyro}
+        return {
+            "speed_mps": {"mean of the wheels": (left + right) / 2},
+            "yaw_rate_radps": turn,
+            "effective_track_m": {},
+        }
+    rates = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
+    steer = table.columns([f"steer_{wheel}_rad" for wheel in robot.wheels])
+    twist = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)[0]
+    found = {}
+    for state, wheels in zip(("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), twist.T, strict=True):
+        found[state] = {"encoders, forward kinematics": wheels}
+        if estimate.name in SEEING:
+            found[state]["camera, at its place"] = table.columns([f"camera_{state}"])[:, 0]
+    found["yaw_rate_radps"] |= gyro
+    return found
 
 
 def _innovation_panel(estimate: Estimate, row: str, value: Array, std: Array) -> Panel:
@@ -210,32 +231,6 @@ def _innovation_panel(estimate: Estimate, row: str, value: Array, std: Array) ->
         title = f"innovation of {row}, variance {used.var():.1e}"
         reach = 1.2 * max(float(np.nanmax(2 * std)), float(np.percentile(np.abs(used), 99.5)))
     return Panel(marks, "innovation", title, y_range=None if reach is None else (-reach, reach))
-
-
-def skid_motion(estimate: Estimate) -> Figure:
-    """Show speed, yaw rate and effective track of a skid-steer robot, and when it was stuck."""
-    table, track_m = estimate.table, estimate.robot.track_m
-    time_s, wheels = table.time_s, table.columns(["wheel_left_mps", "wheel_right_mps"])
-    turn, gyro = np.diff(wheels, axis=1)[:, 0] / track_m, table.columns(["gyro_z_radps"])[:, 0]
-    stuck = stuck_intervals(estimate.track.time_s, np.asarray(estimate.motion))
-    strip = Strip([(each.start_s, each.end_s, "stuck") for each in stuck])
-    measured: dict[tuple[str, str], list[Mark]] = {
-        ("speed_mps", "speed [m/s]"): [Line("mean of the wheels", time_s, wheels.mean(axis=1), 1)],
-        ("yaw_rate_radps", "yaw rate [rad/s]"): [
-            Line(f"wheels over {track_m:g} m", time_s, turn, 1),
-            Line("gyro", time_s, gyro, 2),
-        ],
-        ("effective_track_m", "effective track [m]"): [],
-    }
-    return Figure(
-        f"{estimate.run.run_id}: motion without a speed reference",
-        [
-            Panel([*marks, *_state(estimate, state), strip], label)
-            for (state, label), marks in measured.items()
-        ],
-        "The skid filter with two standard deviations, beside wheels and gyro.",
-        x_label="time [s]",
-    )
 
 
 def slip_figure(estimate: Estimate) -> Figure:

@@ -33,16 +33,13 @@ from terrain.measured_slip.slips import measured_slip
 from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
 from terrain.measured_slip.wheel_distance import DistanceBound
 from terrain.records import RunLog
-from terrain.robots import OmniRobot, Robot, as_drive
+from terrain.robots import OmniRobot, Robot, SwerveRobot, as_drive
 
 if TYPE_CHECKING:
     from pipelines.slip.estimate import EstimateOptions
 
 SHORT_S, SHORT_STRIDE_S = 0.5, 0.1
 """Windows of the stream ``slip`` that runs are written with."""
-
-MIN_SIDEWAYS = 0.2
-"""Ratio of the windows that drive to the side, from which slip is drawn over the direction of travel."""
 
 UNLABELLED = "(no label)"
 SLIP, FINE = ".3f", ".4f"
@@ -117,7 +114,7 @@ def estimate_all(
         distances=distances_of(found, robot, seed) if options.rollers else {},
         not_measured=tuple(found.failed),
         n_runs=len(runs),
-        pictures=_pictures(f"Slip of {robot.name}", options.window_s, surfaces, by_terrain),
+        pictures=_pictures(robot, options.window_s, surfaces, by_terrain),
     )
 
 
@@ -225,51 +222,38 @@ def _roller_parts(result: MeasuredSlipResult, found: RollerFindings) -> list[Par
 
 
 def _pictures(
-    title: str, window_s: float, surfaces: Sequence[SurfaceSlip], by_terrain: Mapping[str, Measured]
+    robot: Robot, window_s: float, surfaces: Sequence[SurfaceSlip], by_terrain: Mapping[str, Measured]
 ) -> dict[str, Figure]:
     """Return slip by surface, by run, and by the direction of travel or, of robots that only drive ahead, the turn."""
     names = [terrain or UNLABELLED for terrain in by_terrain]
     low, high = np.array([row.interval for row in surfaces]).T
-    medians = np.array([row.slip_ratio for row in surfaces])
-    bars = Bars("median, 95 % over runs", names, medians, low, high)
-    label = f"slip ratio of the body over {window_s:g} s"
-    figures = {
-        "slip_by_surface": Figure(
-            f"{title} by surface, measured from outside",
-            (Panel((bars,)),),
-            "The median over runs and its 95 % interval over runs.",
-            x_label=label,
-        )
-    }
-    rolled = np.concatenate([slip.rolled_twist for own in by_terrain.values() for slip in own.slips])
-    with np.errstate(invalid="ignore"):
-        sideways = np.nanmean(np.abs(rolled[:, 1]) > 0.1 * np.abs(rolled[:, 0])) > MIN_SIDEWAYS
+    bars = Bars("median, 95 % over runs", names, [row.slip_ratio for row in surfaces], low, high)
+    sideways = isinstance(robot, OmniRobot | SwerveRobot)
     by_run, by_window, rng = [], [], np.random.default_rng(0)
     for place, (name, own) in enumerate(zip(names, by_terrain.values(), strict=True)):
         slips = [each.body_slip[each.known] for each in own.slips]
-        ratio, of_runs = np.concatenate(slips), np.array([np.median(each) for each in slips if each.size])
-        if not ratio.size:
-            continue
+        of_runs = np.array([np.median(each) for each in slips if each.size])
         by_run.append(Points(name, of_runs, place + rng.uniform(-0.22, 0.22, of_runs.size)))
-        twist = np.concatenate([slip.rolled_twist[slip.known] for slip in own.slips])
+        ahead, left, turn = np.concatenate([slip.rolled_twist[slip.known] for slip in own.slips]).T
         with np.errstate(invalid="ignore", divide="ignore"):
-            turn = twist[:, 2] / np.abs(twist[:, 0])
-        at = np.degrees(np.arctan2(twist[:, 1], twist[:, 0])) if sideways else turn
-        by_window.append(Points(name, at, ratio))
-    if by_run:
-        figures["slip_by_run"] = Figure(
-            f"{title}, a run a point",
-            (Panel(by_run, "surface"),),
-            "The median of each run; surfaces one above another.",
-            x_label=label,
-        )
-    reach, label = 3.0, "yaw rate of the wheels over their speed [rad/m]"
+            at = np.degrees(np.arctan2(left, ahead)) if sideways else turn / np.abs(ahead)
+        by_window.append(Points(name, at, np.concatenate(slips)))
+    label = f"slip ratio of the body over {window_s:g} s"
+    reach, motion = 3.0, "yaw rate of the wheels over their speed [rad/m]"
     if sideways:
-        reach, label = 180.0, "direction of travel in the body's axes [degrees]"
-    figures["slip_by_motion"] = Figure(
-        f"{title} by how it was driven, a window a point",
-        (Panel(by_window, "slip ratio of the body", x_range=(-reach, reach)),),
-        "A window of steady motion a point.",
-        x_label=label,
-    )
-    return figures
+        reach, motion = 180.0, "direction of travel in the body's axes [degrees]"
+    windows = Panel(by_window, "slip ratio of the body", x_range=(-reach, reach))
+    drawn = {
+        "slip_by_surface": (
+            "by surface",
+            Panel([bars]),
+            "The median over runs and its 95 % interval.",
+            label,
+        ),
+        "slip_by_run": ("a run a point", Panel(by_run, "surface"), "The median of each run.", label),
+        "slip_by_motion": ("by how it was driven", windows, "A window of steady motion a point.", motion),
+    }
+    return {
+        name: Figure(f"Slip of {robot.name}, measured from outside, {how}", [panel], caption, x_label=x_label)
+        for name, (how, panel, caption, x_label) in drawn.items()
+    }

@@ -17,9 +17,9 @@ SHOWN_ROWS = 8
 """Rows of a table that is continued in the details."""
 
 
-def named(rows: Mapping[str, Mapping[str, Any]], key: str = "terrain") -> list[dict[str, Any]]:
-    """Return rows with their name among their values."""
-    return [{key: name, **row} for name, row in rows.items()]
+def named(rows: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows of terrains with their names among their values."""
+    return [{"terrain": name, **row} for name, row in rows.items()]
 
 
 def first_rows(
