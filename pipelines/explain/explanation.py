@@ -245,7 +245,6 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
 def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
     """Yield the effects that were withdrawn, what is left unexplained, and the effects that are ruled out."""
     withdrawn, ruled_out = split_ruled_out(diagnosis)
-    alike = {each.name: f"resembles {effect_label(each.name)}, which was withdrawn" for each in withdrawn}
     for effects, title, note in (
         (
             withdrawn,
@@ -261,6 +260,7 @@ def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
         if rows:
             yield Table((title, "value it would have", WHY, Column("z", Z)), rows, note=note)
     if diagnosis.unexplained:
+        alike = {each.name: f"resembles {effect_label(each.name)}, which was withdrawn" for each in withdrawn}
         unexplained = [
             (
                 channel_label(left.channel),
@@ -302,9 +302,10 @@ def _details(result: ExplainResult) -> Iterator[Section]:
         whole = telling_runs(whole, runs.noise, result.n_pictures)
     drawn = [figures.run_figure(run, runs.noise, channels_of([run])) for run in whole]
     yield Section("Whole runs", drawn)
-    limits = [(limit_text(limit, True), False, limit.needs) for limit in diagnosis.not_excited]
-    excited = [limit for limit in diagnosis.limits if limit not in diagnosis.not_excited]
-    limits += [(limit_text(limit, False), True, limit.needs) for limit in excited]
+    limits = []
+    for limit in diagnosis.limits:
+        missed = limit in diagnosis.not_excited
+        limits.append((limit_text(limit, missed), not missed, limit.needs))
     meaning = "Not detected does not mean absent: at its limit an effect is found nine times in ten."
     heads = Column("detection limit", long=True), "excited by the driving", NEEDS
     yield Section("What would not have been detected", [Table(heads, limits, note=meaning)])
