@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipelines.explain import figures
 from pipelines.report.json_file import as_json
 from pipelines.report.numbers import enumerated, format_value, sentence
-from pipelines.report.results import Result, described, frame
+from pipelines.report.results import Result, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 from pipelines.report.versions import versions
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
@@ -33,9 +33,6 @@ from terrain.discrepancy.statements import SESSION_COLUMNS, Statement, session_r
 from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import effect_named
 from terrain.robots import Robot
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 PICTURED = STATED = 3
 """Channels of the first picture, and of the sentences beside the answer: those of which most is stated."""
@@ -111,12 +108,12 @@ class ExplainResult(Result):
         }
         return {**super().as_json(), **as_json(beside)}
 
-    def to_pandas(self) -> pd.DataFrame:
-        """Return the parameters of the named causes, a row each."""
-        return frame(
+    def records(self) -> Iterable[Any]:
+        """Return the parameters of the named causes."""
+        return (
             {"cause": cause.name, **value._asdict(), "held_out_gain": cause.gain, "z": cause.z}
             for cause in self.diagnosis.causes
-            for value in cause.values  # noqa: PD011
+            for value in cause.values
         )
 
 
@@ -161,7 +158,7 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
     notes = ["Values are added to what the description has already."]
     for cause in diagnosis.causes:
         label, beside = effect_label(cause.name), (cause.gain, cause.z, result.terms.get(cause.name, ""))
-        for value in cause.values:  # noqa: PD011
+        for value in cause.values:
             causes.append((label, quantity(value.name, value.value), quantity_interval(value), *beside))
         if cause.aliases:
             notes.append(
