@@ -1,13 +1,11 @@
 """The report of a diagnosis says what the answer says, whatever the answer is."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pipelines.explain.figures import dependence_figures, parts_figure, run_figure, spectra_figure
-from pipelines.report.json_file import as_json
 from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.discrepancy.compared import channels_of
@@ -155,17 +153,6 @@ def test_robots_on_tracks_have_sprockets(explained):
     text = text_of(explained(causes=(cause,), robot=load_robot("marmotte")))
     assert "lacks sprocket radius, 10 %" in text
     assert "wheel" not in text.partition("Where these numbers")[0]
-
-
-def test_json_holds_null_where_nothing_is_known(explained):
-    result = explained(a_gain(filter=Comparison("vio12", "no camera", 2, {})), not_excited=LIMITS[1:3])
-    shown = json.loads(json.dumps(as_json(result), allow_nan=False))
-    assert [limit["detection_limit"] for limit in shown["detection_limits"]] == [0.003, None, 0.05, 0.048]
-    assert shown["not_excited"] == shown["detection_limits"][1:3]
-    assert shown["gain"]["channels"]["speed_x_mps"]["white_after"] is None
-    assert (shown["gain"]["measured"], shown["gain"]["ci"]) == (True, [0.4, 0.6])
-    assert set(shown["gain"]["filter"]) == {"name", "reason", "n_runs", "errors"}
-    assert as_json(explained())["gain"] == {"measured": False, "reason": "nothing was built in"}
 
 
 def test_figures_show_the_residual_before_and_after_with_the_noise_about_the_measurement(few):
