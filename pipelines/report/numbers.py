@@ -75,7 +75,7 @@ def plain_line(text: str) -> str:
     >>> plain_line("a\nb 3\xa0m")
     'a\\nb 3\xa0m'
     """
-    return NBSP.join(printable(part) for part in text.split(NBSP))
+    return NBSP.join(map(printable, text.split(NBSP)))
 
 
 def format_number(number: float) -> str:
