@@ -21,7 +21,6 @@ from terrain.classify.paired import MIN_RUNS, Difference, paired_accuracy
 from terrain.logs.digest import joint_digest
 
 if TYPE_CHECKING:
-    from features.protocols import Samples
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.training_data import TrainingData
 
@@ -34,38 +33,11 @@ class Champion(NamedTuple):
     model: TerrainModel | None
 
 
-class Bench(NamedTuple):
-    """What a champion is judged on: the data of a new version, and how that one did on each run held out.
-
-    Parameters
-    ----------
-    data : that the new version was trained on
-    held_out : its held-out accuracy on each run, by id
-    seed : of the bootstrap over runs
-    """
-
-    data: TrainingData
-    held_out: Mapping[str, HeldOutRun]
-    seed: int
-
-
-class HeldOutRun(NamedTuple):
-    """Windows of a run, and which part of them was classified correctly while it was held out."""
-
-    n_windows: int
-    accuracy: float
-
-
-def held_out_runs(samples: Samples, report: CrossvalResult) -> dict[str, HeldOutRun]:
-    """Return the held-out accuracy of each run, over all of its terrains."""
-    run_of = dict(zip(runs_by_terrain(samples.run_id, samples.terrain).tolist(), samples.run_id, strict=True))
-    n_right: dict[str, float] = {}
-    n_all: dict[str, int] = {}
-    for row in report.per_run:
-        name = str(run_of[row.run_id])
-        n_all[name] = n_all.get(name, 0) + row.n_windows
-        n_right[name] = n_right.get(name, 0.0) + row.n_windows * row.accuracy
-    return {name: HeldOutRun(n_all[name], n_right[name] / n_all[name]) for name in n_all}
+def run_accuracies(data: TrainingData, evaluated: CrossvalResult) -> dict[str, float]:
+    """Return the held-out accuracy of each run, over all of its terrains, by the digest of the run."""
+    run_id, accuracy = data.samples.run_id, {row.run_id: row.accuracy for row in evaluated.per_run}
+    of_window = np.array([accuracy[name] for name in runs_by_terrain(run_id, data.samples.terrain)])
+    return {run.digest: float(of_window[run_id == run.run_id].mean()) for run in data.runs if run.n_windows}
 
 
 def scope_of(info: ModelInfo) -> dict[str, str]:
@@ -95,7 +67,7 @@ def tags_of(info: ModelInfo, evaluated: CrossvalResult) -> dict[str, str]:
 
 
 def judge(
-    champion: Champion | None, info: ModelInfo, evaluated: CrossvalResult, bench: Bench | None = None
+    champion: Champion | None, info: ModelInfo, evaluated: CrossvalResult, data: TrainingData | None = None
 ) -> tuple[bool, str]:
     """Return whether a new version becomes champion, and why.
 
@@ -103,7 +75,7 @@ def judge(
     ----------
     champion : the present one, None where there is none
     info, evaluated : of the new version
-    bench : what both can be judged on; None where the training data are not at hand any more
+    data : that it was trained on; None where they are not at hand any more
     """
     weak = weaknesses(evaluated.accuracy_ci, evaluated.chance)
     if weak and not evaluated.accuracy_ci[0] > evaluated.chance:
@@ -121,20 +93,24 @@ def judge(
             if name == "channels":
                 different = f"its streams, channels or rates are not those of version {version}"
             return False, f"{different}: choose another --name"
-    digests = (info.data_digest,) if bench is None else _digests(info, bench.data)
+    runs = () if data is None else data.runs
+    digests = (
+        info.data_digest,
+        joint_digest([run.digest for run in runs]),
+    )  # of the runs together, and of each
     if model.info.data_digest in digests or joint_digest(model.info.run_digests) == info.data_digest:
         best = float(champion.tags.get("macro_f1", "-inf"))
         comparison = f"{best:.4f} of version {version} on the same data"
         if evaluated.macro_f1 > best:
             return True, f"macro F1 {evaluated.macro_f1:.4f} is better than {comparison}{remark}"
         return False, f"macro F1 {evaluated.macro_f1:.4f} is not better than {comparison}"
-    found = None if bench is None else compare(model, bench)
+    found = None if data is None else compare(model, info, data)
     if found is None:
         return False, (
             f"new data: no run on which version {version} can be judged: it was trained on them and has no "
             "figures by run, or it needs other rates, features or the samples of runs"
         )
-    unknown = len(bench.held_out) - found.n_runs if bench is not None else 0
+    unknown = len(info.run_accuracy) - found.n_runs
     verdict = (
         f"new data: on {found.n_runs} runs{f', {unknown} more not compared' if unknown else ''}, each held out, "
         f"accuracy {found.b:.1%} against {found.a:.1%} of version {version}"
@@ -146,23 +122,21 @@ def judge(
     return better, f"{verdict}{remark if better else ''}"
 
 
-def _digests(info: ModelInfo, data: TrainingData) -> tuple[str, str]:
-    """Return the digests of training data: of the runs together, and of each by itself."""
-    return info.data_digest, joint_digest([run.digest for run in data.runs])
-
-
-def compare(model: TerrainModel, bench: Bench) -> Difference | None:
+def compare(model: TerrainModel, info: ModelInfo, data: TrainingData) -> Difference | None:
     """Return the accuracy of a model, and that of another while each run was held out, on the same runs.
 
     A run that the model was not trained on is predicted, where it can be; one that it was trained on counts
     with the accuracy that it had when it was held out, where that is known.  None where there is no such run.
+
+    Parameters
+    ----------
+    model : that is compared
+    info, data : of the other, and what it was trained on
     """
-    data, held_out, seed = bench
-    run_id, terrain = data.samples.run_id, data.samples.terrain
-    digests = {run.run_id: run.digest for run in data.runs}
-    new = [name for name in held_out if digests[name] not in model.info.run_digests]
-    known = model.info.run_accuracy
-    theirs = {name: known[digests[name]] for name in held_out if digests[name] in known and name not in new}
+    run_id, terrain, known = data.samples.run_id, data.samples.terrain, model.info.run_accuracy
+    held_out = {run.run_id: run.digest for run in data.runs if run.digest in info.run_accuracy}
+    new = [name for name, digest in held_out.items() if digest not in model.info.run_digests]
+    theirs = {name: known[held_out[name]] for name in held_out if held_out[name] in known and name not in new}
     rows = np.isin(run_id, new)
     probability = data.probabilities(model, rows) if rows.any() else None
     if probability is not None:
@@ -171,7 +145,8 @@ def compare(model: TerrainModel, bench: Bench) -> Difference | None:
     if not theirs:
         return None
     names = sorted(theirs)
-    n_windows, own = np.array([held_out[name] for name in names]).T
+    own = np.array([info.run_accuracy[held_out[name]] for name in names])
     other = np.array([theirs[name] for name in names])
     first = np.array([terrain[run_id == name][0] for name in names])
-    return paired_accuracy(first, n_windows, other, own, np.random.default_rng(seed))
+    n_windows = np.array([(run_id == name).sum() for name in names])
+    return paired_accuracy(first, n_windows, other, own, np.random.default_rng(info.seed))

@@ -17,7 +17,7 @@ from pipelines.report.results import Result, described
 from terrain.errors import ModelError
 
 if TYPE_CHECKING:
-    from pipelines.learn.champion import Bench
+    from pipelines.learn.training_data import TrainingData
     from pipelines.live.model import ModelInfo
 
 CHAMPION = "champion"
@@ -37,7 +37,7 @@ class Registered(Result):
 
 
 def log_training(
-    name: str, folder: Path, bench: Bench | None = None, pictures: Mapping[str, bytes] | None = None
+    name: str, folder: Path, data: TrainingData | None = None, pictures: Mapping[str, bytes] | None = None
 ) -> Registered:
     """Log one training run with its model, register the model, and decide on the champion.
 
@@ -45,7 +45,7 @@ def log_training(
     ----------
     name : name of the registered model
     folder : of the model, with the record of its training
-    bench : what the champion and the new version are judged on; None where that is not at hand any more
+    data : that it was trained on, and the champion is judged on; None where they are not at hand any more
     pictures : content of image files by name
 
     Raises
@@ -100,7 +100,7 @@ def log_training(
             except (mlflow.exceptions.MlflowException, OSError, ImportError, ModelError):
                 model = None
             champion = Champion(str(current), client.get_model_version(name, current).tags, model)
-        moved, reason = judge(champion, info, evaluation, bench)
+        moved, reason = judge(champion, info, evaluation, data)
         if moved:
             client.set_registered_model_alias(name, CHAMPION, number)
         client.set_terminated(run_id)

@@ -28,7 +28,6 @@ from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     from pipelines.learn.card import ModelResult
-    from pipelines.learn.champion import Bench
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.search import SearchResult
     from pipelines.learn.training_data import TrainingData
@@ -185,7 +184,7 @@ def train(
     from features.motion import NO_MOTION
     from pipelines.data.tracking import code_commit, ui_line
     from pipelines.learn.card import TrainingRecord, limits_of, write_training
-    from pipelines.learn.champion import Bench, held_out_runs
+    from pipelines.learn.champion import run_accuracies
     from pipelines.learn.model_file import write_model
     from pipelines.learn.training_data import info_of, with_limits
     from pipelines.report.drawing import figure_png
@@ -220,9 +219,7 @@ def train(
         data_digest=data.digest,
         notes=(*evaluation.notes, *missing, *unknown, *notes),
     )
-    held_out = held_out_runs(samples, evaluation)
-    accuracy = {run.digest: held_out[run.run_id].accuracy for run in data.runs if run.run_id in held_out}
-    info = replace(model.info, run_accuracy=accuracy)
+    info = replace(model.info, run_accuracy=run_accuracies(data, evaluation))
     record = TrainingRecord(
         params={
             "recipe": settings.recipe,
@@ -250,7 +247,7 @@ def train(
         folder = settings.out or Path(place)
         write_model(folder, model._replace(info=info))
         card = write_training(folder, settings.name, record)
-        registered = _registered(settings, folder, Bench(data, held_out, settings.seed), pictures)
+        registered = _registered(settings, folder, data, pictures)
     return TrainResult(
         **vars(registered),
         dataset=dataset,
@@ -291,14 +288,14 @@ def _check_storable(data: TrainingData) -> None:
 
 
 def _registered(
-    settings: TrainingSettings, folder: Path, bench: Bench, pictures: Mapping[str, bytes]
+    settings: TrainingSettings, folder: Path, data: TrainingData, pictures: Mapping[str, bytes]
 ) -> Registered:
     """Register a model; where that fails, keep it in a folder and say how it is registered later."""
     from pipelines.data.tracking import TrackingError
     from pipelines.learn.tracking import log_training
 
     try:
-        return log_training(settings.name, folder, bench, pictures)
+        return log_training(settings.name, folder, data, pictures)
     except TrackingError as error:
         kept = settings.out
         if kept is None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipelines.learn.card import read_training
-from pipelines.learn.champion import Bench, Champion, compare, held_out_runs, judge
+from pipelines.learn.champion import Champion, compare, judge, run_accuracies
 from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_runs
@@ -17,9 +17,8 @@ EVALUATION = EvaluationSettings(repeats=1, n_jobs=1, extras=False)
 
 def judged(model, runs):
     data, report = data_of_runs(runs, TRAINING), crossval(runs, EVALUATION)
-    info = replace(model.info, data_digest=data.digest)
-    bench = Bench(data, held_out_runs(data.samples, report), 0)
-    return *judge(Champion("1", {"macro_f1": "0.9"}, model), info, report, bench), data, report
+    info = replace(model.info, data_digest=data.digest, run_accuracy=run_accuracies(data, report))
+    return *judge(Champion("1", {"macro_f1": "0.9"}, model), info, report, data), data, report
 
 
 @pytest.mark.parametrize(
@@ -92,15 +91,16 @@ def test_it_stays_where_it_is_better_and_goes_where_it_is_not(oracle, drive_all)
 def test_its_own_runs_count_with_the_figures_of_when_they_were_held_out(model, oracle, runs, drive_all):
     more = [*runs, *(replace(run, run_id=f"{run.run_id}_new") for run in drive_all(n_runs=1, seed=47))]
     data, report = data_of_runs(more, TRAINING), crossval(more, EVALUATION)
-    held_out = held_out_runs(data.samples, report)
-    assert {name: each.n_windows for name, each in held_out.items()} == {run.run_id: 12 for run in more}
-    assert np.mean([each.accuracy for each in held_out.values()]) == pytest.approx(report.accuracy)
-    cheat = oracle(True)
-    found = compare(cheat, Bench(data, held_out, 0))
+    info, cheat = replace(model.info, run_accuracy=run_accuracies(data, report)), oracle(True)
+    assert list(info.run_accuracy) == [run.digest for run in data.runs]
+    assert np.mean(list(info.run_accuracy.values())) == pytest.approx(report.accuracy)
+    found = compare(cheat, info, data)
     own = list(model.info.run_accuracy.values())
     assert found.n_runs == 15
     assert found.a == pytest.approx((np.sum(own) + 3) / 15)  # what it was trained on is not predicted
     unknown = cheat._replace(info=replace(model.info, run_accuracy={}))
-    assert compare(unknown, Bench(data, held_out, 0)).n_runs == 3
-    only_old = {run.run_id: held_out[run.run_id] for run in runs}
-    assert compare(unknown, Bench(data, only_old, 0)) is None
+    assert compare(unknown, info, data).n_runs == 3
+    only_old = {
+        digest: right for digest, right in info.run_accuracy.items() if digest in model.info.run_accuracy
+    }
+    assert compare(unknown, replace(info, run_accuracy=only_old), data) is None
