@@ -320,6 +320,17 @@ def span_of(run: RunLog, layout: Layout) -> tuple[float, float]:
     )
 
 
+def holds_a_window(run: RunLog, layout: Layout, length_s: float, *, skip_short: bool) -> bool:
+    """Say whether a run is as long as a window; ``DataError`` for a shorter one unless those are skipped."""
+    begin_s, end_s = span_of(run, layout)
+    is_short = end_s - begin_s + TIME_TOLERANCE_S < length_s
+    if is_short and not skip_short:
+        raise DataError(
+            f"run {run.run_id} lasts {max(end_s - begin_s, 0):.2f} s, shorter than a window of {length_s:g} s"
+        )
+    return not is_short
+
+
 def cut_windows(
     runs: Sequence[RunLog],
     rule: WindowRule | None = None,
@@ -372,15 +383,10 @@ def cut_windows(
     dropped: Counter[str] = Counter()
     for run in runs:
         refuse_implausible(run, layout.channels)
-        begin_s, end_s = span_of(run, layout)
-        if end_s - begin_s + TIME_TOLERANCE_S < rule.length_s:
-            if not skip_short:
-                raise DataError(
-                    f"run {run.run_id} lasts {max(end_s - begin_s, 0):.2f} s, "
-                    f"shorter than a window of {rule.length_s:g} s"
-                )
+        if not holds_a_window(run, layout, rule.length_s, skip_short=skip_short):
             dropped["run too short"] += 1
             continue
+        begin_s, end_s = span_of(run, layout)
         if starts_s is None:
             at = regular_starts(begin_s, end_s, rule.length_s, rule.step_s)
         else:

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.model import TerrainModel
@@ -26,10 +27,14 @@ from terrain.control.switching import (
     update,
 )
 from terrain.control.terrain_source import TerrainSource
+from terrain.control.traction import TractionStatus
 from terrain.estimation.ekf.resident import BIASES, ResidentFilter
 from terrain.estimation.live.choice import Estimate, Filter
 from terrain.estimation.live.clocks import Clocks, ClockWatch
 from terrain.records import Command, Sample
+
+COMMAND_VALID_S = 0.25
+"""What drives the wheels has to stop them when it has had no newer command for so long."""
 
 
 class CommandStatus(StrEnum):
@@ -43,19 +48,45 @@ class CommandStatus(StrEnum):
 
 
 class Step(NamedTuple):
-    """What a chain gives for a sample.
+    """What a chain gives for a sample, and what a session says of it.
 
     Parameters
     ----------
     windows : outputs of windows that were finished, in most steps none
     command, status : of the wheels; None of a chain that gives no commands
     failure : why the step failed; empty where it did not
+    time_s : on the robot's clock; NaN before its first sample
+    number : of the step, from 1
+    message : number of the last message that is in it; 0 before the first
+    observation : what is known of the robot, as ``docs/service.md`` describes it; None and NaN where it is not
+    latency_s : from the arrival of the newest sample to the end of the step; NaN without one
     """
 
     windows: Sequence[WindowOutput] = ()
     command: Command | None = None
     status: CommandStatus = CommandStatus.OK
     failure: str = ""
+    time_s: float = math.nan
+    number: int = 0
+    message: int = 0
+    observation: Mapping[str, Any] = MappingProxyType({})
+    latency_s: float = math.nan
+
+    def content(self) -> dict[str, Any]:
+        """Return the message of a session's step."""
+        names = ("time_s", "number", "message", "latency_s", "observation")
+        content = {"type": "step"} | {name: getattr(self, name) for name in names}
+        if (command := self.command) is not None:
+            code = int(command.status.get("status_code", TractionStatus.UNSOUND))
+            content["command"] = {
+                "status": self.status.value,
+                "traction": TractionStatus(code).label,
+                "valid_s": COMMAND_VALID_S,
+                "wheel_radps": command.wheel_radps,
+                "steer_rad": command.steer_rad,
+                "twist": command.twist,
+            }
+        return content
 
 
 class Chain:
@@ -129,7 +160,7 @@ class Chain:
         otherwise its windows begin with the next sample.  ``ConfigError`` where the table is another robot's,
         ``DataError`` where the model does not suit what is measured and estimated, or is none.
         """
-        self.check(model, table)
+        self._check_table(table)
         self.source.swap(model)
         self.table = table
 
@@ -152,7 +183,8 @@ class Chain:
             for state, (mean, std) in known.items()
             if math.isfinite(mean + std) and std > 0.0
         }
-        return LiveState(self.robot_name, name, now_s, biases, self.belief.terrain, self.belief.probability)
+        belief = self.belief.terrain, self.belief.probability, self.target_ratio
+        return LiveState(self.robot_name, name, now_s, biases, *belief)
 
     def restore(self, state: LiveState, now_s: float) -> LiveState:
         """Start from a saved state, before the first sample; return what of it is used.

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -101,10 +100,6 @@ class LivePilot(Chain):
         """Go on with another model and table, as every chain."""
         super().replace(model, table)
         self.control.use(table)
-
-    def state(self, now_s: float) -> LiveState:
-        """Return what is worth keeping over a restart, the target slip among it."""
-        return replace(super().state(now_s), target_ratio=self.target_ratio)
 
     def restore(self, state: LiveState, now_s: float) -> LiveState:
         """Start from a saved state, as every chain."""

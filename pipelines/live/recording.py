@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from pipelines.data.mcap_file import McapWriter
+from pipelines.live.chain import CommandStatus, Step
 from terrain.control.switching import SWITCHING
 from terrain.errors import LogError
 from terrain.files.names import plain_name
@@ -34,7 +35,7 @@ from terrain.logs.run_topics import DECIDED, LATEST_S, WINDOW_TOPIC, RunRecorder
 from terrain.logs.samples import BAD_TIME
 from terrain.logs.schema import unit_of
 from terrain.logs.write import run_folder
-from terrain.records import Array, Command, Reading
+from terrain.records import Array, Reading
 
 if TYPE_CHECKING:
     from pipelines.live.classifying import WindowOutput
@@ -53,6 +54,9 @@ MAX_WAITING_BYTES = 4 << 20
 
 _OVERHEAD_BYTES = 200
 """What an array takes beside its numbers."""
+
+NOT_DECIDED = (CommandStatus.NO_SAMPLES, CommandStatus.FAILED)
+"""Statuses of commands that no controller has decided on."""
 
 RECORDING, FINISHED, NOTHING_KEPT = "recording", "finished", "finished: nothing to keep"
 
@@ -132,23 +136,23 @@ class SessionRecorder:
         for name, (time_s, values) in readings.items():
             self._put(name, np.column_stack([time_s, values]))
 
-    def command(self, time_s: float, twist: Array, command: Command) -> None:
-        """Record a command.
+    def step(self, time_s: float, twist: Array, done: Step) -> None:
+        """Record what a step gave at a time: the command where a controller decided on it, and windows.
 
         Parameters
         ----------
         time_s : of the step
         twist : (3,) desired
-        command : of the wheels, and the figures of the decision, always of the same names
+        done : its command has figures of the decision, always of the same names
         """
-        wheels = (*command.wheel_radps, *command.steer_rad) if self._n_wheels else ()
-        self._put("commands", np.array([[time_s, *twist, *wheels]]))
-        self._channels.setdefault("control", tuple(command.status))
-        self._put("control", np.array([[time_s, *command.status.values()]]))
-
-    def window(self, output: WindowOutput) -> None:
-        """Record the output of the model for a window."""
-        self._put(WINDOW, output)
+        command = None if done.status in NOT_DECIDED else done.command
+        if command is not None:
+            wheels = (*command.wheel_radps, *command.steer_rad) if self._n_wheels else ()
+            self._put("commands", np.array([[time_s, *twist, *wheels]]))
+            self._channels.setdefault("control", tuple(command.status))
+            self._put("control", np.array([[time_s, *command.status.values()]]))
+        for output in done.windows:
+            self._put(WINDOW, output)
 
     def close(self, timeout_s: float = 0.0) -> list[Path]:
         """End the recording; return its files, the last one whole where the thread was done within a time.

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
 
-from pipelines.live.chain import Chain, CommandStatus
+from pipelines.live.chain import COMMAND_VALID_S, Chain, CommandStatus, Step
 from pipelines.live.classifying import Classifier, ClassifierThread, WindowOutput
 from pipelines.live.model import TerrainModel
 from pipelines.live.observer import Observer
@@ -25,20 +25,16 @@ from pipelines.live.recording import RecordingThread, SessionRecorder
 from pipelines.live.state import LiveState
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable
-from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.arrivals import Inbox, StreamHealth, as_numbers
 from terrain.estimation.live.clocks import SessionClock
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.skid_live import LiveSkidEstimate
-from terrain.records import Command, Sample
+from terrain.records import Sample
 from terrain.robots import Robot
 
 TWIST_FRESH_S = 0.5
 """A desired motion that is older is none: the robot is commanded to stop."""
-
-COMMAND_VALID_S = 0.25
-"""What drives the wheels has to stop them when it has had no newer command for so long."""
 
 CONTROL_RATE_LEAST_HZ = 5.0
 """Of commands: a longer step than half a second is taken for a clock that was set, and a command holds for a
@@ -122,48 +118,6 @@ class Hello(BaseModel):
         return rate_hz
 
 
-class StepOutput(NamedTuple):
-    """What comes out of a step.
-
-    Parameters
-    ----------
-    time_s : on the robot's clock; NaN before its first sample
-    number : of the step, from 1
-    message : number of the last message that is in it; 0 before the first
-    command, status : None where none was asked for
-    windows : outputs of windows that were finished, in most cases none
-    failure : why the step failed; empty where it did not
-    observation : what is known of the robot, as ``docs/service.md`` describes it; None and NaN where it is not
-    latency_s : from the arrival of the newest sample to the end of the step; NaN without one
-    """
-
-    time_s: float
-    number: int
-    message: int
-    command: Command | None
-    status: CommandStatus
-    windows: Sequence[WindowOutput]
-    failure: str
-    observation: dict[str, Any]
-    latency_s: float
-
-    def content(self) -> dict[str, Any]:
-        """Return the message of the step."""
-        names = ("time_s", "number", "message", "latency_s", "observation")
-        content = {"type": "step"} | {name: getattr(self, name) for name in names}
-        if (command := self.command) is not None:
-            code = int(command.status.get("status_code", TractionStatus.UNSOUND))
-            content["command"] = {
-                "status": self.status.value,
-                "traction": TractionStatus(code).label,
-                "valid_s": COMMAND_VALID_S,
-                "wheel_radps": command.wheel_radps,
-                "steer_rad": command.steer_rad,
-                "twist": command.twist,
-            }
-        return content
-
-
 class RobotSession:
     """The live chain of one robot, from messages to steps.
 
@@ -214,7 +168,7 @@ class RobotSession:
         self._sampled_s = self._known_s = math.nan
         self._n_steps = self._n_messages = 0
         self.received_s = monotonic()
-        self.last: StepOutput | None = None
+        self.last: Step | None = None
         self.restored: LiveState | None = None
         self._recorder: SessionRecorder | None = None
         self._window: dict[str, Any] | None = None
@@ -315,7 +269,7 @@ class RobotSession:
                 self._twist, self._twist_s = desired, now_s
         return self.inbox.received.total() - before
 
-    def step(self, now_s: float | None = None, time_s: float | None = None) -> StepOutput:
+    def step(self, now_s: float | None = None, time_s: float | None = None) -> Step:
         """Run the chain over what has come since the last step; it does not raise.
 
         Parameters
@@ -331,30 +285,21 @@ class RobotSession:
         fresh = now_s - self._twist_s <= TWIST_FRESH_S
         twist = self._twist if fresh else _NO_TWIST
         done = self.chain.take(Sample(time_s, twist, readings))
-        status = done.status
-        if done.command is not None and status is CommandStatus.OK and not fresh:
-            status = CommandStatus.NO_TWIST
         self._n_steps += 1
         if done.windows:
             self._window = _window_content(done.windows[-1])
         self._streams.take(readings, time_s)
         if self._recorder is not None:
-            if readings:
-                self._recorder.readings(readings)
-            if done.command is not None and done.status not in _NOT_DECIDED:
-                self._recorder.command(time_s, twist, done.command)
-            for output in done.windows:
-                self._recorder.window(output)
-        self.last = StepOutput(
-            time_s,
-            self._n_steps,
-            self._n_messages,
-            done.command,
-            status,
-            done.windows,
-            done.failure,
-            self._observation(time_s),
-            now_s - self._sampled_s + (monotonic() - begun_s),
+            self._recorder.readings(readings)
+            self._recorder.step(time_s, twist, done)
+        if done.command is not None and done.status is CommandStatus.OK and not fresh:
+            done = done._replace(status=CommandStatus.NO_TWIST)
+        self.last = done._replace(
+            time_s=time_s,
+            number=self._n_steps,
+            message=self._n_messages,
+            observation=self._observation(time_s),
+            latency_s=now_s - self._sampled_s + (monotonic() - begun_s),
         )
         return self.last
 
@@ -394,10 +339,6 @@ class RobotSession:
             "sensors": sensors,
             "served": self.served.number,
         }
-
-
-_NOT_DECIDED = (CommandStatus.NO_SAMPLES, CommandStatus.FAILED)
-"""Statuses of commands that no controller has decided on: they are not recorded."""
 
 
 def _window_content(window: WindowOutput) -> dict[str, Any]:

@@ -18,6 +18,7 @@ from pydantic.dataclasses import dataclass
 
 from terrain.control.switching import UNKNOWN
 from terrain.errors import DataError
+from terrain.files.documents import first_fault
 from terrain.files.regular import read_regular
 from terrain.logs.recorded_windows import Number
 
@@ -110,8 +111,8 @@ def to_text(state: LiveState) -> str:
     return _Document(sha256=_sha256(state), state=state).model_dump_json(indent=1) + "\n"
 
 
-def from_text(text: str) -> LiveState:
-    """Return the state that a text holds.
+def from_text(text: str | bytes, place: str = "saved state") -> LiveState:
+    """Return the state that a text holds; messages begin with its place.
 
     Raises
     ------
@@ -122,16 +123,14 @@ def from_text(text: str) -> LiveState:
     --------
     >>> from_text("{}")
     Traceback (most recent call last):
-    terrain.errors.DataError: saved state: is damaged (sha256: Field required)
+    terrain.errors.DataError: saved state: is damaged (key 'sha256' is missing)
     """
     try:
         document = _Document.model_validate_json(text)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "all of it"
-        raise DataError(f"saved state: is damaged ({place}: {first['msg']})") from error
+        raise DataError(f"{place}: is damaged ({first_fault(error)})") from error
     if _sha256(document.state) != document.sha256:
-        raise DataError("saved state: is damaged (its checksum is another)")
+        raise DataError(f"{place}: is damaged (its checksum is another)")
     return document.state
 
 
@@ -143,10 +142,8 @@ def load_state(path: Path) -> LiveState | None:
     DataError
         if it cannot be read or is damaged.
     """
-    if not path.exists():
-        return None
-    content = read_regular(path, str(path), DataError, LARGEST_FILE)
-    try:
-        return from_text(content.decode("utf-8"))
-    except (DataError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: {error}") from error
+    return (
+        from_text(read_regular(path, str(path), DataError, LARGEST_FILE), str(path))
+        if path.exists()
+        else None
+    )

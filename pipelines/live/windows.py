@@ -10,14 +10,13 @@ import numpy as np
 
 from features.stream import WindowFeed
 from features.windows import (
-    TIME_TOLERANCE_S,
     Layout,
     WindowCut,
     check_layout,
     cut_windows,
+    holds_a_window,
     join_windows,
     label_windows,
-    span_of,
 )
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.terrain_filter import TerrainFilter, check_filter
@@ -142,21 +141,15 @@ def windows_of_log(
         feed = feed_of(info, channels, corrected, "" if estimator is None else estimator.name)
     except (ConfigError, DataError) as error:
         raise DataError(f"run {run.run_id}: {error}") from error
-    measured = {
-        name: tuple(c for c in info.channels[name] if c in channels[name])
-        for name in info.channels
-        if name in channels
-    }
-    check_layout(run, Layout(measured, {name: info.rate_hz[name] for name in measured}))
-    begin_s, end_s = span_of(run, Layout(measured, info.rate_hz))
+    names = [name for name in info.channels if name in channels]
+    measured = Layout(
+        {name: tuple(c for c in info.channels[name] if c in channels[name]) for name in names},
+        {name: info.rate_hz[name] for name in names},
+    )
+    check_layout(run, measured)
     nothing = cut_windows([], info.rule, layout=info.layout).windows
-    if end_s - begin_s + TIME_TOLERANCE_S < info.window_s:
-        if skip_short:
-            return WindowCut(nothing, {"run too short": 1})
-        raise DataError(
-            f"run {run.run_id} lasts {max(end_s - begin_s, 0):.2f} s, "
-            f"shorter than a window of {info.window_s:g} s"
-        )
+    if not holds_a_window(run, measured, info.window_s, skip_short=skip_short):
+        return WindowCut(nothing, {"run too short": 1})
     found = [nothing]
     for sample in replay(RunLog(run.run_id, run.robot, streams)):
         estimates = [] if estimator is None else estimator.step(sample.readings)

@@ -190,13 +190,8 @@ class Bridge:
     Attributes
     ----------
     receiver : of the frames; it counts those that are used, and what was not used by kind, steps that failed too
-    n_in : frames received
-    samples, states : samples by stream; control steps by :class:`BridgeState`
-    clipped : values sent as the end of their range, by signal
-    latencies_s : from the stamp of the wheels' newest sample to the correction sent
-    steps_s : time of each control step
-    ticks_missed : control steps left out as one before took too long
-    duration_s : from the start to the stop
+    latencies_s, steps_s : ``wheels_to_correction`` and ``step`` of a :class:`BridgeResult`, each
+    frames_in, samples, states, clipped, ticks_missed, duration_s : as it has them
     """
 
     def __init__(self, layout: Layout, robot: SwerveRobot, chain: Chain) -> None:
@@ -207,7 +202,7 @@ class Bridge:
         self._clock, self._last = SessionClock(), last_samples()
         self._before_s, self._counter, self._new_wheels = math.nan, 0, False
         self._stopped = threading.Event()
-        self.n_in = self.ticks_missed = 0
+        self.frames_in = self.ticks_missed = 0
         self.duration_s = 0.0
         self.samples: Counter[str] = Counter()
         self.states: Counter[str] = Counter()
@@ -263,7 +258,7 @@ class Bridge:
 
     def receive(self, frame: Frame, read_s: float) -> None:
         """Take a frame that was read at a time of this computer."""
-        self.n_in += 1
+        self.frames_in += 1
         if self.receiver.take(frame) is not None:
             self._clock.received(frame.timestamp, read_s)
 
@@ -320,24 +315,16 @@ class Bridge:
         ]
 
 
-Latency = Mapping[str, float | None]
-"""Median and 99th percentile in ms: None where there was no step."""
-
-
-def latency_of(times_s: Sequence[float]) -> Latency:
-    """Return median and 99th percentile of times.
+def latency_of(times_s: Sequence[float]) -> dict[str, float]:
+    """Return median and 99th percentile of times; NaN where there are none.
 
     Examples
     --------
-    >>> latency_of([0.001, 0.002, 0.003])
-    {'median_ms': 2.0, 'p99_ms': 2.98}
-    >>> latency_of([])
-    {'median_ms': None, 'p99_ms': None}
+    >>> latency_of([0.001, 0.002, 0.003]), latency_of([])
+    ({'median_ms': 2.0, 'p99_ms': 2.98}, {'median_ms': nan, 'p99_ms': nan})
     """
-    median_ms = p99_ms = None
-    if times_s:
-        median_ms, p99_ms = np.percentile(1e3 * np.array(times_s), [50.0, 99.0]).round(4).tolist()
-    return {"median_ms": median_ms, "p99_ms": p99_ms}
+    quantiles_ms = np.percentile(1e3 * np.array(times_s or [math.nan]), [50.0, 99.0])
+    return dict(zip(("median_ms", "p99_ms"), quantiles_ms.round(4).tolist(), strict=True))
 
 
 @dataclass(frozen=True, repr=False)
@@ -358,10 +345,10 @@ class BridgeResult(Result):
     clipped: Mapping[str, int] = described("values sent as the end of their range, by signal")
     states: Mapping[str, int] = described("control steps by state of the bridge")
     ticks_missed: int = described("control steps left out as one before took too long")
-    wheels_to_correction: Latency = described(
-        "from the first frame of the wheels' newest sample to its answer"
+    wheels_to_correction: Mapping[str, float] = described(
+        "median and 99th percentile from the first frame of the wheels' newest sample to its answer", "ms"
     )
-    step: Latency = described("time of a control step")
+    step: Mapping[str, float] = described("median and 99th percentile of the time of a control step", "ms")
 
 
 def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
@@ -390,7 +377,7 @@ def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
         dbc=layout.name,
         robot=robot.name,
         duration_s=round(bridge.duration_s, 3),
-        frames_in=bridge.n_in,
+        frames_in=bridge.frames_in,
         frames_used=bridge.receiver.n_used,
         frames_out=link.n_out,
         samples=dict(sorted(bridge.samples.items())),

@@ -20,8 +20,8 @@ from fastapi import WebSocket
 from pydantic import ValidationError
 from starlette.websockets import WebSocketDisconnect, WebSocketState
 
-from pipelines.live.chain import CommandStatus
-from pipelines.live.session import Hello, RobotSession, StepOutput
+from pipelines.live.chain import CommandStatus, Step
+from pipelines.live.session import Hello, RobotSession
 from pipelines.serve.guard import bearer
 from pipelines.serve.hub import Hub
 from pipelines.serve.serve import LONGEST_TOKEN
@@ -93,7 +93,7 @@ class Connection:
         self._end: tuple[int, str] = (1000, "")
         self._budgets = Budgets(hub.limits.per_s)
         self._notes: deque[dict[str, Any]] = deque(maxlen=MAX_NOTES)
-        self._step: StepOutput | None = None
+        self._step: Step | None = None
         self._changed = asyncio.Event()
         self._dropped: Counter[str] = Counter()
 

@@ -96,13 +96,14 @@ class Replayed:
 
 def replayed(
     windows: Sequence[ObservedWindow],
-    classes: tuple[str, ...],
+    model: TerrainModel | None,
     duration_s: float,
     elapsed_s: float,
     *,
     interrupted: bool,
 ) -> dict[str, Any]:
     """Return the figures of windows, of which those are judged whose label is a class of the model."""
+    classes = () if model is None else model.info.classes
     right = [each.terrain == each.label for each in windows if not each.refused and each.label in classes]
     return {
         "n_windows": len(windows),
@@ -156,7 +157,6 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     """
     assert settings.replay is not None
     table, model = load_slip_table(settings.table), loaded(settings, settings.model)
-    classes = () if model is None else model.info.classes
     read = {name: getattr(settings, name) for name in ("robot", *ReadSettings.model_fields)}
     logs, skipped = load(InspectSettings(data=settings.replay, **read))
     robot = None if settings.robot is None else load_robot(settings.robot)
@@ -165,12 +165,12 @@ def run(settings: Settings, progress: Progress = silent) -> ReplayResult:
     with stopping(stop.set):
         for each in logs:
             chain = chain_of_run(each, model, table, robot)
-            runs.append(replay_run(each, chain, settings, classes, progress, stop))
+            runs.append(replay_run(each, chain, settings, progress, stop))
             if runs[-1].interrupted:
                 break
     figures = replayed(
         [window for each in runs for window in each.windows],
-        classes,
+        model,
         sum(each.duration_s for each in runs),
         sum(each.elapsed_s for each in runs),
         interrupted=any(each.interrupted for each in runs),
@@ -229,7 +229,6 @@ def replay_run(
     run: RunLog,
     chain: Chain,
     settings: Settings,
-    classes: tuple[str, ...] = (),
     progress: Progress = silent,
     stop: Event | None = None,
 ) -> ReplayedRun:
@@ -240,7 +239,6 @@ def replay_run(
     run : to be replayed
     chain : of its robot, before its first step
     settings : speed and rate of the steps
-    classes : labels by which windows are judged
     progress : of the seconds of the run
     stop : ends it where it is set
     """
@@ -272,7 +270,7 @@ def replay_run(
     elapsed_s = perf_counter() - begin_s
     counts = Counter(window.terrain for window in windows if not window.refused)
     return ReplayedRun(
-        **replayed(windows, classes, passed_s, elapsed_s, interrupted=interrupted),
+        **replayed(windows, chain.source.model, passed_s, elapsed_s, interrupted=interrupted),
         run_id=run.run_id,
         robot=run.robot,
         chain=chain.name,

@@ -17,6 +17,7 @@ import pipelines.live.recording as recording
 from pipelines.data.bag_runs import recorded_windows
 from pipelines.data.datasets import load_runs
 from pipelines.learn.predict import predict
+from pipelines.live.chain import Step
 from pipelines.live.classifying import Classifier, WindowOutput
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
@@ -100,8 +101,7 @@ def test_a_recorded_observer_is_predicted_as_it_was_live(writer, tmp_path, mower
     observer = Observer(mower_model, channels=channels)
     for each in replay(replace(run, streams=streams), 20.0):
         recorder.readings(each.readings)
-        for output in observer.update(each.readings):
-            recorder.window(output)
+        recorder.step(each.time_s, each.twist, observer.take(each))
     assert recorder.status == "recording"
     (path,) = recorder.close(10.0)
     assert (recorder.status, path) == ("finished", tmp_path / "new" / "session.mcap")
@@ -122,11 +122,10 @@ def test_a_recorded_pilot_is_predicted_as_it_was_live_and_desires_the_same_motio
     def session(each):
         recorder.readings(each.readings)
         twists.append(each.twist)
-        commands.append(pilot.step(each))
-        recorder.command(each.time_s, each.twist, commands[-1])
-        for output in pilot.source.outputs:
-            recorder.window(output)
-        return commands[-1]
+        done = pilot.take(each)
+        commands.append(done.command)
+        recorder.step(each.time_s, each.twist, done)
+        return done.command
 
     drive = make_scenario("survey", AGRIMARO, "grass", 24.0, seed=5)
     simulate(AGRIMARO, drive, {"grass": load_soil("grass")}, 1, controller=session, command_delay_s=0.05)
@@ -153,7 +152,8 @@ def test_windows_of_any_class_are_in_the_file(recorder):
     given = (("a/b: c", 0.9, "", False), ("a/b: c", 0.4, "", True), ("", np.nan, "NaN", True))
     for k, (terrain, probability, why, _) in enumerate(given):
         both, span_s = np.array([probability, 1.0 - probability]), (2.0 * k, 2.0 * k + 2.0)
-        recorder.window(WindowOutput(*span_s, terrain, probability, both, ("a/b: c", "d"), why))
+        output = WindowOutput(*span_s, terrain, probability, both, ("a/b: c", "d"), why)
+        recorder.step(1.0, np.zeros(3), Step([output]))
     _, windows = recorded_windows(recorder.close(10.0)[0])
     assert [(w.doubtful, w.refused) for w in windows] == [(doubtful, why) for *_, why, doubtful in given]
     assert windows[0].probabilities == {"a/b: c": 0.9, "d": pytest.approx(0.1)}

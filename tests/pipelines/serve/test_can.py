@@ -236,7 +236,7 @@ def test_no_frame_breaks_the_rule(frames, extra, every):
         read[id(frame)] = (k * 0.01 + every * 0.003) % 0.6
     bridge = bridged()
     assert len(ticks(bridge, [*mixed, *extra], 0.6, read_at=lambda frame: read[id(frame)])) == 30
-    assert bridge.n_in >= bridge.receiver.n_used
+    assert bridge.frames_in >= bridge.receiver.n_used
 
 
 class Time:

@@ -48,8 +48,8 @@ def replayed(run, model, stop_at_s=np.inf, **settings):
         if done >= stop_at_s:
             stop.set()
 
-    chain, classes = chain_of_run(run, model, TABLE), () if model is None else model.info.classes
-    return replay_run(run, chain, Settings(replay="a log", **settings), classes, progress, stop), moments
+    chain = chain_of_run(run, model, TABLE)
+    return replay_run(run, chain, Settings(replay="a log", **settings), progress, stop), moments
 
 
 def test_an_observer_gives_what_predict_gives(runs, husky_model):
