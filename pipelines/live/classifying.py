@@ -172,12 +172,6 @@ class Classifier(TerrainSource):
     ----------
     failed : number of windows that the model refused, by error message
 
-    Raises
-    ------
-    DataError
-        if the model requires a stream or a channel that is not computed live, or was trained on the estimates
-        of another filter than runs here.
-
     Notes
     -----
     Models and samples go through one queue, so that what was taken before a model is for the model before.
@@ -214,7 +208,7 @@ class Classifier(TerrainSource):
         return counts | {f"window: refused, {why}": n for why, n in self.failed.items()}
 
     def _feed_of(self, model: TerrainModel) -> WindowFeed:
-        """Return what cuts the windows of a model; ``DataError`` where it does not suit what runs here."""
+        """Return what cuts the windows of a model; ``DataError``, as of :func:`feed_of`, where it does not suit."""
         return feed_of(model.info, self._channels, self._robot, self._filter_name)
 
     def check(self, model: TerrainModel | None) -> None:

@@ -108,11 +108,6 @@ class LivePilot(Chain):
         return fresh
 
     @property
-    def terrains(self) -> tuple[str, ...]:
-        """Entries of the table, in the order of the status ``terrain_code``."""
-        return tuple(self.control.terrains)
-
-    @property
     def target_ratio(self) -> float:
         """Target slip in traction that is aimed for; NaN before the first step."""
         return self.control.target_ratio

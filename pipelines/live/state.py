@@ -135,13 +135,7 @@ def from_text(text: str | bytes, place: str = "saved state") -> LiveState:
 
 
 def load_state(path: Path) -> LiveState | None:
-    """Return the state of a file; None where there is none.
-
-    Raises
-    ------
-    DataError
-        if it cannot be read or is damaged.
-    """
+    """Return the state of a file; None where there is none, ``DataError`` for one that cannot be read."""
     return (
         from_text(read_regular(path, str(path), DataError, LARGEST_FILE), str(path))
         if path.exists()

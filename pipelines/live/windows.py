@@ -63,15 +63,7 @@ def live_filter(info: ModelInfo, robot: Robot) -> str:
 def live_estimator(
     info: ModelInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
 ) -> tuple[Filter | None, Robot]:
-    """Return the filter whose estimates a model needs, or None, and the robot as filters take it.
-
-    Raises
-    ------
-    DataError
-        if the robot does not run the filter that the model was trained with.
-    ConfigError
-        if a channel that the filter needs is not measured.
-    """
+    """Return the filter whose estimates a model needs, or None, and the robot as filters take it."""
     driven, correction = correct_live(robot)
     if not needs_filter(info, channels):
         return None, driven

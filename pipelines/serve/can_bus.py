@@ -98,21 +98,16 @@ def open_bus(interface: str, channel: str, bitrate: int | None = None) -> Any:
 class Link:
     """Frames from and to a bus, read by a notifier of python-can; a bus that fails is opened again.
 
-    No error of the bus comes through, all are counted.
+    No later error of the bus comes through, all are counted.
 
     Parameters
     ----------
-    make_bus : opens the bus; called at once, and again after an error of it
+    make_bus : opens the bus; called at once, where its errors come through, and again after an error of it
 
     Attributes
     ----------
     errors : by message
     n_out : frames sent
-
-    Raises
-    ------
-    ConfigError
-        if the bus cannot be opened at first.
     """
 
     def __init__(self, make_bus: Callable[[], Any]) -> None:

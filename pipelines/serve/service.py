@@ -45,11 +45,6 @@ class Service:
     ----------
     hub : of the sessions
     url : of its HTTP side
-
-    Raises
-    ------
-    TerrainError
-        in one sentence, if anything does not fit: what :class:`~pipelines.serve.hub.Hub` needs, or the port.
     """
 
     def __init__(self, settings: Settings) -> None:

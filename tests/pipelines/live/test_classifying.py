@@ -19,18 +19,16 @@ from pipelines.live.classifying import (
     classify_window,
 )
 from pipelines.live.observer import Observer
-from pipelines.live.pilot import LivePilot
-from terrain.control.pilot_settings import PilotSettings, PilotStatus
-from terrain.control.slip_table import load_slip_table
-from terrain.control.switching import SWITCHING, OutputStatus
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.logs.schema import ESTIMATOR_CHANNELS
-from terrain.records import Reading, Sample, Stream
+from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 
-ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
+from . import until
+
+ROBOT = load_robot("agrimaro")
 
 
 def estimated(run):
@@ -74,34 +72,7 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(swerve_model, 
     assert np.abs(late_s).max() < 0.05
 
 
-def test_the_belief_outlasts_a_stop_and_ends_when_a_sensor_of_its_windows_is_lost(swerve_model, survey):
-    """Windows need the IMU: after 5 s of driving without one the terrain is unknown."""
-    settings = PilotSettings(switching=SWITCHING._replace(unconfirmed_max_s=5.0))
-    standing, lost = (LivePilot(ROBOT, TABLE, Classifier(swerve_model, ROBOT), settings) for _ in range(2))
-    seen = []
-    for sample in replay(survey):
-        accepted = standing.step(sample).status["terrain_code"]
-        if sample.time_s > 12.0:
-            sample.readings.pop("imu", None)
-        seen.append((sample.time_s, *lost.step(sample).status.values()))
-    assert standing.terrains[int(accepted)] == "grass"
-    for k in range(1500):  # half a minute
-        last = standing.step(Sample(sample.time_s + 0.02 * (k + 1), np.zeros(3), {})).status
-    assert last["terrain_code"] == accepted
-    fields = ("time_s", *PilotStatus._fields)
-    time_s, code, output, target = (
-        np.array([row[fields.index(name)] for row in seen])
-        for name in ("time_s", "terrain_code", "output_code", "target_ratio")
-    )
-    last_s = time_s[output == OutputStatus.ACCEPTED].max()
-    assert last_s < 12.5
-    assert (code[(time_s > last_s) & (time_s < last_s + 4.9)] >= 0).all()
-    assert (code[time_s > last_s + 5.1] == -1).all()
-    assert target[-1] == TABLE.lookup("")["traction"].slip_ratio
-    assert np.abs(np.diff(target)).max() <= SWITCHING.rate_ratio * 0.0201
-
-
-# What a model says of a window, and the thread that asks it
+# The thread that cuts and classifies
 
 
 Window = namedtuple("Window", "start_s length_s")
@@ -111,34 +82,10 @@ def window(start_s):
     return Window(np.array([start_s]), 2.0)
 
 
-def stub_model(row=(0.25, 0.75)):
-    """A model that gives a row of probabilities, or raises, for any window."""
-
-    def predict_proba(_):
-        if isinstance(row, Exception):
-            raise row
-        return np.array([row])
-
-    recipe = SimpleNamespace(classes_=np.array(["a", "b"]), predict_proba=predict_proba)
-    info = SimpleNamespace(classes=("a", "b"), channels={}, rate_hz={}, rule=row, filter="")
-    return SimpleNamespace(recipe=recipe, info=info, novelty=None, support=None, over_time=None)
-
-
-@pytest.mark.parametrize(
-    ("row", "terrain", "refused"),
-    [
-        ([0.25, 0.75], "b", ""),
-        (ValueError("Input X contains NaN."), "", "Input X contains NaN."),
-        ([np.nan, 0.5], "", "a probability is not finite"),
-    ],
-)
-def test_the_output_is_the_class_of_the_largest_probability_or_why_there_is_none(row, terrain, refused):
-    found = classify_window(stub_model(row), window(4.0))
-    assert found[:3] == (4.0, 6.0, terrain)
-    assert found.refused == refused
-    np.testing.assert_array_equal(found.probabilities, [np.nan, np.nan] if refused else row)
-    np.testing.assert_array_equal(found.probability, np.nan if refused else 0.75)
-    assert found.took_s > 0.0
+def stub_model(name):
+    """A model of a name that cuts any windows."""
+    info = SimpleNamespace(classes=("a",), channels={}, rate_hz={}, rule=name, filter="")
+    return SimpleNamespace(info=info, over_time=None)
 
 
 @pytest.fixture
@@ -172,14 +119,6 @@ def begun(thread, name="m"):
     robot = Classifier(stub_model(name), None, thread)
     until(lambda: not robot._waiting and robot._due_s == 0.0)
     return robot
-
-
-def until(fact, timeout_s=10.0):
-    """Wait for something to become true."""
-    end_s = time.monotonic() + timeout_s
-    while not fact():
-        assert time.monotonic() < end_s, "it did not become true"
-        time.sleep(0.005)
 
 
 def outputs(robot, n):

@@ -176,18 +176,21 @@ def test_samples_that_name_their_columns_need_no_channels(mower_model, two_drive
         observed(Observer(mower_model), RunLog("m", "mower", streams))
 
 
-def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives):
+@pytest.mark.parametrize("why", ["Input X contains NaN.", "a probability is not finite"])
+def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives, why):
     class Refusing:
         classes_ = mower_model.recipe.classes_
 
         def predict_proba(self, windows):
-            raise ValueError("Input X contains NaN.")
+            if "Input" in why:
+                raise ValueError(why)
+            return np.array([[math.nan, 0.5]])
 
     observer = Observer(mower_model._replace(recipe=Refusing()))
     found = observed(observer, two_drives[0])
-    assert {(one.refused, one.terrain) for one in found} == {("Input X contains NaN.", "")}
-    assert np.isnan([one.probability for one in found]).all()
-    assert observer.dropped == {"window: refused, Input X contains NaN.": len(found)}
+    assert {(one.refused, one.terrain) for one in found} == {(why, "")}
+    assert np.isnan([(one.probability, *one.probabilities) for one in found]).all()
+    assert observer.dropped == {f"window: refused, {why}": len(found)}
     assert observer.belief.terrain == ""
 
 

@@ -92,8 +92,9 @@ def test_invalid_settings_are_refused_in_one_sentence(robot, table, settings, me
     assert "\n" not in str(refused.value)
 
 
-def test_a_wheel_that_does_not_follow_its_command_disagrees_and_is_not_called_lost():
-    live = pilot()
+@pytest.mark.parametrize("follows", [True, False], ids=["driven", "watched"])
+def test_a_wheel_that_does_not_follow_its_command_disagrees_unless_another_controller_drives(follows):
+    live = pilot(follows=follows)
     for sample in recorded():
         readings = dict(sample.readings)
         if "wheels" in readings and sample.time_s > 6.0:
@@ -101,7 +102,7 @@ def test_a_wheel_that_does_not_follow_its_command_disagrees_and_is_not_called_lo
             values[:, 1] *= 0.5
             readings["wheels"] = Reading(readings["wheels"].time_s, values)
         live.step(sample._replace(readings=readings))
-    assert live.health["wheel_2"] == "disagrees"
+    assert (live.health["wheel_2"] == "disagrees") is follows
     assert live.estimate.health[SENSORS.index("wheel_2")] == Health.LOST
 
 

@@ -34,6 +34,8 @@ from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil
 
+from . import until
+
 AGRIMARO = load_robot("agrimaro")
 IMU = ("gyro_z_radps", "accel_z_mps2")
 CHANNELS = {"imu": IMU, "wheels": ("speed_left_mps", "speed_right_mps")}
@@ -61,14 +63,6 @@ def recorded(recorder, n=50, start=0):
     for k in range(start, start + n):
         recorder.readings(sample(k / 50))
     return recorder
-
-
-def until(fact, timeout_s=10.0):
-    """Wait for something to become true."""
-    end_s = time.monotonic() + timeout_s
-    while not fact():
-        assert time.monotonic() < end_s, "it did not become true"
-        time.sleep(0.005)
 
 
 def read(path):

@@ -5,8 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from pipelines.live.chain import CommandStatus
 from pipelines.live.classifying import Classifier
@@ -197,39 +195,6 @@ def test_a_step_that_fails_commands_to_stand(samples, monkeypatch, fault, status
     monkeypatch.undo()
     session.put(None, [0.5, 0.0, 0.0], NOW_S + 3.1)
     assert session.step(NOW_S + 3.1).status is CommandStatus.OK
-
-
-leaves = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3) | st.binary(max_size=3)
-names = st.sampled_from(["imu", "wheels", "odometry"]) | st.text(max_size=3)
-anything = st.recursive(
-    leaves, lambda part: st.lists(part, max_size=4) | st.dictionaries(names, part, max_size=4), max_leaves=12
-)
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.tuples(anything, anything), max_size=6))
-def test_whatever_is_sent_nothing_raises_and_commands_are_finite(messages):
-    session = agrimaro()
-    for k, (streams, twist) in enumerate(messages):
-        session.put(streams, twist, NOW_S + k / 10)
-        for numbers in session.step(NOW_S + k / 10).command[:3]:
-            assert np.isfinite(numbers).all()
-
-
-def test_what_was_refused_is_counted_by_reason():
-    session = agrimaro()
-    assert session.put({"imu": [[0.0], [[1.0] * 9]]}, None, 1.0) == 1
-    for broken in ("text", [1], {"lidar": [[0.0], [[1.0]]]}, {"imu": 5}, {"imu": [[0.0], [[1.0]]]}):
-        assert session.put(broken, None, 1.0) == 0
-    session.put(None, [1.0, math.nan, 0.0], 1.0)
-    session.put(None, "fast", 1.0)
-    assert session.dropped == {
-        "samples that are not given by stream": 2,
-        "stream that was not announced": 1,
-        "sample that is no pair of stamps and rows": 1,
-        "imu: not rows of 9 numbers": 1,
-        "twist that is not three numbers": 2,
-    }
 
 
 def swap_at(time_s, model):

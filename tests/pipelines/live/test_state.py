@@ -4,8 +4,6 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
@@ -64,7 +62,7 @@ def test_a_pilot_that_is_restored_knows_the_biases_and_the_terrain_at_once(sampl
     assert bias_of(after).mean == bias_of(before).mean
     assert after.target_ratio == before.target_ratio
     first = next(sample for sample in samples if sample.time_s >= 40.0)
-    assert after.terrains[int(after.step(first).status["terrain_code"])] == "grass"
+    assert after.step(first).status["terrain_code"] == list(load_slip_table().targets).index("grass")
     assert anew.step(first).status["terrain_code"] == -1.0
     driven(after, samples, 40.1, 41.0), driven(anew, samples, 40.1, 41.0)
     assert abs(bias_of(after).mean - 0.02) < 0.004
@@ -125,18 +123,6 @@ def test_open_loop_pilots_and_observers_have_a_state_without_biases(mower_model)
     assert observer.belief.terrain == observer.state(7.0).terrain == "grass"
 
 
-finite = st.floats(-1e6, 1e6)
-
-
-@given(
-    finite, st.tuples(finite, st.floats(1e-9, 1e3)), st.text(max_size=20), st.floats(0, 1) | st.just(math.nan)
-)
-def test_a_state_is_read_as_it_was_written(saved_s, bias, terrain, probability):
-    state = LiveState("r", "f", saved_s, {"gyro_bias_radps": Bias(*bias)}, terrain, probability, math.nan)
-    assert to_text(from_text(to_text(state))) == to_text(state)
-    assert from_text(to_text(state)).biases == state.biases
-
-
 def test_a_state_with_one_wrong_letter_anywhere_is_refused_or_read_as_it_was():
     text, n_refused = to_text(STATE), 0
     for k, letter in enumerate(text):
@@ -151,8 +137,10 @@ def test_a_state_with_one_wrong_letter_anywhere_is_refused_or_read_as_it_was():
 def test_a_file_is_read_back_or_refused_in_one_sentence_with_its_name(tmp_path):
     path = tmp_path / "robot.json"
     assert load_state(path) is None
-    path.write_text(to_text(STATE))
-    assert load_state(path) == STATE
+    unknown = replace(STATE, robot="\u00e9\n", terrain="", probability=math.nan, target_ratio=math.nan)
+    for state in (STATE, unknown):
+        path.write_text(to_text(state))
+        assert repr(load_state(path)) == repr(state)
     negative = to_text(STATE).replace("0.001", "-0.001")
     odd = ["", "[]", "null", "[" * 60_000, "\x00", "1" * 5000, "\udcff", " " * 100_000, negative]
     for damaged in (*odd, '{"version": 2, "sha256": "", "state": {}}'):

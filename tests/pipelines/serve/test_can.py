@@ -15,17 +15,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.data.can_codec import (
-    channels_of,
-    decode,
-    encode,
-    load_layout,
-)
+from pipelines.data.can_codec import channels_of, decode, encode, load_layout
 from pipelines.live.chain import CommandStatus, Step
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bus import Bridge, Link, open_bus
 from pipelines.serve.serve import Settings, run
-from terrain.control.drive_metrics import drive_history, slip_peak
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.situations import SituationOptions, make_situation
 from terrain.control.slip_table import load_slip_table
@@ -349,6 +343,8 @@ def test_a_bus_that_fails_is_opened_again_and_what_it_refuses_is_counted(monkeyp
         opened.append(FailingBus(odd if not opened else []))
         return opened[-1]
 
+    with pytest.raises(ConfigError, match="the bus socketcan 'no0' cannot be opened"):
+        Link(lambda: open_bus("socketcan", "no0"))
     link, bridge = Link(make_bus), bridged()
     assert not link.send([can.Message(arbitration_id=0x101, data=bytes(8), is_extended_id=False)])
     until(lambda: link.errors["receive: Network is down"])
@@ -406,21 +402,6 @@ def test_a_signal_ends_it_in_order():
     assert result.as_json()["states"] == {"NO_TWIST": n_steps}
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"can": "nothing:no0"}, "python-can knows"),
-        ({"can": "no0"}, "the bus socketcan 'no0' cannot be opened"),
-        ({"can": "virtual:x", "robot": "husky"}, "robot husky: drive 'skid_steer' has no pilot"),
-        ({"can": "virtual:x", "dbc": "none.dbc"}, "none.dbc"),
-    ],
-)
-def test_what_cannot_be_driven_is_one_sentence(options, sentence):
-    with pytest.raises(ConfigError, match=sentence) as raised:
-        run(Settings(**options, duration_s=0.1))
-    assert "\n" not in str(raised.value)
-
-
 class RobotSide:
     """The Teensy: sends samples and the desired twist, adds corrections to its own kinematics."""
 
@@ -456,19 +437,14 @@ def driven(controller):
     """A start that is commanded as a step, on grass."""
     where = make_situation("straight", ROBOT, "grass", 3, SituationOptions(accel_mps2=np.inf, duration_s=8.0))
     given, options = (ROBOT, where.scenario, where.soils, where.seed), {"conditions": where.conditions}
-    found = simulate(*given, **options, controller=controller, command_delay_s=0.04)
-    return found, slip_peak(drive_history(found, ROBOT, where.conditions.radius_factors))
+    return simulate(*given, **options, controller=controller, command_delay_s=0.04)
 
 
 def test_the_loop_over_can_drives_as_the_one_without(as_sent):
-    """Slip of a start is limited as without CAN, and the commands differ by little more than roundings."""
-    direct, direct_peak = driven(pilot("traction").step)
-    _, plain_peak = driven(pilot("plain").step)
-    side = RobotSide(as_sent)
+    """The commands differ by little more than roundings."""
+    direct, side = driven(pilot("traction").step), RobotSide(as_sent)
     with side.bus, side.other:
-        over_can, peak = driven(side.step)
-    assert peak == pytest.approx(direct_peak, abs=0.002)
-    assert peak < 0.5 * plain_peak
+        over_can = driven(side.step)
     for wheel in (f"wheel_{i}_radps" for i in (1, 2, 3)):
         apart = over_can.streams["commands"].channel(wheel) - direct.streams["commands"].channel(wheel)
         assert np.abs(apart).max() < 10 * RESOLUTION_RADPS

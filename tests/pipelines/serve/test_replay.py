@@ -13,14 +13,11 @@ import pytest
 
 from pipelines.learn.model_file import write_model
 from pipelines.learn.predict import predict
-from pipelines.live.pilot import LivePilot
 from pipelines.serve.replay import chain_of_run, replay_run
 from pipelines.serve.serve import Settings
 from pipelines.serve.serve import run as serve
-from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.logs.replay import replay
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
@@ -78,19 +75,6 @@ def test_a_pilot_gives_what_predict_gives_though_another_controller_drove(grass,
     assert result.windows[-1].believed == "grass"
     grass_ratio = TABLE.lookup("grass")["traction"].slip_ratio
     assert result.windows[-1].target_ratio == pytest.approx(grass_ratio, abs=0.05)
-
-
-def test_wheels_of_a_log_are_not_compared_with_commands_that_nothing_drove(grass):
-    """Where they are, as on a robot, wheels that do something else are found, and left out."""
-    worst = {}
-    for follows in (True, False):
-        pilot, names = LivePilot(AGRIMARO, settings=PilotSettings(follows=follows)), set()
-        for sample in replay(grass):
-            pilot.step(sample._replace(twist=np.zeros(3)))
-            names |= {name for name, health in pilot.health.items() if health == "disagrees"}
-        worst[follows] = {name for name in names if name.startswith(("wheel", "motor"))}
-    assert worst[True]
-    assert not worst[False]
 
 
 def test_a_pilot_needs_no_model_and_another_robot_does(grass, runs):

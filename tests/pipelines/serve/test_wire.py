@@ -12,6 +12,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import msgpack
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -63,8 +64,8 @@ def decoded(monkeypatch):
     return found
 
 
-def samples(stamp_s, speed=20.0, **more):
-    content = {"type": "samples", "streams": {"wheels": [[stamp_s], [[speed] * 3]]}, "twist": [0.5, 0.0, 0.0]}
+def samples(stamp_s, **more):
+    content = {"type": "samples", "streams": {"wheels": [[stamp_s], [[20.0] * 3]]}, "twist": [0.5, 0.0, 0.0]}
     return {**content, **more}
 
 
@@ -120,22 +121,28 @@ MESSAGE = st.one_of(
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
-@given(st.lists(MESSAGE, min_size=1, max_size=20), st.sampled_from([0, 50]))
-def test_each_message_is_answered_or_taken(service, hello, given_messages, rate_hz):
-    with service.socket() as stranger:
-        assert ask(stranger, hello("stranger", rate_hz=rate_hz))["type"] == "welcome"
+@given(st.lists(MESSAGE, min_size=1, max_size=20), st.sampled_from([0, 50]), st.booleans())
+def test_each_message_is_answered_or_taken(driving, given_messages, rate_hz, packed):
+    """Of a robot that gets commands: they are numbers, whatever is sent."""
+    with driving.socket() as stranger:
+        first = {**DRIVEN, "session": "stranger", "rate_hz": rate_hz}
+        assert ask(stranger, first, packed=packed)["type"] == "welcome"
         for message in given_messages:
             stranger.send(message)
         answer = ask(stranger, {"type": "THE END"})
         while "THE END" not in str(answer):
-            assert answer["type"] in ("error", "step")
-            if answer["type"] == "error":
+            if answer["type"] == "step":
+                assert np.isfinite(
+                    [answer["command"][name] for name in ("wheel_radps", "steer_rad", "twist")]
+                ).all()
+            else:
+                assert answer["type"] == "error"
                 assert answer["code"] in ("malformed", "unknown-type")
                 assert 5 < len(answer["message"]) < 500
             text = stranger.recv(10)
             answer = msgpack.unpackb(text) if isinstance(text, bytes) else json.loads(text)
-    until(lambda: "stranger" not in service.hub.sessions)
-    assert service.hub.trouble == {}
+    until(lambda: "stranger" not in driving.hub.sessions)
+    assert driving.hub.trouble == {}
 
 
 def test_large_messages_are_decoded_in_a_thread_too_large_ones_refused_and_larger_ones_close_the_connection(
@@ -305,10 +312,18 @@ def test_a_slow_receiver_that_goes_on_gets_fresh_commands(driving, monkeypatch):
 def test_a_message_of_which_a_part_is_refused_gives_an_error_and_a_step_of_the_rest(driving):
     with driving.socket() as robot:
         assert ask(robot, {**DRIVEN, "session": "twist", "rate_hz": 0})["type"] == "welcome"
-        for k, twist in enumerate(([math.nan] * 3, [0.5, None, 0.0], [0.5, 0.0], [1e999, 0, 0], "x", {})):
-            robot.send(json.dumps(samples(0.02 * k, step=True, time_s=0.02 * k, twist=twist)))
+        twists = ([math.nan] * 3, [0.5, None, 0.0], [0.5, 0.0], [1e999, 0, 0], "x", {})
+        odd = [
+            *(({"twist": twist}, "twist that is not three numbers") for twist in twists),
+            *(({"streams": streams}, "samples that are not given by stream") for streams in ("text", [1])),
+            ({"streams": {"lidar": [[0.0], [[1.0]]]}}, "stream that was not announced"),
+            ({"streams": {"wheels": 5}}, "sample that is no pair of stamps and rows"),
+            ({"streams": {"wheels": [[0.0], [[1.0]]]}}, "wheels: not rows of 3 numbers"),
+        ]
+        for k, (changed, why) in enumerate(odd):
+            robot.send(json.dumps(samples(0.02 * k, step=True, time_s=0.02 * k, **changed)))
             answers = {answer["type"]: answer for answer in (json.loads(robot.recv(3)) for _ in range(2))}
-            assert "twist that is not three numbers" in answers["error"]["message"]
+            assert answers["error"]["message"] == f"samples: {why}"
             assert answers["step"]["message"] == answers["step"]["number"] == k + 1
     assert driving.hub.trouble == {}
 
