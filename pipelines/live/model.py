@@ -90,14 +90,12 @@ class Assessed(NamedTuple):
     probability : (n, k) in the order of the model's classes
     novelty : (n,) score; NaN where the model has none
     unknown : (n,) whether the window is like no terrain that was learned
-    n_runs : (n,) training runs of the predicted terrain near the window's motion; NaN where not counted
-    supported : (n,) whether they support the prediction; NaN where not counted
+    supported : (n,) whether training runs near the window's motion support the prediction; NaN where not counted
     """
 
     probability: Array
     novelty: Array
     unknown: Array
-    n_runs: Array
     supported: Array
 
 
@@ -109,8 +107,8 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
     DataError
         if the windows are not those that the model requires.
     """
-    nothing = np.full(len(windows), np.nan)
-    novelty, features, recipe = nothing, None, model.recipe
+    novelty = supported = np.full(len(windows), np.nan)
+    features, recipe = None, model.recipe
     if model.novelty is not None:
         features = recipe.matrix.of(windows)
         novelty = novelty_scores(model.novelty, features)
@@ -121,14 +119,10 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
     unknown = np.zeros(len(windows), dtype=bool)
     if model.novelty is not None:
         unknown = ~(novelty <= model.novelty.threshold)
-    motion = None if model.support is None else window_motion(windows)
-    if model.support is None or motion is None:
-        return Assessed(probability, novelty, unknown, nothing, nothing)
-    near = model.support.near_runs(motion.speed_mps, motion.yaw_rate_radps)
-    support = support_of(probability, near)
-    return Assessed(
-        probability, novelty, unknown, support.n_runs.astype(float), support.supported.astype(float)
-    )
+    if model.support is not None and (motion := window_motion(windows)) is not None:
+        near = model.support.near_runs(motion.speed_mps, motion.yaw_rate_radps)
+        supported = support_of(probability, near).supported.astype(float)
+    return Assessed(probability, novelty, unknown, supported)
 
 
 def class_sets(model: TerrainModel, probability: Array) -> list[tuple[str, ...]] | None:

@@ -235,7 +235,7 @@ class RobotSession:
         self.chain.replace(served.model, served.table)
         self.served = served
 
-    def put(self, streams: Any, twist: Any = None, now_s: float | None = None) -> int:
+    def put(self, streams: Any, twist: Any, now_s: float) -> int:
         """Take the samples of a message; return how many rows of it were taken.
 
         Parameters
@@ -245,7 +245,6 @@ class RobotSession:
         twist : desired motion ``(3,)``; None where the message has none
         now_s : of the local clock that never goes back
         """
-        now_s = monotonic() if now_s is None else now_s
         self._n_messages += 1
         before = self.inbox.received.total()
         if isinstance(streams, Mapping):

@@ -67,29 +67,6 @@ def plain(samples, swerve_model):
     return drive(agrimaro(swerve_model), samples)
 
 
-def steered(pilot, samples):
-    """A pilot that begins with the steering where it is measured first."""
-    pilot.start_steering(samples[0].readings["steering"].values[0])
-    return pilot
-
-
-def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(samples, plain, swerve_model):
-    pilot = steered(LivePilot(ROBOT, TABLE, Classifier(swerve_model, ROBOT)), samples)
-    n_driving = 0
-    for output, sample in zip(plain, samples, strict=True):
-        desired = pilot.step(sample)
-        assert output.status is CommandStatus.OK
-        assert output.time_s == pytest.approx(sample.time_s, abs=1e-9)
-        np.testing.assert_allclose(output.command.wheel_radps, desired.wheel_radps, atol=1e-6)
-        np.testing.assert_allclose(output.command.steer_rad, desired.steer_rad, atol=1e-6)
-        n_driving += float(np.abs(desired.wheel_radps).max()) > 1.0
-    assert n_driving > 500
-    last, driving = plain[-1].observation, plain[600].observation
-    assert (last["terrain"], last["target_of"]) == ("grass", "grass")
-    assert np.isfinite(driving["slip_ratio"]).all()
-    assert driving["sensors"]["gyro"] == "fresh"
-
-
 def test_two_sessions_see_what_observers_alone_see_and_do_not_know_of_each_other(mower_model, two_drives):
     runs = two_drives[0], two_drives[4]
     sessions, observers = ([make(mower_model) for _ in runs] for make in (mower, Observer))
@@ -125,10 +102,12 @@ def test_columns_are_taken_by_name_and_what_is_not_sent_is_unknown(samples, plai
     assert all(np.isfinite(o.command.wheel_radps).all() for o in outputs)
 
 
-def test_a_robot_that_asks_for_its_steps_gets_them_at_its_own_time_however_late_messages_are(samples):
-    rng, now_s = np.random.default_rng(2), NOW_S
-    session, pilot = agrimaro(), steered(LivePilot(ROBOT, TABLE), samples)
-    for sample in samples:
+def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(samples, plain, swerve_model):
+    """Also where messages are late, of a robot that says at which time of its own it asks for a step."""
+    rng, now_s, n_driving = np.random.default_rng(2), NOW_S, 0
+    session, pilot = agrimaro(swerve_model), LivePilot(ROBOT, TABLE, Classifier(swerve_model, ROBOT))
+    pilot.start_steering(samples[0].readings["steering"].values[0])
+    for sample, ticked in zip(samples, plain, strict=True):
         now_s = max(now_s, NOW_S + sample.time_s + rng.exponential(0.05))
         streams = {name: (t.tolist(), values.tolist()) for name, (t, values) in sample.readings.items()}
         session.put(streams, sample.twist.tolist(), now_s)
@@ -136,6 +115,14 @@ def test_a_robot_that_asks_for_its_steps_gets_them_at_its_own_time_however_late_
         assert output.time_s == sample.time_s
         np.testing.assert_array_equal(output.command.wheel_radps, desired.wheel_radps)
         np.testing.assert_array_equal(output.command.steer_rad, desired.steer_rad)
+        assert (ticked.status, ticked.time_s) == (CommandStatus.OK, pytest.approx(sample.time_s, abs=1e-9))
+        np.testing.assert_allclose(ticked.command.wheel_radps, desired.wheel_radps, atol=1e-6)
+        n_driving += float(np.abs(desired.wheel_radps).max()) > 1.0
+    assert n_driving > 500
+    last, driving = plain[-1].observation, plain[600].observation
+    assert (last["terrain"], last["target_of"]) == ("grass", "grass")
+    assert np.isfinite(driving["slip_ratio"]).all()
+    assert driving["sensors"]["gyro"] == "fresh"
 
 
 def test_a_desired_motion_that_is_too_old_stops_the_robot_until_a_new_one_comes(samples):
@@ -228,7 +215,7 @@ def test_a_swap_to_other_windows_goes_on_with_them_and_a_model_can_come_after_th
     assert late[-1].observation["terrain"] == "grass"
 
 
-def test_a_swap_that_does_not_suit_is_refused_and_changes_nothing(mower_model, swerve_model):
+def test_what_cannot_be_served_is_refused_in_one_sentence_and_changes_nothing(mower_model, swerve_model):
     session, driven = mower(mower_model), agrimaro(swerve_model)
     others = Served(2, swerve_model, "other", replace(TABLE, robot="husky"))
     with pytest.raises(DataError, match="neither measured nor estimated"):
@@ -239,23 +226,12 @@ def test_a_swap_that_does_not_suit_is_refused_and_changes_nothing(mower_model, s
         with pytest.raises(DataError, match="cannot be replaced by none"):
             one.swap(Served(2, None, "", TABLE))
     assert (session.served.number, session.chain.model, driven.served.number) == (1, mower_model, 1)
-
-
-@pytest.mark.parametrize(
-    ("robot", "channels", "control", "fault"),
-    [
-        (None, SENT, True, "has no description here"),
-        (load_robot("husky"), {"wheels": ("speed_left_mps",)}, True, "has no pilot, only 'swerve' has"),
-        (ROBOT, {"imu": ("gyro_z_radps",)}, False, "no model is served"),
-    ],
-)
-def test_a_request_that_cannot_be_served_is_refused_in_one_sentence(robot, channels, control, fault):
-    with pytest.raises((ConfigError, DataError), match=fault):
-        RobotSession(
-            Hello(session="one", robot="r", streams=channels, control=control),
-            Served(1, None, "", TABLE),
-            robot,
-        )
+    nobody = {"control": True}, "has no description here: commands cannot be given to it"
+    for asked, fault in (nobody, ({}, "no model is served: only a robot that asks for commands can be")):
+        with pytest.raises((ConfigError, DataError), match=fault):
+            RobotSession(
+                Hello(session="one", robot="r", streams=SENT, **asked), Served(1, None, "", TABLE), None
+            )
 
 
 def test_streams_that_stop_are_lost_and_come_back_and_a_silent_robots_terrain_becomes_unknown(
