@@ -226,8 +226,8 @@ def test_what_cannot_be_served_is_refused_in_one_sentence_and_changes_nothing(mo
         with pytest.raises(DataError, match="cannot be replaced by none"):
             one.swap(Served(2, None, "", TABLE))
     assert (session.served.number, session.chain.model, driven.served.number) == (1, mower_model, 1)
-    nobody = {"control": True}, "has no description here: commands cannot be given to it"
-    for asked, fault in (nobody, ({}, "no model is served: only a robot that asks for commands can be")):
+    unknown = {"control": True}, "has no description here: commands cannot be given to it"
+    for asked, fault in (unknown, ({}, "no model is served: only a robot that asks for commands can be")):
         with pytest.raises((ConfigError, DataError), match=fault):
             RobotSession(
                 Hello(session="one", robot="r", streams=SENT, **asked), Served(1, None, "", TABLE), None

@@ -21,14 +21,13 @@ from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bus import Bridge, Link, open_bus
 from pipelines.serve.serve import Settings, run
 from terrain.control.pilot_settings import PilotSettings
-from terrain.control.situations import SituationOptions, make_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import PERIOD_S
 from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics
 from terrain.errors import ConfigError
+from terrain.logs.replay import replay
 from terrain.records import Command
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.run import simulate_run
 
 from .strangers import until
@@ -38,8 +37,13 @@ ACTIVE, RESOLUTION_RADPS = BridgeState.ACTIVE, 0.0005
 
 
 @pytest.fixture(scope="module")
-def frames(run_frames):
-    return run_frames(LAYOUT, simulate_run(ROBOT, "grass", "arc", 7, duration_s=10.0))
+def arc():
+    return simulate_run(ROBOT, "grass", "arc", 7, duration_s=10.0)
+
+
+@pytest.fixture(scope="module")
+def frames(run_frames, arc):
+    return run_frames(LAYOUT, arc)
 
 
 def pilot(controller):
@@ -395,53 +399,14 @@ def test_a_signal_ends_it_in_order():
     assert result.as_json()["states"] == {"NO_TWIST": n_steps}
 
 
-class RobotSide:
-    """The Teensy: sends samples and the desired twist, adds corrections to its own kinematics."""
-
-    def __init__(self, as_sent):
-        self._as_sent, channel = as_sent, f"loop-{uuid.uuid4()}"
-        self.bus = can.Bus(interface="virtual", channel=channel, preserve_timestamps=True)
-        self.other = can.Bus(interface="virtual", channel=channel)
-        self.bridge, self._kinematics = bridged(pilot("traction")), pilot("plain")
-        self._counters = Counter()
-        self.added = []
-
-    def _send(self, name, row, time_s):
-        for frame in encode(LAYOUT, name, self._as_sent(name, row), self._counters[name]):
-            self.bus.send(changed(frame, timestamp=float(time_s)))
-        self._counters[name] += 1
-
-    def step(self, sample):
-        for name, reading in sample.readings.items():
-            for time_s, row in zip(reading.time_s, reading.values, strict=True):
-                self._send(name, row, time_s)
-        self._send("twist", sample.twist, sample.time_s)
-        while (received := self.other.recv(0)) is not None:
-            self.bridge.receive(received, sample.time_s)
-        for frame in self.bridge.tick(sample.time_s):
-            self.other.send(frame)
-        theory = self._kinematics.step(sample)
-        added, _ = ([*decode(LAYOUT, self.bus.recv(0)).values.values()] for _ in range(2))
-        self.added.append(added)
-        return Command(theory.wheel_radps + np.array(added), theory.steer_rad, theory.twist, {})
-
-
-def driven(controller):
-    """A start that is commanded as a step, on grass."""
-    where = make_situation("straight", ROBOT, "grass", 3, SituationOptions(accel_mps2=np.inf, duration_s=8.0))
-    given, options = (ROBOT, where.scenario, where.soils, where.seed), {"conditions": where.conditions}
-    return simulate(*given, **options, controller=controller, command_delay_s=0.04)
-
-
-def test_the_loop_over_can_drives_as_the_one_without(as_sent):
-    """The commands differ by little more than roundings."""
-    direct, side = driven(pilot("traction").step), RobotSide(as_sent)
-    with side.bus, side.other:
-        over_can = driven(side.step)
-    for wheel in (f"wheel_{i}_radps" for i in (1, 2, 3)):
-        apart = over_can.streams["commands"].channel(wheel) - direct.streams["commands"].channel(wheel)
-        assert np.abs(apart).max() < 10 * RESOLUTION_RADPS
-        assert np.sqrt(np.mean(apart**2)) < 2 * RESOLUTION_RADPS
-    assert np.abs(side.added).max() > 0.5
-    assert set(side.bridge.states) == {"ACTIVE"}
-    assert not side.bridge.receiver.dropped
+def test_with_a_pilot_corrections_are_what_it_commands_beyond_plain_kinematics(frames, arc):
+    """As the robot adds them to its own kinematics, it drives as it would without CAN."""
+    direct, plain = pilot("traction"), pilot("plain")
+    expected = [
+        direct.take(sample).command.wheel_radps - plain.take(sample).command.wheel_radps
+        for sample in replay(arc)
+    ]
+    _, added, states = zip(*ticks(bridged(pilot("traction")), frames, 10.0), strict=True)
+    np.testing.assert_allclose(added, expected[1:501], atol=RESOLUTION_RADPS)
+    assert np.abs(added).max() > 1.0
+    assert set(states) == {ACTIVE}
