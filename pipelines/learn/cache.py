@@ -20,17 +20,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from features.extractor import FeatureExtractor
+from features.labelled import labelled
 from features.motion import Motion, wheel_stream, window_motion
 from features.protocols import Samples
-from features.windows import Layout, WindowRule, cut_windows, layout_of
+from features.windows import Layout, WindowCut, WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import RunLoader, run_loaders
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.learn.parallel import counted, parallel
 from pipelines.learn.recipes import recipe_of
-from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
+from pipelines.learn.settings import LearnSettings
 from pipelines.learn.training_data import TrainingData, trained_runs
 from pipelines.report.json_file import as_json
-from pipelines.report.numbers import format_counts
 from pipelines.report.results import Progress, silent
 from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError
@@ -86,17 +86,15 @@ def cached_data(
     settings: LearnSettings,
     cache_dir: Path,
     progress: Progress = silent,
-    recipe: str = FEATURE_RECIPE,
 ) -> tuple[TrainingData, list[str]]:
     """Return the labelled windows of runs by their features, out of a cache as far as they are there.
 
     Parameters
     ----------
     loaders : one a run, as :func:`loaders_of`
-    settings : how windows are cut, processes at once, and, where they have them, ``--only`` and ``--without``
+    settings : recipe, how windows are cut, processes at once, and, where they have them, ``--only`` and ``--without``
     cache_dir : folder of the cache, which several data sets and rules may share
     progress : called as runs are done
-    recipe : of features
 
     Returns
     -------
@@ -126,7 +124,7 @@ def cached_data(
     load_of = dict(zip([head.run_id or str(i) for i, head in enumerate(heads)], loaders, strict=True))
     _refuse_shared([(load_of[a], load_of[b]) for a, b in pairs if {a, b} <= used], n_jobs, progress)
     chosen = sorted(chosen, key=lambda head: head.run_id)
-    unfitted = recipe_of(settings, recipe)
+    unfitted = recipe_of(settings, settings.recipes[0])
     extractor, signal_sets = unfitted[0], unfitted[0].signal_sets
     layout = layout_of([head.sketch() for head in chosen], signal_sets, speeds=rule.steady is not None)
     extractor.fit(cut_windows([], rule, layout=layout).windows)
@@ -242,24 +240,17 @@ def _table(
         if (found := _read(file)) is None:
             raise LogError(f"{file}: was changed while it was used")
         about, columns = found
-        known = columns["terrain"] != ""
         dropped.update(about["dropped"])
-        if not known.all():
-            dropped["no single label"] += int((~known).sum())
-        kept = {name: values[known] for name, values in columns.items()}
-        parts.append({**kept, "run_id": np.full(int(known.sum()), head.run_id, dtype=object)})
+        parts.append({**columns, "run_id": np.full(len(columns["terrain"]), head.run_id, dtype=object)})
     table = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
-    n, features = len(table["run_id"]), table["features"]
-    if not n and not dropped["no single label"]:
-        raise DataError(f"not one window is left: {format_counts(dropped) or 'no run is long enough'}")
-    if not n:
-        raise DataError("no window has a terrain label: nothing can be trained or tested")
+    windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], table["terrain"])
+    cut, known = labelled(WindowCut(windows, dropped)), table["terrain"] != ""
+    features = table["features"][known]
     if np.array_equal(features, np.broadcast_to(features[:1], features.shape), equal_nan=True):
         raise DataError("no feature ever varies: nothing can be learned from them")
-    windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], table["terrain"])
     repaired = dict(sum((Counter(head.repaired) for head in heads), Counter()))
-    samples = Samples(windows, dict(dropped), windows.run_id, rule.overlap, repaired=repaired)
-    return samples, features, Motion(*(table[name] for name in Motion._fields))
+    samples = Samples(cut.windows, dict(cut.dropped), cut.windows.run_id, rule.overlap, repaired=repaired)
+    return samples, features, Motion(*(table[name][known] for name in Motion._fields))
 
 
 def _sha256(document: Any) -> str:

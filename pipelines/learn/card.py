@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 import time
+from collections import ChainMap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,19 +34,8 @@ from pipelines.live.model import ModelInfo, assess
 from pipelines.report.numbers import NOT_KNOWN, enumerated, format_value, sentence
 from pipelines.report.results import Result, described
 from pipelines.report.tree import Column, Pairs, Report, Section, Table, Text
-from terrain.classify.breakaway import Breakaway
-from terrain.classify.confidence import CoverageFigures, ReliabilityBin
-from terrain.classify.conformal_figures import ConformalFigures
-from terrain.classify.held_out import FoldFigures
 from terrain.classify.importance import ChannelImportance
-from terrain.classify.learning_curve import LearningCurve
-from terrain.classify.metrics import ClassFigures, RunFigures
-from terrain.classify.next_drives import NextDrive, SupportRow
-from terrain.classify.sequence_figures import DelayFigures, SequenceFigures
-from terrain.classify.slow_fast import SlowFast, run_speeds
-from terrain.classify.stiffness_figures import StiffnessFigures
-from terrain.classify.support_figures import PartFigures
-from terrain.classify.unknown_figures import LeftOutTerrain
+from terrain.classify.slow_fast import run_speeds
 from terrain.errors import ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import parse_document
@@ -93,14 +83,15 @@ class TrainingRecord(BaseModel):
         return dict(self)
 
 
-_RECORDS = (
-    *(Breakaway, ClassFigures, ConformalFigures, CoverageFigures, DelayFigures, FoldFigures, LearningCurve),
-    *(LeftOutTerrain, NextDrive, PartFigures, ReliabilityBin, RunFigures, SequenceFigures, SlowFast),
-    *(StiffnessFigures, SupportRow),
+_MODULES = (
+    *("breakaway", "confidence", "conformal_figures", "held_out", "learning_curve", "metrics", "next_drives"),
+    *("sequence_figures", "slow_fast", "stiffness_figures", "support_figures", "unknown_figures"),
 )
-"""Types of the fields of an evaluation, whose own module imports them for a type checker alone."""
+"""Of the types of an evaluation's fields, which its own module imports for a type checker alone."""
 
-TrainingRecord.model_rebuild(_types_namespace={kind.__name__: kind for kind in _RECORDS})
+TrainingRecord.model_rebuild(
+    _types_namespace=ChainMap(*(vars(import_module(f"terrain.classify.{name}")) for name in _MODULES))
+)
 
 
 @dataclass(frozen=True, repr=False, kw_only=True)

@@ -11,10 +11,11 @@ import pandas as pd
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
+from features.labelled import labelled
 from features.motion import window_motion
 from features.protocols import Samples
 from features.recipes import make_recipe
-from features.windows import WindowRule
+from features.windows import WindowCut, WindowRule
 from pipelines.learn.model_file import MANIFEST_FILE, model_info, read_model, write_model
 from pipelines.learn.training_data import with_limits
 from terrain.errors import ConfigError, DataError
@@ -74,16 +75,13 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         Raises
         ------
         DataError
-            if there is one terrain only, or there are too few windows of one.
+            if no window has a label, there is one terrain only, or there are too few windows of one.
         """
         windows = _windows(X)
-        terrain = windows.terrain if y is None else np.asarray(y, dtype=object)
+        terrain = np.array([name or "" for name in (windows.terrain if y is None else y)], dtype=object)
         if len(terrain) != len(windows):
             raise DataError(f"{len(terrain)} terrains for {len(windows)} windows")
-        known = np.array([bool(name) for name in terrain], dtype=bool)
-        if not known.any():
-            raise DataError("no window has a terrain label: nothing can be trained")
-        windows = replace(windows, terrain=terrain)[known]
+        windows = labelled(WindowCut(replace(windows, terrain=terrain), {})).windows
         gap = _overlap(windows)
         recipe = make_recipe(self.recipe, self.signal_sets, gap=gap, seed=self.seed, functions=self.functions)
         samples = Samples(windows, {}, windows.run_id, gap)

@@ -29,16 +29,15 @@ if TYPE_CHECKING:
 MAX_ROWS = 10
 PERCENT = ".1%"
 
-optional = partial(described, default=None)
-"""Field of a result that is None where it was not asked for, or is not known."""
+optional = partial(described, optional=True)
 
 
 @dataclass(frozen=True, repr=False)
 class CrossvalResult(Result):
     """An evaluation on held-out windows: its figures, how they were obtained, and what to know of them.
 
-    Figures are means over the repeats, intervals of 95 % over runs within classes.  What was not asked for,
-    or is not known, is None and left out of JSON, as is ``data``: where the data lie, for the next step.
+    Figures are means over the repeats, intervals of 95 % over runs within classes.  ``data``, where the data
+    lie for the next step, is not in JSON.
     """
 
     classes: tuple[str, ...] = described("terrains")
@@ -121,13 +120,10 @@ class CrossvalResult(Result):
 
     def as_json(self) -> Any:
         """Return the fields that are known by name; of checks that were made, all."""
-        always = {"accuracy_spread", "stride_s"}
+        made: tuple[str, ...] = () if self.support is None else ("supported_auc",)
         if self.learning_curve is not None:
-            always |= {"speed_only_accuracy", "stiffness", "courses", "recorded_courses"}
-        if self.support is not None:
-            always |= {"supported_auc"}
-        written = super().as_json().items()
-        return {name: value for name, value in written if name in always or getattr(self, name) is not None}
+            made += ("speed_only_accuracy", "stiffness", "courses", "recorded_courses")
+        return dict.fromkeys(made) | super().as_json()
 
     def records(self) -> Iterable[Any]:
         """Return precision, recall, F1 and windows of each terrain."""

@@ -150,14 +150,9 @@ class Predictions(Result):
     n_unsupported: int | None = described(
         "windows whose prediction no training run supports; None where not counted", default=None
     )
-    model: str | None = described("as it was asked for", default=None)
-    dataset: str | None = described("name of the data", default=None)
-    skipped: tuple[str, ...] | None = described("runs that a repairing reader had to skip", default=None)
-
-    def as_json(self) -> Any:
-        """Return all fields without those that the caller did not give."""
-        unknown = [name for name in ("model", "dataset", "skipped") if getattr(self, name) is None]
-        return {name: value for name, value in Result.as_json(self).items() if name not in unknown}
+    model: str | None = described("as it was asked for", optional=True)
+    dataset: str | None = described("name of the data", optional=True)
+    skipped: tuple[str, ...] | None = described("runs that a repairing reader had to skip", optional=True)
 
     def to_pandas(self) -> pd.DataFrame:
         """Return a row a window; its target slips in a column each."""

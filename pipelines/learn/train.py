@@ -104,16 +104,15 @@ class TrainResult(Registered):
     chosen: Mapping[str, Any] = described("hyper-parameters that inner folds chose")
     importance: tuple[ChannelImportance, ...] = described("what each channel is worth on held-out runs")
     crossval: CrossvalResult = described("evaluation on held-out runs")
-    skipped: tuple[str, ...] | None = described("runs that a repairing reader had to skip", default=None)
-    search: SearchResult | None = described("of hyper-parameters; None without one", default=None)
+    skipped: tuple[str, ...] | None = described("runs that a repairing reader had to skip", optional=True)
+    search: SearchResult | None = described("of hyper-parameters", optional=True)
     ui: str = ""
     card: ModelResult | None = None
 
     def as_json(self) -> Any:
-        """Return all described fields but those that are not known."""
-        shown = replace(self, crossval=replace(self.crossval, dataset=None, data_digest=None, skipped=None))
-        written = Registered.as_json(shown).items()
-        return {name: value for name, value in written if value is not None}
+        """Return all described fields; what they say of the data, the evaluation says no more."""
+        evaluation = replace(self.crossval, dataset=None, data_digest=None, skipped=None)
+        return super(TrainResult, replace(self, crossval=evaluation)).as_json()
 
     def records(self) -> Iterable[Any]:
         """Return precision, recall and F1 of each terrain on held-out runs."""
@@ -155,9 +154,7 @@ def run(settings: Settings, progress: Progress = silent) -> TrainResult | Regist
             runs, skipped = load(settings)
             data = data_of_runs(runs, asked)
         else:
-            data, skipped = cached_data(
-                loaders_of(settings), asked, settings.cache, progress, settings.recipe
-            )
+            data, skipped = cached_data(loaders_of(settings), asked, settings.cache, progress)
         found = train(data, asked, settings.dataset, progress)
     return replace(found, skipped=tuple(skipped))
 

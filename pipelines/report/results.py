@@ -20,7 +20,9 @@ def silent(task: str, done: int, total: int) -> None:
     """Report no progress."""
 
 
-def described(text: str, unit: str = "", *, default: Any = MISSING, form: str = "") -> Any:
+def described(
+    text: str, unit: str = "", *, default: Any = MISSING, form: str = "", optional: bool = False
+) -> Any:
     """Return a field of a result.
 
     Parameters
@@ -29,11 +31,10 @@ def described(text: str, unit: str = "", *, default: Any = MISSING, form: str = 
     unit : in SI, ``1`` of a ratio, empty where there is none
     default : where it may be left out
     form : how it is written, as :func:`pipelines.report.numbers.format_value` takes it
+    optional : None, and then left out of JSON, where it was not asked for or is not known
     """
-    metadata = {"description": text, "unit": unit, "form": form}
-    if default is MISSING:
-        return field(metadata=metadata)
-    return field(default=default, metadata=metadata)
+    metadata = {"description": text, "unit": unit, "form": form, "optional": optional}
+    return field(default=None if optional else default, metadata=metadata)
 
 
 class Result:
@@ -65,7 +66,9 @@ class Result:
         """Return the fields by name, as :func:`pipelines.report.json_file.as_json` writes them."""
         from pipelines.report.json_file import as_json
 
-        return {name: as_json(getattr(self, name)) for name in self.about()}
+        values = {name: getattr(self, name) for name in self.about()}
+        shown = (name for name in values if values[name] is not None or not self.about()[name]["optional"])
+        return {name: as_json(values[name]) for name in shown}
 
     def pairs(self, *names: str) -> list[tuple[Any, ...]]:
         """Return rows of :class:`~pipelines.report.tree.Pairs`: what fields are, their values and forms."""
@@ -92,8 +95,8 @@ class Result:
         return pd.DataFrame([as_json(record) for record in self.records()])
 
     @classmethod
-    def about(cls) -> dict[str, Mapping[str, str]]:
-        """Return description, unit and form of each described field, by its name."""
+    def about(cls) -> dict[str, Mapping[str, Any]]:
+        """Return what :func:`described` was given for each field, by its name."""
         named = {each.name: each.metadata for each in fields(cls)}  # type: ignore[arg-type]
         return {name: about for name, about in named.items() if "description" in about}
 

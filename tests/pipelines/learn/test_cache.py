@@ -42,13 +42,13 @@ def runs_dir(tmp_path, make_run):
 def cached(runs_dir, tmp_path):
     """Return a function that reads the runs through a cache: data, skipped runs, and how many were computed."""
 
-    def cached(settings=SETTINGS, folder="cache", recipe="svm", **options):
+    def cached(settings=SETTINGS, folder="cache", **options):
         left, loaders = [], run_loaders(AlignedRunsSettings(data=runs_dir, **options))
 
         def progress(task, done, total):
             left.extend([total - done] if task == "features" else [])
 
-        return *cached_data(loaders, settings, tmp_path / folder, progress, recipe), left[0]
+        return *cached_data(loaders, settings, tmp_path / folder, progress), left[0]
 
     return cached
 
@@ -75,7 +75,7 @@ def test_cached_features_are_those_of_the_runs_bit_for_bit(runs_dir, cached):
 @pytest.mark.parametrize("recipe", ["svm", "svm@imu"])
 def test_what_is_trained_is_the_same_from_two_processes(runs_dir, cached, recipe):
     asked = RecipeSettings(steady=False, n_jobs=2, recipe=recipe)
-    there, here = cached(asked, recipe=recipe)[0], data_of_runs(load_runs(runs_dir), asked)
+    there, here = cached(asked)[0], data_of_runs(load_runs(runs_dir), asked)
     assert there.runs == here.runs
     fitted = [
         each.recipe[-1].fit(each.rows, each.samples.terrain, here.samples.run_id) for each in (there, here)
