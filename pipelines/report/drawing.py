@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import textwrap
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +62,10 @@ def draw(figure: Figure) -> Drawn:
         layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.05),
     )
     FigureCanvasAgg(drawn)
-    grid = drawn.add_gridspec(len(heights), 1, height_ratios=heights)
+    grid, names = drawn.add_gridspec(len(heights), 1, height_ratios=heights), strip_names(figure)
     for i, panel in enumerate(figure.panels):
         axes = drawn.add_subplot(grid[i])
-        _draw_panel(axes, panel, strip_names(figure))
+        _draw_panel(axes, panel, names)
         if i == len(heights) - 1 and figure.x_label and not panel.x_label:
             axes.set_xlabel(figure.x_label)
     title = textwrap.fill(plain_line(figure.title), int(TITLE_LETTERS_AN_INCH * WIDTH_IN))
@@ -75,17 +76,17 @@ def draw(figure: Figure) -> Drawn:
 
 
 def _height_in(panel: Panel) -> float:
-    bars = [mark for mark in panel.marks if mark.kind == "bars"]
-    if bars:
-        return 0.6 + BAR_HEIGHT_IN * len(bars[0].x) * max(1.0, 0.7 * len(bars))
-    if all(mark.kind == "strip" for mark in panel.marks):
+    kinds = Counter(mark.kind for mark in panel.marks)
+    if kinds["bars"]:
+        return 0.6 + BAR_HEIGHT_IN * len(panel.marks[0].x) * max(1.0, 0.7 * kinds["bars"])
+    if set(kinds) == {"strip"}:
         return STRIP_HEIGHT_IN
     return 4.5 if panel.equal else PANEL_HEIGHT_IN
 
 
 def strip_names(figure: Figure) -> list[str]:
     """Return the names of all intervals of a figure, each of which has one colour in all panels."""
-    marks = [mark for panel in figure.panels for mark in panel.marks if mark.kind == "strip"]
+    marks = (mark for panel in figure.panels for mark in panel.marks if mark.kind == "strip")
     return list(dict.fromkeys(name for mark in marks for _, _, name in mark.x))
 
 

@@ -38,10 +38,11 @@ def format_value(value: Any, form: str = "", unit: str = "") -> str:
     >>> format_value((0.7236, 0.9079), ".1%"), format_value(0.12648, unit="m/s")
     ('72.4 to 90.8\xa0%', '0.126\xa0m/s')
     """
-    values: tuple[Any, ...] = (value,)
-    if isinstance(value, tuple) and len(value) == 2 and not any(isinstance(end, str) for end in value):
-        values = tuple(0.0 if isinstance(end, float) and abs(end) < TINY else end for end in value)
-    texts = [_bare(each, form) for each in values]
+    pair = isinstance(value, tuple) and len(value) == 2
+    if pair and not isinstance(value[0], str) and not isinstance(value[1], str):
+        texts = [_bare(0.0 if isinstance(end, float) and abs(end) < TINY else end, form) for end in value]
+    else:
+        texts = [_bare(value, form)]
     if NOT_KNOWN in texts:
         return NOT_KNOWN
     ending = "%" if form.endswith("%") else unit
