@@ -105,10 +105,6 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
 class ClassifierThread:
     """A thread that cuts and classifies the windows of any number of robots, one after the other.
 
-    Parameters
-    ----------
-    classify : what is done with a window
-
     Attributes
     ----------
     failures : number of errors that were not foreseen, by type; each costs its window
@@ -120,8 +116,7 @@ class ClassifierThread:
     >>> thread.stop()
     """
 
-    def __init__(self, classify: Callable[[TerrainModel, Windows], WindowOutput] = classify_window) -> None:
-        self.classify = classify
+    def __init__(self) -> None:
         self.failures: Counter[str] = Counter()
         self._pool = ThreadPoolExecutor(1, "classifier")
         self._n_due = self._n_done = 0
@@ -280,7 +275,6 @@ class Classifier(TerrainSource):
 
     def _work(self) -> None:
         """Cut and classify what waits."""
-        classify = classify_window if self._thread is None else self._thread.classify
         try:
             while self._waiting:
                 taken = self._waiting.popleft()
@@ -288,7 +282,7 @@ class Classifier(TerrainSource):
                     self._part = taken
                 elif self._part is not None:
                     for window in self._part.feed.push(*taken):
-                        self._finished.append(classify(self._part.model, window))
+                        self._finished.append(classify_window(self._part.model, window))
         finally:
             if self._part is not None:
                 due_s = self._part.feed.due_s  # minus infinity before all streams have begun

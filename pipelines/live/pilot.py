@@ -45,7 +45,6 @@ class LivePilot(Chain):
     table : target slips
     source : of the current terrain; without one it stays unknown
     settings : controller and its settings
-    steer_rad : (3,) last command of the steering
     channels : of each stream, in the order of the columns of the samples that :meth:`take` is given; what is
         not among them is unknown.  Where the steering is measured, :meth:`take` begins with it where it stands
 
@@ -76,7 +75,6 @@ class LivePilot(Chain):
         table: SlipTable | None = None,
         source: TerrainSource | None = None,
         settings: PilotSettings = DEFAULT_SETTINGS,
-        steer_rad: Array | None = None,
         channels: Mapping[str, Sequence[str]] = CHANNELS,
     ) -> None:
         table = load_slip_table() if table is None else table
@@ -86,7 +84,7 @@ class LivePilot(Chain):
         if settings.controller not in OPEN_LOOP:
             self._filter = LiveEstimator(driven, PILOT_FILTER, correction=correction)
         states = () if self._filter is None else self._filter.states
-        self.control = RobotControl(driven, table, settings, states, steer_rad)
+        self.control = RobotControl(driven, table, settings, states)
         self._steering_zeros_rad = np.array(driven.steering_zeros_rad)
         self._columns = {
             stream: None if tuple(channels[stream]) == names else places_among(names, list(channels[stream]))
@@ -118,11 +116,6 @@ class LivePilot(Chain):
         found = zip(SENSORS, self.control.health, strict=True)
         return {name: Health(status).name.lower() for name, status in found}
 
-    def start_steering(self, measured_rad: Array) -> Array:
-        """Take measured angles (3,), zeros not subtracted, for the last command, before a step; return it."""
-        self.control.steer_rad = measured_rad - self._steering_zeros_rad
-        return self.control.steer_rad
-
     def take(self, sample: Sample) -> Step:
         """Return the command for a sample: to stand, where nothing is known yet or the step fails."""
         readings = {
@@ -149,7 +142,7 @@ class LivePilot(Chain):
         if self._awaits_steering and "steering" in readings and len(readings["steering"].values):
             measured_rad = readings["steering"].values[-1]
             if np.isfinite(measured_rad).all():
-                self._standing_rad = self.start_steering(measured_rad)
+                self._standing_rad = self.control.steer_rad = measured_rad - self._steering_zeros_rad
                 self._awaits_steering = False
         return not self._awaits_steering
 

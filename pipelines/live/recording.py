@@ -76,7 +76,6 @@ class SessionRecorder:
     channels : of each stream that is recorded, in the order of the columns of its readings
     wheels : names of the wheels that are commanded
     writer : thread that writes; shared by all recordings
-    part_bytes : size above which a file is followed by another
 
     Attributes
     ----------
@@ -104,7 +103,6 @@ class SessionRecorder:
         wheels: Sequence[str] = (),
         *,
         writer: RecordingThread,
-        part_bytes: int = PART_BYTES,
     ) -> None:
         run_folder(run_id, folder)
         self._channels = {name: tuple(each) for name, each in channels.items()}
@@ -112,7 +110,7 @@ class SessionRecorder:
         commanded = (*TWIST, *(f"wheel_{w}_radps" for w in wheels), *(f"steer_{w}_rad" for w in wheels))
         self._channels["commands"] = commanded
         self._n_wheels = len(wheels)
-        self._folder, self._part_bytes, self._writer = Path(folder), part_bytes, writer
+        self._folder, self._writer = Path(folder), writer
         self._head = RunHead(run_id=run_id, robot=robot, session=run_id, source="recorded live", labels=[])
         self._lock = threading.Lock()
         self._waiting: list[tuple[str, Array | WindowOutput]] = []
@@ -185,7 +183,7 @@ class SessionRecorder:
         ended = bool(self._ended)  # seen before the samples are taken, so that all of them are
         try:
             self._flush()
-            if self._file is not None and (ended or self._file.tell() > self._part_bytes):
+            if self._file is not None and (ended or self._file.tell() > PART_BYTES):
                 self._run.finish(dropped=+self._dropped)
                 os.fsync(self._file.fileno())
                 self._file.close()
@@ -292,10 +290,6 @@ def _reason(error: OSError) -> str:
 class RecordingThread:
     """A thread that writes any number of recordings, one after the other.
 
-    Parameters
-    ----------
-    flush_s : time between two writings of a recording
-
     Raises
     ------
     ConfigError
@@ -308,10 +302,10 @@ class RecordingThread:
     True
     """
 
-    def __init__(self, flush_s: float = FLUSH_S) -> None:
+    def __init__(self) -> None:
         # imports now what would hold up the sessions later
         McapWriter(BytesIO(), RunHead(run_id="", robot="", source="", labels=[]))
-        self._flush_s, self._stopped = flush_s, False
+        self._stopped = False
         self._recordings: list[SessionRecorder] = []
         self._woken = threading.Event()
         self._thread = threading.Thread(target=self._write, name="recording", daemon=True)
@@ -334,7 +328,7 @@ class RecordingThread:
 
     def _write(self) -> None:
         while not self._stopped or self._recordings:
-            self._woken.wait(self._flush_s)
+            self._woken.wait(FLUSH_S)
             self._woken.clear()
             for one in tuple(self._recordings):
                 if self._stopped:

@@ -67,7 +67,6 @@ class RobotControl:
     table : target slips
     settings : accepted ones (:func:`~terrain.control.pilot_settings.check_pilot`)
     states : of the filter that estimates the motion; none for a controller that uses no measurement
-    steer_rad : (3,) last command of the steering
 
     Attributes
     ----------
@@ -86,7 +85,6 @@ class RobotControl:
         table: SlipTable,
         settings: PilotSettings,
         states: Sequence[str],
-        steer_rad: Array | None = None,
     ) -> None:
         self._settings, self._estimates = settings, bool(states)
         self._radius_m, self._positions_m = robot.wheel_radius_m, np.array(robot.wheel_positions_m)
@@ -103,7 +101,7 @@ class RobotControl:
         self.use(table)
         # what a step leaves to the next
         self.health = [0] * len(SENSORS)
-        self.steer_rad = np.zeros(3) if steer_rad is None else np.array(steer_rad, dtype=np.float64)
+        self.steer_rad = np.zeros(3)
         self.target_ratio, self._tilt_rad, self._tracking = math.nan, (0.0, 0.0), initial_tracking()
 
     def use(self, table: SlipTable) -> None:

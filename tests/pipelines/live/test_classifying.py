@@ -105,7 +105,8 @@ def gate(monkeypatch):
         return WindowOutput(window.start_s[0], 0.0, "a", 1.0, np.ones(1), ("a",), nearest=model.info.rule)
 
     monkeypatch.setattr("pipelines.live.classifying.feed_of", feed_of)
-    event, thread = threading.Event(), ClassifierThread(classify)
+    monkeypatch.setattr("pipelines.live.classifying.classify_window", classify)
+    event, thread = threading.Event(), ClassifierThread()
     yield event, thread
     event.set()
     thread.stop()

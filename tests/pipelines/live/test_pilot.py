@@ -106,17 +106,18 @@ def test_a_wheel_that_does_not_follow_its_command_disagrees_unless_another_contr
     assert (live.estimate.health[SENSORS.index("wheel_2")] == Health.LOST) == follows
 
 
-@pytest.mark.parametrize(
-    ("probability", "output", "believed"),
-    [(0.45, OutputStatus.BELOW_THRESHOLD, False), (0.9, OutputStatus.ACCEPTED, True)],
-)
-def test_a_classifier_whose_probability_never_suffices_is_reported(probability, output, believed):
-    source = TerrainSource()
-    source.update = lambda sample, _: [TerrainEstimate(sample.time_s, "grass", probability)]
-    live = LivePilot(ROBOT, TABLE, source)
-    statuses = [live.step(Sample(k / 50, np.zeros(3), {})).status for k in range(100)]
-    assert {status["output_code"] for status in statuses} == {output}
-    assert (statuses[-1]["terrain_code"] >= 0) is believed
+def test_a_classifier_whose_probability_never_suffices_is_reported_and_one_that_ends_not_believed_for_long():
+    for probability, output in ((0.45, OutputStatus.BELOW_THRESHOLD), (0.9, OutputStatus.ACCEPTED)):
+        source = TerrainSource()
+        source.update = lambda sample, _, p=probability: [TerrainEstimate(sample.time_s, "grass", p)]
+        live = LivePilot(ROBOT, TABLE, source)
+        statuses = [live.step(Sample(k / 50, np.zeros(3), {})).status for k in range(100)]
+        assert {status["output_code"] for status in statuses} == {output}
+        assert (live.belief.terrain == "grass") is (output is OutputStatus.ACCEPTED)
+    del source.update
+    for sample in recorded():
+        live.step(sample._replace(time_s=sample.time_s + 2.0))
+    assert (live.belief.terrain, live.step(sample).status["terrain_code"]) == ("", -1.0)
 
 
 # Sensors that fail in the closed loop: plain commands are no better

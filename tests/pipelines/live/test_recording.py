@@ -42,8 +42,9 @@ CHANNELS = {"imu": IMU, "wheels": ("speed_left_mps", "speed_right_mps")}
 
 
 @pytest.fixture
-def writer():
-    thread = RecordingThread(flush_s=0.05)
+def writer(monkeypatch):
+    monkeypatch.setattr(recording, "FLUSH_S", 0.05)
+    thread = RecordingThread()
     yield thread
     thread.stop()
 
@@ -201,8 +202,8 @@ def test_a_second_recording_of_a_name_gets_another_and_nothing_is_kept_of_one_wi
     assert {read(path).run_id for path in tmp_path.iterdir()} == {"field", "field_2"}
 
 
-def test_a_recording_goes_on_in_files_without_a_gap(writer, tmp_path):
-    recorder = SessionRecorder(tmp_path, "field", "husky", CHANNELS, writer=writer, part_bytes=20_000)
+def test_a_recording_goes_on_in_files_without_a_gap(recorder, monkeypatch):
+    monkeypatch.setattr(recording, "PART_BYTES", 20_000)
     n = 0
     while len(recorder.files) < 3:
         recorded(recorder, 50, n)
@@ -333,7 +334,7 @@ def test_a_file_that_ends_anywhere_gives_all_chunks_that_are_whole(recorder, tmp
 
 
 def test_stop_ends_what_was_not_closed(tmp_path):
-    writer = RecordingThread(flush_s=60.0)
+    writer = RecordingThread()
     recorder = recorded(SessionRecorder(tmp_path, "field", "husky", CHANNELS, writer=writer))
     assert writer.stop()
     assert recorder.status == "finished"

@@ -106,12 +106,11 @@ def test_commands_are_those_of_a_pilot_that_is_given_the_samples_at_once(samples
     """Also where messages are late, of a robot that says at which time of its own it asks for a step."""
     rng, now_s, n_driving = np.random.default_rng(2), NOW_S, 0
     session, pilot = agrimaro(swerve_model), LivePilot(ROBOT, TABLE, Classifier(swerve_model, ROBOT))
-    pilot.start_steering(samples[0].readings["steering"].values[0])
     for sample, ticked in zip(samples, plain, strict=True):
         now_s = max(now_s, NOW_S + sample.time_s + rng.exponential(0.05))
         streams = {name: (t.tolist(), values.tolist()) for name, (t, values) in sample.readings.items()}
         session.put(streams, sample.twist.tolist(), now_s)
-        output, desired = session.step(now_s, sample.time_s), pilot.step(sample)
+        output, desired = session.step(now_s, sample.time_s), pilot.take(sample).command
         assert output.time_s == sample.time_s
         np.testing.assert_array_equal(output.command.wheel_radps, desired.wheel_radps)
         np.testing.assert_array_equal(output.command.steer_rad, desired.steer_rad)

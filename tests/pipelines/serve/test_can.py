@@ -16,17 +16,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.data.can_codec import channels_of, decode, encode, load_layout
-from pipelines.live.chain import CommandStatus, Step
+from pipelines.live.chain import CommandStatus
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bus import Bridge, Link, open_bus
 from pipelines.serve.serve import Settings, run
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import PERIOD_S
-from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics
+from terrain.control.wheel_corrections import BridgeState
 from terrain.errors import ConfigError
 from terrain.logs.replay import replay
-from terrain.records import Command
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
@@ -67,17 +66,12 @@ class Slower:
     """
 
     def __init__(self, changed=lambda step, n: step):
-        self._kinematics, self._before_s, self._changed, self._n = None, math.nan, changed, 0
+        self._plain, self._changed, self._n = pilot("plain"), changed, 0
 
     def take(self, sample):
-        if self._kinematics is None:
-            steer_rad = sample.readings["steering"].values[-1] - ROBOT.steering_zeros_rad
-            self._kinematics = LowLevelKinematics(ROBOT, steer_rad)
-        dt_s = sample.time_s - self._before_s
-        radps = self._kinematics.step(sample.twist, dt_s if 0 < dt_s < 0.5 else PERIOD_S)
-        self._before_s, self._n = sample.time_s, self._n + 1
-        command = Command(radps - 1.0, self._kinematics.steer_rad, sample.twist, {"status_code": 0.0})
-        return self._changed(Step((), command), self._n)
+        step, self._n = self._plain.take(sample), self._n + 1
+        command = step.command._replace(wheel_radps=step.command.wheel_radps - 1.0)
+        return self._changed(step._replace(command=command), self._n)
 
 
 def bridged(chain=None):
