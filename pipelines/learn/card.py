@@ -113,13 +113,7 @@ class ModelResult(ModelInfo, Result):
 
 
 def model_result(folder: Path, name: str) -> ModelResult:
-    """Return what the model in a folder states of itself, as it was asked for by name.
-
-    Raises
-    ------
-    ModelError
-        if there is no model, or a file of it is damaged.
-    """
+    """Return what the model in a folder states of itself, as it was asked for by name; errors as :func:`read_model`."""
     model = read_model(folder)
     info, record = read_training(folder)
     files = [file for file in (folder / MODEL_FILE, folder / ONNX_FILE) if file.is_file()]
@@ -137,13 +131,7 @@ def model_result(folder: Path, name: str) -> ModelResult:
 
 
 def read_training(folder: Path) -> tuple[ModelInfo, TrainingRecord | None]:
-    """Return what a model is and how it was trained; None of one that was not evaluated.
-
-    Raises
-    ------
-    ModelError
-        if there is no model, or a file of it is damaged.
-    """
+    """Return what a model is and how it was trained, None of one not evaluated; errors as :func:`read_files`."""
     info, contents = read_files(folder)
     if TRAINING_FILE not in contents:
         return info, None

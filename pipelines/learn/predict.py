@@ -167,14 +167,7 @@ class Predictions(Result):
 
 
 def run(settings: Settings, progress: Progress = silent) -> Predictions | ChangesResult:
-    """Read runs, and predict their terrain or find changes of the ground.
-
-    Raises
-    ------
-    ConfigError, LogError, DataError, ModelError
-        if a setting is not accepted, a run or the model cannot be read, or the runs are not such as the model
-        needs.
-    """
+    """Read runs, and predict their terrain or find changes of the ground; errors as what reads and predicts."""
     from terrain.files.atomic import atomic_write, ensure_writable
 
     if settings.out is not None:

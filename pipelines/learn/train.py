@@ -42,6 +42,9 @@ NETWORKS = ("cnn", "stack", "best")
 
 PERCENT = ".1%"
 
+PARAMS = ("recipe", "window_s", "stride_s", "steady", "seed", "repeats", "n_windows", "n_runs", "dataset")
+"""What MLflow has of the evaluation's settings and counts as parameters."""
+
 
 class TrainingSettings(RecipeSettings):
     """Training: what is trained, and under which name it is registered."""
@@ -131,14 +134,7 @@ class RegisterResult(Registered):
 
 
 def run(settings: Settings, progress: Progress = silent) -> TrainResult | RegisterResult:
-    """Read runs, or their cached features, train and register; or register a folder.
-
-    Raises
-    ------
-    TerrainError
-        if a setting is not accepted, the data do not suffice, or the tracking store fails; a model that was
-        trained by then is kept in a folder, which the message names.
-    """
+    """Read runs, or their cached features, train and register; or register a folder; errors as :func:`train`."""
     from pipelines.data.tracking import ensure_tracking
     from pipelines.learn.cache import cached_data, loaders_of
     from pipelines.learn.parallel import computing
@@ -176,7 +172,8 @@ def train(
     Raises
     ------
     TerrainError
-        if the data do not suffice, the model could not be stored, or the tracking store fails.
+        if the data do not suffice, the model could not be stored, or the tracking store fails; a model that
+        was trained by then is kept in a folder, which the message names.
     """
     from features.motion import NO_MOTION
     from pipelines.data.tracking import code_commit, ui_line
@@ -205,7 +202,7 @@ def train(
             f"choice {default}"
         )
     evaluation, importance, fitted = _evaluated(data, settings, progress)
-    recipe, samples, rule = data.recipe, data.samples, settings.rule
+    recipe, samples = data.recipe, data.samples
     recipe.steps[-1] = (recipe.steps[-1][0], fitted)
     info = info_of(data, settings, dataset, code_commit())
     model, missing = with_limits(recipe, info, samples, data.features, data.motion)
@@ -218,19 +215,8 @@ def train(
     )
     info = replace(model.info, run_accuracy=run_accuracies(data, evaluation))
     record = TrainingRecord(
-        params={
-            "recipe": settings.recipe,
-            "window_s": rule.length_s,
-            "stride_s": rule.step_s,
-            "steady": rule.steady is not None,
-            "seed": settings.seed,
-            "skip_short": settings.skip_short,
-            "signal_sets": ",".join(settings.signal_sets),
-            "repeats": evaluation.repeats,
-            "n_windows": len(data),
-            "n_runs": evaluation.n_runs,
-            "dataset": dataset,
-        },
+        params={name: getattr(evaluation, name) for name in PARAMS}
+        | {"skip_short": settings.skip_short, "signal_sets": ",".join(settings.signal_sets)},
         runs=data.runs,
         evaluation=evaluation,
         importance=importance,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -99,36 +100,22 @@ class TrainingData:
                 return np.asarray(recipe.predict_proba(windows[rows]))
             except DataError:
                 return None
-        if type(recipe[0]) is not FeatureExtractor or not same_features(recipe.matrix, self.recipe.matrix):
+        if type(recipe[0]) is not FeatureExtractor or not _same_features(recipe.matrix, self.recipe.matrix):
             return None
         return np.asarray(recipe[-1].predict_proba(self.rows[rows]))
 
 
-def same_features(a: FeatureMatrix, b: FeatureMatrix) -> bool:
-    """Return whether two matrices have the same features of a window, but for rounding.
-
-    Examples
-    --------
-    >>> layout = Layout({"imu": ("accel_z_mps2",)}, {"imu": 100.0})
-    >>> matrix = FeatureMatrix(layout, 2.0, {"imu": 200})
-    >>> same_features(matrix, matrix), same_features(matrix, matrix._replace(length_s=1.0))
-    (True, False)
-    """
-    rates = [(a.layout.rate_hz[name], b.layout.rate_hz.get(name, np.nan)) for name in a.layout.channels]
-    return (
-        (a.layout.channels, dict(a.n_samples), a.length_s, a.level_sets)
-        == (b.layout.channels, dict(b.n_samples), b.length_s, b.level_sets)
-    ) and all(abs(one / other - 1.0) < SAME_RATE for one, other in rates)
+def _same_features(a: FeatureMatrix, b: FeatureMatrix) -> bool:
+    """Return whether two matrices have the same features of a window, but for rounding."""
+    of_a, of_b = ((m.layout.channels, dict(m.n_samples), m.length_s, m.level_sets) for m in (a, b))
+    rates_hz = a.layout.rate_hz.items()
+    return of_a == of_b and all(
+        math.isclose(rate_hz, b.layout.rate_hz[name], rel_tol=SAME_RATE) for name, rate_hz in rates_hz
+    )
 
 
 def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingData:
-    """Return what a recipe is fitted on, of runs.
-
-    Raises
-    ------
-    DataError
-        as :func:`features.protocols.samples_of`.
-    """
+    """Return what a recipe is fitted on, of runs; errors as :func:`features.protocols.samples_of`."""
     samples = samples_of(
         runs,
         settings.rule,
@@ -201,14 +188,9 @@ def fitted_model(
 
     Parameters
     ----------
-    runs : labelled
+    runs : labelled; errors as :func:`data_of_runs` and :func:`info_of`
     settings : recipe and windows; the defaults without
     dataset, commit : for the record
-
-    Raises
-    ------
-    DataError
-        if the data do not suffice, or the model uses estimates that several filters made.
     """
     settings = settings or RecipeSettings()
     data = data_of_runs(runs, settings)
