@@ -121,14 +121,7 @@ def check_drive(settings: Settings, inputs: DriveInputs) -> list[Controller]:
 
 
 def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent) -> DriveResult:
-    """Drive all controllers at the same seeds, and evaluate them.
-
-    Parameters
-    ----------
-    settings : what is driven
-    inputs : robots, table, and the classifier where a controller needs one
-    progress : of the drives
-    """
+    """Drive all controllers at the same seeds, and evaluate them; a model is given where a controller needs one."""
     names, table = settings.controllers, inputs.table
     controllers = check_drive(settings, inputs)
 
@@ -202,12 +195,11 @@ def report(result: DriveResult) -> Report:
     pairs = pairs_to_compare(names) if shown else []
     grade = f", {result.grade_deg:g}° uphill" if result.grade_deg else ""
     named = Path(result.terrain).stem if result.terrain.endswith("ml") else result.terrain
-    terrain = "all terrains" if named == COURSE else named
     labels = [metric_label(key) for key in shown]
     means = [(name, *(compared.value(name, key).mean for key in shown)) for name in names]
     columns = [Column("mean over seeds"), *(Column(label.text, unit=label.unit) for label in labels)]
     return Report(
-        title=f"{result.scenario} on {terrain}{grade}",
+        title=f"{result.scenario} on {'all terrains' if named == COURSE else named}{grade}",
         answer=verdict(result, pairs),
         lead=(
             f"{result.robot} · {plural(len(result.seeds), 'seed')} · delay {1000 * result.delay_s:g} ms · "

@@ -70,13 +70,9 @@ def _terrain_source(controller: Controller, model: TerrainModel | None, robot: R
 
 
 def train_classifier(robot: Robot, seed: int, progress: Progress = silent) -> TerrainModel:
-    """Return a classifier that was trained on simulated labelled runs of a robot, as many as of quickstart.
+    """Return a classifier that was trained on simulated labelled runs of a swerve robot, as many as of quickstart.
 
-    Parameters
-    ----------
-    robot : swerve robot
-    seed : of the runs; they differ from the drives of ``terrain drive`` at any seed
-    progress : of the runs and the training
+    The runs differ from the drives of ``terrain drive`` at any seed.
     """
     from pipelines.learn.settings import RecipeSettings
     from pipelines.learn.training_data import fitted_model

@@ -30,15 +30,9 @@ LEAST_POWER = 1e-300
 
 
 def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figure:
-    """Return channels of a run as measured and simulated, a panel each.
+    """Return channels of a run, or of a stretch of one, as measured and simulated, a panel each.
 
     The noise is drawn about the measurement: a simulation outside of the band is off by more than noise.
-
-    Parameters
-    ----------
-    run : or a stretch of one
-    noise : of the fit runs
-    channels : names, from the top
     """
     bands = BAND_STDS * noise.size(run.pace_mps)
     panels = []

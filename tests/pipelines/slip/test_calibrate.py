@@ -113,11 +113,6 @@ def test_what_filters_are_given_is_right_afterwards(calibrated):
         errors.append(np.abs(np.nanmean(table.columns(steer) - true, axis=0)).max())
     assert errors[0] > 0.015
     assert errors[1] < 0.003
-    standing, sensors = measurement_table(driven("stand", 51), load_robot(out)), NOMINAL.sensors
-    accel, gyro = (np.nanmean(standing.columns([row])) for row in ("accel_x_mps2", "gyro_z_radps"))
-    # what a power-on leaves, and the bench's own power-on
-    assert abs(accel) < 4 * np.hypot(sensors.accel_bias_std_mps2, 9.8 * sensors.tilt_std_rad)
-    assert abs(gyro) < 4 * sensors.gyro_bias_std_radps
     cruise = measurement_table(driven("straight", 52), load_robot(out))
     rates = cruise.columns([f"wheel_{i}_radps" for i in (1, 2, 3)])
     camera = cruise.columns(["camera_speed_x_mps"])
