@@ -28,7 +28,8 @@ SlipSourceName = Literal["none", "dynamic", "kinematic", "multi", "multi-grip"]
 ALL = "all"
 """``--faults`` that names every fault."""
 
-Numbers = Annotated[tuple[float, ...], ByCommas]
+Ratio = Annotated[float, Field(ge=0.5, le=2.0)]
+Duration = Annotated[float, Field(gt=0.0)]
 
 
 class DrivenSettings(JobsSettings):
@@ -82,21 +83,15 @@ class ComparisonSettings(BaseSettings):
     duration_s: float | None = setting(None, "Length of a drive in s.", option="--duration")
     accel_mps2: float = setting(1.0, "Rise of the desired speed in m/s^2; inf for a step.", option="--accel")
     grade_deg: float = setting(0.0, "Slope in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0)
-    radius_factors: Numbers | None = setting(
+    radius_factors: Annotated[tuple[Ratio, ...], ByCommas] | None = setting(
         None,
         "True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default.",
         option="--radius",
+        min_length=3,
+        max_length=3,
     )
     leg_backlash_rad: float = setting(0.0, "Backlash of the third leg in rad.", option="--leg-backlash")
     plant: str | None = setting(None, "Robot as it really is, where it differs from --robot.")
-
-    @field_validator("radius_factors")
-    @classmethod
-    def _three_ratios(cls, ratios: tuple[float, ...] | None) -> tuple[float, ...] | None:
-        if ratios is not None and (len(ratios) != 3 or not all(0.5 <= each <= 2.0 for each in ratios)):
-            text = ",".join(map(str, ratios))
-            raise ValueError(f"--radius is {text}; three ratios from 0.5 to 2 are required, as in 1,1.02,1")
-        return ratios
 
     @model_validator(mode="after")
     def _consistent(self) -> ComparisonSettings:
@@ -119,7 +114,7 @@ class FaultSettings(BaseSettings):
     faults: Names = setting((), "Drive through these faults: names or kinds of them, by commas, or 'all'.")
     situations: Names = setting(SITUATIONS, f"By commas: {', '.join(SITUATIONS)}.")
     stop_terrains: Names = setting(("wet_floor",), "Soils of stop, by commas.", option="--stop-terrain")
-    durations_s: Annotated[tuple[Annotated[float, Field(gt=0.0)], ...], ByCommas] = setting(
+    durations_s: Annotated[tuple[Duration, ...], ByCommas] = setting(
         (3.0, math.inf), "For how long a fault acts in s, by commas; inf for good.", option="--durations"
     )
     draw: Names = setting(
@@ -145,7 +140,9 @@ class PathSettings(BaseSettings):
     )
     grip: float = setting(0.7, "Largest side force over load.", gt=0.0, le=1.5)
     offset: float = setting(0.0, "Desired distance to the left of the path in m.", ge=-100.0, le=100.0)
-    stop: Numbers = setting((), "Distances in m at which to stop for 3 s, by commas.")
+    stop: Annotated[tuple[float, ...], ByCommas] = setting(
+        (), "Distances in m at which to stop for 3 s, by commas."
+    )
     point_std: float = setting(
         0.0, "Standard deviation of the points in m: 0.02 for points of an RTK receiver.", ge=0.0, le=10.0
     )

@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import field_validator
-
 from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import Names, setting
@@ -31,7 +29,9 @@ PAGE_FILE, EXTENDED_FILE, NEXT_FILE = "report.html", "extended.yaml", "next_driv
 class ExplainOptions(BaseSettings):
     """What may be named, of which runs, and how the gain is measured."""
 
-    effects: Names | None = setting(None, "Effects that may be named, by commas; all by default.")
+    effects: Names | None = setting(
+        None, "Effects that may be named, by commas; all by default.", min_length=1
+    )
     terrain: str | None = setting(None, "Use only runs of this label.")
     hold_out: int | None = setting(
         None, "Runs held out to measure the gain; a quarter of six or more by default.", ge=0
@@ -41,13 +41,6 @@ class ExplainOptions(BaseSettings):
     )
     seed: int = setting(0, "Of the choice of held-out runs, and of the bootstrap.", ge=0)
 
-    @field_validator("effects")
-    @classmethod
-    def _check_effects(cls, effects: tuple[str, ...] | None) -> tuple[str, ...] | None:
-        if effects == ():
-            raise ValueError("--effects names none; leave it out for all of them")
-        return effects
-
 
 class Settings(ExplainOptions, AlignedRunsSettings):
     """Runs to explain, and the simulation under test."""
@@ -55,14 +48,9 @@ class Settings(ExplainOptions, AlignedRunsSettings):
     robot: str = setting(..., "Robot whose simulation is tested: name or YAML file.")
     out: Path = setting(..., "Folder of the page and of the extended robot.")
     model: str | None = setting(None, "Extended description of that robot, tested in its place.")
-    pictures: str = setting("6", "Most runs that the page draws: a number, or 'all'.")
-
-    @field_validator("pictures")
-    @classmethod
-    def _check_pictures(cls, pictures: str) -> str:
-        if pictures != "all" and not pictures.isdecimal():
-            raise ValueError(f"--pictures is {pictures!r}; a number or 'all' is required")
-        return pictures
+    pictures: str = setting(
+        "6", "Most runs that the page draws: a number, or 'all'.", pattern="^([0-9]+|all)$"
+    )
 
 
 def run(settings: Settings, progress: Progress) -> ExplainResult:

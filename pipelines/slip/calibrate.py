@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
-from pydantic import field_validator
+from pydantic import Field, field_validator
 
 from pipelines.data.settings import RunsSettings
 from pipelines.report.settings import ByCommas, Names, setting
@@ -20,12 +20,11 @@ EXAMPLE = "terrain calibrate --data raw/ --robot agrimaro --out mine.yaml"
 RESULTS = ("pipelines.slip.robot", "pipelines.slip.odometry", "pipelines.slip.soil")
 """Modules of the kinds, with their results."""
 
-LAW_NAMES = (
-    "simulator",
-    *("bekker", "wong_reece", "ishigami", "ishigami_ding", "ishigami_travel"),
-    "inflow",
-)
+Law = Literal["simulator", "bekker", "wong_reece", "ishigami", "ishigami_ding", "ishigami_travel", "inflow"]
 """Laws of a wheel in sand; ``simulator`` is the one of ``terrain simulate``."""
+
+Length = Annotated[float, Field(ge=0.2, le=3600.0)]
+"""Seconds of a leg that is compared: the shortest has two poses of a lidar."""
 
 
 class RobotSettings(BaseSettings):
@@ -39,8 +38,10 @@ class RobotSettings(BaseSettings):
 class OdometrySettings(BaseSettings):
     """Odometry of a tracked robot (--what odometry)."""
 
-    lengths: Annotated[tuple[float, ...], ByCommas] = setting(
-        (2.0, 6.0), "Seconds after which poses are compared, by commas; windows of DRIVE have their own."
+    lengths: Annotated[tuple[Length, ...], ByCommas] = setting(
+        (2.0, 6.0),
+        "Seconds after which poses are compared, by commas; windows of DRIVE have their own.",
+        min_length=1,
     )
     folds: int = setting(5, "Folds of whole runs.", ge=2)
 
@@ -48,7 +49,9 @@ class OdometrySettings(BaseSettings):
 class SoilSettings(BaseSettings):
     """Soil of a wheel testbed (--what soil)."""
 
-    laws: Names = setting(LAW_NAMES, "Laws to compare, by commas; the last one is reported in full.")
+    laws: Annotated[tuple[Law, ...], ByCommas] = setting(
+        get_args(Law), "Laws to compare, by commas; the last one is reported in full.", min_length=1
+    )
     check: Path | None = setting(
         None, "Folder of further trials, which the last law predicts and no fit has."
     )
@@ -57,11 +60,7 @@ class SoilSettings(BaseSettings):
 
     @field_validator("laws")
     @classmethod
-    def _check_laws(cls, names: tuple[str, ...]) -> tuple[str, ...]:
-        unknown = [name for name in names if name not in LAW_NAMES]
-        if unknown or not names:
-            found = repr(unknown[0]) if unknown else "empty"
-            raise ValueError(f"--laws is {found}; choose among {', '.join(LAW_NAMES)}")
+    def _check_last(cls, names: tuple[str, ...]) -> tuple[str, ...]:
         if names[-1] == "simulator":
             raise ValueError("--laws ends in 'simulator'; the last one is a law of stresses, as 'inflow' is")
         return tuple(dict.fromkeys(names))

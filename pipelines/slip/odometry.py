@@ -15,7 +15,6 @@ from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Report, Table, Text, sections
 from terrain.calibration.odometry import ParameterFound, judge_odometry
 from terrain.calibration.odometry_judge import KindScore, LegScores
-from terrain.errors import ConfigError
 from terrain.estimation.observers.slip_model_file import check_slip_model_file, write_slip_model
 from terrain.logs.drive import FILE_NAME, find_sessions
 from terrain.logs.drive_poses import WindowPoses, read_window_poses
@@ -23,9 +22,6 @@ from terrain.robots import TrackedRobot, as_drive, load_robot
 
 if TYPE_CHECKING:
     from pipelines.slip.calibrate import Settings
-
-SHORTEST_S, LONGEST_S = 0.2, 3600.0
-"""Legs that are compared: the shortest has two poses of a lidar."""
 
 FLAT = "no slope was driven, or no tilt measured: what slopes do is not fitted"
 
@@ -64,7 +60,7 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
     Raises
     ------
     ConfigError
-        if the robot is not tracked, a length is not accepted, or the file is there already.
+        if the robot is not tracked, or the file is there already.
     DataError
         if fewer runs than folds have poses.
     """
@@ -72,8 +68,6 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
     runs = load(settings).runs
     refusal = "robot {name}: drive {drive!r} has no tracks; --what odometry is for 'tracked'"
     robot = as_drive(TrackedRobot, load_robot(settings.robot), refusal)
-    if not all(SHORTEST_S <= length <= LONGEST_S for length in settings.lengths) or not settings.lengths:
-        raise ConfigError(f"--lengths: {SHORTEST_S:g} to {LONGEST_S:g} seconds are accepted")
     if settings.out is not None:
         check_slip_model_file(settings.out)
     windows: Mapping[str, tuple[WindowPoses, ...]] = {}

@@ -106,8 +106,8 @@ def test_of_few_runs_none_is_held_out_by_default(a_run, few):
     [
         ("--effects gravity", "effect 'gravity' is unknown"),
         ("--effects steering_backlash", "does not apply to a robot with the drive 'skid_steer'"),
-        ("--effects ,", "--effects names none"),
-        ("--pictures few", "--pictures is 'few'; a number or 'all' is required"),
+        ("--effects ,", "--effects is ',': value should have at least 1 item"),
+        ("--pictures few", "--pictures is 'few': string should match pattern '^([0-9]+|all)$'"),
         ("--terrain sand", "no run is labelled 'sand' throughout; labels are field"),
         ("--hold-out 5", "--hold-out is 5 of 7 runs; the diagnosis requires at least 3"),
         ("--robot agrimaro", "7 of 7 runs are of the robot 'husky'"),

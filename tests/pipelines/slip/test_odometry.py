@@ -56,7 +56,7 @@ def test_what_cannot_be_judged_is_refused_and_a_model_that_is_there_left_as_it_i
     (tmp_path / "slip.yaml").write_text("mine")
     for also, error, message in (
         ({"robot": "husky"}, ConfigError, "drive 'skid_steer' has no tracks"),
-        ({"lengths": (0.0,)}, ConfigError, "--lengths: 0.2 to 3600 seconds"),
+        ({"lengths": (0.0,)}, ConfigError, "--lengths is 0.0: input should be greater than or equal to 0.2"),
         ({"lengths": (60.0,)}, DataError, "no run has poses"),
         ({"folds": 7}, DataError, "6 runs have legs, at least 7 are required"),
         ({"out": tmp_path / "slip.yaml"}, ConfigError, "is there already"),

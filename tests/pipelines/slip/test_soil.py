@@ -91,7 +91,7 @@ def test_what_is_refused(make_run, tmp_path):
     write_run(make_run(), tmp_path / "runs")
     (tmp_path / "file").write_text("")
     for changed, error, sentence in (
-        ({"laws": ("mud",)}, ConfigError, "--laws is 'mud'; choose among simulator, bekker"),
+        ({"laws": ("mud",)}, ConfigError, "--laws is 'mud': input should be 'simulator', 'bekker'"),
         ({"laws": ("inflow", "simulator")}, ConfigError, "--laws ends in 'simulator'"),
         ({"draws": 1}, ConfigError, "--draws is 1: input should be greater than or equal to 2"),
         ({}, DataError, "none of 1 runs is a trial of a wheel testbed"),
