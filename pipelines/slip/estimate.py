@@ -8,8 +8,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import field_validator
-
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import Names, setting
 from pipelines.report.settings import Settings as BaseSettings
@@ -74,8 +72,12 @@ class PoseSettings(BaseSettings):
 
     window_s: float = setting(2.0, "Window length in s.", "--window", gt=0.0)
     stride_s: float = setting(1.0, "From window to window in s.", "--stride", gt=0.0)
-    delay: str = setting(
-        "auto", "Delay of the outside measurement in s; 'auto' finds it, a session at a time."
+    delay_s: float | None = setting(
+        None,
+        "Delay of the outside measurement in s; by default it is found, a session at a time.",
+        "--delay",
+        ge=-5.0,
+        le=5.0,
     )
     predict: bool = setting(False, "Predict slip from currents and wheel speeds, on held-out runs.")
     hold_out: Names = setting(
@@ -83,17 +85,6 @@ class PoseSettings(BaseSettings):
     )
     rollers: bool = setting(False, "Of omni robots: rollers' friction by surface, load of the wheels.")
     seed: int = setting(0, "Deals and draws runs.", ge=0)
-
-    @field_validator("delay")
-    @classmethod
-    def _check_delay(cls, text: str) -> str:
-        try:
-            within = text == "auto" or abs(float(text)) <= 5.0
-        except ValueError:
-            within = False
-        if not within:
-            raise ValueError(f"--delay is {text!r}; 'auto' or seconds from -5 to 5 are required")
-        return text
 
 
 class EstimateOptions(PoseSettings, SlipModelSettings, NoiseSettings):

@@ -84,8 +84,7 @@ def estimate_all(
     if options.rollers:
         as_drive(OmniRobot, robot, NO_ROLLERS)
     asked: dict[str, Any] = {"window_s": options.window_s, "stride_s": options.stride_s, "seed": seed}
-    delay_s = None if options.delay == "auto" else float(options.delay)
-    found = measure(runs, robot, **asked, delay_s=delay_s, progress=progress)
+    found = measure(runs, robot, **asked, delay_s=options.delay_s, progress=progress)
     if not found.slips:
         raise DataError(f"none of {len(runs)} runs has a slip; the first for this: {found.failed[0]}")
     rng, by_terrain = np.random.default_rng(seed), found.by_terrain()

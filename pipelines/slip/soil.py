@@ -16,7 +16,7 @@ from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Part, Report, Section, Table, Text, sections
 from pipelines.slip.shown import write_figures
-from terrain.errors import ConfigError, DataError
+from terrain.errors import DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.logs.digest import data_digest
 from terrain.records import RunLog
@@ -66,8 +66,6 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
 
     Raises
     ------
-    ConfigError
-        if ``out`` is a file.
     LogError
         if a trial, also of ``check``, cannot be read.
     DataError
@@ -77,8 +75,6 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
     """
     runs, skipped = load(settings)
     out = settings.out
-    if out is not None and out.is_file():
-        raise ConfigError(f"{out}: is a file; --out names a folder of soils")
     for folder in (out, settings.figures):
         if folder is not None:
             ensure_writable(folder)

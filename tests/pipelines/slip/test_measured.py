@@ -65,7 +65,7 @@ def two_grounds():
 
 
 def measured_slips(runs, **options):
-    return estimate_runs(runs, filter="pose", **({"delay": "0"} | options)).result
+    return estimate_runs(runs, filter="pose", **({"delay_s": 0.0} | options)).result
 
 
 def test_slip_by_surface_and_its_prediction(one_ground, two_grounds):
@@ -226,7 +226,7 @@ def test_runs_that_are_not_used_are_named_and_runs_that_show_no_slip_refused(run
 def test_measured_runs_reach_what_is_stated(measured):
     """Bounds are those of the task, not today's figures: a wrong sign or scale misses them by far."""
     runs = load_runs(measured("robotino") / "one_surface")
-    result = measured_slips(runs, delay="auto", predict=True)
+    result = measured_slips(runs, delay_s=None, predict=True)
     slips = {row.terrain: row.slip_ratio for row in result.surfaces}
     assert slips["table"] < slips["brown"] < slips["gray"] < slips["green"]
     for row in result.predictions:

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from pipelines.cli.main import app
 from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
-from terrain.errors import ConfigError, DataError
+from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.logs.write import write_run
 from terrain.soil_identification.laws import LAWS, SINKAGES, forces_of, sinkage_of
 from terrain.soil_identification.trials import WHEELS, Trials
@@ -95,7 +95,7 @@ def test_what_is_refused(make_run, tmp_path):
         ({"laws": ("inflow", "simulator")}, ConfigError, "--laws ends in 'simulator'"),
         ({"draws": 1}, ConfigError, "--draws is 1: input should be greater than or equal to 2"),
         ({}, DataError, "none of 1 runs is a trial of a wheel testbed"),
-        ({"out": tmp_path / "file"}, ConfigError, "is a file; --out names a folder"),
+        ({"out": tmp_path / "file"}, TerrainError, "file: cannot be written"),
         ({"robot": "husky"}, ConfigError, "--robot is not for --what soil"),
     ):
         with pytest.raises(error, match=sentence):
