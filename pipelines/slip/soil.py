@@ -81,13 +81,12 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
     further: list[RunLog] = []
     if (check := settings.check) is not None:
         further = load_runs(check, layout=settings.layout, repair=settings.repair)
-        if not any(run.robot in WHEELS for run in further):
-            raise DataError(f"--check {check}: none of {len(further)} runs is a trial of a wheel testbed")
-    if not any(run.robot in WHEELS for run in runs):
-        raise DataError(
-            f"none of {len(runs)} runs is a trial of a wheel testbed (robots {', '.join(WHEELS)}): "
-            "give a folder with smooth.csv or grouser.csv"
-        )
+    for folder, given in ((settings.data, runs), (check, further)):
+        if given and not any(run.robot in WHEELS for run in given):
+            raise DataError(
+                f"{folder}: none of {len(given)} runs is a trial of a wheel testbed (robots {', '.join(WHEELS)}): "
+                "give a folder with smooth.csv or grouser.csv"
+            )
     results: list[WheelResult] = []
     pictures: dict[str, Figure] = {}
     for robot, wheel in WHEELS.items():
