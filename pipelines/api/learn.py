@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
+from features.protocols import Samples
 from features.recipes import make_recipe
 from features.windows import SteadyMotion, WindowRule
 from features.windows import cut_windows as cut
 from pipelines.learn.classifier import TerrainClassifier
 from pipelines.learn.comparison import ComparisonResult
-from pipelines.learn.crossval import cross_validate as evaluate
+from pipelines.learn.crossval import evaluated
 from pipelines.learn.evaluation import CrossvalResult
+from pipelines.learn.settings import EvaluationSettings
+from pipelines.report.results import Progress, silent
 from terrain.errors import DataError
 from terrain.records import RunLog, Windows
 
@@ -50,24 +53,52 @@ def cut_windows(
     return found.windows
 
 
-def cross_validate(model: Any, windows: Windows, **options: Any) -> CrossvalResult | ComparisonResult:
+def cross_validate(
+    model: Any, windows: Windows, *, names: Sequence[str] = (), progress: Progress = silent, **options: Any
+) -> CrossvalResult | ComparisonResult:
     """Evaluate one classifier, or several side by side, on windows with labels; whole runs are held out.
 
     Parameters
     ----------
-    model : a :class:`TerrainClassifier`, a scikit-learn classifier of features, the name of a recipe; or a list
+    model : a :class:`TerrainClassifier`, a scikit-learn classifier of features, a whole recipe or the name of one;
+        or a list of them
     windows : with the run and the terrain of each
-    options : as :func:`pipelines.learn.crossval.cross_validate`, such as ``protocol``, ``repeats``, ``seed``
+    names : of the models, for the report
+    progress : called as folds are done
+    options : fields of :class:`~pipelines.learn.settings.EvaluationSettings`, as ``protocol``, ``repeats``,
+        ``seed``, ``n_jobs``; and ``functions``, a list of own functions of a window
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.neighbors import KNeighborsClassifier
+    >>> from terrain.records import Windows
+    >>> rng, run = np.random.default_rng(0), np.repeat(np.arange(10), 8)
+    >>> terrain = np.where(run % 2, "ice", "mud").astype(object)
+    >>> shaking = rng.normal(size=(80, 1, 200)) * np.where(run % 2, 1.0, 3.0)[:, None, None]
+    >>> windows = Windows({"imu": shaking}, {"imu": ("accel_z_mps2",)}, {"imu": 100.0}, 2.0,
+    ...                   2.0 * np.arange(80), run.astype(str).astype(object), terrain)
+    >>> def peak(window):
+    ...     return np.abs(window["imu", "accel_z_mps2"]).max()
+    >>> found = cross_validate(KNeighborsClassifier(3), windows, functions=[peak], repeats=1, n_jobs=1)
+    >>> found.recipe, found.n_features, found.accuracy
+    ('KNeighborsClassifier', 52, 1.0)
     """
+    functions = options.pop("functions", ())
+    settings = EvaluationSettings(**{"extras": False} | options)
+    known = windows[windows.terrain != ""]
+    if not len(known):
+        raise DataError("no window has a terrain label: nothing can be trained or tested")
+    gap, contenders = settings.rule.overlap, []
+    samples = Samples(known, {}, known.run_id, gap)
     models = list(model) if isinstance(model, list | tuple) else [model]
-    recipes = [_recipe(each) for each in models]
-    return evaluate(recipes, windows, **{"names": [_name(each) for each in models]} | options)
-
-
-def _recipe(model: Any) -> Any:
-    if not isinstance(model, TerrainClassifier):
-        return model
-    return make_recipe(model.recipe, model.signal_sets, seed=model.seed, functions=model.functions)
+    for name, each in zip(names or [_name(each) for each in models], models, strict=True):
+        if isinstance(each, TerrainClassifier):
+            recipe = make_recipe(each.recipe, each.signal_sets, seed=each.seed, functions=each.functions)
+        else:
+            recipe = make_recipe(each, settings.signal_sets, gap=gap, seed=settings.seed, functions=functions)
+        contenders.append((name, recipe, samples))
+    return evaluated(contenders, settings, progress)
 
 
 def _name(model: Any) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipelines.drive.controllers import DriveInputs, drive_once, train_classifier
 from pipelines.drive.run_figures import run_figures
-from pipelines.learn.parallel import counted, parallel
+from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report.figure import Bars, Figure, Panel, Points
 from pipelines.report.numbers import NOT_KNOWN, format_value, plural
@@ -130,8 +130,8 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
     ) -> dict[str, list[Drive]]:
         """Return the drives of each controller, one a seed, in as many processes as the settings say."""
         jobs = [(inputs.of(each), each, seed) for each in controllers for seed in settings.all_seeds]
-        found = parallel(_drive_one, (settings,), jobs, min(settings.jobs, len(jobs)))
-        drives, n = [*counted(found, len(jobs), task, progress)], len(settings.all_seeds)
+        found = parallel(_drive_one, (settings,), jobs, settings.jobs, task, progress)
+        drives, n = list(found), len(settings.all_seeds)
         return {each.name: drives[n * place : n * place + n] for place, each in enumerate(controllers)}
 
     def ramp(rise_mps2: float | None) -> Controller:

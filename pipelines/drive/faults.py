@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pipelines.drive.drive import ALL
-from pipelines.learn.parallel import counted, parallel
+from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report.figure import Figure, Line, Panel, Strip
 from pipelines.report.numbers import NOT_KNOWN, plural
@@ -25,7 +25,6 @@ from pipelines.report.tree import Column, Pairs, Report, Table, sections
 from pipelines.report.versions import versions
 from terrain.control.fault_drives import (
     CleanDrive,
-    Driven,
     FaultCase,
     FaultLoop,
     FaultRow,
@@ -142,12 +141,8 @@ def drive_faults(
 ) -> FaultsResult:
     """Drive each fault of the settings in each situation with a robot and its table, and evaluate the drives."""
     chosen, places, loop = _chosen_faults(settings, robot), _places(settings), fault_loop(robot, slips)
-
-    def computed(task: str, function: Callable[..., Any], tasks: Sequence[Sequence[Any]]) -> list[Any]:
-        found = parallel(function, (loop,), tasks, min(settings.jobs, len(tasks)))
-        return [*counted(found, len(tasks), task, progress)]
-
-    made = computed("drive without faults", drive_references, [(place,) for place in places])
+    of_places = [(place,) for place in places]
+    made = parallel(drive_references, (loop,), of_places, settings.jobs, "drive without faults", progress)
     references: dict[Place, References] = dict(zip(places, made, strict=True))
     cases = [
         FaultCase(fault.name, duration_s, *place)
@@ -156,10 +151,11 @@ def drive_faults(
         for duration_s in sorted(settings.durations_s)
     ]
     tasks = [(case, references[Place(*case[2:])]) for case in cases]
-    rows: list[FaultRow] = computed("drive with faults", evaluate_case, tasks)
+    found = parallel(evaluate_case, (loop,), tasks, settings.jobs, "drive with faults", progress)
+    rows: list[FaultRow] = list(found)
     shown = drawn_cases(rows, settings.draw) if settings.out is not None or settings.draw else []
-    figures = (fault_figure(case, drive_case(loop, case), references[Place(*case[2:])]) for case in shown)
-    drawn = tuple(counted(figures, len(shown), "draw", progress)) if shown else ()
+    tasks = [(case, references[Place(*case[2:])]) for case in shown]
+    drawn = parallel(fault_figure, (loop,), tasks, settings.jobs, "draw", progress) if shown else ()
     return FaultsResult(
         robot=robot.name,
         table=slips.name,
@@ -167,12 +163,12 @@ def drive_faults(
         delay_s=DELAY_S,
         limits=LIMITS,
         abouts={fault.name: fault.about for fault in chosen},
-        clean=tuple(clean_drive(place, found) for place, found in references.items()),
+        clean=tuple(clean_drive(place, each) for place, each in references.items()),
         rows=tuple(rows),
         bars=count_bars([row.bars for row in rows]),
         n_rows=len(rows),
         n_met=sum(not row.unmet for row in rows),
-        drawn=drawn,
+        drawn=tuple(drawn),
     )
 
 
@@ -186,8 +182,9 @@ def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
     return LivePilot(robot, slips, KnownTerrain(), settings)
 
 
-def fault_figure(case: FaultCase, driven: Driven, references: References) -> Figure:
-    """Return the figure of a drive with a fault beside those of the same place: speeds, slip, status over time."""
+def fault_figure(loop: FaultLoop, case: FaultCase, references: References) -> Figure:
+    """Drive with a fault, and draw it beside the drives of the same place: speeds, slip, status over time."""
+    driven = drive_case(loop, case)
     drive, plain, start_s = driven.drive, references.plain, references.start_s
     time_s, last_s = drive.time_s, float(drive.time_s[-1])
     acts = Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])

@@ -26,7 +26,7 @@ from features.protocols import Samples
 from features.windows import Layout, WindowCut, WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import RunLoader, run_loaders
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
-from pipelines.learn.parallel import counted, parallel
+from pipelines.learn.parallel import parallel
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import LearnSettings
 from pipelines.learn.training_data import TrainingData, trained_runs
@@ -132,9 +132,8 @@ def cached_data(
     made_of = _sha256([FORMAT_VERSION, __version__, as_json([rule, layout, signal_sets, names])])
     files = [place / "features" / f"{_sha256([head.digest, made_of])[:32]}.parquet" for head in chosen]
     todo = [i for i, file in enumerate(files) if _read(file) is None]
-    each = ((load_of[chosen[i].run_id], files[i]) for i in todo)
-    stored = parallel(_store_run, (rule, layout, extractor), each, n_jobs)
-    list(counted(stored, len(todo), "features", progress))
+    each = [(load_of[chosen[i].run_id], files[i]) for i in todo]
+    list(parallel(_store_run, (rule, layout, extractor), each, n_jobs, "features", progress))
     samples, features, moved = _table(chosen, files, rule)
     motion = None if wheel_stream(layout.channels) is None else moved
     runs = trained_runs([head[:4] for head in chosen], samples)
@@ -147,9 +146,9 @@ def _heads(
 ) -> tuple[list[RunHead], list[tuple[str, str]]]:
     """Return the head of each run, and the pairs of ids that may hold the same measurements."""
     heads: list[RunHead] = []
-    read = parallel(_head, (place,), ((load,) for load in loaders), n_jobs)
+    each = [(load,) for load in loaders]
     with PrintFiles() as prints:
-        for head, codes, time_s in counted(read, len(loaders), "channels", progress):
+        for head, codes, time_s in parallel(_head, (place,), each, n_jobs, "channels", progress):
             heads.append(head)
             prints.add(RunPrint(codes, time_s, bytes.fromhex(head.print_digest)))
         pairs = [(heads[a].run_id, heads[b].run_id) for a, b in prints.possible_pairs()]
@@ -201,8 +200,8 @@ def _period_s(time_s: Array) -> float:
 
 def _refuse_shared(pairs: Sequence[tuple[RunLoader, RunLoader]], n_jobs: int, progress: Progress) -> None:
     """Raise ``DataError`` where the two runs of a pair hold the same measurements."""
-    compared = parallel(_compared, (), pairs, n_jobs)
-    if found := [each for found in counted(compared, len(pairs), "compare runs", progress) for each in found]:
+    compared = parallel(_compared, (), pairs, n_jobs, "compare runs", progress)
+    if found := [each for found in compared for each in found]:
         raise DataError(
             f"{'; '.join(sentences(sorted(found)))}: held out, they would be recognised and not classified; "
             "leave one of them out by --without, or merge them by --merge-duplicates without --cache"

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from pipelines.learn.evaluate import weaknesses
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.metrics import runs_by_terrain
 from terrain.classify.paired import MIN_RUNS, Difference, paired_accuracy
@@ -77,7 +76,7 @@ def judge(
     info, evaluated : of the new version
     data : that it was trained on; None where they are not at hand any more
     """
-    weak = weaknesses(evaluated.accuracy_ci, evaluated.chance)
+    weak = evaluated.weaknesses
     if weak and not evaluated.accuracy_ci[0] > evaluated.chance:
         return False, weak[0]
     remark = f"; {'; '.join(weak)}" if weak else ""

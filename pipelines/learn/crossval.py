@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from pydantic import model_validator
 
@@ -17,82 +16,64 @@ from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import ComputeSettings, computing
-from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings
+from pipelines.learn.settings import CacheSettings, EvaluationSettings
 from pipelines.report.results import Progress, silent
-from pipelines.report.settings import Settings as BaseSettings
-from pipelines.report.settings import setting
-from terrain.errors import ConfigError, DataError
+from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
     from features.protocols import Samples
     from features.recipes import WindowPipeline
     from pipelines.learn.comparison import ComparisonResult
-    from terrain.records import RunLog, Windows
+    from terrain.records import RunLog
 
 EXAMPLE = "terrain crossval --data runs/ --recipe svm"
 RESULTS = ("pipelines.learn.comparison",)
 
 
-class CacheSettings(BaseSettings):
-    """Cached features, by which runs need not be read again."""
-
-    cache: Path | None = setting(None, "Folder of cached features; one that was interrupted goes on.")
-
-
-class Settings(EvaluationSettings, AlignedRunsSettings, CacheSettings, ComputeSettings):
+class Settings(EvaluationSettings, CacheSettings, AlignedRunsSettings, ComputeSettings):
     """What is evaluated, of which runs."""
 
     @model_validator(mode="after")
-    def _check_cache(self) -> Self:
-        if self.cache is None:
-            return self
-        if self.model or self.recipes != (FEATURE_RECIPE,) or self.feature:
+    def _check_runs(self) -> Self:
+        of_runs = self.protocol in ("published", "slow-fast", "fast-slow") or self.speed is not None
+        if self.cache is not None and (of_runs or self.model):
             raise ConfigError(
-                f"--cache is for recipe {FEATURE_RECIPE!r} alone, on the package's own features"
+                "--cache holds features of windows; --model, this protocol or --speed needs the runs"
             )
-        if self.protocol in ("published", "slow-fast", "fast-slow") or self.speed is not None:
-            raise ConfigError("--cache holds features of windows; this protocol or --speed needs the runs")
-        if self.merge_duplicates:
-            raise ConfigError("--cache keeps each run by itself: it does not go with --merge-duplicates")
         return self
 
 
 def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | ComparisonResult:
-    """Read runs, and evaluate recipes or models on them.
+    """Read runs, or their cached features, and evaluate recipes or models on them.
 
     Raises
     ------
     ConfigError, LogError, DataError
         if a setting is not accepted, a run cannot be read, or the data cannot answer.
     """
+    found: CrossvalResult | ComparisonResult
     with computing(settings.compute):
         if settings.cache is not None:
-            return _of_cache(settings, settings.cache, progress)
-        from terrain.logs.digest import data_digest
+            from pipelines.learn.cache import cached_data, loaders_of
+            from pipelines.learn.evaluate import evaluate_recipe
 
-        runs, skipped = load(settings)
-        asked = settings.with_(skip_short=settings.repair)
-        if settings.model:
-            from pipelines.learn.comparison import compare_models
-            from pipelines.learn.model_file import read_model
-
-            found = compare_models(runs, [read_model(each) for each in settings.model], asked)
+            data, skipped = cached_data(loaders_of(settings), settings, settings.cache, progress)
+            (name,), computed, digest = settings.recipes, (data.rows, data.motion), data.digest
+            found, _ = evaluate_recipe(data.recipe, name, data.samples, settings, progress, computed)
         else:
-            found = crossval(runs, asked, progress)
-    named = replace(found, dataset=settings.dataset, data_digest=data_digest(runs), data=str(settings.data))
+            from terrain.logs.digest import data_digest
+
+            runs, skipped = load(settings)
+            asked, digest = settings.with_(skip_short=settings.repair), data_digest(runs)
+            if settings.model:
+                from pipelines.learn.comparison import compare_models
+                from pipelines.learn.model_file import read_model
+
+                found = compare_models(runs, [read_model(each) for each in settings.model], asked)
+            else:
+                found = crossval(runs, asked, progress)
+    named = replace(found, dataset=settings.dataset, data_digest=digest, data=str(settings.data))
     return replace(named, skipped=tuple(skipped)) if isinstance(named, CrossvalResult) else named
-
-
-def _of_cache(settings: Settings, folder: Path, progress: Progress) -> CrossvalResult:
-    """Evaluate the SVM on cached features; what is missing among them is computed first."""
-    from pipelines.learn.cache import cached_data, loaders_of
-    from pipelines.learn.evaluate import evaluate_recipe
-
-    data, skipped = cached_data(loaders_of(settings), settings, folder, progress)
-    given = data.rows, data.motion
-    found, _ = evaluate_recipe(data.recipe, FEATURE_RECIPE, data.samples, settings, progress, given)
-    of_data: dict[str, Any] = {"dataset": settings.dataset, "data_digest": data.digest}
-    return replace(found, **of_data, data=str(settings.data), skipped=tuple(skipped))
 
 
 def crossval(
@@ -123,14 +104,15 @@ def crossval(
             skip_short=settings.skip_short,
         )
         contenders.append((name, recipe, samples))
-    return _evaluated(contenders, settings, progress)
+    return evaluated(contenders, settings, progress)
 
 
-def _evaluated(
+def evaluated(
     contenders: Sequence[tuple[str, WindowPipeline, Samples]],
     settings: EvaluationSettings,
     progress: Progress,
 ) -> CrossvalResult | ComparisonResult:
+    """Evaluate a recipe, of which name, recipe and samples are given, or compare several on the same folds."""
     if len(contenders) > 1:
         from pipelines.learn.comparison import side_by_side
 
@@ -139,53 +121,3 @@ def _evaluated(
 
     name, recipe, samples = contenders[0]
     return evaluate_recipe(recipe, name, samples, settings, progress)[0]
-
-
-def cross_validate(
-    recipe: Any, windows: Windows, *, names: Sequence[str] = (), progress: Progress = silent, **options: Any
-) -> CrossvalResult | ComparisonResult:
-    """Evaluate one recipe, or several side by side, on windows with labels; whole runs are held out.
-
-    Parameters
-    ----------
-    recipe : a scikit-learn classifier of features, a whole recipe or the name of one, or a list of them
-    windows : with the run and the terrain of each
-    names : of the recipes, for the report
-    progress : called as folds are done
-    options : fields of :class:`EvaluationSettings`, as ``protocol``, ``repeats``, ``seed``, ``n_jobs``; and
-        ``functions``, a list of own functions of a window
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sklearn.neighbors import KNeighborsClassifier
-    >>> from terrain.records import Windows
-    >>> rng, run = np.random.default_rng(0), np.repeat(np.arange(10), 8)
-    >>> terrain = np.where(run % 2, "ice", "mud").astype(object)
-    >>> shaking = rng.normal(size=(80, 1, 200)) * np.where(run % 2, 1.0, 3.0)[:, None, None]
-    >>> windows = Windows({"imu": shaking}, {"imu": ("accel_z_mps2",)}, {"imu": 100.0}, 2.0,
-    ...                   2.0 * np.arange(80), run.astype(str).astype(object), terrain)
-    >>> def peak(window):
-    ...     return np.abs(window["imu", "accel_z_mps2"]).max()
-    >>> found = cross_validate(KNeighborsClassifier(3), windows, functions=[peak], repeats=1, n_jobs=1)
-    >>> found.recipe, found.n_features, found.accuracy
-    ('KNeighborsClassifier', 52, 1.0)
-    """
-    from features.protocols import Samples
-    from features.recipes import make_recipe
-
-    functions = options.pop("functions", ())
-    recipes = list(recipe) if isinstance(recipe, list | tuple) else [recipe]
-    settings = EvaluationSettings(**{"extras": False} | options)
-    known = windows[windows.terrain != ""]
-    if not len(known):
-        raise DataError("no window has a terrain label: nothing can be trained or tested")
-    gap = settings.rule.overlap
-    samples = Samples(known, {}, known.run_id, gap)
-    made = [
-        make_recipe(each, settings.signal_sets, gap=gap, seed=settings.seed, functions=functions)
-        for each in recipes
-    ]
-    texts = names or [each if isinstance(each, str) else type(each).__name__ for each in recipes]
-    contenders = [(text, each, samples) for text, each in zip(texts, made, strict=True)]
-    return _evaluated(contenders, settings, progress)

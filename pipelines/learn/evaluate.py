@@ -14,10 +14,10 @@ from features.protocols import N_FOLDS, PROTOCOLS, Samples, folds_of, slow_and_f
 from features.recipes import WindowPipeline, feature_matrix
 from features.sequences import following
 from pipelines.learn.evaluation import CrossvalResult
-from pipelines.learn.parallel import counted, parallel
+from pipelines.learn.parallel import parallel
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings, RecipeSettings
-from pipelines.report.numbers import format_counts, format_value
+from pipelines.report.numbers import format_counts
 from pipelines.report.results import Progress, silent
 from terrain.classify.breakaway import breakaways
 from terrain.classify.folds import Fold, single_run_classes
@@ -34,9 +34,6 @@ from terrain.terramechanics.stiffness import known_levels
 
 CHECKED_WITH = FEATURE_RECIPE
 """The recipe of the checks beside the figures: they are of the data, and have many fits."""
-
-WIDE_INTERVAL = 0.2
-"""Accuracies that differ by half of this cannot be distinguished where the 95 % interval is wider."""
 
 NO_EXTRAS = (
     "from cached features: speed alone, slow against fast, the learning curve and terrain over time need the "
@@ -78,8 +75,8 @@ def evaluate(
     each = [*zip(folds, [None] * len(folds) if asks is None else asks, strict=True)]
     if on_all:  # first, as it takes longest
         each.insert(0, (Fold(0, 0, np.arange(n), np.zeros(0, dtype=int)), itself))
-    results = parallel(fit_fold, shared, each, min(n_jobs, len(each)))
-    return HeldOut.of_folds([*counted(results, len(each), task, progress)], examples.terrain)
+    results = parallel(fit_fold, shared, each, n_jobs, task, progress)
+    return HeldOut.of_folds(list(results), examples.terrain)
 
 
 def evaluate_recipe(
@@ -88,7 +85,7 @@ def evaluate_recipe(
     samples: Samples,
     settings: EvaluationSettings | RecipeSettings,
     progress: Progress = silent,
-    cached: tuple[Array, Motion | None] | None = None,
+    computed: tuple[Array, Motion | None] | None = None,
     ask: Callable[[Examples, Fold], Callable[[Any], Any] | None] | None = None,
 ) -> tuple[CrossvalResult, HeldOut]:
     """Evaluate a recipe on windows by the protocol of the settings; also return its held-out probabilities.
@@ -99,7 +96,7 @@ def evaluate_recipe(
     samples : labelled windows with their groups
     settings : protocol, repeats, seed, processes and extras; these are computed under ``grouped`` only
     progress : called as the work goes on
-    cached : features (n, f) and motion of the windows, where they are there already
+    computed : features (n, f) and motion of the windows, where they are there already
     ask : gives for each fold what is called with its fitted classifier, which is then fitted on all windows, too;
         not together with extras
 
@@ -111,7 +108,7 @@ def evaluate_recipe(
     protocol, seed, windows = settings.protocol, settings.seed, samples.windows
     folds = folds_of(samples, protocol, settings.repeats or PROTOCOLS[protocol].repeats, seed)
     progress("features", 0, 1)
-    features, motion = cached or (feature_matrix(recipe, windows), window_motion(windows))
+    features, motion = computed or (feature_matrix(recipe, windows), window_motion(windows))
     progress("features", 1, 1)
     examples = Examples(features, samples.terrain, samples.group)
     beside, published = settings.extras and protocol == "grouped", protocol == "published"
@@ -123,12 +120,17 @@ def evaluate_recipe(
     held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, ask is not None)
     found: dict[str, Any] = {}
     notes = []
-    if beside and cached is None:
+    if beside and computed is None:
         found |= _extras(recipe, features, samples, held_out, settings, progress)
     elif beside:
         notes.append(NO_EXTRAS)
     if protocol == "leave-terrain-out":
-        found |= _leave_terrain_out(recipe, features, samples, settings, progress)
+        _, checked = _of_svm(recipe, features, samples, settings)
+        terrain, run_id, gap = samples.terrain, samples.group.astype(str), samples.gap
+        left_out = left_out_folds(terrain, run_id, N_FOLDS, gap, seed)
+        shared = checked, terrain, run_id, gap, seed
+        scores = [*parallel(score_fold, shared, left_out, settings.jobs, protocol, progress)]
+        found |= unknown_figures(scores, terrain, run_id, windows.start_s, seed)._asdict()
     if not published:
         found["conformal"] = set_figures(held_out, windows, seed)
         if motion is None:
@@ -161,7 +163,7 @@ def evaluation_of(held_out: HeldOut, samples: Samples, seed: int, **fields: Any)
         notes=(),
         **fields,
     )
-    return replace(result, notes=weaknesses(result.accuracy_ci, result.chance))
+    return replace(result, notes=result.weaknesses)
 
 
 def _of_svm(
@@ -222,23 +224,6 @@ def _extras(
     return found
 
 
-def _leave_terrain_out(
-    recipe: WindowPipeline,
-    features: Array,
-    samples: Samples,
-    settings: EvaluationSettings | RecipeSettings,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Return how well a terrain that was left out of training is found to be unknown, by field."""
-    _, features = _of_svm(recipe, features, samples, settings)
-    terrain, run_id, seed, gap = samples.terrain, samples.group.astype(str), settings.seed, samples.gap
-    folds = left_out_folds(terrain, run_id, N_FOLDS, gap, seed)
-    shared = features, terrain, run_id, gap, seed
-    scored = parallel(score_fold, shared, folds, min(settings.jobs, len(folds)))
-    scores = [*counted(scored, len(folds), settings.protocol, progress)]
-    return unknown_figures(scores, terrain, run_id, samples.windows.start_s, seed)._asdict()
-
-
 def _notes(
     samples: Samples, recipe: WindowPipeline, settings: EvaluationSettings | RecipeSettings
 ) -> Iterator[str]:
@@ -268,30 +253,3 @@ def _notes(
         yield f"windows left out: {format_counts(samples.dropped)}"
     if samples.repaired:
         yield f"changed or left out in reading the logs: {format_counts(samples.repaired)}"
-
-
-def weaknesses(accuracy_ci: tuple[float, float], chance: float) -> tuple[str, ...]:
-    r"""Return in sentences why a figure must not be relied on, none where it may.
-
-    Examples
-    --------
-    >>> for text in weaknesses((0.31, 0.48), 0.4):
-    ...     print(text.replace("\N{NO-BREAK SPACE}", " "))
-    the accuracy (95 % over runs: 31.0 to 48.0 %) is not above chance,
-        40.0 % (always the most frequent class)
-    >>> weaknesses((0.85, 0.95), 0.4)
-    ()
-    """
-    low, high = accuracy_ci
-    found = []
-    if not low > chance:
-        found.append(
-            f"the accuracy (95 % over runs: {format_value((low, high), '.1%')}) is not above chance, "
-            f"{format_value(chance, '.1%')} (always the most frequent class)"
-        )
-    if not high - low <= WIDE_INTERVAL:
-        found.append(
-            f"the interval of the accuracy is {100 * (high - low):.0f} points wide: more runs are needed to "
-            "rely on it"
-        )
-    return tuple(found)

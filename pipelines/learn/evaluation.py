@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 MAX_ROWS = 10
 PERCENT = ".1%"
 
+WIDE_INTERVAL = 0.2
+"""Accuracies that differ by half of this cannot be distinguished where the 95 % interval is wider."""
+
 optional = partial(described, optional=True)
 
 
@@ -117,6 +120,23 @@ class CrossvalResult(Result):
         """Accuracy of always predicting the class with the most windows."""
         counts = [figures.n_windows for figures in self.per_class.values()]
         return max(counts) / sum(counts)
+
+    @property
+    def weaknesses(self) -> tuple[str, ...]:
+        """Why the accuracy must not be relied on, in sentences; none where it may."""
+        low, high = self.accuracy_ci
+        found = []
+        if not low > self.chance:
+            found.append(
+                f"the accuracy (95 % over runs: {format_value((low, high), PERCENT)}) is not above chance, "
+                f"{format_value(self.chance, PERCENT)} (always the most frequent class)"
+            )
+        if not high - low <= WIDE_INTERVAL:
+            found.append(
+                f"the interval of the accuracy is {100 * (high - low):.0f} points wide: more runs are needed to "
+                "rely on it"
+            )
+        return tuple(found)
 
     def as_json(self) -> Any:
         """Return the fields that are known by name; of checks that were made, all."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.learn.parallel import counted
+from pipelines.learn.parallel import parallel
 from pipelines.report.numbers import format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Report, Table, Text, sections
@@ -66,8 +66,8 @@ def find_changes(
     """
     described_robot = one_robot([*runs, *quiet], None if robot is None else load_robot(robot))
     detector = quiet_detector(quiet, runs, described_robot, false_alarms)
-    found = (watch(run, described_robot, detector) for run in runs)
-    watched = [*counted(found, len(runs), "watch", progress)]
+    each = [(run, described_robot, detector) for run in runs]
+    watched = [*parallel(watch, (), each, 1, "watch", progress)]
     with_step = [run for run in watched if run.step is not None]
     without = [run for run in watched if run.judged and run.step is None]
     delays = np.array([run.delay_s for run in with_step if run.found])

@@ -13,12 +13,12 @@ import logging
 import os
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from functools import partial
 from importlib.util import find_spec
-from itertools import islice
+from itertools import islice, starmap
 from socket import create_connection
 from time import monotonic
 from typing import Any, NamedTuple, Self
@@ -26,7 +26,7 @@ from urllib.parse import urlsplit
 
 from pydantic import model_validator
 
-from pipelines.report.results import Progress
+from pipelines.report.results import Progress, silent
 from pipelines.report.settings import Settings, setting
 from pipelines.report.versions import difference, software
 from terrain.errors import ConfigError, TerrainError
@@ -191,12 +191,17 @@ def computing(compute: str) -> Iterator[str]:
 
 
 def parallel(
-    function: Callable[..., Any], shared: Sequence[Any], each: Iterable[Sequence[Any]], n_jobs: int
+    function: Callable[..., Any],
+    shared: Sequence[Any],
+    each: Collection[Sequence[Any]],
+    n_jobs: int,
+    task: str = "",
+    progress: Progress = silent,
 ) -> Iterator[Any]:
     """Yield ``function(*shared, *one)`` for each ``one``, in their order, as soon as they are there.
 
-    Few tasks are in progress at once, so that neither arguments nor results pile up; what is local and what a
-    cluster computes has the same bytes.
+    Few tasks are in progress at once, so that results do not pile up; what is local and what a cluster computes
+    has the same bytes.
 
     Parameters
     ----------
@@ -204,6 +209,7 @@ def parallel(
     shared : arguments that all tasks have; they are sent to a worker once
     each : the other arguments of each task
     n_jobs : processes at once on this machine; a cluster has as many as it has
+    task, progress : name of the work, and what is called as results are there
 
     Raises
     ------
@@ -215,14 +221,22 @@ def parallel(
     >>> list(parallel(pow, (2,), [(3,), (5,)], 1))
     [8, 32]
     """
-    cluster = _cluster.get()
+    cluster, n_jobs = _cluster.get(), min(n_jobs, len(each))
     if cluster is not None:
-        yield from cluster.results(function, shared, each)
-        return
-    if n_jobs <= 1:
-        for one in each:
-            yield function(*shared, *one)
-        return
+        results = cluster.results(function, shared, each)
+    elif n_jobs > 1:
+        results = _in_processes(function, shared, each, n_jobs)
+    else:
+        results = starmap(partial(function, *shared), each)
+    progress(task, 0, len(each))
+    for done, result in enumerate(results, start=1):
+        yield result
+        progress(task, done, len(each))
+
+
+def _in_processes(
+    function: Callable[..., Any], shared: Sequence[Any], each: Iterable[Sequence[Any]], n_jobs: int
+) -> Iterator[Any]:
     from joblib import Parallel, delayed
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
@@ -237,14 +251,6 @@ def parallel(
             "a process ended in the middle of its task, killed or out of memory: "
             "use fewer at once with --jobs, or give them more memory"
         ) from error
-
-
-def counted(results: Iterable[Any], number: int, task: str, progress: Progress) -> Iterator[Any]:
-    """Yield results as they come, and report the progress of a task to their number."""
-    progress(task, 0, number)
-    for done, result in enumerate(results, start=1):
-        yield result
-        progress(task, done, number)
 
 
 def end_with_parent(parent: int) -> None:

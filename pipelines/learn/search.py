@@ -109,7 +109,7 @@ def search(
     progress("trials", resumed, n_trials)
     while len(trials) < n_trials:
         suggested = _suggest(optuna, trials, n_trials, seed)
-        each = ((params,) for params in suggested)
+        each = [(params,) for params in suggested]
         for trial in parallel(_tried, (kept, samples.gap, seed), each, n_jobs):
             trials.append(trial)
             progress("trials", len(trials), n_trials)

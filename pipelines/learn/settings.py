@@ -89,16 +89,12 @@ class WindowSettings(Settings):
     skip_short: bool = setting(False, "Leave out and count runs shorter than a window.", option="")
 
     @property
-    def default_window_s(self) -> float:
-        """Length of a window where none is asked for."""
-        return WINDOW_S
-
-    @property
     def rule(self) -> WindowRule:
         """How windows are cut."""
         from features.windows import WindowRule
 
-        length_s = self.default_window_s if self.window_s is None else self.window_s
+        default_s = PUBLISHED_WINDOW_S if getattr(self, "protocol", "") == "published" else WINDOW_S
+        length_s = default_s if self.window_s is None else self.window_s
         return WindowRule(length_s, self.stride_s, WindowRule().steady if self.steady else None)
 
 
@@ -126,6 +122,28 @@ class LearnSettings(WindowSettings, JobsSettings):
             if self.params is not None and (name in WITHOUT_SVM or ":" in name):
                 raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
         return self
+
+
+class CacheSettings(LearnSettings):
+    """Cached features, by which runs need not be read again."""
+
+    cache: Path | None = setting(None, "Folder of cached features; one that was interrupted goes on.")
+
+    @model_validator(mode="after")
+    def _check_cache(self) -> Self:
+        if self.cache is not None:
+            self.require_features("--cache")
+            if self.merge_duplicates:
+                raise ConfigError("--cache keeps each run by itself: it does not go with --merge-duplicates")
+        return self
+
+    def require_features(self, option: str) -> None:
+        """Raise ``ConfigError`` where the recipe learns from more than the package's own features."""
+        if [text.partition("@")[0] for text in self.recipes] != [FEATURE_RECIPE] or self.feature:
+            raise ConfigError(
+                f"{option} is for recipe {FEATURE_RECIPE!r} on the package's own features, not for "
+                f"{', '.join(self.recipes)}{' with --feature' if self.feature else ''}"
+            )
 
 
 class RecipeSettings(LearnSettings):
@@ -165,11 +183,6 @@ class EvaluationSettings(LearnSettings):
         if self.protocol not in SEVERAL_REPEATS and (self.repeats or 1) > 1:
             raise ConfigError(f"{self.protocol!r} has a single fold assignment: it has one repeat")
         return self
-
-    @property
-    def default_window_s(self) -> float:
-        """Length of a window where none is asked for."""
-        return PUBLISHED_WINDOW_S if self.protocol == "published" else WINDOW_S
 
     @property
     def speed_mps(self) -> tuple[float, float] | None:

@@ -18,7 +18,7 @@ from pydantic import model_validator
 from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn.parallel import ComputeSettings
-from pipelines.learn.settings import FEATURE_RECIPE, RecipeSettings
+from pipelines.learn.settings import CacheSettings, RecipeSettings
 from pipelines.learn.tracking import Registered
 from pipelines.report.numbers import format_value, plural
 from pipelines.report.results import Progress, described, silent
@@ -46,12 +46,11 @@ PARAMS = ("recipe", "window_s", "stride_s", "steady", "seed", "repeats", "n_wind
 """What MLflow has of the evaluation's settings and counts as parameters."""
 
 
-class TrainingSettings(RecipeSettings):
+class TrainingSettings(RecipeSettings, CacheSettings):
     """Training: what is trained, and under which name it is registered."""
 
     name: str = setting(..., "Name of the registered model.")
     out: Path | None = setting(None, "Folder of the model, beside MLflow.")
-    cache: Path | None = setting(None, "Folder of cached features; one that was interrupted goes on.")
     search: int = setting(
         0, "Candidates of the SVM's hyper-parameters that are tried before.", ge=0, le=10_000
     )
@@ -66,16 +65,10 @@ class TrainingSettings(RecipeSettings):
             raise ConfigError(
                 f"model name {self.name!r}: must not be empty nor hold any of / : @ . and blanks"
             )
-        for option, used in (("--search", self.search), ("--cache", self.cache)):
-            if used and (self.recipe.partition("@")[0] != FEATURE_RECIPE or self.feature):
-                raise ConfigError(
-                    f"{option} is for recipe {FEATURE_RECIPE!r} on the package's own features, not for "
-                    f"{self.recipe!r}{' with --feature' if self.feature else ''}"
-                )
+        if self.search:
+            self.require_features("--search")
         if self.search and self.params is not None:
             raise ConfigError("--search and --params do not go together: search, or use what was found")
-        if self.cache is not None and self.merge_duplicates:
-            raise ConfigError("--cache keeps each run by itself: it does not go with --merge-duplicates")
         return self
 
 

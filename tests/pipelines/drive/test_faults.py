@@ -116,7 +116,7 @@ def test_the_report_counts_what_is_met_and_names_what_is_not(few):
     assert drawn == [FaultCase("duplicates_imu", math.inf, "steady", "grass", 400)]
     assert all(case.fault == "loss_odometry" for case in drawn_cases(few.rows))
     references = drive_references(LOOP, Place(*drawn[0][2:]))
-    figure = fault_figure(drawn[0], drive_case(LOOP, drawn[0]), references)
+    figure = fault_figure(LOOP, drawn[0], references)
     assert figure.title == "duplicates_imu, for good: steady on grass, seed 400"
     assert figure.panels[0].marks[0].x[0][0] == references.start_s
 

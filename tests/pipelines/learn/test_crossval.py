@@ -277,7 +277,7 @@ def test_settings_that_make_no_sense_are_refused():
         ({"recipe": ("svm@radar", "svm")}, "unknown signal set 'radar'"),
         ({"signal_sets": ("sonar",)}, "unknown signal set 'sonar'; there are imu, wheels"),
         *(({"speed": text}, "LOW:HIGH") for text in ("fast", "0.3:0.1", "-1:2", "0:inf")),
-        ({"cache": "c", "recipe": ("cnn",)}, "--cache is for recipe 'svm' alone"),
+        ({"cache": "c", "recipe": ("cnn",)}, "--cache is for recipe 'svm' on"),
         ({"cache": "c", "protocol": "published"}, "--cache holds features of windows"),
         ({"cache": "c", "merge_duplicates": True}, "--cache keeps each run by itself"),
     ):

@@ -49,14 +49,7 @@ def test_an_address_is_read_and_another_text_refused_in_one_sentence(compute, ad
 
 
 def test_results_of_two_processes_come_in_the_order_of_their_tasks():
-    assert list(parallel(pow, (2,), ((number,) for number in range(40)), 2)) == [2**k for k in range(40)]
-
-
-def test_local_results_come_in_order_while_tasks_are_still_made():
-    numbers = ((number,) for number in range(40))
-    results = parallel(pow, (2,), numbers, 1)
-    assert (next(results), next(numbers)) == (1, (1,))
-    assert list(results) == [2**k for k in range(2, 40)]
+    assert list(parallel(pow, (2,), [(number,) for number in range(40)], 2)) == [2**k for k in range(40)]
 
 
 def test_no_scheduler_is_one_sentence():
