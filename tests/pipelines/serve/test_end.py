@@ -20,7 +20,7 @@ from pipelines.serve.hub import Hub
 from pipelines.serve.serve import Settings
 from terrain.control.slip_table import load_slip_table
 
-from .strangers import CHANNELS, ask, until
+from .strangers import CHANNELS, ask, hello, messages, running, until
 
 N_ROBOTS = 8
 
@@ -40,7 +40,7 @@ def process(model_folder, states):
             serving.kill()
 
 
-def stream(url, k, messages, run, terrains, reasons):
+def stream(url, k, run, terrains, reasons):
     """Drive until the connection ends; keep the terrain, and why it ended."""
     try:
         with TerrainClient(url, f"robot-{k}", "mower", CHANNELS, rate_hz=0) as robot:
@@ -58,7 +58,7 @@ def stream(url, k, messages, run, terrains, reasons):
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGKILL])
 def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
-    model_folder, hello, messages, two_drives, tmp_path, number
+    model_folder, two_drives, tmp_path, number
 ):
     terrains, reasons, expected = {}, {}, {k: "ab"[k % 2] for k in range(N_ROBOTS)}
 
@@ -68,9 +68,7 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
 
     with process(model_folder, tmp_path) as (serving, url), process(model_folder, tmp_path) as (_, again):
         threads = [
-            threading.Thread(
-                target=stream, args=(url, k, messages, two_drives[3 * (k % 2)], terrains, reasons)
-            )
+            threading.Thread(target=stream, args=(url, k, two_drives[3 * (k % 2)], terrains, reasons))
             for k in range(N_ROBOTS)
         ]
         for thread in threads:
@@ -93,7 +91,7 @@ def test_a_service_that_is_ended_under_load_goes_on_after_a_restart(
     assert saved() == expected
 
 
-def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, hello, tmp_path, monkeypatch):
+def test_a_full_disk_is_named_until_there_is_room_again(model_folder, tmp_path, monkeypatch):
     def full(self, *arguments, **named):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -115,7 +113,7 @@ def test_a_full_disk_is_named_until_there_is_room_again(running, model_folder, h
 
 @pytest.mark.parametrize("leaves", [True, False])
 def test_a_session_that_is_beginning_leaves_nothing_behind_or_gets_the_model_that_replaces(
-    model_folder, mower_model, hello, monkeypatch, tmp_path, leaves
+    model_folder, mower_model, monkeypatch, tmp_path, leaves
 ):
     hub = Hub(Settings(model=str(model_folder), record=tmp_path))
     begun, go_on, begin = threading.Event(), threading.Event(), hub._begin

@@ -9,7 +9,7 @@ import pytest
 
 from pipelines.serve.client import TerrainClient
 
-from .strangers import CHANNELS
+from .strangers import CHANNELS, running
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -188,7 +188,7 @@ def test_robots_come_and_go_and_are_chosen_by_the_keyboard(driving, opened):
 
 
 def test_the_page_asks_for_a_token_says_that_the_service_has_gone_and_goes_on_when_it_is_back(
-    running, model_folder, opened, monkeypatch
+    model_folder, opened, monkeypatch
 ):
     monkeypatch.setenv("TERRAIN_TOKEN", TOKEN)
     with running(model=str(model_folder)) as service, robot(service, token=TOKEN):

@@ -18,15 +18,13 @@ from terrain.control.slip_table import load_slip_table
 from terrain.files.resources import data_folder
 from terrain.logs.replay import replay
 
-from .strangers import CHANNELS, ask, until
+from .strangers import CHANNELS, ask, hello, messages, running, until
 
 TABLE = (data_folder("target_slip") / "default.yaml").read_text()
 
 
 @pytest.mark.parametrize("packed", [False, True])
-def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(
-    service, hello, messages, two_drives, mower_model, packed
-):
+def test_a_robot_gets_the_terrain_and_target_slips_of_its_samples(service, two_drives, mower_model, packed):
     run, observer = two_drives[4], Observer(mower_model)
     found, seen = [], []
     for sample in replay(run):
@@ -81,7 +79,7 @@ def test_steps_come_at_the_rate_that_was_asked_for(service):
     assert client.latest(0.0) is None
 
 
-def test_a_step_is_at_the_robots_time_or_where_it_has_none_at_its_clocks(service, hello):
+def test_a_step_is_at_the_robots_time_or_where_it_has_none_at_its_clocks(service):
     with service.socket() as socket:
         assert ask(socket, hello("at"))["type"] == "welcome"
         content = {"type": "samples", "streams": {"imu": [[5.0], [[0.1]]]}, "step": True}
@@ -115,7 +113,7 @@ def test_the_client_waits_for_steps_and_says_what_went_wrong(service):
         TerrainClient(service.ws, "x", "mower", {"imu": ["gyro_z_radps"]})
 
 
-def test_health_card_and_figures_in_the_form_of_prometheus(service, hello, messages, two_drives):
+def test_health_card_and_figures_in_the_form_of_prometheus(service, two_drives):
     def figures():
         families = text_string_to_metric_families(service.get("/metrics")[1])
         return {
@@ -145,27 +143,23 @@ def test_health_card_and_figures_in_the_form_of_prometheus(service, hello, messa
 RISES = {"sessions": 1, "messages_total": 100, "rows_total": 200, "step_seconds_count": 100}
 
 
-def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(
-    running, model_folder, hello, messages, two_drives
-):
+def test_another_model_is_put_in_while_a_robot_is_served_and_no_window_is_lost(model_folder, two_drives):
     with running(model=str(model_folder)) as service, service.socket() as socket:
-        say, starts, numbers = partial(ask, socket, packed=False), [], []
-        say(hello("swapped"))
+        ask(socket, hello("swapped"))
+        starts, numbers = set(), []
         for k, message in enumerate(messages(two_drives[4])):
-            if k in (150, 320):
-                status, text = service.put("/model", {"uri": str(model_folder)})
-                assert (status, json.loads(text)["number"]) == (200, 2 if k == 150 else 3)
-            seen = say(message)["observation"]
+            if k == 150:
+                put = service.put("/model", {"uri": str(model_folder)})
+            if k == 320:
+                put = service.put("/table", TABLE.replace("0.1", "0.11"), "application/yaml")
+            seen = ask(socket, message)["observation"]
             time.sleep(0.0005)
             numbers.append(seen["served"])
-            if seen["window"]:
-                starts.append(seen["window"]["start_s"])
-        assert numbers == [1] * 150 + [2] * 170 + [3] * (len(numbers) - 320)
-        assert sorted(set(starts)) == [0.0, 2.0, 4.0, 6.0, 8.0, 10.0][: len(set(starts))]
-        assert len(set(starts)) >= 5
-        lower = TABLE.replace("0.1", "0.11")
-        status, text = service.put("/table", lower, "application/yaml")
-        assert (status, json.loads(text)["number"]) == (200, 4)
+            starts |= {seen["window"]["start_s"]} if seen["window"] else set()
+    assert (put[0], json.loads(put[1])["number"]) == (200, 3)
+    assert numbers == [1] * 150 + [2] * 170 + [3] * (len(numbers) - 320)
+    assert sorted(starts) == [0.0, 2.0, 4.0, 6.0, 8.0, 10.0][: len(starts)]
+    assert len(starts) >= 5
 
 
 @pytest.mark.parametrize(
@@ -196,7 +190,7 @@ def test_what_cannot_be_served_is_refused_and_the_old_goes_on(
     assert service.hub.served.number == number
 
 
-def test_a_session_that_is_silent_is_taken_by_its_robot_that_comes_back(service, hello, monkeypatch):
+def test_a_session_that_is_silent_is_taken_by_its_robot_that_comes_back(service, monkeypatch):
     monkeypatch.setattr("pipelines.serve.hub.SILENT_S", 0.3)
     with service.socket() as first, service.socket() as second:
         assert ask(first, hello("back"))["type"] == "welcome"
@@ -209,7 +203,7 @@ def test_a_session_that_is_silent_is_taken_by_its_robot_that_comes_back(service,
             first.recv(10)
 
 
-def test_a_robot_that_comes_back_knows_its_terrain(service, hello, messages, two_drives):
+def test_a_robot_that_comes_back_knows_its_terrain(service, two_drives):
     with service.socket() as socket:
         assert ask(socket, hello("returning"))["restored"] is None
         for message in messages(two_drives[4]):
@@ -222,9 +216,7 @@ def test_a_robot_that_comes_back_knows_its_terrain(service, hello, messages, two
         assert first["observation"]["terrain"] == "b"
 
 
-def test_a_session_that_asks_for_it_becomes_a_run_with_its_windows(
-    running, model_folder, hello, messages, two_drives, tmp_path
-):
+def test_a_session_that_asks_for_it_becomes_a_run_with_its_windows(model_folder, two_drives, tmp_path):
     run = two_drives[4]
     with running(model=str(model_folder), record=tmp_path) as service:
         with service.socket() as socket:

@@ -11,7 +11,7 @@ from pipelines.serve.service import Service
 from terrain.errors import ConfigError, TerrainError
 from terrain.files.resources import data_folder
 
-from .strangers import ask
+from .strangers import ask, hello, running
 
 TOKEN = "t" * 20
 FOR_HUSKY = (data_folder("target_slip") / "default.yaml").read_bytes() + b"\nschema: 2\nrobot: husky\n"
@@ -93,9 +93,7 @@ def test_after_a_refused_start_the_port_is_free_and_no_thread_is_left(
     assert found.report.answer.endswith("can be served: a and b.")
 
 
-def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(
-    running, model_folder, hello, tmp_path
-):
+def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(model_folder, tmp_path):
     for name, content in {"bytes": b"\xff\x00", "half": b'{"version": 1', "deep": b"[" * 60_000}.items():
         (tmp_path / f"{name}.json").write_bytes(content)
     (tmp_path / "folder.json").mkdir()

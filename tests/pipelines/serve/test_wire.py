@@ -22,7 +22,7 @@ from pipelines.serve import connection, guard
 from pipelines.serve.client import ServiceError, TerrainClient
 from pipelines.serve.hub import LIMITS
 
-from .strangers import CHANNELS, ask, frame, raw, until
+from .strangers import CHANNELS, ask, frame, hello, raw, running, until
 
 TOKEN = "a token of the tests"
 BEARER = {"Authorization": f"Bearer {TOKEN}"}
@@ -41,7 +41,7 @@ def resident_bytes():
 
 
 @pytest.fixture(scope="module")
-def guarded(running, model_folder, tmp_path_factory):
+def guarded(model_folder, tmp_path_factory):
     """A service that requires a token, whose wrong tokens wait for a fifth of a second."""
     file = tmp_path_factory.mktemp("token") / "token"
     file.write_text(TOKEN)
@@ -78,7 +78,7 @@ def samples(stamp_s, **more):
         ("with the welcome", False),
     ],
 )
-def test_a_robot_that_is_gone_without_a_message_leaves_nothing_behind(service, hello, reset, when):
+def test_a_robot_that_is_gone_without_a_message_leaves_nothing_behind(service, reset, when):
     for k in range(5):
         name = f"gone-{reset}-{when.replace(' ', '')}-{k}"
         with raw(service, None if when == "with the welcome" else hello(name)) as line:
@@ -146,7 +146,7 @@ def test_each_message_is_answered_or_taken(driving, given_messages, rate_hz, pac
 
 
 def test_large_messages_are_decoded_in_a_thread_too_large_ones_refused_and_larger_ones_close_the_connection(
-    service, hello, decoded
+    service, decoded
 ):
     with service.socket() as robot:
         assert ask(robot, hello("large"))["type"] == "welcome"
@@ -165,7 +165,7 @@ def test_large_messages_are_decoded_in_a_thread_too_large_ones_refused_and_large
 
 
 def test_before_its_token_nothing_of_a_client_is_decoded_and_wrong_tokens_wait_and_are_counted(
-    guarded, hello, decoded
+    guarded, decoded
 ):
     wrong = '{"type": "samples", "streams": {"imu": [' + "0.123," * 40_000
     for first in (wrong, json.dumps(hello("x")), "", TOKEN[:-1], TOKEN + TOKEN, TOKEN.encode()):
@@ -188,7 +188,7 @@ def test_before_its_token_nothing_of_a_client_is_decoded_and_wrong_tokens_wait_a
     assert guarded.hub.metrics.totals()["wrong_tokens"] == 10
 
 
-def test_a_token_comes_in_the_header_or_as_the_first_frame(guarded, hello, monkeypatch):
+def test_a_token_comes_in_the_header_or_as_the_first_frame(guarded, monkeypatch):
     """And its robot is served for longer than a request may take."""
     with monkeypatch.context() as patch, guarded.socket() as robot:
         patch.setattr(guard, "REQUEST_S", 0.2)
@@ -204,7 +204,7 @@ def test_a_token_comes_in_the_header_or_as_the_first_frame(guarded, hello, monke
 
 
 def test_before_its_hello_a_client_is_answered_once_at_a_time_and_large_messages_are_not_decoded(
-    service, hello, decoded
+    service, decoded
 ):
     with service.socket() as stranger:
         begun_s = time.monotonic()
@@ -216,7 +216,7 @@ def test_before_its_hello_a_client_is_answered_once_at_a_time_and_large_messages
         assert ask(stranger, hello("greeted"))["type"] == "welcome"
 
 
-def test_more_robots_than_are_accepted_wait_until_one_has_left(guarded, hello, monkeypatch):
+def test_more_robots_than_are_accepted_wait_until_one_has_left(guarded, monkeypatch):
     until(lambda: not guarded.hub.sessions)
     monkeypatch.setattr(guarded.hub, "limits", LIMITS._replace(sessions=1))
     with guarded.socket(additional_headers=BEARER) as late:
@@ -338,7 +338,7 @@ def test_a_message_of_which_a_part_is_refused_gives_an_error_and_a_step_of_the_r
     ],
 )  # fmt: skip
 def test_what_is_over_a_budget_is_named_and_the_rest_is_taken(
-    service, hello, decoded, monkeypatch, most, content, sentence
+    service, decoded, monkeypatch, most, content, sentence
 ):
     monkeypatch.setattr(service.hub, "limits", LIMITS._replace(**most))
     with service.socket(close_timeout=0.1) as robot:
