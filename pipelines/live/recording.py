@@ -152,17 +152,9 @@ class SessionRecorder:
         for output in done.windows:
             self._put(WINDOW, output)
 
-    def close(self, timeout_s: float = 0.0) -> list[Path]:
-        """End the recording; return its files, the last one whole where the thread was done within a time.
-
-        Parameters
-        ----------
-        timeout_s : how long is waited for the thread; not at all by default
-        """
+    def close(self) -> None:
+        """End the recording; its files are whole when the thread has settled it."""
         self._end(FINISHED)
-        if timeout_s > 0.0:
-            self.settled.wait(timeout_s)
-        return self.files
 
     def _put(self, stream: str, content: Array | WindowOutput) -> None:
         if self._ended:

@@ -137,9 +137,8 @@ class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
             raise ValueError(f"{' and '.join(asked)} are two modes: one of them is accepted")
         mode = asked[0] if asked else "the WebSocket service"
         for name, group in (modes | {"the WebSocket service": ServiceSettings}).items():
-            for field, about in group.model_fields.items():
-                if name != mode and getattr(self, field) != about.get_default():
-                    raise ValueError(f"{about.alias} is an option of {name}, not of {mode}")
+            if name != mode:
+                self.refuse(group.model_fields, f"is an option of {name}, not of {mode}")
         return self
 
 

@@ -66,6 +66,13 @@ def recorded(recorder, n=50, start=0):
     return recorder
 
 
+def closed(recorder):
+    """The files of a recording that is ended."""
+    recorder.close()
+    assert recorder.settled.wait(10.0)
+    return recorder.files
+
+
 def read(path):
     (run,) = load_runs(path)
     return run
@@ -98,7 +105,7 @@ def test_a_recorded_observer_is_predicted_as_it_was_live(writer, tmp_path, mower
         recorder.readings(each.readings)
         recorder.step(each.time_s, each.twist, observer.take(each))
     assert recorder.status == "recording"
-    (path,) = recorder.close(10.0)
+    (path,) = closed(recorder)
     assert (recorder.status, path) == ("finished", tmp_path / "new" / "session.mcap")
     again = assert_predicted_as_live(path, mower_model)
     assert (again.run_id, again.robot, again.session) == ("session", "mower", "session")
@@ -124,7 +131,7 @@ def test_a_recorded_pilot_is_predicted_as_it_was_live_and_desires_the_same_motio
 
     drive = make_scenario("survey", AGRIMARO, "grass", 24.0, seed=5)
     simulate(AGRIMARO, drive, {"grass": load_soil("grass")}, 1, controller=session, command_delay_s=0.05)
-    run = assert_predicted_as_live(recorder.close(10.0)[0], swerve_model)
+    run = assert_predicted_as_live(closed(recorder)[0], swerve_model)
     wheels = [[*twist, *one.wheel_radps, *one.steer_rad] for twist, one in zip(twists, commands, strict=True)]
     assert run.streams["commands"].channels[:4] == (
         *("speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
@@ -139,7 +146,7 @@ def test_a_recorded_pilot_is_predicted_as_it_was_live_and_desires_the_same_motio
 def test_stamps_of_any_clock_come_back_as_they_were(recorder, origin_s):
     stamps = origin_s + np.arange(20) / 50
     recorder.readings({name: Reading(stamps, np.ones((20, 2))) for name in CHANNELS})
-    np.testing.assert_array_equal(read(recorder.close(10.0)[0]).streams["imu"].time_s, stamps)
+    np.testing.assert_array_equal(read(closed(recorder)[0]).streams["imu"].time_s, stamps)
 
 
 def test_windows_of_any_class_are_in_the_file(recorder):
@@ -149,7 +156,7 @@ def test_windows_of_any_class_are_in_the_file(recorder):
         both, span_s = np.array([probability, 1.0 - probability]), (2.0 * k, 2.0 * k + 2.0)
         output = WindowOutput(*span_s, terrain, probability, both, ("a/b: c", "d"), why)
         recorder.step(1.0, np.zeros(3), Step([output]))
-    _, windows = recorded_windows(recorder.close(10.0)[0])
+    _, windows = recorded_windows(closed(recorder)[0])
     assert [(w.doubtful, w.refused) for w in windows] == [(doubtful, why) for *_, why, doubtful in given]
     assert windows[0].probabilities == {"a/b: c": 0.9, "d": pytest.approx(0.1)}
 
@@ -164,7 +171,7 @@ def test_what_a_run_cannot_hold_is_dropped_and_counted(writer, tmp_path):
     recorder.readings({"odometry": Reading(np.array([0.1]), np.ones((1, 1)))})
     recorder.readings({"gnss": Reading(np.array([500.0, 500.1]), np.ones((2, 1)))})
     recorder.readings({"steering": Reading(np.array([0.0, 1.0]), np.full((2, 1), np.nan))})
-    run = read(recorder.close(10.0)[0])
+    run = read(closed(recorder)[0])
     assert set(run.streams) == {"imu", "wheels"}
     assert run.streams["imu"].channels == ("accel_z_mps2",)
     assert np.isnan(run.streams["imu"].values[3, 0])
@@ -195,10 +202,10 @@ def test_names_that_are_not_accepted_are_refused_at_once(writer, tmp_path, run_i
 def test_a_second_recording_of_a_name_gets_another_and_nothing_is_kept_of_one_without_samples(
     recorder, writer, tmp_path
 ):
-    assert recorder.close(10.0) == []
+    assert closed(recorder) == []
     assert recorder.status == "finished: nothing to keep"
     others = [SessionRecorder(tmp_path, "field", "husky", CHANNELS, writer=writer) for _ in range(2)]
-    assert [recorded(other).close(10.0)[0].name for other in others] == ["field.mcap", "field_2.mcap"]
+    assert [closed(recorded(other))[0].name for other in others] == ["field.mcap", "field_2.mcap"]
     assert {read(path).run_id for path in tmp_path.iterdir()} == {"field", "field_2"}
 
 
@@ -209,7 +216,7 @@ def test_a_recording_goes_on_in_files_without_a_gap(recorder, monkeypatch):
         recorded(recorder, 50, n)
         n += 50
         until(lambda: not recorder._waiting)
-    recorder.close(10.0)
+    closed(recorder)
     names = [path.name for path in recorder.files[:3]]
     assert names == ["field.mcap", "field_part2.mcap", "field_part3.mcap"]
     runs = [read(path) for path in recorder.files]
@@ -247,7 +254,7 @@ def test_a_full_disk_ends_a_recording_and_keeps_what_was_written(recorder, monke
     recorded(recorder, 10, 50)
     assert recorder.settled.wait(10.0)
     assert recorder.status == "stopped: no space left on the disk"
-    assert len(read(recorded(recorder, 10, 60).close()[0]).streams["imu"]) == 50
+    assert len(read(closed(recorded(recorder, 10, 60))[0]).streams["imu"]) == 50
 
 
 def test_little_room_on_the_disk_ends_a_recording_with_a_whole_file(recorder, monkeypatch):
@@ -269,8 +276,8 @@ def test_a_folder_that_is_removed_or_cannot_be_made_ends_its_recording_and_no_ot
         recorded(recorder, 50, 50)
     assert one.settled.wait(10.0)
     assert one.status == "stopped: the folder was removed"
-    assert len(read(other.close(10.0)[0]).streams["imu"]) == 100
-    assert no_folder.close(10.0) == []
+    assert len(read(closed(other)[0]).streams["imu"]) == 100
+    assert closed(no_folder) == []
     assert no_folder.status == "stopped: cannot be written (Not a directory)"
 
 
@@ -287,7 +294,7 @@ def test_memory_is_bounded_where_the_disk_hangs(recorder, monkeypatch):
     assert recorder.status == "stopped: the disk is too slow"
     assert sum(rows.nbytes for _, rows in recorder._waiting) < 110_000
     hangs.set()
-    assert len(read(recorder.close(10.0)[0]).streams["imu"]) == 50 * (k + 1)
+    assert len(read(closed(recorder)[0]).streams["imu"]) == 50 * (k + 1)
 
 
 KILLED = """
@@ -325,7 +332,7 @@ def test_a_file_that_ends_anywhere_gives_all_chunks_that_are_whole(recorder, tmp
         until(lambda: not recorder._waiting)
         time.sleep(0.1)
         sizes.append(recorder.files[0].stat().st_size)
-    whole, torn = recorder.close(10.0)[0].read_bytes(), tmp_path / "torn.mcap"
+    whole, torn = closed(recorder)[0].read_bytes(), tmp_path / "torn.mcap"
     for cut in sorted({*np.linspace(sizes[0], len(whole), 15).astype(int).tolist(), *sizes}):
         torn.write_bytes(whole[:cut])
         stamps = read(torn).streams["imu"].time_s

@@ -15,7 +15,8 @@ playwright = pytest.importorskip("playwright.sync_api", reason="playwright is no
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 
-DRIVEN = {"wheels": [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]}
+MOTORS = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
+SENT = {**CHANNELS, "wheels": [*CHANNELS["wheels"], *MOTORS]}
 TOKEN = "a token of the page's test"
 MARKUP = "<img src=x onerror=document.title='run'>"
 
@@ -84,26 +85,18 @@ def opened(browser):
 
 
 @contextmanager
-def robot(service, session="mower-1", token="", **options):
+def robot(service, session="mower-1", **options):
     """A robot that drives until the block ends."""
     ended = threading.Event()
 
     def drive():
-        control = options.get("control", False)
-        streams = DRIVEN if control else CHANNELS
-        name = "agrimaro" if control else "mower"
-        with TerrainClient(
-            service.ws, session, name, streams, rate_hz=20.0, token=token, **options
-        ) as client:
+        name = "agrimaro" if options.get("control") else "mower"
+        with TerrainClient(service.ws, session, name, SENT, rate_hz=20.0, **options) as client:
             begun_s, k = time.monotonic(), 0
             while not ended.wait(max(begun_s + 0.02 * k - time.monotonic(), 0.0)):
                 now_s, k = begun_s + 0.02 * k, k + 1  # of a sensor: even, however late they are sent
-                if control:
-                    row = [20.0, 21.0, 19.0, 1.0, 1.5, 2.0]
-                    client.send({"wheels": ([now_s], [row])}, (0.5, 0.0, 0.0))
-                else:
-                    noise = 2.0 if k % 2 else -2.0
-                    client.send({"imu": ([now_s], [[noise]]), "wheels": ([now_s], [[0.5]])})
+                rows = {"imu": [2.0 if k % 2 else -2.0], "wheels": [0.5, 20.0, 21.0, 19.0, 1.0, 1.5, 2.0]}
+                client.send({stream: ([now_s], [row]) for stream, row in rows.items()}, (0.5, 0.0, 0.0))
 
     thread = threading.Thread(target=drive)
     thread.start()
