@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
 from features.recipes import WindowPipeline, make_recipe
 from pipelines.learn.settings import FEATURE_RECIPE, WITHOUT_SVM, LearnSettings
@@ -36,7 +36,7 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     if ":" in name or settings.feature:
         options["functions"] = [load_named(each) for each in settings.feature]
     if settings.params is not None and name not in WITHOUT_SVM:
-        options["candidates"] = (Candidate(*read_params(settings.params)),)
+        options["candidates"] = (read_params(settings.params),)
     return make_recipe(
         load_named(name) if ":" in name else name,
         tuple(part.strip() for part in sets.split(",")) if separator else settings.signal_sets,
@@ -46,24 +46,16 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
     )
 
 
-class SvmParams(NamedTuple):
-    """Hyper-parameters of the SVM, as :class:`terrain.classify.svm.Candidate`."""
-
-    C: Annotated[float, Field(gt=0.0, le=1e6)]
-    gamma: Annotated[float, Field(gt=0.0, le=1e3)]
-    percentile: Annotated[float, Field(gt=0.0, le=100.0)]
-
-
 class BestFile(BaseModel):
     """What ``--params`` reads of the file of a search."""
 
     model_config = ConfigDict(extra="ignore")
 
     version: Literal[1]
-    params: SvmParams
+    params: Candidate
 
 
-def read_params(file: Path) -> SvmParams:
+def read_params(file: Path) -> Candidate:
     """Return the hyper-parameters of a file that a search wrote.
 
     Raises

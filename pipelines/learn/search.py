@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pydantic import TypeAdapter
 
-from pipelines.learn.recipes import SvmParams
+from terrain.classify.svm import Candidate
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
 from terrain.files.names import printable
@@ -43,7 +43,7 @@ N_DRAWS = 1000
 class Trial(NamedTuple):
     """Hyper-parameters, and the accuracy on inner folds with its 95 % interval over runs."""
 
-    params: SvmParams
+    params: Candidate
     accuracy: float
     accuracy_ci: tuple[float, float]
 
@@ -155,7 +155,7 @@ def _begin(folder: Path, text: str) -> list[Trial]:
         raise LogError(f"{lines}: is damaged ({printable(str(error).splitlines()[0])[:200]})") from error
 
 
-def _suggest(optuna: Any, trials: Sequence[Trial], n_trials: int, seed: int) -> list[SvmParams]:
+def _suggest(optuna: Any, trials: Sequence[Trial], n_trials: int, seed: int) -> list[Candidate]:
     """Return the next batch: it depends on the trials before it and on the seed, and on nothing else."""
     drawn = int.from_bytes(hashlib.sha256(f"{seed} {len(trials)}".encode()).digest()[:4], "big")
     sampler = optuna.samplers.TPESampler(seed=drawn, n_startup_trials=2 * BATCH, constant_liar=True)
@@ -171,10 +171,10 @@ def _suggest(optuna: Any, trials: Sequence[Trial], n_trials: int, seed: int) -> 
             )
         )
     asked = [study.ask(distributions).params for _ in range(min(BATCH, n_trials - len(trials)))]
-    return [SvmParams(**{name: float(f"{value:.4g}") for name, value in each.items()}) for each in asked]
+    return [Candidate(**{name: float(f"{value:.4g}") for name, value in each.items()}) for each in asked]
 
 
-def _tried(examples: Examples, gap: int, seed: int, params: SvmParams) -> Trial:
+def _tried(examples: Examples, gap: int, seed: int, params: Candidate) -> Trial:
     """Return the accuracy of one candidate on inner folds of whole runs."""
     import numpy as np
 
@@ -196,7 +196,7 @@ def _tried(examples: Examples, gap: int, seed: int, params: SvmParams) -> Trial:
     return Trial(params, float(correct.mean()), percentile_interval(draws))
 
 
-def _held_out(examples: Examples, outer: Fold, best: SvmParams, gap: int, seed: int) -> Difference:
+def _held_out(examples: Examples, outer: Fold, best: Candidate, gap: int, seed: int) -> Difference:
     """Return the accuracy of the default choice and of the best candidate on runs that no trial has seen."""
     import numpy as np
 

@@ -183,11 +183,10 @@ def train(
     searched, notes = None, []
     if settings.search:
         from pipelines.learn.search import search
-        from terrain.classify.svm import Candidate
 
         folder = settings.trials or Path(f"search-{settings.name}")
         searched = search(data, settings.search, folder, settings.seed, settings.jobs, progress)
-        data.recipe[-1].set_params(candidates=(Candidate(*searched.best.params),))
+        data.recipe[-1].set_params(candidates=(searched.best.params,))
         default, best = (format_value(value, PERCENT) for value in searched.held_out[:2])
         notes.append(
             "hyper-parameters were searched on these runs, which makes the accuracy optimistic: on "
@@ -197,7 +196,7 @@ def train(
     evaluation, importance, fitted = _evaluated(data, settings, progress)
     recipe, samples = data.recipe, data.samples
     recipe.steps[-1] = (recipe.steps[-1][0], fitted)
-    info = info_of(data, settings, dataset, code_commit())
+    info = info_of(data, settings, dataset)
     model, missing = with_limits(recipe, info, samples, data.features, data.motion)
     unknown = (f"support: {NO_MOTION}",) if data.motion is None else ()
     evaluation = replace(
@@ -206,7 +205,7 @@ def train(
         data_digest=data.digest,
         notes=(*evaluation.notes, *missing, *unknown, *notes),
     )
-    info = replace(model.info, run_accuracy=run_accuracies(data, evaluation))
+    info = replace(model.info, commit=code_commit(), run_accuracy=run_accuracies(data, evaluation))
     record = TrainingRecord(
         params={name: getattr(evaluation, name) for name in PARAMS}
         | {"skip_short": settings.skip_short, "signal_sets": ",".join(settings.signal_sets)},

@@ -135,7 +135,7 @@ def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingDa
     )
 
 
-def info_of(data: TrainingData, settings: RecipeSettings, dataset: str, commit: str) -> ModelInfo:
+def info_of(data: TrainingData, settings: RecipeSettings, dataset: str) -> ModelInfo:
     """Return how the training windows were cut, as those of a new log must be, and where they came from.
 
     Raises
@@ -158,7 +158,6 @@ def info_of(data: TrainingData, settings: RecipeSettings, dataset: str, commit: 
         seed=settings.seed,
         data_digest=data.digest,
         dataset=dataset,
-        commit=commit,
         robots=tuple(sorted({each.robot for each in runs})),
         filter=filters.pop(),
     )
@@ -182,7 +181,7 @@ def with_limits(
 
 
 def fitted_model(
-    runs: Sequence[RunLog], settings: RecipeSettings | None = None, dataset: str = "", commit: str = ""
+    runs: Sequence[RunLog], settings: RecipeSettings | None = None, dataset: str = ""
 ) -> TerrainModel:
     """Return a model that is fitted on labelled runs, without evaluation, limits and registration.
 
@@ -190,10 +189,10 @@ def fitted_model(
     ----------
     runs : labelled; errors as :func:`data_of_runs` and :func:`info_of`
     settings : recipe and windows; the defaults without
-    dataset, commit : for the record
+    dataset : for the record
     """
     settings = settings or RecipeSettings()
     data = data_of_runs(runs, settings)
-    info = info_of(data, settings, dataset, commit)
+    info = info_of(data, settings, dataset)
     data.recipe[-1].fit(data.rows, data.samples.terrain, groups=data.samples.windows.run_id)
     return TerrainModel(data.recipe, info)

@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.feature_selection import SelectPercentile, VarianceThreshold, f_classif
 from sklearn.impute import SimpleImputer
@@ -46,9 +47,9 @@ class Candidate(NamedTuple):
     the number; ``percentile`` is the percentage of the features that an F test keeps.
     """
 
-    C: float
-    gamma: float
-    percentile: float
+    C: Annotated[float, Field(gt=0.0, le=1e6)]
+    gamma: Annotated[float, Field(gt=0.0, le=1e3)]
+    percentile: Annotated[float, Field(gt=0.0, le=100.0)]
 
 
 CANDIDATES: tuple[Candidate, ...] = (

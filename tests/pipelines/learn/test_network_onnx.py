@@ -24,13 +24,6 @@ def quick(name):
     return recipe
 
 
-RECIPES = ("cnn", "stack", "best")
-with_network = pytest.mark.parametrize("fitted", RECIPES[:2], indirect=True)  # "best" may be the SVM
-every_recipe = pytest.mark.parametrize(
-    "fitted", [*RECIPES[:2], pytest.param("best", marks=pytest.mark.slow)], indirect=True
-)
-
-
 @pytest.fixture(scope="module")
 def fitted(request, windows):
     return quick(request.param).fit(windows, windows.terrain.astype(str))
@@ -43,7 +36,9 @@ def folder(fitted, model_dir):
     return model_dir
 
 
-@every_recipe
+@pytest.mark.parametrize(
+    "fitted", ["cnn", "stack", pytest.param("best", marks=pytest.mark.slow)], indirect=True
+)
 def test_a_model_read_back_gives_the_same_bytes(folder, fitted, windows):
     desired = fitted.predict_proba(windows)
     assert np.array_equal(read_model(folder).recipe.predict_proba(windows), desired)
@@ -60,7 +55,7 @@ def test_a_classifier_fitted_on_the_matrix_is_that_of_the_windows(windows):
     assert np.array_equal(alone.predict_proba(features), whole.predict_proba(windows))
 
 
-@with_network
+@pytest.mark.parametrize("fitted", ["cnn", "stack"], indirect=True)  # "best" may be the SVM
 def test_onnx_computes_the_network(folder, fitted, windows):
     network = getattr(fitted[-1], "network_", fitted[-1])
     session = onnxruntime.InferenceSession((folder / ONNX_FILE).read_bytes())
