@@ -16,17 +16,8 @@ from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
+from terrain.measured_slip import measure
 from terrain.measured_slip.delay import Delay
-from terrain.measured_slip.measure import (
-    NO_ROLLERS,
-    Measured,
-    NamedSurface,
-    distances_of,
-    measure,
-    named_surfaces,
-    one_robot,
-    rollers_of,
-)
 from terrain.measured_slip.prediction_scores import PredictionFigures, predictions
 from terrain.measured_slip.rollers import RollerFindings
 from terrain.measured_slip.slips import measured_slip
@@ -60,7 +51,9 @@ class MeasuredSlipResult(TracksResult):
     surfaces: tuple[SurfaceSlip, ...] = described("by terrain, runs without a label last")
     predictions: tuple[PredictionFigures, ...] = described("of slip from currents and wheel speeds")
     rollers: RollerFindings | None = described("what makes an omni robot slip; none unless asked for")
-    named: tuple[NamedSurface, ...] = described("surfaces that rollers name window by window, by group")
+    named: tuple[measure.NamedSurface, ...] = described(
+        "surfaces that rollers name window by window, by group"
+    )
     distances: Mapping[str, DistanceBound] = described(
         "of the wheels of an omni robot from its middle, by surface, where its turns follow the wheels"
     )
@@ -80,11 +73,11 @@ def estimate_all(
 
     ``keep`` gets each run with the stream ``slip``, over windows of :data:`SHORT_S`.
     """
-    robot, seed = one_robot(runs, robot), options.seed
+    robot, seed = measure.one_robot(runs, robot), options.seed
     if options.rollers:
-        as_drive(OmniRobot, robot, NO_ROLLERS)
+        as_drive(OmniRobot, robot, measure.NO_ROLLERS)
     asked: dict[str, Any] = {"window_s": options.window_s, "stride_s": options.stride_s, "seed": seed}
-    found = measure(runs, robot, **asked, delay_s=options.delay_s, progress=progress)
+    found = measure.measure(runs, robot, **asked, delay_s=options.delay_s, progress=progress)
     if not found.slips:
         raise DataError(f"none of {len(runs)} runs has a slip; the first for this: {found.failed[0]}")
     rng, by_terrain = np.random.default_rng(seed), found.by_terrain()
@@ -93,7 +86,7 @@ def estimate_all(
     if options.predict:
         cases = slip_cases(found.runs, found.slips, options.window_s)
         predicted = predictions(cases, options.hold_out, seed, progress)
-    rollers = rollers_of(found, robot, seed) if options.rollers else None
+    rollers = measure.rollers_of(found, robot, seed) if options.rollers else None
     if keep is not None:
         for done, run in enumerate(found.runs, start=1):
             late_s = found.delays[run.session].applied_s
@@ -109,8 +102,8 @@ def estimate_all(
         surfaces=surfaces,
         predictions=tuple(predicted),
         rollers=rollers,
-        named=() if rollers is None else named_surfaces(found, robot, rollers),
-        distances=distances_of(found, robot, seed) if options.rollers else {},
+        named=() if rollers is None else measure.named_surfaces(found, robot, rollers),
+        distances=measure.distances_of(found, robot, seed) if options.rollers else {},
         not_measured=tuple(found.failed),
         n_runs=len(runs),
         pictures=_pictures(robot, options.window_s, surfaces, by_terrain),
@@ -221,7 +214,7 @@ def _roller_parts(result: MeasuredSlipResult, found: RollerFindings) -> list[Par
 
 
 def _pictures(
-    robot: Robot, window_s: float, surfaces: Sequence[SurfaceSlip], by_terrain: Mapping[str, Measured]
+    robot: Robot, window_s: float, surfaces: Sequence[SurfaceSlip], by_terrain: Mapping[str, measure.Measured]
 ) -> dict[str, Figure]:
     """Return slip by surface, by run, and by the direction of travel or, of robots that only drive ahead, the turn."""
     names = [terrain or UNLABELLED for terrain in by_terrain]

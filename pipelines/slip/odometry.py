@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Report, Table, Text, sections
 from terrain.calibration.odometry import ParameterFound, judge_odometry
-from terrain.calibration.odometry_judge import KindScore, LegScores
+from terrain.calibration.odometry_judge import LegScores
 from terrain.estimation.observers.slip_model_file import check_slip_model_file, write_slip_model
 from terrain.logs.drive import FILE_NAME, find_sessions
 from terrain.logs.drive_poses import WindowPoses, read_window_poses
@@ -89,21 +89,16 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
     )
 
 
-def _gain(name: str) -> Callable[[KindScore], Any]:
-    """Return a gain or its interval; those of a kind over itself are not shown."""
-    return lambda row: getattr(row, name) if getattr(row, name.removesuffix("_ci")) != 0.0 else None
-
-
 KINDS = (
     Column("odometry", of="kind"),
     Column("RMSE", RMSE, "m", of="rmse_m"),
     Column("95 %", RMSE, of="rmse_ci_m"),
     Column("median", RMSE, "m", of="median_m"),
     Column("heading", ".1f", "degrees", of=lambda row: math.degrees(row.yaw_rmse_rad)),
-    Column("below encoder", ".0%", of=_gain("gain_encoder")),
-    Column("95 %", ".0%", of=_gain("gain_encoder_ci")),
-    Column("below gyro", ".0%", of=_gain("gain_gyro")),
-    Column("95 %", ".0%", of=_gain("gain_gyro_ci")),
+    Column("below encoder", ".0%", of="gain_encoder"),
+    Column("95 %", ".0%", of="gain_encoder_ci"),
+    Column("below gyro", ".0%", of="gain_gyro"),
+    Column("95 %", ".0%", of="gain_gyro_ci"),
 )
 
 
