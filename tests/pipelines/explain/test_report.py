@@ -8,35 +8,26 @@ import pytest
 from pipelines.explain.figures import dependence_figures, parts_figure, run_figure, spectra_figure
 from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
+from terrain.discrepancy import verdict
 from terrain.discrepancy.compared import channels_of
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
 from terrain.discrepancy.filter_gain import Change, Comparison
 from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
 from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.discrepancy.nameless import Learned, Nameless
-from terrain.discrepancy.verdict import (
-    Cause,
-    Limit,
-    NextDrive,
-    RuledOut,
-    RunGroup,
-    Unexplained,
-    Value,
-    Varying,
-)
 from terrain.robots import load_robot
 
 HUSKY = load_robot("husky")
 LIMITS = (
-    Limit("steering_offset_1_rad", 0.003, "rad", "several speeds"),
-    Limit("payload_ratio", np.inf, "ratio", "slopes"),
-    Limit("clock_rate_ratio", 0.05, "ratio", "switching"),
-    Limit("effective_track_ratio", 0.048, "ratio", "turns"),
+    verdict.Limit("steering_offset_1_rad", 0.003, "rad", "several speeds"),
+    verdict.Limit("payload_ratio", np.inf, "ratio", "slopes"),
+    verdict.Limit("clock_rate_ratio", 0.05, "ratio", "switching"),
+    verdict.Limit("effective_track_ratio", 0.048, "ratio", "turns"),
 )
-LEVER_ARM = Cause(
+LEVER_ARM = verdict.Cause(
     "lever_arm",
     ("an_alias",),
-    (Value("lever_x_m", 0.1, "m", 0.09, 0.11), Value("lever_y_m", -0.05, "m", -0.06, -0.04)),
+    (verdict.Value("lever_x_m", 0.1, "m", 0.09, 0.11), verdict.Value("lever_y_m", -0.05, "m", -0.06, -0.04)),
     *(0.4, 0.3, 0.5, ("speed_y_mps", "speed_x_mps"), 9.04, 4.0),
 )
 
@@ -52,12 +43,12 @@ def a_gain(refused=False, high=0.8, **comparisons):
 def explained(few):
     """Return what makes a result without any finding but those that are given."""
 
-    def make(gain=None, statements=(), robot=HUSKY, **findings):
+    def make(gain=None, robot=HUSKY, **findings):
         empty = {"robot": "a<b>", "causes": (), "limits": LIMITS, "not_excited": (), "next_drive": None}
-        empty["ruled_out"] = (RuledOut("scrub", "the runs show nothing of it", 0.44),)
+        empty["ruled_out"] = (verdict.RuledOut("scrub", "the runs show nothing of it", 0.44),)
         diagnosed = replace(few.diagnosed, diagnosis=replace(few.diagnosis, **(empty | findings)))
         gain = gain or HeldOutGain(None, "nothing was built in")
-        return replace(few, diagnosed=diagnosed, gain=gain, statements=tuple(statements), robot=robot)
+        return replace(few, diagnosed=diagnosed, gain=gain, statements=(), robot=robot)
 
     return make
 
@@ -86,10 +77,17 @@ def test_the_answer_is_the_cause_with_its_interval_and_the_gain(explained):
 NAMELESS = Nameless(2, {"speed_x_mps": Learned(0.02, 0.01, 0.76, 0.75, -0.02)}, 0.76, 0.75)
 FILTER = Comparison("vio12", None, 2, {"speed_mps": Change(0.1, 0.05, (-0.06, -0.04))})
 CLASSIFIER = Comparison("svm", None, 2, {"accuracy": Change(0.8, 0.9, None)}, ("a",))
-RIVALS = {name: (Value(f"{name}_ratio", 0.2, "ratio", 0.1, 0.3),) for name in ("payload", "motor_constant")}
-GROUPS = RunGroup(0.0, 0.01, ("a", "b")), RunGroup(0.3, 0.01, tuple("cdefgh"))
-PAYLOAD = Varying("payload", "payload_ratio", "ratio", ("scrub",), 0.1, 0.14, 9.0, GROUPS, "current_a")
-LEFT = Unexplained("current_a", "wheel 1 turn", 12.34, 0.2), Unexplained("speed_x_mps", "time", np.inf, 0)
+RIVALS = {
+    name: (verdict.Value(f"{name}_ratio", 0.2, "ratio", 0.1, 0.3),) for name in ("payload", "motor_constant")
+}
+GROUPS = verdict.RunGroup(0.0, 0.01, ("a", "b")), verdict.RunGroup(0.3, 0.01, tuple("cdefgh"))
+PAYLOAD = verdict.Varying(
+    "payload", "payload_ratio", "ratio", ("scrub",), 0.1, 0.14, 9.0, GROUPS, "current_a"
+)
+LEFT = (
+    verdict.Unexplained("current_a", "wheel 1 turn", 12.34, 0.2),
+    verdict.Unexplained("speed_x_mps", "time", np.inf, 0),
+)
 
 
 FINDINGS = (
@@ -129,7 +127,7 @@ FINDINGS = (
         {
             "clocks": (Clock("r3", 0.0123, 0.001), Clock("r4", np.nan, np.inf)),
             "excluded_runs": (Excluded("r<9>", "its gyro stands still"),),
-            "next_drive": NextDrive("climb", 6.0, "it parts them"),
+            "next_drive": verdict.NextDrive("climb", 6.0, "it parts them"),
         },
         (
             f"r3 0.0123 0.0010 r4 {NOT_KNOWN}",
@@ -148,7 +146,7 @@ def test_what_was_found_is_stated_with_its_numbers(explained, findings, stated):
 
 
 def test_robots_on_tracks_have_sprockets(explained):
-    value = Value("wheel_radius_ratio", 0.1, "ratio", 0.09, 0.11)
+    value = verdict.Value("wheel_radius_ratio", 0.1, "ratio", 0.09, 0.11)
     cause = LEVER_ARM._replace(name="wheel_radius", aliases=(), values=(value,))
     text = text_of(explained(causes=(cause,), robot=load_robot("marmotte")))
     assert "lacks sprocket radius, 10 %" in text
