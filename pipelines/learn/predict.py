@@ -110,11 +110,11 @@ class WindowPrediction(NamedTuple):
     slip_entry: str
     status: Mapping[str, str]
     label: str | None
-    filtered_terrain: str | None = None
-    nearest: str = ""
-    novelty: float | None = None
-    supported: bool | None = None
-    terrain_set: tuple[str, ...] | None = None
+    filtered_terrain: str | None
+    nearest: str
+    novelty: float | None
+    supported: bool | None
+    terrain_set: tuple[str, ...] | None
 
 
 @dataclass(frozen=True, repr=False)
@@ -140,15 +140,13 @@ class Predictions(Result):
     table: Mapping[str, Mapping[str, Any]] = described(
         "target slips by terrain and drive state, and the entry of the table that they come from"
     )
-    filtered: tuple[str, ...] = described(
-        "runs that the live chain filtered, as they had no estimates", default=()
-    )
+    filtered: tuple[str, ...] = described("runs that the live chain filtered, as they had no estimates")
     filtered_accuracy: float | None = described(
-        "as the accuracy, of the terrain filtered over time", "1", form=PERCENT, default=None
+        "as the accuracy, of the terrain filtered over time", "1", form=PERCENT
     )
-    n_unknown: int = described("windows that are like no terrain that was learned", default=0)
+    n_unknown: int = described("windows that are like no terrain that was learned")
     n_unsupported: int | None = described(
-        "windows whose prediction no training run supports; None where not counted", default=None
+        "windows whose prediction no training run supports; None where not counted"
     )
     model: str | None = described("as it was asked for", optional=True)
     dataset: str | None = described("name of the data", optional=True)

@@ -156,8 +156,9 @@ def rows_of(file):
 
 
 def changed(file, change):
-    """Change the rows of a table."""
-    pd.DataFrame(change(rows_of(file))).to_csv(file, index=False)
+    """Put other rows, or a text, in place of those of a table."""
+    made = change(rows_of(file))
+    file.write_text(made if isinstance(made, str) else pd.DataFrame(made).to_csv(index=False))
     return file
 
 
@@ -216,6 +217,12 @@ def test_what_the_model_is_certain_of_needs_no_answer(proposed, tmp_path):
         (lambda rows: [rows[0] | {"end_s": "900"}], ConfigError, "no stretch of run"),
         (lambda rows: [rows[0] | {"start_s": "nan"}], LogError, "line 2: is no proposal .start_s is 'nan'"),
         (lambda rows: [rows[0] | {"n_windows": "many"}], LogError, "line 2: is no proposal .n_windows is"),
+        (
+            lambda rows: f"{','.join(rows[0])}\nold,0\n",
+            LogError,
+            "line 2: is no proposal: it is longer or sh",
+        ),
+        (lambda rows: "a,b\n1,2\n", LogError, "column 'run_id' is missing"),
     ],
 )
 def test_a_table_that_does_not_fit_is_refused_in_one_sentence(proposed, tmp_path, change, error, sentence):
@@ -226,17 +233,9 @@ def test_a_table_that_does_not_fit_is_refused_in_one_sentence(proposed, tmp_path
     assert not (tmp_path / "out").exists()
 
 
-def test_other_files_short_rows_and_folders_that_are_there_are_refused(proposed, tmp_path, tracked, drive):
-    head = proposed.file.read_text().splitlines()[0]
-    for name, text, sentence in (
-        ("notes.csv", "a,b\n1,2\n", "column 'run_id' is missing"),
-        ("short.csv", f"{head}\nold,0\n", "line 2: is no proposal: it is longer or shorter"),
-        ("nowhere.csv", None, "cannot be opened"),
-    ):
-        if text is not None:
-            (tmp_path / name).write_text(text)
-        with pytest.raises(LogError, match=sentence):
-            label(Settings(data=proposed.data, answers=tmp_path / name, out=tmp_path / "out"))
+def test_files_that_are_not_there_and_folders_that_are_are_refused(proposed, tmp_path, tracked, drive):
+    with pytest.raises(LogError, match="cannot be opened"):
+        label(Settings(data=proposed.data, answers=tmp_path / "nowhere.csv", out=tmp_path / "out"))
     with pytest.raises(ConfigError, match="exists already"):
         answered(proposed, proposed.data)
     write_run(drive("short", "GRASS", 3, duration_s=1.5), tmp_path / "short")
