@@ -255,7 +255,7 @@ def replay_run(
         if int(sample.time_s - start_s) > int(passed_s):
             progress(f"replay {run.run_id}, s", int(sample.time_s - start_s), math.ceil(end_s - start_s))
         passed_s = sample.time_s - start_s
-        stop.wait(max(begin_s + passed_s / settings.speed_ratio - perf_counter(), 0.0))
+        stop.wait(max(begin_s + passed_s / (settings.speed or math.inf) - perf_counter(), 0.0))
         done = chain.take(sample)
         belief = chain.belief.terrain
         believed[belief] += 1

@@ -7,7 +7,6 @@ bus instead, with ``--replay`` over a log.
 from __future__ import annotations
 
 import ipaddress
-import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
 from pipelines.data.settings import ReadSettings
 from pipelines.report.numbers import enumerated, plural
@@ -32,8 +31,6 @@ EXAMPLE = "terrain serve --model models:/field@champion --robot agrimaro --state
 
 RESULTS = ("pipelines.serve.can_bus", "pipelines.serve.replay")
 """Modes beside the service, each with a result and a report of its own."""
-
-AS_FAST_AS_IT_GOES = "max"
 
 SHORTEST_TOKEN = 16
 """Characters; a shorter one can be tried out."""
@@ -104,25 +101,12 @@ class ReplaySettings(ReadSettings):
     replay: Path | None = setting(
         None, "Log, in any layout that convert reads, that is sent through the live chain."
     )
-    speed: str = setting(
-        AS_FAST_AS_IT_GOES, "Times the log's own speed, as 1 or 4; 'max' is as fast as it goes."
+    speed: float | None = setting(
+        None,
+        "Times the log's own speed, as 1 or 4; by default as fast as it goes.",
+        gt=0.0,
+        allow_inf_nan=False,
     )
-
-    @property
-    def speed_ratio(self) -> float:
-        """Times the log's own speed; infinite for ``max``."""
-        return math.inf if self.speed == AS_FAST_AS_IT_GOES else float(self.speed)
-
-    @field_validator("speed")
-    @classmethod
-    def _check_speed(cls, text: str) -> str:
-        try:
-            ratio = 1.0 if text == AS_FAST_AS_IT_GOES else float(text)
-        except ValueError:
-            ratio = 0.0
-        if not 0.0 < ratio < math.inf:
-            raise ValueError(f"--speed is {text!r}: a number above zero, or 'max', is required")
-        return text
 
 
 class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):

@@ -98,7 +98,7 @@ def test_a_run_that_lacks_what_is_needed_is_refused_in_a_sentence(grass, runs, h
 
 
 def test_the_speed_is_that_of_the_clock_until_it_is_to_end(runs, husky_model):
-    result, moments = replayed(runs[1], husky_model, stop_at_s=18.0, speed="20")
+    result, moments = replayed(runs[1], husky_model, stop_at_s=18.0, speed=20.0)
     begin_s = moments[0][0] - moments[0][1] / 20
     assert min(wall_s - begin_s - done / 20 for wall_s, done in moments) > -0.06
     assert result.times_real_time == pytest.approx(20.0, rel=0.2)

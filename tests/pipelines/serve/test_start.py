@@ -112,7 +112,7 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(model_fo
         ({"can": "can0", "replay": "runs"}, "--can and --replay are two modes: one of them is accepted"),
         ({"can": "can0", "port": 1}, "--port is an option of the WebSocket service, not of --can"),
         ({"replay": "runs", "duration_s": 1.0}, "--duration is an option of --can, not of --replay"),
-        ({"speed": "4"}, "--speed is an option of --replay, not of the WebSocket service"),
+        ({"speed": 4.0}, "--speed is an option of --replay, not of the WebSocket service"),
         *(
             ({"replay": "runs", "speed": text}, "--speed is")
             for text in ("0", "-1", "inf", "nan", "fast", "")
