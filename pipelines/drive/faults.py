@@ -56,11 +56,6 @@ DELAY_S = PilotSettings().delay_s
 LEARNING_SEED = 5000
 """Of the simulated runs that targets are learned from; seeds of drives are far below."""
 
-SHORT_BARS: Mapping[str, str] = dict(
-    zip(BARS, ("ok", "on", "slip", "peak", "stop", "back", "over", "finite"), strict=True)
-)
-"""Names of the bars in the cells of tables."""
-
 MET = "met"
 SHOWN_FAULTS = 8
 """Faults with unmet bars that the answer's table has."""
@@ -241,7 +236,7 @@ DRIVES = (
     Column("above desired, s", of="figures.overspeed_s"),
     Column("exceptions", of="figures.n_exceptions"),
     Column("not finite", of="figures.n_not_finite"),
-    Column("bars unmet", of=lambda row: _short(row.unmet) or MET),
+    Column("bars unmet", of=lambda row: bars_text([row])),
     Column("sensors named", of=lambda row: _named([row])),
 )
 
@@ -258,10 +253,7 @@ def report(result: FaultsResult) -> Report:
     if worst:
         more = f" and {len(worst) - SHOWN_FAULTS} more" if len(worst) > SHOWN_FAULTS else ""
         answer += f"; not met with {', '.join(worst[:SHOWN_FAULTS])}{more}"
-    bars = [
-        (SHORT_BARS[name], bar.n_met, bar.n_unmet, bar.n_not_judged, bar.text)
-        for name, bar in result.bars.items()
-    ]
+    bars = [(name, bar.n_met, bar.n_unmet, bar.n_not_judged, bar.text) for name, bar in result.bars.items()]
     overview = []
     for name, rows in by_fault.items():
         at = [[row for row in rows if _place(row.case) == heading] for heading in headings]
@@ -308,16 +300,12 @@ def report(result: FaultsResult) -> Report:
 
 
 def bars_text(rows: Sequence[FaultRow]) -> str:
-    """Return the bars that rows do not meet, by their short names."""
+    """Return the bars that rows do not meet."""
     unmet = [row for row in rows if row.unmet]
     if not unmet:
         return MET if rows else NOT_KNOWN
-    text = _short(name for name in SHORT_BARS if any(name in row.unmet for row in unmet))
+    text = " ".join(name for name in BARS if any(name in row.unmet for row in unmet))
     return text if len(unmet) == len(rows) else f"{text} ({len(unmet)} of {len(rows)})"
-
-
-def _short(names: Iterable[str]) -> str:
-    return " ".join(SHORT_BARS[name] for name in names)
 
 
 def _named(rows: Sequence[FaultRow]) -> str:

@@ -37,7 +37,6 @@ from terrain.robots import Robot
 PICTURED = STATED = 3
 """Channels of the first picture, and of the sentences beside the answer: those of which most is stated."""
 
-COMPARISON_TITLES = {"filter": "Error of the filter {name}", "classifier": "Classifier {name}"}
 ERROR_LABELS = {
     "speed_mps": ("speed, root mean square", "m/s"),
     "yaw_rate_radps": ("yaw rate, root mean square", "rad/s"),
@@ -228,15 +227,13 @@ def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
         less, black_box = Column("square less by", PERCENT), Column("by a black-box reference", PERCENT)
         heads = ("channel", "unit", "rms before", "after", less, Column("95 %", PERCENT), "", black_box)
         yield Table(heads, rows, note=note)
-    for kind, words in COMPARISON_TITLES.items():
-        if (compared := found.comparisons.get(kind)) is None:
-            continue
-        title = words.format(name=compared.name)
-        if compared.reason:
-            yield Text(f"{title}: not measured: {compared.reason}.")
-        elif compared.errors:
+    for kind, compared in found.comparisons.items():
+        if compared is not None and compared.reason:
+            yield Text(f"What it changes for the {kind} {compared.name} is not measured: {compared.reason}.")
+        elif compared is not None and compared.errors:
             changes = [(*ERROR_LABELS[key], *change) for key, change in compared.errors.items()]
-            yield Table(("figure", "unit", "before", "after", "change, 95 %"), changes, title)
+            figures_of = ("figure", "unit", "before", "after", "change, 95 %")
+            yield Table(figures_of, changes, f"What it changes for the {kind} {compared.name}")
 
 
 def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:

@@ -102,7 +102,7 @@ FINDINGS = (
             f"accuracy 0.8 0.9 {NOT_KNOWN}",
         ),
     ),
-    ({"gain": a_gain(filter=Comparison("vio12", "no camera", 2, {}))}, ("not measured: no camera",)),
+    ({"gain": a_gain(filter=Comparison("vio12", "no camera", 2, {}))}, ("vio12 is not measured: no camera",)),
     (
         {"ambiguous_sets": (tuple(RIVALS),), "ambiguous_values": RIVALS},
         (
