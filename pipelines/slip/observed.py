@@ -72,25 +72,24 @@ def estimate_all(
 
 
 SLIPS = (
-    Column("run", of="run_id", long=True),
+    Column("run", of="run.run_id", long=True),
     Column("slip", of="name"),
     Column("mean", SLIP, of="slip.mean"),
     Column("std", ".4f", of="slip.std"),
     Column("true", SLIP, of="slip.true_mean"),
     Column("RMSE", ".4f", of="slip.rmse"),
     Column("NEES", ".2f", of="slip.nees"),
-    Column("position RMSE", ".3f", "m", of="position_m"),
+    Column("position RMSE", ".3f", "m", of="run.position_rmse_m"),
 )
 
 
 def report(result: ObserverResult) -> Report:
     """Return each slip of a run, its truth where it is known, and how long the observer had which status."""
-    rows = []
-    for run in result.runs:
-        of_run = {"run_id": run.run_id, "position_m": run.position_rmse_m}
-        for name, slip in run.slip.items() or [("not estimated", None)]:
-            rows.append({"name": name, "slip": slip, **of_run})
-            of_run = {"run_id": ""}
+    rows = [
+        {"run": run, "name": name, "slip": slip}
+        for run in result.runs
+        for name, slip in run.slip.items() or [("not estimated", None)]
+    ]
     return tracks_report(
         result,
         f"Slip by the observer {result.filter}",
