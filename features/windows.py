@@ -192,6 +192,53 @@ def rows_of_sets(stream: str, channels: tuple[str, ...], sets: frozenset[str]) -
     return tuple(i for i, channel in enumerate(channels) if signal_set_of(stream, channel) in sets)
 
 
+def windows_of(
+    runs: Iterable[RunLog], length_s: float = 2.0, stride_s: float | None = None, *, steady: bool = True
+) -> Windows:
+    """Cut runs into windows of equal length; runs that are shorter are left out.
+
+    Parameters
+    ----------
+    runs : whose channels and rates fit each other
+    length_s, stride_s : of a window, and from start to start; one length by default
+    steady : keep windows of steady motion only
+
+    Raises
+    ------
+    DataError
+        if no window is left, or runs do not fit each other.
+
+    Examples
+    --------
+    >>> import terrain
+    >>> terrain.cut_windows([terrain.simulate("husky", "grass", "straight", duration_s=8.0)])
+    3 windows of 2 s from 1 runs: grass
+    """
+    rule = WindowRule(length_s, stride_s, SteadyMotion() if steady else None)
+    found = cut_windows(list(runs), rule, skip_short=True)
+    if not len(found.windows):
+        dropped = ", ".join(f"{n} {why}" for why, n in found.dropped.items())
+        raise DataError(
+            f"no window of {length_s:g} s is left; dropped: {dropped or 'none, there are no runs'}"
+        )
+    return found.windows
+
+
+def overlap_of(windows: Windows) -> int:
+    """Return how many windows on either side of a window may share samples with it; at least its neighbour.
+
+    Examples
+    --------
+    >>> run = np.array(["a"] * 3, dtype=object)
+    >>> overlap_of(Windows({}, {}, {}, 2.0, np.array([0.0, 0.5, 1.0]), run, run))
+    4
+    """
+    same = windows.run_id[1:] == windows.run_id[:-1]
+    steps_s = np.diff(windows.start_s)[same]
+    steps_s = steps_s[steps_s > 0]
+    return int(np.ceil(windows.length_s / steps_s.min() - 1e-9)) if len(steps_s) else 1
+
+
 def check_layout(run: RunLog, layout: Layout) -> None:
     """Raise ``DataError`` when a run lacks a stream, a channel or the rate of ``layout``."""
     for name, channels in layout.channels.items():

@@ -17,16 +17,16 @@ from terrain.kernel_caches import discard_stale
 __version__ = "0.1.0"
 
 FACE = {
-    "load_runs": "pipelines.api.runs.load_runs",
-    "Runs": "pipelines.api.runs.Runs",
+    "load_runs": "pipelines.data.datasets.load_runs",
+    "Runs": "pipelines.data.runs.Runs",
     "load_robot": "terrain.robots.load_robot",
-    "simulate": "pipelines.api.runs.simulate",
+    "simulate": "terrain.simulation.run.simulate_run",
     "estimate": "pipelines.slip.estimate.estimate_runs",
     "learn_slip": "pipelines.slip.learn_slip.learn_slip_table",
-    "cut_windows": "pipelines.api.learn.cut_windows",
+    "cut_windows": "features.windows.windows_of",
     "TerrainClassifier": "pipelines.learn.classifier.TerrainClassifier",
-    "cross_validate": "pipelines.api.learn.cross_validate",
-    "explain": "pipelines.api.runs.explain",
+    "cross_validate": "pipelines.learn.crossval.cross_validate",
+    "explain": "pipelines.explain.explain.explain",
     "Observer": "pipelines.live.observer.Observer",
     "replay": "terrain.logs.replay.replay",
 }

@@ -177,7 +177,7 @@ def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) ->
     )
 
 
-def _refuse_other_runs(runs: list[RunLog], data: Path | None, folder: Path) -> None:
+def _refuse_other_runs(runs: Sequence[RunLog], data: Path | None, folder: Path) -> None:
     from pipelines.data.datasets import load_runs
     from terrain.logs.digest import data_digest
 
@@ -185,7 +185,7 @@ def _refuse_other_runs(runs: list[RunLog], data: Path | None, folder: Path) -> N
         raise DataError(f"{folder}: holds other runs than {data or 'this simulation'}; choose another --out")
 
 
-def _keep(runs: list[RunLog], data: Path | None, folder: Path, progress: Progress) -> dict[str, Any]:
+def _keep(runs: Sequence[RunLog], data: Path | None, folder: Path, progress: Progress) -> dict[str, Any]:
     """Write run folders into ``folder``; earlier ones of the same data are used as they are."""
     from terrain.files.atomic import atomic_folder
     from terrain.logs.write import write_run

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from pipelines.data.runs import Runs
 from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
 from terrain.errors import ConfigError, LogError
 
@@ -96,7 +97,7 @@ def load_runs(
     robot: str | Path | None = None,
     on_skip: Callable[[str], None] = _log.warning,
     **reading: Any,
-) -> list[RunLog]:
+) -> Runs:
     """Return the runs that lie under a folder, sorted by their id.
 
     Parameters
@@ -122,7 +123,7 @@ def load_runs(
     runs, skipped = load(AlignedRunsSettings(data=Path(folder), robot=name, **reading))
     for sentence in skipped:
         on_skip(sentence)
-    return runs
+    return Runs(runs)
 
 
 def load(settings: RunsSettings) -> LoadedRuns:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -192,3 +192,20 @@ def explain_runs(
         notes=notes_of(diagnosis, diagnosed.terrains, terrains_apart(diagnosis, diagnosed.compared)),
         powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
     )
+
+
+def explain(runs: Iterable[RunLog], robot: Robot | str, **options: Any) -> ExplainResult:
+    """Return what the simulation of a robot gets wrong about its runs, and the extended robot.
+
+    Parameters
+    ----------
+    runs, robot, options : as :func:`explain_runs`
+
+    Returns
+    -------
+    ExplainResult
+        with ``report``, ``extended`` (the robot with the named causes built in; as it was where none was named)
+        and ``to_pandas()``
+    """
+    found = explain_runs(list(runs), robot, **options)
+    return replace(found, extended=found.extended or found.robot)

@@ -14,8 +14,8 @@ from sklearn.utils.validation import check_is_fitted
 from features.labelled import labelled
 from features.motion import window_motion
 from features.protocols import Samples
-from features.recipes import make_recipe
-from features.windows import WindowCut, WindowRule
+from features.recipes import WindowPipeline, make_recipe
+from features.windows import WindowCut, WindowRule, overlap_of
 from pipelines.learn.model_file import MANIFEST_FILE, model_info, read_model, write_model
 from pipelines.learn.training_data import with_limits
 from terrain.errors import ConfigError, DataError
@@ -64,6 +64,10 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         self.seed = seed
         self.functions = functions
 
+    def unfitted(self, gap: int) -> WindowPipeline:
+        """Return the recipe, where so many windows on either side of one may share samples with it."""
+        return make_recipe(self.recipe, self.signal_sets, gap=gap, seed=self.seed, functions=self.functions)
+
     def fit(self, X: Windows, y: Array | None = None) -> Self:
         """Fit the recipe and what it knows of its own limits; inner folds are made of whole runs.
 
@@ -82,8 +86,8 @@ class TerrainClassifier(ClassifierMixin, BaseEstimator):
         if len(terrain) != len(windows):
             raise DataError(f"{len(terrain)} terrains for {len(windows)} windows")
         windows = labelled(WindowCut(replace(windows, terrain=terrain), {})).windows
-        gap = _overlap(windows)
-        recipe = make_recipe(self.recipe, self.signal_sets, gap=gap, seed=self.seed, functions=self.functions)
+        gap = overlap_of(windows)
+        recipe = self.unfitted(gap)
         samples = Samples(windows, {}, windows.run_id, gap)
         recipe.fit(windows, samples.terrain)
         info = model_info(
@@ -168,11 +172,3 @@ def _windows(given: Any) -> Windows:
             f"windows are needed, as terrain.cut_windows gives them; this is a {type(given).__name__}"
         )
     return given
-
-
-def _overlap(windows: Windows) -> int:
-    """Return how many windows on either side of a window may share samples with it; at least its neighbour."""
-    same = windows.run_id[1:] == windows.run_id[:-1]
-    steps_s = np.diff(windows.start_s)[same]
-    steps_s = steps_s[steps_s > 0]
-    return int(np.ceil(windows.length_s / steps_s.min() - 1e-9)) if len(steps_s) else 1

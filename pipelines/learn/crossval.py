@@ -104,10 +104,10 @@ def crossval(
             skip_short=settings.skip_short,
         )
         contenders.append((name, recipe, samples))
-    return evaluated(contenders, settings, progress)
+    return _evaluated(contenders, settings, progress)
 
 
-def evaluated(
+def _evaluated(
     contenders: Sequence[tuple[str, WindowPipeline, Samples]],
     settings: EvaluationSettings,
     progress: Progress,
@@ -121,3 +121,55 @@ def evaluated(
 
     name, recipe, samples = contenders[0]
     return evaluate_recipe(recipe, name, samples, settings, progress)[0]
+
+
+def cross_validate(
+    recipe: Any, windows: Windows, *, progress: Progress = silent, **options: Any
+) -> CrossvalResult | ComparisonResult:
+    """Evaluate one recipe, or several side by side, on windows with labels; whole runs are held out.
+
+    Parameters
+    ----------
+    recipe : a :class:`~pipelines.learn.classifier.TerrainClassifier`, a scikit-learn classifier of features, a
+        whole recipe or the name of one; or a list of them
+    windows : with the run and the terrain of each
+    progress : called as folds are done
+    options : fields of :class:`EvaluationSettings`, as ``protocol``, ``repeats``, ``seed``, ``n_jobs``; and
+        ``functions``, a list of own functions of a window
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.neighbors import KNeighborsClassifier
+    >>> from terrain.records import Windows
+    >>> rng, run = np.random.default_rng(0), np.repeat(np.arange(10), 8)
+    >>> terrain = np.where(run % 2, "ice", "mud").astype(object)
+    >>> shaking = rng.normal(size=(80, 1, 200)) * np.where(run % 2, 1.0, 3.0)[:, None, None]
+    >>> windows = Windows({"imu": shaking}, {"imu": ("accel_z_mps2",)}, {"imu": 100.0}, 2.0,
+    ...                   2.0 * np.arange(80), run.astype(str).astype(object), terrain)
+    >>> def peak(window):
+    ...     return np.abs(window["imu", "accel_z_mps2"]).max()
+    >>> found = cross_validate(KNeighborsClassifier(3), windows, functions=[peak], repeats=1, n_jobs=1)
+    >>> found.recipe, found.n_features, found.accuracy
+    ('KNeighborsClassifier', 52, 1.0)
+    """
+    from features.protocols import Samples
+    from features.recipes import make_recipe
+    from features.windows import overlap_of
+
+    functions = options.pop("functions", ())
+    recipes = list(recipe) if isinstance(recipe, list | tuple) else [recipe]
+    settings = EvaluationSettings(**{"extras": False} | options)
+    known = windows[windows.terrain != ""]
+    if not len(known):
+        raise DataError("no window has a terrain label: nothing can be trained or tested")
+    gap = overlap_of(known)
+    samples, contenders = Samples(known, {}, known.run_id, gap), []
+    for each in recipes:
+        kind = each
+        if hasattr(each, "unfitted"):
+            kind, made = each.recipe, each.unfitted(gap)
+        else:
+            made = make_recipe(each, settings.signal_sets, gap=gap, seed=settings.seed, functions=functions)
+        contenders.append((kind if isinstance(kind, str) else type(kind).__name__, made, samples))
+    return _evaluated(contenders, settings, progress)

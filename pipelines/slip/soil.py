@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -78,7 +78,7 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
     for folder in (out, settings.figures):
         if folder is not None:
             ensure_writable(folder)
-    further: list[RunLog] = []
+    further: Sequence[RunLog] = ()
     if (check := settings.check) is not None:
         further = load_runs(check, layout=settings.layout, repair=settings.repair)
     for folder, given in ((settings.data, runs), (check, further)):

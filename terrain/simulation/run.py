@@ -12,6 +12,7 @@ import math
 import zlib
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from terrain.errors import ConfigError
 from terrain.extension import warn_outside
 from terrain.kinematics.wheel_motion import wheel_motion
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
+from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot, load_robot
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
@@ -61,10 +62,10 @@ class Setup(NamedTuple):
 
 
 def simulate_run(
-    robot: Robot,
+    robot: Robot | str | Path,
     terrain: str,
     scenario: str,
-    seed: int,
+    seed: int = 0,
     number: int = 1,
     *,
     duration_s: float | None = None,
@@ -81,7 +82,7 @@ def simulate_run(
 
     Parameters
     ----------
-    robot : swerve robot with all sections, or another robot with all but steering
+    robot : swerve robot with all sections, or another robot with all but steering; or its name or YAML file
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
     scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
         alone, for calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions
@@ -102,7 +103,15 @@ def simulate_run(
     -----
     OutsideRegionWarning
         if the run leaves the region that the robot's effects were validated in.
+
+    Examples
+    --------
+    >>> run = simulate_run("husky", "grass", "straight", duration_s=6.0)
+    >>> run.run_id, sorted(run.streams)[:2]
+    ('grass_straight_01', ['commands', 'imu'])
     """
+    if isinstance(robot, str | Path):
+        robot = load_robot(robot)
     if effects and scenario in (BENCH, SLIP):
         raise ConfigError(f"scenario {scenario!r} is simulated without effects: leave them out")
     if scenario == BENCH:

@@ -10,10 +10,9 @@ from sklearn.linear_model import LogisticRegression, RidgeClassifier
 from sklearn.neighbors import KNeighborsClassifier
 
 from features.recipes import feature_matrix, make_recipe
-from pipelines.api.learn import cross_validate
 from pipelines.learn.card import model_result
 from pipelines.learn.classifier import TerrainClassifier
-from pipelines.learn.crossval import crossval
+from pipelines.learn.crossval import cross_validate, crossval
 from terrain.classify.own import OwnClassifier
 from terrain.errors import ConfigError, DataError, ModelError
 

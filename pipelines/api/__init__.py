@@ -1,1 +1,0 @@
-"""The Python API that ``import terrain`` offers lazily: the same functions as the commands, on objects."""
