@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import model_validator
 
@@ -18,13 +18,13 @@ from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import ComputeSettings, computing
 from pipelines.learn.settings import CacheSettings, EvaluationSettings
 from pipelines.report.results import Progress, silent
-from terrain.errors import ConfigError
+from terrain.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from features.protocols import Samples
     from features.recipes import WindowPipeline
     from pipelines.learn.comparison import ComparisonResult
-    from terrain.records import RunLog
+    from terrain.records import RunLog, Windows
 
 EXAMPLE = "terrain crossval --data runs/ --recipe svm"
 RESULTS = ("pipelines.learn.comparison",)
