@@ -12,21 +12,27 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 from pydantic import TypeAdapter
 
-from terrain.classify.svm import Candidate
+from features.protocols import folds_of
+from pipelines.learn.evaluate import evaluate
+from pipelines.learn.parallel import parallel
+from pipelines.learn.training_data import TrainingData
+from pipelines.report.json_file import as_json
+from pipelines.report.results import Progress
+from terrain.bootstrap import percentile_interval
+from terrain.classify.confidence import run_weights
+from terrain.classify.folds import Fold
+from terrain.classify.held_out import Examples
+from terrain.classify.inner import inner_splits
+from terrain.classify.paired import Difference, Outcome, compare_outcomes
+from terrain.classify.svm import CANDIDATES, Candidate, GroupedSVC
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
 from terrain.files.names import printable
-
-if TYPE_CHECKING:
-    from pipelines.learn.training_data import TrainingData
-    from pipelines.report.results import Progress
-    from terrain.classify.folds import Fold
-    from terrain.classify.held_out import Examples
-    from terrain.classify.paired import Difference
 
 BATCH = 4
 """Trials that are suggested together; a batch does not depend on how many are computed at once."""
@@ -89,13 +95,6 @@ def search(
     LogError
         if the folder is damaged.
     """
-    import numpy as np
-
-    from features.protocols import folds_of
-    from pipelines.learn.parallel import parallel
-    from pipelines.report.json_file import as_json
-    from terrain.classify.held_out import Examples
-
     optuna = _optuna()
     samples = data.samples
     examples = Examples(data.features, samples.terrain, samples.group)
@@ -176,15 +175,6 @@ def _suggest(optuna: Any, trials: Sequence[Trial], n_trials: int, seed: int) -> 
 
 def _tried(examples: Examples, gap: int, seed: int, params: Candidate) -> Trial:
     """Return the accuracy of one candidate on inner folds of whole runs."""
-    import numpy as np
-
-    from pipelines.learn.evaluate import evaluate
-    from terrain.bootstrap import percentile_interval
-    from terrain.classify.confidence import run_weights
-    from terrain.classify.folds import Fold
-    from terrain.classify.inner import inner_splits
-    from terrain.classify.svm import GroupedSVC
-
     _, terrain, group = examples
     splits = inner_splits(terrain, group, N_INNER_FOLDS, seed, gap)
     folds = [Fold(0, number, *rows) for number, rows in enumerate(splits)]
@@ -198,12 +188,6 @@ def _tried(examples: Examples, gap: int, seed: int, params: Candidate) -> Trial:
 
 def _held_out(examples: Examples, outer: Fold, best: Candidate, gap: int, seed: int) -> Difference:
     """Return the accuracy of the default choice and of the best candidate on runs that no trial has seen."""
-    import numpy as np
-
-    from pipelines.learn.evaluate import evaluate
-    from terrain.classify.paired import Outcome, compare_outcomes
-    from terrain.classify.svm import CANDIDATES, GroupedSVC
-
     default, found = (
         Outcome.of(evaluate(GroupedSVC(each, gap=gap, seed=seed), examples, [outer]), examples.group)
         for each in (CANDIDATES, (best,))

@@ -67,7 +67,7 @@ def test_no_trial_sees_the_runs_that_judge_it(data, tmp_path, monkeypatch):
         seen.append(set(np.unique(shared[0].group.astype(str))))
         return (function(*shared, *one) for one in each)
 
-    monkeypatch.setattr("pipelines.learn.parallel.parallel", spy)
+    monkeypatch.setattr("pipelines.learn.search.parallel", spy)
     report = sweep(data, tmp_path / "out", trials=4)
     assert report.held_out_runs
     assert all(not groups & set(report.held_out_runs) for groups in seen)
