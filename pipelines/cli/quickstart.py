@@ -102,7 +102,6 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     ensure_tracking()
     with _compiling_ahead():
         given, slip, figures = _simulated(settings, progress) if data is None else (load_runs(data), None, ())
-        _refuse_other_runs(given, data, out / "runs")
         runs = distinct_runs(given, merge=settings.merge_duplicates).runs
         dataset = SIMULATED if data is None else data.resolve().name
         training, held_out = hold_out_runs(runs)
@@ -177,21 +176,19 @@ def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) ->
     )
 
 
-def _refuse_other_runs(runs: Sequence[RunLog], data: Path | None, folder: Path) -> None:
-    from pipelines.data.datasets import load_runs
-    from terrain.logs.digest import data_digest
-
-    if folder.exists() and data_digest(load_runs(folder)) != data_digest(runs):
-        raise DataError(f"{folder}: holds other runs than {data or 'this simulation'}; choose another --out")
-
-
 def _keep(runs: Sequence[RunLog], data: Path | None, folder: Path, progress: Progress) -> dict[str, Any]:
-    """Write run folders into ``folder``; earlier ones of the same data are used as they are."""
+    """Write run folders into ``folder``; earlier ones of the same data are used as they are, others refused."""
+    from pipelines.data.datasets import load_runs
     from terrain.files.atomic import atomic_folder
+    from terrain.logs.digest import data_digest
     from terrain.logs.write import write_run
 
     kept = {"out": folder, "n_runs": len(runs), "reused": folder.exists()}
     if kept["reused"]:
+        if data_digest(load_runs(folder)) != data_digest(runs):
+            raise DataError(
+                f"{folder}: holds other runs than {data or 'this simulation'}; choose another --out"
+            )
         progress("write runs", len(runs), len(runs))
     elif data is not None:
         from pipelines.data import convert

@@ -221,10 +221,10 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
     if not folder.is_dir():
         raise LogError(f"{folder}: is no folder; {ACCEPTED}")
     if layout == "can":
-        from pipelines.data import can_codec, can_logs
+        from pipelines.data import can_frames
 
         name = CAN_ROBOT if robot is None else robot.name
-        return can_logs.find_runs(folder, can_codec.load_layout(mapping, ()), name)
+        return can_frames.find_runs(folder, can_frames.load_layout(mapping, ()), name)
     if mapping is not None and layout not in ("auto", "csv"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if mapping is not None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.data.mcap_file import McapWriter, library
+from pipelines.data.bag_files import McapWriter, library
 from pipelines.data.settings import Target
 from terrain.files.atomic import atomic_file, atomic_folder
 from terrain.kinematics.standard_messages import StandardTopic, standard_topic

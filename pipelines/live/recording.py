@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 
-from pipelines.data.mcap_file import McapWriter
+from pipelines.data.bag_files import McapWriter
 from pipelines.live.chain import CommandStatus, Step
 from terrain.control.switching import SWITCHING
 from terrain.errors import LogError

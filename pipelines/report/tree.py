@@ -8,7 +8,7 @@ written, so that screen and page show one number in one form.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from importlib import import_module
 from pathlib import Path
@@ -169,7 +169,7 @@ class Report:
     answer: str
     picture: Figure | None = None
     parts: Sequence[Part] = ()
-    details: Sequence[Section] = field(default=())
+    details: Sequence[Section] = ()
     next_step: str = ""
     lead: str = ""
 
@@ -183,27 +183,23 @@ class Report:
         """
         path = Path(path)
         check_file(path, "--report", ENDINGS)
-        atomic_write(path, _written(self, "markdown_text" if path.suffix.lower() == ".md" else "html_page"))
+        atomic_write(
+            path,
+            _written(self, "markdown.markdown_text" if path.suffix.lower() == ".md" else "html.html_page"),
+        )
         return path
 
     def __str__(self) -> str:
-        return _written(self, "terminal_text")
+        return _written(self, "terminal.terminal_text")
 
     def _repr_html_(self) -> str:
-        return _written(self, "html_fragment")
-
-
-WRITERS = {
-    "html_page": "html",
-    "html_fragment": "html",
-    "markdown_text": "markdown",
-    "terminal_text": "terminal",
-}
-"""Functions that write a report, and their modules, which import this one."""
+        return _written(self, "html.html_fragment")
 
 
 def _written(report: Report, writer: str) -> str:
-    text: str = getattr(import_module(f"pipelines.report.{WRITERS[writer]}"), writer)(report)
+    """Return what a function of one of the modules that import this one makes of a report."""
+    module, _, name = writer.partition(".")
+    text: str = getattr(import_module(f"pipelines.report.{module}"), name)(report)
     return text
 
 

@@ -18,17 +18,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.data.can_codec import (
+from pipelines.data.can_frames import (
     OPTIONAL,
     RECEIVED,
     SIGNALS,
     Layout,
+    Receiver,
     channels_of,
     encode,
     library,
     load_layout,
 )
-from pipelines.data.can_logs import Receiver
 from pipelines.live.chain import Chain, CommandStatus
 from pipelines.live.classifying import ClassifierThread
 from pipelines.live.session import chain_of

@@ -11,7 +11,7 @@ import pytest
 
 from features.windows import cut_windows
 from pipelines.cli import main as cli
-from pipelines.data.can_codec import QUATERNION, RECEIVED, SIGNALS, encode
+from pipelines.data.can_frames import QUATERNION, RECEIVED, SIGNALS, encode
 from pipelines.learn.model_file import read_model
 from pipelines.learn.training_data import data_of_runs, fitted_model
 from pipelines.live.model import TerrainModel

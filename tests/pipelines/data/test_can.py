@@ -13,17 +13,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.data.can_codec import (
+from pipelines.data.can_frames import (
+    INCOMPLETE_S,
     OPTIONAL,
     QUATERNION,
+    QUEUE,
+    READERS,
     SIGNALS,
     Drop,
+    Receiver,
     channels_of,
     decode,
     encode,
     load_layout,
 )
-from pipelines.data.can_logs import INCOMPLETE_S, QUEUE, READERS, Receiver
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError
 from terrain.files.resources import data_folder

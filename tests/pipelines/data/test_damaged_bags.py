@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
+from pipelines.data.bag_files import MCAP_MAGIC
 from pipelines.data.datasets import load_runs
-from pipelines.data.mcap_file import MAGIC
 from terrain.errors import ConfigError, LogError
 
 from .foreign_bags import husky_rows, refused, write_bag, write_mcap, write_ros1
@@ -112,7 +112,7 @@ def chunk(size, compression, packed, crc=0):
 def test_a_chunk_that_grows_beyond_bounds_is_refused_without_being_unpacked(tmp_path, compression, stated):
     zeros = bytes(100_000_000)
     packed = zstandard.compress(zeros) if compression == "zstd" else lz4.frame.compress(zeros)
-    content = MAGIC + chunk(stated, compression, packed)
+    content = MCAP_MAGIC + chunk(stated, compression, packed)
     del zeros
     tracemalloc.start()
     try:
@@ -140,12 +140,12 @@ def test_a_bag_of_ros_1_does_not_unpack_to_more_than_is_accepted(whole, monkeypa
         b"\x05" + b"\xff" * 8,
         record(3, b"\x01\x00\xff\xff\xff\xff"),
         record(5, bytes(22)) + record(15, bytes(4)),
-        MAGIC,
+        MCAP_MAGIC,
     ],
 )
 def test_records_and_chunks_that_are_nonsense_are_one_sentence(tmp_path, content):
     for repair in (False, True):
-        assert read(tmp_path, "zstd", MAGIC + content, repair) is None
+        assert read(tmp_path, "zstd", MCAP_MAGIC + content, repair) is None
 
 
 def test_a_view_in_the_place_of_a_table_is_refused(tmp_path):

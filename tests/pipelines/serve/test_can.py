@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.data.can_codec import channels_of, decode, encode, load_layout
+from pipelines.data.can_frames import channels_of, decode, encode, load_layout
 from pipelines.live.chain import CommandStatus
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bus import Bridge, Link, open_bus
