@@ -12,7 +12,7 @@ import click
 from pydantic.fields import FieldInfo
 
 from pipelines.cli.table import Command
-from pipelines.report.results import Result
+from pipelines.report.results import Result, write_json
 from pipelines.report.settings import Settings, setting
 
 REQUIRED = "Required"
@@ -39,7 +39,6 @@ class OneFile(click.Command):
         super().__init__(command.name, params=parameters, callback=self._execute)
 
     def _execute(self, **options: Any) -> Result:
-        from pipelines.report.json_file import write_json
         from pipelines.report.terminal import print_report, progress_bar
         from pipelines.report.writing import ENDINGS, check_file
 

@@ -84,21 +84,8 @@ class RunLoader(NamedTuple):
         return None if self.repair or self.align else self.run_folder
 
 
-class LoadedRuns(NamedTuple):
-    """Runs, and a sentence for each run that a repairing read had to skip."""
-
-    runs: list[RunLog]
-    skipped: list[str]
-
-
-def load_runs(
-    folder: str | Path,
-    *,
-    robot: str | Path | None = None,
-    on_skip: Callable[[str], None] = _log.warning,
-    **reading: Any,
-) -> Runs:
-    """Return the runs that lie under a folder, sorted by their id.
+def load_runs(folder: str | Path, *, robot: str | Path | None = None, **reading: Any) -> Runs:
+    """Return the runs that lie under a folder, sorted by their id; a warning is logged for each that is skipped.
 
     Parameters
     ----------
@@ -107,7 +94,6 @@ def load_runs(
         MCAP file
     robot : the robot of logs that do not name theirs, by name or its YAML file; of those of DRIVE
         :data:`DRIVE_ROBOT` by default
-    on_skip : called with a sentence for each run that is skipped when repairing; logs a warning by default
     layout : one of :data:`~pipelines.data.settings.Layout`; ``auto`` looks, as by default
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
         their DBC, by default AgriMaRo's; of bags their topics (``terrain.logs.topic_mapping``)
@@ -122,12 +108,12 @@ def load_runs(
     name = None if robot is None else str(robot)
     runs, skipped = load(AlignedRunsSettings(data=Path(folder), robot=name, **reading))
     for sentence in skipped:
-        on_skip(sentence)
+        _log.warning(sentence)
     return Runs(runs)
 
 
-def load(settings: RunsSettings) -> LoadedRuns:
-    """Return the runs of the settings, sorted by their id.
+def load(settings: RunsSettings) -> tuple[list[RunLog], list[str]]:
+    """Return the runs of the settings, sorted by their id, and a sentence for each that a repairing read skipped.
 
     Raises
     ------
@@ -164,7 +150,7 @@ def load(settings: RunsSettings) -> LoadedRuns:
     runs = sorted(one_spelling(str(folder), runs, repair=repair), key=lambda run: run.run_id)
     if isinstance(settings, AlignedRunsSettings):
         runs = chosen_runs(runs, settings)
-    return LoadedRuns(runs, [f"run skipped: {fault}" for fault in faults])
+    return runs, [f"run skipped: {fault}" for fault in faults]
 
 
 def run_loaders(settings: RunsSettings) -> list[RunLoader]:

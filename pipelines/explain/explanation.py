@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.explain import figures
-from pipelines.report.json_file import as_json
 from pipelines.report.numbers import enumerated, format_value, sentence
-from pipelines.report.results import Result, described
+from pipelines.report.results import Result, as_json, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 from pipelines.report.versions import versions
 from terrain.discrepancy.channel_words import CHANNEL_WORDS

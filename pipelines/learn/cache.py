@@ -30,8 +30,7 @@ from pipelines.learn.parallel import parallel
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import LearnSettings
 from pipelines.learn.training_data import TrainingData, trained_runs
-from pipelines.report.json_file import as_json
-from pipelines.report.results import Progress, silent
+from pipelines.report.results import Progress, as_json, silent
 from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable

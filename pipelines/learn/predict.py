@@ -20,7 +20,7 @@ from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.figure import Figure, Panel, Strip
 from pipelines.report.numbers import format_counts, format_value, plural
-from pipelines.report.results import Progress, Result, described, silent
+from pipelines.report.results import Progress, Result, as_json, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Part, Report, Section, Table, Text
@@ -155,8 +155,6 @@ class Predictions(Result):
     def to_pandas(self) -> pd.DataFrame:
         """Return a row a window; its target slips in a column each."""
         import pandas as pd
-
-        from pipelines.report.json_file import as_json
 
         table = pd.json_normalize([as_json(each) for each in self.windows], sep="_")
         if len(table):

@@ -21,8 +21,7 @@ from features.protocols import folds_of
 from pipelines.learn.evaluate import evaluate
 from pipelines.learn.parallel import parallel
 from pipelines.learn.training_data import TrainingData
-from pipelines.report.json_file import as_json
-from pipelines.report.results import Progress
+from pipelines.report.results import Progress, as_json
 from terrain.bootstrap import percentile_interval
 from terrain.classify.confidence import run_weights
 from terrain.classify.folds import Fold

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from pipelines.data.tracking import log_run, mlflow_store
-from pipelines.report.results import Result, described
+from pipelines.report.results import Result, as_json, described
 from terrain.errors import ModelError
 
 if TYPE_CHECKING:
@@ -61,7 +61,6 @@ def log_training(
     from pipelines.learn.card import read_training
     from pipelines.learn.champion import Champion, judge, tags_of
     from pipelines.learn.model_file import read_model
-    from pipelines.report.json_file import as_json
 
     info, record = read_training(folder)
     if record is None:

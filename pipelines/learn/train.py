@@ -21,7 +21,7 @@ from pipelines.learn.parallel import ComputeSettings
 from pipelines.learn.settings import CacheSettings, RecipeSettings
 from pipelines.learn.tracking import Registered
 from pipelines.report.numbers import format_value, plural
-from pipelines.report.results import Progress, described, silent
+from pipelines.report.results import Progress, as_json, described, silent
 from pipelines.report.settings import setting
 from pipelines.report.tree import Report, Section, Text
 from terrain.errors import ConfigError
@@ -175,7 +175,6 @@ def train(
     from pipelines.learn.model_file import write_model
     from pipelines.learn.training_data import info_of, with_limits
     from pipelines.report.drawing import figure_png
-    from pipelines.report.json_file import as_json
     from pipelines.report.tree import figures_of
     from pipelines.report.versions import versions
 

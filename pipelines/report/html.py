@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pipelines.report.figure import Figure
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from pipelines.report.tree import Part, Report, Section
 
 ASSETS = Path(__file__).parent / "assets"

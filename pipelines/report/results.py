@@ -1,11 +1,17 @@
-"""Results of commands: frozen records whose fields say what they are, and all that derives from them."""
+"""Results of commands: frozen records whose fields say what they are, and all that derives from them, as JSON."""
 
 from __future__ import annotations
 
+import json
+import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, field, fields
+from dataclasses import MISSING, field, fields, is_dataclass
+from enum import Enum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from terrain.files.atomic import atomic_write
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,6 +43,49 @@ def described(
     return field(default=None if optional else default, metadata=metadata)
 
 
+def as_json(value: Any) -> Any:
+    """Return what JSON can hold of a result: a number that is not finite is None.
+
+    Parameters
+    ----------
+    value : a record (dataclass or named tuple), a mapping, a sequence, an array, an enum, a path, a number
+        or a text; a record with a method ``as_json`` decides itself what it shows
+
+    Examples
+    --------
+    >>> from typing import NamedTuple
+    >>> class Figure(NamedTuple):
+    ...     mean: float
+    ...     ci: tuple[float, float] | None
+    >>> as_json({"energy": Figure(1.5, None), "bad": float("nan")})
+    {'energy': {'mean': 1.5, 'ci': None}, 'bad': None}
+    """
+    if value is None or (isinstance(value, bool | str | int) and not isinstance(value, Enum)):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "as_json"):
+        return as_json(value.as_json())
+    if is_dataclass(value) and not isinstance(value, type):
+        return {each.name: as_json(getattr(value, each.name)) for each in fields(value)}
+    if isinstance(value, tuple) and hasattr(value, "_fields"):
+        return {name: as_json(each) for name, each in zip(value._fields, value, strict=True)}
+    if isinstance(value, Mapping):
+        return {str(key): as_json(each) for key, each in value.items()}
+    if hasattr(value, "tolist"):
+        return as_json(value.tolist())
+    return [as_json(each) for each in value]
+
+
+def write_json(path: Path, result: Any) -> None:
+    """Write a result to a file, whole or not at all."""
+    atomic_write(path, json.dumps(as_json(result), indent=2, allow_nan=False) + "\n")
+
+
 class Result:
     """Base of the results of commands, which are frozen dataclasses.
 
@@ -63,9 +112,7 @@ class Result:
         return made
 
     def as_json(self) -> Any:
-        """Return the fields by name, as :func:`pipelines.report.json_file.as_json` writes them."""
-        from pipelines.report.json_file import as_json
-
+        """Return the fields by name, as :func:`as_json` writes them."""
         values = {name: getattr(self, name) for name in self.about()}
         shown = (name for name in values if values[name] is not None or not self.about()[name]["optional"])
         return {name: as_json(values[name]) for name in shown}
@@ -89,8 +136,6 @@ class Result:
     def to_pandas(self) -> pd.DataFrame:
         """Return a table, the fields of its rows as ``--json`` has them."""
         import pandas as pd
-
-        from pipelines.report.json_file import as_json
 
         return pd.DataFrame([as_json(record) for record in self.records()])
 

@@ -12,7 +12,7 @@ from fastapi.responses import FileResponse, JSONResponse, PlainTextResponse
 from fastapi.staticfiles import StaticFiles
 
 from pipelines import report
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from pipelines.serve.connection import Connection
 from pipelines.serve.guard import Guard
 from pipelines.serve.hub import Hub

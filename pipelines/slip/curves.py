@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from pipelines.report.figure import Band, Figure, Mark, Panel, Points
-from pipelines.report.json_file import as_json
 from pipelines.report.numbers import enumerated, format_value, plural
-from pipelines.report.results import Progress, described
+from pipelines.report.results import Progress, as_json, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.shown import file_name, first_rows, named
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of, law_marks

@@ -65,7 +65,7 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
         if fewer runs than folds have poses.
     """
     assert settings.robot is not None
-    runs = load(settings).runs
+    runs, _ = load(settings)
     refusal = "robot {name}: drive {drive!r} has no tracks; --what odometry is for 'tracked'"
     robot = as_drive(TrackedRobot, load_robot(settings.robot), refusal)
     if settings.out is not None:

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from studies import consistency
 from studies.consistency import GROUPS, consistency_by_terrain
 from terrain.robots import load_robot

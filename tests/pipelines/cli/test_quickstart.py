@@ -9,7 +9,7 @@ from pipelines.cli.quickstart import Settings, run
 from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn.model_file import read_model
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.errors import ConfigError, DataError
 from terrain.logs.digest import data_digest
@@ -39,7 +39,7 @@ def test_the_runs_that_are_predicted_took_no_part(held_out):
     assert {each.run_id for each in result.crossval.per_run} == {each.run_id for each in training}
     assert [" --without ASPHALT_3" in step for step in result.commands] == [True, True, False]
     assert result.commands[-1].endswith(" --only ASPHALT_3")
-    loaded = load(AlignedRunsSettings(data=folder / "data", without=("ASPHALT_3",))).runs
+    loaded, _ = load(AlignedRunsSettings(data=folder / "data", without=("ASPHALT_3",)))
     assert data_digest(loaded) == result.data_digest
 
     page = result.report_file.read_text()
@@ -90,7 +90,7 @@ def test_runs_are_chosen_by_id(make_run, tmp_path):
         write_run(make_run(f"a{number}", seed=number), tmp_path)
 
     def chosen(**options):
-        return [each.run_id for each in load(AlignedRunsSettings(data=tmp_path, **options)).runs]
+        return [each.run_id for each in load(AlignedRunsSettings(data=tmp_path, **options))[0]]
 
     assert chosen() == ["a0", "a1", "a2"]
     assert chosen(only=("a2", "a0")) == ["a0", "a2"]

@@ -5,7 +5,7 @@ import pytest
 
 from pipelines.data import convert, inspect
 from pipelines.data.datasets import load_runs
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.errors import TerrainError
 from terrain.logs.digest import data_digest

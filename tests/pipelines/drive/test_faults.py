@@ -9,7 +9,7 @@ import pytest
 from pipelines.drive.drive import Settings
 from pipelines.drive.faults import bars_text, drive_faults, fault_figure, fault_loop
 from pipelines.live.pilot import LivePilot
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from terrain.control.drive_metrics import drive_history, stopping_distance
 from terrain.control.fault_drives import (
     FaultCase,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from pipelines.drive.drive import Settings, SlipSourceName, run
-from pipelines.report.json_file import as_json
-from pipelines.report.results import silent
+from pipelines.report.results import as_json, silent
 from terrain.control.car_following import SlipSource
 
 

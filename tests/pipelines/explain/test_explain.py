@@ -9,8 +9,7 @@ import yaml
 
 from pipelines.explain.explain import EXTENDED_FILE, PAGE_FILE, explain_runs
 from pipelines.live.pilot import LivePilot
-from pipelines.report.json_file import as_json
-from pipelines.report.results import silent
+from pipelines.report.results import as_json, silent
 from pipelines.report.terminal import terminal_text
 from pipelines.slip import calibrate
 from pipelines.slip.estimate import estimate_runs

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.learn.comparison import compare_models
 from pipelines.learn.crossval import crossval
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from terrain.classify.paired import Verdict
 from terrain.classify.support import SupportLevel
 from terrain.errors import DataError

@@ -17,8 +17,8 @@ from pipelines.learn import settings as learn_settings
 from pipelines.learn.crossval import EvaluationSettings, Settings, crossval, run
 from pipelines.learn.evaluate import evaluate
 from pipelines.learn.settings import ProtocolName
-from pipelines.report.json_file import as_json
 from pipelines.report.numbers import format_counts
+from pipelines.report.results import as_json
 from terrain.classify.held_out import Examples
 from terrain.classify.support import SupportLevel
 from terrain.errors import ConfigError

@@ -22,7 +22,7 @@ from features.windows import WindowRule
 from pipelines.learn import parallel as cluster
 from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.parallel import ComputeSettings, computing, parallel, scheduler_address
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from pipelines.report.versions import difference, software
 from terrain.errors import ConfigError, TerrainError
 

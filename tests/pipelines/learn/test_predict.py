@@ -9,7 +9,7 @@ import pytest
 from pipelines.learn.predict import NOT_LEARNED, Settings, predict, run
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import fitted_model
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.logs.write import write_run

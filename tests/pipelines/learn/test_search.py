@@ -10,8 +10,7 @@ from pipelines.learn.recipes import read_params
 from pipelines.learn.search import STUDY_FILE, TRIALS_FILE, search
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.training_data import data_of_runs
-from pipelines.report.json_file import as_json
-from pipelines.report.results import silent
+from pipelines.report.results import as_json, silent
 from terrain.errors import ConfigError, LogError
 
 

@@ -19,7 +19,7 @@ from pipelines.learn.card import limits_of, model_result
 from pipelines.learn.model_file import CARD_FILE, TRAINING_FILE, read_model, seal
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.train import Settings, run
-from pipelines.report.json_file import as_json
+from pipelines.report.results import as_json
 from terrain.classify.importance import ChannelDrops
 from terrain.errors import ConfigError, ModelError, TerrainError
 from terrain.logs.write import write_run

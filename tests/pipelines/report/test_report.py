@@ -6,6 +6,8 @@ import json
 import math
 import re
 from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -18,7 +20,7 @@ from pipelines.report.figure import Band, Bars, Figure, Line, Panel, Points, Str
 from pipelines.report.html import figure_data, html_page
 from pipelines.report.markdown import markdown_text
 from pipelines.report.numbers import format_value
-from pipelines.report.results import Result, described
+from pipelines.report.results import Result, as_json, described
 from pipelines.report.terminal import terminal_text
 from pipelines.report.tree import Column, Pairs, Report, Section, Table, Text, figures_of
 from terrain.errors import ConfigError
@@ -183,3 +185,46 @@ def test_a_schema_describes_what_is_written():
     schema = Found.schema()["properties"]
     assert schema["ratio"] == {"description": "of slip", "unit": "1"}
     assert list(schema) == list(Found("a", "a", 1.0).as_json())
+
+
+class Colour(Enum):
+    red = "red"
+
+
+class Point(NamedTuple):
+    x: float
+    y: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    colour: Colour
+    points: tuple[Point, ...]
+    file: Path
+
+
+class Shown(NamedTuple):
+    value: float
+
+    def as_json(self):
+        return {"shown": self.value}
+
+
+def test_every_kind_of_value_becomes_what_json_holds():
+    drawn = Drawn(Colour.red, (Point(1.0, None), Point(math.nan, math.inf)), Path("a/b"))
+    found = as_json(
+        {"drawn": drawn, 3: np.array([1, 2]), "n": np.float64(0.5), "own": Shown(2.0), "on": True}
+    )
+    assert found == {
+        "drawn": {"colour": "red", "points": [{"x": 1.0, "y": None}, {"x": None, "y": None}], "file": "a/b"},
+        "3": [1, 2],
+        "n": 0.5,
+        "own": {"shown": 2.0},
+        "on": True,
+    }
+    assert json.loads(json.dumps(found, allow_nan=False)) == found
+
+
+def test_a_value_that_json_cannot_hold_is_an_error():
+    with pytest.raises(TypeError):
+        as_json(object())

@@ -114,7 +114,7 @@ def test_loggers_that_are_apart_are_named_and_aligned_on_request(tmp_path):
     assert "apart in 1 of 1 runs, by -0.4" in sentence
     write_run(late, tmp_path)
     assert run(Settings(data=tmp_path, filter="skid", align=True), silent).clocks == ()
-    loaded = load(AlignedRunsSettings(data=tmp_path, align=True)).runs[0]
+    loaded = load(AlignedRunsSettings(data=tmp_path, align=True))[0][0]
     assert loaded.streams["wheels"].time_s[0] == pytest.approx(0.0, abs=0.05)
 
 
