@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from time import perf_counter
@@ -23,7 +23,7 @@ from terrain.estimation.live.choice import Estimate
 from terrain.estimation.live.clocks import last_stamp_s
 from terrain.estimation.live.estimator import CHANNELS
 from terrain.extension import correct_live
-from terrain.records import Array, Reading, Sample, Windows
+from terrain.records import Reading, Sample, Windows
 from terrain.robots import Robot
 
 PILOT_FILTER = "vio15"
@@ -44,8 +44,7 @@ class WindowOutput(NamedTuple):
     start_s, end_s : of the window, on the clock of its stamps
     terrain, probability : class of the largest probability; empty and NaN where the window was refused, empty
         where it is like no terrain that was learned
-    probabilities : (k,) in the order of ``classes``
-    classes : of the model
+    probabilities : of each class of the model, in its order
     refused : why there is no output; empty where there is one
     took_s : time of features and classifier
     nearest : class of the largest probability also where the terrain is unknown
@@ -57,8 +56,7 @@ class WindowOutput(NamedTuple):
     end_s: float
     terrain: str
     probability: float
-    probabilities: Array
-    classes: tuple[str, ...]
+    probabilities: Mapping[str, float]
     refused: str = ""
     took_s: float = math.nan
     nearest: str = ""
@@ -81,9 +79,9 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
         if not np.isfinite(probabilities).all():
             raise DataError("a probability is not finite")
     except Exception as error:  # whatever broken samples lead a recipe to, it must not stop the loop
-        refused, nothing = str(error) or type(error).__name__, np.full(len(classes), math.nan)
+        refused, nothing = str(error) or type(error).__name__, dict.fromkeys(classes, math.nan)
         took_s = perf_counter() - started_s
-        return WindowOutput(start_s, end_s, "", math.nan, nothing, classes, refused, took_s)
+        return WindowOutput(start_s, end_s, "", math.nan, nothing, refused, took_s)
     took_s = perf_counter() - started_s
     best = int(probabilities.argmax())
     nearest, supported = str(model.recipe.classes_[best]), assessed.supported[0]
@@ -92,56 +90,13 @@ def classify_window(model: TerrainModel, window: Windows) -> WindowOutput:
         end_s,
         UNKNOWN if assessed.unknown[0] else nearest,
         float(probabilities[best]),
-        probabilities,
-        classes,
+        dict(zip(classes, probabilities.tolist(), strict=True)),
         "",
         took_s,
         nearest,
         float(assessed.novelty[0]),
         None if math.isnan(supported) else bool(supported),
     )
-
-
-class ClassifierThread:
-    """A thread that cuts and classifies the windows of any number of robots, one after the other.
-
-    Attributes
-    ----------
-    failures : number of errors that were not foreseen, by type; each costs its window
-
-    Examples
-    --------
-    >>> thread = ClassifierThread()
-    >>> thread.due(lambda: None)
-    >>> thread.stop()
-    """
-
-    def __init__(self) -> None:
-        self.failures: Counter[str] = Counter()
-        self._pool = ThreadPoolExecutor(1, "classifier")
-        self._n_due = self._n_done = 0
-
-    @property
-    def busy(self) -> bool:
-        """Whether the thread has something to do."""
-        return self._n_due > self._n_done
-
-    def stop(self) -> None:
-        """Let the thread finish the window that it is at, and end."""
-        self._pool.shutdown(cancel_futures=True)
-
-    def due(self, work: Callable[[], None]) -> None:
-        """Let the thread do the work of a robot; nothing where the thread has ended."""
-        self._n_due += 1
-        with suppress(RuntimeError):
-            self._pool.submit(self._run, work)
-
-    def _run(self, work: Callable[[], None]) -> None:
-        try:
-            work()
-        except Exception as error:  # of one window: the thread serves the next
-            self.failures[type(error).__name__] += 1
-        self._n_done += 1
 
 
 class _Part(NamedTuple):
@@ -158,8 +113,9 @@ class Classifier(TerrainSource):
     ----------
     model : fitted on such windows; None where it comes later
     robot : its description; may be missing where every channel of the model is measured
-    thread : that cuts and classifies; by default that is done at once, for logs and simulations, which can wait.
-        Arrays that are taken are kept for it and must not change
+    thread : of one worker, which cuts and classifies for any number of robots, one after the other; an error
+        that was not foreseen costs its window.  By default that is done at once, for logs and simulations,
+        which can wait.  Arrays that are taken are kept for it and must not change
     channels : of each stream that is measured; those of a pilot's robot by default
     filter_name : filter that runs here; that of a pilot by default
 
@@ -178,7 +134,7 @@ class Classifier(TerrainSource):
         self,
         model: TerrainModel | None,
         robot: Robot | None,
-        thread: ClassifierThread | None = None,
+        thread: ThreadPoolExecutor | None = None,
         channels: Mapping[str, Sequence[str]] = CHANNELS,
         filter_name: str = PILOT_FILTER,
     ) -> None:
@@ -247,7 +203,8 @@ class Classifier(TerrainSource):
         if self._thread is None:
             self._work()
         else:
-            self._thread.due(self._work)
+            with suppress(RuntimeError):  # the thread has ended
+                self._thread.submit(self._work)
 
     def take(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> list[WindowOutput]:
         """Take readings and estimates; return the outputs of windows that are there by now."""
@@ -295,9 +252,10 @@ class Classifier(TerrainSource):
         for output in self.take(sample.readings, estimates):
             terrain, probability = output.terrain, output.probability
             if self._over_time is not None:
-                window = output.end_s, output.probabilities, output.novelty, output.unknown
+                classes, probabilities = zip(*output.probabilities.items(), strict=True)
+                window = output.end_s, np.array(probabilities), output.novelty, output.unknown
                 best, probability = self._over_time.take(*window)
-                terrain = output.classes[best] if best >= 0 else UNKNOWN
+                terrain = classes[best] if best >= 0 else UNKNOWN
             elif output.refused:
                 continue
             found.append(TerrainEstimate(output.end_s, terrain, probability))

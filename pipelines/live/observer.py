@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
 from pipelines.live.chain import Chain, Step
-from pipelines.live.classifying import Classifier, ClassifierThread, WindowOutput
+from pipelines.live.classifying import Classifier, WindowOutput
 from pipelines.live.model import TerrainModel
 from pipelines.live.windows import live_estimator
 from terrain.control.slip_table import SlipTable, load_slip_table
@@ -64,7 +65,7 @@ class Observer(Chain):
         robot: Robot | None = None,
         channels: Mapping[str, Sequence[str]] | None = None,
         *,
-        thread: ClassifierThread | None = None,
+        thread: ThreadPoolExecutor | None = None,
         switching: SwitchSettings = SWITCHING,
     ) -> None:
         check_switching(switching)

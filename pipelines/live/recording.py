@@ -254,7 +254,7 @@ def recorded(output: WindowOutput) -> RecordedWindow:
         end_s=output.end_s,
         terrain=output.terrain,
         probability=probability,
-        probabilities=dict(zip(output.classes, output.probabilities.tolist(), strict=True)),
+        probabilities=dict(output.probabilities),
         doubtful=not (output.terrain and probability >= SWITCHING.probability_least),
         refused=output.refused,
     )

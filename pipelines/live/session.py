@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 from time import monotonic, time
@@ -17,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
 
 from pipelines.live.chain import COMMAND_VALID_S, Chain, CommandStatus, Step
-from pipelines.live.classifying import Classifier, ClassifierThread, WindowOutput
+from pipelines.live.classifying import Classifier, WindowOutput
 from pipelines.live.model import TerrainModel
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
@@ -150,7 +151,7 @@ class RobotSession:
         hello: Hello,
         served: Served,
         robot: Robot | None,
-        thread: ClassifierThread | None = None,
+        thread: ThreadPoolExecutor | None = None,
         leave: Callable[[str, str], None] = lambda code, sentence: None,
     ) -> None:
         self.hello, self.served, self.leave = hello, served, leave
@@ -345,7 +346,7 @@ def _window_content(window: WindowOutput) -> dict[str, Any]:
         "start_s": window.start_s,
         "end_s": window.end_s,
         "terrain": window.terrain or None,
-        "probabilities": dict(zip(window.classes, window.probabilities.tolist(), strict=True)),
+        "probabilities": window.probabilities,
         "refused": window.refused or None,
         "nearest": window.nearest or None,
         "novelty": window.novelty,
@@ -359,7 +360,7 @@ def chain_of(
     model: TerrainModel | None,
     table: SlipTable,
     pilot: PilotSettings | None = None,
-    thread: ClassifierThread | None = None,
+    thread: ThreadPoolExecutor | None = None,
 ) -> Chain:
     """Return what the samples of a robot go through: a pilot of these settings, without them an observer."""
     if pilot is not None and robot is not None:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,6 @@ from pipelines.data.can_frames import (
     load_layout,
 )
 from pipelines.live.chain import Chain, CommandStatus
-from pipelines.live.classifying import ClassifierThread
 from pipelines.live.session import chain_of
 from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described, silent
@@ -361,7 +361,7 @@ def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
         loaded(settings, settings.model),
         load_slip_table(settings.table),
         PilotSettings(controller=settings.controller),
-        ClassifierThread(),
+        ThreadPoolExecutor(1, "classifier"),
     )
     bridge, link = Bridge(layout, robot, chain), Link(lambda: open_bus(interface, channel, settings.bitrate))
     with stopping(bridge.stop):

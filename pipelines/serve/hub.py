@@ -6,6 +6,7 @@ import asyncio
 import hmac
 from collections import OrderedDict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from tempfile import NamedTemporaryFile
 from time import monotonic
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pipelines.learn.model_file import drawn_window
-from pipelines.live.classifying import Classifier, ClassifierThread, classify_window
+from pipelines.live.classifying import Classifier, classify_window
 from pipelines.live.model import TerrainModel
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread
@@ -118,7 +119,7 @@ class Hub:
         self.trouble: dict[str, str] = {}
         self._left: OrderedDict[str, LiveState] = OrderedDict()
         self._recorder = None if settings.record is None else RecordingThread()
-        self._thread = ClassifierThread()
+        self._thread = ThreadPoolExecutor(1, "classifier")
 
     def admits(self, token: str) -> bool:
         """Say whether a token is the required one, in a time that does not tell how much of it is right."""
@@ -267,7 +268,7 @@ class Hub:
 
     def stop(self) -> None:
         """End the threads; recordings are written."""
-        self._thread.stop()
+        self._thread.shutdown(cancel_futures=True)
         if self._recorder is not None:
             self._recorder.stop()
 

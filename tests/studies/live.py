@@ -6,6 +6,7 @@ import asyncio
 import gc
 import math
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 
 from features.windows import cut_windows
 from pipelines.learn.model_file import read_model
-from pipelines.live.classifying import Classifier, ClassifierThread, classify_window
+from pipelines.live.classifying import Classifier, classify_window
 from pipelines.live.pilot import LivePilot
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
@@ -99,6 +100,20 @@ def _as_served() -> Iterator[None]:
         gc.unfreeze()
 
 
+class _Thread(ThreadPoolExecutor):
+    """A classifier's thread that says whether it has something to do."""
+
+    last: Future[Any] | None = None
+
+    def submit(self, *work: Any) -> Future[Any]:  # type: ignore[override]
+        self.last = super().submit(*work)
+        return self.last
+
+    @property
+    def busy(self) -> bool:
+        return self.last is not None and not self.last.done()
+
+
 def step_times_us(robot: Robot, model: Any, run: RunLog, repeats: int = REPEATS) -> tuple[Spread, Spread]:
     """Return the times of steps as fast as a log goes: alone, and while the thread classifies a window.
 
@@ -107,7 +122,7 @@ def step_times_us(robot: Robot, model: Any, run: RunLog, repeats: int = REPEATS)
     beside a window do not.
     """
     samples = list(replay(run, STEP_RATE_HZ))
-    thread = ClassifierThread()
+    thread = _Thread(1)
     times_us: dict[bool, list[float]] = {False: [], True: []}
     try:
         with _as_served():
@@ -124,13 +139,13 @@ def step_times_us(robot: Robot, model: Any, run: RunLog, repeats: int = REPEATS)
                         while waiting and thread.busy:
                             sleep(0.0)
     finally:
-        thread.stop()
+        thread.shutdown(cancel_futures=True)
     return spread(times_us[False]), spread(times_us[True])
 
 
 def paced_step_times_us(robot: Robot, model: Any, run: RunLog, seconds: float) -> Spread:
     """Return the time of a step at its own rate in real time: between two of them the memory goes cold."""
-    thread, times_us = ClassifierThread(), []
+    thread, times_us = ThreadPoolExecutor(1), []
     try:
         with _as_served():
             pilot = LivePilot(robot, source=Classifier(model, robot, thread))
@@ -143,7 +158,7 @@ def paced_step_times_us(robot: Robot, model: Any, run: RunLog, seconds: float) -
                 pilot.step(sample)
                 times_us.append((perf_counter() - begun_s) * 1e6)
     finally:
-        thread.stop()
+        thread.shutdown(cancel_futures=True)
     return spread(times_us[len(times_us) // 10 :])
 
 

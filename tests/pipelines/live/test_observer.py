@@ -189,7 +189,7 @@ def test_a_window_that_the_model_refuses_is_named(mower_model, two_drives, why):
     observer = Observer(mower_model._replace(recipe=Refusing()))
     found = observed(observer, two_drives[0])
     assert {(one.refused, one.terrain) for one in found} == {(why, "")}
-    assert np.isnan([(one.probability, *one.probabilities) for one in found]).all()
+    assert np.isnan([(one.probability, *one.probabilities.values()) for one in found]).all()
     assert observer.dropped == {f"window: refused, {why}": len(found)}
     assert observer.belief.terrain == ""
 

@@ -153,8 +153,8 @@ def test_windows_of_any_class_are_in_the_file(recorder):
     recorded(recorder)
     given = (("a/b: c", 0.9, "", False), ("a/b: c", 0.4, "", True), ("", np.nan, "NaN", True))
     for k, (terrain, probability, why, _) in enumerate(given):
-        both, span_s = np.array([probability, 1.0 - probability]), (2.0 * k, 2.0 * k + 2.0)
-        output = WindowOutput(*span_s, terrain, probability, both, ("a/b: c", "d"), why)
+        both, span_s = {"a/b: c": probability, "d": 1.0 - probability}, (2.0 * k, 2.0 * k + 2.0)
+        output = WindowOutput(*span_s, terrain, probability, both, why)
         recorder.step(1.0, np.zeros(3), Step([output]))
     _, windows = recorded_windows(closed(recorder)[0])
     assert [(w.doubtful, w.refused) for w in windows] == [(doubtful, why) for *_, why, doubtful in given]
