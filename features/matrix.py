@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import NamedTuple
@@ -34,6 +35,10 @@ terrain.  ``driving``: speeds and yaw rates among the estimator's states.
 """
 
 
+SAME_RATE = 1e-6
+"""Rates that differ by less, relative to one another, give the same features but for rounding."""
+
+
 class FeatureMatrix(NamedTuple):
     """What features are computed from.
 
@@ -49,6 +54,14 @@ class FeatureMatrix(NamedTuple):
     length_s: float
     n_samples: Mapping[str, int]
     level_sets: tuple[str, ...] = ()
+
+    def equals(self, other: FeatureMatrix) -> bool:
+        """Whether both give the same features of a window, but for rounding."""
+        own, its = ((m.layout.channels, dict(m.n_samples), m.length_s, m.level_sets) for m in (self, other))
+        rates_hz = self.layout.rate_hz.items()
+        return own == its and all(
+            math.isclose(rate_hz, other.layout.rate_hz[name], rel_tol=SAME_RATE) for name, rate_hz in rates_hz
+        )
 
     def of(self, windows: Windows) -> Array:
         """Return the features (n_windows, n_features); NaN where a feature is not defined.

@@ -13,7 +13,6 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,13 +65,11 @@ class RunHead(NamedTuple):
 
     def sketch(self) -> RunLog:
         """Return a run of two samples a stream that has these channels and rates, and nothing else."""
-        return RunLog(self.run_id, self.robot, {name: _pair(tuple(c), p) for name, c, p in self.streams})
-
-
-@lru_cache(maxsize=1024)
-def _pair(channels: tuple[str, ...], period_s: float) -> Stream:
-    time_s = np.array([0.0, period_s]) if np.isfinite(period_s) else np.zeros(1)
-    return Stream(time_s, np.zeros((len(time_s), len(channels))), channels)
+        streams = {
+            name: Stream(np.array([0.0, period_s]), np.zeros((2, len(channels))), tuple(channels))
+            for name, channels, period_s in self.streams
+        }
+        return RunLog(self.run_id, self.robot, streams)
 
 
 def loaders_of(source: AlignedRunsSettings) -> list[RunLoader]:

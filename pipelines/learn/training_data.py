@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from features.extractor import FeatureExtractor
-from features.matrix import FeatureMatrix
 from features.motion import Motion, window_motion
 from features.protocols import Samples, samples_of
 from features.recipes import WindowPipeline, feature_matrix
@@ -25,9 +23,6 @@ from terrain.errors import DataError
 from terrain.estimation.live.choice import ESTIMATED
 from terrain.logs.digest import data_digest
 from terrain.records import Array, RunLog
-
-SAME_RATE = 1e-6
-"""Rates that differ by less, relative to one another, give the same features but for rounding."""
 
 
 class TrainedRun(NamedTuple):
@@ -100,18 +95,9 @@ class TrainingData:
                 return np.asarray(recipe.predict_proba(windows[rows]))
             except DataError:
                 return None
-        if type(recipe[0]) is not FeatureExtractor or not _same_features(recipe.matrix, self.recipe.matrix):
+        if type(recipe[0]) is not FeatureExtractor or not recipe.matrix.equals(self.recipe.matrix):
             return None
         return np.asarray(recipe[-1].predict_proba(self.rows[rows]))
-
-
-def _same_features(a: FeatureMatrix, b: FeatureMatrix) -> bool:
-    """Return whether two matrices have the same features of a window, but for rounding."""
-    of_a, of_b = ((m.layout.channels, dict(m.n_samples), m.length_s, m.level_sets) for m in (a, b))
-    rates_hz = a.layout.rate_hz.items()
-    return of_a == of_b and all(
-        math.isclose(rate_hz, b.layout.rate_hz[name], rel_tol=SAME_RATE) for name, rate_hz in rates_hz
-    )
 
 
 def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingData:

@@ -26,7 +26,7 @@ from terrain.control.switching import OutputStatus
 from terrain.control.terrain_source import TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.control.wheel_controllers import PERIOD_S
-from terrain.estimation.live.clocks import Clocks, numbers
+from terrain.estimation.live.clocks import Clocks, finite_twist
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
 from terrain.estimation.live.health import SENSORS, Health
@@ -182,14 +182,6 @@ class LivePilot(Chain):
             time_s, dt_s, desired, self.estimate, self.belief, output, holds=self.source.certain
         )
         return command
-
-
-def finite_twist(given: object) -> Array:
-    """Return a desired twist (3,); zeros where it is none."""
-    twist = numbers(given)
-    if twist is None or twist.shape != (3,) or not math.isfinite(sum(twist.tolist())):
-        return np.zeros(3)
-    return twist
 
 
 def _ordered(values: Array, places: Array | None) -> Array:

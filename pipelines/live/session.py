@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationInfo, field_validator
 
 from pipelines.live.chain import COMMAND_VALID_S, Chain, CommandStatus, Step
-from pipelines.live.classifying import Classifier, WindowOutput
+from pipelines.live.classifying import Classifier
 from pipelines.live.model import TerrainModel
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
@@ -42,6 +42,13 @@ CONTROL_RATE_LEAST_HZ = 5.0
 quarter of a second."""
 
 _NO_TWIST = np.zeros(3)
+
+MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+SEEN = ("slip_ratio", "slip_std", "wheel_speed_mps", "current_a", *MOTION)
+"""What an observation has of the estimate of a motion."""
+
+WINDOW = ("start_s", "end_s", "terrain", "probabilities", "refused", "nearest", "novelty", "supported")
+"""What an observation has of the last window; an empty text is null."""
 
 
 class Served(NamedTuple):
@@ -287,7 +294,8 @@ class RobotSession:
         done = self.chain.take(Sample(time_s, twist, readings))
         self._n_steps += 1
         if done.windows:
-            self._window = _window_content(done.windows[-1])
+            found = {name: getattr(done.windows[-1], name) for name in WINDOW}
+            self._window = {name: None if value == "" else value for name, value in found.items()}
         self._streams.take(readings, time_s)
         if self._recorder is not None:
             self._recorder.readings(readings)
@@ -306,19 +314,17 @@ class RobotSession:
     def _observation(self, time_s: float) -> dict[str, Any]:
         belief, seen = self.chain.belief, self.chain.estimate
         target = self.served.table.lookup(belief.terrain)
-        slip_ratio = slip_std = np.full(len(self._wheels), math.nan)
-        motion = math.nan, math.nan, math.nan
         if isinstance(seen, LiveEstimate):
-            slip_ratio, slip_std = seen.slip_ratio, seen.slip_std
-            speeds_mps, currents_a = seen.wheel_speed_mps, seen.current_a
-            motion = seen.speed_x_mps, seen.speed_y_mps, seen.yaw_rate_radps
+            known = {name: getattr(seen, name) for name in SEEN}
         else:
-            speeds_mps = self._streams.last("wheels", [f"speed_{wheel}_mps" for wheel in self._wheels])
-            currents_a = self._streams.last("wheels", [f"current_{wheel}_a" for wheel in self._wheels])
+            known = dict.fromkeys(SEEN[:2], np.full(len(self._wheels), math.nan))
+            for name, channel in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
+                known[name] = self._streams.last("wheels", [channel.format(wheel) for wheel in self._wheels])
+            known |= dict.fromkeys(MOTION, math.nan)
             if isinstance(seen, LiveSkidEstimate):
-                motion = seen.speed_mps, math.nan, seen.yaw_rate_radps
+                known |= {"speed_x_mps": seen.speed_mps, "yaw_rate_radps": seen.yaw_rate_radps}
             elif seen is not None and len(seen.slip) == len(self._wheels):
-                slip_ratio, slip_std = seen.slip, seen.slip_std
+                known |= {"slip_ratio": seen.slip, "slip_std": seen.slip_std}
         sensors = self.chain.health or self._streams.health(time_s)
         if math.isnan(time_s):
             sensors = dict.fromkeys(sensors, "lost")
@@ -331,27 +337,10 @@ class RobotSession:
                 for state, one in target.items()
             },
             "target_of": next(iter(target.values())).terrain,
-            "slip_ratio": slip_ratio,
-            "slip_std": slip_std,
-            "wheel_speed_mps": speeds_mps,
-            "current_a": currents_a,
-            **dict(zip(("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), motion, strict=True)),
+            **known,
             "sensors": sensors,
             "served": self.served.number,
         }
-
-
-def _window_content(window: WindowOutput) -> dict[str, Any]:
-    return {
-        "start_s": window.start_s,
-        "end_s": window.end_s,
-        "terrain": window.terrain or None,
-        "probabilities": window.probabilities,
-        "refused": window.refused or None,
-        "nearest": window.nearest or None,
-        "novelty": window.novelty,
-        "supported": window.supported,
-    }
 
 
 def chain_of(

@@ -8,7 +8,6 @@ from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from tempfile import NamedTemporaryFile
 from time import monotonic
 from typing import Any, NamedTuple
 
@@ -223,7 +222,7 @@ class Hub:
 
     async def replace_table(self, text: str) -> Served:
         """Serve another table of target slips, given as its YAML, as :meth:`swap` does."""
-        table = await asyncio.to_thread(_table_of, text)
+        table = await asyncio.to_thread(load_slip_table, "the table", text=text)
         async with self.changing:
             return self.swap(self.served.model, self.served.model_name, table)
 
@@ -271,17 +270,6 @@ class Hub:
         self._thread.shutdown(cancel_futures=True)
         if self._recorder is not None:
             self._recorder.stop()
-
-
-def _table_of(text: str) -> SlipTable:
-    """Return the table of a YAML text; ``ConfigError`` where it is none."""
-    with NamedTemporaryFile("w", encoding="utf-8", suffix=".yaml") as file:
-        file.write(text)
-        file.flush()
-        try:
-            return load_slip_table(file.name)
-        except ConfigError as error:
-            raise ConfigError(str(error).replace(file.name, "the table")) from None
 
 
 def warm_up(model: TerrainModel, robot: Robot | None) -> None:

@@ -141,13 +141,16 @@ def _is_valid(entry: Mapping[str, SlipTarget]) -> bool:
     return not any(target.status is TargetStatus.INVALID for target in entry.values())
 
 
-def load_slip_table(path: str | Path | None = None, robot: str | None = None) -> SlipTable:
+def load_slip_table(
+    path: str | Path | None = None, robot: str | None = None, text: str | None = None
+) -> SlipTable:
     """Read a table; the packaged ``default`` one without a path.
 
     Parameters
     ----------
     path : YAML file
     robot : name of the robot that is to be driven; any by default
+    text : content, of which the path is but the name in messages
 
     Raises
     ------
@@ -158,7 +161,7 @@ def load_slip_table(path: str | Path | None = None, robot: str | None = None) ->
         braking over steady to traction.
     """
     file = data_folder("target_slip") / "default.yaml" if path is None else Path(path)
-    content = read_yaml(file)
+    content = read_yaml(file, text)
     schema = _schema(file, content)
     of_robot = _check_frame(file, content, schema)
     if robot is not None and of_robot and of_robot != robot:

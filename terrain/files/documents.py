@@ -166,8 +166,8 @@ def _is_deep(found: Any) -> bool:
     return True
 
 
-def read_yaml(path: Path) -> Any:
-    """Return what a YAML file holds, unchecked; no file can run code.
+def read_yaml(path: Path, text: str | None = None) -> Any:
+    """Return what a YAML file holds, or a text in place of it, unchecked; no file can run code.
 
     Raises
     ------
@@ -175,7 +175,9 @@ def read_yaml(path: Path) -> Any:
         if it cannot be opened, is no regular file or too large, or as :func:`parse_yaml` does.
     """
     try:
-        return parse_yaml(read_regular(path, str(path), ConfigError, MAX_YAML_BYTES))
+        return parse_yaml(
+            text if text is not None else read_regular(path, str(path), ConfigError, MAX_YAML_BYTES)
+        )
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from error
 

@@ -79,6 +79,14 @@ def numbers(value: Any) -> Array | None:
         return None
 
 
+def finite_twist(given: object) -> Array:
+    """Return a desired twist (3,); zeros where it is none."""
+    twist = numbers(given)
+    if twist is None or twist.shape != (3,) or not math.isfinite(sum(twist.tolist())):
+        return np.zeros(3)
+    return twist
+
+
 class _StreamClock:
     """The clock of one stream.
 
