@@ -14,7 +14,7 @@ from types import ModuleType
 
 from pipelines.cli.options import described_options
 from pipelines.cli.table import COMMANDS
-from pipelines.report.markdown import markdown_table
+from pipelines.report.pages import markdown_table
 from pipelines.report.results import Result
 from pipelines.report.settings import Settings
 from pipelines.report.tree import Column, Table

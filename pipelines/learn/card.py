@@ -144,7 +144,7 @@ def read_training(folder: Path) -> tuple[ModelInfo, TrainingRecord | None]:
 
 def write_training(folder: Path, name: str, record: TrainingRecord) -> ModelResult:
     """Write how a model was trained, and its card, beside the model; the time of one window is measured here."""
-    from pipelines.report.markdown import markdown_text
+    from pipelines.report.pages import markdown_text
     from terrain.classify.network_onnx import time_of_onnx
 
     model = read_model(folder)

@@ -185,7 +185,7 @@ class Report:
         check_file(path, "--report", ENDINGS)
         atomic_write(
             path,
-            _written(self, "markdown.markdown_text" if path.suffix.lower() == ".md" else "html.html_page"),
+            _written(self, "pages.markdown_text" if path.suffix.lower() == ".md" else "pages.html_page"),
         )
         return path
 
@@ -193,7 +193,7 @@ class Report:
         return _written(self, "terminal.terminal_text")
 
     def _repr_html_(self) -> str:
-        return _written(self, "html.html_fragment")
+        return _written(self, "pages.html_fragment")
 
 
 def _written(report: Report, writer: str) -> str:

@@ -18,7 +18,7 @@ import deremetz  # noqa: E402
 import tazzari  # noqa: E402
 import yamauchi  # noqa: E402
 
-from pipelines.report.html import html_page  # noqa: E402
+from pipelines.report.pages import html_page  # noqa: E402
 from terrain.control.car_following import SlipSource  # noqa: E402
 from terrain.errors import ConfigError  # noqa: E402
 from terrain.robots import load_robot  # noqa: E402

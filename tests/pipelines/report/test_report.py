@@ -17,9 +17,8 @@ from hypothesis import strategies as st
 
 from pipelines.report.drawing import figure_png, figure_svg
 from pipelines.report.figure import Band, Bars, Figure, Line, Panel, Points, Strip
-from pipelines.report.html import figure_data, html_page
-from pipelines.report.markdown import markdown_text
 from pipelines.report.numbers import format_value
+from pipelines.report.pages import figure_data, html_page, markdown_text
 from pipelines.report.results import Result, as_json, described
 from pipelines.report.terminal import terminal_text
 from pipelines.report.tree import Column, Pairs, Report, Section, Table, Text, figures_of

@@ -1,6 +1,7 @@
-"""A report as one HTML file, whose figures zoom; and as a fragment with pictures, for notebooks.
+"""A report as one HTML file, whose figures zoom; as a fragment with pictures, for notebooks; and as Markdown.
 
-All that a report holds is escaped.  The page needs no network: style and scripts are inside it.
+All that a report holds is escaped: names from files may hold any sign.  The page needs no network: style and
+scripts are inside it.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -17,12 +19,17 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from pipelines.report.figure import Figure
+from pipelines.report.numbers import plain_line
 from pipelines.report.results import as_json
-from pipelines.report.tree import Part, Report, Section
+from pipelines.report.tree import Part, Report, Section, Table
 
 ASSETS = Path(__file__).parent / "assets"
 DIGITS = 6
 """Significant digits of what a figure draws: more than can be seen."""
+
+MARKDOWN = "parts.md.j2"
+_SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~&!])")
+_ADDRESS = re.compile(r"(https?|ftp)(?=://)", re.IGNORECASE)
 
 MAX_POINTS = 2000
 """More points of a line than this are more than a page can show."""
@@ -35,11 +42,12 @@ MAX_SVG_BYTES = 300_000
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("pipelines.report", "templates"),
-        autoescape=True,
+        autoescape=lambda name: name != MARKDOWN,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["markdown"] = escape_markdown
     environment.globals |= {"sections": _sections, "shade": _shade}
     return environment
 
@@ -90,6 +98,51 @@ def _body(report: Report, picture: Callable[[Figure], Markup]) -> Markup:
     parts = _environment().get_template("parts.html.j2").make_module({"picture": picture})
     body: Markup = parts.body(report)  # type: ignore[attr-defined]
     return body
+
+
+def escape_markdown(text: str) -> str:
+    r"""Return a text that Markdown shows as it is, on one line.
+
+    Examples
+    --------
+    >>> print(escape_markdown("DIRT_ROAD | <b>\n# one"))
+    DIRT\_ROAD \| \<b\>\\n\# one
+    """
+    return _ADDRESS.sub(r"\1\\", _SPECIAL.sub(r"\\\1", plain_line(text)))
+
+
+def markdown_text(report: Report) -> str:
+    """Return a report as Markdown, as a model card has it; details are folded, figures are left to pages.
+
+    Examples
+    --------
+    >>> print(markdown_text(Report("Runs", "All are right.", lead="18 runs")))
+    # Runs
+    <BLANKLINE>
+    **All are right.**
+    <BLANKLINE>
+    18 runs
+    <BLANKLINE>
+    """
+    return _markdown("body", report) + "\n"
+
+
+def markdown_table(table: Table) -> str:
+    r"""Return the table alone.
+
+    Examples
+    --------
+    >>> print(markdown_table(Table(("run", "windows"), [("a|b", 3)])))
+    | run | windows |
+    |---|---:|
+    | a\|b | 3 |
+    """
+    return _markdown("table", table)
+
+
+def _markdown(macro: str, part: Report | Table) -> str:
+    text: str = getattr(_environment().get_template(MARKDOWN).module, macro)(part)
+    return text.rstrip("\n")
 
 
 def figure_data(figures: Sequence[Figure]) -> Any:
