@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 
 from pipelines.cli.table import Command
 from pipelines.report.results import Result, write_json
-from pipelines.report.settings import Settings, setting
+from pipelines.report.settings import ENDINGS, Settings, check_file, setting
 
 REQUIRED = "Required"
 """Heading of what has to be given."""
@@ -40,7 +40,6 @@ class OneFile(click.Command):
 
     def _execute(self, **options: Any) -> Result:
         from pipelines.report.terminal import print_report, progress_bar
-        from pipelines.report.writing import ENDINGS, check_file
 
         # what is not given is None, or () of an option that may be repeated
         given = {name: value for name, value in options.items() if value not in (None, ())}

@@ -95,7 +95,7 @@ SIGNALS: Mapping[str, Mapping[str, str]] = {
         "health_code": "SensorHealth",
     }
 }
-"""Signal of each channel, by stream."""
+"""Signal of each channel, by stream; the channels are in the order of its columns."""
 
 RECEIVED = ("wheels", "steering", "imu", "odometry", "twist")
 """Streams that the bridge receives, the last of them desired and not measured; it sends the others."""
@@ -124,17 +124,6 @@ LONGEST = 1.02
 
 INCOMPLETE_S = 0.02
 """A sample whose other frames have not come for so long is used without them."""
-
-
-def channels_of(stream: str) -> tuple[str, ...]:
-    """Return the channels of a stream, in the order of its columns.
-
-    Examples
-    --------
-    >>> channels_of("twist")
-    ('speed_x_mps', 'speed_y_mps', 'yaw_rate_radps')
-    """
-    return tuple(SIGNALS[stream])
 
 
 class Drop(StrEnum):
@@ -455,7 +444,7 @@ class _Assembler:
 
     def __init__(self, stream: str, columns: frozenset[int], dropped: Counter[str], most: float) -> None:
         self._stream, self._needed, self._dropped, self._most = stream, columns, dropped, most
-        self._width = len(channels_of(stream))
+        self._width = len(SIGNALS[stream])
         self._adds_real_part = stream == "odometry" and QUATERNION[3] not in columns
         self._row: dict[int, float] = {}
         self._counter: int | None = None
@@ -634,7 +623,7 @@ def _frames(path: Path) -> Iterator[Frame]:
 def _stream(path: Path, layout: Layout, name: str, reading: Reading, repairs: Counter[str] | None) -> Stream:
     """Return a stream with the channels that the DBC has."""
     columns = sorted(layout.columns(name) | ({QUATERNION[3]} if name == "odometry" else set()))
-    channels = channels_of(name)
+    channels = tuple(SIGNALS[name])
     return checked_stream(
         f"{path}, {name}",
         reading.time_s,

@@ -9,11 +9,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 
 from terrain.errors import ConfigError
+from terrain.files.atomic import ensure_writable
+
+ENDINGS = (".html", ".md")
+"""Of reports."""
 
 
 def separated(given: Any) -> Any:
@@ -99,6 +104,23 @@ class JobsSettings(Settings):
     def jobs(self) -> int:
         """Processes at once: what was asked for, or one a core."""
         return self.n_jobs or os.cpu_count() or 1
+
+
+def check_file(path: Path, option: str, endings: tuple[str, ...] = ()) -> None:
+    """Refuse a file that cannot be written, before the work is done.
+
+    Raises
+    ------
+    ConfigError
+        if it is a folder, has none of the endings, or nothing can be written there.
+    """
+    if path.is_dir():
+        raise ConfigError(f"{path}: is a folder; {option} names a file")
+    if endings and path.suffix.lower() not in endings:
+        raise ConfigError(
+            f"{option} is {str(path)!r}; a name that ends in {' or '.join(endings)} is required"
+        )
+    ensure_writable(path.parent)
 
 
 def _one_sentence(model: type[Settings], error: ValidationError) -> str:

@@ -16,7 +16,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 from pipelines.report.figure import Figure
 from pipelines.report.numbers import format_value
-from pipelines.report.writing import ENDINGS, check_file
+from pipelines.report.settings import ENDINGS, check_file
 from terrain.files.atomic import atomic_write
 
 

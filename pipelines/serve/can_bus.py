@@ -25,7 +25,6 @@ from pipelines.data.can_frames import (
     SIGNALS,
     Layout,
     Receiver,
-    channels_of,
     encode,
     library,
     load_layout,
@@ -302,7 +301,7 @@ class Bridge:
     ) -> list[Frame]:
         figures = {**status, "bridge_code": float(state)}
         known = {name: v for name, v in figures.items() if v >= 0.0 or not name.endswith("_code")}
-        values = [known.get(name, math.nan) for name in channels_of("status")]  # a code below zero is none
+        values = [known.get(name, math.nan) for name in SIGNALS["status"]]  # a code below zero is none
         counter, self._counter = self._counter, self._counter + 1
         return [
             *encode(self._layout, "corrections", added.tolist(), counter, now_s, self.clipped),
@@ -357,7 +356,7 @@ def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
     )
     chain = chain_of(
         robot,
-        {name: channels_of(name) for name in RECEIVED if name != "twist"},
+        {name: tuple(SIGNALS[name]) for name in RECEIVED if name != "twist"},
         loaded(settings, settings.model),
         load_slip_table(settings.table),
         PilotSettings(controller=settings.controller),

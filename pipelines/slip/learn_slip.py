@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.data.settings import RunsSettings
-from pipelines.report.settings import setting
+from pipelines.report.settings import check_file, setting
 
 if TYPE_CHECKING:
     from pipelines.report.results import Progress
@@ -41,7 +41,6 @@ def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
         if a folder cannot be written.
     """
     from pipelines.data.datasets import load
-    from pipelines.report.writing import check_file
     from pipelines.slip.curves import LearnedCurves, log_curves
     from pipelines.slip.shown import write_figures
     from terrain.files.atomic import ensure_writable

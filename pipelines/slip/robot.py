@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 from pipelines.data.datasets import load_runs
 from pipelines.report.numbers import plural
 from pipelines.report.results import Progress, Result, described
+from pipelines.report.settings import check_file
 from pipelines.report.tree import Column, Report, Text, sections
-from pipelines.report.writing import check_file
 from pipelines.slip.shown import first_rows
 from terrain.calibration.description import described_with, description_yaml, findings_of, hard_grounds
 from terrain.calibration.finding import Finding

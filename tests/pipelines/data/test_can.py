@@ -22,7 +22,6 @@ from pipelines.data.can_frames import (
     SIGNALS,
     Drop,
     Receiver,
-    channels_of,
     decode,
     encode,
     load_layout,
@@ -73,7 +72,7 @@ def bounds(stream, column):
 @given(data=st.data())
 def test_any_number_comes_back_within_half_a_resolution_and_never_wraps(stream, data):
     """A value beyond is the end of the range, counted; one that is not finite is not measured."""
-    width = len(channels_of(stream))
+    width = len(SIGNALS[stream])
     rows = [st.floats(*bounds(stream, column)[:2]) | st.floats() for column in range(width)]
     values, counter = data.draw(st.tuples(*rows)), data.draw(st.integers(0, 10_000))
     clipped, n_beyond = Counter(), 0
@@ -113,7 +112,7 @@ def test_any_bytes_are_decoded_to_values_in_range_or_refused(stream, data):
 
 @pytest.mark.parametrize("stream", ["corrections", "status", "twist"])
 def test_each_wrong_bit_of_a_checked_message_is_found(stream):
-    (frame,) = encode(LAYOUT, stream, [0.1] * len(channels_of(stream)), 77)
+    (frame,) = encode(LAYOUT, stream, [0.1] * len(SIGNALS[stream]), 77)
     for bit in range(64):
         data = bytearray(frame.data)
         data[bit // 8] ^= 1 << bit % 8
@@ -276,7 +275,7 @@ def test_what_no_controller_needs_may_lack(tmp_path):
     for stream in ("odometry", "status"):
         lacking = set(range(len(SIGNALS[stream]))) - layout.columns(stream)
         assert lacking
-        assert {channels_of(stream)[column] for column in lacking} <= OPTIONAL
+        assert {tuple(SIGNALS[stream])[column] for column in lacking} <= OPTIONAL
     assert "CameraPosition" not in {plan.message.name for plan in layout.by_stream["odometry"]}
 
 
@@ -351,7 +350,7 @@ def test_a_log_is_the_run_that_was_sent(tmp_path, estimated_run, run_frames, suf
     for name in ("wheels", "steering", "imu", "odometry"):
         sent, read = run.streams[name], found.streams[name]
         np.testing.assert_allclose(read.time_s, sent.time_s, atol=2e-4)
-        for column, channel in enumerate(channels_of(name)):
+        for column, channel in enumerate(SIGNALS[name]):
             if channel in sent.channels and channel != "confidence_ratio":
                 step = 1e-5 if (name, column) == REAL_PART else PLANS[name, column].scale
                 np.testing.assert_allclose(read.channel(channel), sent.channel(channel), atol=step)

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipelines.data.can_frames import channels_of, decode, encode, load_layout
+from pipelines.data.can_frames import SIGNALS, decode, encode, load_layout
 from pipelines.live.chain import CommandStatus
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bus import Bridge, Link, open_bus
@@ -138,7 +138,7 @@ def test_a_stream_that_ends_stops_corrections_in_time_and_one_that_returns_start
             return [changed(last[frame.arbitration_id], timestamp=frame.timestamp)]
         if how == "not measured":
             n_ended[frame.arbitration_id] += 1
-            values = [math.nan] * len(channels_of(stream))
+            values = [math.nan] * len(SIGNALS[stream])
             sent = encode(LAYOUT, stream, values, 90 + n_ended[frame.arbitration_id], frame.timestamp)
             return [sent[ids.index(frame.arbitration_id)]]
         if how == "damaged":  # the twist has a CRC
