@@ -92,8 +92,10 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
     from pipelines.learn.training_data import data_of_runs
+    from pipelines.slip.filtered import motion_figure, slip_figure
     from terrain.classify.folds import hold_out_runs
     from terrain.control.slip_table import load_slip_table
+    from terrain.estimation.labelled import labelled_runs
     from terrain.files.atomic import ensure_writable
     from terrain.logs.merge import distinct_runs
 
@@ -101,7 +103,13 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     ensure_writable(out)
     ensure_tracking()
     with _compiling_ahead():
-        given, slip, figures = _simulated(settings, progress) if data is None else (load_runs(data), None, ())
+        given: Sequence[RunLog]
+        slip, figures = None, tuple[Figure, ...]()
+        if data is None:
+            given, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
+            figures = slip_figure(example), motion_figure(example)
+        else:
+            given = load_runs(data)
         runs = distinct_runs(given, merge=settings.merge_duplicates).runs
         dataset = SIMULATED if data is None else data.resolve().name
         training, held_out = hold_out_runs(runs)
@@ -141,17 +149,6 @@ def _compiling_ahead() -> Iterator[None]:
     finally:
         ahead.kill()
         ahead.wait()
-
-
-def _simulated(
-    settings: Settings, progress: Progress
-) -> tuple[list[RunLog], tuple[TerrainSlip, ...], tuple[Figure, ...]]:
-    """Return the runs, and what is known of them because they were simulated."""
-    from pipelines.slip.filtered import motion_figure, slip_figure
-    from terrain.estimation.labelled import labelled_runs
-
-    runs, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
-    return runs, slip, (slip_figure(example), motion_figure(example))
 
 
 def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) -> tuple[str, ...]:

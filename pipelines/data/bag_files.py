@@ -247,8 +247,6 @@ def mcap_topics(path: Path) -> list[Topic]:
     try:
         with path.open("rb") as file:
             summary = reader.SeekingReader(file, record_size_limit=MAX_RECORD_BYTES).get_summary()
-    except OSError as error:
-        raise LogError(f"{short_name(path)}: cannot be read ({error.strerror or error})") from error
     except Exception:  # whatever the end of a file that was not closed looks like
         summary = None
     if summary and summary.channels:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipelines.data.datasets import load, verdict
 from pipelines.data.settings import MAPPING_TEXT, RunsSettings, Target
@@ -126,23 +126,17 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
             shutil.rmtree(place, ignore_errors=True) if place.is_dir() else place.unlink(missing_ok=True)
         raise
     dropped = sum((Counter(each.dropped) for each in runs), Counter[str]())
-    common: dict[str, Any] = {
-        "out": settings.out,
-        "n_runs": len(runs),
-        "dropped": dict(sorted(dropped.items())),
-        "skipped": tuple(skipped),
-        "digest": data_digest(runs),
-    }
+    found = settings.out, len(runs), dict(sorted(dropped.items())), tuple(skipped), data_digest(runs)
     if settings.to != "runs":
         files = {run_id: place.name for run_id, place in places.items()}
-        return ExportResult(**common, files=files, topics=dict(sorted(counts.items())))
+        return ExportResult(*found, files, dict(sorted(counts.items())))
     labels = Counter(terrain for each in runs for terrain in each.terrains)
     return ImportResult(
-        **common,
-        run_ids=tuple(each.run_id for each in runs),
-        labels=dict(sorted(labels.items())),
-        duplicates=shared_stretches(runs),
-        doubts=doubts,
+        *found,
+        tuple(each.run_id for each in runs),
+        dict(sorted(labels.items())),
+        shared_stretches(runs),
+        doubts,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, overload
 
 from pipelines.report.numbers import enumerated, plural
@@ -31,9 +31,6 @@ class Runs(Sequence[RunLog]):
 
     def __len__(self) -> int:
         return len(self._runs)
-
-    def __iter__(self) -> Iterator[RunLog]:
-        return iter(self._runs)
 
     @overload
     def __getitem__(self, index: int) -> RunLog: ...

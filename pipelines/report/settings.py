@@ -50,10 +50,6 @@ def setting(default: Any, text: str, option: str | None = None, repeated: bool =
     return Field(default, description=text, alias=option, json_schema_extra={"repeated": repeated}, **bounds)
 
 
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
-
-
 class Settings(BaseModel):
     """Base of all settings: frozen, unknown names refused, errors in one sentence.
 
@@ -74,7 +70,7 @@ class Settings(BaseModel):
         extra="forbid",
         arbitrary_types_allowed=True,
         populate_by_name=True,
-        alias_generator=_option,
+        alias_generator=lambda name: f"--{name.replace('_', '-')}",
     )
 
     def __init__(self, **values: Any) -> None:
