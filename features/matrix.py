@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import NamedTuple
@@ -58,10 +57,8 @@ class FeatureMatrix(NamedTuple):
     def equals(self, other: FeatureMatrix) -> bool:
         """Whether both give the same features of a window, but for rounding."""
         own, its = ((m.layout.channels, dict(m.n_samples), m.length_s, m.level_sets) for m in (self, other))
-        rates_hz = self.layout.rate_hz.items()
-        return own == its and all(
-            math.isclose(rate_hz, other.layout.rate_hz[name], rel_tol=SAME_RATE) for name, rate_hz in rates_hz
-        )
+        its_hz, rates_hz = other.layout.rate_hz, self.layout.rate_hz.items()
+        return own == its and all(abs(rate / its_hz[name] - 1.0) <= SAME_RATE for name, rate in rates_hz)
 
     def of(self, windows: Windows) -> Array:
         """Return the features (n_windows, n_features); NaN where a feature is not defined.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Report, Section, Table, Text
 from terrain.errors import ConfigError, DataError, LogError
-from terrain.files.names import plain_name, shown
+from terrain.files.names import plain_name
 
 if TYPE_CHECKING:
     from terrain.classify.proposals import LabelSource, Proposal
@@ -29,9 +28,6 @@ EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
 
 SOURCES_FILE = "label_sources.json"
 """Beside a run: where each of its labels comes from."""
-
-TOLERANCE_S = 0.5
-"""A stretch of a table may be that far outside of its run, and reach into the next one."""
 
 
 class Settings(BaseSettings):
@@ -237,37 +233,9 @@ def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult
 
 def _checked_answers(file: Path, runs: Sequence[RunLog], *, new_class: bool) -> list[tuple[Proposal, str]]:
     """Return the proposals of a table with their answers; an empty one leaves a proposal to its confidence."""
-    from terrain.classify.proposals import NONE, YES
-    from terrain.logs.borealtc import whole_run_label
-
-    rows = _answers(file)
-    spans_s = {run.run_id: whole_run_label(run.streams, "")[:2] for run in runs}
-    terrains = {label.terrain for run in runs for label in run.labels}
-    known = {*terrains, *(proposal.terrain for proposal, _ in rows), YES, NONE, ""}
-    until_s: dict[str, float] = {}
-    for (run_id, start_s, end_s, *_), answer in sorted(rows, key=lambda row: row[0][:2]):
-        if run_id not in spans_s:
-            raise ConfigError(f"{file}: run {shown(run_id)} is none of those whose labels are set")
-        first_s, last_s = spans_s[run_id]
-        if not first_s - TOLERANCE_S <= start_s < end_s <= last_s + TOLERANCE_S:
-            raise ConfigError(
-                f"{file}: {start_s:g} to {end_s:g} s is no stretch of run {run_id}, which is from "
-                f"{first_s:g} to {last_s:g} s"
-            )
-        if start_s < until_s.get(run_id, -math.inf) - TOLERANCE_S:
-            raise ConfigError(f"{file}: stretches of run {run_id} overlap at {start_s:g} s")
-        until_s[run_id] = end_s
-        if answer not in known and not (new_class and plain_name(answer)):
-            raise ConfigError(
-                f"{file}: {shown(answer)} is no terrain that is known here "
-                f"({', '.join(sorted(known - {''}))}); --new-class accepts others"
-            )
-    return rows
-
-
-def _answers(file: Path) -> list[tuple[Proposal, str]]:
-    from terrain.classify.proposals import Proposal
+    from terrain.classify.proposals import Proposal, check_answers
     from terrain.files.documents import first_fault
+    from terrain.logs.borealtc import whole_run_label
     from terrain.logs.csv_table import text_rows
 
     proposal = TypeAdapter(Proposal, config=ConfigDict(allow_inf_nan=False))
@@ -280,6 +248,12 @@ def _answers(file: Path) -> list[tuple[Proposal, str]]:
         except ValidationError as error:
             raise LogError(f"{file}, line {number}: is no proposal ({first_fault(error)})") from error
         rows.append((found, cells[-1].strip()))
+    spans_s = {run.run_id: whole_run_label(run.streams, "")[:2] for run in runs}
+    terrains = {label.terrain for run in runs for label in run.labels}
+    try:
+        check_answers(rows, spans_s, terrains, new_class=new_class)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from None
     return rows
 
 

@@ -17,6 +17,7 @@ from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import SWITCHING, SwitchSettings, TerrainBelief, check_switching, drive_on
 from terrain.estimation.live.choice import Estimate
 from terrain.estimation.live.clocks import ClockWatch, last_stamp_s
+from terrain.kinematics.wheel_speed import speed_columns
 from terrain.records import Reading, Sample
 from terrain.robots import Robot
 
@@ -85,7 +86,7 @@ class Observer(Chain):
             self._filter, corrected = live_estimator(model.info, self._robot, self.channels)
         name = "" if self._filter is None else self._filter.name
         self.source = Classifier(model, self._robot, self._thread, self.channels, name)
-        self._speed_columns, self._mps_per_unit = _speeds(self.channels.get("wheels", ()), corrected)
+        self._speed_columns, self._mps_per_unit = speed_columns(self.channels.get("wheels", ()), corrected)
 
     @property
     def model(self) -> TerrainModel:
@@ -149,12 +150,3 @@ class Observer(Chain):
         except (TypeError, ValueError, LookupError, AttributeError, OverflowError):
             return math.inf
         return math.inf if np.isnan(speeds).all() else float(np.nanmax(speeds)) * self._mps_per_unit
-
-
-def _speeds(wheels: Sequence[str], robot: Robot | None) -> tuple[list[int], float]:
-    """Return the columns that tell how fast the wheels turn, and what makes them speeds in m/s."""
-    columns = [i for i, name in enumerate(wheels) if name.startswith("speed_")]
-    if columns or robot is None or not robot.describes("motors"):
-        return columns, 1.0
-    motors = [i for i, name in enumerate(wheels) if name.startswith("motor_")]
-    return motors, robot.wheel_radius_m / robot.motors.reduction_ratio

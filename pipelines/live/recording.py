@@ -26,14 +26,11 @@ import numpy as np
 from pipelines.data.bag_files import McapWriter
 from pipelines.live.chain import CommandStatus, Step
 from terrain.control.switching import SWITCHING
-from terrain.errors import LogError
-from terrain.files.names import plain_name
 from terrain.logs.read import RunHead
 from terrain.logs.recorded_windows import RecordedWindow
 from terrain.logs.replay import TWIST
-from terrain.logs.run_topics import DECIDED, LATEST_S, WINDOW_TOPIC, RunRecorder
+from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, RunRecorder, check_recordable
 from terrain.logs.samples import BAD_TIME
-from terrain.logs.schema import unit_of
 from terrain.logs.write import run_folder
 from terrain.records import Array, Reading
 
@@ -106,7 +103,7 @@ class SessionRecorder:
     ) -> None:
         run_folder(run_id, folder)
         self._channels = {name: tuple(each) for name, each in channels.items()}
-        _check_channels(self._channels)
+        check_recordable(self._channels)
         commanded = (*TWIST, *(f"wheel_{w}_radps" for w in wheels), *(f"steer_{w}_rad" for w in wheels))
         self._channels["commands"] = commanded
         self._n_wheels = len(wheels)
@@ -258,16 +255,6 @@ def recorded(output: WindowOutput) -> RecordedWindow:
         doubtful=not (output.terrain and probability >= SWITCHING.probability_least),
         refused=output.refused,
     )
-
-
-def _check_channels(channels: Mapping[str, Sequence[str]]) -> None:
-    for name, each in channels.items():
-        if not plain_name(name) or name in DECIDED:
-            raise LogError(f"stream {name!r} cannot be recorded as a sensor's")
-        if not each or len(set(each)) < len(each) or "time_s" in each:
-            raise LogError(f"stream {name!r}: channels {', '.join(each)!r} are no list of different names")
-        for channel in each:
-            unit_of(channel)
 
 
 def _reason(error: OSError) -> str:

@@ -26,7 +26,7 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.stopping import stopping
 from pipelines.report.tree import Column, Report, Table, Text, sections
 from pipelines.serve.serve import Settings, loaded
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.pilot_settings import PilotSettings, check_table
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.estimator import CHANNELS
@@ -194,14 +194,10 @@ def chain_of_run(
     Raises
     ------
     ConfigError
-        if the robot has no pilot and there is no model, or the table is another robot's.
+        if the robot has no pilot and there is no model.
     DataError
-        if the run lacks what the model or the pilot needs.
+        if the run lacks what the model or the pilot needs, or the table is another robot's.
     """
-    if table.robot and run.robot != table.robot:
-        raise ConfigError(
-            f"table {table.name} is for robot {table.robot!r}, run {run.run_id} is of {run.robot!r}"
-        )
     channels = {name: stream.channels for name, stream in run.streams.items() if name in SENSORS}
     found: Robot | None = None
     try:
@@ -220,6 +216,7 @@ def chain_of_run(
     elif model is None:
         raise ConfigError(f"run {run.run_id}: robot {run.robot!r} has no pilot: give a model with --model")
     try:
+        check_table(table, run.robot)
         return chain_of(found, channels, model, table, pilot)
     except (ConfigError, DataError) as error:
         raise DataError(f"run {run.run_id}: {error}") from error

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from terrain.classify.smoothing import smoothed_classes
+from terrain.errors import ConfigError
+from terrain.files.names import plain_name, shown
 from terrain.records import Array
 
 MAX_GAP_WINDOWS = 2.0
@@ -17,6 +20,8 @@ MAX_GAP_WINDOWS = 2.0
 ACCEPTED = 0.9
 """Least mean probability of a proposal that is taken over without a question."""
 
+TOLERANCE_S = 0.5
+"""A stretch of a table may be that far outside of its run, and reach into the next one."""
 
 YES, NONE = "yes", "none"
 """Answers beside the name of a terrain: the proposal is right; the stretch is of no terrain."""
@@ -160,3 +165,36 @@ def with_label(labels: Sequence[LabelSource], added: LabelSource) -> list[LabelS
         parts = (each.start_s, min(each.end_s, added.start_s)), (max(each.start_s, added.end_s), each.end_s)
         kept += [each._replace(start_s=start_s, end_s=end_s) for start_s, end_s in parts if start_s < end_s]
     return [*kept, added] if added.terrain else kept
+
+
+def check_answers(
+    rows: Sequence[tuple[Proposal, str]],
+    spans_s: Mapping[str, tuple[float, float]],
+    terrains: Iterable[str],
+    *,
+    new_class: bool,
+) -> None:
+    """Raise ``ConfigError`` where proposals with their answers do not fit runs of these spans.
+
+    An answer is one of the terrains, one that is proposed, :data:`YES`, :data:`NONE` or empty; with
+    ``new_class`` any that can be a name.
+    """
+    known = {*terrains, *(proposal.terrain for proposal, _ in rows), YES, NONE, ""}
+    until_s: dict[str, float] = {}
+    for (run_id, start_s, end_s, *_), answer in sorted(rows, key=lambda row: row[0][:2]):
+        if run_id not in spans_s:
+            raise ConfigError(f"run {shown(run_id)} is none of those whose labels are set")
+        first_s, last_s = spans_s[run_id]
+        if not first_s - TOLERANCE_S <= start_s < end_s <= last_s + TOLERANCE_S:
+            raise ConfigError(
+                f"{start_s:g} to {end_s:g} s is no stretch of run {run_id}, which is from "
+                f"{first_s:g} to {last_s:g} s"
+            )
+        if start_s < until_s.get(run_id, -math.inf) - TOLERANCE_S:
+            raise ConfigError(f"stretches of run {run_id} overlap at {start_s:g} s")
+        until_s[run_id] = end_s
+        if answer not in known and not (new_class and plain_name(answer)):
+            raise ConfigError(
+                f"{shown(answer)} is no terrain that is known here "
+                f"({', '.join(sorted(known - {''}))}); --new-class accepts others"
+            )

@@ -70,3 +70,12 @@ def wheel_speeds_from(
         return np.hstack([values[:, kept], values[:, at] / ratio * radius_m])
 
     return (*(channels[i] for i in kept), *speeds), with_speeds
+
+
+def speed_columns(channels: Sequence[str], robot: Robot | None) -> tuple[list[int], float]:
+    """Return the columns of wheels that tell how fast they turn, and what makes them speeds in m/s."""
+    columns = [i for i, name in enumerate(channels) if name.startswith("speed_")]
+    if columns or robot is None or not robot.describes("motors"):
+        return columns, 1.0
+    motors = [i for i, name in enumerate(channels) if name.startswith("motor_")]
+    return motors, robot.wheel_radius_m / robot.motors.reduction_ratio

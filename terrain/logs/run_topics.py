@@ -21,7 +21,7 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 
 from terrain.errors import DataError, LogError
 from terrain.files.documents import first_fault, parse_json
-from terrain.files.names import shown
+from terrain.files.names import plain_name, shown
 from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
 from terrain.logs.labels import label_changes
 from terrain.logs.read import MAX_STREAMS, MAY_BE_UNKNOWN, LabelEntry, RunHead
@@ -83,6 +83,17 @@ class Messages(NamedTuple):
     definition: str
     log_ns: Array
     contents: list[bytes]
+
+
+def check_recordable(channels: Mapping[str, Sequence[str]]) -> None:
+    """Raise ``LogError`` where streams of sensors have names that a recording cannot have."""
+    for name, each in channels.items():
+        if not plain_name(name) or name in DECIDED:
+            raise LogError(f"stream {name!r} cannot be recorded as a sensor's")
+        if not each or len(set(each)) < len(each) or TIME_FIELD in each:
+            raise LogError(f"stream {name!r}: channels {', '.join(each)!r} are no list of different names")
+        for channel in each:
+            unit_of(channel)
 
 
 def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[str] = ()) -> StreamTopic:
