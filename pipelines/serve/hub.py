@@ -71,9 +71,6 @@ class Limits(NamedTuple):
         return budgets | {"s of decoding": self.decoding_s_per_s}
 
 
-LIMITS = Limits()
-
-
 class Hub:
     """Sessions of robots on one model and table, all of it loaded and checked, and its code run once.
 

@@ -3,7 +3,7 @@
 import pytest
 
 from pipelines.learn.model_file import write_model
-from pipelines.serve.hub import LIMITS
+from pipelines.serve.hub import Limits
 from terrain.control.slip_table import load_slip_table
 
 from .strangers import running
@@ -26,7 +26,7 @@ def service(model_folder):
 @pytest.fixture(scope="module")
 def driving(model_folder):
     """A service without a model, which gives commands to robots of any channels."""
-    limits = LIMITS._replace(hello_s=1.0, too_slow_s=0.6)
+    limits = Limits()._replace(hello_s=1.0, too_slow_s=0.6)
     with running(limits, model=str(model_folder)) as found:
         found.hub.swap(None, "", load_slip_table())
         yield found

@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from pipelines.serve import connection, guard
 from pipelines.serve.client import ServiceError, TerrainClient
-from pipelines.serve.hub import LIMITS
+from pipelines.serve.hub import Limits
 
 from .strangers import CHANNELS, ask, frame, hello, raw, running, until
 
@@ -153,11 +153,11 @@ def test_large_messages_are_decoded_in_a_thread_too_large_ones_refused_and_large
         for size in (1_000, 100_000):
             assert ask(robot, {"type": "x" * size})["code"] == "unknown-type"
         assert [in_thread for _, in_thread in decoded] == [False, False, True]
-        for filling in ("x" * LIMITS.message_bytes, "x" * 1_000_000):
+        for filling in ("x" * Limits().message_bytes, "x" * 1_000_000):
             answer = ask(robot, {"type": filling})
             assert (answer["code"], answer["fatal"]) == ("too-large", False)
             time.sleep(0.5)
-        assert ask(robot, b"\xc0" * (LIMITS.message_bytes + 1))["code"] == "too-large"
+        assert ask(robot, b"\xc0" * (Limits().message_bytes + 1))["code"] == "too-large"
     with raw(service) as line:
         line.sendall(frame(b"x" * 1_100_000)[:14])
         assert line.recv(4)[2:] == struct.pack("!H", 1009)
@@ -218,7 +218,7 @@ def test_before_its_hello_a_client_is_answered_once_at_a_time_and_large_messages
 
 def test_more_robots_than_are_accepted_wait_until_one_has_left(guarded, monkeypatch):
     until(lambda: not guarded.hub.sessions)
-    monkeypatch.setattr(guarded.hub, "limits", LIMITS._replace(sessions=1))
+    monkeypatch.setattr(guarded.hub, "limits", Limits()._replace(sessions=1))
     with guarded.socket(additional_headers=BEARER) as late:
         with guarded.socket(additional_headers=BEARER) as robot:
             assert ask(robot, hello("first"))["type"] == "welcome"
@@ -340,7 +340,7 @@ def test_a_message_of_which_a_part_is_refused_gives_an_error_and_a_step_of_the_r
 def test_what_is_over_a_budget_is_named_and_the_rest_is_taken(
     service, decoded, monkeypatch, most, content, sentence
 ):
-    monkeypatch.setattr(service.hub, "limits", LIMITS._replace(**most))
+    monkeypatch.setattr(service.hub, "limits", Limits()._replace(**most))
     with service.socket(close_timeout=0.1) as robot:
         assert ask(robot, hello(f"fast-{sentence.split()[3]}"))["limits"].items() >= most.items()
         for _ in range(100):
