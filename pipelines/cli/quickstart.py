@@ -143,12 +143,11 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
 def _compiling_ahead() -> Iterator[None]:
     """Have a process of its own compile the kernels that prediction needs, where they are not compiled yet."""
     words = [sys.executable, "-c", "import pipelines.live.windows"]
-    ahead = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        yield
-    finally:
-        ahead.kill()
-        ahead.wait()
+    with subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as ahead:
+        try:
+            yield
+        finally:
+            ahead.kill()
 
 
 def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) -> tuple[str, ...]:

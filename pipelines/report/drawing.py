@@ -36,9 +36,9 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7", "#56b4e9", "#8
 STYLE = Path(__file__).parent / "assets" / "report.mplstyle"
 
 
-def figure_png(figure: Figure, dpi: int = PNG_DPI) -> bytes:
+def figure_png(figure: Figure) -> bytes:
     """Return a figure as PNG: the same bytes for the same figure, with no date and no version inside."""
-    return _saved(figure, format="png", dpi=dpi, metadata={"Software": None})
+    return _saved(figure, format="png", dpi=PNG_DPI, metadata={"Software": None})
 
 
 def figure_svg(figure: Figure) -> str:

@@ -33,9 +33,8 @@ from pipelines.live.chain import Chain, CommandStatus
 from pipelines.live.session import chain_of
 from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described, silent
-from pipelines.report.stopping import stopping
 from pipelines.report.tree import Column, Pairs, Report, Table, sections
-from pipelines.serve.serve import Settings, loaded
+from pipelines.serve.serve import Settings, loaded, stopping
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import step_or_period

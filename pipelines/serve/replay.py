@@ -23,9 +23,8 @@ from pipelines.live.windows import needs_filter
 from pipelines.report.figure import Figure, Panel, Strip
 from pipelines.report.numbers import format_counts, format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
-from pipelines.report.stopping import stopping
 from pipelines.report.tree import Column, Report, Table, Text, sections
-from pipelines.serve.serve import Settings, loaded
+from pipelines.serve.serve import Settings, loaded, stopping
 from terrain.control.pilot_settings import PilotSettings, check_table
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import ipaddress
 import os
-from collections.abc import Mapping
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -124,6 +126,22 @@ class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
             if name != mode:
                 self.refuse(group.model_fields, f"is an option of {name}, not of {mode}")
         return self
+
+
+@contextmanager
+def stopping(stop: Callable[[], None]) -> Iterator[None]:
+    """Call a function at Ctrl-C or SIGTERM in place of ending at once, for modes that end with a summary.
+
+    An interrupt that is raised while a kernel is compiled is lost there; a call is not.
+    """
+    before = {name: signal.getsignal(name) for name in (signal.SIGINT, signal.SIGTERM)}
+    for name in before:
+        signal.signal(name, lambda *_: stop())
+    try:
+        yield
+    finally:
+        for name, handler in before.items():
+            signal.signal(name, handler)
 
 
 def is_loopback(host: str) -> bool:
