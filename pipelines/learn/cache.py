@@ -3,8 +3,8 @@
 Two passes, so that memory is bounded by a run and the table: the first finds channels and rates that all runs
 have in common, the second cuts, computes and writes what is not there yet; one that was interrupted goes on.  Of
 a run folder whose files did not change since, only the cache is read.  Fingerprints of each run show which pairs
-of runs may hold the same measurements; these are read again and compared.  Files are numpy's archives, which have a
-checksum of each array.
+of runs may hold the same measurements; these are read again and compared.  Files are Parquet with a checksum of
+each page.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
-from zipfile import ZipFile
 
 import numpy as np
 
@@ -40,7 +39,7 @@ from terrain.logs.fingerprints import RunPrint, run_print
 from terrain.logs.merge import sentences
 from terrain.records import Array, RunLog, Stream, Windows
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 5
 
 
 class RunHead(NamedTuple):
@@ -127,7 +126,7 @@ def cached_data(
     extractor.fit(cut_windows([], rule, layout=layout).windows)
     names = extractor.get_feature_names_out().tolist()
     made_of = _sha256([FORMAT_VERSION, __version__, as_json([rule, layout, signal_sets, names])])
-    files = [place / "features" / f"{_sha256([head.digest, made_of])[:32]}.npz" for head in chosen]
+    files = [place / "features" / f"{_sha256([head.digest, made_of])[:32]}.parquet" for head in chosen]
     todo = [i for i, file in enumerate(files) if _read(file) is None]
     each = [(load_of[chosen[i].run_id], files[i]) for i in todo]
     list(parallel(_store_run, (rule, layout, extractor), each, n_jobs, "features", progress))
@@ -165,7 +164,7 @@ def _head(place: Path, load: RunLoader) -> tuple[RunHead, Array, Array]:
         parts = sorted(path for path in load.plain_folder.iterdir() if path.is_file())
         states = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in parts]
         name = _sha256([str(load.plain_folder), states, repr(load.robot), __version__, FORMAT_VERSION])
-        file = place / "runs" / f"{name}.npz"
+        file = place / "runs" / f"{name}.parquet"
         if (found := _read(file)) is not None:
             about, arrays = found
             return RunHead(**about), arrays["code"], arrays["time_s"]
@@ -221,7 +220,7 @@ def _store_run(
         file,
         {"dropped": dict(cut.dropped)},
         start_s=windows.start_s,
-        terrain=windows.terrain.astype(str),
+        terrain=windows.terrain,
         features=extractor.transform(windows).astype(np.float64),
         **motion._asdict(),
     )
@@ -239,9 +238,8 @@ def _table(
         dropped.update(about["dropped"])
         parts.append({**columns, "run_id": np.full(len(columns["terrain"]), head.run_id, dtype=object)})
     table = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
-    terrain = table["terrain"].astype(object)
-    windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], terrain)
-    cut, known = labelled(WindowCut(windows, dropped)), terrain != ""
+    windows = Windows({}, {}, {}, rule.length_s, table["start_s"], table["run_id"], table["terrain"])
+    cut, known = labelled(WindowCut(windows, dropped)), table["terrain"] != ""
     features = table["features"][known]
     if np.array_equal(features, np.broadcast_to(features[:1], features.shape), equal_nan=True):
         raise DataError("no feature ever varies: nothing can be learned from them")
@@ -256,20 +254,41 @@ def _sha256(document: Any) -> str:
 
 def _write(file: Path, about: Mapping[str, Any], **arrays: Array) -> None:
     """Write a file of the cache, whole or not at all; the same content gives the same bytes."""
-    text = json.dumps([about, list(arrays)], sort_keys=True)
+    import pyarrow
+    from pyarrow import parquet
+
+    columns: dict[str, Any] = {name: pyarrow.array(each.ravel()) for name, each in arrays.items()}
+    for name, each in arrays.items():
+        if each.ndim > 1:
+            row = pyarrow.list_(pyarrow.field("element", columns[name].type), each.shape[1])  # as it is read
+            columns[name] = pyarrow.FixedSizeListArray.from_arrays(columns[name], type=row)
+    text = json.dumps(about, sort_keys=True)
+    table = pyarrow.table(columns)
+    metadata = {
+        "about": text,
+        "sha256": _sha256([text, str(table.schema)]),
+    }  # pages have checksums of their own
     with atomic_file(file) as stream:
-        np.savez_compressed(stream, about=text, **arrays)  # type: ignore[arg-type]
+        table = table.replace_schema_metadata(metadata)
+        parquet.write_table(table, stream, compression="zstd", write_page_checksum=True)
 
 
 def _read(file: Path) -> tuple[dict[str, Any], dict[str, Array]] | None:
     """Return what a file says of its arrays, and these; None where it is missing or damaged."""
+    from pyarrow import parquet, types
+
     try:
-        with ZipFile(file) as archive:
-            if archive.testzip() is not None:
-                return None
-        with np.load(file, allow_pickle=False) as found:
-            arrays = dict(found)
-        about, names = json.loads(str(arrays.pop("about")))
-        return (about, arrays) if names == list(arrays) else None
-    except Exception:  # zipfile and numpy raise whatever a damaged file leads them to
+        with file.open("rb") as stream:
+            table = parquet.read_table(stream, use_threads=False, page_checksum_verification=True)
+        schema, arrays = table.schema, {}
+        text = schema.metadata[b"about"].decode()
+        if schema.metadata[b"sha256"].decode() != _sha256([text, str(schema.remove_metadata())]):
+            return None
+        for name in table.column_names:
+            column, shape = table[name].combine_chunks(), [table.num_rows]
+            if types.is_fixed_size_list(column.type):
+                column, shape = column.flatten(), [*shape, column.type.list_size]
+            arrays[name] = column.to_numpy(zero_copy_only=False).reshape(shape)
+        return json.loads(text), arrays
+    except Exception:  # pyarrow raises whatever a damaged file leads it to
         return None
