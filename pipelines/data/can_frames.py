@@ -9,24 +9,20 @@ one, stands for a value that was not measured; of a signal of floating point NaN
 signal can hold is sent as the end of its range, never wrapped.  CRC-8 of SAE J1850 is over the identifier, 2
 bytes or 4 of an extended one, high byte first, and the data with the CRC's own bits as 0.
 
-Logs are ASC and BLF of Vector's tools, candump's log, TRC; one run a file.  The frames of one instant have
-equal counters, and make one sample, which is stamped by the first of them.  A sample is complete when all
-channels that the DBC has of its stream have come.  A frame that was lost leaves NaN in its part of the sample,
-which ends with the first frame of the next; frames of a sample that has ended are late, and those of a counter
-that stands still repeat an old measurement: both are dropped and counted.
+Logs are ASC and BLF of Vector's tools, candump's log, TRC; one run a file.  Which frames make one sample is said in
+:mod:`terrain.logs.parts`.
 """
 
 from __future__ import annotations
 
 import math
-from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -36,6 +32,7 @@ from terrain.files.resources import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.borealtc import whole_run_label
 from terrain.logs.mapping import check_unit
+from terrain.logs.parts import Assembler, Part
 from terrain.logs.replay import TWIST
 from terrain.logs.samples import checked_stream
 from terrain.logs.schema import (
@@ -119,9 +116,6 @@ READERS = {
 QUEUE = 1000
 """Most samples of a stream between two readings: ten seconds of an IMU; the oldest are dropped."""
 
-LONGEST = 1.02
-"""Square of the length of a quaternion's vector part that rounding can explain."""
-
 INCOMPLETE_S = 0.02
 """A sample whose other frames have not come for so long is used without them."""
 
@@ -141,23 +135,6 @@ class Drop(StrEnum):
 
 USUAL = (Drop.UNKNOWN, Drop.ERROR, Drop.BUS_OFF, Drop.REMOTE)
 """What a log of any bus has besides the frames that are read: counted, and no fault of the log."""
-
-
-class Part(NamedTuple):
-    """What one frame has of a sample.
-
-    Parameters
-    ----------
-    stream : that the sample belongs to
-    counter : of the sample; None where the message has none
-    values : by column of the stream, SI; NaN where nothing was measured
-    n_out_of_range : values beyond the bounds of their signal, which are NaN too
-    """
-
-    stream: str
-    counter: int | None
-    values: Mapping[int, float]
-    n_out_of_range: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -439,68 +416,6 @@ def encode(
     return frames
 
 
-class _Assembler:
-    """Samples of one stream, of the columns that a DBC has; the oldest of more than ``most`` are dropped."""
-
-    def __init__(self, stream: str, columns: frozenset[int], dropped: Counter[str], most: float) -> None:
-        self._stream, self._needed, self._dropped, self._most = stream, columns, dropped, most
-        self._width = len(SIGNALS[stream])
-        self._adds_real_part = stream == "odometry" and QUATERNION[3] not in columns
-        self._row: dict[int, float] = {}
-        self._counter: int | None = None
-        self._last: int | None = None
-        self._time_s = math.nan
-        self._done = array("d")  # of each sample its time and its row
-
-    def take(self, time_s: float, part: Part) -> None:
-        if part.counter is not None and part.counter == self._last:
-            self._dropped[f"{self._stream}: repeated or late"] += 1
-            return
-        known = part.counter is not None and self._counter is not None
-        if self._row and known and part.counter != self._counter:
-            self.finish()
-        elif not self._row.keys().isdisjoint(part.values):
-            if known:
-                self._dropped[f"{self._stream}: repeated or late"] += 1
-                return
-            self.finish()
-        if not self._row:
-            self._time_s = time_s
-        if part.counter is not None:
-            self._counter = part.counter
-        self._row |= part.values
-        if part.n_out_of_range:
-            self._dropped[f"{self._stream}: out of range"] += part.n_out_of_range
-        if self._row.keys() >= self._needed:
-            self.finish()
-
-    def finish(self) -> None:
-        """End the sample, complete or not."""
-        if not self._row:
-            return
-        if not self._row.keys() >= self._needed:
-            self._dropped[f"{self._stream}: part missing"] += 1
-        if self._adds_real_part:
-            square = sum(self._row.get(column, math.nan) ** 2 for column in QUATERNION[:3])
-            self._row[QUATERNION[3]] = math.sqrt(max(1.0 - square, 0.0)) if square <= LONGEST else math.nan
-        if len(self._done) >= self._most * (1 + self._width):
-            del self._done[: 1 + self._width]
-            self._dropped[f"{self._stream}: queue full"] += 1
-        self._done.extend((self._time_s, *(self._row.get(i, math.nan) for i in range(self._width))))
-        self._row = {}
-        self._last, self._counter = self._counter, None
-
-    def reading(self, before_s: float) -> Reading | None:
-        """Return the samples that are done or began before a time, and hold them no more; None without any."""
-        if self._time_s < before_s:
-            self.finish()
-        if not self._done:
-            return None
-        rows = np.array(self._done).reshape(-1, 1 + self._width)
-        self._done = array("d")
-        return Reading(rows[:, 0].copy(), rows[:, 1:].copy())
-
-
 class Receiver:
     """Samples from frames as they come; whatever comes, it does not raise.
 
@@ -529,11 +444,13 @@ class Receiver:
         self._layout = layout
         self.dropped: Counter[str] = Counter()
         self.n_used = 0
-        self._streams = {
-            name: _Assembler(name, layout.columns(name), self.dropped, most)
-            for name in streams
-            if name in layout.by_stream
-        }
+        self._streams = {}
+        for name in streams:
+            if name in layout.by_stream:
+                columns = layout.columns(name)
+                quaternion = QUATERNION if name == "odometry" and QUATERNION[3] not in columns else ()
+                about = len(SIGNALS[name]), columns, self.dropped, most, quaternion
+                self._streams[name] = Assembler(name, *about)
 
     def take(self, frame: Frame) -> str | None:
         """Take a frame; return the stream that it is of, None where it is not used."""
