@@ -89,13 +89,11 @@ def run(settings: Settings, progress: Progress = silent) -> LabelStudy:
     classes = np.unique(examples.terrain)
     probability = np.full((len(STRATEGIES), repeats, len(windows), len(classes)), np.nan)
     counts = []
-    progress("labels", 0, len(folds))
-    each = ((fold, settings.seed + number) for number, fold in enumerate(folds))
-    shared = (recipe[-1], examples, motion)
-    for fold, found in zip(folds, parallel(_fold_labels, shared, each, evaluation.jobs), strict=True):
+    each = [(fold, settings.seed + number) for number, fold in enumerate(folds)]
+    given = _fold_labels, (recipe[-1], examples, motion), each, evaluation.jobs
+    for fold, found in zip(folds, parallel(*given, "labels", progress), strict=True):
         probability[:, fold.repeat, fold.test] = found.probability
         counts.append(found.n_labelled)
-        progress("labels", len(counts), len(folds))
     outcomes = [
         Outcome(
             windows.run_id.astype(str),

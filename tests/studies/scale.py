@@ -228,10 +228,9 @@ def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
     with TemporaryDirectory(dir=settings.scratch, prefix="fleet-") as folder:
         runs = Path(folder) / "runs"
         begun_s = perf_counter()
-        numbers = ((number,) for number in range(sizes[-1]))
-        written = parallel(write_generated, (settings.seed, runs), numbers, max(settings.workers))
-        for done, _ in enumerate(written):
-            progress("write runs", done + 1, sizes[-1])
+        numbers = [(number,) for number in range(sizes[-1])]
+        given = write_generated, (settings.seed, runs), numbers, max(settings.workers)
+        list(parallel(*given, "write runs", progress))
         write_s = perf_counter() - begun_s
         points: list[Point] = []
         for n_workers in settings.workers:
