@@ -9,8 +9,8 @@ one, stands for a value that was not measured; of a signal of floating point NaN
 signal can hold is sent as the end of its range, never wrapped.  CRC-8 of SAE J1850 is over the identifier, 2
 bytes or 4 of an extended one, high byte first, and the data with the CRC's own bits as 0.
 
-Logs are ASC and BLF of Vector's tools, candump's log, TRC; one run a file.  Which frames make one sample is said in
-:mod:`terrain.logs.parts`.
+Logs are ASC and BLF of Vector's tools, candump's log, TRC; one run a file.  :mod:`terrain.logs.parts` has which frames
+make one sample.
 """
 
 from __future__ import annotations
