@@ -92,10 +92,8 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     from pipelines.learn.predict import predict
     from pipelines.learn.train import TrainingSettings, train
     from pipelines.learn.training_data import data_of_runs
-    from pipelines.slip.filtered import motion_figure, slip_figure
     from terrain.classify.folds import hold_out_runs
     from terrain.control.slip_table import load_slip_table
-    from terrain.estimation.labelled import labelled_runs
     from terrain.files.atomic import ensure_writable
     from terrain.logs.merge import distinct_runs
 
@@ -106,6 +104,10 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
         given: Sequence[RunLog]
         slip, figures = None, tuple[Figure, ...]()
         if data is None:
+            # imports compile kernels: while the other process does, too
+            from pipelines.slip.filtered import motion_figure, slip_figure
+            from terrain.estimation.labelled import labelled_runs
+
             given, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
             figures = slip_figure(example), motion_figure(example)
         else:
