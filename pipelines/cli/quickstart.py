@@ -104,7 +104,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
         given: Sequence[RunLog]
         slip, figures = None, tuple[Figure, ...]()
         if data is None:
-            # imports compile kernels: while the other process does, too
+            # kernels are compiled when they are imported: meanwhile, not before
             from pipelines.slip.filtered import motion_figure, slip_figure
             from terrain.estimation.labelled import labelled_runs
 

@@ -20,8 +20,8 @@ from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.limits import learn_limits
 from terrain.errors import DataError
-from terrain.estimation.live.choice import ESTIMATED
 from terrain.logs.digest import data_digest
+from terrain.logs.schema import ESTIMATED
 from terrain.records import Array, RunLog
 
 

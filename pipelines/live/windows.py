@@ -22,7 +22,6 @@ from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.terrain_filter import TerrainFilter, check_filter
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live.choice import (
-    ESTIMATED,
     LIVE_FILTERS,
     Filter,
     estimated_channels,
@@ -30,6 +29,7 @@ from terrain.estimation.live.choice import (
 )
 from terrain.extension import correct_live
 from terrain.logs.replay import SENSORS, replay
+from terrain.logs.schema import ESTIMATED
 from terrain.records import RunLog
 from terrain.robots import Robot, robot_named
 

@@ -162,6 +162,9 @@ ESTIMATOR_CHANNELS: tuple[str, ...] = (
 )
 """States of a filter that go into windows."""
 
+ESTIMATED = ("estimator", "slip")
+"""Streams that a filter adds to what is measured (:func:`terrain.estimation.enriched.enriched`)."""
+
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
 

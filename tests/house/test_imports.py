@@ -57,3 +57,13 @@ def test_a_circle_is_found():
 def test_no_file_lies_directly_in_pipelines():
     files = [path.name for path in (ROOT / "pipelines").iterdir() if path.is_file()]
     assert sorted(files) == ["__init__.py", "py.typed"]
+
+
+def test_training_compiles_no_live_estimator():
+    """Its kernels take a minute where none is compiled; quickstart has another process compile them meanwhile."""
+    code = (
+        "import sys, pipelines.learn.card, pipelines.learn.predict, pipelines.learn.train, "
+        "pipelines.learn.training_data; print(*(each for each in sys.modules if 'estimation.live' in each))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

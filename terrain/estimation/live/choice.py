@@ -28,9 +28,6 @@ LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
 """Filters and observers that run sample by sample, by drive, without a file of their own; the first is used
 where none is named."""
 
-ESTIMATED = ("estimator", "slip")
-"""Streams that a filter adds to what is measured (:func:`terrain.estimation.enriched.enriched`)."""
-
 
 def make_live_filter(
     name: str,
