@@ -92,11 +92,8 @@ def judge(
             if name == "channels":
                 different = f"its streams, channels or rates are not those of version {version}"
             return False, f"{different}: choose another --name"
-    runs = () if data is None else data.runs
-    digests = (
-        info.data_digest,
-        joint_digest([run.digest for run in runs]),
-    )  # of the runs together, and of each
+    each = joint_digest([run.digest for run in data.runs]) if data is not None else ""
+    digests = info.data_digest, each  # of the runs together, and of each by itself
     if model.info.data_digest in digests or joint_digest(model.info.run_digests) == info.data_digest:
         best = float(champion.tags.get("macro_f1", "-inf"))
         comparison = f"{best:.4f} of version {version} on the same data"

@@ -149,9 +149,8 @@ class CacheSettings(LearnSettings):
 class RecipeSettings(LearnSettings):
     """One recipe."""
 
-    protocol: ClassVar[str] = (
-        "grouped"  # what is trained is judged by whole runs held out, without further checks
-    )
+    # what is trained is judged by whole runs held out, without further checks
+    protocol: ClassVar[str] = "grouped"
     extras: ClassVar[bool] = False
     recipe: Annotated[str, AfterValidator(check_recipe)] = setting(FEATURE_RECIPE, RECIPE_TEXT)
 

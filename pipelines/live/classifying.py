@@ -114,8 +114,8 @@ class Classifier(TerrainSource):
     model : fitted on such windows; None where it comes later
     robot : its description; may be missing where every channel of the model is measured
     thread : of one worker, which cuts and classifies for any number of robots, one after the other; an error
-        that was not foreseen costs its window.  By default that is done at once, for logs and simulations,
-        which can wait.  Arrays that are taken are kept for it and must not change
+        that was not foreseen costs its window, and is counted.  By default that is done at once, for logs and
+        simulations, which can wait.  Arrays that are taken are kept for it and must not change
     channels : of each stream that is measured; those of a pilot's robot by default
     filter_name : filter that runs here; that of a pilot by default
 
@@ -147,6 +147,7 @@ class Classifier(TerrainSource):
         self._part: _Part | None = None  # that is worked with
         self._due_s, self._n_overrun = math.inf, 0
         self._counts: Mapping[str, int] = {}
+        self._faults: Mapping[str, int] = {}
         if model is not None:
             self._begin(model, self._feed_of(model))
 
@@ -156,7 +157,7 @@ class Classifier(TerrainSource):
         counts = dict(self._counts)
         if self._n_overrun:
             counts["steps: overrun"] = self._n_overrun
-        return counts | {f"window: refused, {why}": n for why, n in self.failed.items()}
+        return counts | dict(self._faults) | {f"window: refused, {why}": n for why, n in self.failed.items()}
 
     def _feed_of(self, model: TerrainModel) -> WindowFeed:
         """Return what cuts the windows of a model; ``DataError``, as of :func:`feed_of`, where it does not suit."""
@@ -204,7 +205,15 @@ class Classifier(TerrainSource):
             self._work()
         else:
             with suppress(RuntimeError):  # the thread has ended
-                self._thread.submit(self._work)
+                self._thread.submit(self._work_beside)
+
+    def _work_beside(self) -> None:
+        """Do what waits, on the thread: nobody sees what is raised there, so that it is counted by its type."""
+        try:
+            self._work()
+        except Exception as error:  # of one window: the next are served
+            kind = f"window: lost to a fault, {type(error).__name__}"
+            self._faults = {**self._faults, kind: self._faults.get(kind, 0) + 1}
 
     def take(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> list[WindowOutput]:
         """Take readings and estimates; return the outputs of windows that are there by now."""

@@ -113,9 +113,12 @@ class Result:
 
     def as_json(self) -> Any:
         """Return the fields by name, as :func:`as_json` writes them."""
-        values = {name: getattr(self, name) for name in self.about()}
-        shown = (name for name in values if values[name] is not None or not self.about()[name]["optional"])
-        return {name: as_json(values[name]) for name in shown}
+        values = {name: (getattr(self, name), about["optional"]) for name, about in self.about().items()}
+        return {
+            name: as_json(value)
+            for name, (value, optional) in values.items()
+            if value is not None or not optional
+        }
 
     def pairs(self, *names: str) -> list[tuple[Any, ...]]:
         """Return rows of :class:`~pipelines.report.tree.Pairs`: what fields are, their values and forms."""

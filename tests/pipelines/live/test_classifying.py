@@ -180,8 +180,9 @@ def test_models_are_changed_in_order_and_an_unforeseen_error_costs_one_window(ga
         robot.swap(stub_model(name))
     for start_s in (-1.0, 1.0, 2.0):
         robot._waiting.append(({"imu": Reading(np.array([start_s]), np.zeros((1, 1)))}, []))
-        thread.submit(robot._work)
+        thread.submit(robot._work_beside)
     assert [one.nearest for one in outputs(robot, 4)] == ["first", "second", "third", "third"]
+    assert robot.dropped == {"window: lost to a fault, KeyError": 1}
 
 
 def test_on_a_thread_a_robot_gets_the_windows_that_it_would_get_at_once(mower_model, two_drives):
