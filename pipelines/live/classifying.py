@@ -208,7 +208,7 @@ class Classifier(TerrainSource):
                 self._thread.submit(self._work_beside)
 
     def _work_beside(self) -> None:
-        """Do what waits, on the thread: nobody sees what is raised there, so that it is counted by its type."""
+        """Do what waits, on the thread: what is raised there reaches no caller, so that it is counted by its type."""
         try:
             self._work()
         except Exception as error:  # of one window: the next are served
