@@ -1,0 +1,67 @@
+"""Records: named numbers and arrays that compiled functions take, and write in place, as one argument.
+
+A record is one element of a structured array.  What a plant, a filter, a controller or an observer is made of
+(parameters), remembers (state) and takes at a step (row) is one record each, so that a step reads
+``step(params[0], state[0], row[0], dt_s)``, a snapshot is a copy of the array, and no number has a place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from terrain.records import Array
+
+
+def record(fields: Mapping[str, Any]) -> np.dtype[Any]:
+    """Return the type of a record.
+
+    Parameters
+    ----------
+    fields : by name ``float``, ``int``, ``bool``, another record, or any of these with a shape, as
+        ``(float, 3)`` or ``(LINE, 29)``
+
+    Examples
+    --------
+    >>> wheel = record({"speed_mps": float, "forces_n": (float, 2)})
+    >>> robot = record({"wheels": (wheel, 3), "time_s": float})
+    >>> filled(robot, np.nan)[0]["wheels"][1]["forces_n"]
+    array([nan, nan])
+    """
+    return np.dtype(
+        [(name, *(field if isinstance(field, tuple) else (field,))) for name, field in fields.items()],
+        align=True,
+    )
+
+
+def filled(fields: np.dtype[Any], value: float = 0.0, **values: Any) -> Array:
+    """Return a structured array (1,) of one record, for a compiled function to take its element 0.
+
+    Parameters
+    ----------
+    fields : type of the record
+    value : of all numbers that are not whole; whole ones are 0, and flags False
+    values : by name, in place of it
+
+    Examples
+    --------
+    >>> filled(record({"speed_mps": float, "n": int}), speed_mps=2.0)[0].item()
+    (2.0, 0)
+    """
+    one = np.zeros(1, fields)
+    if value != 0.0:
+        _fill(one, value)
+    for name, given in values.items():
+        one[name] = given
+    return one
+
+
+def _fill(array: Array, value: float) -> None:
+    if array.dtype.names is None:
+        if array.dtype.kind == "f":
+            array[...] = value
+        return
+    for name in array.dtype.names:
+        _fill(array[name], value)
