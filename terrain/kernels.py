@@ -2,7 +2,8 @@
 
 A record is one element of a structured array.  What a plant, a filter, a controller or an observer is made of
 (parameters), remembers (state) and takes at a step (row) is one record each, so that a step reads
-``step(params[0], state[0], row[0], dt_s)``, a snapshot is a copy of the array, and no number has a place.
+``step(params[0], state[0], row[0], dt_s)``, a snapshot is a copy of the array, and no number has a place.  From
+Python pass the arrays, and take their elements 0 in compiled code: numba knows an array's type at once.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ def record(fields: Mapping[str, Any]) -> np.dtype[Any]:
     Parameters
     ----------
     fields : by name ``float``, ``int``, ``bool``, another record, or any of these with a shape, as
-        ``(float, 3)`` or ``(LINE, 29)``
+        ``(float, 3)`` or ``(LINE, 29)``; flags are of a byte each, as compiled code has no arrays of bits
 
     Examples
     --------
@@ -30,9 +31,9 @@ def record(fields: Mapping[str, Any]) -> np.dtype[Any]:
     >>> filled(robot, np.nan)[0]["wheels"][1]["forces_n"]
     array([nan, nan])
     """
+    pairs = ((name, field if isinstance(field, tuple) else (field, ())) for name, field in fields.items())
     return np.dtype(
-        [(name, *(field if isinstance(field, tuple) else (field,))) for name, field in fields.items()],
-        align=True,
+        [(name, np.uint8 if kind is bool else kind, shape) for name, (kind, shape) in pairs], align=True
     )
 
 
@@ -42,7 +43,7 @@ def filled(fields: np.dtype[Any], value: float = 0.0, **values: Any) -> Array:
     Parameters
     ----------
     fields : type of the record
-    value : of all numbers that are not whole; whole ones are 0, and flags False
+    value : of all numbers that are not whole; whole ones and flags are 0
     values : by name, in place of it
 
     Examples
