@@ -2,6 +2,7 @@
 
 import csv
 import os
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -13,6 +14,10 @@ from threadpoolctl import threadpool_limits
 from terrain.records import Label, RunLog, Stream
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+
+sys.path.insert(
+    0, str(REPOSITORY / "tests")
+)  # studies are imported as ``studies.NAME``, as their runner does
 
 
 def pytest_configure(config):

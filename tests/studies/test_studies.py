@@ -16,7 +16,7 @@ from pipelines.report.results import Result
 from pipelines.report.tree import Report
 from studies import figures, labels, long_drives, mutants, scale, slip_peaks, trials
 from studies.__main__ import STUDIES, main
-from terrain.discrepancy.trials.rows import Row
+from studies.blind_trials.hidden import Row
 from terrain.errors import ConfigError, DataError
 from terrain.robots import load_robot
 from terrain.simulation.slip_sweep import Drive

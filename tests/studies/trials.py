@@ -1,6 +1,6 @@
 """Blind trials of the diagnosis over many processes: effects are hidden in simulated runs, diagnosed and counted.
 
-The trials themselves are those of :mod:`terrain.discrepancy.trials`.
+The trials themselves are those of :mod:`studies.blind_trials`.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from pydantic import field_validator
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
 from pipelines.report.tree import Column, Report, Table, Text
+from studies.blind_trials.hidden import Case, Row, cases_of
+from studies.blind_trials.scoring import FOUND_TRIALS, Score, found_from, table_of
+from studies.blind_trials.trial import Trial, run_trial
 from terrain.discrepancy.preparation import MIN_RUNS
-from terrain.discrepancy.trials.hidden_effects import Case, cases_of
-from terrain.discrepancy.trials.rows import Row
-from terrain.discrepancy.trials.scoring import FOUND_TRIALS, Score, found_from, table_of
-from terrain.discrepancy.trials.trial import Trial, run_trial
 from terrain.errors import ConfigError
 
 EXAMPLE = "python tests/studies trials --n 100 --seed 2211 --rows none,strong"

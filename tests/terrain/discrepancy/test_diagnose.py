@@ -6,14 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.limits import confusable_class, limits_of
+from studies.blind_trials.trial import simulation_of
 
 import terrain.discrepancy.diagnose as diagnose_module
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.preparation import MIN_RUNS
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.limits import confusable_class, limits_of
-from terrain.discrepancy.trials.trial import simulation_of
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import GYRO, HEADING, effect_named
 from terrain.errors import DataError

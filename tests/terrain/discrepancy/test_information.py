@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
 
 from terrain.discrepancy.information import (
     N_BLOCKS,
@@ -20,8 +22,6 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.effects import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
 from terrain.robots import load_robot
 from terrain.simulation.planar.hills import Hills

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
 
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.latencies import latencies_of, starting_values
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
 from terrain.effects import GYRO, HEADING, SPEED_X
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot

@@ -4,6 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy.fitting import Problem, relinearize
 from terrain.discrepancy.information import Statistics
@@ -11,9 +14,6 @@ from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import _found
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.trial import simulation_of
 from terrain.effects import effect_named, vector_of
 from terrain.robots import load_robot
 

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy.information import information_at
 from terrain.discrepancy.probes import probe_residuals
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.trial import simulation_of
 from terrain.effects import CHANNELS, library_of, vector_of
 from terrain.robots import load_robot
 

@@ -5,6 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy.fitting import RISE, Problem, names_of, steps_of
 from terrain.discrepancy.information import move_point
@@ -13,9 +16,6 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import search, with_rivals
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.trial import simulation_of
 from terrain.effects import BOUNDS, INDEX, LIBRARY, effect_named
 from terrain.robots import load_robot
 

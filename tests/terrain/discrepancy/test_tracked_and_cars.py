@@ -2,6 +2,10 @@
 
 import numpy as np
 import pytest
+from studies.blind_trials.drives import CAR_MPS2, STEP_HZ, car_drives, rich_drives
+from studies.blind_trials.hidden import Row, cases_of, hidden_runs
+from studies.blind_trials.limits import limits_of
+from studies.blind_trials.trial import run_trial, simulation_of
 
 from terrain.discrepancy.command_response import traces_of
 from terrain.discrepancy.diagnose import diagnose
@@ -9,11 +13,6 @@ from terrain.discrepancy.health.signs import candidate_changes
 from terrain.discrepancy.next_drive import next_command
 from terrain.discrepancy.robot_terms import in_robot_terms, value_in_robot_terms
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.trials.drives import CAR_MPS2, STEP_HZ, car_drives, rich_drives
-from terrain.discrepancy.trials.hidden_effects import cases_of, hidden_runs
-from terrain.discrepancy.trials.limits import limits_of
-from terrain.discrepancy.trials.rows import Row
-from terrain.discrepancy.trials.trial import run_trial, simulation_of
 from terrain.discrepancy.verdict import Value
 from terrain.effects import CURRENT, effect_named
 from terrain.errors import DataError

@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import search
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.trial import simulation_of
 from terrain.discrepancy.varying import run_scatter, varying_effects
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import effect_named

@@ -5,6 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy import withdrawal
 from terrain.discrepancy.fitting import Problem
@@ -12,9 +15,6 @@ from terrain.discrepancy.probes import ProbeResult, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import _found, search
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.trial import simulation_of
 from terrain.discrepancy.withdrawal import (
     PROBE_ALIKE,
     PROBE_RATIO,

@@ -7,6 +7,9 @@ from functools import cache
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.trial import simulation_of
 
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.health import Column, Fault, FaultKind, faults_of, repaired
@@ -17,9 +20,6 @@ from terrain.discrepancy.health.units import KEYS, SWERVE_TURN, _best, _middle, 
 from terrain.discrepancy.latencies import latencies_of
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import Signals, signals_of
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.trial import simulation_of
 from terrain.effects import CHANNELS
 from terrain.logs.drive import DriveRobot, find_runs
 from terrain.logs.imu_axes import GYRO_TURNED

@@ -4,6 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import welch
+from studies.blind_trials.limits import noise_psd
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import (
@@ -28,7 +29,6 @@ from terrain.simulation.planar.ground import planar_ground
 from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.model import Ground, make_planar
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.noise_spectra import noise_psd
 from terrain.simulation.planar.replay import replay
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.scenario.make import make_scenario

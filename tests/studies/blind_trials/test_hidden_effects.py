@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from studies.blind_trials.drives import LEAD_S, command_drives, poor_drives, rich_drives
+from studies.blind_trials.hidden import hidden_runs
+from studies.blind_trials.limits import POWER, TEST_SIZE, confusable_class, limits_of
+from studies.blind_trials.trial import simulation_of
 from terrain.discrepancy.answers import POWER_Z
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.selection import Z_EFFECT
-from terrain.discrepancy.trials.drives import LEAD_S, command_drives, poor_drives, rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.limits import POWER, TEST_SIZE, confusable_class, limits_of
-from terrain.discrepancy.trials.trial import simulation_of
 from terrain.effects import effect_named, library_of
 from terrain.robots import load_robot
 

@@ -6,13 +6,22 @@ from itertools import count
 import numpy as np
 import pytest
 
-from terrain.discrepancy.trials.dynamic_runs import dynamic_runs, setting_of
-from terrain.discrepancy.trials.hidden_effects import SHORT_RUNS, Case, cases_of
-from terrain.discrepancy.trials.known_truth import KNOWN, N_STALLED, TRACK_ERROR, TRACK_SCATTER, WHEELS_LATE_S
-from terrain.discrepancy.trials.limits import Limits
-from terrain.discrepancy.trials.rows import Row
-from terrain.discrepancy.trials.stages import GROSS, stage_of
-from terrain.discrepancy.trials.stalled_logs import CREEP_RATIO
+from studies.blind_trials.hidden import (
+    CREEP_RATIO,
+    KNOWN,
+    N_STALLED,
+    SHORT_RUNS,
+    TRACK_ERROR,
+    TRACK_SCATTER,
+    WHEELS_LATE_S,
+    Case,
+    Row,
+    cases_of,
+    dynamic_runs,
+    setting_of,
+)
+from studies.blind_trials.limits import Limits
+from studies.blind_trials.trial import GROSS, stage_of
 from terrain.effects import BOUNDS, effect_named
 from terrain.robots import load_robot
 

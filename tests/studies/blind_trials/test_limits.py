@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from terrain.discrepancy.trials.drives import command_drives, rich_drives
-from terrain.discrepancy.trials.limits import Limits, limits_of
+from studies.blind_trials.drives import command_drives, rich_drives
+from studies.blind_trials.limits import Limits, limits_of
 from terrain.effects import effect_named
 from terrain.robots import load_robot
 

@@ -6,14 +6,11 @@ from types import SimpleNamespace
 
 import pytest
 
+from studies.blind_trials.hidden import Row, Statement, cases_of
+from studies.blind_trials.scoring import is_right, states_something, table_of, wrong_names
+from studies.blind_trials.trial import CLOCK_STATED_S, Trial, Varying, run_trial
 from terrain.discrepancy.health import Column, FaultKind
 from terrain.discrepancy.health.runs import Clock
-from terrain.discrepancy.trials.hidden_effects import cases_of
-from terrain.discrepancy.trials.measured_scores import is_right, states_something, wrong_names
-from terrain.discrepancy.trials.rows import Row
-from terrain.discrepancy.trials.scoring import table_of
-from terrain.discrepancy.trials.trial import CLOCK_STATED_S, Trial, Varying, run_trial
-from terrain.discrepancy.trials.written_faults import Statement
 from terrain.discrepancy.verdict import RunGroup, Value, Verdict
 
 RIGHT = Trial(
@@ -197,7 +194,7 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
         ),
     )
     case = cases_of(Row.FAULT, 1, 0, 3)[0]
-    monkeypatch.setattr("terrain.discrepancy.trials.trial.diagnose", lambda *_: answer)
+    monkeypatch.setattr("studies.blind_trials.trial.diagnose", lambda *_: answer)
     found = run_trial(case)
     assert found.clock_s == pytest.approx(-0.25)
     assert found.excluded == ("b",)

@@ -6,10 +6,9 @@ from dataclasses import replace
 import pytest
 from scipy.stats import binomtest
 
-from terrain.discrepancy.trials.hidden_effects import OUTSIDE
-from terrain.discrepancy.trials.rows import Row
-from terrain.discrepancy.trials.scoring import FOUND_TRIALS, found_from, rate_of, table_of
-from terrain.discrepancy.trials.trial import Trial
+from studies.blind_trials.hidden import OUTSIDE, Row
+from studies.blind_trials.scoring import FOUND_TRIALS, found_from, rate_of, table_of
+from studies.blind_trials.trial import Trial
 from terrain.discrepancy.verdict import Verdict
 
 PLAIN = Trial(

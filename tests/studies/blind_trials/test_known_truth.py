@@ -3,14 +3,21 @@
 import numpy as np
 import pytest
 
+from studies.blind_trials.drives import command_drives
+from studies.blind_trials.hidden import (
+    KNOWN,
+    SHORT_RUNS,
+    TRACK,
+    TRACK_ERROR,
+    TRACK_RATIO,
+    Case,
+    Row,
+    as_command_log,
+    hidden_runs,
+    value_is_right,
+)
+from studies.blind_trials.trial import run_trial, simulation_of
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.trials.command_logs import as_command_log
-from terrain.discrepancy.trials.drives import command_drives
-from terrain.discrepancy.trials.hidden_effects import SHORT_RUNS, Case, hidden_runs
-from terrain.discrepancy.trials.known_truth import KNOWN, TRACK_ERROR, value_is_right
-from terrain.discrepancy.trials.rows import Row
-from terrain.discrepancy.trials.scattered_values import TRACK, TRACK_RATIO
-from terrain.discrepancy.trials.trial import run_trial, simulation_of
 from terrain.discrepancy.verdict import Verdict
 from terrain.robots import load_robot
 

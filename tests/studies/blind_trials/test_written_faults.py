@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from terrain.discrepancy.trials.drives import rich_drives
-from terrain.discrepancy.trials.hidden_effects import hidden_runs
-from terrain.discrepancy.trials.written_faults import FAULTS, Statement, fault_named, faults_of, with_fault
+from studies.blind_trials.drives import rich_drives
+from studies.blind_trials.hidden import FAULTS, Statement, fault_named, faults_of, hidden_runs, with_fault
 from terrain.robots import load_robot
 
 STATEMENTS = {

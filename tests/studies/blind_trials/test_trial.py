@@ -1,13 +1,14 @@
 """One blind trial: what it depends on, and what it counts when the diagnosis refuses the runs."""
 
+import doctest
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 
-from terrain.discrepancy.trials.hidden_effects import cases_of
-from terrain.discrepancy.trials.rows import Row
-from terrain.discrepancy.trials.scoring import table_of
-from terrain.discrepancy.trials.trial import run_trial
+from studies.blind_trials.hidden import Row, cases_of
+from studies.blind_trials.scoring import table_of
+from studies.blind_trials.trial import run_trial
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import library_of
 from terrain.errors import DataError
@@ -34,7 +35,12 @@ def test_refused_runs_count_as_a_false_alarm(monkeypatch):
     def refuse(*_):
         raise DataError("runs: only 2 of 8 are fit to be compared")
 
-    monkeypatch.setattr("terrain.discrepancy.trials.trial.diagnose", refuse)
+    monkeypatch.setattr("studies.blind_trials.trial.diagnose", refuse)
     found = run_trial(cases_of(Row.NONE, 1, 0, 3)[0])
     assert (found.verdict, found.named, found.right) == (Verdict.REFUSED, (), True)
     assert table_of([found])["none: false alarms"].hits == 1
+
+
+@pytest.mark.parametrize("name", ["drives", "hidden", "limits", "scoring", "trial"])
+def test_examples_in_docstrings_hold(name):
+    assert doctest.testmod(import_module(f"studies.blind_trials.{name}")).failed == 0

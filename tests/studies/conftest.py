@@ -1,6 +1,0 @@
-"""Studies are imported as ``studies.NAME``, as their runner does."""
-
-import sys
-from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
