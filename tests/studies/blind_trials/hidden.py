@@ -15,6 +15,7 @@ import numpy as np
 
 from studies.blind_trials.drives import STEP_HZ, Drives
 from studies.blind_trials.limits import Limits, Sensing, confusable_class
+from terrain.discrepancy.health import Column, FaultKind
 from terrain.effects import (
     BOTH,
     BOUNDS,
@@ -119,15 +120,7 @@ ENTRY_TAKEN_OUT = (3.0, 10.0)
 
 
 class Case(NamedTuple):
-    """One trial to be done.
-
-    Parameters
-    ----------
-    row, number : kind of the trial, and its number
-    robot : name
-    n_runs : in the trial
-    seed : of all trials
-    """
+    """One trial to be done: its kind and number, the robot's name, how many runs, and the seed of all trials."""
 
     row: Row
     number: int
@@ -368,25 +361,13 @@ SENSOR_LATE_S = (0.1, 0.3)
 
 
 def with_late_streams(runs: Sequence[RunLog], names: Collection[str], late_s: float) -> tuple[RunLog, ...]:
-    """Return runs in which some streams, where a run has them, are stamped later than they were sampled.
-
-    Examples
-    --------
-    >>> from terrain.records import Stream
-    >>> run = RunLog("a", "husky", {"imu": Stream([0.0, 1.0], [[0.0], [1.0]], ("gyro_z_radps",))})
-    >>> with_late_streams([run], ("imu",), 0.25)[0].streams["imu"].time_s
-    array([0.25, 1.25])
-    """
-    return tuple(
-        replace(
-            run,
-            streams={
-                name: replace(stream, time_s=stream.time_s + late_s) if name in names else stream
-                for name, stream in run.streams.items()
-            },
-        )
-        for run in runs
-    )
+    """Return runs in which some streams, where a run has them, are stamped later than they were sampled."""
+    late = []
+    for run in runs:
+        own = {name: run.streams[name] for name in names if name in run.streams}
+        shifted = {name: replace(stream, time_s=stream.time_s + late_s) for name, stream in own.items()}
+        late.append(replace(run, streams={**run.streams, **shifted}))
+    return tuple(late)
 
 
 # -- Logs of stalled runs: the wheels turn as in any run, the body hardly moves ----------------------------
@@ -563,18 +544,17 @@ class WrittenFault(NamedTuple):
     drives : of robots whose logs show it
     stream : that has it
     write : gives the stream with the fault, of a robot
-    channel : the channel that is stated has one of these words, in lower case
-    words : the kind or the sentence has one of these
-    without : words of another channel
+    kind, column : of the statement, as :class:`terrain.discrepancy.health.Fault` has them
+    word : in the sentence
     """
 
     name: str
     drives: tuple[str, ...]
     stream: str
     write: Callable[[Stream, Robot], Stream]
-    channel: tuple[str, ...]
-    words: tuple[str, ...]
-    without: tuple[str, ...] = ()
+    kind: FaultKind
+    column: Column
+    word: str = ""
 
     def stated_in(self, statements: Iterable[Statement]) -> bool:
         """Return whether one states this fault.
@@ -584,14 +564,7 @@ class WrittenFault(NamedTuple):
         >>> fault_named("gyro_deg").stated_in([Statement("unit", "gyro", "the gyro is in deg/s")])
         True
         """
-        for statement in statements:
-            channel, text = statement.channel.lower(), f"{statement.kind} {statement.sentence}".lower()
-            own = any(word in channel for word in self.channel) and not any(
-                w in channel for w in self.without
-            )
-            if own and any(word in text for word in self.words):
-                return True
-        return False
+        return any(s[:2] == (self.kind, self.column) and self.word in s.sentence for s in statements)
 
 
 def _scaled(part: str, factor: float) -> Callable[[Stream, Robot], Stream]:
@@ -624,31 +597,19 @@ def _swapped(*kinds: str) -> Callable[[Stream, Robot], Stream]:
     return write
 
 
-_GYRO = ("gyro", "yaw")
-_SKID, _SWERVE, _BOTH = SKIDDING, (SWERVE,), BOTH
+_SIGN, _UNIT, _SWAPPED = FaultKind.SIGN, FaultKind.UNIT, FaultKind.SWAPPED
+_ALL_WHEELS = _swapped("speed_{}_mps", "motor_{}_radps")
 
 FAULTS: tuple[WrittenFault, ...] = (
-    WrittenFault("gyro_sign", _BOTH, "imu", _scaled("gyro_z_", -1.0), _GYRO, ("sign", "invert")),
-    WrittenFault("gyro_deg", _BOTH, "imu", _scaled("gyro_", 180.0 / math.pi), _GYRO, ("deg",)),
-    WrittenFault("wheels_kmh", _SKID, "wheels", _scaled("speed_", 3.6), ("wheel",), ("km/h",)),
+    WrittenFault("gyro_sign", BOTH, "imu", _scaled("gyro_z_", -1.0), _SIGN, Column.GYRO),
+    WrittenFault("gyro_deg", BOTH, "imu", _scaled("gyro_", 180.0 / math.pi), _UNIT, Column.GYRO, "deg/s"),
+    WrittenFault("wheels_kmh", SKIDDING, "wheels", _scaled("speed_", 3.6), _UNIT, Column.WHEELS, "km/h"),
+    WrittenFault("camera_kmh", SKIDDING, "odometry", _scaled("speed_", 3.6), _UNIT, Column.SPEED, "km/h"),
     WrittenFault(
-        "camera_kmh", _SKID, "odometry", _scaled("speed_", 3.6), ("camera", "ground", "speed_x"), ("km/h",)
+        "wheels_rpm", (SWERVE,), "wheels", _scaled("motor_", 30 / math.pi), _UNIT, Column.WHEELS, "rpm"
     ),
-    WrittenFault(
-        "wheels_rpm", _SWERVE, "wheels", _scaled("motor_", 30.0 / math.pi), ("wheel", "motor"), ("rpm",)
-    ),
-    WrittenFault(
-        "swapped_currents", _SKID, "wheels", _swapped("current_{}_a"), ("current",), ("swap", "exchange")
-    ),
-    WrittenFault(
-        "swapped_wheels",
-        _BOTH,
-        "wheels",
-        _swapped("speed_{}_mps", "motor_{}_radps"),
-        ("wheel", "motor"),
-        ("swap", "exchange"),
-        ("current",),
-    ),
+    WrittenFault("swapped_currents", SKIDDING, "wheels", _swapped("current_{}_a"), _SWAPPED, Column.CURRENTS),
+    WrittenFault("swapped_wheels", BOTH, "wheels", _ALL_WHEELS, _SWAPPED, Column.WHEELS),
 )
 """All of them.  A swap of currents does not show on a swerve robot, of which only their sum is compared."""
 
