@@ -66,3 +66,16 @@ def _fill(array: Array, value: float) -> None:
         return
     for name in array.dtype.names:
         _fill(array[name], value)
+
+
+def is_finite(array: Array) -> bool:
+    """Return whether all numbers of a structured array are finite.
+
+    Examples
+    --------
+    >>> is_finite(filled(record({"speed_mps": float, "n": int}))), is_finite(filled(record({"x_m": float}), np.nan))
+    (True, False)
+    """
+    if array.dtype.names is None:
+        return bool(np.isfinite(array).all())
+    return all(is_finite(array[name]) for name in array.dtype.names)

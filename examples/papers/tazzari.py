@@ -10,6 +10,7 @@ import numpy as np
 from claims import Finding, Numbers, Trial
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from tracks import janosi_slip
 
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.angles import wrapped
@@ -43,9 +44,8 @@ from terrain.simulation.tracked.given_slip import GivenSlip
 from terrain.simulation.tracked.motion import STATE_SIZE, STEP_S, VX, YAW, W, X, advance
 from terrain.simulation.tracked.run import COMMANDS_HZ, NOISY, QUIET, TrackedSensors, simulate_tracked
 from terrain.simulation.tracked.slope import LEVEL
-from terrain.terramechanics.resistance import compaction_resistance
 from terrain.terramechanics.soil import Soil, load_soil
-from terrain.terramechanics.traction import friction_limit, janosi_slip
+from terrain.terramechanics.traction import compaction_resistance, friction_limit
 
 PAPER = TrackedSettings()
 """L and Lambda the identity, section V."""

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from claims import Finding, Numbers, Trial
 from scipy import stats
+from tracks import straight_slip_line, track_balance
 
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.bootstrap import bootstrap_rows, percentile_interval
@@ -49,10 +50,8 @@ from terrain.robots import TrackedRobot, as_drive, load_robot
 from terrain.simulation.tracked.given_slip import GivenSlip
 from terrain.simulation.tracked.run import simulate_tracked
 from terrain.simulation.tracked.slope import Slope
-from terrain.terramechanics.resistance import bekker_pressure, plate_sinkage
 from terrain.terramechanics.soil import Soil, load_soil, scattered
-from terrain.terramechanics.track import straight_slip_line, track_balance
-from terrain.terramechanics.traction import mobilised_ratio
+from terrain.terramechanics.traction import bekker_pressure, mobilised_ratio, plate_sinkage
 
 ROBOT, SAND = "patako", "toyoura_sand"
 FIRM = "firm_soil_gravel"

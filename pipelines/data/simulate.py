@@ -90,7 +90,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     from terrain.robots import load_robot
     from terrain.simulation.conditions import Conditions, Faults
     from terrain.simulation.run import BENCH_TERRAIN, COURSE, run_id_of, simulate_run
-    from terrain.simulation.sensors.gnss import Gnss
+    from terrain.simulation.sensors import Gnss
     from terrain.terramechanics.soil import load_soil, soil_names
 
     scenario, out = settings.scenario, settings.out

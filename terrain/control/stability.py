@@ -44,7 +44,7 @@ from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
-from terrain.simulation.sensors.motion import STEP_S
+from terrain.simulation.sensors import STEP_S
 
 SAMPLE_TIME_S = 0.02
 """Sample time of the commands, assumed: the thesis specifies none."""

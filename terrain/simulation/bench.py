@@ -11,7 +11,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.records import RunLog
 from terrain.robots import Robot
-from terrain.simulation.sensors.imu import imu_samples
+from terrain.simulation.sensors import imu_samples
 
 TURN_S = 1.5
 """Time by hand from one position to the next; assumed."""

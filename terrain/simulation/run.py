@@ -31,9 +31,7 @@ from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.scenario.make import make_scenario
-from terrain.simulation.sensors.gnss import Gnss
-from terrain.simulation.sensors.raw_fixes import with_raw_fixes
-from terrain.simulation.sensors.sensor import is_lost
+from terrain.simulation.sensors import Gnss, is_lost, with_raw_fixes
 from terrain.simulation.slip_sweep import learning_run
 from terrain.simulation.tracked.run import COMMANDS_HZ, simulate_tracked
 from terrain.simulation.tracked.slope import Slope

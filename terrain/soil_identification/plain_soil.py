@@ -21,7 +21,7 @@ from terrain.soil_identification.fit import FORCE_MISFIT_RATIO
 from terrain.soil_identification.laws import Prediction
 from terrain.soil_identification.trials import Trials, Wheel
 from terrain.terramechanics.soil import Soil
-from terrain.terramechanics.traction import ground_array, wheel_ground
+from terrain.terramechanics.traction import ground_record, wheel_ground
 
 PARAMETERS = ("friction_angle_rad", "shear_modulus_m", "kphi_npmn2", "slip_sinkage_ratio")
 _START = np.array([0.5, 0.01, 1e6, 0.5])
@@ -65,7 +65,7 @@ def plain_prediction(soil: Soil, trials: Trials, wheel: Wheel) -> Prediction:
     ----------
     soil, trials, wheel : of the prediction
     """
-    ground = ground_array(soil, wheel.tip_radius_m, wheel.width_m, 0.0)
+    ground = ground_record(soil, wheel.tip_radius_m, wheel.width_m, 0.0)[0]
     out = np.full((len(trials), 4), np.nan)
     for i, (omega, travel, angle, load) in enumerate(trials.motion):
         speed, ahead, across = omega * wheel.radius_m, travel * math.cos(angle), travel * math.sin(angle)

@@ -26,7 +26,7 @@ from terrain.files.documents import read_yaml
 from terrain.files.names import shown
 from terrain.files.resources import data_folder
 from terrain.terramechanics.soil import Soil, extra_soil_names, load_soil, soil_names
-from terrain.terramechanics.traction import ground_array, net_pull, wheel_ground
+from terrain.terramechanics.traction import ground_record, net_pull, wheel_ground
 
 TABLE = "stiffness.yaml"
 
@@ -80,7 +80,7 @@ def response_of(
     ('SOFT', 0.0068, 0.34)
     """
     geometry = wheel_radius_m, tyre_width_m, contact_length_m
-    _, _, resistance_n, sinkage_m = wheel_ground(ground_array(soil, *geometry), float(normal_n), 0.0, 0.0)
+    _, _, resistance_n, sinkage_m = wheel_ground(ground_record(soil, *geometry)[0], float(normal_n), 0.0, 0.0)
     pull_n = float(net_pull(soil, normal_n, np.linspace(0.0, 0.99, N_SLIPS), *geometry).max())
     difficulty = min(resistance_n / (pull_n + resistance_n), 1.0) if pull_n > -resistance_n else 1.0
     return GroundResponse(stiffness_level(soil), float(sinkage_m), float(difficulty))

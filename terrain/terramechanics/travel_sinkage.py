@@ -24,7 +24,7 @@ from __future__ import annotations
 import numpy as np
 
 from terrain.records import Array
-from terrain.terramechanics.resistance import rigid_wheel_sinkage, slip_sinkage_factor
+from terrain.terramechanics.traction import rigid_wheel_sinkage, slip_sinkage_factor
 
 TRAVEL: dict[str, tuple[float, float]] = {
     "rolling_m": (0.0144, 0.0072),

@@ -19,7 +19,7 @@ from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots.bicycle import BicycleRobot
 from terrain.simulation.bicycle import plant
-from terrain.simulation.sensors.truth import BODY_TRUTH
+from terrain.simulation.sensors import BODY_TRUTH
 from terrain.slip import slip_angle
 
 TICK_S, FIX_S, TRUTH_S = 0.02, 0.1, 0.01

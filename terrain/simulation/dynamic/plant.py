@@ -1,4 +1,4 @@
-"""All numbers of one simulated run that do not change during it.
+"""A swerve robot on its terrain: the records of its dynamic simulation, and how stiff its contacts may be.
 
 Effects of the robot (:mod:`terrain.effects.catalogue`) act where a real robot would have them:
 
@@ -15,85 +15,214 @@ Effects of the robot (:mod:`terrain.effects.catalogue`) act where a real robot w
   ``c ph |v|``;
 - **rolling_resistance, slip_resistance, viscous_drag**: more resistance at each axle, by its load, its slip
   and its share of the speed; what is less than none is none.
+
+How stiff a contact may be for the steps of the integration: beyond that it pushes the robot by itself.  A wheel
+of inertia I and radius r on a contact of stiffness ``K = (dF/ds) / sigma``, with the deflection u, the relaxation
+length sigma and the damping T, :data:`terrain.simulation.contact.DEFLECTION_DAMPING_S`::
+
+    F = K (u + T x)        x = w r - v        du/dt = x        dx/dt = -k u - k T x
+
+with ``k = K (r^2 / I + 1 / m)`` and m the mass of the body.  ``step.step`` steps the rate first, and the
+deflection with the new rate::
+
+    x' = x - dt k (u + T x)        u' = u + dt x'
+
+The characteristic polynomial is ``z^2 - (2 - dt k T - dt^2 k) z + 1 - dt k T``.  By Jury's criterion its
+roots are inside the unit circle where ``4 - 2 dt k T - dt^2 k > 0``, that is::
+
+    k < 4 / (dt (dt + 2 T))
+
+The decay of the deflection with the distance rolled only widens this.  Beyond the limit a wheel's rate
+changes its sign from step to step and grows until the contact slides.  Its force then jumps between the
+friction limits of the load, which for a large mass exceed what the motors can give by orders of magnitude.
+
+Three contacts share the body: the largest eigenvalue of all of them together is at most the largest of the
+wheels' own plus the trace of the body's, ``sum K_i (2 / m + rho_i^2 / I_z)``, with rho_i the distance of a
+wheel from the centre of mass.  A tyre as a spring k_t with a damper c under a corner of mass m_i is stepped
+alike, and is stable where ``dt^2 k_t + 2 dt c < 4 m_i``.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import PlantPart, in_plant, parameters_of
 from terrain.errors import ConfigError
+from terrain.kernels import filled, record
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions
-from terrain.simulation.dynamic.profile import TerrainProfile
-from terrain.simulation.sensors.motion import N_RECORD, STEP_S
+from terrain.simulation.contact import DEFLECTION_DAMPING_S
+from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.sensors import STEP_S
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import GROUND, ground_record, wheel_ground
+
+FIELD_STEP_M = 0.1
+"""Grid of the variation of the terrain along the path."""
+
+MAX_FIELD_CELLS = 5 * 10**6
+"""Cells of terrain up to the farthest point that the fastest wheel can reach; 24 h at 2 m/s take 3.5
+million."""
+
+MAX_DELAY_STEPS = 500
+"""Steps of the longest delay of the steering, half a second."""
+
+CONTACT_LIMIT_PS2 = 4.0 / (STEP_S * (STEP_S + 2.0 * DEFLECTION_DAMPING_S))
+"""Largest stable ``k`` in 1/s^2."""
+
+LOAD_MARGIN_RATIO = 2.0
+"""Load transfer and rough ground load a wheel with up to so many times its share of the weight."""
+
+_SMALL_SLIP = 1e-4
+
+PATCH = record({"ground": GROUND, "roughness_m3": float, "start_m": float})
+"""A soil under the wheels, its ISO 8608 roughness, and the path length at which it begins, the first at 0."""
+
+PLANT = record(
+    {
+        "wheels_m": (float, (3, 2)),
+        "com_m": (float, 2),
+        "radius_m": (float, 3),
+        "load_fraction": (float, 3),
+        "load_per_force_ratio": (float, (3, 2)),
+        "grade_ratio": (float, 2),
+        "steer_offset_rad": (float, 3),
+        "linked": bool,
+        "hidden": bool,
+        "steer_delay_steps": int,
+        **dict.fromkeys(
+            (
+                *("com_height_m", "mass_kg", "yaw_inertia_kgm2", "wheel_inertia_kgm2"),
+                *("relaxation_m", "contact_length_m", "ride_stiffness_npm", "ride_damping_nspm"),
+                *("torque_max_nm", "speed_max_radps", "torque_time_constant_s", "friction_nm"),
+                *("speed_gain", "speed_integral", "estimate_time_constant_s", "hall_steps"),
+                *("report_time_constant_s", "steer_rate_max_radps", "steer_accel_max_radps2", "backlash_rad"),
+                *("leg_backlash_rad", "undulation_ratio", "undulation_length_m", "steer_backlash_rad"),
+                *("weight_n", "force_slip_ratio", "shear_slip_ratio", "slip_resistance_ratio"),
+                *("rolling_ratio", "drag_nspm", "side_hill_ratio"),
+            ),
+            float,
+        ),
+    }
+)
+"""All numbers of one simulated run that do not change while it is driven."""
+
+WHEEL_STATE = record(
+    dict.fromkeys(
+        (
+            *("rate_radps", "angle_rad", "steer_rad", "steer_motor_rad", "steer_motor_radps"),
+            *("deflection_x_m", "deflection_y_m", "torque_nm", "integral_nm"),
+            *("estimate_radps", "reported_radps", "hall_count"),
+            *("ride_m", "ride_mps", "ride_mps2", "road_m", "contact_m"),
+            *("heading_rad", "creep_ratio"),
+        ),
+        float,
+    )
+)
+"""A wheel; its heading is that in the play of its linkage, and its creep is over the slip of the ground."""
+
+STATE = record(
+    dict.fromkeys(
+        (
+            *("position_x_m", "position_y_m", "yaw_rad", "speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
+            *("path_m", "accel_x_mps2", "accel_y_mps2", "leg_rad"),
+        ),
+        float,
+    )
+    | {"wheels": (WHEEL_STATE, 3), "n_steps": int, "late_rad": (float, (MAX_DELAY_STEPS, 3))}
+)
+"""Position is that of the body's origin; speeds and accelerations (dv/dt + w x v, of the step before) are
+those of its centre of mass in body axes; the third leg is at 0 in the middle of its play; ``late_rad`` are
+angles of the encoders that have not reached the wheels yet."""
 
 
-class Plant(NamedTuple):
-    """All numbers of one simulated run that do not change while it is driven."""
+class TerrainProfile(NamedTuple):
+    """The terrain of one run along the path.
 
-    wheels_m: Array
-    com_m: Array
-    com_height_m: float
-    mass_kg: float
-    yaw_inertia_kgm2: float
-    radius_m: Array
-    wheel_inertia_kgm2: float
-    relaxation_m: float
-    contact_length_m: float
-    ride_stiffness_npm: float
-    ride_damping_nspm: float
-    load_fraction: Array
-    load_per_force_ratio: Array
-    reduction_ratio: float
-    torque_max_nm: float
-    speed_max_radps: float
-    torque_time_constant_s: float
-    friction_nm: float
-    speed_gain: float
-    speed_integral: float
-    estimate_time_constant_s: float
-    hall_steps: float
-    report_time_constant_s: float
-    steer_rate_max_radps: float
-    steer_accel_max_radps2: float
-    backlash_rad: float
-    leg_backlash_rad: float
-    grade_ratio: Array
-    undulation_ratio: float
-    undulation_length_m: float
-    grounds: Array
-    roughness_m3: Array
-    patch_start_m: Array
+    Parameters
+    ----------
+    patches : (patches,) of :data:`PATCH`
+    field : (2, 3, cells) factors along the path on thrust and on resistance, for each wheel
+    """
+
+    patches: Array
     field: Array
-    linked: bool
-    steer_offset_rad: Array
-    steer_backlash_rad: float
-    steer_delay_steps: int
-    hidden: bool
-    weight_n: float
-    force_slip_ratio: float
-    shear_slip_ratio: float
-    slip_resistance_ratio: float
-    rolling_ratio: float
-    drag_nspm: float
-    side_hill_ratio: float
 
 
-def make_plant(robot: Robot, conditions: Conditions, profile: TerrainProfile) -> Plant:
-    """Return the plant of a robot with its load on its terrain.
+def uniform_profile(
+    robot: Robot, *soils: Soil, roughness_m3: float = 0.0, start_m: tuple[float, ...] = (0.0,)
+) -> TerrainProfile:
+    """Return a terrain of one soil a patch without variation along the path, all patches equally rough."""
+    return TerrainProfile(_patches(robot, soils, [roughness_m3] * len(soils), start_m), np.ones((2, 3, 1)))
+
+
+def draw_profile(
+    robot: Robot,
+    scenario: Scenario,
+    soils: Mapping[str, Soil],
+    conditions: Conditions,
+    rng: np.random.Generator,
+) -> TerrainProfile:
+    """Return the terrain of a scenario, drawn as its soils and the conditions describe.
+
+    Raises
+    ------
+    ConfigError
+        if a terrain has no soil, or the robot gets too far to hold its terrain in memory.
+    """
+    for patch in scenario.patches:
+        if patch.terrain not in soils:
+            raise ConfigError(f"scenario {scenario.name}: terrain {patch.terrain!r} has no soil")
+    used = [soils[patch.terrain] for patch in scenario.patches]
+    start_m = np.array([patch.start_m for patch in scenario.patches])
+    speed_max_radps = robot.equipment.motors.speed_max_radps
+    farthest_m = 2.0 * robot.wheel_radius_m * speed_max_radps * scenario.time_s[-1]
+    n_cells = math.ceil(farthest_m / FIELD_STEP_M) + 1
+    if n_cells > MAX_FIELD_CELLS:
+        raise ConfigError(
+            f"robot {robot.name}: its wheels can come {farthest_m / 2e3:g} km far in this run, "
+            f"{MAX_FIELD_CELLS * FIELD_STEP_M / 2e3:g} km of terrain are simulated at most"
+        )
+    keep = math.exp(-FIELD_STEP_M / conditions.field_length_m)
+    white = rng.standard_normal((2, 3, n_cells))
+    white[:, :, 1:] *= math.sqrt(1.0 - keep**2)
+    unit = lfilter([1.0], [1.0, -keep], white, axis=2)
+    patch_of_cell = np.searchsorted(start_m, np.arange(n_cells) * FIELD_STEP_M, side="right") - 1
+    ratios = np.array([[soil.thrust_field_ratio, soil.resistance_field_ratio] for soil in used])
+    spread = ratios[patch_of_cell].T
+    field = np.exp(spread[:, None, :] * unit - 0.5 * spread[:, None, :] ** 2)
+    roughness = [soil.roughness_m3 * conditions.roughness_factor for soil in used]
+    return TerrainProfile(_patches(robot, used, roughness, start_m), field)
+
+
+def _patches(
+    robot: Robot, soils: Sequence[Soil], roughness_m3: Sequence[float], start_m: Sequence[float] | Array
+) -> Array:
+    body = robot.equipment.body
+    patches = np.zeros(len(soils), PATCH)
+    for patch, soil in zip(patches, soils, strict=True):
+        (patch["ground"],) = ground_record(
+            soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
+        )
+    patches["roughness_m3"], patches["start_m"] = roughness_m3, start_m
+    return patches
+
+
+def make_plant(robot: Robot, conditions: Conditions) -> Array:
+    """Return the plant of a robot with its load, (1,) of :data:`PLANT`.
 
     Parameters
     ----------
     robot : with sections body, motors, steering and sensors; of its effects those listed above act, and a
         payload
     conditions : load, slope, tyres and the backlash of the third leg
-    profile : the terrain
 
     Raises
     ------
@@ -108,8 +237,9 @@ def make_plant(robot: Robot, conditions: Conditions, profile: TerrainProfile) ->
     offset_m = conditions.payload_kg / mass_kg * np.asarray(conditions.payload_m)
     com_m = np.array([body.com_x_m, body.com_y_m]) + offset_m
     load_fraction, load_per_moment = _load_shares(robot, conditions, com_m)
-    return Plant(
-        wheels_m=np.array(robot.wheel_positions_m),
+    return filled(
+        PLANT,
+        wheels_m=robot.wheel_positions_m,
         com_m=com_m,
         com_height_m=body.com_height_m,
         mass_kg=mass_kg,
@@ -121,8 +251,7 @@ def make_plant(robot: Robot, conditions: Conditions, profile: TerrainProfile) ->
         ride_stiffness_npm=body.tyre_stiffness_npm,
         ride_damping_nspm=body.tyre_damping_nspm,
         load_fraction=load_fraction,
-        load_per_force_ratio=np.ascontiguousarray(-body.com_height_m * load_per_moment),
-        reduction_ratio=motors.reduction_ratio,
+        load_per_force_ratio=-body.com_height_m * load_per_moment,
         torque_max_nm=motors.torque_max_nm,
         speed_max_radps=motors.speed_max_radps,
         torque_time_constant_s=motors.torque_time_constant_s,
@@ -135,16 +264,12 @@ def make_plant(robot: Robot, conditions: Conditions, profile: TerrainProfile) ->
         steer_rate_max_radps=steering.rate_max_radps,
         steer_accel_max_radps2=steering.accel_max_radps2,
         backlash_rad=steering.dead_band_rad,
-        leg_backlash_rad=float(conditions.leg_backlash_rad),
-        grade_ratio=np.array(conditions.grade_ratio, dtype=float),
-        undulation_ratio=float(conditions.undulation_ratio),
-        undulation_length_m=float(conditions.undulation_length_m),
-        grounds=np.ascontiguousarray(profile.grounds, dtype=float),
-        roughness_m3=np.ascontiguousarray(profile.roughness_m3, dtype=float),
-        patch_start_m=np.ascontiguousarray(profile.start_m, dtype=float),
-        field=np.ascontiguousarray(profile.field, dtype=float),
+        leg_backlash_rad=conditions.leg_backlash_rad,
+        grade_ratio=conditions.grade_ratio,
+        undulation_ratio=conditions.undulation_ratio,
+        undulation_length_m=conditions.undulation_length_m,
         linked=any(effects[name] != 0.0 for name in in_plant(PlantPart.LINKAGE)),
-        steer_offset_rad=np.array([effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)]),
+        steer_offset_rad=[effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
         steer_backlash_rad=effects["steering_backlash_rad"],
         steer_delay_steps=round(effects["steering_delay_s"] / STEP_S),
         hidden=any(effects[name] != 0.0 for name in in_plant(PlantPart.CONTACT)),
@@ -173,6 +298,64 @@ def _load_shares(robot: Robot, conditions: Conditions, com_m: Array) -> tuple[Ar
     return load_fraction, inverse[:, 1:]
 
 
-def record_width(plant: Plant) -> int:
-    """Return how many numbers are recorded a step: what the encoders see where a linkage hides the wheels."""
-    return N_RECORD + 3 * plant.linked
+def start_state(steer_rad: Array) -> Array:
+    """Return the state, (1,) of :data:`STATE`, of a robot at rest at the origin, its steering motors at 0.
+
+    Its wheels hang in their play at ``steer_rad`` (3,).
+    """
+    wheels = np.zeros(3, WHEEL_STATE)
+    wheels["steer_rad"] = wheels["heading_rad"] = steer_rad
+    return filled(STATE, wheels=wheels, late_rad=steer_rad)
+
+
+def contact_ratio(plant: Array, profile: TerrainProfile) -> float:
+    """Return ``k`` of a plant under its weight, on its stiffest ground, over its limit: unstable from 1 on."""
+    robot = plant[0]
+    load_n = robot["mass_kg"] * GRAVITY_MPS2 * robot["load_fraction"]
+    spin = robot["radius_m"] ** 2 / robot["wheel_inertia_kgm2"]
+    arm_m2 = ((robot["wheels_m"] - robot["com_m"]) ** 2).sum(axis=1)
+    body = 2.0 / robot["mass_kg"] + arm_m2 / robot["yaw_inertia_kgm2"]
+    rates_ps2 = []
+    for ground in profile.patches["ground"]:  # the thrust over its slip is steepest at the start of the curve
+        slope_n = np.array([wheel_ground(ground, load, _SMALL_SLIP, 0.0)[0] for load in load_n]) / _SMALL_SLIP
+        stiffness_npm = slope_n / robot["relaxation_m"]
+        rates_ps2.append((stiffness_npm * spin).max() + (stiffness_npm * body).sum())
+    return float(max(rates_ps2)) / CONTACT_LIMIT_PS2
+
+
+def tyre_ratio(plant: Array) -> float:
+    """Return how stiff and damped the tyres are over their limit: unstable from 1 on."""
+    robot = plant[0]
+    corner_kg = robot["mass_kg"] * float(robot["load_fraction"].min())
+    damped = STEP_S * robot["ride_stiffness_npm"] + 2.0 * robot["ride_damping_nspm"]
+    return float(STEP_S * damped / 4.0 / corner_kg)
+
+
+def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
+    """Refuse a plant whose contacts or tyres are too stiff for the steps of the integration.
+
+    Parameters
+    ----------
+    plant, profile : of a robot on its terrain
+    name : of the robot
+
+    Raises
+    ------
+    ConfigError
+        if the contacts, with :data:`LOAD_MARGIN_RATIO`, or the tyres are beyond their limit, or a number of
+        them is not finite.
+    """
+    steps = f"robot {name}: its motion cannot be integrated in steps of {STEP_S:g} s: "
+    mass_kg = plant["mass_kg"][0]
+    contact = LOAD_MARGIN_RATIO * contact_ratio(plant, profile)
+    if not contact <= 1.0:
+        raise ConfigError(
+            f"{steps}under {mass_kg:g} kg the contacts are {contact:.3g} times too stiff for the "
+            "inertia of wheels and yaw; reduce mass or load, or raise these inertias"
+        )
+    tyre = tyre_ratio(plant)
+    if not tyre <= 1.0:
+        raise ConfigError(
+            f"{steps}with {mass_kg:g} kg the tyres are {tyre:.3g} times too stiff or too damped; raise "
+            "the mass, or reduce their stiffness and damping"
+        )

@@ -1,5 +1,10 @@
 """One run of the dynamic plant: robot, scenario and soils in, an ordinary run log with its truth out.
 
+With a controller the loop is closed: it gets what the sensors have written so far, and commands the wheels.  At
+instant ``t_k`` of the scenario the step that starts there has run with the command in force, so a sample stamped
+``t_k`` of a sensor without latency is there; the command of the controller is in force from the step that starts
+a delay later, one step at the least.
+
 Examples
 --------
 >>> from terrain.robots import load_robot
@@ -14,6 +19,7 @@ Examples
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
@@ -21,27 +27,36 @@ from itertools import pairwise
 import numpy as np
 
 from terrain.effects import OTHER_LOGGER, PlantPart, checked_effects, in_plant
-from terrain.errors import ConfigError
+from terrain.errors import ConfigError, DataError, LogError
 from terrain.extension import apply_homes
+from terrain.kernels import filled, is_finite
 from terrain.kinematics.swerve import wheel_commands
+from terrain.logs.schema import unit_of
 from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot, SwerveRobot, as_drive
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
-from terrain.simulation.dynamic.loop import Drive, in_loop
-from terrain.simulation.dynamic.plant import Plant, make_plant, record_width
-from terrain.simulation.dynamic.profile import draw_profile
-from terrain.simulation.dynamic.states import start_state
+from terrain.simulation.dynamic.plant import (
+    TerrainProfile,
+    check_step,
+    draw_profile,
+    make_plant,
+    start_state,
+)
 from terrain.simulation.dynamic.step import advance, settle
-from terrain.simulation.dynamic.step_limit import check_step
 from terrain.simulation.scenario.scenario import Scenario
-from terrain.simulation.sensors.camera import CameraSensor
-from terrain.simulation.sensors.gnss import Gnss, GnssSensor
-from terrain.simulation.sensors.imu import ImuSensor
-from terrain.simulation.sensors.motion import BODY_RECORD, STEP_S, Motion
-from terrain.simulation.sensors.sensor import Sensor
-from terrain.simulation.sensors.steering import SteeringSensor
-from terrain.simulation.sensors.truth import truth_stream
-from terrain.simulation.sensors.wheels import WheelSensor
+from terrain.simulation.sensors import (
+    BODY_ROW,
+    STEP_S,
+    CameraSensor,
+    Gnss,
+    GnssSensor,
+    ImuSensor,
+    Motion,
+    Sensor,
+    SteeringSensor,
+    WheelSensor,
+    truth_stream,
+)
 from terrain.terramechanics.soil import Soil
 
 MIN_LABEL_S = 0.5
@@ -126,20 +141,23 @@ def simulate(
     substeps, delay_steps = _substeps(robot, scenario), _delay_steps(command_delay_s)
     rngs = _generators(seed)
     built = _built(robot, effects or {})
-    plant = _plant(built, scenario, soils, conditions or Conditions(), rngs["terrain"])
+    conditions = conditions or Conditions()
+    profile = draw_profile(built, scenario, soils, conditions, rngs["terrain"])
+    plant = make_plant(built, conditions)
+    check_step(plant, profile, built.name)
     n_steps = len(scenario.time_s) * substeps
-    state = start_state(plant, plant.backlash_rad * rngs["start"].uniform(-1.0, 1.0, 3))
-    settle(plant, state)
+    state = start_state(plant["backlash_rad"][0] * rngs["start"].uniform(-1.0, 1.0, 3))
+    settle(plant, profile, state)
     road_noise = rngs["road"].standard_normal((n_steps, 3))
-    motion = Motion(np.empty((n_steps, record_width(plant))), 0)
+    motion = Motion(np.empty(n_steps, BODY_ROW), 0)
     sensors = _sensors(motion, built, faults, gnss, rngs)
     status: dict[str, Array] = {}
     if controller is None:
         admitted, wheel_radps, steer_rad = _commands(robot, scenario)
-        advance(plant, state, wheel_radps, steer_rad, substeps, road_noise, motion.record)
+        advance(plant, profile, state, wheel_radps, steer_rad, substeps, road_noise, motion.record)
         decided = np.hstack([admitted, wheel_radps, steer_rad])
     else:
-        drive = Drive(plant, state, road_noise, motion.record)
+        drive = Drive(plant, profile, state, road_noise, motion.record)
         decided, status = in_loop(controller, delay_steps, scenario, substeps, drive, motion, sensors)
     _check_motion(motion, robot)
     motion.grow(n_steps)
@@ -242,10 +260,10 @@ def _check_rates(robot: Robot) -> None:
 
 
 def _check_motion(motion: Motion, robot: Robot) -> None:
-    lost = [name for name in BODY_RECORD if not np.isfinite(motion.body(name)).all()]
+    finite = all(np.isfinite(motion.record[name]).all() for name in BODY_ROW.names or () if name != "wheels")
     fastest_radps = float(np.abs(motion.wheel("wheel_radps")).max())
     limit_radps = MAX_WHEEL_SPEEDS * robot.equipment.motors.speed_max_radps
-    if lost or not fastest_radps <= limit_radps:
+    if not finite or not fastest_radps <= limit_radps:
         raise ConfigError(
             f"robot {robot.name}: its motion cannot be integrated in steps of {STEP_S:g} s; a mass, an "
             "inertia, a stiffness, a gain or the load is out of scale with the rest"
@@ -265,18 +283,6 @@ def _commands(robot: Robot, scenario: Scenario) -> tuple[Array, Array, Array]:
     )
 
 
-def _plant(
-    robot: Robot,
-    scenario: Scenario,
-    soils: Mapping[str, Soil],
-    conditions: Conditions,
-    rng: np.random.Generator,
-) -> Plant:
-    plant = make_plant(robot, conditions, draw_profile(robot, scenario, soils, conditions, rng))
-    check_step(plant, robot.name)
-    return plant
-
-
 def _labels(motion: Motion, scenario: Scenario) -> tuple[Label, ...]:
     """One label a stretch in which all three wheels are on the same ground."""
     patch = motion.wheel("patch_ratio")
@@ -289,3 +295,134 @@ def _labels(motion: Motion, scenario: Scenario) -> tuple[Label, ...]:
             continue
         labels.append(Label(round(start_s, 3), round(end_s, 3), scenario.patches[int(one[begin])].terrain))
     return tuple(labels)
+
+
+class Drive:
+    """A plant that is driven on and on, by commands that come into force one after the other.
+
+    Parameters
+    ----------
+    plant, profile, state, road_noise, rows : as :func:`terrain.simulation.dynamic.step.advance` takes them,
+        for all steps
+    """
+
+    def __init__(
+        self, plant: Array, profile: TerrainProfile, state: Array, road_noise: Array, rows: Array
+    ) -> None:
+        self._plant, self._profile, self._state, self._noise, self._rows = (
+            plant,
+            profile,
+            state,
+            road_noise,
+            rows,
+        )
+        self._wheel, self._steer = np.zeros((1, 3)), np.zeros((1, 3))
+        self._due: deque[tuple[int, Array, Array]] = deque()
+        self._n_steps = 0
+
+    def command(self, step: int, wheel_radps: Array, steer_rad: Array) -> None:
+        """Let a command (3,), (3,) come into force with a step, not before those that were given before."""
+        self._due.append((step, wheel_radps, steer_rad))
+
+    def until(self, n_steps: int) -> bool:
+        """Drive until so many steps are done; false where the state is not finite: the rest of it is NaN."""
+        while self._n_steps < n_steps:
+            first = self._n_steps
+            if self._due and self._due[0][0] <= first:
+                _, self._wheel[0], self._steer[0] = self._due.popleft()
+                continue
+            end = min(n_steps, self._due[0][0]) if self._due else n_steps
+            held = (self._wheel, self._steer, end - first, self._noise[first:end], self._rows[first:end])
+            advance(self._plant, self._profile, self._state, *held)
+            self._n_steps = end
+        finite = is_finite(self._state)
+        if not finite:
+            self._rows[self._n_steps :] = filled(BODY_ROW, np.nan)[0]
+            self._n_steps = len(self._rows)
+        return finite
+
+
+def in_loop(
+    controller: Callable[[Sample], Command],
+    delay_steps: int,
+    scenario: Scenario,
+    substeps: int,
+    drive: Drive,
+    motion: Motion,
+    sensors: Mapping[str, Sensor],
+) -> tuple[Array, dict[str, Array]]:
+    """Drive a scenario by a controller, to its last row.
+
+    Parameters
+    ----------
+    controller : called once an instant of the scenario
+    delay_steps : from an instant to when its command is in force; taken as one where it is none
+    scenario, substeps : what is required, and how many steps pass from instant to instant
+    drive, motion : over the same record, nothing driven yet; a motion that cannot be integrated ends in NaN
+    sensors : of the motion, by stream
+
+    Returns
+    -------
+    decided : (n, 9) twist, wheel rates and steering angles of each command
+    status : (n,) by name
+
+    Raises
+    ------
+    DataError
+        if a command or its status is not what is required.
+    """
+    decided = np.empty((len(scenario.time_s), 9))
+    status: list[Mapping[str, float]] = []
+    for k, time_s in enumerate(scenario.time_s.tolist()):
+        step = k * substeps
+        if not drive.until(step + 1):
+            break
+        motion.grow(step + 1)
+        for sensor in sensors.values():
+            sensor.update()
+        arrived = ((name, sensor.arrived(time_s)) for name, sensor in sensors.items())
+        readings = {name: reading for name, reading in arrived if reading is not None}
+        one, two, three = motion.record["wheels"]["patch_ratio"][step].tolist()
+        terrain = scenario.patches[int(one)].terrain if one == two == three else ""
+        command = controller(Sample(time_s, scenario.twist[k], readings, terrain))
+        decided[k] = _numbers(command, time_s)
+        status.append(_status(command, status[0] if status else None, time_s))
+        drive.command(step + max(delay_steps, 1), decided[k, 3:6], decided[k, 6:])
+    drive.until(len(motion.record))
+    names = status[0] if status else ()
+    return decided, {name: np.array([row[name] for row in status]) for name in names}
+
+
+def _numbers(command: Command, time_s: float) -> Array:
+    """Return twist, wheel rates and steering angles of a command in a row (9,)."""
+    row = np.empty(9)
+    for i, name in enumerate(("twist", "wheel_radps", "steer_rad")):
+        given = getattr(command, name)
+        try:
+            values = np.asarray(given, dtype=float)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        if values.shape != (3,) or not np.isfinite(values).all():
+            shown = " ".join(repr(given).split())
+            raise DataError(
+                f"controller: {name} of its command at {time_s:g} s is {shown}, 3 finite numbers are required"
+            )
+        row[3 * i : 3 * i + 3] = values
+    return row
+
+
+def _status(command: Command, first: Mapping[str, float] | None, time_s: float) -> dict[str, float]:
+    """Return the status of a command; ``first`` is that of the first one."""
+    try:
+        status = {name: float(value) for name, value in command.status.items()}
+        if first is None:
+            for name in status:
+                unit_of(name)
+    except (AttributeError, TypeError, ValueError, LogError) as error:
+        raise DataError(f"controller: status of its command at {time_s:g} s: {error}") from None
+    if first is not None and status.keys() != first.keys():
+        raise DataError(
+            f"controller: status of its command at {time_s:g} s has {', '.join(status) or 'nothing'}, "
+            f"that of the first has {', '.join(first) or 'nothing'}: the same names are required"
+        )
+    return status

@@ -21,7 +21,7 @@ from terrain.robots import Robot
 from terrain.simulation.faults import changes as change
 from terrain.simulation.faults.changes import Change, on
 from terrain.simulation.faults.fault import STREAMS, Action, Nature, SensorFault
-from terrain.simulation.sensors.imu import TILT_NOISE_RAD
+from terrain.simulation.sensors import TILT_NOISE_RAD
 
 SPEED_STEP_MPS, MOTOR_FACTOR, PITCH_STEP_RAD, YAW_STEP_RAD = 0.3, 1.2, 0.2, 0.3
 GYRO_STEP_RADPS, ACCEL_STEP_MPS2, STEERING_STEP_RAD = 0.1, 2.0, 0.1

@@ -10,7 +10,7 @@ from numba import njit
 from terrain.kinematics.wheel_motion import WheelMotion
 from terrain.records import Array, Stream
 from terrain.robots import Robot
-from terrain.simulation.sensors.truth import wheel_channels
+from terrain.simulation.sensors import wheel_channels
 
 COMMANDS_HZ = 50.0
 """Rate of the twists, as scenarios have them."""

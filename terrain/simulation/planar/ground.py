@@ -11,7 +11,7 @@ from terrain.errors import ConfigError
 from terrain.robots import Robot
 from terrain.simulation.planar.model import Ground
 from terrain.terramechanics.soil import Soil
-from terrain.terramechanics.traction import equilibrium_slip, ground_array, wheel_ground
+from terrain.terramechanics.traction import equilibrium_slip, ground_record, wheel_ground
 
 SCRUB_SHARE = 0.4
 """Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the
@@ -60,7 +60,7 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
     slip = equilibrium_slip(soil, normal_n, 0.0, *wheel)
     if math.isnan(slip):
         raise ConfigError(f"robot {robot.name}: it gets stuck on terrain {soil.name!r}")
-    ground = ground_array(soil, *wheel)
+    ground = ground_record(soil, *wheel)[0]
     thrust_n = wheel_ground(ground, normal_n, max(slip, 1e-3), 0.0)[0]
     more_n = wheel_ground(ground, _MORE * normal_n, max(slip, 1e-3), 0.0)[0]
     thrusts = [wheel_ground(ground, normal_n, float(s), 0.0)[0] / normal_n for s in _SLIPS]

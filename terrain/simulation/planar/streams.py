@@ -27,11 +27,18 @@ from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import CAMERA_HZ, IMU_HZ, WHEELS_HZ, Noise, coloured, lag_weights
 from terrain.simulation.planar.omni import currents_of
 from terrain.simulation.planar.signals import delayed
-from terrain.simulation.sensors.camera import N_ERRORS, camera_samples
-from terrain.simulation.sensors.imu import ImuErrors, described_calibration, imu_values
-from terrain.simulation.sensors.steering import encoder_angle
-from terrain.simulation.sensors.truth import BODY_TRUTH, GYRO_BIAS, wheel_channels
-from terrain.simulation.sensors.wheels import add_rate_noise
+from terrain.simulation.sensors import (
+    BODY_TRUTH,
+    GYRO_BIAS,
+    N_ERRORS,
+    ImuErrors,
+    add_rate_noise,
+    camera_samples,
+    described_calibration,
+    encoder_angle,
+    imu_values,
+    wheel_channels,
+)
 from terrain.slip import slip_angle, slip_ratio
 
 CRAWL_MPS = 0.25

@@ -41,8 +41,8 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import TrackedRobot
-from terrain.terramechanics.resistance import compaction_resistance, plate_sinkage
 from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import compaction_resistance, plate_sinkage
 
 ELEMENTS = 16
 """Elements along a track: forces are within 1 % of those of 200."""

@@ -19,8 +19,15 @@ from terrain.errors import ConfigError
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import TrackedRobot
-from terrain.simulation.sensors.raw_fixes import COMPASS_STD_RAD, RAW_HZ, RAW_STD_M, raw_fixes
-from terrain.simulation.sensors.truth import BODY_TRUTH, GYRO_BIAS, wheel_channels
+from terrain.simulation.sensors import (
+    BODY_TRUTH,
+    COMPASS_STD_RAD,
+    GYRO_BIAS,
+    RAW_HZ,
+    RAW_STD_M,
+    raw_fixes,
+    wheel_channels,
+)
 from terrain.simulation.tracked.contact import CONTACT_SIZE, contact_array
 from terrain.simulation.tracked.given_slip import GivenSlip
 from terrain.simulation.tracked.motion import HEAP, STATE_SIZE, STEP_S, TRAVELLED, VX, VY, YAW, W, X, Y, drive

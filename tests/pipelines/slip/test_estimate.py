@@ -18,7 +18,7 @@ from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
-from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.sensors import Gnss
 
 ROBOT = load_robot("agrimaro")
 

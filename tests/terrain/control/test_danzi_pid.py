@@ -17,11 +17,9 @@ from terrain.control.slip_table import DRIVE_STATES
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
-from terrain.simulation.dynamic.plant import make_plant
-from terrain.simulation.dynamic.profile import uniform_profile
-from terrain.simulation.dynamic.states import start_state
+from terrain.simulation.dynamic.plant import make_plant, start_state, uniform_profile
 from terrain.simulation.dynamic.step import advance
-from terrain.simulation.sensors.motion import BODY_RECORD, N_BODY_RECORD, N_RECORD, WHEEL_RECORD
+from terrain.simulation.sensors import BODY_ROW
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import equilibrium_slip
 
@@ -281,11 +279,10 @@ def test_invalid_settings_are_refused_in_one_sentence(arguments, message):
 def driven(settings, target, duration_s=60.0, wheel_speed_mps=1.0, delay_rows=50):
     """Return the speed over ground (n,) each millisecond: level grass, the truth fed back 50 ms late."""
     substeps = round(DT_S * 1000)
-    plant = make_plant(ROBOT, Conditions(), uniform_profile(ROBOT, load_soil("grass")))
-    state, memory, n = start_state(plant, np.zeros(3)), new_state(), round(duration_s / DT_S)
-    record = np.zeros((n * substeps, N_RECORD))
-    speed, accel = (record[:, BODY_RECORD.index(name)] for name in ("speed_x_mps", "accel_x_mps2"))
-    rate = record[:, N_BODY_RECORD + WHEEL_RECORD.index("wheel_radps") :: len(WHEEL_RECORD)]
+    plant, profile = make_plant(ROBOT, Conditions()), uniform_profile(ROBOT, load_soil("grass"))
+    state, memory, n = start_state(np.zeros(3)), new_state(), round(duration_s / DT_S)
+    record = np.zeros(n * substeps, BODY_ROW)
+    speed, accel, rate = record["speed_x_mps"], record["accel_x_mps2"], record["wheels"]["wheel_radps"]
     targets, still = np.array([target, -0.15, target]), np.zeros((1, 3))
     for k in range(n):
         command, added = np.full(3, min(k * DT_S, 1.0) * wheel_speed_mps / ROBOT.wheel_radius_m), np.zeros(3)
@@ -296,7 +293,8 @@ def driven(settings, target, duration_s=60.0, wheel_speed_mps=1.0, delay_rows=50
                 settings, memory, command, rate[seen], v, a, abs(speed[seen]), targets, DT_S
             )
         rows = slice(k * substeps, (k + 1) * substeps)
-        advance(plant, state, (command + added)[None], still, substeps, np.zeros((substeps, 3)), record[rows])
+        sent, noise = (command + added)[None], np.zeros((substeps, 3))
+        advance(plant, profile, state, sent, still, substeps, noise, record[rows])
     return speed
 
 

@@ -11,11 +11,9 @@ from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
-from terrain.simulation.dynamic.plant import make_plant
-from terrain.simulation.dynamic.profile import uniform_profile
-from terrain.simulation.dynamic.states import start_state
+from terrain.simulation.dynamic.plant import make_plant, start_state, uniform_profile
 from terrain.simulation.dynamic.step import advance
-from terrain.simulation.sensors.motion import BODY_RECORD, N_BODY_RECORD, N_RECORD, WHEEL_RECORD
+from terrain.simulation.sensors import BODY_ROW
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import equilibrium_slip, net_pull
 
@@ -100,8 +98,8 @@ def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, form,
 
 def on_grass(settings, target, wheel_speed_mps, n_delayed, duration_s=14.0):
     """Slip at each sample; from 3 s on under control, at 5 s a kick. Truth behind the encoders' low-pass."""
-    plant = make_plant(ROBOT, Conditions(), uniform_profile(ROBOT, load_soil("grass")))
-    state, memory, record = start_state(plant, np.zeros(3)), new_state(), np.zeros((20, N_RECORD))
+    plant, profile = make_plant(ROBOT, Conditions()), uniform_profile(ROBOT, load_soil("grass"))
+    state, memory, record = start_state(np.zeros(3)), new_state(), np.zeros(20, BODY_ROW)
     queue, found = [np.zeros(3)] * n_delayed, []
     rate, speed, share = np.zeros(3), 0.0, 0.001 / ROBOT.sensors.encoder_time_constant_s
     for k in range(round(duration_s / DT_S)):
@@ -120,11 +118,11 @@ def on_grass(settings, target, wheel_speed_mps, n_delayed, duration_s=14.0):
             )
         queue.append(added + (0.2 * command if 250 <= k < 255 else 0.0))
         sent = (command + queue.pop(0))[None]
-        advance(plant, state, sent, np.zeros((1, 3)), 20, np.zeros((20, 3)), record)
+        advance(plant, profile, state, sent, np.zeros((1, 3)), 20, np.zeros((20, 3)), record)
         for row in record:
-            rate = rate + share * (row[N_BODY_RECORD :: len(WHEEL_RECORD)] - rate)
-            speed += share * (row[BODY_RECORD.index("speed_x_mps")] - speed)
-        found.append(record[-1, N_BODY_RECORD + WHEEL_RECORD.index("slip_ratio")])
+            rate = rate + share * (row["wheels"]["wheel_radps"] - rate)
+            speed += share * (row["speed_x_mps"] - speed)
+        found.append(record["wheels"]["slip_ratio"][-1, 0])
     return np.array(found)
 
 

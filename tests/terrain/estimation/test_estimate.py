@@ -13,7 +13,7 @@ from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
-from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.sensors import Gnss
 
 ROBOT = load_robot("agrimaro")
 STEADY_CAMERA = Faults(by_chance=False)

@@ -12,7 +12,7 @@ from terrain.estimation.summary import summarize
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import make_scenario
-from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import load_soil
 
 ROBOT = load_robot("agrimaro")

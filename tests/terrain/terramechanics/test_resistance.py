@@ -7,16 +7,15 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 from scipy.special import beta
 
-from terrain.terramechanics.resistance import (
+from terrain.terramechanics.soil import load_soil
+from terrain.terramechanics.traction import (
     bekker_pressure,
     compaction_resistance,
     contact_length,
-    grade_resistance,
     rigid_wheel_sinkage,
     rolling_resistance,
     slip_sinkage_factor,
 )
-from terrain.terramechanics.soil import load_soil
 
 RADIUS_M, WIDTH_M = 0.2, 0.1
 
@@ -96,9 +95,6 @@ def test_the_arc_takes_over_from_the_tyre_and_ends_at_the_axle():
     assert lengths[-1] == pytest.approx(RADIUS_M * math.pi / 2)
 
 
-def test_grade_is_odd_and_rolling_needs_a_load():
-    assert (
-        grade_resistance(900.0, 0.2) == -grade_resistance(900.0, -0.2) == pytest.approx(900 * math.sin(0.2))
-    )
+def test_rolling_resistance_needs_a_load():
     assert rolling_resistance(300.0, 0.05) == 15.0
     assert rolling_resistance(-300.0, 0.05) == 0.0

@@ -20,7 +20,7 @@ from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.contact import shear_slip
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario.make import make_scenario
-from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import load_soil
 
 ROBOT = load_robot("agrimaro")

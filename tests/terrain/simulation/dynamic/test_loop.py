@@ -13,15 +13,11 @@ from terrain.logs.write import write_run
 from terrain.records import Command
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
-from terrain.simulation.dynamic.loop import Drive
-from terrain.simulation.dynamic.plant import make_plant
-from terrain.simulation.dynamic.profile import uniform_profile
-from terrain.simulation.dynamic.simulate import COMMAND_CHANNELS, simulate
-from terrain.simulation.dynamic.states import start_state
+from terrain.simulation.dynamic.plant import make_plant, start_state, uniform_profile
+from terrain.simulation.dynamic.simulate import COMMAND_CHANNELS, Drive, simulate
 from terrain.simulation.dynamic.step import advance, settle
 from terrain.simulation.scenario.make import make_scenario
-from terrain.simulation.sensors.gnss import Gnss
-from terrain.simulation.sensors.motion import N_RECORD
+from terrain.simulation.sensors import BODY_ROW, Gnss
 from terrain.terramechanics.soil import load_soil, soil_names
 
 ROBOT = load_robot("agrimaro")
@@ -144,22 +140,22 @@ def test_pieces_between_commands_are_the_drive_in_which_each_step_has_its_own(de
     conditions = Conditions(
         payload_kg=10.0, payload_m=(0.1, 0.0), grade_ratio=(0.03, 0.02), leg_backlash_rad=0.02
     )
-    plant = make_plant(ROBOT, conditions, uniform_profile(ROBOT, soil, roughness_m3=1e-4))
+    plant, profile = make_plant(ROBOT, conditions), uniform_profile(ROBOT, soil, roughness_m3=1e-4)
     n, substeps = 60, 20
     wheel, steer = 4 * rng.random((n, 3)), 0.3 * rng.standard_normal((n, 3))
     noise = rng.standard_normal((n * substeps, 3))
-    start = start_state(plant, np.zeros(3))
-    settle(plant, start)
+    start = start_state(np.zeros(3))
+    settle(plant, profile, start)
     one, other = start.copy(), start.copy()
-    pieces, whole = np.empty((n * substeps, N_RECORD)), np.empty((n * substeps, N_RECORD))
-    drive = Drive(plant, one, noise, pieces)
+    pieces, whole = np.empty(n * substeps, BODY_ROW), np.empty(n * substeps, BODY_ROW)
+    drive = Drive(plant, profile, one, noise, pieces)
     for k in range(n):
         assert drive.until(k * substeps + 1)
         drive.command(k * substeps + delay, wheel[k], steer[k])
     assert drive.until(n * substeps)
     tick = (np.arange(n * substeps) - delay) // substeps
     held_wheel, held_steer = (np.where(tick[:, None] >= 0, rows[tick], 0.0) for rows in (wheel, steer))
-    advance(plant, other, held_wheel, held_steer, 1, noise, whole)
+    advance(plant, profile, other, held_wheel, held_steer, 1, noise, whole)
     assert one.tobytes() == other.tobytes()
     assert pieces.tobytes() == whole.tobytes()
 

@@ -13,7 +13,7 @@ from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.dynamic.simulate import COMMAND_CHANNELS, simulate
 from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.scenario.scenario import Scenario
-from terrain.simulation.sensors.gnss import Gnss
+from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import Scatter, load_soil, soil_names
 
 ROBOT = load_robot("agrimaro")
@@ -242,9 +242,9 @@ def test_a_ground_that_is_crossed_in_a_moment_gets_no_label():
 def test_terrain_varies_along_the_path_as_soil_and_conditions_state(monkeypatch):
     plants = []
 
-    def noted(plant, state, wheel, steer, substeps, noise, record):
-        plants.append(plant)
-        record[:] = 0.0
+    def noted(plant, profile, state, wheel, steer, substeps, noise, rows):
+        plants.append(profile)
+        rows[:] = np.zeros(1, rows.dtype)
 
     monkeypatch.setattr("terrain.simulation.dynamic.simulate.advance", noted)
     rough = Scatter("friction_angle_rad", 0.0, 0.3), Scatter("rolling_resistance_ratio", 0.0, 0.5)
@@ -257,7 +257,7 @@ def test_terrain_varies_along_the_path_as_soil_and_conditions_state(monkeypatch)
     simulate(ROBOT, drive, soils, 0, conditions=Conditions(roughness_factor=3.0, field_length_m=1.0))
     (plant,) = plants
     assert plant.field.shape[2] * 0.1 > 0.2 * 10.0 * time_s[-1]  # as far as it can come
-    np.testing.assert_allclose(plant.roughness_m3, [12e-6, 3 * soils["rough"].roughness_m3])
+    np.testing.assert_allclose(plant.patches["roughness_m3"], [12e-6, 3 * soils["rough"].roughness_m3])
     assert (plant.field[:, :, :1000] == 1.0).all()
     field = plant.field[:, :, 1000:]
     n_apart = field.shape[2] * 0.1 / (2 * 1.0)

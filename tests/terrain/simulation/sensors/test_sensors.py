@@ -12,20 +12,20 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.kinematics.camera import body_motion, odometry_stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import NO_FAULTS, Faults
-from terrain.simulation.sensors.camera import CameraSensor
-from terrain.simulation.sensors.gnss import Gnss, GnssSensor
-from terrain.simulation.sensors.imu import IMU_BANDWIDTH_HZ, TILT_NOISE_RAD, ImuSensor
-from terrain.simulation.sensors.motion import (
-    BODY_RECORD,
-    N_BODY_RECORD,
-    N_RECORD,
+from terrain.simulation.sensors import (
+    BODY_ROW,
+    IMU_BANDWIDTH_HZ,
     STEP_S,
-    WHEEL_RECORD,
+    TILT_NOISE_RAD,
+    CameraSensor,
+    Gnss,
+    GnssSensor,
+    ImuSensor,
     Motion,
+    SteeringSensor,
+    WheelSensor,
+    truth_stream,
 )
-from terrain.simulation.sensors.steering import SteeringSensor
-from terrain.simulation.sensors.truth import truth_stream
-from terrain.simulation.sensors.wheels import WheelSensor
 
 ROBOT = load_robot("agrimaro")
 QUIET = Faults(by_chance=False)
@@ -48,13 +48,12 @@ SILENT_IMU, SILENT_CAMERA = silenced("sensors"), silenced("camera")
 
 def motion_of(duration_s, **columns):
     """Return a motion that is 0 but for the columns given: numbers, (n,) or, for wheels, (n, 3) arrays."""
-    record = np.zeros((round(duration_s / STEP_S), N_RECORD))
+    record = np.zeros(round(duration_s / STEP_S), BODY_ROW)
     for name, values in columns.items():
-        if name in BODY_RECORD:
-            record[:, BODY_RECORD.index(name)] = values
-        else:
-            first = N_BODY_RECORD + WHEEL_RECORD.index(name)
-            record[:, first :: len(WHEEL_RECORD)] = values
+        of = record if name in BODY_ROW.names else record["wheels"]
+        of[name] = values
+        if name == "steer_rad":
+            record["encoder_rad"] = values
     return Motion(record)
 
 
@@ -133,8 +132,9 @@ def test_every_logger_keeps_its_own_rate_and_begins_at_0():
 def random_motion(n=700):
     """A motion in which nothing stands still."""
     draw = rng(11)
-    record = 0.05 * draw.standard_normal((n, N_RECORD)).cumsum(axis=0)
-    record[:, BODY_RECORD.index("grade_x_ratio")] = 0.2 * np.sin(np.arange(n) / 50)
+    numbers = 0.05 * draw.standard_normal((n, BODY_ROW.itemsize // 8)).cumsum(axis=0)
+    record = numbers.view(BODY_ROW)[:, 0]
+    record["grade_x_ratio"] = 0.2 * np.sin(np.arange(n) / 50)
     return record
 
 
@@ -173,7 +173,7 @@ def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
 
 def test_no_sample_depends_on_later_motion_and_each_arrives_once():
     record, later = random_motion(), random_motion()
-    later[301:] += 1.0
+    later.view(float).reshape(len(later), -1)[301:] += 1.0
     arrived = []
     for rows in (record, later):
         motion = Motion(rows, 0)
@@ -425,8 +425,8 @@ def test_body_motion_from_camera_poses_is_the_true_motion():
     # at the camera: v + w x r
     at_camera = [0.8 - 0.4 * camera.lever_y_m, 0.1 + 0.4 * camera.lever_x_m]
     np.testing.assert_allclose(back.speed_mps, [at_camera] * len(rows), atol=1e-9)
-    np.testing.assert_allclose(back.yaw_rad, motion.body("yaw_rad")[rows], atol=1e-9)
-    position = np.column_stack([motion.body("position_x_m"), motion.body("position_y_m")])[rows]
+    np.testing.assert_allclose(back.yaw_rad, motion.record["yaw_rad"][rows], atol=1e-9)
+    position = np.column_stack([motion.record["position_x_m"], motion.record["position_y_m"]])[rows]
     np.testing.assert_allclose(back.position_m, position, atol=1e-9)
 
 
@@ -437,11 +437,13 @@ def test_the_camera_without_noise_gives_the_ideal_odometry_stream():
     _, rows = motion.at(camera.rate_hz, camera.latency_s)
     seen = odometry_stream(
         found.time_s,
-        motion.record[rows, :2],
-        np.column_stack([motion.tilt_rad[rows], motion.body("yaw_rad")[rows]]),
-        np.column_stack([motion.record[rows, 3:5], motion.body("yaw_rate_radps")[rows]]),
+        np.column_stack([motion.record[name][rows] for name in ("position_x_m", "position_y_m")]),
+        np.column_stack([motion.tilt_rad[rows], motion.record["yaw_rad"][rows]]),
+        np.column_stack(
+            [motion.record[name][rows] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")]
+        ),
         camera,
-        yaw_0=motion.body("yaw_rad")[0],
+        yaw_0=motion.record["yaw_rad"][0],
     )
     assert found.channels == seen.channels
     np.testing.assert_allclose(found.values, seen.values, rtol=0, atol=1e-12)
@@ -510,8 +512,8 @@ def test_gnss_reports_delayed_positions_with_their_accuracy():
     std = np.concatenate([stream.channel("std_position_m") for stream in seen])
     np.testing.assert_array_equal(std, np.where(fixed, 0.02, 0.5))
     then = np.maximum(np.round((seen[0].time_s - 0.1) / STEP_S).astype(int), 0)
-    position = np.column_stack([motion.body("position_x_m"), motion.body("position_y_m")])[then]
-    yaw = motion.body("yaw_rad")[then]
+    position = np.column_stack([motion.record["position_x_m"], motion.record["position_y_m"]])[then]
+    yaw = motion.record["yaw_rad"][then]
     velocity = np.column_stack([0.8 * np.cos(yaw) - 0.1 * np.sin(yaw), 0.8 * np.sin(yaw) + 0.1 * np.cos(yaw)])
     errors = np.vstack([columns_of(stream, "position_{}_m", "xy") - position for stream in seen])
     assert_std(errors[fixed], 0.02, 0.0)

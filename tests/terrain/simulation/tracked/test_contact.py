@@ -20,9 +20,8 @@ from terrain.simulation.tracked.contact import (
 )
 from terrain.simulation.tracked.motion import STATE_SIZE, VX, VY, W, _residual, drive, twist_on_soil
 from terrain.simulation.tracked.slope import tilt_at
-from terrain.terramechanics.resistance import compaction_resistance, plate_sinkage
 from terrain.terramechanics.soil import load_soil
-from terrain.terramechanics.traction import mobilised_ratio
+from terrain.terramechanics.traction import compaction_resistance, mobilised_ratio, plate_sinkage
 
 PATAKO, SAND = load_robot("patako"), load_soil("dry_sand")
 FIRM = replace(SAND, rolling_resistance_ratio=0.0, kc_npmn1=math.nan, kphi_npmn2=math.nan)

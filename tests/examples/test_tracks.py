@@ -1,6 +1,8 @@
 """Forces on a tracked robot on a grade: integrals, small slip, reach, and the simulated robot."""
 
 import math
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +13,18 @@ from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.simulation.tracked.run import QUIET, simulate_tracked
 from terrain.simulation.tracked.slope import Slope
-from terrain.terramechanics.resistance import bekker_pressure
 from terrain.terramechanics.soil import load_soil
-from terrain.terramechanics.track import straight_slip_line, track_balance
+from terrain.terramechanics.traction import bekker_pressure, janosi_force, mobilised_ratio
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
+
+from tracks import (
+    grade_resistance,
+    janosi_slip,
+    shear_of_ratio,
+    straight_slip_line,
+    track_balance,
+)
 
 ROBOT = load_robot("patako")
 SAND = load_soil("toyoura_sand")
@@ -64,3 +75,23 @@ def test_it_is_the_slip_of_the_simulated_robot():
         slip = 1 - run.streams["truth"].channel("speed_x_mps")[-1] / 0.05
         # the simulated pressure moves to the rear on a grade, where the soil has been sheared further
         assert slip == pytest.approx(track_balance(ROBOT, SAND, grade).slip_ratio, rel=0.2, abs=0.002)
+
+
+def test_shear_of_ratio_inverts_the_mobilised_ratio():
+    """To rounding: the ratio near 1 holds x to eps / (1 - f), which is what x itself allows."""
+    shear = np.concatenate([[0.0], np.logspace(-12, 3, 601)])
+    found = shear_of_ratio([mobilised_ratio(x) for x in shear])
+    np.testing.assert_allclose(found, shear, rtol=2e-13)
+    assert np.isnan(shear_of_ratio([-0.1, 1.0, 1.5, np.nan])).all()
+
+
+def test_slip_of_a_force_inverts_the_force():
+    slips = np.array([-1.0, -0.3, -1e-9, 0.0, 1e-9, 0.05, 0.3, 1.0])
+    forces = [janosi_force(slip, 2000.0, 1.2, 0.02) for slip in slips]
+    np.testing.assert_allclose(janosi_slip(forces, 2000.0, 1.2, 0.02), slips, rtol=1e-12)
+    assert np.isnan(janosi_slip([2000.0, -2500.0], 2000.0, 1.2, 0.02)).all()
+
+
+def test_the_pull_of_gravity_is_odd_in_the_grade():
+    uphill = grade_resistance(900.0, 0.2)
+    assert uphill == -grade_resistance(900.0, -0.2) == pytest.approx(900 * math.sin(0.2))

@@ -15,21 +15,24 @@ the roll; (17) and (19) print ``1 - exp(-x) / x``.  Rolling resistance of the tr
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 from scipy.optimize import brentq
+from scipy.special import lambertw
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
+from terrain.records import Array
 from terrain.robots import TrackedRobot
-from terrain.terramechanics.resistance import (
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import (
     compaction_resistance,
-    grade_resistance,
+    friction_limit,
+    mobilised_ratio,
     plate_sinkage,
     rolling_resistance,
 )
-from terrain.terramechanics.soil import Soil
-from terrain.terramechanics.traction import friction_limit, mobilised_ratio
 
 LARGEST_SLIP = 1.0
 
@@ -51,6 +54,65 @@ class TrackBalance(NamedTuple):
     grade_n: float
     limit_n: float
     slip_ratio: float
+
+
+def shear_of_ratio(ratio: Any) -> Array:
+    """Return the shearing ``x = s l / K`` (...) of a share of the limit; inverts ``mobilised_ratio``.
+
+    ``f = 1 - (1 - exp(-x)) / x`` is ``x = g + W(-g exp(-g))`` with ``g = 1 / (1 - f)`` and the branch W_0 of
+    Lambert's function.  Near f = 0 that is at the branch point, where half of the digits are lost: there a
+    series is taken, and a step of Newton's method follows everywhere.
+
+    Parameters
+    ----------
+    ratio : shares of the limit; NaN comes out for negative ones, and at or beyond the limit
+
+    Examples
+    --------
+    >>> shear_of_ratio([0.0, 0.367879441171, 0.99, 1.0]).round(6)
+    array([  0.,   1., 100.,  nan])
+    """
+    f = np.asarray(ratio, float)
+    f = np.where((f >= 0.0) & (f < 1.0), f, np.nan)
+    g = 1.0 / (1.0 - f)
+    closed = g + lambertw(-g * np.exp(-g)).real
+    x = np.where(f < 0.01, f * (2.0 + f * (4.0 / 3.0 + f * 10.0 / 9.0)), closed)
+    for _ in range(2):
+        shares = np.vectorize(mobilised_ratio, otypes=[float])(np.nan_to_num(x))
+        slope = np.where(x > 1e-4, (np.exp(-x) - (1.0 - shares)) / -np.maximum(x, 1e-4), 0.5 - x / 3.0)
+        x = np.where(x < 30.0, x - (shares - f) / slope, x)
+    return np.asarray(x)
+
+
+def janosi_slip(force_n: Any, limit_n: float, contact_length_m: float, shear_modulus_m: float) -> Array:
+    """Return the slip (...) that a force takes on ground that shears, with its sign: (7) of Tazzari inverted.
+
+    Parameters
+    ----------
+    force_n : any; NaN comes out at or beyond the limit
+    limit_n, contact_length_m, shear_modulus_m : as for :func:`~terrain.terramechanics.traction.janosi_force`
+
+    Examples
+    --------
+    >>> janosi_slip([42.1565, -42.1565, 170.0], 170.0, 0.12, 0.02).round(4)
+    array([ 0.1, -0.1,  nan])
+    """
+    force = np.asarray(force_n, float)
+    slip = shear_of_ratio(np.abs(force) / limit_n) * (shear_modulus_m / contact_length_m)
+    return np.asarray(np.copysign(slip, force))
+
+
+def grade_resistance(weight_n: float, grade_rad: float) -> float:
+    """Return the part of the weight in N that pulls back; uphill positive, ``grade = -pitch`` in body frames.
+
+    Corrected: Yamauchi (10) prints ``W cos(roll) sin(pitch)``.
+
+    Examples
+    --------
+    >>> round(grade_resistance(900.0, 0.1), 1), round(grade_resistance(900.0, -0.1), 1)
+    (89.9, -89.9)
+    """
+    return weight_n * math.sin(grade_rad)
 
 
 def _check(soil: Soil) -> None:

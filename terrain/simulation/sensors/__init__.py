@@ -1,1 +1,0 @@
-"""Sensors of simulated robots: errors, low-pass, latency, quantisation and loss."""
