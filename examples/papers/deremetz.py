@@ -11,9 +11,9 @@ import numpy as np
 from claims import Finding, Numbers, Trial
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
-from terrain.control.car_evaluation import FollowedDrive, followed_drive
 from terrain.control.car_following import CarFollower, SlipSource
 from terrain.control.car_scenarios import GRIP_RATIO, STOP, Course, slope_course, stop_course
+from terrain.control.path_drive import FollowedDrive, followed_drive
 from terrain.control.paths import X, Y
 from terrain.estimation.observers.family import Observer
 from terrain.estimation.observers.sideslip_dynamic import DynamicSettings, sideslip_dynamic_observer

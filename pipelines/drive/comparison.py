@@ -21,7 +21,6 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Pairs, Part, Report, Table, Text, sections
 from pipelines.report.versions import versions
 from pipelines.slip.table import law_marks
-from terrain.control.comparison import Difference, MeanInterval
 from terrain.control.controllers import (
     TRACK,
     Controller,
@@ -33,7 +32,9 @@ from terrain.control.controllers import (
 from terrain.control.drive_comparison import (
     ABSOLUTE,
     Comparison,
+    Difference,
     Drive,
+    MeanInterval,
     Metrics,
     add_energies,
     evaluated,
@@ -41,7 +42,7 @@ from terrain.control.drive_comparison import (
     steepest_grade,
 )
 from terrain.control.drive_curves import DriveCurves
-from terrain.control.drive_evaluation import metric_label
+from terrain.control.drive_metrics import metric_label
 from terrain.control.situations import COURSE, SITUATIONS, SLOPE, Situation, SituationOptions, make_situation
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.records import RunLog

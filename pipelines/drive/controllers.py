@@ -11,7 +11,7 @@ from pipelines.report.results import Progress, silent
 from terrain.control.controllers import Controller, Source
 from terrain.control.situations import Situation, simulate_situation
 from terrain.control.slip_table import SlipTable
-from terrain.control.terrain_source import KnownTerrain, TerrainSource
+from terrain.control.switching import KnownTerrain, TerrainSource
 from terrain.errors import ConfigError
 from terrain.records import RunLog
 from terrain.robots import Robot

@@ -24,24 +24,29 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Pairs, Report, Table, sections
 from pipelines.report.versions import versions
 from terrain.control.fault_drives import (
+    BARS,
+    LIMITS,
+    STOP,
+    BarCount,
     CleanDrive,
     FaultCase,
     FaultLoop,
     FaultRow,
+    Limits,
     Place,
     References,
     clean_drive,
+    count_bars,
     drawn_cases,
     drive_case,
     drive_references,
     evaluate_case,
+    make_fault_situation,
 )
-from terrain.control.fault_evaluation import BARS, LIMITS, BarCount, Limits, count_bars
-from terrain.control.fault_situations import STOP, make_fault_situation
 from terrain.control.learned_table import simulated_table
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.control.terrain_source import KnownTerrain
+from terrain.control.switching import KnownTerrain
 from terrain.errors import ConfigError
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
 from terrain.simulation.faults.catalogue import fault_catalogue, select_faults

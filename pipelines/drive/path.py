@@ -15,10 +15,10 @@ from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_counts, format_value
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Pairs, Part, Report, Section, Text
-from terrain.control.car_evaluation import FollowedDrive
 from terrain.control.car_following import SlipSource
 from terrain.control.path_drive import (
     WHEELS,
+    FollowedDrive,
     PathPlan,
     columns_of,
     drive_along,
@@ -26,8 +26,7 @@ from terrain.control.path_drive import (
     path_figures,
     tick_statuses,
 )
-from terrain.control.path_file import read_path
-from terrain.control.paths import ReferencePath, X, Y, path_warnings
+from terrain.control.paths import ReferencePath, X, Y, path_warnings, read_path
 from terrain.errors import ConfigError
 from terrain.files.atomic import atomic_write
 from terrain.robots import BicycleRobot, as_drive, load_robot

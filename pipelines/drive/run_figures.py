@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Strip
+from terrain.control.danzi_pid import DriveState
 from terrain.control.drive_curves import DriveCurves, spans
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS
-from terrain.control.power_state import DriveState
 from terrain.control.traction import TractionStatus
 
 CAPTION = (

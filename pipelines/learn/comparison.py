@@ -66,9 +66,9 @@ def side_by_side(
 
     from features.motion import window_motion
     from pipelines.learn.evaluate import evaluate_recipe
+    from terrain.classify.next_drives import held_out_support
     from terrain.classify.paired import Outcome, compare_with_first
     from terrain.classify.support import support_levels
-    from terrain.classify.support_figures import held_out_support
 
     first, _, samples = contenders[0]
     for name, _, other in contenders[1:]:

@@ -26,7 +26,7 @@ from terrain.classify.learning_curve import drawn_folds, learning_curve
 from terrain.classify.next_drives import coverage_of
 from terrain.classify.sequence_figures import sequence_figures
 from terrain.classify.slow_fast import Applicability, run_speeds
-from terrain.classify.stiffness_figures import stiffness_figures
+from terrain.classify.stiffness import stiffness_figures
 from terrain.classify.svm import GroupedSVC
 from terrain.classify.unknown_figures import left_out_folds, score_fold, unknown_figures
 from terrain.records import Array

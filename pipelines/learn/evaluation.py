@@ -14,16 +14,13 @@ from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, T
 
 if TYPE_CHECKING:
     from terrain.classify.breakaway import Breakaway
-    from terrain.classify.confidence import CoverageFigures, ReliabilityBin
-    from terrain.classify.conformal_figures import ConformalFigures
-    from terrain.classify.held_out import FoldFigures
+    from terrain.classify.held_out import ConformalFigures, FoldFigures
     from terrain.classify.learning_curve import LearningCurve
-    from terrain.classify.metrics import ClassFigures, RunFigures
-    from terrain.classify.next_drives import NextDrive, SupportRow
+    from terrain.classify.metrics import ClassFigures, CoverageFigures, ReliabilityBin, RunFigures
+    from terrain.classify.next_drives import NextDrive, PartFigures, SupportRow
     from terrain.classify.sequence_figures import DelayFigures, SequenceFigures
     from terrain.classify.slow_fast import SlowFast
-    from terrain.classify.stiffness_figures import StiffnessFigures
-    from terrain.classify.support_figures import PartFigures
+    from terrain.classify.stiffness import StiffnessFigures
     from terrain.classify.unknown_figures import LeftOutTerrain
 
 MAX_ROWS = 10

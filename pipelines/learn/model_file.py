@@ -28,7 +28,7 @@ from pipelines.live.model import ModelInfo, TerrainModel
 from terrain import __version__
 from terrain.classify.network_numbers import check_network
 from terrain.classify.network_onnx import network_onnx, numbers_of_onnx
-from terrain.classify.novelty_numbers import NoveltyNumbers, check_novelty
+from terrain.classify.novelty import NoveltyNumbers, check_novelty
 from terrain.classify.support import SupportTable, check_support
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
@@ -45,7 +45,7 @@ CARD_FILE, TRAINING_FILE = "model_card.md", "training.json"
 FILES = (MODEL_FILE, ONNX_FILE, CARD_FILE, TRAINING_FILE)
 """Files that a manifest may list; what else lies beside them is not read."""
 
-VERSION = 4
+VERSION = 5
 
 FETCH_TIMEOUT_S = 120.0
 
@@ -70,9 +70,9 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "terrain.classify.grouped_network.Trial",
     "terrain.classify.ground_response.GroundResponse",
     "terrain.classify.network_numbers.SampleColumns",
-    "terrain.classify.novelty_numbers.NoveltyNumbers",
+    "terrain.classify.novelty.NoveltyNumbers",
     "terrain.classify.own.OwnClassifier",
-    "terrain.classify.regime_process.Process",
+    "terrain.classify.ground_response.Process",
     "terrain.classify.response.GroupedResponse",
     "terrain.classify.response.ResponseChoice",
     "terrain.classify.response.ResponseColumns",

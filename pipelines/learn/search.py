@@ -23,10 +23,9 @@ from pipelines.learn.parallel import parallel
 from pipelines.learn.training_data import TrainingData
 from pipelines.report.results import Progress, as_json
 from terrain.bootstrap import percentile_interval
-from terrain.classify.confidence import run_weights
-from terrain.classify.folds import Fold
+from terrain.classify.folds import Fold, inner_splits
 from terrain.classify.held_out import Examples
-from terrain.classify.inner import inner_splits
+from terrain.classify.metrics import run_weights
 from terrain.classify.paired import Difference, Outcome, compare_outcomes
 from terrain.classify.svm import CANDIDATES, Candidate, GroupedSVC
 from terrain.errors import ConfigError, LogError

@@ -23,10 +23,10 @@ from terrain.control.switching import (
     OutputStatus,
     SwitchSettings,
     TerrainBelief,
+    TerrainSource,
     output_status,
     update,
 )
-from terrain.control.terrain_source import TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.estimation.ekf.resident import BIASES, ResidentFilter
 from terrain.estimation.live.choice import Estimate, Filter

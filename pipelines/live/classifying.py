@@ -16,8 +16,7 @@ from features.stream import WindowFeed
 from pipelines.live.model import ModelInfo, TerrainModel, assess
 from pipelines.live.windows import feed_of
 from terrain.classify.terrain_filter import LiveTerrainFilter
-from terrain.control.switching import UNKNOWN
-from terrain.control.terrain_source import TerrainEstimate, TerrainSource
+from terrain.control.switching import UNKNOWN, TerrainEstimate, TerrainSource
 from terrain.errors import DataError
 from terrain.estimation.live.choice import Estimate
 from terrain.estimation.live.clocks import last_stamp_s

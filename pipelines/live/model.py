@@ -1,7 +1,7 @@
 """A trained model, and what it says of windows.
 
 A window is *unknown* where it is less like all learned terrains than nearly all known windows are
-(:mod:`terrain.classify.novelty_numbers`), and *unsupported* where few training runs drove the predicted
+(:mod:`terrain.classify.novelty`), and *unsupported* where few training runs drove the predicted
 terrain like this (:mod:`terrain.classify.support`).  Of windows of known terrains,
 5 % are unknown by definition.
 """
@@ -18,7 +18,7 @@ from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.report.results import described
 from terrain.classify.conformal import conformal_sets
-from terrain.classify.novelty_numbers import NoveltyNumbers, novelty_scores
+from terrain.classify.novelty import NoveltyNumbers, novelty_scores
 from terrain.classify.support import SupportTable, support_of
 from terrain.classify.terrain_filter import TerrainFilter
 from terrain.records import Array, Windows

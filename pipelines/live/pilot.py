@@ -22,8 +22,7 @@ from pipelines.live.state import LiveState
 from terrain.control.pilot_settings import DEFAULT_SETTINGS, OPEN_LOOP, PilotSettings, check_pilot
 from terrain.control.robot_control import RobotControl
 from terrain.control.slip_table import SlipTable, load_slip_table
-from terrain.control.switching import OutputStatus
-from terrain.control.terrain_source import TerrainSource
+from terrain.control.switching import OutputStatus, TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.control.wheel_controllers import PERIOD_S
 from terrain.estimation.live.clocks import Clocks, finite_twist

@@ -14,8 +14,7 @@ from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.shown import named
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of
-from terrain.control.measured_table import learn_surfaces
-from terrain.control.transfer import MIN_RUNS, Transfer
+from terrain.control.learned_table import MIN_RUNS, Transfer, learn_surfaces
 from terrain.errors import DataError
 from terrain.logs.digest import data_digest
 from terrain.measured_slip.measure import measure_steady

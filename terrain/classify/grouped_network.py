@@ -19,7 +19,7 @@ from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from terrain.classify.augment import Augmentation, mirrors_of
-from terrain.classify.inner import inner_splits
+from terrain.classify.folds import inner_splits
 from terrain.classify.network import (
     Task,
     fit_member,

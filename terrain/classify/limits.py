@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.classify.conformal import conformal_threshold, held_out_scores
-from terrain.classify.novelty import NoveltyScore
-from terrain.classify.novelty_numbers import NoveltyNumbers
+from terrain.classify.novelty import NoveltyNumbers, NoveltyScore
 from terrain.classify.support import SupportTable, learn_support
 from terrain.errors import DataError
 from terrain.records import Array

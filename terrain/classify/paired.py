@@ -15,8 +15,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from terrain.bootstrap import percentile_interval, stratified_counts
-from terrain.classify.confidence import Interval, confidence_auc
 from terrain.classify.held_out import HeldOut
+from terrain.classify.metrics import Interval, confidence_auc
 from terrain.classify.support import SupportLevel
 from terrain.errors import DataError
 from terrain.records import Array

@@ -25,8 +25,7 @@ from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from terrain.classify.ground_response import fit_ground
-from terrain.classify.regime_process import regimes
+from terrain.classify.ground_response import fit_ground, regimes
 from terrain.errors import DataError
 from terrain.records import Array
 

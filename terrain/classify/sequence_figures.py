@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
-from terrain.classify.confidence import runs_of_classes
-from terrain.classify.metrics import TIME_TOLERANCE_S
+from terrain.classify.metrics import TIME_TOLERANCE_S, runs_of_classes
 from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
 from terrain.records import Array, Label
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrain.control.danzi_pid import DriveState
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS, low_passed_slip
-from terrain.control.power_state import DriveState
 from terrain.control.slip_table import SlipTable
 from terrain.kinematics.true_slip import true_slip
 from terrain.records import Array, RunLog

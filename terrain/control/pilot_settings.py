@@ -6,13 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from terrain.control.path_tracking import SETTINGS as TRACKING
+from terrain.control.path_tracking import TrackSettings
 from terrain.control.pid import Gains
 from terrain.control.slip_table import SlipTable
 from terrain.control.stability import check_stable
 from terrain.control.switching import SWITCHING, SwitchSettings, check_switching
-from terrain.control.tracking_settings import SETTINGS as TRACKING
-from terrain.control.tracking_settings import TrackSettings
-from terrain.control.traction_settings import SETTINGS, TractionSettings
+from terrain.control.traction import SETTINGS, TractionSettings
 from terrain.control.wheel_controllers import (
     RampController,
     ThesisController,
@@ -77,7 +77,7 @@ class PilotStatus(NamedTuple):
     balance_ratio : slip of steady motion
     slip_ratio, slip_std_ratio : largest slip of a wheel, and largest standard deviation
     stale_s : time since the speed over ground was measured last
-    drive_state_code : :class:`terrain.control.power_state.DriveState`
+    drive_state_code : :class:`terrain.control.danzi_pid.DriveState`
     driven_mps, desired_mps : commanded and desired speed of the fastest wheel
     heading_error_rad, cross_track_m : of path tracking
     track_status_code : :class:`terrain.control.path_tracking.TrackStatus`

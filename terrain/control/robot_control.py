@@ -20,15 +20,14 @@ from terrain.control.path_tracking import (
     PoseEstimate,
     TrackReport,
     TrackStatus,
+    check_tracking,
     initial_tracking,
     track_step,
 )
 from terrain.control.pilot_settings import PilotSettings, PilotStatus, wheel_controller
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import OutputStatus, TerrainBelief, approach, drive_on
-from terrain.control.tracking_settings import check_tracking
-from terrain.control.traction import TractionStatus
-from terrain.control.traction_settings import TractionTarget
+from terrain.control.traction import TractionStatus, TractionTarget
 from terrain.control.wheel_controllers import (
     UNOBSERVED,
     WheelObserver,

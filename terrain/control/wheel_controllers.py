@@ -13,22 +13,19 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numba import boolean, float64, int64, njit, void
 
-from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
+from terrain.control.danzi_pid import DriveState, new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
-from terrain.control.power_state import DriveState
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.control.traction import (
     MAX_STEP_S,
-    TractionStatus,
-    forget_terrain,
-    initial_state,
-    traction_step,
-)
-from terrain.control.traction_settings import (
     TractionSettings,
+    TractionStatus,
     TractionTarget,
     WheelMeasurements,
     check_settings,
+    forget_terrain,
+    initial_state,
+    traction_step,
     with_motor_driver,
 )
 from terrain.entry_point import entry_point

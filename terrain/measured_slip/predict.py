@@ -22,8 +22,7 @@ import numpy as np
 from scipy.stats import norm
 from sklearn.base import BaseEstimator, RegressorMixin
 
-from terrain.classify.ground_response import fit_ground
-from terrain.classify.regime_process import regimes
+from terrain.classify.ground_response import fit_ground, regimes
 from terrain.classify.response import GroupedResponse, ResponseColumns
 from terrain.errors import DataError
 from terrain.records import Array

@@ -13,8 +13,7 @@ from pipelines.live.pilot import LivePilot
 from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
 from terrain.control.pid import Gains
 from terrain.control.pilot_settings import PilotSettings
-from terrain.control.traction import initial_state, traction_step
-from terrain.control.traction_settings import SETTINGS, TractionTarget, WheelMeasurements
+from terrain.control.traction import SETTINGS, TractionTarget, WheelMeasurements, initial_state, traction_step
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

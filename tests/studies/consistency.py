@@ -11,7 +11,7 @@ from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
 from pipelines.report.tree import Report, Table
-from terrain.control.comparison import MeanInterval, mean_interval
+from terrain.control.drive_comparison import MeanInterval, mean_interval
 from terrain.estimation.coverage import nees_by_group, slip_coverage
 from terrain.estimation.estimate import estimate_run
 from terrain.robots import Robot, load_robot

@@ -12,15 +12,19 @@ from pipelines.live.pilot import LivePilot
 from pipelines.report.results import as_json
 from terrain.control.drive_metrics import drive_history, stopping_distance
 from terrain.control.fault_drives import (
+    BARS,
+    FAULT_SITUATIONS,
+    RATIO_ABOVE_MPS,
     FaultCase,
     Place,
     drawn_cases,
     drive_case,
     drive_references,
     evaluate_case,
+    fault_drive,
+    fault_figures,
+    make_fault_situation,
 )
-from terrain.control.fault_evaluation import BARS, RATIO_ABOVE_MPS, fault_drive, fault_figures
-from terrain.control.fault_situations import FAULT_SITUATIONS, make_fault_situation
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.situations import simulate_situation
 from terrain.control.slip_table import load_slip_table

@@ -9,16 +9,13 @@ import pytest
 
 from pipelines.drive.faults import fault_loop
 from pipelines.live.pilot import LivePilot
-from terrain.control.fault_drives import FaultCase, Place, drive_case, drive_references, evaluate_case
-from terrain.control.fault_evaluation import LIMITS
+from terrain.control.aims import braking_by_slip
+from terrain.control.fault_drives import LIMITS, FaultCase, Place, drive_case, drive_references, evaluate_case
 from terrain.control.pid import Gains
 from terrain.control.pilot_settings import CONTROLLERS, PilotSettings, PilotStatus
-from terrain.control.slick import braking_by_slip
 from terrain.control.slip_table import CurveEntry, load_slip_table
-from terrain.control.switching import OutputStatus
-from terrain.control.terrain_source import TerrainEstimate, TerrainSource
-from terrain.control.traction import TractionStatus
-from terrain.control.traction_settings import SETTINGS
+from terrain.control.switching import OutputStatus, TerrainEstimate, TerrainSource
+from terrain.control.traction import SETTINGS, TractionStatus
 from terrain.errors import ConfigError
 from terrain.estimation.live.health import SENSORS, Health
 from terrain.logs.replay import replay

@@ -19,7 +19,7 @@ from pipelines.live.state import (
 )
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import load_slip_table
-from terrain.control.terrain_source import KnownTerrain
+from terrain.control.switching import KnownTerrain
 from terrain.errors import DataError
 from terrain.logs.replay import replay
 from terrain.robots import load_robot

@@ -9,7 +9,7 @@ import pytest
 from pipelines.data.datasets import load_runs
 from pipelines.slip.estimate import estimate_runs
 from pipelines.slip.learn_slip import learn_slip_table
-from terrain.control.measured_table import FEW_RUNS, NO_PEAK
+from terrain.control.learned_table import FEW_RUNS, NO_PEAK
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.kinematics import omni

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sklearn.metrics import roc_auc_score
 
-from terrain.classify.confidence import (
+from terrain.classify.metrics import (
     CALIBRATION_BINS,
     accuracy_at_coverage,
     calibration_error,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from terrain.classify.conformal import conformal_sets, conformal_threshold
-from terrain.classify.conformal_figures import conformal_figures
+from terrain.classify.held_out import conformal_figures
 from terrain.errors import DataError
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from terrain.classify.coupling import (
+from terrain.classify.svm import (
     class_probabilities,
     fit_scale,
     pairs_of,

@@ -7,10 +7,9 @@ import pytest
 
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import FoldResult, HeldOut
-from terrain.classify.next_drives import coverage_of
+from terrain.classify.next_drives import coverage_of, held_out_support
 from terrain.classify.regimes import Motion
 from terrain.classify.support import SupportLevel
-from terrain.classify.support_figures import held_out_support
 
 RUNS = [(name, speed) for speed in (0.2, 0.6) for name in ("ice", "mud") for _ in range(5)]
 

@@ -3,9 +3,15 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from terrain.classify.inner import inner_probabilities, inner_splits
-from terrain.classify.novelty import KNOWN_KEPT, NoveltyScore
-from terrain.classify.novelty_numbers import check_novelty, largest_margin, novelty_scores, novelty_terms
+from terrain.classify.folds import inner_probabilities, inner_splits
+from terrain.classify.novelty import (
+    KNOWN_KEPT,
+    NoveltyScore,
+    check_novelty,
+    largest_margin,
+    novelty_scores,
+    novelty_terms,
+)
 from terrain.classify.svm import GroupedSVC
 from terrain.errors import DataError
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from terrain.classify.proposals import Proposal, questions
-from terrain.classify.smoothing import smoothed_classes
+from terrain.classify.proposals import Proposal, questions, smoothed_classes
 
 
 def test_doubt_is_of_what_is_improbable_unsupported_or_unknown():

@@ -4,7 +4,7 @@ from sklearn.base import clone
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from terrain.classify.regime_process import (
+from terrain.classify.ground_response import (
     SPEED_LENGTH,
     fit_process,
     left_out,

@@ -12,8 +12,8 @@ from terrain.classify.stiffness import (
     cluster_runs,
     cost_matrix,
     least_cost_class,
+    stiffness_figures,
 )
-from terrain.classify.stiffness_figures import stiffness_figures
 from terrain.errors import DataError
 
 SOFT, FIRM, HARD = StiffnessLevel

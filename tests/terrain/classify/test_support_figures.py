@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrain.classify.support_figures import HeldOutSupport, support_accuracy
+from terrain.classify.next_drives import HeldOutSupport, support_accuracy
 
 
 def drawn(seed, n=80, repeats=3):

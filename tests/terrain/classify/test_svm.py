@@ -5,9 +5,8 @@ from sklearn.base import clone
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from terrain.classify import svm
-from terrain.classify.coupling import class_probabilities
 from terrain.classify.folds import split_runs
-from terrain.classify.svm import CANDIDATES, GroupedSVC
+from terrain.classify.svm import CANDIDATES, GroupedSVC, class_probabilities
 from terrain.errors import DataError
 
 TERRAINS = np.array(["ice", "sand", "snow"])

@@ -8,14 +8,19 @@ import pytest
 
 from terrain.control.controllers import make_controller
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
-from terrain.control.path_tracking import PoseEstimate, TrackStatus, initial_tracking, track_step
+from terrain.control.path_tracking import SETTINGS as TRACKING
+from terrain.control.path_tracking import (
+    PoseEstimate,
+    TrackStatus,
+    check_tracking,
+    initial_tracking,
+    track_step,
+)
 from terrain.control.pilot_settings import OPEN_LOOP
 from terrain.control.robot_control import RobotControl
 from terrain.control.situations import SituationOptions, make_situation, simulate_situation, start_times
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import OutputStatus, TerrainBelief
-from terrain.control.tracking_settings import SETTINGS as TRACKING
-from terrain.control.tracking_settings import check_tracking
 from terrain.control.traction import TractionStatus
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.logs.replay import TWIST

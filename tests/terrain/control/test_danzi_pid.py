@@ -6,13 +6,14 @@ import pytest
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.danzi_pid import (
     FORMS,
+    DriveState,
     ThesisStatus,
     new_state,
+    power_state,
     thesis_settings,
     thesis_step,
 )
 from terrain.control.pid import Gains, PidState, pid_step
-from terrain.control.power_state import DriveState, power_state
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.errors import ConfigError
 from terrain.robots import load_robot

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from terrain.control.danzi_pid import DriveState
 from terrain.control.drive_curves import drive_curves
-from terrain.control.drive_evaluation import EnergyCurve, energy_at_equal_distance
-from terrain.control.power_state import DriveState
+from terrain.control.drive_metrics import EnergyCurve, energy_at_equal_distance
 from terrain.control.slip_table import load_slip_table
 from terrain.records import RunLog, Stream
 

@@ -6,15 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from terrain.control.fault_evaluation import (
+from terrain.control.fault_drives import (
     BARS,
+    FAULT_SITUATIONS,
     LIMITS,
     FaultDrive,
     bar_texts,
     fault_figures,
     judge,
+    make_fault_situation,
 )
-from terrain.control.fault_situations import FAULT_SITUATIONS, make_fault_situation
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.simulation.faults.fault import Nature

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from terrain.control.path_file import read_path
-from terrain.control.paths import ROLL
+from terrain.control.paths import ROLL, read_path
 from terrain.errors import TerrainError
 
 

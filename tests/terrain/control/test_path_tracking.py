@@ -6,8 +6,14 @@ import math
 import numpy as np
 import pytest
 
-from terrain.control.path_tracking import PoseEstimate, TrackStatus, initial_tracking, track_step
-from terrain.control.tracking_settings import SETTINGS, check_tracking
+from terrain.control.path_tracking import (
+    SETTINGS,
+    PoseEstimate,
+    TrackStatus,
+    check_tracking,
+    initial_tracking,
+    track_step,
+)
 from terrain.errors import ConfigError
 from terrain.estimation.live.estimator import LiveEstimator
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.slick import DECELERATION_RATIO, LOCKED_RATIO, SLICK_RATIO, braking_by_slip
+from terrain.control.aims import DECELERATION_RATIO, LOCKED_RATIO, SLICK_RATIO, braking_by_slip
 from terrain.control.slip_table import CurveEntry
 from terrain.slip_learning.laws import LAW_PARAMETERS, traction_ratio
 

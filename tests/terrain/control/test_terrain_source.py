@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from terrain.control.terrain_source import KnownTerrain, TerrainSource
+from terrain.control.switching import KnownTerrain, TerrainSource
 from terrain.records import Sample
 
 

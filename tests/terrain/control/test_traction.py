@@ -6,20 +6,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.control import traction
-from terrain.control.power_state import DriveState
+from terrain.control.danzi_pid import DriveState
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.control.traction import (
+    SETTINGS,
     STATE_SIZE,
     TractionStatus,
-    forget_terrain,
-    initial_state,
-    traction_step,
-)
-from terrain.control.traction_settings import (
-    SETTINGS,
     TractionTarget,
     WheelMeasurements,
     check_settings,
+    forget_terrain,
+    initial_state,
+    traction_step,
     with_motor_driver,
 )
 from terrain.errors import ConfigError

@@ -7,7 +7,7 @@ import pytest
 
 from pipelines.drive.controllers import DriveInputs, drive_once
 from terrain.control.controllers import make_controller
-from terrain.control.fault_situations import START, STOP, make_fault_situation
+from terrain.control.fault_drives import START, STOP, make_fault_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.live.clocks import Clocks
 from terrain.estimation.live.estimator import LiveEstimator
