@@ -84,8 +84,8 @@ class TrainingRecord(BaseModel):
 
 
 _MODULES = (
-    *("breakaway", "confidence", "conformal_figures", "held_out", "learning_curve", "metrics", "next_drives"),
-    *("sequence_figures", "slow_fast", "stiffness_figures", "support_figures", "unknown_figures"),
+    *("breakaway", "held_out", "learning_curve", "metrics", "next_drives", "sequence_figures", "slow_fast"),
+    *("stiffness", "unknown_figures"),
 )
 """Of the types of an evaluation's fields, which its own module imports for a type checker alone."""
 
