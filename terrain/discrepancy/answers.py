@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of
+from terrain.discrepancy.evidence import Evidence, partial_information
 from terrain.discrepancy.fitting import names_of
-from terrain.discrepancy.information import Information, partial_information
 from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.robot_terms import UNITS
 from terrain.discrepancy.search import Found
@@ -128,7 +128,7 @@ def ruled_out_of(
     return out
 
 
-def residuals_of(info: Information, start: Information) -> dict[str, Residual]:
+def residuals_of(info: Evidence, start: Evidence) -> dict[str, Residual]:
     """Return how far measured and simulated are apart, by channel."""
     out = {}
     for channel in measured_channels(info.rows):

@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from scipy.interpolate import CubicSpline
 
-from terrain.discrepancy.information import Information
+from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.residuals import Rows
 from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
@@ -116,7 +116,7 @@ class _Fit(NamedTuple):
     cov: Array
 
 
-def shifts_of(info: Information) -> Shift:
+def shifts_of(info: Evidence) -> Shift:
     """Return the shifts of all runs.
 
     Raises

@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.fitting import Problem
-from terrain.discrepancy.information import Information
 from terrain.discrepancy.search import Found
 from terrain.discrepancy.varying import run_scatter
 
@@ -21,7 +21,7 @@ MEAN_PER_SCATTER = math.sqrt(3.0)
 """Mean over standard deviation of what is spread evenly from none."""
 
 
-def with_conditions(problem: Problem, info: Information) -> Problem:
+def with_conditions(problem: Problem, info: Evidence) -> Problem:
     """Return the problem with the error that conditions make which differ between its runs.
 
     Parameters

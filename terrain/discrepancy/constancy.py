@@ -13,8 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from terrain.discrepancy.information import N_BLOCKS, Information
-from terrain.effects import INDEX
+from terrain.discrepancy.evidence import N_BLOCKS, Evidence
 from terrain.records import Array
 
 VARIES_RATIO = 0.5
@@ -92,7 +91,7 @@ class Constancy(NamedTuple):
 
 
 def constancy_of(
-    info: Information, names: Sequence[str], own: Sequence[str], change: Array, inflation: float
+    info: Evidence, names: Sequence[str], own: Sequence[str], change: Array, inflation: float
 ) -> Constancy:
     """Return the values of some of the fitted parameters in parts of the data.
 
@@ -106,10 +105,12 @@ def constancy_of(
     n, half = len(info.rows), len(info.rows) // 2
     by_time = np.tile(np.arange(N_BLOCKS), (n, 1))
     by_run = np.repeat((np.arange(n) >= half).astype(int)[:, None], N_BLOCKS, axis=1)
-    thirds = _fit_groups(info, names, own, by_time, inflation)
-    split = {"time": thirds}
-    if half >= MIN_HALF_RUNS:
-        split["runs"] = _fit_groups(info, names, own, by_run, inflation)
+    others = [name for name in names if name not in own]
+    where = {"time": by_time, "runs": by_run} if half >= MIN_HALF_RUNS else {"time": by_time}
+    split = {}
+    for kind, group in where.items():
+        values, cov = info.fit(own, others, group)
+        split[kind] = values, inflation * cov
     found = {kind: _difference(*fit) for kind, fit in split.items()}
     size = float(np.linalg.norm(change[[list(names).index(name) for name in own]]))
     certain = {kind: ratio for kind, (ratio, beyond) in found.items() if beyond}
@@ -124,43 +125,6 @@ def constancy_of(
     }
     ratio = found[kind][0] / size if size > 0 else math.inf
     return Constancy(groups["time"], groups.get("runs", ()), ratio, kind, bool(certain))
-
-
-def _fit_groups(
-    info: Information, names: Sequence[str], own: Sequence[str], group_of: Array, inflation: float
-) -> tuple[Array, Array]:
-    """Fit parameters in each group of the data, with all others and what varies from run to run in common.
-
-    Parameters
-    ----------
-    group_of : (runs, N_BLOCKS) the group of each third of each run
-
-    Returns
-    -------
-    values : (groups, p); NaN where a group shows nothing
-    cov : (groups, p, groups, p)
-    """
-    mine, others = info.places(own), info.places([name for name in names if name not in own])
-    n_groups, p = int(group_of.max()) + 1, len(mine)
-    q, k = info.nuisances.size, n_groups * p + len(others)
-    total, score = np.zeros((k, k)), np.zeros(k)
-    away = np.array([info.origin[INDEX[n]] - info.vector[INDEX[n]] for n in info.parameters])
-    for i, grams in enumerate(info.grams):
-        gram = np.zeros((q + k + 1, q + k + 1))
-        for b in range(N_BLOCKS):
-            columns = np.zeros((len(away) + 1, q + k + 1))
-            at = q + group_of[i, b] * p
-            columns[info.nuisances, np.arange(q)] = 1.0
-            columns[mine, np.arange(at, at + p)] = 1.0
-            columns[others, np.arange(q + n_groups * p, q + k)] = 1.0
-            columns[:, -1] = *away, 1.0
-            gram += columns.T @ grams[b] @ columns
-        free = gram[q:, q:] - gram[q:, :q] @ info.inner[i] @ gram[:q, q:]
-        total, score = total + free[:-1, :-1], score + free[:-1, -1]
-    cov = np.linalg.pinv(total, hermitian=True, rcond=1e-12)
-    shown = (np.diag(total) > 1e-9 * np.diag(total)[: n_groups * p].max())[: n_groups * p]
-    values = np.where(shown, (cov @ score)[: n_groups * p], np.nan).reshape(n_groups, p)
-    return values, inflation * cov[: n_groups * p, : n_groups * p].reshape(n_groups, p, n_groups, p)
 
 
 def _by_group(values: Array, cov: Array) -> tuple[Array, Array]:

@@ -23,9 +23,9 @@ from terrain.discrepancy.answers import (
     values_of,
 )
 from terrain.discrepancy.conditions import with_conditions
+from terrain.discrepancy.evidence import Evidence, recentre
 from terrain.discrepancy.fitting import Problem, names_of
 from terrain.discrepancy.health import clocks_of
-from terrain.discrepancy.information import Information, recentre
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.preparation import MIN_RUNS, prepare
@@ -138,7 +138,7 @@ def diagnose_signals(
 
 
 def _withdraw_wrong(
-    problem: Problem, start: Information, found: Found, withdrawn: dict[str, RuledOut]
+    problem: Problem, start: Evidence, found: Found, withdrawn: dict[str, RuledOut]
 ) -> tuple[Found, dict[str, RuledOut]]:
     """Return the causes that may be named, and those that were withdrawn, by name.
 
@@ -159,7 +159,7 @@ def _withdraw_wrong(
 
 def _withdraw(
     problem: Problem,
-    start: Information,
+    start: Evidence,
     found: Found,
     cause: Effect,
     reason: str,
@@ -186,7 +186,7 @@ def _is_beside(problem: Problem, found: Found, varying: Sequence[Varying]) -> bo
 
 def _without_varying(
     problem: Problem,
-    start: Information,
+    start: Evidence,
     found: Found,
     withdrawn: dict[str, RuledOut],
     varying: Sequence[Varying],
@@ -282,7 +282,7 @@ def _bound(parameter: str) -> float:
     return max(abs(low), high)
 
 
-def _information_after(problem: Problem, found: Found, named: Sequence[Effect]) -> Information:
+def _information_after(problem: Problem, found: Found, named: Sequence[Effect]) -> Evidence:
     """Return the information around the simulation with the named causes built in."""
     vector = problem.simulation.vector.copy()
     for name, value in zip(found.names, found.change, strict=True):

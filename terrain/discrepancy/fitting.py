@@ -8,15 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.information import (
-    Information,
+from terrain.discrepancy.evidence import (
+    Evidence,
+    Nearby,
     Statistics,
-    information_at,
+    evidence_at,
     loss_of,
+    misfit_of,
     move_point,
+    nearby,
     recentre,
 )
-from terrain.discrepancy.nearby import Nearby, misfit_of, nearby
 from terrain.discrepancy.residuals import LowPass
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import Signals
@@ -69,14 +71,14 @@ class Problem(NamedTuple):
         names: Sequence[str] | None = None,
         statistics: Statistics | None = None,
         own: Mapping[str, Array] | None = None,
-    ) -> Information:
-        """Return the information of the runs around a point; see :func:`information_at`."""
+    ) -> Evidence:
+        """Return the information of the runs around a point; see :func:`evidence_at`."""
         desired = self.parameters if names is None else names
-        return information_at(
+        return evidence_at(
             self.signals, self.simulation, vector, desired, self.low_pass, statistics, own, self.scatter
         )
 
-    def near(self, info: Information, vector: Array, names: Sequence[str]) -> Nearby:
+    def near(self, info: Evidence, vector: Array, names: Sequence[str]) -> Nearby:
         """Return the information on a few parameters at another point, with the noise of an information."""
         return nearby(info, self.signals, self.simulation, vector, names, self.low_pass)
 
@@ -87,7 +89,7 @@ class Refit(NamedTuple):
     Parameters
     ----------
     loss : how badly it fits, as minus twice a log-likelihood; see
-        :func:`~terrain.discrepancy.nearby.misfit_of`
+        :func:`~terrain.discrepancy.evidence.misfit_of`
     square : whitened square that it leaves
     change, std : (k,) of its parameters
     """
@@ -111,7 +113,7 @@ def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
 
 
 def steps_of(
-    problem: Problem, info: Information, base: Array, names: Sequence[str], n_most: int
+    problem: Problem, info: Evidence, base: Array, names: Sequence[str], n_most: int
 ) -> Iterator[Nearby]:
     """Yield the information at the points of a nonlinear fit of parameters, until it converges.
 
@@ -136,7 +138,7 @@ def steps_of(
             return
 
 
-def relinearize(problem: Problem, info: Information, base: Array, causes: Sequence[Effect]) -> Information:
+def relinearize(problem: Problem, info: Evidence, base: Array, causes: Sequence[Effect]) -> Evidence:
     """Fit, and return the information around the fitted point."""
     point = info.origin if causes else base
     for near in steps_of(problem, info, base, names_of(causes), MAX_REFITS):
@@ -144,13 +146,13 @@ def relinearize(problem: Problem, info: Information, base: Array, causes: Sequen
     return recentre(problem.at(point), base)
 
 
-def penalised_loss(info: Information, causes: Sequence[Effect]) -> float:
+def penalised_loss(info: Evidence, causes: Sequence[Effect]) -> float:
     """Return minus twice the log-likelihood of causes, with what each of their parameters has to gain."""
     names = names_of(causes)
     return loss_of(info, names) + PARAMETER_LOSS * len(names)
 
 
-def fit_again(problem: Problem, info: Information, base: Array, names: Sequence[str]) -> Refit:
+def fit_again(problem: Problem, info: Evidence, base: Array, names: Sequence[str]) -> Refit:
     """Return the best point of a nonlinear fit of parameters."""
     best: tuple[float, Nearby] | None = None
     for near in steps_of(problem, info, base, names, RIVAL_REFITS):

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
+from terrain.discrepancy.evidence import N_BLOCKS, Evidence, evidence_at
 from terrain.discrepancy.fitting import names_of
 from terrain.discrepancy.health import unfit_runs
 from terrain.discrepancy.health.runs import Excluded
-from terrain.discrepancy.information import N_BLOCKS, Information, information_at
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.signals import Signals, signals_of
@@ -136,7 +136,7 @@ def gain_of_signals(
     """Return the same for runs that are on one clock already; see :func:`gain`."""
     signals, excluded, after = fit_to_judge(extended, runs)
     low_pass = low_pass_of(signals)
-    before = information_at(signals, simulation, simulation.vector, (), low_pass, after.statistics)
+    before = evidence_at(signals, simulation, simulation.vector, (), low_pass, after.statistics)
     by_run = len(signals) >= MIN_CLUSTERS
     weights = bootstrap_counts(len(signals) * (1 if by_run else N_BLOCKS), N_BOOTSTRAP, seed)
     channels = {}
@@ -166,7 +166,7 @@ def gain_of_signals(
 
 def fit_to_judge(
     simulation: Simulation, runs: Sequence[Signals]
-) -> tuple[tuple[Signals, ...], tuple[Excluded, ...], Information]:
+) -> tuple[tuple[Signals, ...], tuple[Excluded, ...], Evidence]:
     """Return the runs that are fit to be judged on, those that are not, and the information of the first.
 
     Parameters
@@ -183,14 +183,14 @@ def fit_to_judge(
     if not signals:
         raise DataError("gain: there is no run that was not used in the diagnosis")
     low_pass, names = low_pass_of(signals), names_of(simulation.library)
-    info = information_at(signals, simulation, simulation.vector, names, low_pass)
+    info = evidence_at(signals, simulation, simulation.vector, names, low_pass)
     excluded = unfit_runs(signals, info) if len(signals) >= MIN_JUDGED else ()
     if excluded:
         gone = {run.run_id for run in excluded}
         signals = tuple(run for run in signals if run.run_id not in gone)
         if not signals:
             raise DataError(f"gain: none of {len(runs)} runs is fit to be compared ({excluded[0].reason})")
-        info = information_at(signals, simulation, simulation.vector, names, low_pass)
+        info = evidence_at(signals, simulation, simulation.vector, names, low_pass)
     return signals, tuple(excluded), info
 
 
@@ -204,7 +204,7 @@ def _squares(residuals: Sequence[Array], by_run: bool) -> Array:
     return np.array(out)
 
 
-def _costs(info: Information, by_run: bool) -> Array:
+def _costs(info: Evidence, by_run: bool) -> Array:
     """Return what each cluster (n,) adds to minus twice the log-likelihood, its own scatter integrated out.
 
     Each third of a run has a scatter of its own, since parts of a common one need not be positive.

@@ -19,11 +19,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.signal import lfilter
 
-from terrain.discrepancy.information import (
-    Information,
+from terrain.discrepancy.evidence import (
+    Evidence,
     Statistics,
     correlation,
-    information_at,
+    evidence_at,
     partial_information,
 )
 from terrain.discrepancy.noise import ORDER, Noise
@@ -113,7 +113,7 @@ def next_drive(
     simulation: Simulation,
     sets: Sequence[tuple[str, ...]],
     missed: Sequence[Limit],
-    info: Information | None = None,
+    info: Evidence | None = None,
 ) -> NextDrive | None:
     """Return the next drive, None where nothing is to be distinguished or no scenario helps.
 
@@ -133,7 +133,7 @@ def next_drive(
 
 
 def _separating_drive(
-    simulation: Simulation, sets: Sequence[tuple[str, ...]], info: Information | None
+    simulation: Simulation, sets: Sequence[tuple[str, ...]], info: Evidence | None
 ) -> NextDrive | None:
     """Return the drive that best distinguishes all sets, with more channels if none does."""
     logged = _logged(simulation.robot, info)
@@ -179,7 +179,7 @@ def _separating_drive(
 
 
 def _exciting_drive(
-    simulation: Simulation, missed: Sequence[Limit], info: Information | None
+    simulation: Simulation, missed: Sequence[Limit], info: Evidence | None
 ) -> NextDrive | None:
     """Return the drive that excites most of what the runs did not excite."""
     names = [limit.name for limit in missed]
@@ -236,7 +236,7 @@ def _index_text(index: float) -> str:
     return f"{index:.2g}" if index < EXACT_INDEX else f"over {EXACT_INDEX:g}"
 
 
-def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
+def _logged(robot: Robot, info: Evidence | None) -> tuple[str, ...]:
     """Return the channels of the runs, or those expected from the robot's description."""
     if info is not None:
         return measured_channels(info.rows)
@@ -250,7 +250,7 @@ def _logged(robot: Robot, info: Information | None) -> tuple[str, ...]:
 
 
 def _drives(
-    simulation: Simulation, names: Sequence[str], channels: Sequence[str], info: Information | None
+    simulation: Simulation, names: Sequence[str], channels: Sequence[str], info: Evidence | None
 ) -> list[_Drive]:
     """Return the information of each scenario on each grade on parameters, from channels."""
     driven, signals = [], []
@@ -265,7 +265,7 @@ def _drives(
     if not signals:
         return []
     vector = simulation.vector if info is None else info.vector
-    info_of_drives = information_at(
+    info_of_drives = evidence_at(
         signals, simulation, vector, names, low_pass_of(signals), _statistics(simulation, info)
     )
     at = info_of_drives.places(names)
@@ -329,7 +329,7 @@ def _signals(
     return Signals("", "", 1.0 / CLOCK_HZ, 0.0, wheel_speed_mps, steer_rad, grade, roll, measured)
 
 
-def _statistics(simulation: Simulation, info: Information | None) -> Statistics:
+def _statistics(simulation: Simulation, info: Evidence | None) -> Statistics:
     """Return noise and scatter of the runs, and a typical noise of channels that they do not have."""
     std = np.array([TYPICAL_STD[name] for name in CHANNELS])
     growth, filters = np.zeros((len(CHANNELS), 3)), np.zeros((len(CHANNELS), ORDER + 1))

@@ -10,7 +10,7 @@ import numpy as np
 
 from terrain.discrepancy.answers import INTERVAL_T
 from terrain.discrepancy.constancy import constancy_of
-from terrain.discrepancy.information import Information
+from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.verdict import Cause, Value
 
 
@@ -29,7 +29,7 @@ class PartValues(NamedTuple):
     parts: tuple[Part, ...]
 
 
-def part_values(info: Information, causes: Sequence[Cause]) -> tuple[PartValues, ...]:
+def part_values(info: Evidence, causes: Sequence[Cause]) -> tuple[PartValues, ...]:
     """Return the values of named causes by thirds of the time and halves of the runs.
 
     Parameters

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from terrain.discrepancy.evidence import Statistics, recentre
 from terrain.discrepancy.fitting import Problem
-from terrain.discrepancy.information import Statistics, recentre
 from terrain.discrepancy.search import Found
 from terrain.discrepancy.selection import fit_change
 from terrain.effects import INDEX

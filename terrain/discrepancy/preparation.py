@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.discrepancy.clocks import Shift, shifts_of
+from terrain.discrepancy.evidence import Evidence, move_point
 from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.health import Fault, faults_of, repaired, unfit_runs
 from terrain.discrepancy.health.runs import Excluded
-from terrain.discrepancy.information import Information, move_point
 from terrain.discrepancy.latencies import Latencies, latencies_of, starting_values
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import Signals
@@ -43,7 +43,7 @@ class Prepared(NamedTuple):
     faults: tuple[Fault, ...]
     excluded: tuple[Excluded, ...]
     seeds: Mapping[str, float]
-    aligned: Information
+    aligned: Evidence
     shift: Shift
 
 
@@ -81,7 +81,7 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
     return Prepared(problem, faults, excluded, seeds, aligned, shift)
 
 
-def _aligned(problem: Problem, latencies: Latencies) -> tuple[dict[str, float], Information, Shift]:
+def _aligned(problem: Problem, latencies: Latencies) -> tuple[dict[str, float], Evidence, Shift]:
     """Return lags to start from, the information of the runs with them built in, and their clocks there."""
     values = starting_values(latencies)
     seeds = {name: value for name, value in values.items() if name in problem.parameters}

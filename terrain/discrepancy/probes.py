@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from terrain.discrepancy.information import Information
+from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.noise import whiten
 from terrain.discrepancy.residuals import INPUTS, Rows
 from terrain.discrepancy.selection import pooled_variance, z_of, z_of_t
-from terrain.effects import CHANNELS, INDEX
+from terrain.effects import CHANNELS
 from terrain.records import Array
 
 Z_PROBE = 4.5
@@ -49,7 +49,7 @@ class ProbeResult(NamedTuple):
 
     Parameters
     ----------
-    z : as of :class:`terrain.discrepancy.selection.Evidence`
+    z : as of :class:`terrain.discrepancy.selection.WaldTest`
     gain : fall of minus twice the log-likelihood, were it built in
     alike : by selected parameter, the correlation of what the input and the parameter change in the channel
     """
@@ -107,7 +107,7 @@ def probe_inputs(rows: Rows, rate_hz: float) -> dict[str, Array]:
 
 
 def probe_residuals(
-    info: Information,
+    info: Evidence,
     names: Sequence[str],
     change: Array,
     error: Mapping[tuple[str, str], float] = MappingProxyType({}),
@@ -146,7 +146,7 @@ def probe_residuals(
     return results
 
 
-def _waves(info: Information, c: int, wheel: int, times: float) -> list[Array]:
+def _waves(info: Evidence, c: int, wheel: int, times: float) -> list[Array]:
     """Return cosine and sine (2, rows) of a multiple of a wheel's angle, whitened as channel c."""
     pairs = []
     for run, residual in zip(info.rows, info.white_residual, strict=True):
@@ -156,7 +156,7 @@ def _waves(info: Information, c: int, wheel: int, times: float) -> list[Array]:
     return pairs
 
 
-def _white(info: Information, run: Rows, c: int, columns: Array, residual: Array) -> Array:
+def _white(info: Evidence, run: Rows, c: int, columns: Array, residual: Array) -> Array:
     """Whiten columns (q, m) as channel c, 0 where its residual is not known."""
     scaled = columns / info.noise.size(run.pace_mps)[:, c]
     white = whiten(info.noise.filters[c : c + 1], np.ascontiguousarray(scaled[:, :, None]))[:, :, 0]
@@ -183,9 +183,9 @@ class _Blocks(NamedTuple):
     g: Array
 
 
-def _blocks_of(info: Information, names: Sequence[str], change: Array) -> _Blocks:
+def _blocks_of(info: Evidence, names: Sequence[str], change: Array) -> _Blocks:
     at = info.places(names)
-    change = change - np.array([info.origin[INDEX[name]] - info.vector[INDEX[name]] for name in names])
+    change = change - info.away[at]
     edges, a, g = [], [], []
     for i, run in enumerate(info.rows):
         n_blocks = max(round(float(run.time_s[-1] - run.time_s[0]) / BLOCK_S), 1)
@@ -202,7 +202,7 @@ def _blocks_of(info: Information, names: Sequence[str], change: Array) -> _Block
 
 
 def _probe_results(
-    info: Information, names: Sequence[str], blocks: _Blocks, c: int, columns: list[Array], error: Array
+    info: Evidence, names: Sequence[str], blocks: _Blocks, c: int, columns: list[Array], error: Array
 ) -> list[ProbeResult]:
     """Return the results of columns (q, m) a run, in channel c, where the simulation has an error (q,)."""
     at, q = blocks.at, columns[0].shape[0]
@@ -251,7 +251,7 @@ def _probe_results(
     return answers
 
 
-def _of_model(info: Information, at: list[int], c: int, columns: list[Array], follow: Array) -> Array:
+def _of_model(info: Evidence, at: list[int], c: int, columns: list[Array], follow: Array) -> Array:
     """Return the variance (q,) of a probe's score by the simulation's own error.
 
     Of errors in units of several parameters the largest counts: each was measured as if it were alone.
@@ -285,7 +285,7 @@ def _variance(left: Array, sizes: Array, free: float) -> tuple[float, float]:
     return pooled_variance(left, np.clip(sizes / free, 0.0, 0.9), free)
 
 
-def _wheel_turn_probe(info: Information, c: int, pairs: list[Array], placebo: float) -> ProbeResult:
+def _wheel_turn_probe(info: Evidence, c: int, pairs: list[Array], placebo: float) -> ProbeResult:
     """Return the result of a wave with a phase of its own in each run: two columns a run.
 
     ``placebo`` is the mean square of waves that no wheel makes: what they explain is no turn of a wheel.
@@ -300,7 +300,7 @@ def _wheel_turn_probe(info: Information, c: int, pairs: list[Array], placebo: fl
     return ProbeResult(z if in_most_runs else 0.0, float(each.sum()) - 2 * each.size)
 
 
-def _wave_statistics(info: Information, c: int, pairs: list[Array]) -> Array:
+def _wave_statistics(info: Evidence, c: int, pairs: list[Array]) -> Array:
     """Return what two columns explain of the residual of each run (runs,), as chi^2 with 2 degrees."""
     each = []
     for i, x in enumerate(pairs):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from terrain.discrepancy.evidence import Evidence, correlation, loss_of, partial_information
 from terrain.discrepancy.fitting import Problem, Refit, fit_again, names_of
-from terrain.discrepancy.information import Information, correlation, loss_of, partial_information
-from terrain.discrepancy.selection import evidence
+from terrain.discrepancy.selection import wald_test
 from terrain.effects import Effect
 from terrain.records import Array
 
@@ -50,7 +51,7 @@ class Rival(NamedTuple):
 
 
 def rivals_of(
-    problem: Problem, info: Information, start: Information, causes: Sequence[Effect]
+    problem: Problem, info: Evidence, start: Evidence, causes: Sequence[Effect]
 ) -> dict[str, tuple[Rival, ...]]:
     """Return by cause all effects that, refitted in its place, fit as well as it does, the best first.
 
@@ -60,12 +61,12 @@ def rivals_of(
     likelihood: a rival that leaves a larger square than the noise of the wheels can make is none.
     """
     base, judges = start.vector, (info, start)
-    runs_alone = info._replace(model_std=np.zeros_like(info.model_std))  # in what all runs have they agree
+    runs_alone = replace(info, model_std=np.zeros_like(info.model_std))  # in what all runs have they agree
     own: list[Refit] = []  # losses of the causes by both judges, where anything comes near
     rivals = {}
     for cause in causes:
         others = [other for other in causes if other is not cause]
-        inflation = evidence(runs_alone, names_of(others), cause).inflation
+        inflation = wald_test(runs_alone, names_of(others), cause).inflation
         found = []
         for effect in _near(problem, info, cause, others, inflation):
             own = own or [fit_again(problem, judge, base, names_of(causes)) for judge in judges]
@@ -81,7 +82,7 @@ def rivals_of(
 
 
 def _near(
-    problem: Problem, info: Information, cause: Effect, others: Sequence[Effect], inflation: float
+    problem: Problem, info: Evidence, cause: Effect, others: Sequence[Effect], inflation: float
 ) -> list[Effect]:
     """Return the effects that come near a cause beside the others, by linear fits."""
     causes = [*others, cause]
@@ -94,16 +95,16 @@ def _near(
         if effect not in causes
         and loss_of(info, names_of([*others, effect])) - now < most
         and _alike(info, others, cause, effect) > SHARED
-        and evidence(info, names_of(others), effect).inside
+        and wald_test(info, names_of(others), effect).inside
     ]
 
 
-def _allowed(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
+def _allowed(info: Evidence, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
     """Return by how much a rival may fit worse than a cause and still be a rival."""
     return TWIN_LOSS if _alike(info, others, cause, rival) > TWIN else RIVAL_LOSS
 
 
-def _alike(info: Information, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
+def _alike(info: Evidence, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
     """Return the correlation of what a cause and another effect change beside the others."""
     base, own, its = (info.places(names_of(effects)) for effects in (others, [cause], [rival]))
     free = partial_information(info.a.sum(axis=0), base, [*own, *its])[1]

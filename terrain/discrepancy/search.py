@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.fitting import Problem, Refit, fit_again, names_of, penalised_loss, relinearize
-from terrain.discrepancy.information import (
-    Information,
+from terrain.discrepancy.evidence import (
+    Evidence,
     move_point,
     partial_information,
     recentre,
 )
+from terrain.discrepancy.fitting import Problem, Refit, fit_again, names_of, penalised_loss, relinearize
 from terrain.discrepancy.rivals import RIVAL_LOSS, Rival, rivals_of
-from terrain.discrepancy.selection import Evidence, evidence, fit_change
+from terrain.discrepancy.selection import WaldTest, fit_change, wald_test
 from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
 
@@ -51,16 +51,16 @@ class Found(NamedTuple):
     """
 
     causes: tuple[Effect, ...]
-    info: Information
+    info: Evidence
     names: tuple[str, ...]
     change: Array
     cov: Array
     rivals: dict[str, tuple[Rival, ...]]
-    tried: dict[str, Evidence]
+    tried: dict[str, WaldTest]
     assumed_scatter: Mapping[str, float]
 
 
-def search(problem: Problem, start: Information, seeds: Mapping[str, float] | None = None) -> Found:
+def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None = None) -> Found:
     """Return the causes that explain the runs.
 
     Parameters
@@ -84,8 +84,8 @@ def search(problem: Problem, start: Information, seeds: Mapping[str, float] | No
 
 
 def _grow(
-    problem: Problem, info: Information, base: Array, causes: list[Effect]
-) -> tuple[list[Effect], Information]:
+    problem: Problem, info: Evidence, base: Array, causes: list[Effect]
+) -> tuple[list[Effect], Evidence]:
     """Add effects, refit, drop and swap, until none is significant that is not there."""
     barred: set[str] = set()  # added to the current causes, and dropped again
     seen = {_set_of(causes)}  # sets that were reached; none twice, or the search goes in circles
@@ -113,7 +113,7 @@ def _grow(
     return causes, info
 
 
-def refit(problem: Problem, start: Information, found: Found, causes: Sequence[Effect]) -> Found:
+def refit(problem: Problem, start: Evidence, found: Found, causes: Sequence[Effect]) -> Found:
     """Return some of the causes that were found, fitted without the others; no other is searched.
 
     Those that are no longer significant are dropped.
@@ -122,24 +122,24 @@ def refit(problem: Problem, start: Information, found: Found, causes: Sequence[E
     return _found(problem, info, kept)
 
 
-def _found(problem: Problem, info: Information, causes: Sequence[Effect]) -> Found:
+def _found(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> Found:
     """Return what there is to say about causes at their fit, rivals left out."""
     names = names_of(causes)
     change, cov = fit_change(info, names)
     tried = {
-        effect.name: evidence(info, [n for n in names if n not in names_of([effect])], effect)
+        effect.name: wald_test(info, [n for n in names if n not in names_of([effect])], effect)
         for effect in problem.library
     }
     return Found(tuple(causes), info, names, change, cov, {}, tried, problem.simulation.known_scatter)
 
 
-def with_rivals(problem: Problem, start: Information, found: Found) -> Found:
+def with_rivals(problem: Problem, start: Evidence, found: Found) -> Found:
     """Return the same with the effects that fit as well in the place of a cause."""
     return found._replace(rivals=rivals_of(problem, found.info, start, found.causes))
 
 
 def _next(
-    info: Information,
+    info: Evidence,
     base: Array,
     causes: Sequence[Effect],
     left: Sequence[Effect],
@@ -149,7 +149,7 @@ def _next(
 
     Where much is wrong the linear gain is inaccurate: then the best few are compared by nonlinear fits.
     """
-    found = [(evidence(info, names_of(causes), effect), effect) for effect in left]
+    found = [(wald_test(info, names_of(causes), effect), effect) for effect in left]
     candidates = [
         (float(each.gain.sum()), effect)
         for each, effect in found
@@ -166,7 +166,7 @@ def _next(
 
 
 def _is_inside_by_fit(
-    base: Array, causes: Sequence[Effect], effect: Effect, found: Evidence, fit: Callable[[Effect], Refit]
+    base: Array, causes: Sequence[Effect], effect: Effect, found: WaldTest, fit: Callable[[Effect], Refit]
 ) -> bool:
     """Return whether an effect that gains much is within its bounds by a nonlinear fit alone.
 
@@ -181,11 +181,11 @@ def _is_inside_by_fit(
 
 def _refit_significant(
     problem: Problem,
-    info: Information,
+    info: Evidence,
     base: Array,
     causes: list[Effect],
     seen: Set[frozenset[str]] = frozenset(),
-) -> tuple[list[Effect], Information]:
+) -> tuple[list[Effect], Evidence]:
     """Refit causes, and drop the weakest until all are significant beside the others.
 
     A set that was reached before is not fitted again: the information is the one given.
@@ -205,8 +205,8 @@ def _set_of(causes: Sequence[Effect]) -> frozenset[str]:
 
 
 def _swap_for_better(
-    problem: Problem, info: Information, base: Array, causes: list[Effect]
-) -> tuple[list[Effect], Information]:
+    problem: Problem, info: Evidence, base: Array, causes: list[Effect]
+) -> tuple[list[Effect], Evidence]:
     """Replace a cause by an effect that fits better, as long as there is one."""
     for _ in range(MAX_CAUSES):
         better = _better(info, causes, problem.library)
@@ -219,7 +219,7 @@ def _swap_for_better(
     return causes, info
 
 
-def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect]:
+def _pair(info: Evidence, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect]:
     """Return two effects that are significant beside each other and the causes, where neither is alone.
 
     Two of opposite sign, as an offset and a rate of a clock, hide each other.
@@ -241,32 +241,32 @@ def _pair(info: Information, causes: Sequence[Effect], library: Sequence[Effect]
             break
         pair = [left[int(i)], left[int(j)]]
         found = [
-            evidence(info, (*names_of(causes), *names_of([other])), one) for one, other in (pair, pair[::-1])
+            wald_test(info, (*names_of(causes), *names_of([other])), one) for one, other in (pair, pair[::-1])
         ]
         if all(one.significant and one.z > Z_PAIR for one in found):
             return pair
     return []
 
 
-def _weakest(info: Information, causes: Sequence[Effect]) -> int | None:
+def _weakest(info: Evidence, causes: Sequence[Effect]) -> int | None:
     """Return the least significant cause, None if all are significant beside the others."""
     z = []
     for cause in causes:
         others = names_of([other for other in causes if other is not cause])
-        found = evidence(info, others, cause)
+        found = wald_test(info, others, cause)
         z.append(np.inf if found.significant else found.z)
     weakest = int(np.argmin(z))
     return weakest if np.isfinite(z[weakest]) else None
 
 
-def _better(info: Information, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect] | None:
+def _better(info: Evidence, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect] | None:
     """Return the causes with one replaced by an effect that fits better, if there is one."""
     now = penalised_loss(info, causes)
     best: tuple[float, list[Effect]] = (now - RIVAL_LOSS, [])
     for i, cause in enumerate(causes):
         others = [other for other in causes if other is not cause]
         for effect in library:
-            if effect in causes or not evidence(info, names_of(others), effect).significant:
+            if effect in causes or not wald_test(info, names_of(others), effect).significant:
                 continue
             swapped = [*causes[:i], effect, *causes[i + 1 :]]
             loss = penalised_loss(info, swapped)

@@ -11,7 +11,7 @@ from scipy.stats import chi2, norm
 from scipy.stats import t as student
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
-from terrain.discrepancy.information import Information, partial_information
+from terrain.discrepancy.evidence import Evidence, partial_information
 from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
 
@@ -30,7 +30,7 @@ MIN_CLUSTERS = 6
 N_BOOTSTRAP = 1000
 
 
-class Evidence(NamedTuple):
+class WaldTest(NamedTuple):
     """Evidence of an effect beside those selected.
 
     Parameters
@@ -62,7 +62,7 @@ class Evidence(NamedTuple):
         return max(self.dispersion, 1.0)
 
 
-def fit_change(info: Information, names: Sequence[str]) -> tuple[Array, Array]:
+def fit_change(info: Evidence, names: Sequence[str]) -> tuple[Array, Array]:
     """Return the change (k,) of parameters that fits all runs best, and its covariance by the noise."""
     at = info.places(names)
     a = info.a[:, at][:, :, at].sum(axis=0)
@@ -70,7 +70,7 @@ def fit_change(info: Information, names: Sequence[str]) -> tuple[Array, Array]:
     return cov @ info.g[:, at].sum(axis=0), cov
 
 
-def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evidence:
+def wald_test(info: Evidence, selected: Sequence[str], effect: Effect) -> WaldTest:
     """Return the evidence of an effect beside the parameters selected."""
     own = [p.name for p in effect.parameters]
     base, new = info.places([name for name in selected if name not in own]), info.places(own)
@@ -79,7 +79,7 @@ def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evid
     total, score = a.sum(axis=0), g.sum(axis=0)
     n = len(base)
     if not np.diag(total)[n:].min() > 1e-12:
-        return Evidence(effect.name, np.zeros(len(own)), 0.0, 0.0, np.zeros(len(a)), False)
+        return WaldTest(effect.name, np.zeros(len(own)), 0.0, 0.0, np.zeros(len(a)), False)
     # direction in which the new ones change while the selected ones follow
     follow, free = partial_information(total, range(n), range(n, len(both)))
     own_score = score[n:] - follow.T @ score[:n]
@@ -93,7 +93,7 @@ def evidence(info: Information, selected: Sequence[str], effect: Effect) -> Evid
     )
     dispersion, dof = _dispersion(info, both, n, follow, free, change)
     z = z_of_t(math.sqrt(_one_degree(statistic, len(own))) / math.sqrt(dispersion), dof)
-    return Evidence(effect.name, change, z, dispersion, held_out_gain(info, base, both), inside)
+    return WaldTest(effect.name, change, z, dispersion, held_out_gain(info, base, both), inside)
 
 
 def _one_degree(statistic: float, degrees: int) -> float:
@@ -107,7 +107,7 @@ def _one_degree(statistic: float, degrees: int) -> float:
 
 
 def _dispersion(
-    info: Information, both: list[int], n: int, follow: Array, free: Array, change: Array
+    info: Evidence, both: list[int], n: int, follow: Array, free: Array, change: Array
 ) -> tuple[float, float]:
     """Return the variance of a change along itself over that from the noise, and its degrees of freedom.
 
@@ -115,10 +115,7 @@ def _dispersion(
     degrees of freedom as there are informative clusters; the noise gives 1 with :data:`TRUST_DOF`.  Both are
     weighted by their degrees of freedom.
     """
-    runs = len(info.a) >= MIN_CLUSTERS
-    a = info.a if runs else info.a_blocks.reshape(-1, *info.a.shape[1:])
-    g = info.g if runs else info.g_blocks.reshape(-1, info.g.shape[1])
-    a, g = a[:, both][:, :, both], g[:, both]
+    a, g = info.clusters(both, len(info.a) >= MIN_CLUSTERS)
     direction = np.concatenate([-follow @ change, change])
     size = float(change @ free @ change)
     if not size > 0:
@@ -169,12 +166,12 @@ def z_of(log_p: float) -> float:
     return math.sqrt(-2.0 * log_p)
 
 
-def held_out_gain(info: Information, base: list[int], both: list[int]) -> Array:
+def held_out_gain(info: Evidence, base: list[int], both: list[int]) -> Array:
     """Return the fall (runs,) of each run's loss when it is left out, of ``both`` over ``base``."""
     return _held_out_loss(info, base) - _held_out_loss(info, both)
 
 
-def _held_out_loss(info: Information, at: list[int]) -> Array:
+def _held_out_loss(info: Evidence, at: list[int]) -> Array:
     if not at:
         return np.zeros(len(info.a))
     a, g = info.a[:, at][:, :, at], info.g[:, at]

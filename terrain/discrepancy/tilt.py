@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from terrain.discrepancy.evidence import Evidence, evidence_at
 from terrain.discrepancy.fitting import names_of
-from terrain.discrepancy.information import Information, information_at
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
@@ -57,7 +57,7 @@ def _best_effective_ratio(
     losses = []
     for ratio in RATIOS:
         tried = replace(simulation, grounds={runs[0].terrain: ground._replace(effective_ratio=ratio)})
-        losses.append(_loss(information_at(runs, tried, simulation.vector, names, low_pass)))
+        losses.append(_loss(evidence_at(runs, tried, simulation.vector, names, low_pass)))
     ratio, least = best_ratio(np.array(losses))
     return ratio if losses[-1] - least > TILT_LOSS else 1.0
 
@@ -75,7 +75,7 @@ def best_ratio(losses: Array) -> tuple[float, float]:
     return round(float(bottom), 3), float(a * bottom**2 + b * bottom + c)
 
 
-def _loss(info: Information) -> float:
+def _loss(info: Evidence) -> float:
     """Return minus twice the log-likelihood of what the whole library leaves, up to a constant."""
     scale = -np.log(np.abs(info.noise.filters[:, 0]))
     total = 0.0

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrain.discrepancy.evidence import PRIOR_STD, Evidence, marginal_parts, recentre
 from terrain.discrepancy.fitting import Problem
-from terrain.discrepancy.information import N_BLOCKS, PRIOR_STD, Information, recentre
 from terrain.discrepancy.mixed_model import MixedFit, fit_mixed
 from terrain.discrepancy.rivals import RIVAL_LINEAR, RIVAL_LOSS
 from terrain.discrepancy.search import Found
@@ -93,7 +93,7 @@ class _Tried(NamedTuple):
 
 def run_scatter(found: Found, name: str) -> float:
     """Return the scatter from run to run of a parameter, noise taken off."""
-    shared = found.change - _away(found.info, found.names)
+    shared = found.change - found.info.away[found.info.places(found.names)]
     fit = MixedFit(0.0, shared, found.info.nuisance_std)
     return _values_by_run(found, name, found.names, (), fit).scatter
 
@@ -141,7 +141,7 @@ def varying_effects(problem: Problem, found: Found) -> tuple[Varying, ...]:
     )
 
 
-def _is_possible(info: Information, runs: _RunValues) -> bool:
+def _is_possible(info: Evidence, runs: _RunValues) -> bool:
     """Return whether the values of most runs are what the parameter may be."""
     low, high = BOUNDS[runs.name]
     seen = runs.weight > 0
@@ -156,7 +156,7 @@ def _clearness(found: Found, effect: Effect) -> float:
 
 
 def _at_common_fit(found: Found, effect: Effect) -> list[_RunValues]:
-    fit = MixedFit(0.0, found.change - _away(found.info, found.names), _least_std(found, ()))
+    fit = MixedFit(0.0, found.change - found.info.away[found.info.places(found.names)], _least_std(found, ()))
     return [_values_by_run(found, p.name, found.names, (), fit) for p in effect.parameters]
 
 
@@ -195,7 +195,7 @@ def _refitted(problem: Problem, found: Found, tried: _Tried) -> _Tried:
     return tried
 
 
-def _kept(info: Information, own: Sequence[str]) -> Array:
+def _kept(info: Evidence, own: Sequence[str]) -> Array:
     """Return which of the nuisances are of no effect of their own."""
     return ~np.isin(info.nuisances, info.places(own))
 
@@ -212,11 +212,6 @@ def _assumed(found: Found, name: str) -> float:
     return float(found.assumed_scatter.get(name, 0.0))
 
 
-def _away(info: Information, names: Sequence[str]) -> Array:
-    """Return where sensitivities were taken, over the point from which changes are counted."""
-    return np.array([info.origin[INDEX[name]] - info.vector[INDEX[name]] for name in names])
-
-
 def _values_by_run(
     found: Found, name: str, names: Sequence[str], own: Sequence[str], fit: MixedFit
 ) -> _RunValues:
@@ -231,25 +226,17 @@ def _values_by_run(
     varies = np.array([*info.nuisances[_kept(info, own)], *info.places(own)], dtype=int)
     beside = varies != info.places([name])[0]
     kept, q = varies[beside], int(beside.sum())
-    precision = np.diag(1.0 / fit.std[beside] ** 2)
     columns = np.zeros((len(info.parameters) + 1, q + 2))  # what varies, the parameter, and the residual
     columns[kept, np.arange(q)] = 1.0
     columns[info.places([name])[0], q] = 1.0
     columns[info.places(names), -1] = -fit.shared
     columns[-1, -1] = 1.0
-    parts = columns.T @ info.grams @ columns
-    gram = parts.sum(axis=1)
-    follow = np.linalg.solve(gram[:, :q, :q] + precision, gram[:, :q, q:])
-    prior = follow.transpose(0, 2, 1) @ precision @ follow / N_BLOCKS
-    back = follow[:, None].transpose(0, 1, 3, 2)
-    along = back @ parts[:, :, :q, q:]
-    inner = back @ parts[:, :, :q, :q] @ follow[:, None]
-    taken = parts[:, :, q:, q:] - along - along.transpose(0, 1, 3, 2) + inner + prior[:, None]
-    mean = _away(info, [name])[0] + (fit.shared[list(names).index(name)] if name in names else 0.0)
+    taken = marginal_parts(columns.T @ info.grams @ columns, np.arange(q), fit.std[beside])[:, :, q:, q:]
+    mean = info.away[info.places([name])[0]] + (fit.shared[list(names).index(name)] if name in names else 0.0)
     return _between_runs(name, taken[:, :, 0, 1], taken[:, :, 0, 0], _assumed(found, name), float(mean))
 
 
-def _clearest_channel(info: Information, name: str) -> str:
+def _clearest_channel(info: Evidence, name: str) -> str:
     place = info.places([name])[0]
     power = sum((change[place] ** 2).sum(axis=0) for change in info.white_change)
     return CHANNELS[int(np.argmax(power))]

@@ -52,7 +52,7 @@ class Cause(NamedTuple):
     gain, gain_low, gain_high : ratio of the whitened squared residual that it removes from runs left out of
         its fit, and its 95 % interval by bootstrap over runs
     channels : where it shows, the clearest first
-    z, dispersion : its evidence, see :class:`terrain.discrepancy.selection.Evidence`
+    z, dispersion : its evidence, see :class:`terrain.discrepancy.selection.WaldTest`
     caveat : what the values depend on, in words; empty where they are the same throughout
     """
 

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.discrepancy.constancy import Constancy, constancy_of
+from terrain.discrepancy.evidence import Evidence, move_point, partial_information, recentre
 from terrain.discrepancy.fitting import Problem
-from terrain.discrepancy.information import Information, move_point, partial_information, recentre
 from terrain.discrepancy.probes import ProbeResult
 from terrain.discrepancy.search import Found
 from terrain.discrepancy.selection import fit_change
-from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
+from terrain.effects import BOUNDS, CHANNELS, Effect
 from terrain.records import Array
 
 NEAR_BOUND = 0.02
@@ -170,7 +170,6 @@ def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
     every, others = info.places(found.names), info.places([n for n in found.names if n not in own])
     fits = [_fits(info, places) for places in (others, every)]
     squares = np.zeros((2, 2, len(CHANNELS)))
-    away = np.array([info.vector[INDEX[n]] - info.origin[INDEX[n]] for n in info.parameters])
     kept = ~np.isin(info.nuisances, info.places(own))
     free, precision = info.nuisances[kept], np.diag(1.0 / info.nuisance_std[kept] ** 2)
     for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
@@ -180,7 +179,7 @@ def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
         cost = precision @ (shown / np.maximum(shown.sum(axis=1, keepdims=True), 1e-30))
         for m, (places, (common, held_out)) in enumerate(zip((others, every), fits, strict=True)):
             for kind, x in enumerate((common, held_out[i])):
-                moved = away.copy()
+                moved = -info.away
                 moved[places] += x
                 left = residual - np.tensordot(moved, change, axes=1)
                 own_change = inner @ (scatter @ left.ravel())
@@ -193,7 +192,7 @@ def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
     }
 
 
-def _fits(info: Information, places: Sequence[int]) -> tuple[Array, Array]:
+def _fits(info: Evidence, places: Sequence[int]) -> tuple[Array, Array]:
     """Return the fit (k,) of parameters to all runs, and to all but each run (runs, k)."""
     a, g = info.a[:, places][:, :, places], info.g[:, places]
     if not len(places):

@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 
 from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Shift, offsets_of, shifts_of
+from terrain.discrepancy.evidence import PRIOR_STD, Evidence
 from terrain.discrepancy.health.common import (
     FOLLOWS,
     STRETCH_S,
@@ -24,7 +25,6 @@ from terrain.discrepancy.health.common import (
 )
 from terrain.discrepancy.health.response import MOTION, Response, gains_of, responses_of
 from terrain.discrepancy.health.runs import Clock, Excluded
-from terrain.discrepancy.information import PRIOR_STD, Information
 from terrain.discrepancy.latencies import Latencies
 from terrain.discrepancy.signals import Signals
 from terrain.effects import CHANNELS, CURRENT, INDEX, SPEED_X, SPEED_Y
@@ -74,7 +74,7 @@ _CURRENT = CHANNELS.index(CURRENT)
 
 def unfit_runs(
     signals: Sequence[Signals],
-    info: Information,
+    info: Evidence,
     shift: Shift | None = None,
     latencies: Latencies | None = None,
 ) -> tuple[Excluded, ...]:
@@ -104,7 +104,7 @@ def unfit_runs(
     return tuple(Excluded(signals[i].run_id, reasons[i]) for i in sorted(reasons))
 
 
-def clocks_of(info: Information, shift: Shift | None = None) -> tuple[Clock, ...]:
+def clocks_of(info: Evidence, shift: Shift | None = None) -> tuple[Clock, ...]:
     """Return how far IMU and camera are behind the wheels at the middle of each run, NaN where unknown."""
     offset_s, std_s = offsets_of(shifts_of(info) if shift is None else shift)
     built_in = info.vector[INDEX["clock_offset_s"]]
@@ -114,7 +114,7 @@ def clocks_of(info: Information, shift: Shift | None = None) -> tuple[Clock, ...
     )
 
 
-def _dead(signals: Sequence[Signals], info: Information, responses: Sequence[Response]) -> dict[int, str]:
+def _dead(signals: Sequence[Signals], info: Evidence, responses: Sequence[Response]) -> dict[int, str]:
     """Return runs with a wheel or a channel of which hardly anything is there."""
     reasons: dict[int, str] = {}
     common = common_gains(responses)
@@ -152,7 +152,7 @@ def _disagrees(response: Response, common: Array) -> bool:
     return bool((correlation[asked] < FOLLOWS).any() or (off > math.log(OFF_RATIO)).any())
 
 
-def _late(info: Information, shift: Shift) -> dict[int, str]:
+def _late(info: Evidence, shift: Shift) -> dict[int, str]:
     """Return runs with a clock of their own: all channels that measure it are off, and by the same lag."""
     offset_s = offsets_of(shift)[0] + info.vector[INDEX["clock_offset_s"]]
     reasons: dict[int, str] = {}
@@ -182,7 +182,7 @@ def _behind(offset_s: float) -> str:
     return f"{abs(offset_s):.2f} s {'behind' if offset_s >= 0 else 'ahead of'}"
 
 
-def _frozen(signals: Sequence[Signals], info: Information) -> dict[int, str]:
+def _frozen(signals: Sequence[Signals], info: Evidence) -> dict[int, str]:
     """Return runs with a channel that is constant, or clipped, while the prediction varies."""
     reasons: dict[int, str] = {}
     for i, (run, rows) in enumerate(zip(signals, info.rows, strict=True)):
@@ -211,7 +211,7 @@ def _frozen(signals: Sequence[Signals], info: Information) -> dict[int, str]:
     return reasons
 
 
-def _unlike(info: Information, among: Sequence[int]) -> dict[int, str]:
+def _unlike(info: Evidence, among: Sequence[int]) -> dict[int, str]:
     """Return runs that no simulation in common with those of the same terrain fits."""
     reasons: dict[int, str] = {}
     for terrain in dict.fromkeys(info.rows[i].terrain for i in among):
@@ -224,7 +224,7 @@ def _unlike(info: Information, among: Sequence[int]) -> dict[int, str]:
     return reasons
 
 
-def _least_alike(info: Information, left: Sequence[int]) -> tuple[int, str] | None:
+def _least_alike(info: Evidence, left: Sequence[int]) -> tuple[int, str] | None:
     """Return the run that is least consistent with the others, and why, if it is an outlier."""
     ratio, noise_ratio = common_fit_cost(info, left)
     worst = int(np.argmax(ratio))
@@ -236,7 +236,7 @@ def _least_alike(info: Information, left: Sequence[int]) -> tuple[int, str] | No
     return None
 
 
-def common_fit_cost(info: Information, left: Sequence[int]) -> tuple[Array, Array]:
+def common_fit_cost(info: Evidence, left: Sequence[int]) -> tuple[Array, Array]:
     """Return what a simulation in common costs each run, over what it costs the others, and in noise a row.
 
     The cost is that in minus twice the log-likelihood, over a fit of each run by itself.

@@ -1,13 +1,11 @@
 """Whether a value is one number, on linear problems whose parameters change as is known."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
 from terrain.discrepancy.constancy import CAVEAT_RATIO, VARIES_RATIO, constancy_of
-from terrain.discrepancy.information import grams_of
+from terrain.discrepancy.evidence import Evidence, grams_of
 from terrain.effects import PARAMETERS
 
 NAMES = ("payload_ratio", "gyro_bias_radps")
@@ -15,7 +13,7 @@ N_RUNS, N_ROWS, SIZE = 8, 120, 0.2
 
 
 def problem(value, excited=None, seed=0, n_runs=N_RUNS, noise=1.0, second=1.0):
-    """Return runs in the form of an Information; the second parameter is 0.1 throughout.
+    """Return runs as evidence; the second parameter is 0.1 throughout.
 
     Parameters
     ----------
@@ -25,27 +23,18 @@ def problem(value, excited=None, seed=0, n_runs=N_RUNS, noise=1.0, second=1.0):
     """
     rng = np.random.default_rng(seed)
     at = (np.arange(N_ROWS) + 0.5) / N_ROWS
-    a, g, changes, residuals = np.zeros((n_runs, 2, 2)), np.zeros((n_runs, 2)), [], []
+    changes, residuals = [], []
     for i in range(n_runs):
         j = 30.0 * rng.standard_normal((2, N_ROWS))
         j[1] = second * (j[1] + 0.2 * j[0])
         j[0] *= 1.0 if excited is None else excited(at)
         r = value(i, at) * j[0] + 0.1 * j[1] + noise * rng.standard_normal(N_ROWS)
-        a[i], g[i] = j @ j.T, j @ r
         changes.append(j[:, :, None])
         residuals.append(r[:, None])
-    nowhere = np.zeros(len(PARAMETERS))
-    return SimpleNamespace(
-        a=a,
-        g=g,
-        rows=residuals,
-        parameters=NAMES,
-        origin=nowhere,
-        vector=nowhere,
-        nuisances=np.zeros(0, dtype=int),
-        inner=[np.zeros((0, 0))] * n_runs,
-        grams=np.array([grams_of(r, j) for r, j in zip(residuals, changes, strict=True)]),
-        places=lambda names: [NAMES.index(name) for name in names],
+    nowhere, none = np.zeros(len(PARAMETERS)), np.zeros(0, dtype=int)
+    grams = np.array([grams_of(r, j) for r, j in zip(residuals, changes, strict=True)])
+    return Evidence(
+        *(NAMES, nowhere, nowhere, grams, none, np.zeros(0), tuple(residuals), None, (), (), np.zeros(2)),
     )
 
 

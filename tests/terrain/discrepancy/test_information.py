@@ -8,16 +8,17 @@ from numpy.testing import assert_allclose
 from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 
-from terrain.discrepancy.information import (
+from terrain.discrepancy.evidence import (
     N_BLOCKS,
     correlation,
-    information_at,
+    evidence_at,
     loss_of,
+    misfit_of,
     move_point,
+    nearby,
     partial_information,
     recentre,
 )
-from terrain.discrepancy.nearby import misfit_of, nearby
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
@@ -59,7 +60,7 @@ def signals():
 
 @pytest.fixture(scope="module")
 def info(signals):
-    return information_at(signals, SIMULATION, SIMULATION.vector, NAMES, low_pass_of(signals))
+    return evidence_at(signals, SIMULATION, SIMULATION.vector, NAMES, low_pass_of(signals))
 
 
 def dense(info, i):
@@ -110,9 +111,7 @@ def test_the_form_is_generalised_least_squares_with_scatter_written_out(info):
 def test_a_nuisance_is_a_parameter_too_and_its_scatter_widens_its_variance(info, signals):
     assert info.parameters[: len(NAMES)] == NAMES
     assert set(np.array(info.parameters)[info.nuisances]) == set(SCATTER._fields)
-    firm = information_at(
-        signals, Simulation(HUSKY), info.vector, NAMES, low_pass_of(signals), info.statistics
-    )
+    firm = evidence_at(signals, Simulation(HUSKY), info.vector, NAMES, low_pass_of(signals), info.statistics)
     name = ["rolling_resistance_ratio"]  # which scatters
     wide, narrow = fit_change(info, name)[1][0, 0], fit_change(firm, name)[1][0, 0]
     # the mean over runs cannot be better known than its scatter lets
@@ -121,17 +120,17 @@ def test_a_nuisance_is_a_parameter_too_and_its_scatter_widens_its_variance(info,
 
 
 def test_blocks_sum_up_to_the_whole(info):
-    assert info.a_blocks.shape[1] == N_BLOCKS
+    assert info.blocks[0].shape[1] == N_BLOCKS
     scale = np.abs(info.a).max()
-    assert_allclose(info.a_blocks.sum(axis=1), info.a, atol=1e-9 * scale)
-    assert_allclose(info.g_blocks.sum(axis=1), info.g, atol=1e-9 * np.abs(info.g).max())
+    assert_allclose(info.blocks[0].sum(axis=1), info.a, atol=1e-9 * scale)
+    assert_allclose(info.blocks[1].sum(axis=1), info.g, atol=1e-9 * np.abs(info.g).max())
 
 
 def test_changes_counted_from_another_point_end_at_the_same_values(signals, info):
     base = info.vector
     there = vector_of({"camera_yaw_rad": 0.02, "payload_ratio": 0.05})
     low_pass = low_pass_of(signals)
-    moved_info = information_at(signals, SIMULATION, there, NAMES, low_pass, info.statistics)
+    moved_info = evidence_at(signals, SIMULATION, there, NAMES, low_pass, info.statistics)
     here = recentre(moved_info, base)
     names = list(NAMES[:2])
     change, _ = fit_change(moved_info, names)
@@ -153,7 +152,7 @@ def test_nearby_is_the_same_form_at_another_point_by_the_same_noise(signals, inf
     assert_allclose(here.a / np.outer(scale, scale), info.a[:, at][:, :, at].sum(0) / np.outer(scale, scale))
     assert_allclose(here.g / scale, info.g[:, at].sum(0) / scale, atol=1e-9)
     there = move_point(info.vector, names, np.array([0.05, 0.02, 0.02]))
-    direct = information_at(signals, SIMULATION, there, names, low_pass, info.statistics)
+    direct = evidence_at(signals, SIMULATION, there, names, low_pass, info.statistics)
     near = nearby(info, signals, SIMULATION, there, names, low_pass)
     at = direct.places(names)
     assert_allclose(near.a, direct.a[:, at][:, :, at].sum(0), rtol=0.02, atol=0.01 * near.a.max())
@@ -162,7 +161,7 @@ def test_nearby_is_the_same_form_at_another_point_by_the_same_noise(signals, inf
 
 
 def test_a_simulation_of_which_nothing_scatters_is_fitted_too(signals, info):
-    firm = information_at(
+    firm = evidence_at(
         signals,
         Simulation(HUSKY),
         info.vector,
@@ -234,8 +233,8 @@ def test_what_runs_vary_by_does_not_leak_between_their_thirds():
         runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(seed), hidden)
         signals = [signals_of(run, HUSKY) for run in runs]
         there = vector_of(hidden)
-        info = information_at(signals, SIMULATION, there, list(hidden), low_pass_of(signals))
-        a, g = info.a_blocks[:, :, 0, 0].sum(axis=0), info.g_blocks[:, :, 0].sum(axis=0)
+        info = evidence_at(signals, SIMULATION, there, list(hidden), low_pass_of(signals))
+        a, g = info.blocks[0][:, :, 0, 0].sum(axis=0), info.blocks[1][:, :, 0].sum(axis=0)
         off.append(g / np.sqrt(a))
     assert np.abs(off).max() < 4.0
     assert np.std(off) < 1.6

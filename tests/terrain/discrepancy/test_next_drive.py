@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from terrain.discrepancy.information import Information, information_at
+from terrain.discrepancy.evidence import Evidence, evidence_at
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import signals_of
@@ -32,12 +32,12 @@ def drive(simulation: Simulation, name: str, grade_deg: float = 0.0, seed: int =
     return simulate_planar(simulation.robot, twist, seed, hills=hills, noise=load_noise(), run_id=f"{seed}")
 
 
-def information_of(simulation: Simulation, runs: list[RunLog], names: list[str]) -> Information:
+def information_of(simulation: Simulation, runs: list[RunLog], names: list[str]) -> Evidence:
     signals = [signals_of(run, simulation.robot) for run in runs]
-    return information_at(signals, simulation, simulation.vector, names, low_pass_of(signals))
+    return evidence_at(signals, simulation, simulation.vector, names, low_pass_of(signals))
 
 
-def collinearity(info: Information, names: list[str]) -> float:
+def collinearity(info: Evidence, names: list[str]) -> float:
     """Index of two parameters of one number each, by its definition."""
     at = info.places(names)
     a = info.a[:, at][:, :, at].sum(axis=0)

@@ -8,8 +8,8 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
+from terrain.discrepancy.evidence import Statistics
 from terrain.discrepancy.fitting import Problem, relinearize
-from terrain.discrepancy.information import Statistics
 from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import _found

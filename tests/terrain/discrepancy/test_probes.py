@@ -1,12 +1,14 @@
 """Probes: what the residual depends on is seen where it acts in short events, and chance is not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
-from terrain.discrepancy.information import information_at
+from terrain.discrepancy.evidence import evidence_at
 from terrain.discrepancy.probes import probe_residuals
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import signals_of
@@ -23,7 +25,7 @@ def information_of_drives(**outside):
     runs = hidden_runs(HUSKY, drives, np.random.SeedSequence(5), {}, outside)
     signals = [signals_of(run, HUSKY) for run in runs]
     names = [p.name for effect in library_of(HUSKY.drive) for p in effect.parameters]
-    return information_at(signals, simulation_of(HUSKY), vector_of({}), names, low_pass_of(signals))
+    return evidence_at(signals, simulation_of(HUSKY), vector_of({}), names, low_pass_of(signals))
 
 
 @pytest.fixture(scope="module")

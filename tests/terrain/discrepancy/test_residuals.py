@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from terrain.discrepancy.information import information_at
+from terrain.discrepancy.evidence import evidence_at
 from terrain.discrepancy.residuals import (
     SETTLE_S,
     decimate,
@@ -234,7 +234,7 @@ def test_noise_of_the_wheels_is_not_attributed_to_a_mass_or_a_motor():
     for instrument_cutoff_hz in (low_pass.instrument_cutoff_hz, np.inf):
         same = low_pass._replace(instrument_cutoff_hz=instrument_cutoff_hz)
         names = ["motor_constant_ratio", "rolling_resistance_ratio", "accel_bias_mps2"]
-        info = information_at(signals, simulation, simulation.vector, names, same)
+        info = evidence_at(signals, simulation, simulation.vector, names, same)
         change, cov = fit_change(info, names)
         off[instrument_cutoff_hz] = change[0], change[0] / np.sqrt(cov[0, 0])
     assert off[np.inf][1] < -4.0

@@ -1,7 +1,7 @@
 """Which effects fit as well in the place of a cause, by the losses and squares of their fits."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,11 +15,12 @@ CAUSE, OTHER = effect_named("payload"), effect_named("motor_constant")
 SQUARE = 1000.0
 
 
-class Judge(NamedTuple):
-    """An information of which only the point is read."""
+@dataclass(frozen=True)
+class Judge:
+    """Evidence of which only the point is read."""
 
-    vector: np.ndarray = np.zeros(1)
-    model_std: np.ndarray = np.zeros(1)
+    vector: tuple = (0.0,)
+    model_std: tuple = (0.0,)
 
 
 @pytest.fixture
@@ -33,7 +34,7 @@ def fitted(monkeypatch):
 
         monkeypatch.setattr(rivals, "fit_again", fit)
         monkeypatch.setattr(rivals, "_near", lambda *_: [OTHER])
-        monkeypatch.setattr(rivals, "evidence", lambda *_: SimpleNamespace(inflation=inflation))
+        monkeypatch.setattr(rivals, "wald_test", lambda *_: SimpleNamespace(inflation=inflation))
         monkeypatch.setattr(rivals, "_allowed", lambda *_: RIVAL_LOSS)
         found = rivals_of(None, Judge(), Judge(), [CAUSE])
         return [each.effect.name for each in found[CAUSE.name]]

@@ -5,8 +5,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from terrain.discrepancy import scatter
-from terrain.discrepancy.scatter import PRIOR_RUNS, scatter_of
+from terrain.discrepancy import evidence as scatter
+from terrain.discrepancy.evidence import PRIOR_RUNS, scatter_of
 
 ASSUMED = np.array([0.02, 0.05])
 

@@ -9,9 +9,8 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
+from terrain.discrepancy.evidence import Nearby, move_point
 from terrain.discrepancy.fitting import RISE, Problem, names_of, steps_of
-from terrain.discrepancy.information import move_point
-from terrain.discrepancy.nearby import Nearby
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import search, with_rivals
 from terrain.discrepancy.selection import fit_change

@@ -8,10 +8,10 @@ import pytest
 from numpy.testing import assert_allclose
 
 from terrain.discrepancy.clocks import shifts_of
+from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.health import clocks_of, unfit_runs
 from terrain.discrepancy.health.runs import Excluded
-from terrain.discrepancy.information import Information
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
@@ -44,7 +44,7 @@ def drive(robot=HUSKY, seed=0, name="survey", duration_s=40.0, **options) -> Run
     )
 
 
-def looked_at(runs: Sequence[RunLog]) -> tuple[tuple[Signals, ...], Information]:
+def looked_at(runs: Sequence[RunLog]) -> tuple[tuple[Signals, ...], Evidence]:
     robot = HUSKY if runs[0].robot == "husky" else AGRIMARO
     scatter = load_scatter()._asdict()
     if robot is AGRIMARO:
