@@ -13,7 +13,7 @@ from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
 from pipelines.report.numbers import plural
 from pipelines.report.results import Progress, silent
-from terrain.discrepancy.filter_gain import Comparison, accuracy_change
+from terrain.discrepancy.held_out import Comparison, accuracy_change
 from terrain.errors import TerrainError
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS

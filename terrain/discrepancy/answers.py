@@ -8,21 +8,17 @@ import numpy as np
 
 from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of
 from terrain.discrepancy.evidence import Evidence, partial_information
-from terrain.discrepancy.fitting import names_of
 from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.robot_terms import UNITS
-from terrain.discrepancy.search import Found
+from terrain.discrepancy.search import Found, names_of
 from terrain.discrepancy.selection import Z_EFFECT, gain_interval
 from terrain.discrepancy.varying import run_scatter
-from terrain.discrepancy.verdict import Cause, Limit, Residual, RuledOut, Value
+from terrain.discrepancy.verdict import INTERVAL_T, Cause, Limit, Residual, RuledOut, Value
 from terrain.discrepancy.withdrawal import shown_channels
 from terrain.effects import CHANNELS, Effect
 
 POWER_Z = 1.28
 """Added to the threshold, so that nine in ten are detected."""
-
-INTERVAL_T = 2.36
-"""Half a 95 % interval in standard deviations: t with the 7 degrees that eight runs give."""
 
 
 def values_of(found: Found, effect: Effect) -> tuple[Value, ...]:

@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.discrepancy.noise import Noise
-from terrain.discrepancy.residual_statistics import binned_means, input_range
-from terrain.discrepancy.residuals import INPUTS, LowPass, Rows, rows_of
+from terrain.discrepancy.residuals import INPUTS, LowPass, Rows, binned_means, input_range, rows_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS

@@ -22,20 +22,17 @@ from terrain.discrepancy.answers import (
     ruled_out_of,
     values_of,
 )
-from terrain.discrepancy.conditions import with_conditions
+from terrain.discrepancy.constancy import values_by_session
 from terrain.discrepancy.evidence import Evidence, recentre
-from terrain.discrepancy.fitting import Problem, names_of
 from terrain.discrepancy.health import clocks_of
 from terrain.discrepancy.next_drive import next_drive
-from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.preparation import MIN_RUNS, prepare
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
-from terrain.discrepancy.search import Found, refit, search, with_rivals
+from terrain.discrepancy.search import Found, Problem, names_of, pooled, refit, search, with_rivals
 from terrain.discrepancy.selection import EXCITED_RATIO
-from terrain.discrepancy.sessions import values_by_session
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effects
+from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effects, with_conditions
 from terrain.discrepancy.verdict import Cause, Diagnosis, RuledOut, Unexplained, Varying, Verdict
 from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw, shown_beside
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect, effect_named

@@ -7,17 +7,24 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from terrain.discrepancy.compared import ComparedRun, compare_runs, without_levels
+from terrain.discrepancy.constancy import PartValues, part_values
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.extend import extend
-from terrain.discrepancy.filter_gain import Comparison, filter_gain
-from terrain.discrepancy.fitting import Problem
-from terrain.discrepancy.gain import Gain, fit_to_judge, gain_of_signals
 from terrain.discrepancy.health import repaired
-from terrain.discrepancy.hold_out import HOLD_OUT_FROM, repair_held_out, split_runs
+from terrain.discrepancy.held_out import (
+    HOLD_OUT_FROM,
+    Comparison,
+    Gain,
+    filter_gain,
+    fit_to_judge,
+    gain_of_signals,
+    repair_held_out,
+    split_runs,
+)
 from terrain.discrepancy.nameless import Nameless, nameless_gain
 from terrain.discrepancy.noise import Noise
-from terrain.discrepancy.parts import PartValues, part_values
 from terrain.discrepancy.residuals import LowPass, low_pass_of
+from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.statements import acting_causes

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.answers import INTERVAL_T
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.verdict import Diagnosis
+from terrain.discrepancy.verdict import INTERVAL_T, Diagnosis
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot

@@ -19,7 +19,7 @@ import numpy as np
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of
-from terrain.discrepancy.gain import N_BOOTSTRAP
+from terrain.discrepancy.held_out import N_BOOTSTRAP
 from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.verdict import finite
 from terrain.effects import CHANNELS

@@ -9,11 +9,11 @@ import numpy as np
 
 from terrain.discrepancy.clocks import Shift, shifts_of
 from terrain.discrepancy.evidence import Evidence, move_point
-from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.health import Fault, faults_of, repaired, unfit_runs
 from terrain.discrepancy.health.runs import Excluded
 from terrain.discrepancy.latencies import Latencies, latencies_of, starting_values
 from terrain.discrepancy.residuals import low_pass_of, rows_of
+from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import Effect

@@ -8,7 +8,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from terrain.discrepancy.channel_words import CHANNEL_WORDS
-from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.held_out import Gain
 from terrain.discrepancy.robot_terms import quantity
 from terrain.discrepancy.statements import listed
 from terrain.discrepancy.verdict import Diagnosis, Limit, Value, Varying

@@ -27,7 +27,7 @@ class Simulation:
     model_error : how large the simulation's own error is in units of parameters, the same in all runs; what
         is no larger is not stated
     varied_error, varied_scatter : mean over runs and scatter of them that conditions may make which differ
-        from run to run, in units of parameters: see :mod:`terrain.discrepancy.conditions`
+        from run to run, in units of parameters: see :mod:`terrain.discrepancy.varying`
     probe_error : how much the residual of a channel depends on an input by the simulation's own error
 
     Raises

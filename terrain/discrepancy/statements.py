@@ -10,7 +10,7 @@ import numpy as np
 
 from terrain.discrepancy.channel_words import CHANNEL_WORDS, off_by
 from terrain.discrepancy.compared import ComparedRun, channels_of, compare_runs, rms_of
-from terrain.discrepancy.gain import Gain
+from terrain.discrepancy.held_out import Gain
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.response_slopes import Slope, slopes_of
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from terrain.discrepancy.evidence import Evidence, evidence_at
-from terrain.discrepancy.fitting import names_of
 from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.search import names_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import Effect

@@ -16,6 +16,10 @@ AGREE_P = 0.01
 any by chance."""
 
 
+INTERVAL_T = 2.36
+"""Half a 95 % interval in standard deviations: t with the 7 degrees that eight runs give."""
+
+
 class Verdict(StrEnum):
     """Outcome of a diagnosis.
 

@@ -9,9 +9,8 @@ import numpy as np
 
 from terrain.discrepancy.constancy import Constancy, constancy_of
 from terrain.discrepancy.evidence import Evidence, move_point, partial_information, recentre
-from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.probes import ProbeResult
-from terrain.discrepancy.search import Found
+from terrain.discrepancy.search import Found, Problem
 from terrain.discrepancy.selection import fit_change
 from terrain.effects import BOUNDS, CHANNELS, Effect
 from terrain.records import Array

@@ -13,7 +13,7 @@ from pipelines.report.results import as_json, silent
 from pipelines.report.terminal import terminal_text
 from pipelines.slip import calibrate
 from pipelines.slip.estimate import estimate_runs
-from terrain.discrepancy.answers import INTERVAL_T
+from terrain.discrepancy.verdict import INTERVAL_T
 from terrain.errors import ConfigError, TerrainError
 from terrain.extension import write_extended
 from terrain.logs.write import write_run

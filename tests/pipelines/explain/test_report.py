@@ -11,9 +11,8 @@ from pipelines.report.terminal import terminal_text
 from terrain.discrepancy import verdict
 from terrain.discrepancy.compared import channels_of
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
-from terrain.discrepancy.filter_gain import Change, Comparison
-from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
 from terrain.discrepancy.health.runs import Clock, Excluded
+from terrain.discrepancy.held_out import Change, ChannelGain, Comparison, Gain, Reduction
 from terrain.discrepancy.nameless import Learned, Nameless
 from terrain.robots import load_robot
 

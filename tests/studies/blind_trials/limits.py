@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from studies.blind_trials.drives import STEP_HZ, Drives
 from terrain.constants import GRAVITY_MPS2
-from terrain.discrepancy.rivals import RIVAL_LOSS
+from terrain.discrepancy.search import RIVAL_LOSS
 from terrain.effects import (
     ACCEL,
     CHANNELS,

@@ -8,11 +8,11 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
-from terrain.discrepancy.conditions import with_conditions
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.varying import with_conditions
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import effect_named
 from terrain.errors import ConfigError

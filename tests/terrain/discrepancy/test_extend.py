@@ -4,10 +4,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrain.discrepancy.answers import INTERVAL_T
 from terrain.discrepancy.extend import extend, extended_effects
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.verdict import Cause, Diagnosis, Value, Verdict
+from terrain.discrepancy.verdict import INTERVAL_T, Cause, Diagnosis, Value, Verdict
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 

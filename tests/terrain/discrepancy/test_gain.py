@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from terrain.discrepancy.filter_gain import accuracy_change
-from terrain.discrepancy.gain import gain
+from terrain.discrepancy.held_out import accuracy_change, gain
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import ConfigError, DataError
 from terrain.robots import load_robot

@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.optimize import minimize
 
-from terrain.discrepancy.mixed_model import fit_mixed
+from terrain.discrepancy.varying import fit_mixed
 
 N_RUNS, N_ROWS = 12, 30
 SHARED, OWN = [0, 1], [1, 2]

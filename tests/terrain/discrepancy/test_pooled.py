@@ -9,10 +9,8 @@ from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy.evidence import Statistics
-from terrain.discrepancy.fitting import Problem, relinearize
-from terrain.discrepancy.pooled import pooled
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import _found
+from terrain.discrepancy.search import Problem, _found, pooled, relinearize
 from terrain.discrepancy.signals import signals_of
 from terrain.effects import effect_named, vector_of
 from terrain.robots import load_robot

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.noise import noise_of
-from terrain.discrepancy.residual_statistics import binned_means, noise_spectrum, run_means, spectrum
+from terrain.discrepancy.residuals import binned_means, noise_spectrum, run_means, spectrum
 
 RATE_HZ = 6.25
 

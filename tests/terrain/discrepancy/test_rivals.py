@@ -6,9 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrain.discrepancy import rivals
-from terrain.discrepancy.fitting import Refit
-from terrain.discrepancy.rivals import RIVAL_LOSS, RIVAL_RISE, rivals_of
+from terrain.discrepancy import search as rivals
+from terrain.discrepancy.search import RIVAL_LOSS, RIVAL_RISE, Refit, rivals_of
 from terrain.effects import effect_named
 
 CAUSE, OTHER = effect_named("payload"), effect_named("motor_constant")

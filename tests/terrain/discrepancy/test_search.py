@@ -10,9 +10,8 @@ from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy.evidence import Nearby, move_point
-from terrain.discrepancy.fitting import RISE, Problem, names_of, steps_of
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import search, with_rivals
+from terrain.discrepancy.search import RISE, Problem, names_of, search, steps_of, with_rivals
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
 from terrain.effects import BOUNDS, INDEX, LIBRARY, effect_named
@@ -188,7 +187,7 @@ def test_a_step_that_raises_the_square_is_halved(monkeypatch):
     assert all(after <= (1 + RISE) * before for before, after in pairwise(losses))
     assert points[-1].vector[INDEX["camera_yaw_rad"]] == pytest.approx(0.0, abs=1e-4)
     # without that guard it goes from bound to bound
-    monkeypatch.setattr("terrain.discrepancy.fitting.MAX_HALVINGS", 0)
+    monkeypatch.setattr("terrain.discrepancy.search.MAX_HALVINGS", 0)
     free = list(steps_of(bent, info, base, names, 12))
     assert abs(free[-1].vector[INDEX["camera_yaw_rad"]]) == BOUNDS["camera_yaw_rad"][1]
 
@@ -202,7 +201,7 @@ def test_what_changes_other_channels_is_no_rival(monkeypatch):
     assert {cause.name for cause in found.causes} == {"camera_yaw", "payload"}
     alone = found._replace(causes=(effect_named("payload"),))  # as if the yaw had been withdrawn
     assert with_rivals(asked, start, alone).rivals == {"payload": ()}
-    monkeypatch.setattr("terrain.discrepancy.rivals.SHARED", -1.0)
+    monkeypatch.setattr("terrain.discrepancy.search.SHARED", -1.0)
     assert "camera_yaw" in [each.effect.name for each in with_rivals(asked, start, alone).rivals["payload"]]
 
 

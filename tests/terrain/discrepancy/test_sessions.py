@@ -8,8 +8,8 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
+from terrain.discrepancy.constancy import agreement
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.sessions import agreement
 from terrain.discrepancy.statements import SESSION_COLUMNS, notes_of, session_rows
 from terrain.effects import effect_named
 from terrain.robots import load_robot

@@ -7,7 +7,7 @@ import pytest
 
 from terrain.discrepancy.channel_words import off_by
 from terrain.discrepancy.compared import ComparedRun, compare_runs
-from terrain.discrepancy.gain import ChannelGain, Gain, Reduction
+from terrain.discrepancy.held_out import ChannelGain, Gain, Reduction
 from terrain.discrepancy.next_drive import next_command
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.response_slopes import Slope, slope_through_zero, slopes_of

@@ -7,9 +7,8 @@ from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import search
+from terrain.discrepancy.search import Problem, search
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.varying import run_scatter, varying_effects
 from terrain.discrepancy.verdict import Verdict

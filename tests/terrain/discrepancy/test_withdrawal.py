@@ -10,10 +10,9 @@ from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy import withdrawal
-from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.probes import ProbeResult, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import _found, search
+from terrain.discrepancy.search import Problem, _found, search
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.withdrawal import (
     PROBE_ALIKE,

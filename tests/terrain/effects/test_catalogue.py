@@ -193,7 +193,7 @@ from dataclasses import replace
 import terrain.effects as effects
 from terrain.discrepancy.sentences import limit_text
 from terrain.discrepancy.robot_terms import quantity
-from terrain.discrepancy import residuals, search, information
+from terrain.discrepancy import residuals, search, evidence
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit
 from terrain.extension import corrected

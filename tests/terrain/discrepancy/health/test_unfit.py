@@ -9,10 +9,10 @@ from numpy.testing import assert_allclose
 
 from terrain.discrepancy.clocks import shifts_of
 from terrain.discrepancy.evidence import Evidence
-from terrain.discrepancy.fitting import Problem
 from terrain.discrepancy.health import clocks_of, unfit_runs
 from terrain.discrepancy.health.runs import Excluded
 from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import DataError
