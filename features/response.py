@@ -12,7 +12,7 @@ from features.windows import WindowRule, cut_windows, layout_of
 from terrain.classify.response import ResponseColumns
 from terrain.errors import DataError
 from terrain.logs.regimes import regime_of
-from terrain.measured_slip.prediction_scores import Cases
+from terrain.measured_slip.predict import Cases
 from terrain.measured_slip.slips import MeasuredSlip
 from terrain.records import Array, RunLog, Windows
 

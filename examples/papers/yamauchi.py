@@ -17,15 +17,22 @@ import numpy as np
 from claims import Finding, Numbers, Trial
 from scipy import stats
 from tracks import straight_slip_line, track_balance
+from yamauchi_slip import (
+    SlipIdentification,
+    SlipSamples,
+    TurningFit,
+    angle_columns,
+    fit_runs,
+    fit_side_slip,
+    fit_straight_slip,
+    fit_turning,
+    identify_slip_model,
+    slip_samples,
+)
 
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.bootstrap import bootstrap_rows, percentile_interval
-from terrain.calibration.clustered_fit import fit_runs
-from terrain.calibration.slip_model import SlipIdentification, identify_slip_model
-from terrain.calibration.straight_slip import fit_side_slip, fit_straight_slip
-from terrain.calibration.track_motion import SlipSamples, odometry_rows, slip_samples
-from terrain.calibration.turning_angle import angle_columns
-from terrain.calibration.turning_exponent import TurningFit, fit_turning
+from terrain.calibration.odometry import odometry_rows
 from terrain.estimation.observers.family import Observer, ObserverTrack, observe
 from terrain.estimation.observers.plain_odometry import endo_odometry_observer, gyrodometry_observer
 from terrain.estimation.observers.rows import feed_of, ticks

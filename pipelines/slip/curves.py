@@ -20,9 +20,8 @@ from terrain.errors import DataError
 from terrain.logs.digest import data_digest
 from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
-from terrain.slip_learning.curve import N_BOOTSTRAP
+from terrain.slip_learning.curve import N_BOOTSTRAP, PeakStatus
 from terrain.slip_learning.learn import FILTER, LearnedTerrain, learn_terrains
-from terrain.slip_learning.peak import PeakStatus
 
 LAW_NAMES = {"janosi": "Janosi and Hanamoto", "magic": "Magic Formula"}
 """Of the laws of thrust over slip."""

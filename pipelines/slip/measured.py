@@ -18,11 +18,10 @@ from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
 from terrain.measured_slip import measure
 from terrain.measured_slip.delay import Delay
-from terrain.measured_slip.prediction_scores import PredictionFigures, predictions
-from terrain.measured_slip.rollers import RollerFindings
+from terrain.measured_slip.predict import PredictionFigures, predictions
+from terrain.measured_slip.rollers import DistanceBound, RollerFindings
 from terrain.measured_slip.slips import measured_slip
 from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
-from terrain.measured_slip.wheel_distance import DistanceBound
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, SwerveRobot, as_drive
 

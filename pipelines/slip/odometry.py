@@ -13,8 +13,7 @@ from pipelines.data.datasets import drive_robot, load
 from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Report, Table, Text, sections
-from terrain.calibration.odometry import ParameterFound, judge_odometry
-from terrain.calibration.odometry_judge import LegScores
+from terrain.calibration.odometry import LegScores, ParameterFound, judge_odometry
 from terrain.estimation.observers.slip_model_file import check_slip_model_file, write_slip_model
 from terrain.logs.drive import FILE_NAME, find_sessions
 from terrain.logs.drive_poses import WindowPoses, read_window_poses

@@ -15,7 +15,7 @@ from pipelines.report.tree import Column, Report, Text, sections
 from pipelines.slip.shown import first_rows
 from terrain.calibration.description import described_with, description_yaml, findings_of, hard_grounds
 from terrain.calibration.finding import Finding
-from terrain.calibration.noise import measurement_variances
+from terrain.calibration.sensors import measurement_variances
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write
 from terrain.robots import SwerveRobot, read_description, robot_from

@@ -20,10 +20,16 @@ from terrain.errors import DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.logs.digest import data_digest
 from terrain.records import RunLog
-from terrain.soil_identification.comparison import BAR_RATIO, WheelResult, compare_laws
-from terrain.soil_identification.held_out import GIVEN, HELD_OUT, Misfit
-from terrain.soil_identification.laws import Prediction
-from terrain.soil_identification.soil_file import soil_yaml
+from terrain.soil_identification.comparison import (
+    BAR_RATIO,
+    GIVEN,
+    HELD_OUT,
+    Misfit,
+    WheelResult,
+    compare_laws,
+)
+from terrain.soil_identification.fit import Prediction
+from terrain.soil_identification.plain_soil import soil_yaml
 from terrain.soil_identification.trials import WHEELS, Trials, trials_of
 
 if TYPE_CHECKING:

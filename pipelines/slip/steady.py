@@ -18,7 +18,7 @@ from terrain.control.learned_table import MIN_RUNS, Transfer, learn_surfaces
 from terrain.errors import DataError
 from terrain.logs.digest import data_digest
 from terrain.measured_slip.measure import measure_steady
-from terrain.measured_slip.operating import OperatingPoints
+from terrain.measured_slip.surfaces import OperatingPoints
 from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
 

@@ -11,13 +11,10 @@ import yaml
 
 from terrain.calibration.finding import Finding
 from terrain.calibration.lag import starts_and_stops, time_constants
-from terrain.calibration.noise import sensor_noise
 from terrain.calibration.omni import identify_omni
-from terrain.calibration.six_positions import MIN_POSITION_S, accelerometer
+from terrain.calibration.sensors import MIN_POSITION_S, accelerometer, gyro_bias, sensor_noise, standing
 from terrain.calibration.skid_steer import identify
-from terrain.calibration.standing import gyro_bias, standing
-from terrain.calibration.steady import steady_stretches, why_none
-from terrain.calibration.wheels import SLIP_RATIO, reduction_ratio, steering_zeros
+from terrain.calibration.wheels import SLIP_RATIO, reduction_ratio, steady_stretches, steering_zeros, why_none
 from terrain.errors import DataError
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, robot_from

@@ -7,12 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
 
+from terrain.identify import half_width, std_interval
 from terrain.records import Array
-
-CONFIDENCE = 0.95
-"""Of every interval."""
 
 
 class Finding(NamedTuple):
@@ -50,28 +47,11 @@ def undetermined(parameters: Sequence[str], reason: str) -> list[Finding]:
     return [Finding(name, math.nan, math.nan, math.nan, 0, "", (), reason) for name in parameters]
 
 
-def half_width(std: Array | float, dof: float) -> Array:
-    """Return half the interval of a normal number whose standard deviation has ``dof`` degrees of freedom.
-
-    Examples
-    --------
-    >>> half_width(1.0, 10.0).round(2), half_width(1.0, float("inf")).round(2)
-    (np.float64(2.23), np.float64(1.96))
-    """
-    return np.float64(stats.t.ppf((1 + CONFIDENCE) / 2, dof)) * np.asarray(std)
-
-
-def std_interval(variance: float, dof: float) -> tuple[float, float]:
-    """Return the interval of a standard deviation whose variance was found with ``dof`` degrees of freedom.
-
-    Examples
-    --------
-    >>> low, high = std_interval(4.0, 100.0)
-    >>> round(low, 2), round(high, 2)
-    (1.76, 2.32)
-    """
-    low, high = stats.chi2.ppf([(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], dof)
-    return math.sqrt(variance * dof / high), math.sqrt(variance * dof / low)
+def around(
+    parameter: str, value: float, half: float, n: int, counted: str, runs: tuple[str, ...], note: str = ""
+) -> Finding:
+    """Return a finding whose interval is ``half`` on either side of its value."""
+    return Finding(parameter, float(value), float(value - half), float(value + half), n, counted, runs, note)
 
 
 def biases(
@@ -109,10 +89,7 @@ def biases(
         between = float(((found - mean) ** 2).sum() / (3 * (k - 1)))
         half = np.broadcast_to(half_width(math.sqrt(between / k), 3 * (k - 1)), 3)
     found_biases = [
-        Finding(
-            name, float(mean[i]), float(mean[i] - half[i]), float(mean[i] + half[i]), n, counted, runs, note
-        )
-        for i, name in enumerate(parameters)
+        around(name, mean[i], half[i], n, counted, runs, note) for i, name in enumerate(parameters)
     ]
     if k < MIN_POWER_ONS:
         return found_biases + undetermined(

@@ -25,10 +25,10 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import minimize_scalar
 
-from terrain.calibration.finding import Finding, half_width, undetermined
-from terrain.calibration.motion import MAX_GAP_S, at_times, origin_twist
-from terrain.calibration.standing import Stretch
+from terrain.calibration.finding import Finding, undetermined
+from terrain.calibration.sensors import MAX_GAP_S, Stretch, at_times, origin_twist
 from terrain.estimation.measurements.resampling import low_pass
+from terrain.identify import half_width
 from terrain.kinematics.swerve import forward
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot

@@ -1,31 +1,686 @@
-"""Odometry of a tracked robot fitted to folds of runs and judged on the others, with the slip model of all."""
+r"""Odometry of a tracked robot fitted to legs of a drive and judged on runs held out, with the slip model of all runs.
+
+**Legs.**  A leg begins and ends at a pose, by lidar or cameras, beside the robot's own sensors.  Poses of one fixed
+frame are cut into legs one after the other; those of the windows of DRIVE are legs as they are, and chained over a
+whole command: what was driven from the last pose of a window to the first of the next, some tenths of a second, is
+predicted by the speeds that the lidar shows there.
+
+**Fit.**  Each kind of odometry is one slip model with other parts free.  The observed point lies at l in the body, and
+its sensor is turned by :math:`\gamma`; with the pose of the body :math:`(p, \psi)` that the odometry sums from 0,
+
+.. math:: moved = R(\gamma)^T \big(p + R(\psi)\, l - l\big),
+
+and parameters minimise the distance from the measured end of each leg, bounded in its influence (soft L1, at
+the median distance that is left), with the prior of unknown ground
+(:func:`~terrain.estimation.observers.slip_learning.unknown_ground`) as a ridge.  All kinds have the same
+scale of the tracks, l and :math:`\gamma` fitted, which are no slip.
+
+**The adaptive observer** is judged on a command's last window by efficiencies of the first ones.  The lidar poses of
+all windows but the last are fixes for it, brought to the body by the mount that odometry was fitted with; the
+motion over the last one is dead reckoning with the efficiencies of the tracks that it came to, without another fix
+and without the gyro.
+"""
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
+from numba import njit
 
-from terrain.calibration.adaptive_legs import dead_reckoning, efficiencies_before, of_point
-from terrain.calibration.odometry_fit import (
-    ENCODER,
-    GYRODOMETRY,
-    SLIP,
-    FittedOdometry,
-    fit_odometry,
-    level,
-    without_tilt,
-)
-from terrain.calibration.odometry_judge import LegScores, held_out_ends, score_legs
-from terrain.calibration.odometry_legs import Leg, legs_of_poses, legs_of_windows
+from terrain.angles import unwrapped
+from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.errors import DataError
-from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel
+from terrain.estimation.observers.family import ObserverStatus, observe
+from terrain.estimation.observers.rows import feed_of, rows_of
+from terrain.estimation.observers.slip_learning import unknown_ground
+from terrain.estimation.observers.slip_model import (
+    ANGLE,
+    COMPACTION,
+    EXPONENT,
+    GRADE,
+    N_MODEL,
+    N_PARAMETERS,
+    PARAMETERS,
+    SIDE,
+    TRACK_RATIO,
+    TURN_GRADE,
+    TURN_SHIFT,
+    TURN_SIDE,
+    SlipModel,
+    body_velocity,
+    model_of,
+    next_displacement,
+)
+from terrain.estimation.observers.slip_odometry import ROWS as ODOMETRY_ROWS
+from terrain.estimation.observers.tracked import ROWS, tracked_observer
+from terrain.estimation.observers.tracked_settings import TrackedSettings
+from terrain.identify import Fit, Parameter, deal, folds, identify
 from terrain.logs.drive_poses import WindowPoses
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
+
+STEP_S = 0.05
+"""Longest step within a leg: that of the logs of DRIVE."""
+
+GAP_S = 0.25
+"""Longest time without a sample within a leg, and without a pose at its ends."""
+
+MAX_WINDOW_GAP_S = 0.5
+"""Longest gap between two windows of a command."""
+
+
+class Leg(NamedTuple):
+    """A stretch of a run.
+
+    Parameters
+    ----------
+    run : number of the run
+    moved : (3,) measured change of pose of the observed point, in the frame of its first pose
+    step_s : from sample to sample
+    speeds_mps : (n, 2) of the tracks
+    yaw_rate_radps : (n,) of the gyro
+    tilt_rad : (n, 2) roll and pitch; 0 where they are not measured
+    length_s : of the leg
+    """
+
+    run: int
+    moved: Array
+    step_s: float
+    speeds_mps: Array
+    yaw_rate_radps: Array
+    tilt_rad: Array
+    length_s: float
+
+
+def odometry_rows(run: RunLog, robot: TrackedRobot) -> tuple[Array, Array]:
+    """Return the ticks (n,) of a run's encoders, and what an odometry takes at each (n, 5).
+
+    Raises
+    ------
+    DataError
+        if the run has no speeds of tracks.
+    """
+    return rows_of(run, feed_of(run, robot, ODOMETRY_ROWS))
+
+
+def legs_of_windows(
+    run: RunLog, number: int, windows: Sequence[WindowPoses], robot: TrackedRobot, delay_s: float
+) -> tuple[list[Leg], Leg | None]:
+    """Return the legs of a command's windows, and that of all of them in a row; None where they have gaps.
+
+    Parameters
+    ----------
+    run : of the command
+    number : of the run
+    windows : its poses
+    robot : that drove
+    delay_s : of the poses behind the gyro and the tracks
+
+    Notes
+    -----
+    Poses are of an earlier time than their stamps by the delay; before its first sample a run is taken to
+    have driven as at that.
+    """
+    found = (
+        _leg(run, number, window.pose[-1], (window.time_s[0], window.time_s[-1]), robot, delay_s)
+        for window in windows
+    )
+    single = [leg for leg in found if leg is not None]
+    moved = np.zeros(3)
+    for k, window in enumerate(windows):
+        if k > 0:
+            gap = motion_over_gap(run, windows[k - 1].time_s[-1], window.time_s[0])
+            if gap is None:
+                return single, None
+            moved = composed(moved, gap)
+        moved = composed(moved, window.pose[-1])
+    if len(windows) < 2:
+        return single, None
+    ends = windows[0].time_s[0], windows[-1].time_s[-1]
+    return single, _leg(run, number, moved, ends, robot, delay_s)
+
+
+def legs_of_poses(
+    run: RunLog, number: int, robot: TrackedRobot, length_s: float, delay_s: float = 0.0
+) -> list[Leg]:
+    """Return legs of a run with poses in one frame, one after the other.
+
+    Parameters
+    ----------
+    run : with the stream pose
+    number : of the run
+    robot : that drove
+    length_s : of each leg
+    delay_s : of the poses behind the gyro and the tracks
+    """
+    pose = run.streams["pose"]
+    values = pose.values.copy()
+    values[:, 2] = unwrapped(values[:, 2])
+    known = np.isfinite(values).all(axis=1)
+    time_s, values = pose.time_s[known], values[known]
+    legs: list[Leg] = []
+    if not len(time_s):
+        return legs
+    for begin_s in np.arange(time_s[0], time_s[-1] - length_s + 1e-9, length_s):
+        first, last = np.searchsorted(time_s, [begin_s - 1e-9, begin_s + length_s - 1e-9]).tolist()
+        last = min(last, len(time_s) - 1)
+        late_s = max(time_s[first] - begin_s, abs(time_s[last] - begin_s - length_s))
+        if late_s > GAP_S:  # no pose there
+            continue
+        moved = relative(values[first], values[last])
+        leg = _leg(run, number, moved, (time_s[first], time_s[last]), robot, delay_s)
+        legs += [leg] if leg is not None else []
+    return legs
+
+
+def composed(first: Array, then: Array) -> Array:
+    """Return the pose (3,) after one change of pose and another in its frame.
+
+    Examples
+    --------
+    >>> composed(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 0.0, 0.0])).round(6).tolist()
+    [1.0, 1.0, 1.570796]
+    """
+    cos, sin = np.cos(first[2]), np.sin(first[2])
+    x, y = cos * then[0] - sin * then[1], sin * then[0] + cos * then[1]
+    return np.array([first[0] + x, first[1] + y, first[2] + then[2]])
+
+
+def relative(first: Array, last: Array) -> Array:
+    """Return a pose (3,) in the frame of another.
+
+    Examples
+    --------
+    >>> start, change = np.array([1.0, 2.0, 0.3]), np.array([0.5, -0.2, 0.1])
+    >>> relative(start, composed(start, change)).round(6).tolist()
+    [0.5, -0.2, 0.1]
+    """
+    cos, sin = np.cos(first[2]), np.sin(first[2])
+    x, y = last[0] - first[0], last[1] - first[1]
+    return np.array([cos * x + sin * y, cos * y - sin * x, last[2] - first[2]])
+
+
+def _leg(
+    run: RunLog, number: int, moved: Array, ends_s: tuple[float, float], robot: TrackedRobot, delay_s: float
+) -> Leg | None:
+    """Return a leg; None where tracks or gyro were not measured in a part of it."""
+    time_s, rows = odometry_rows(run, robot)
+    if not np.isfinite(rows[:, 2]).any():
+        raise DataError(f"run {run.run_id!r} has no gyro_z_radps, which odometry with slip needs")
+    for column in (0, 1, 2):
+        if _has_gap(time_s[np.isfinite(rows[:, column])], ends_s[0] - delay_s, ends_s[1] - delay_s):
+            return None
+    length_s = ends_s[1] - ends_s[0]
+    n = max(int(np.ceil(length_s / STEP_S)), 1)
+    step_s = length_s / n
+    at_s = ends_s[0] - delay_s + (np.arange(n) + 0.5) * step_s
+    known = np.isfinite(rows)
+    left, right, rate, roll, pitch = (
+        np.interp(at_s, time_s[known[:, k]], rows[known[:, k], k]) if known[:, k].any() else np.zeros(n)
+        for k in range(5)
+    )
+    return Leg(
+        number, moved, step_s, np.column_stack([left, right]), rate, np.column_stack([roll, pitch]), length_s
+    )
+
+
+def _has_gap(time_s: Array, from_s: float, to_s: float) -> bool:
+    """Return whether samples leave a gap between two times; a run may begin a delay after the first."""
+    inside = time_s[(time_s > from_s - GAP_S) & (time_s < to_s + GAP_S)]
+    if len(inside) < 2:
+        return True
+    return bool(
+        np.diff(inside).max() > GAP_S or inside[-1] < to_s - GAP_S or inside[0] > from_s + MAX_WINDOW_GAP_S
+    )
+
+
+def motion_over_gap(run: RunLog, from_s: float, to_s: float) -> Array | None:
+    """Return the change of pose between two times by the speeds that a lidar shows around them."""
+    lidar = run.streams.get("lidar")
+    if lidar is None or not 0.0 <= to_s - from_s <= MAX_WINDOW_GAP_S:
+        return None
+    known = np.isfinite(lidar.values).all(axis=1)
+    near = known & (np.abs(lidar.time_s - 0.5 * (from_s + to_s)) < 2.0 * MAX_WINDOW_GAP_S)
+    if near.sum() < 3:
+        return None
+    speed_x, speed_y, rate = lidar.values[near].mean(axis=0) * (to_s - from_s)
+    half = 0.5 * rate
+    return composed(np.array([0.0, 0.0, half]), np.array([speed_x, speed_y, half]))
+
+
+MOUNT = (
+    Parameter("lever_x_m", 0.0, prior_std=0.3),
+    Parameter("lever_y_m", 0.0, prior_std=0.3),
+    Parameter("turned_rad", 0.0, prior_std=0.1),
+)
+"""What is known of a mount before: on the robot, and mounted straight within 6 degrees."""
+
+LOWEST = {EXPONENT: 0.0, TRACK_RATIO: 0.05}
+"""Bounds of parameters of the slip model."""
+
+SCALE_STD_RATIO = 0.1
+"""Of the sprocket's radius beside the described one."""
+
+FIRST_ERROR_M, LEAST_ERROR_M, PASSES = 0.1, 1e-4, 4
+"""Error of a leg of 2 s that a fit begins with, and the least; each pass takes what the one before left."""
+
+MIN_LEGS = 10
+
+FLAT_RAD = 0.02
+"""Root mean square tilt, a degree, below which the ground counts as level."""
+
+
+class Kind(NamedTuple):
+    """A kind of odometry.
+
+    Parameters
+    ----------
+    name : as reports have it
+    free : places of the slip model that are fitted
+    by_gyro : whether the yaw rate is the gyro's; else that of the tracks
+    """
+
+    name: str
+    free: tuple[int, ...]
+    by_gyro: bool
+
+
+ENCODER = Kind("encoder odometry", (COMPACTION, TRACK_RATIO), False)
+GYRODOMETRY = Kind("gyrodometry", (COMPACTION,), True)
+ENDO = Kind("Endo", (COMPACTION, EXPONENT), True)
+SLIP = Kind(
+    "slip-compensated",
+    tuple(place for place in range(N_MODEL) if place != TRACK_RATIO),
+    True,
+)
+KINDS = (ENCODER, GYRODOMETRY, ENDO, SLIP)
+"""Encoder odometry has the best single effective track."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedOdometry:
+    """A kind of odometry fitted to legs.
+
+    Parameters
+    ----------
+    kind : which
+    model : its slip model, with the covariance of what was fitted, clustered by runs
+    fit : of the free parameters of the model, and of :data:`MOUNT`
+    """
+
+    kind: Kind
+    model: SlipModel
+    fit: Fit
+
+    @property
+    def mount(self) -> Array:
+        """Place of the observed point in the body, and angle of its sensor (3,)."""
+        return self.fit.value[-len(MOUNT) :]
+
+
+def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> FittedOdometry:
+    """Fit a kind of odometry.
+
+    Parameters
+    ----------
+    kind : which parts of the model are free
+    legs : to fit; longer ones count by the inverse of their length
+    robot : that drove them
+
+    Raises
+    ------
+    DataError
+        if there are fewer than ten legs.
+    """
+    if len(legs) < MIN_LEGS:
+        raise DataError(f"{len(legs)} legs have poses at both ends, {MIN_LEGS} or more are required")
+    prior = unknown_ground()
+    vector = np.where(np.isin(np.arange(N_MODEL), kind.free), prior.vector, SlipModel().vector)
+    std = np.sqrt(np.diag(prior.covariance))
+    std[COMPACTION] = SCALE_STD_RATIO
+    free = np.array(kind.free)
+    parameters = [
+        Parameter(PARAMETERS[k], float(vector[k]), LOWEST.get(k, -math.inf), math.inf, float(std[k]))
+        for k in free
+    ]
+    packed, measured = _packed(legs), np.array([leg.moved[:2] for leg in legs])
+    longer = np.array([max(leg.length_s / 2.0, 1.0) for leg in legs])
+    runs, number = np.unique([leg.run for leg in legs], return_inverse=True)
+
+    def errors_m(values: Array) -> Array:
+        vector[free] = values[: -len(MOUNT)]
+        ends = _ends(packed, vector, values[-len(MOUNT) :], robot, kind.by_gyro)
+        return np.asarray((ends[:, :2] - measured) / longer[:, None])
+
+    error_m, starts = FIRST_ERROR_M, list[Array]()
+    for _ in range(PASSES):
+
+        def residual(values: Array, error_m: float = error_m) -> Array:
+            return errors_m(values) / error_m
+
+        fit = identify(residual, [*parameters, *MOUNT], number, "soft_l1", starts)
+        starts, distance_m = [fit.value], np.hypot(*errors_m(fit.value).T)
+        error_m = max(float(np.median(distance_m)), LEAST_ERROR_M)
+    covariance = np.zeros((N_MODEL, N_MODEL))
+    covariance[np.ix_(free, free)] = fit.cov[: len(free), : len(free)]
+    left_m = distance_m * longer
+    path_m = np.array([np.abs(leg.speeds_mps.mean(axis=1)).sum() * leg.step_s for leg in legs])
+    ratio = float(np.sqrt((left_m**2).mean() / max((path_m**2).mean(), 1e-12)))
+    model = model_of(
+        vector,
+        covariance=covariance,
+        run_slip_std_ratio=ratio / math.sqrt(2.0),
+        run_angle_std_rad=ratio / math.sqrt(2.0),
+        found=f"{len(runs)} runs, {len(legs)} legs",
+    )
+    return FittedOdometry(kind, model, fit)
+
+
+def predict_ends(fitted: FittedOdometry, legs: Sequence[Leg], robot: TrackedRobot) -> Array:
+    """Return the change of pose (n, 3) of the observed point over each leg."""
+    return _ends(_packed(legs), fitted.model.vector, fitted.mount, robot, fitted.kind.by_gyro)
+
+
+def without_tilt(legs: Sequence[Leg]) -> bool:
+    """Return whether legs show no slopes: the rms of their mean tilts is below :data:`FLAT_RAD`."""
+    tilts = np.array([leg.tilt_rad.mean(axis=0) for leg in legs])
+    return bool(np.sqrt((tilts**2).mean(axis=0)).max() < FLAT_RAD)
+
+
+def level(kind: Kind) -> Kind:
+    """Return a kind without the parameters that only slopes show."""
+    tilt = {GRADE, TURN_GRADE, SIDE, TURN_SIDE, TURN_SHIFT, *(ANGLE + k for k in (4, 5, 7))}
+    return kind._replace(free=tuple(place for place in kind.free if place not in tilt))
+
+
+class _Packed(NamedTuple):
+    """All legs in a row: samples, where each leg ends, and its step."""
+
+    speeds: Array
+    rate: Array
+    tilt: Array
+    end: Array
+    step_s: Array
+
+
+def _packed(legs: Sequence[Leg]) -> _Packed:
+    return _Packed(
+        np.concatenate([leg.speeds_mps for leg in legs]),
+        np.concatenate([leg.yaw_rate_radps for leg in legs]),
+        np.concatenate([leg.tilt_rad for leg in legs]),
+        np.cumsum([len(leg.yaw_rate_radps) for leg in legs]),
+        np.array([leg.step_s for leg in legs]),
+    )
+
+
+def _ends(packed: _Packed, vector: Array, mount: Array, robot: TrackedRobot, by_gyro: bool) -> Array:
+    theta = np.zeros(N_PARAMETERS)
+    theta[:N_MODEL] = vector
+    geometry = np.array([robot.half_track_m, robot.contact_length_m])
+    return np.asarray(_sum_legs(theta, mount, geometry, by_gyro, packed))
+
+
+@njit(cache=True)
+def _sum_legs(
+    theta: Array,
+    mount: Array,
+    geometry: Array,
+    by_gyro: bool,
+    packed: _Packed,
+) -> Array:
+    """Return the change of pose (legs, 3) of the observed point; ``geometry`` is d and the length."""
+    speeds, rate, tilt, end, step_s = packed
+    half_track_m, length_m = geometry
+    out, slopes, first = np.empty((len(end), 3)), np.empty((3, N_PARAMETERS)), 0
+    by_track = 2.0 * half_track_m * theta[TRACK_RATIO]
+    for leg in range(len(end)):
+        x, y, yaw, displaced = 0.0, 0.0, 0.0, 0.0
+        for k in range(first, end[leg]):
+            pair = (speeds[k, 0], speeds[k, 1])
+            turn = rate[k] if by_gyro else (pair[1] - pair[0]) * (1.0 - theta[COMPACTION]) / by_track
+            displaced = next_displacement(displaced, pair, turn, length_m, step_s[leg])
+            if by_gyro:
+                v_x, v_y, _, _ = body_velocity(
+                    theta, half_track_m, pair, turn, (tilt[k, 0], tilt[k, 1]), displaced, slopes
+                )
+            else:
+                v_x, v_y = 0.5 * (pair[0] + pair[1]) * (1.0 - theta[COMPACTION]), 0.0
+            middle = yaw + 0.5 * turn * step_s[leg]
+            x += step_s[leg] * (v_x * math.cos(middle) - v_y * math.sin(middle))
+            y += step_s[leg] * (v_x * math.sin(middle) + v_y * math.cos(middle))
+            yaw += turn * step_s[leg]
+        first = end[leg]
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        x += (cos - 1.0) * mount[0] - sin * mount[1]
+        y += sin * mount[0] + (cos - 1.0) * mount[1]
+        turned_cos, turned_sin = math.cos(mount[2]), math.sin(mount[2])
+        out[leg, 0] = turned_cos * x + turned_sin * y
+        out[leg, 1] = turned_cos * y - turned_sin * x
+        out[leg, 2] = yaw
+    return out
+
+
+DRAWS = 2000
+"""Bootstrap samples of runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class KindScore:
+    """Error of a kind of odometry over legs of one length.
+
+    Parameters
+    ----------
+    kind : name
+    rmse_m, rmse_ci_m : root mean square distance from the measured end, held out, and its 95 % interval
+    median_m : of the distances
+    yaw_rmse_rad : root mean square error of the heading
+    gain_encoder, gain_encoder_ci : by how much the RMSE is below that of encoder odometry, as a ratio
+    gain_gyro, gain_gyro_ci : the same against gyrodometry
+    """
+
+    kind: str
+    rmse_m: float
+    rmse_ci_m: tuple[float, float]
+    median_m: float
+    yaw_rmse_rad: float
+    gain_encoder: float
+    gain_encoder_ci: tuple[float, float]
+    gain_gyro: float
+    gain_gyro_ci: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class LegScores:
+    """Scores of all kinds over legs of one length.
+
+    Parameters
+    ----------
+    length_s : of the legs, their mean
+    n_legs, n_runs : how many
+    path_m : root mean square of the distance between the ends of a leg
+    kinds : in the order of :data:`~terrain.calibration.odometry.KINDS`
+    """
+
+    length_s: float
+    n_legs: int
+    n_runs: int
+    path_m: float
+    kinds: tuple[KindScore, ...]
+
+
+def held_out_ends(
+    groups: Mapping[str, Sequence[Leg]],
+    robot: TrackedRobot,
+    n_folds: int,
+    seed: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, dict[str, Array]]:
+    """Return by kind and group the predicted ends (n, 3) of legs whose runs were held out of the fit.
+
+    Parameters
+    ----------
+    groups : legs by length
+    robot : that drove them
+    n_folds : whole runs are dealt into so many
+    seed : of the deal
+    progress : called after each fit
+
+    Raises
+    ------
+    DataError
+        if there are fewer runs than folds.
+    """
+    every = [leg for legs in groups.values() for leg in legs]
+    run = np.array([leg.run for leg in every])
+    if (n_runs := len(np.unique(run))) < n_folds:
+        raise DataError(f"{n_runs} runs have legs, at least {n_folds} are required for {n_folds} folds")
+    fold = deal(run, n_folds, np.random.default_rng(seed))
+    kinds = [level(kind) for kind in KINDS] if without_tilt(every) else list(KINDS)
+    ends = {kind.name: np.full((len(every), 3), np.nan) for kind in kinds}
+    for done, ((train, test), kind) in enumerate(itertools.product(folds(fold), kinds), start=1):
+        fitted = fit_odometry(kind, [every[k] for k in train], robot)
+        ends[kind.name][test] = predict_ends(fitted, [every[k] for k in test], robot)
+        progress(done, n_folds * len(kinds))
+    edges = np.cumsum([len(legs) for legs in groups.values()])[:-1]
+    return {name: dict(zip(groups, np.split(end, edges), strict=True)) for name, end in ends.items()}
+
+
+def score_legs(legs: Sequence[Leg], ends: Mapping[str, Array], seed: int) -> LegScores:
+    """Return the scores of kinds over legs of one length.
+
+    Parameters
+    ----------
+    legs : n of them
+    ends : predicted (n, 3) by the name of the kind
+    seed : of the bootstrap over runs
+    """
+    measured = np.array([leg.moved for leg in legs])
+    runs, number = np.unique([leg.run for leg in legs], return_inverse=True)
+    squares = {name: ((end[:, :2] - measured[:, :2]) ** 2).sum(axis=1) for name, end in ends.items()}
+    per_run = {name: np.bincount(number, square) for name, square in squares.items()}
+    counts, legs_of_run = bootstrap_counts(len(runs), DRAWS, seed), np.bincount(number)
+    drawn = {name: np.sqrt((counts @ sums) / (counts @ legs_of_run)) for name, sums in per_run.items()}
+    rmse = {name: math.sqrt(square.mean()) for name, square in squares.items()}
+
+    def gain(name: str, against: Kind) -> tuple[float, tuple[float, float]]:
+        over = 1.0 - drawn[name] / drawn[against.name]
+        return 1.0 - rmse[name] / rmse[against.name], percentile_interval(over)
+
+    scores = []
+    for name, end in ends.items():
+        by_encoder, by_gyro = gain(name, ENCODER), gain(name, GYRODOMETRY)
+        scores.append(
+            KindScore(
+                name,
+                rmse[name],
+                percentile_interval(drawn[name]),
+                float(np.median(np.sqrt(squares[name]))),
+                math.sqrt(np.mean((end[:, 2] - measured[:, 2]) ** 2)),
+                *by_encoder,
+                *by_gyro,
+            )
+        )
+    return LegScores(
+        float(np.mean([leg.length_s for leg in legs])),
+        len(legs),
+        len(runs),
+        math.sqrt((measured[:, :2] ** 2).sum(axis=1).mean()),
+        tuple(scores),
+    )
+
+
+SETTINGS = TrackedSettings(
+    observation_gain_ps=(2.0, 2.0, 2.0), normalised=True, position_std_m=0.03, yaw_std_rad=0.04
+)
+"""Gains that settle within four seconds at any speed, and about the noise of these poses."""
+
+
+def efficiencies_before(
+    run: RunLog, windows: Sequence[WindowPoses], robot: TrackedRobot, delay_s: float, mount: Array
+) -> Array | None:
+    """Return the efficiencies (2,) of the left and the right track before a command's last window.
+
+    None where there are fewer than two windows, gaps that are too long, or too few fixes.
+
+    Parameters
+    ----------
+    run : of the command
+    windows : its poses
+    robot : that drove
+    delay_s : of the poses behind the gyro and the tracks
+    mount : (3,) of :class:`~terrain.calibration.odometry.FittedOdometry`
+    """
+    if len(windows) < 2:
+        return None
+    time_s, own = odometry_rows(run, robot)
+    rows = np.full((len(time_s), len(ROWS)), np.nan)
+    rows[:, :2], rows[:, 5] = own[:, :2], own[:, 2]
+    origin = np.zeros(3)
+    for k, window in enumerate(windows[:-1]):
+        if k > 0:
+            gap = motion_over_gap(run, windows[k - 1].time_s[-1], window.time_s[0])
+            if gap is None:
+                return None
+            origin = composed(origin, gap)
+        for stamp_s, pose in zip(window.time_s - delay_s, window.pose, strict=True):
+            tick = int(np.argmin(np.abs(time_s - stamp_s)))
+            if abs(time_s[tick] - stamp_s) < 0.5 * (time_s[1] - time_s[0]) + 1e-9:
+                rows[tick, 2:5] = of_body(composed(origin, pose), mount)
+        origin = composed(origin, window.pose[-1])
+    until = int(np.searchsorted(time_s, windows[-2].time_s[-1] - delay_s, side="right"))
+    if until < 2:
+        return None
+    track = observe(tracked_observer(robot, SETTINGS), time_s[:until], rows[:until])
+    if track.status[-1] == ObserverStatus.STARTING:
+        return None
+    eta = track.mean[-1, [track.states.index(f"eta_{side}_ratio") for side in ("left", "right")]]
+    return np.asarray(eta)
+
+
+def of_body(pose: Array, mount: Array) -> Array:
+    """Return the pose (3,) of the body where that of the observed point is measured, both from 0.
+
+    Examples
+    --------
+    >>> mount = np.array([-0.05, 0.01, 0.02])
+    >>> of_body(of_point(np.array([1.0, 0.5, 0.8]), mount), mount).round(6).tolist()
+    [1.0, 0.5, 0.8]
+    """
+    lever = complex(mount[0], mount[1])
+    seen = complex(pose[0], pose[1]) * np.exp(1j * mount[2])
+    body = seen + lever - lever * np.exp(1j * pose[2])
+    return np.array([body.real, body.imag, pose[2]])
+
+
+def of_point(pose: Array, mount: Array) -> Array:
+    """Return the pose (3,) of the observed point, for that of the body: the inverse of :func:`of_body`."""
+    lever = complex(mount[0], mount[1])
+    seen = (complex(pose[0], pose[1]) + lever * np.exp(1j * pose[2]) - lever) * np.exp(-1j * mount[2])
+    return np.array([seen.real, seen.imag, pose[2]])
+
+
+def dead_reckoning(leg: Leg, eta: Array, robot: TrackedRobot) -> Array:
+    """Return the change of pose (3,) of the body over a leg with efficiencies (2,): Tazzari (5).
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> speeds, still = np.full((20, 2), 0.5), np.zeros(20)
+    >>> leg = Leg(0, np.zeros(3), 0.1, speeds, still, np.zeros((20, 2)), 2.0)
+    >>> dead_reckoning(leg, np.array([0.9, 0.9]), load_robot("marmotte")).round(3).tolist()
+    [0.9, 0.0, 0.0]
+    """
+    left, right = (leg.speeds_mps * eta).T
+    turned = (right - left) / robot.track_m * leg.step_s
+    yaw = np.cumsum(turned) - 0.5 * turned
+    ahead = 0.5 * (left + right) * leg.step_s
+    return np.array([(ahead * np.cos(yaw)).sum(), (ahead * np.sin(yaw)).sum(), turned.sum()])
+
 
 SHORT_RATIO = 0.8
 """A command's leg that is so much shorter than the longest of all is left out: its windows are not whole."""
@@ -118,7 +773,8 @@ def judge_odometry(
     if windows:
         adaptive = _adaptive(runs, windows, groups, ends, robot, delay_s, fitted.mount, seed)
     x_m, y_m, angle_rad = map(float, fitted.mount)
-    found = _parameters(fitted, n_runs)
+    rows = zip(fitted.fit.parameters, fitted.fit.value.tolist(), *fitted.fit.interval.tolist(), strict=True)
+    found = {p.name: ParameterFound(*row) for p, *row in rows if p.name in PARAMETERS}
     return JudgedOdometry(n_runs, scores, fitted.model, found, (x_m, y_m), angle_rad, adaptive, delay_s, flat)
 
 
@@ -145,18 +801,6 @@ def _pose_legs(runs: Sequence[RunLog], robot: TrackedRobot, length_s: float) -> 
         if "pose" in run.streams
         for leg in legs_of_poses(run, number, robot, length_s)
     ]
-
-
-def _parameters(fitted: FittedOdometry, n_runs: int) -> dict[str, ParameterFound]:
-    """Return the fitted parameters, with intervals by Student's t over runs: the clusters of the fit."""
-    std = np.sqrt(np.diag(fitted.model.covariance))
-    wide = float(student.ppf(0.975, max(n_runs - 1, 1)))
-    reach = np.where(np.isin(np.arange(len(std)), fitted.kind.free), wide * std, np.nan)
-    return {
-        name: ParameterFound(float(value), float(value - half), float(value + half))
-        for name, value, half in zip(PARAMETERS, fitted.model.vector, reach, strict=True)
-        if np.isfinite(half)
-    }
 
 
 def _adaptive(

@@ -12,7 +12,7 @@ at several speeds and took no less current at the higher ones.
 each wheel carries (:mod:`terrain.measured_slip.rollers`), and so the centre of mass
 :math:`\sum_i n_i p_i`; a slip that is the same in all directions is a wheel that rolls on a radius
 :math:`(1 - \kappa) r`, or an outside measurement whose scale is off, which they do not distinguish.  The
-distance of the wheels follows from how small turns agree (:mod:`terrain.measured_slip.wheel_distance`),
+distance of the wheels follows from how small turns agree (:mod:`terrain.measured_slip.rollers`),
 surface by surface: slip in turning makes it too large, what else turns the robot moves it up or down, so that
 the mean is given with the intervals of all surfaces.
 
@@ -28,13 +28,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.calibration.finding import Finding, half_width, undetermined
+from terrain.calibration.finding import Finding, around, undetermined
 from terrain.errors import DataError
+from terrain.identify import half_width
 from terrain.measured_slip.delay import estimate_delay
-from terrain.measured_slip.rollers import MIN_RUNS, RollerFindings, roller_findings
-from terrain.measured_slip.slips import MeasuredSlip, measured_slip
-from terrain.measured_slip.travelled import outside_source
-from terrain.measured_slip.wheel_distance import distance_bound
+from terrain.measured_slip.rollers import MIN_RUNS, RollerFindings, distance_bound, roller_findings
+from terrain.measured_slip.slips import MeasuredSlip, measured_slip, outside_source
 from terrain.records import Array, RunLog
 from terrain.robots.omni import OmniRobot
 
@@ -104,11 +103,10 @@ def motor_friction(runs: Sequence[RunLog], robot: OmniRobot) -> Finding:
     mean_a, slope = means.mean(axis=0)
     half = float(half_width(means[:, 0].std(ddof=1) / math.sqrt(len(means)), len(means) - 1))
     each = ", ".join(f"{a:.3f}" for a in means[:, 0])
-    return Finding(
+    return around(
         FRICTION,
-        float(mean_a * nm_per_a),
-        float((mean_a - half) * nm_per_a),
-        float((mean_a + half) * nm_per_a),
+        mean_a * nm_per_a,
+        half * nm_per_a,
         sum(fit.n for fit in fits),
         "stretches",
         tuple(dict.fromkeys(fit.run_id for fit in fits)),
@@ -201,7 +199,7 @@ def _load(found: RollerFindings, robot: OmniRobot, ids: tuple[str, ...]) -> list
     apart_m = np.abs(robot.wheel_positions_m - robot.wheel_positions_m[:, None])  # q at each of the wheels
     half_m = np.einsum("i,qia->qa", half, apart_m).min(axis=0)
     return [
-        Finding(name, float(m), float(m - wide), float(m + wide), len(ids), "runs", ids, note)
+        around(name, m, wide, len(ids), "runs", ids, note)
         for name, m, wide in zip((COM_X, COM_Y), com_m, half_m, strict=True)
     ]
 

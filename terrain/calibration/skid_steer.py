@@ -28,7 +28,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import trim_mean
 
-from terrain.calibration.finding import Finding, half_width, undetermined
+from terrain.calibration.finding import Finding, around, undetermined
+from terrain.identify import half_width, jackknife
 from terrain.records import Array, RunLog
 
 SLIP_RATIO = (0.0, 0.02)
@@ -198,17 +199,14 @@ def _jackknifed(
         )
         return undetermined([name], reason)[0]
     value, n = estimate([each for group in used for each in group])
-    left_out = np.array(
-        [estimate([each for j, group in enumerate(used) if j != i for each in group])[0] for i in range(k)]
-    )
-    variance = float((k - 1) / k * ((left_out - left_out.mean()) ** 2).sum())
+    std = jackknife(lambda some: estimate([each for i in some for each in used[i]])[0], k)
     of_grid = DELAY_RESOLUTION_S if name in (LIDAR_DELAY, WHEELS_DELAY) else 0.0
-    half = math.hypot(float(half_width(math.sqrt(variance), k - 1)), of_grid)
+    half = math.hypot(float(half_width(std, k - 1)), of_grid)
     if not math.isfinite(value) or not math.isfinite(half):
         return undetermined([name], "nothing in the runs shows it")[0]
     runs = tuple(each.run_id for group in used for each in group)
     counted = "steady stretches" if name in (RADIUS, TRACK) else "runs"
-    return Finding(name, value, value - half, value + half, n, counted, runs, note)
+    return around(name, value, half, n, counted, runs, note)
 
 
 def _summary(run: Driven, any_gyro: bool) -> Summary:

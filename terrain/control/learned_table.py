@@ -22,16 +22,20 @@ import numpy as np
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.control.slip_table import DRIVE_STATES, SIGN, CurveEntry, SlipTable, load_slip_table
 from terrain.measured_slip.measure import Measured
-from terrain.measured_slip.operating import OperatingPoints, operating_points
 from terrain.measured_slip.slips import MeasuredSlip
-from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
+from terrain.measured_slip.surfaces import OperatingPoints, SurfaceSlip, operating_points, surface_slip
 from terrain.records import Array, RunLog, SlipTarget, TargetStatus
 from terrain.robots import Robot
 from terrain.simulation.slip_sweep import learning_runs
-from terrain.slip_learning.curve import SlipCurve
-from terrain.slip_learning.laws import LAW_PARAMETERS
+from terrain.slip_learning.curve import (
+    LAW_PARAMETERS,
+    MIN_ABOVE_BALANCE_SLIP,
+    SlipCurve,
+    Targets,
+    energy_jpm,
+    tractive_efficiency,
+)
 from terrain.slip_learning.learn import LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
-from terrain.slip_learning.targets import MIN_ABOVE_BALANCE_SLIP, Targets, energy_jpm, tractive_efficiency
 from terrain.terramechanics.soil import load_soil
 
 FALLBACK = "unknown"

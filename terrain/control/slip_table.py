@@ -23,8 +23,7 @@ from terrain.files.descriptions import check_keys
 from terrain.files.documents import read_yaml
 from terrain.files.resources import data_folder
 from terrain.records import Array, SlipTarget, TargetStatus
-from terrain.slip_learning.laws import LAW_BOUNDS, LAW_PARAMETERS, traction_ratio
-from terrain.slip_learning.peak import PeakStatus
+from terrain.slip_learning.curve import LAW_BOUNDS, LAW_PARAMETERS, PeakStatus, traction_ratio
 
 DRIVE_STATES = ("traction", "braking", "steady")
 
@@ -50,8 +49,8 @@ class CurveEntry:
 
     Parameters
     ----------
-    law, parameters : by :data:`terrain.slip_learning.laws.LAW_PARAMETERS`
-    peak_slip_ratio, peak_interval_ratio, peak_status : of net traction (:mod:`terrain.slip_learning.peak`);
+    law, parameters : by :data:`terrain.slip_learning.curve.LAW_PARAMETERS`
+    peak_slip_ratio, peak_interval_ratio, peak_status : of net traction (:mod:`terrain.slip_learning.curve`);
         the interval contains it with 90 %
     slip_range_ratio : slips that were observed
     resistance_ratio, resistance_std : over load

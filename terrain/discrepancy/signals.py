@@ -24,7 +24,7 @@ from terrain.errors import DataError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import POSE_CHANNELS
-from terrain.measured_slip.travelled import travelled
+from terrain.measured_slip.slips import travelled
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
 

@@ -18,9 +18,14 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.measured_slip.rates import window_rates
-from terrain.measured_slip.slips import rolled_twists, wheel_directions, wheel_speeds
-from terrain.measured_slip.travelled import Travelled, travelled
+from terrain.measured_slip.slips import (
+    Travelled,
+    rolled_twists,
+    travelled,
+    wheel_directions,
+    wheel_speeds,
+    window_rates,
+)
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 

@@ -10,9 +10,14 @@ import numpy as np
 
 from terrain.errors import DataError
 from terrain.measured_slip.delay import Delay, DelayStatus, estimate_delay
-from terrain.measured_slip.rollers import RollerFindings, roller_findings, surface_of_windows
+from terrain.measured_slip.rollers import (
+    DistanceBound,
+    RollerFindings,
+    distance_bound,
+    roller_findings,
+    surface_of_windows,
+)
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip
-from terrain.measured_slip.wheel_distance import DistanceBound, distance_bound
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, as_drive, robot_named
 

@@ -1,25 +1,35 @@
-"""What makes an omni robot slip, from runs whose motion was measured from outside: rollers, load, scale.
+r"""What makes an omni robot slip, from runs whose motion was measured from outside: rollers, load, scale, distance.
 
 The steady law of :mod:`terrain.simulation.planar.omni_contact` is fitted to the median motion of each run,
 slip along the direction that the wheels roll and speed across it: the sharing of the load and the scale are
 those of the robot, the friction of the rollers over traction is that of each surface.  Intervals are of draws
 of runs; what the law leaves is judged on every fifth run in turn, held out.  A group of runs that is not
 fitted (with weights, say) is asked which sharing of the load would explain it, all else equal.
+
+Wheels at the distance d from the robot's middle that roll :math:`\varphi_i` without slip turn the body by
+:math:`\psi = \sum_i r \varphi_i / (3 d)`.  Over runs on one surface the slope of the turn measured from
+outside over that of the described distance is :math:`(1 - s)\,d_0 / d`, with the slip s of turning, which a
+robot that is commanded not to turn hardly shows.  Where s is not known, :math:`d_0` over the slope is the
+distance of wheels that turn the body without slip: an upper bound, but for what else turns it.  Intervals are
+those of draws of runs; how far surfaces differ says what else there is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.errors import DataError
+from terrain.identify import Parameter, folds, identify
 from terrain.measured_slip.slips import MeasuredSlip
 from terrain.records import Array
 from terrain.robots import Robot
+from terrain.robots.omni import OmniRobot
 from terrain.simulation.planar.omni_contact import steady_twist
 
 N_FOLDS = 5
@@ -123,16 +133,15 @@ def roller_findings(
         raise DataError("no surface is named whose runs could be fitted")
     fitted = cases.at(np.flatnonzero(np.isin(cases.group, names)))
     law = _Law(robot, names)
-    best = law.fit(fitted, law.start())
+    best = law.fit(fitted)
     rng = np.random.default_rng(seed)
     places = [np.flatnonzero(fitted.group == name) for name in names]
     draws = np.array([law.fit(fitted.at(_drawn(places, rng)), best) for _ in range(N_DRAWS)])
-    fold = np.concatenate([np.arange(len(rows)) % N_FOLDS for rows in places])
-    order = np.concatenate(places)
-    left = np.full(len(fitted.slip), np.nan)
-    for number in range(N_FOLDS):
-        test = order[fold == number]
-        part = law.fit(fitted.at(order[fold != number]), best)
+    fold, left = np.empty(len(fitted.slip), int), np.empty(len(fitted.slip))
+    for rows in places:
+        fold[rows] = np.arange(len(rows)) % N_FOLDS
+    for train, test in folds(fold):
+        part = law.fit(fitted.at(train), best)
         left[test] = law.motion(fitted.at(test), part)[0] - fitted.slip[test]
     loads = np.array([law.loads(draw) for draw in draws])
     others = [name for name in dict.fromkeys(cases.group.tolist()) if name not in names]
@@ -193,9 +202,9 @@ class _Law:
 
     def __init__(self, robot: Robot, surfaces: Sequence[str]) -> None:
         self.robot, self.surfaces = robot, list(surfaces)
-
-    def start(self) -> Array:
-        return np.concatenate([[1.0, 1.0, 0.03], np.full(len(self.surfaces), -1.0)])
+        loads = [Parameter(f"load_{i}_ratio", 1.0, 0.05, 20.0) for i in (1, 3)]
+        rollers = [Parameter(f"log_roller_{name}_ratio", -1.0, _FREE, 3.0) for name in surfaces]
+        self.parameters = [*loads, Parameter("scale_ratio", 0.03, -0.3, 0.6), *rollers]
 
     def loads(self, parameters: Array) -> Array:
         share = np.array([parameters[0], 1.0, parameters[1]])
@@ -219,16 +228,13 @@ class _Law:
             side[rows] = (ahead[:, 0] * twist[:, 1] - ahead[:, 1] * twist[:, 0]) / speed
         return slip, side
 
-    def fit(self, cases: _Cases, start: Array) -> Array:
-        def misfit(parameters: Array) -> Array:
-            slip, side = self.motion(cases, parameters)
-            return np.concatenate([slip - cases.slip, side - cases.side])
+    def misfit(self, cases: _Cases, parameters: Array, group: str = "") -> Array:
+        slip, side = self.motion(cases, parameters, group)
+        return np.concatenate([slip - cases.slip, side - cases.side])
 
-        low = np.concatenate([[0.05, 0.05, -0.3], np.full(len(self.surfaces), _FREE)])
-        high = np.concatenate([[20.0, 20.0, 0.6], np.full(len(self.surfaces), 3.0)])
-        return np.asarray(
-            least_squares(misfit, np.clip(start, low + 1e-6, high - 1e-6), bounds=(low, high)).x
-        )
+    def fit(self, cases: _Cases, start: Array | None = None) -> Array:
+        starts = [] if start is None else [start]
+        return identify(partial(self.misfit, cases), self.parameters, starts=starts).value
 
 
 def _other_load(
@@ -239,13 +245,12 @@ def _other_load(
         return None
 
     def misfit(loads: Array, surface: str) -> Array:
-        slip, side = law.motion(cases, np.concatenate([loads, best[2:]]), surface)
-        return np.concatenate([slip - cases.slip, side - cases.side])
+        return law.misfit(cases, np.concatenate([loads, best[2:]]), surface)
 
     surface = min(law.surfaces, key=lambda name: _rms(misfit(best[:2], name)))
-    found = least_squares(misfit, best[:2], args=(surface,), bounds=(0.05, 20.0))
-    rms = _rms(misfit(best[:2], surface)), _rms(found.fun)
-    return surface, tuple(law.loads(found.x).tolist()), rms
+    found = identify(partial(misfit, surface=surface), law.parameters[:2], starts=[best[:2]])
+    rms = _rms(misfit(best[:2], surface)), _rms(found.residual)
+    return surface, tuple(law.loads(found.value).tolist()), rms
 
 
 def _cases(runs: Sequence[MeasuredSlip], groups: Sequence[str]) -> _Cases:
@@ -262,3 +267,57 @@ def _cases(runs: Sequence[MeasuredSlip], groups: Sequence[str]) -> _Cases:
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+MIN_CORRELATION = 0.8
+"""Of the turns of runs; below, something else turns the robot, as sliding over soft ground."""
+
+N_DISTANCE_DRAWS = 1000
+
+
+class DistanceBound(NamedTuple):
+    """Distance of wheels that turn without slip, its 95 % interval over runs, and how well turns agree."""
+
+    distance_m: float
+    interval_m: tuple[float, float]
+    correlation: float
+    n_runs: int
+
+    @property
+    def sentence(self) -> str:
+        """The distance, in words."""
+        low_m, high_m = self.interval_m
+        return (
+            f"turns are those of wheels {self.distance_m:.4f} m from the middle that turn without slip "
+            f"({low_m:.4f} to {high_m:.4f}, {self.n_runs} runs)."
+        )
+
+
+def distance_bound(
+    runs: Sequence[MeasuredSlip], robot: OmniRobot, rng: np.random.Generator
+) -> DistanceBound | None:
+    """Return the bound that runs on one surface give; None where their turns do not follow the wheels.
+
+    Parameters
+    ----------
+    runs : measured, on a surface where wheels slip little
+    robot : with the distance as described
+    rng : draws runs
+    """
+    turns = []
+    for run in runs:
+        known = np.isfinite(run.twist[:, 2]) & np.isfinite(run.rolled_twist[:, 2])
+        if known.any():
+            turns.append((run.rolled_twist[known, 2].mean(), run.twist[known, 2].mean()))
+    if len(turns) < 3:
+        return None
+    rolled, seen = np.array(turns).T
+    spread = float(np.sqrt((rolled @ rolled) * (seen @ seen)))
+    correlation = float(rolled @ seen) / spread if spread > 0.0 else 0.0
+    if correlation < MIN_CORRELATION:
+        return None
+    rows = bootstrap_rows(len(turns), N_DISTANCE_DRAWS, rng)
+    described_m = robot.wheel_distance_m
+    draws = described_m * (rolled[rows] ** 2).sum(axis=1) / (rolled[rows] * seen[rows]).sum(axis=1)
+    found_m = described_m * float(rolled @ rolled) / float(rolled @ seen)
+    return DistanceBound(found_m, percentile_interval(draws), correlation, len(turns))

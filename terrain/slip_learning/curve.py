@@ -1,28 +1,427 @@
-"""The slip curve of a terrain: law, resistance, peak, and the slips that targets are made of."""
+"""The slip curve of a terrain: law, resistance, peak, and the target slips that it gives.
+
+**Laws** of thrust over load against slip, those of :mod:`terrain.terramechanics.traction` divided by the load, with
+the same parameters for all wheel loads::
+
+    janosi   f = M (1 - (1 - exp(-s / k)) k / s)                       k = K / l
+    magic    f = D sin(C atan(B s - E (B s - atan(B s))))
+
+**Fit.**  Samples (slip s, thrust over load mu) of a run are correlated in time and share the run's terrain, load and
+tyres, so they are gathered in bins of slip first, and each run has a factor g_r and an offset of slip b_r of
+its own::
+
+    mu = g_r f(s + b_r; theta)      g_r about 1, RUN_STD_RATIO; b_r about 0, SLIP_OFFSET_STD
+
+Errors are in both axes: where the curve has the slope f', a bin has the variance ``var(mu) + f'^2 var(s)``
+(effective variance; Orear, American Journal of Physics 50, 1982).
+
+**Peak.**  Net traction (drawbar pull of a wheel over its load) is f(s) - rho, with the thrust over load f and the
+resistance over load rho.  Its peak slip is
+
+- where the largest net traction within the observed slips lies, if that is not within :data:`EDGE_SLIP` of
+  their end (:attr:`PeakStatus.PEAK`);
+- else the smallest slip with 95 % of the largest net traction within the observed slips
+  (:attr:`PeakStatus.NO_PEAK`): on terrain that shears, traction rises monotonically, and more slip gains next
+  to nothing.
+
+Its 90 % interval is from a bootstrap over whole runs, so that it contains what differs from run to run,
+whether or not a factor describes it; percentiles are taken further out as a few runs demand (expanded
+percentile interval; Hesterberg, American Statistician 69 (4), 371-386, 2015).
+
+**Targets** for traction, braking and steady motion, with weight W, wheel radius r and bearing friction T_f::
+
+    eta(s) = (f - rho) / f (1 - s)      tractive efficiency
+    E(s)   = (f W r + 3 T_f) w / v      energy a metre at the wheels
+
+where w r / v is 1 / (1 - s) in traction and 1 - |s| in braking.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri, stdtrit
 
 from terrain.bootstrap import bootstrap_rows
+from terrain.constants import GRAVITY_MPS2
+from terrain.identify import Parameter, identify, select
 from terrain.records import Array, read_only
-from terrain.slip_learning.fit import NO_CURVE, chosen_law, fit_curve, left_out_scores
-from terrain.slip_learning.laws import slip_at, traction_ratio
-from terrain.slip_learning.peak import (
-    INTERVAL,
-    SYSTEMATIC_SLIP_STD,
-    Peak,
-    net_peak,
-    peak_interval,
-    peak_slip_of_kind,
-)
-from terrain.slip_learning.samples import RunBins, slip_range
+from terrain.robots import Robot
+from terrain.slip_learning.forces import RunBins, slip_range
+
+LAW_PARAMETERS: Mapping[str, tuple[str, ...]] = {
+    "janosi": ("limit_ratio", "shear_ratio"),
+    "magic": ("stiffness_ratio", "shape_ratio", "peak_friction_ratio", "curvature_ratio"),
+}
+"""Parameters of each law, in the order of :func:`traction_ratio`: M and k; B, C, D and E."""
+
+LAW_BOUNDS: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "janosi": ((1e-3, 1e-3), (5.0, 20.0)),
+    "magic": ((0.1, 1.0, 1e-3, -5.0), (200.0, 2.3, 5.0, 1.0)),
+}
+"""Lower and upper bounds of each law's parameters, in their order."""
+
+
+def traction_ratio(law: str, parameters: Sequence[float] | Array, slip_ratio: Array) -> Array:
+    """Return the thrust over load (n,) at each slip (n,); odd in the slip.
+
+    Examples
+    --------
+    >>> traction_ratio("janosi", (0.5, 0.4), np.array([-0.1, 0.0, 0.1, 0.4])).round(3)
+    array([-0.058,  0.   ,  0.058,  0.184])
+    >>> traction_ratio("magic", (10.0, 1.9, 1.0, 0.97), np.array([0.05, 0.18])).round(3)
+    array([0.736, 1.   ])
+    """
+    magnitude = np.abs(slip_ratio)
+    if law == "janosi":
+        limit, shear = parameters
+        x = magnitude / shear
+        small = x < 1e-3
+        safe = np.where(small, 1.0, x)
+        return np.sign(slip_ratio) * limit * np.where(small, x / 2 - x * x / 6, 1 + np.expm1(-safe) / safe)
+    stiffness, shape, peak, curvature = parameters
+    x = stiffness * magnitude
+    angle = shape * np.arctan(x - curvature * (x - np.arctan(x)))
+    return np.sign(slip_ratio) * peak * np.maximum(np.sin(angle), 0.0)
+
+
+def slip_at(law: str, parameters: Sequence[float], traction: float, high_slip: float = 1.0) -> float:
+    """Return the smallest slip with a given thrust over load; NaN where no slip up to ``high_slip`` has it.
+
+    Examples
+    --------
+    >>> round(slip_at("janosi", (0.5, 0.4), 0.1), 3)
+    0.186
+    """
+    slips = np.linspace(0.0, high_slip, 2001)
+    reached = traction_ratio(law, parameters, slips) >= traction
+    if not reached.any():
+        return math.nan
+    first = int(np.argmax(reached))
+    if first == 0:
+        return 0.0
+    f = traction_ratio(law, parameters, slips[first - 1 : first + 1])
+    return float(np.interp(traction, f, slips[first - 1 : first + 1]))
+
+
+RUN_STD_RATIO = 0.15
+"""Prior standard deviation of a run's factor about 1: friction from place to place (8 %), and load."""
+
+SLIP_OFFSET_STD = 0.004
+"""Prior standard deviation of the offset of all slips of a run: half a percent of rolling radius a wheel
+(data/spread), of three wheels."""
+
+NO_CURVE = "none"
+"""Name of the reference model of :func:`select_law`, which does not depend on the slip."""
+
+_PRIOR = {"shape_ratio": (1.65, 1.0), "curvature_ratio": (0.5, 2.0)}
+"""Mean and standard deviation: Pacejka's usual C of pure longitudinal slip, and E up to 1; they matter where
+the data end before the peak."""
+
+_MIN_VARIANCE = 1e-9
+
+
+class Fit(NamedTuple):
+    """A law with its parameters, the factor of each run, and the mean squared normalized residual."""
+
+    law: str
+    parameters: tuple[float, ...]
+    run_factors: tuple[float, ...]
+    misfit: float
+
+
+class _RunTerms(NamedTuple):
+    """Factor less 1 and offset of slip of each run (runs,), and the residual of each bin (k,)."""
+
+    factor: Array
+    offset: Array
+    residual: Array
+
+
+class _Pooled:
+    """All bins of all runs, one after the other."""
+
+    def __init__(self, runs: Sequence[RunBins]) -> None:
+        self.n = len(runs)
+        self.run = np.repeat(np.arange(self.n), [len(run.slip_ratio) for run in runs])
+        self.slip, self.slip_std, self.traction, self.std = (
+            np.concatenate([getattr(run, name) for run in runs])
+            for name in ("slip_ratio", "slip_std", "traction_ratio", "traction_std")
+        )
+
+    def curve(self, law: str, theta: Sequence[float] | Array) -> tuple[Array, Array]:
+        """Return value and slope (k,) of the curve at each bin."""
+        f = traction_ratio(law, theta, self.slip)
+        return f, (traction_ratio(law, theta, self.slip + 1e-4) - f) / 1e-4
+
+    def variance(self, law: str, theta: Sequence[float] | Array) -> Array:
+        """Return the effective variance (k,) of each bin."""
+        by_slip = self.curve(law, theta)[1] * self.slip_std
+        return np.asarray(np.maximum(self.std**2 + by_slip**2, _MIN_VARIANCE))
+
+    def run_terms(self, law: str, theta: Array, variance: Array) -> _RunTerms:
+        """Return the most likely factor and offset of each run.
+
+        ``mu = (1 + g) f + b f'`` is linear in both, with a prior on each: the solution is in closed form.
+        """
+        f, slope = self.curve(law, theta)
+        residual = self.traction - f
+        sums = [
+            np.bincount(self.run, product / variance, self.n)
+            for product in (f * f, f * slope, slope * slope, f * residual, slope * residual)
+        ]
+        gg, gb, bb = sums[0] + RUN_STD_RATIO**-2, sums[1], sums[2] + SLIP_OFFSET_STD**-2
+        det = gg * bb - gb**2
+        factor, offset = (bb * sums[3] - gb * sums[4]) / det, (gg * sums[4] - gb * sums[3]) / det
+        return _RunTerms(factor, offset, residual - factor[self.run] * f - offset[self.run] * slope)
+
+    def residuals(self, theta: Array, law: str, variance: Array) -> Array:
+        """Return normalized residuals of bins and of the runs' priors."""
+        terms = self.run_terms(law, theta, variance)
+        normalized = terms.residual / np.sqrt(variance)
+        return np.concatenate([normalized, terms.factor / RUN_STD_RATIO, terms.offset / SLIP_OFFSET_STD])
+
+    def cost(self, law: str, theta: Array) -> float:
+        """Return twice the negative log likelihood of the bins and of the priors, but for a constant."""
+        variance, named = self.variance(law, theta), zip(LAW_PARAMETERS[law], theta, strict=True)
+        priors = [(value - _PRIOR[name][0]) / _PRIOR[name][1] for name, value in named if name in _PRIOR]
+        return float(
+            np.sum(self.residuals(theta, law, variance) ** 2)
+            + np.sum(np.log(variance))
+            + np.sum(np.square(priors))
+        )
+
+    def log_likelihood(self, f: Array, slope: Array, variance: Array) -> float:
+        """Return the log density of the bins of a single run, its factor and its offset integrated out."""
+        effects = np.column_stack([f * RUN_STD_RATIO, slope * SLIP_OFFSET_STD])
+        cov = np.diag(variance) + effects @ effects.T
+        residual = self.traction - f
+        _, log_det = np.linalg.slogdet(cov)
+        mahalanobis = residual @ np.linalg.solve(cov, residual)
+        return -0.5 * float(mahalanobis + log_det + len(f) * math.log(2 * math.pi))
+
+
+def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None = None) -> Fit:
+    """Return a law fitted to runs, each with a factor and an offset of its own.
+
+    Parameters
+    ----------
+    law : one of :data:`LAW_PARAMETERS`
+    runs : at least one with a bin
+    start : parameters to start from, of a fit to nearly the same runs; by default several starts are tried
+
+    Notes
+    -----
+    The effective variance of a bin depends on the slope, hence on the fit: it is held constant during a
+    search and then renewed.  If it changed within the search, a steep curve would excuse its own residuals.
+    """
+    pooled = _Pooled(runs)
+    guesses = _starts(law, pooled) if start is None else [np.asarray(start)]
+    found = [_search(pooled, law, guess, renew=start is None) for guess in guesses]
+    theta = min(found, key=lambda theta: pooled.cost(law, theta))
+    variance = pooled.variance(law, theta)
+    terms = pooled.run_terms(law, theta, variance)
+    misfit = float(np.mean(terms.residual**2 / variance))
+    return Fit(law, tuple(theta.tolist()), tuple((1.0 + terms.factor).tolist()), misfit)
+
+
+def _parameters(law: str, near: Array) -> list[Parameter]:
+    """Return the parameters of a law, to be searched from values that are near."""
+    rows = zip(LAW_PARAMETERS[law], near.tolist(), *LAW_BOUNDS[law], strict=True)
+    return [
+        Parameter(name, mean, low, high, std, max(abs(value), 0.1))
+        for name, value, low, high in rows
+        for mean, std in [_PRIOR.get(name, (value, math.inf))]
+    ]
+
+
+def _search(pooled: _Pooled, law: str, guess: Array, renew: bool) -> Array:
+    """Return the parameters of least cost near a guess, with the variance of bins renewed twice or never."""
+    low, high = (np.array(bound) for bound in LAW_BOUNDS[law])
+    theta = np.clip(guess, low + 1e-6, high - 1e-6)
+    variance = pooled.std**2 if renew else pooled.variance(law, theta)
+    for _ in range(3 if renew else 1):
+        residual = partial(pooled.residuals, law=law, variance=variance)
+        own = _parameters(law, theta)
+        found = identify(residual, own, starts=[theta], xtol=1e-5, ftol=1e-5, max_nfev=60)
+        theta = np.clip(found.value, low + 1e-6, high - 1e-6)
+        variance = pooled.variance(law, theta)
+    return np.asarray(theta)
+
+
+def _starts(law: str, pooled: _Pooled) -> list[Array]:
+    top = max(float(np.quantile(pooled.traction, 0.95)), 0.02)
+    reach = max(float(np.max(pooled.slip)), 0.05)
+    if law == "janosi":
+        return [
+            np.array([top * scale, reach * part]) for scale, part in ((1.2, 0.05), (1.5, 0.3), (3.0, 1.0))
+        ]
+    return [
+        np.array([math.tan(math.pi / (2 * shape)) / (reach * part), shape, top, curvature])
+        for part in (0.2, 0.5, 1.0)
+        for shape, curvature in ((1.4, 0.0), (1.9, 0.9))
+    ]
+
+
+def select_law(runs: Sequence[RunBins]) -> tuple[str, tuple[float, ...], dict[str, Array]]:
+    """Return the law that predicts left-out runs better, its parameters, and the scores of each by run.
+
+    A score is the log likelihood of a run under a fit to the others.  ``magic`` is taken where it is better by
+    more than a standard error, since it nearly contains the other.  :data:`NO_CURVE` is a model that does not
+    depend on the slip: the mean of the others' bins.
+    """
+    of_all = {law: fit_curve(law, runs).parameters for law in LAW_PARAMETERS}
+
+    def score(law: str, train: Array, test: Array) -> Array:
+        others, left_out = [runs[i] for i in train], _Pooled([runs[i] for i in test])
+        if law == NO_CURVE:
+            traction = np.concatenate([other.traction_ratio for other in others])
+            f = np.full(len(left_out.slip), float(traction.mean()))
+            variance = left_out.std**2 + float(np.var(traction)) + _MIN_VARIANCE
+            return np.array([left_out.log_likelihood(f, np.zeros_like(f), variance)])
+        theta = fit_curve(law, others, of_all[law]).parameters
+        f, slope = left_out.curve(law, theta)
+        return np.array([left_out.log_likelihood(f, slope, left_out.variance(law, theta))])
+
+    each = np.arange(len(runs))
+    law, scores = select(score, list(LAW_PARAMETERS), each)
+    return law, of_all[law], {**scores, **select(score, [NO_CURVE], each)[1]}
+
+
+INTERVAL = 0.9
+"""Probability with which an interval contains the peak slip."""
+
+EDGE_SLIP = 0.03
+"""A maximum this near the end of the observed slips may still rise beyond it."""
+
+NEAR_PEAK_RATIO = 0.95
+"""Part of the largest net traction that defines the peak slip of a curve without a peak."""
+
+SHAPE_STD_RATIO = 0.02
+"""Error of the thrust at one slip against that at another, a peak's slip apart, that all runs share: residue
+of low-pass filter and lag.  It moves a flat peak further than a sharp one."""
+
+SYSTEMATIC_SLIP_STD = 0.005
+"""Error that all runs of a robot share, which no bootstrap contains: half a percent of rolling radius."""
+
+
+class PeakStatus(StrEnum):
+    """Kind of a peak slip."""
+
+    PEAK = "peak"
+    NO_PEAK = "no_peak"
+
+
+class Peak(NamedTuple):
+    """Slip at which net traction is largest or nearly so, and which of the two."""
+
+    slip_ratio: float
+    status: PeakStatus
+
+
+def net_peak(net_ratio: Callable[[Array], Array], low_slip: float, high_slip: float) -> Peak:
+    """Return where net traction is largest within a range, or has 95 % of it where it rises to the end.
+
+    Parameters
+    ----------
+    net_ratio : net traction at each of an array of slips, in any unit of force
+    low_slip, high_slip : the range
+
+    Examples
+    --------
+    >>> net_peak(lambda s: 1 - (s - 0.2) ** 2, 0.0, 0.6)
+    Peak(slip_ratio=0.2, status=<PeakStatus.PEAK: 'peak'>)
+    >>> net_peak(lambda s: s, 0.0, 0.6)
+    Peak(slip_ratio=0.57, status=<PeakStatus.NO_PEAK: 'no_peak'>)
+    """
+    slips = np.linspace(low_slip, high_slip, max(2, 1 + round((high_slip - low_slip) / 0.0005)))
+    net = net_ratio(slips)
+    top = int(np.argmax(net))
+    if slips[top] < high_slip - EDGE_SLIP and top > 0:
+        return Peak(round(float(slips[top]), 6), PeakStatus.PEAK)
+    near = net >= NEAR_PEAK_RATIO * net[top] if net[top] > 0 else np.arange(len(net)) >= top
+    return Peak(round(float(slips[int(np.argmax(near))]), 6), PeakStatus.NO_PEAK)
+
+
+def peak_slip_of_kind(
+    status: PeakStatus, net_ratio: Callable[[Array], Array], low_slip: float, high_slip: float
+) -> float:
+    """Return the peak slip by the definition of a given status, of a bootstrap draw for instance."""
+    slips = np.linspace(low_slip, high_slip, 1001)
+    net = net_ratio(slips)
+    top = int(np.argmax(net))
+    if status is PeakStatus.PEAK or net[top] <= 0:
+        return float(slips[top])
+    return float(slips[int(np.argmax(net >= NEAR_PEAK_RATIO * net[top]))])
+
+
+def peak_interval(
+    draws: Array,
+    runs: Sequence[RunBins],
+    peak: Peak,
+    thrust_ratio: Callable[[Array], Array],
+    high_slip: float,
+) -> tuple[float, float]:
+    """Return the 90 % interval of a peak slip.
+
+    Parameters
+    ----------
+    draws : (m,) peak slips of the bootstrap over runs
+    runs : behind the curve
+    peak : of the curve
+    thrust_ratio : thrust over load of the curve at each of an array of slips
+    high_slip : largest slip observed
+    """
+    shared = math.hypot(SYSTEMATIC_SLIP_STD, _shape_std(thrust_ratio, peak, high_slip))
+    return expanded_interval(draws, n_informative_runs(runs, peak, high_slip), peak.slip_ratio, shared)
+
+
+def _shape_std(thrust_ratio: Callable[[Array], Array], peak: Peak, high_slip: float) -> float:
+    """Return how far a tilt of the curve by :data:`SHAPE_STD_RATIO` moves a peak or the slip at 95 %.
+
+    Near a peak ``f = f_0 (1 - a (s - s_0)^2)``, with a by the thrust at two thirds of s_0; the tilt
+    is over the peak's slip.  Without a peak, the tilt over the observed slips raises f here against f there.
+    """
+    slip = peak.slip_ratio
+    below, here, third = thrust_ratio(np.array([slip - 1e-3, slip, 2 / 3 * slip]))
+    if peak.status is PeakStatus.NO_PEAK:
+        slope = max((here - below) / 1e-3, 1e-6)
+        moved = SHAPE_STD_RATIO * here * (high_slip - slip) / high_slip / slope
+    else:
+        moved = SHAPE_STD_RATIO / (2 * max(1.0 - third / here, 1e-4) / (slip / 3) ** 2 * slip)
+    return float(min(moved, slip / 2))
+
+
+def n_informative_runs(runs: Sequence[RunBins], peak: Peak, high_slip: float) -> int:
+    """Return how many runs determine a peak, at least 2: with slips beyond it, or in the upper half."""
+    beyond = peak.slip_ratio if peak.status is PeakStatus.PEAK else high_slip / 2
+    return max(2, sum(bool((run.slip_ratio > beyond).any()) for run in runs))
+
+
+def expanded_interval(
+    draws: Array, n_runs: int, centre: float, shared_std: float = SYSTEMATIC_SLIP_STD
+) -> tuple[float, float]:
+    """Return the 90 % interval of a slip by its bootstrap draws over ``n_runs`` runs.
+
+    The percentiles are those of the normal law at ``sqrt(n / (n - 1)) t``, the quantile of Student's law with
+    n - 1 degrees of freedom; the error that all runs share is added to both sides in squares.
+    """
+    quantile = math.sqrt(n_runs / (n_runs - 1)) * float(stdtrit(n_runs - 1, 0.5 + INTERVAL / 2))
+    tail = float(ndtr(-quantile))
+    low, high = np.quantile(draws, [tail, 1 - tail])
+    shared = shared_std * float(ndtri(0.5 + INTERVAL / 2))
+    low, high = min(float(low), centre), max(float(high), centre)
+    return (
+        max(centre - math.hypot(centre - low, shared), 0.0),
+        min(centre + math.hypot(high - centre, shared), 1.0),
+    )
+
 
 MIN_RUNS = 3
 """Fewer runs do not show how runs differ."""
@@ -72,7 +471,7 @@ class SlipCurve:
     Parameters
     ----------
     law : ``janosi`` or ``magic``
-    parameters : by :data:`terrain.slip_learning.laws.LAW_PARAMETERS`
+    parameters : by :data:`terrain.slip_learning.curve.LAW_PARAMETERS`
     resistance_ratio, resistance_std : rolling and compaction resistance over load
     slip_range : smallest and largest slip that two runs or more reach
     peak : of net traction
@@ -154,11 +553,10 @@ def learn_curve(
     if (why := insufficiency(runs)) is not None:
         raise ValueError(why)
     low, high = slip_range(runs)
-    scores = left_out_scores(runs)
-    law = chosen_law(scores)
+    law, parameters, scores = select_law(runs)
     rho, rho_std = weighted_resistance(resistances)
     rho = 0.0 if -2 * rho_std < rho < 0 else rho  # slightly negative: not significantly different from none
-    model = _Model(law, fit_curve(law, runs).parameters, rho)
+    model = _Model(law, parameters, rho)
     rows = bootstrap_rows(len(runs), n_bootstrap, rng)
     draws = [_refitted(model, runs, resistances, drawn) for drawn in rows]
     peak = net_peak(model.net_traction, low, high)
@@ -237,3 +635,99 @@ def weighted_resistance(resistances: Resistances) -> tuple[float, float]:
     mean = float(ratio @ weight / weight.sum())
     scatter = float(np.sum(weight * (ratio - mean) ** 2) / weight.sum()) / max(len(ratio) - 1, 1)
     return mean, math.sqrt(max(scatter, 1.0 / float(weight.sum())))
+
+
+PEAK_SLIP_RATIO = 0.9
+"""Target of traction over the peak slip: beyond the peak more slip gives less traction and a wheel spins up,
+and the thrust at nine tenths of the peak slip is within a hundredth of it."""
+
+MIN_ABOVE_BALANCE_SLIP = 0.03
+"""Traction has to differ from steady motion by more than the error of the slip, or no robot would start."""
+
+BRAKING_CAP_SLIP = 0.3
+"""Where thrust rises monotonically, a wheel is not braked further: it would gain little, lose its side force
+with the slip, and plough instead of roll."""
+
+
+class TargetSlip(NamedTuple):
+    """A target slip, its standard deviation, and what it is derived from."""
+
+    slip_ratio: float
+    slip_std: float
+    source: str
+
+
+class Targets(NamedTuple):
+    """Targets of a terrain, and the two slips of which that of traction is the lesser.
+
+    ``peak_based_slip_ratio`` is :data:`PEAK_SLIP_RATIO` of the peak slip, ``working_slip_ratio`` the slip
+    with the net traction of a start.
+    """
+
+    traction: TargetSlip
+    braking: TargetSlip
+    steady: TargetSlip
+    peak_based_slip_ratio: float
+    working_slip_ratio: float
+
+    def of(self, drive_state: str) -> TargetSlip:
+        """Return the target of ``traction``, ``braking`` or ``steady``."""
+        return {"traction": self.traction, "braking": self.braking, "steady": self.steady}[drive_state]
+
+
+def targets_of(curve: SlipCurve) -> Targets:
+    """Return the targets of a terrain: braking <= 0 <= steady <= traction."""
+    n = f"{curve.n_runs} runs, {curve.law}"
+    steady = TargetSlip(
+        max(curve.balance_slip_ratio, 0.0), curve.balance_std, f"balance with the resistance; {n}"
+    )
+    traction, braking = _traction(curve, steady.slip_ratio), _braking(curve)
+    return Targets(
+        traction._replace(source=f"{traction.source}; {n}"),
+        braking._replace(source=f"{braking.source}; {n}"),
+        steady,
+        PEAK_SLIP_RATIO * curve.peak.slip_ratio,
+        curve.working_slip_ratio,
+    )
+
+
+def _traction(curve: SlipCurve, steady_slip_ratio: float) -> TargetSlip:
+    """Return the target near the peak, but not beyond what a start requires: more slip only costs energy.
+
+    It is at least :data:`MIN_ABOVE_BALANCE_SLIP` above the steady one.
+    """
+    by_peak = PEAK_SLIP_RATIO * curve.peak.slip_ratio
+    of = (
+        "the peak slip"
+        if curve.peak.status is PeakStatus.PEAK
+        else "the slip at 95 % of the largest traction"
+    )
+    target = TargetSlip(by_peak, PEAK_SLIP_RATIO * curve.peak_std, f"{PEAK_SLIP_RATIO:g} of {of}")
+    if curve.working_slip_ratio < by_peak:
+        target = TargetSlip(curve.working_slip_ratio, curve.working_std, "net traction of a start")
+    least = steady_slip_ratio + MIN_ABOVE_BALANCE_SLIP
+    return TargetSlip(least, curve.balance_std, "just above balance") if target.slip_ratio < least else target
+
+
+def _braking(curve: SlipCurve) -> TargetSlip:
+    """Return the peak slip mirrored; where there is no peak, at most :data:`BRAKING_CAP_SLIP`."""
+    slip, std = curve.peak.slip_ratio, curve.peak_std
+    if curve.peak.status is PeakStatus.PEAK:
+        return TargetSlip(-slip, std, "the peak slip mirrored")
+    if slip > BRAKING_CAP_SLIP:
+        return TargetSlip(-BRAKING_CAP_SLIP, SYSTEMATIC_SLIP_STD, "capped: thrust rises monotonically")
+    return TargetSlip(-slip, std, "the slip at 95 % of the largest traction, mirrored")
+
+
+def tractive_efficiency(curve: SlipCurve, slip_ratio: float) -> float:
+    """Return the work of net traction over that of a wheel; NaN without thrust."""
+    thrust = float(curve.thrust_ratio(np.array([slip_ratio]))[0])
+    return (thrust - curve.resistance_ratio) / thrust * (1.0 - slip_ratio) if thrust > 0 else math.nan
+
+
+def energy_jpm(curve: SlipCurve, slip_ratio: float, robot: Robot) -> float:
+    """Return the energy in J a metre at the wheels of the robot without payload; negative in recuperation."""
+    thrust = float(curve.thrust_ratio(np.array([slip_ratio]))[0])
+    turns = 1.0 / (1.0 - slip_ratio) if slip_ratio >= 0 else 1.0 + slip_ratio
+    friction_n = len(robot.wheels) * robot.motors.friction_nm / robot.wheel_radius_m
+    return (thrust * robot.mass_kg * GRAVITY_MPS2 + friction_n) * turns

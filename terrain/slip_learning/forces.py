@@ -1,7 +1,7 @@
-"""Thrust, load and slip of each wheel over a run: motor current, attitude and slip on one clock.
+"""Thrust, load and slip of each wheel over a run, its mass and resistance, and bins of slip: what a curve is fitted to.
 
-Of wheel i, with its rate w, radius r, inertia J, the current I of its motor, the robot's mass m and its
-specific force f = a + g up (the reading of an ideal accelerometer)::
+**Forces.**  Of wheel i, with its rate w, radius r, inertia J, the current I of its motor, the robot's mass m and
+its specific force f = a + g up (the reading of an ideal accelerometer)::
 
     T = I kt n eta                                       torque at the wheel
     F = (T - T_friction tanh(w / w_0) - J dw/dt) / r     thrust of the terrain
@@ -13,37 +13,162 @@ efficiency is taken as one factor between current and torque, driving and driven
 braking forces of a real robot come out too small by about its square.
 
 Slips have passed the encoders' low-pass filter, the current has not: everything goes through the same filter.
-Thrust belongs to the slip of the contact (:mod:`terrain.slip_learning.contacts`).
 
-Terrain is taken as isotropic (:mod:`terrain.terramechanics.traction`): the force of a wheel that also slips
-sideways, as on a cross slope, is along the slip vector.  Its sample is the magnitude of that vector and of
+**Slip of the contact.**  Thrust follows the slip only over the relaxation length sigma of the contact (Pacejka,
+Tyre and Vehicle Dynamics, 7.2.1), so that in a start it belongs to a slip of a moment ago.  The slip given here is
+that of the contact, u / sigma with ``du/dt = (w r - v) - max(|w r|, |v|) u / sigma``; in steady motion it is the
+slip ratio.  Terrain is taken as isotropic (:mod:`terrain.terramechanics.traction`): the force of a wheel that also
+slips sideways, as on a cross slope, is along the slip vector.  Its sample is the magnitude of that vector and of
 the force.
+
+**Balance.**  With the thrusts F of the wheels, the specific force f along the direction of travel (acceleration and
+grade), the specific force f_z normal to the terrain, the mass m and the resistance over load rho::
+
+    sum F = m (f + rho f_z)
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.measurements.resampling import on_clock
 from terrain.estimation.measurements.table import MeasurementTable
+from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack, read_only
 from terrain.robots import Robot
-from terrain.slip_learning.contacts import (
-    MIN_SPEED_MPS,
-    SMALL_SLIP,
-    Contacts,
-    Travel,
-    travel_of,
-    wheel_contacts,
-)
+
+MIN_SPEED_MPS = 0.2
+"""At lower speeds, an error of 1 cm/s in the speed is over 5 % of slip."""
+
+MAX_SIDE_RATIO = 0.5
+"""Lateral over longitudinal slip above which a wheel's longitudinal thrust is not used."""
+
+SMALL_SLIP = 0.02
+"""Lateral slip up to which the reduction of the longitudinal thrust is negligible."""
+
+
+class Contacts(NamedTuple):
+    """Motion of the wheels, (n, wheels) each.
+
+    Parameters
+    ----------
+    steer_rad, rate_radps : of the wheels
+    wheel_speed_mps : wheel circumferential speed w r
+    forward_mps, left_mps : velocity over ground in the wheel's frame
+    reference_speed_mps : denominator of the slip, the larger magnitude of w r and ``forward_mps``
+    slip_ratio : longitudinal slip of the contact
+    """
+
+    steer_rad: Array
+    rate_radps: Array
+    wheel_speed_mps: Array
+    forward_mps: Array
+    left_mps: Array
+    reference_speed_mps: Array
+    slip_ratio: Array
+
+    @property
+    def side_ratio(self) -> Array:
+        """Magnitude of the lateral slip."""
+        return np.asarray(np.abs(self.left_mps) / np.maximum(self.reference_speed_mps, MIN_SPEED_MPS))
+
+    @property
+    def oblique(self) -> Array:
+        """Whether the lateral slip is neither negligible nor too large for its share in the slip vector."""
+        side = self.side_ratio
+        return np.asarray((side >= SMALL_SLIP) & (side <= MAX_SIDE_RATIO * np.abs(self.slip_ratio)))
+
+    @property
+    def vector_factor(self) -> Array:
+        """Length of the slip vector over its longitudinal component, negative where a wheel rolls back."""
+        oblique = self.oblique
+        side = self.side_ratio / np.where(oblique, self.slip_ratio, 1.0)
+        rolling = np.where(self.wheel_speed_mps + self.forward_mps < 0.0, -1.0, 1.0)
+        return np.asarray(rolling * np.where(oblique, np.hypot(1.0, side), 1.0))
+
+
+class Travel(NamedTuple):
+    """Speed (n,) of the body, its direction of travel (n, 2) in the body frame, and its yaw rate (n,)."""
+
+    speed_mps: Array
+    direction: Array
+    yaw_rate_radps: Array
+
+    @property
+    def moving(self) -> Array:
+        """Whether (n,) the speed is above :data:`MIN_SPEED_MPS`; the direction is zero elsewhere."""
+        return np.asarray(self.speed_mps > MIN_SPEED_MPS)
+
+
+def wheel_contacts(
+    robot: Robot, track: StateTrack, table: MeasurementTable, relaxation_length_m: float
+) -> Contacts:
+    """Return the motion of each wheel by a state track and the wheel rates measured beside it."""
+    steer = np.column_stack([track.state(f"steer_{wheel}_rad") for wheel in robot.wheels])
+    rate = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
+    twist = np.column_stack([track.state(name) for name in TWIST])
+    forward, left = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
+    wheel_speed = rate * robot.wheel_radius_m
+    slip_speed = wheel_speed - forward
+    reference = np.maximum(np.abs(wheel_speed), np.abs(forward))
+    slips = [
+        contact_slip(track.time_s, slip_speed[:, i], reference[:, i], relaxation_length_m)
+        for i in range(len(robot.wheels))
+    ]
+    return Contacts(steer, rate, wheel_speed, forward, left, reference, np.column_stack(slips))
+
+
+def travel_of(track: StateTrack) -> Travel:
+    """Return the motion of the body."""
+    speed = np.hypot(track.state("speed_x_mps"), track.state("speed_y_mps"))
+    direction = np.divide(
+        np.column_stack([track.state("speed_x_mps"), track.state("speed_y_mps")]),
+        speed[:, None],
+        out=np.zeros((speed.size, 2)),
+        where=(speed > MIN_SPEED_MPS)[:, None],
+    )
+    return Travel(speed, direction, track.state("yaw_rate_radps"))
+
+
+@njit(cache=True)
+def contact_slip(
+    time_s: Array, slip_speed_mps: Array, reference_speed_mps: Array, relaxation_m: float
+) -> Array:
+    """Return the slip (n,) of a contact that follows the slip velocity over its relaxation length.
+
+    Parameters
+    ----------
+    time_s : (n,) strictly increasing
+    slip_speed_mps : (n,) w r - v
+    reference_speed_mps : (n,) the larger magnitude of wheel circumferential speed and speed over ground
+    relaxation_m : above 0
+
+    Examples
+    --------
+    >>> time_s = np.arange(0.0, 1.0, 0.02)
+    >>> slip = contact_slip(time_s, np.full(50, 0.1), np.full(50, 1.0), 0.05)  # from rest in the contact
+    >>> slip[[0, 2, -1]].round(3)
+    array([0.   , 0.055, 0.1  ])
+    """
+    out = np.zeros_like(slip_speed_mps)
+    for k in range(1, time_s.size):
+        step_s = time_s[k] - time_s[k - 1]
+        rate = 0.5 * (reference_speed_mps[k] + reference_speed_mps[k - 1]) / relaxation_m
+        speed = 0.5 * (slip_speed_mps[k] + slip_speed_mps[k - 1]) / relaxation_m
+        left = math.exp(-rate * step_s)
+        gained = (1.0 - left) / rate if rate > 1e-6 else step_s
+        out[k] = min(max(out[k - 1] * left + speed * gained, -1.0), 1.0)
+    return out
+
 
 MAX_SLIP_STD = 0.05
 """A less certain slip carries no information on a curve that rises within 0.1 to 0.3."""
@@ -346,3 +471,247 @@ def _noise_gain(time_s: Array, time_constant_s: float) -> float:
         return 1.0
     keep = math.exp(-float(np.median(np.diff(time_s))) / time_constant_s)
     return (1.0 - keep) / (1.0 + keep)
+
+
+def valid_intervals(time_s: Array, valid: Array, length_s: float) -> list[slice]:
+    """Return consecutive slices of one length in which every sample is valid.
+
+    Examples
+    --------
+    >>> valid = np.array([True, True, True, False, True, True, True, True])
+    >>> valid_intervals(np.arange(8) * 0.1, valid, 0.2)
+    [slice(0, 2, None), slice(4, 6, None), slice(6, 8, None)]
+    """
+    if time_s.size < 2:
+        return []
+    size = max(2, round(length_s / float(np.median(np.diff(time_s)))))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], valid.astype(int), [0]])))
+    return [
+        slice(begin, begin + size)
+        for first, last in edges.reshape(-1, 2)
+        for begin in range(int(first), int(last) - size + 1, size)
+    ]
+
+
+BALANCE_S = 0.5
+"""Length of a mean; vertical oscillation of the body at 7 Hz averages out."""
+
+CORRELATED_MEANS = 4.0
+"""Means whose errors are alike, over 2 s of terrain."""
+
+MIN_MEANS = 4
+"""Fewer means are too few for a median."""
+
+THRUST_STD_RATIO = 0.03
+"""Error that all thrusts of a run share: of the torque constant with the motor's temperature, and of currents
+that are sampled in step with the commands."""
+
+MASS_STD_RATIO = 0.15
+"""Prior of the mass, relative to the described robot: payloads up to a third of it (data/spread)."""
+
+MAX_MASS_STDS = 4.0
+"""A mass further than this from its prior is not used: outside 36 to 144 kg for 90."""
+
+TILT_STD_RAD = 0.01
+"""Error of a grade by the attitude: mounting, and the body's tilt on its springs and on rough terrain."""
+
+
+class Balance(NamedTuple):
+    """Mass of the robot and resistance of its wheels over their load, each with one standard deviation."""
+
+    mass_kg: float
+    mass_std_kg: float
+    resistance_ratio: float
+    resistance_std: float
+
+
+class _Means(NamedTuple):
+    """Means (k,) over :data:`BALANCE_S`, and where (k - 1,) one follows another without a gap."""
+
+    thrust_n: Array
+    accel_mps2: Array
+    force_mps2: Array
+    normal_mps2: Array
+    consecutive: Array
+
+
+def body_balance(forces: WheelForces, robot: Robot, where: Array) -> Balance:
+    """Return mass and resistance of a run; the resistance is NaN where there are too few means.
+
+    Parameters
+    ----------
+    forces : of the run
+    robot : whose mass, with a standard deviation of :data:`MASS_STD_RATIO`, is the prior
+    where : (n,) whether an instant is on the terrain
+
+    Notes
+    -----
+    Medians give rho; an attitude wrong by :data:`TILT_STD_RAD` is part of its uncertainty.
+    """
+    parts = valid_intervals(forces.time_s, forces.balance_valid & where, BALANCE_S)
+    if len(parts) < MIN_MEANS:
+        return Balance(robot.mass_kg, robot.mass_kg * MASS_STD_RATIO, math.nan, math.nan)
+    means = _means(forces, parts)
+    mass_kg, mass_std_kg = _mass(means, robot.mass_kg)
+    ratio = (means.thrust_n / mass_kg - means.force_mps2) / means.normal_mps2
+    rho = float(np.median(ratio))
+    scatter = 1.4826 * float(np.median(np.abs(ratio - rho))) * math.sqrt(CORRELATED_MEANS / len(ratio))
+    by_mass = mass_std_kg / mass_kg * abs(float(np.median(means.thrust_n / mass_kg / means.normal_mps2)))
+    return Balance(mass_kg, mass_std_kg, rho, math.hypot(math.hypot(scatter, by_mass), TILT_STD_RAD))
+
+
+def _means(forces: WheelForces, parts: list[slice]) -> _Means:
+    thrust_n, grade, normal = (
+        np.array([values[part].mean() for part in parts])
+        for values in (forces.total_thrust_n, forces.grade_mps2, forces.normal_mps2)
+    )
+    ends = [(part.start, part.stop - 1) for part in parts]
+    gained_mps = np.array([forces.speed_mps[b] - forces.speed_mps[a] for a, b in ends])
+    accel = gained_mps / np.array([forces.time_s[b] - forces.time_s[a] for a, b in ends])
+    consecutive = np.diff([part.start for part in parts]) == parts[0].stop - parts[0].start
+    return _Means(thrust_n, accel, grade + accel, normal, consecutive)
+
+
+def _mass(means: _Means, prior_kg: float) -> tuple[float, float]:
+    """Return the mass and its standard deviation: its prior, combined with an estimate by changes.
+
+    The mass is estimated by what changes from one mean to the next, with the changes of the acceleration a
+    as the instrument, ``m = sum(da dF) / sum(da df)``: a is the speed gained over each mean and known well,
+    while the attitude has the error of the body's tilt on rough terrain, which would bias m to low values.
+    """
+    prior_std_kg = prior_kg * MASS_STD_RATIO
+    d_thrust, d_force, d_accel = (
+        np.diff(values)[means.consecutive] for values in (means.thrust_n, means.force_mps2, means.accel_mps2)
+    )
+    covariation = float(d_accel @ d_force)
+    found_kg = float(d_accel @ d_thrust) / covariation if covariation > 0.0 else math.nan
+    # a robot that hardly changes its speed may come out at any mass, with a small error from few changes
+    if len(d_accel) < MIN_MEANS or not abs(found_kg - prior_kg) < MAX_MASS_STDS * prior_std_kg:
+        return prior_kg, prior_std_kg
+    residual = d_accel * (d_thrust - found_kg * d_force)
+    scatter_kg = math.sqrt(float(residual @ residual)) / covariation
+    found_std_kg = math.hypot(scatter_kg, THRUST_STD_RATIO * found_kg)
+    weight = prior_std_kg**2 / (prior_std_kg**2 + found_std_kg**2)
+    return prior_kg + weight * (found_kg - prior_kg), math.sqrt(weight) * found_std_kg
+
+
+SAMPLE_S = 0.2
+"""Length of a sample: ten of the wheels' own, which reduces the ripple of Hall steps to a third."""
+
+LAG_S = 0.02
+"""One sampling period of the wheels: to this is known which slip a thrust belongs to."""
+
+BIN_EDGES = (
+    *(-0.02, 0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.07, 0.09, 0.12, 0.15, 0.18, 0.21, 0.24, 0.27),
+    *(0.3, 0.34, 0.38, 0.42, 0.46, 0.5, 0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 1.0),
+)
+"""Bins of slip: narrow where the curve of hard terrain bends."""
+
+MIN_IN_BIN = 2
+"""Samples that make a bin."""
+
+BIN_STD_RATIO, BIN_STD = 0.03, 0.003
+"""Error of the mean of even a full bin, relative to its thrust and as thrust over load: terrain varies along
+the path by 3 % (data/soils), and no law is exact.  It keeps bins with many samples from dominating."""
+
+
+class TractionSamples(NamedTuple):
+    """Samples of one run on one terrain, (k,) each.
+
+    Parameters
+    ----------
+    slip_ratio, slip_std : of the contact
+    traction_ratio, traction_std : thrust over load
+    lag_std : change of the thrust over load within :data:`LAG_S`; unlike noise it does not average out
+    """
+
+    slip_ratio: Array
+    slip_std: Array
+    traction_ratio: Array
+    traction_std: Array
+    lag_std: Array
+
+
+class RunBins(NamedTuple):
+    """Bins of slip of one run: mean slip, its std, mean thrust over load, its std; (k,) each."""
+
+    run_id: str
+    slip_ratio: Array
+    slip_std: Array
+    traction_ratio: Array
+    traction_std: Array
+
+
+def traction_samples(
+    forces: WheelForces, mass_kg: float, where: Array, wheel_speed_std_mps: float
+) -> TractionSamples:
+    """Return means over :data:`SAMPLE_S`, of one wheel each.
+
+    Parameters
+    ----------
+    forces : of a run
+    mass_kg : of the robot with its payload
+    where : (n,) whether an instant is on the terrain
+    wheel_speed_std_mps : standard deviation of a single wheel speed
+
+    Notes
+    -----
+    Means are taken before samples are sorted by slip: a single slip has the error of the ripple of Hall
+    steps, and sorting by it would flatten a steep curve.
+    """
+    rows = []
+    valid = forces.valid
+    for i in range(valid.shape[1]):
+        for part in valid_intervals(forces.time_s, valid[:, i] & where, SAMPLE_S):
+            load_n = float(forces.load_npkg[part, i].mean()) * mass_kg
+            n, last = part.stop - part.start, part.stop - 1
+            noise_std = wheel_speed_std_mps / (forces.reference_speed_mps[part, i].mean() * math.sqrt(n))
+            mean_std = float(np.mean(forces.slip_std[part, i]))
+            change_n = abs(float(forces.thrust_n[last, i] - forces.thrust_n[part.start, i]))
+            rows.append(
+                (
+                    float(forces.slip_ratio[part, i].mean()),
+                    math.hypot(noise_std, mean_std / math.sqrt(2.0)),
+                    float(forces.thrust_n[part, i].mean()) / load_n,
+                    forces.thrust_std_n / math.sqrt(n / 5.0) / load_n,
+                    LAG_S / SAMPLE_S * change_n / load_n,
+                )
+            )
+    return TractionSamples(*np.array(rows).reshape(-1, 5).T)
+
+
+def run_bins(run_id: str, samples: TractionSamples) -> RunBins:
+    """Return the bins of one run's samples that hold :data:`MIN_IN_BIN` or more."""
+    bin_number = np.digitize(samples.slip_ratio, BIN_EDGES)
+    rows = []
+    for number in range(1, len(BIN_EDGES)):
+        inside = bin_number == number
+        n = int(inside.sum())
+        if n < MIN_IN_BIN:
+            continue
+        slip, slip_std, traction, traction_std, lag_std = (column[inside] for column in samples)
+        residual = traction - traction.mean()
+        scatter = float(np.sqrt((residual @ residual) / (n - 1) / n))
+        floor = BIN_STD + BIN_STD_RATIO * abs(float(traction.mean()))
+        noise = max(scatter, float(traction_std.mean()) / math.sqrt(n))
+        std = math.hypot(noise, floor, float(lag_std.mean()))
+        slip_mean_std = math.sqrt(float((slip_std**2).mean()) / n)
+        rows.append((slip.mean(), slip_mean_std, traction.mean(), std))
+    return RunBins(run_id, *np.array(rows).reshape(-1, 4).T)
+
+
+def slip_range(runs: Sequence[RunBins]) -> tuple[float, float]:
+    """Return the smallest and the largest slip that two runs or more reach; NaN where no two runs have bins.
+
+    Examples
+    --------
+    >>> def bins(*slips):
+    ...     return RunBins("r", np.array(slips), *np.zeros((3, len(slips))))
+    >>> slip_range([bins(0.01, 0.3), bins(0.05, 0.5), bins(0.03, 0.4)])
+    (0.03, 0.4)
+    """
+    with_bins = [run.slip_ratio for run in runs if len(run.slip_ratio)]
+    if len(with_bins) < 2:
+        return math.nan, math.nan
+    low, high = sorted(min(s) for s in with_bins)[1], sorted(max(s) for s in with_bins)[-2]
+    return max(0.0, float(low)), float(high)

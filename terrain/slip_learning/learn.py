@@ -14,18 +14,25 @@ from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
 from terrain.extension import correct
 from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
-from terrain.slip_learning.balance import Balance, body_balance
 from terrain.slip_learning.curve import (
     N_BOOTSTRAP,
     Resistances,
     SlipCurve,
+    Targets,
     contradiction,
     insufficiency,
     learn_curve,
+    targets_of,
 )
-from terrain.slip_learning.forces import wheel_forces
-from terrain.slip_learning.samples import RunBins, run_bins, slip_range, traction_samples
-from terrain.slip_learning.targets import Targets, targets_of
+from terrain.slip_learning.forces import (
+    Balance,
+    RunBins,
+    body_balance,
+    run_bins,
+    slip_range,
+    traction_samples,
+    wheel_forces,
+)
 
 FILTER = "vio15"
 """Filter whose state holds the slip speed of each wheel."""

@@ -1,4 +1,7 @@
-"""Laws of a wheel in sand, compared on what is left out of their fits; the last one in full."""
+"""Laws of a wheel in sand, compared on slips and slip angles that their fits did not have; the last one in full.
+
+For reference, a polynomial of slip and angle shows how well a fit without any mechanics predicts.
+"""
 
 from __future__ import annotations
 
@@ -11,29 +14,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrain.identify import folds
 from terrain.records import Array
-from terrain.soil_identification.coupling import Coupling, side_coupling, without_coupling
-from terrain.soil_identification.fit import LawFit, fit_law, predict
-from terrain.soil_identification.held_out import (
-    GIVEN,
-    HELD_OUT,
-    Misfit,
-    Predictor,
-    held_out_predictions,
-    law_predictor,
-    misfit,
-    regime_misfits,
-    setting_misfits,
-)
-from terrain.soil_identification.intervals import (
+from terrain.soil_identification.fit import (
+    LAWS,
+    SINKAGES,
     CohesionRow,
+    Law,
+    LawFit,
     ModulusSpread,
-    Parameter,
+    Prediction,
+    SoilParameter,
     cohesion_profile,
+    fit_law,
     modulus_spread,
     parameters_of,
+    predict,
 )
-from terrain.soil_identification.laws import LAWS, SINKAGES, Law, Prediction
 from terrain.soil_identification.plain_soil import (
     PARAMETERS,
     PlainFit,
@@ -42,8 +39,154 @@ from terrain.soil_identification.plain_soil import (
     plain_prediction,
     plain_soil,
 )
-from terrain.soil_identification.polynomial import polynomial_predictions
-from terrain.soil_identification.trials import Trials, Wheel, setting_means
+from terrain.soil_identification.trials import (
+    Coupling,
+    Trials,
+    Wheel,
+    setting_means,
+    side_coupling,
+    without_coupling,
+)
+
+HELD_OUT = {"slip": "slip_setting", "angle": "angle_setting"}
+"""What is held out in turn: all trials of one commanded wheel speed, or of one slip angle."""
+
+GIVEN = ("load", "sinkage")
+
+REGIMES: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
+    "skidding, 0 to 30 deg": ((-1.1, -0.1), (0.0, 31.0)),
+    "skidding, 45 to 75 deg": ((-1.1, -0.1), (31.0, 76.0)),
+    "skidding, 90 deg": ((-1.1, -0.1), (76.0, 91.0)),
+    "rolling, 0 to 30 deg": ((-0.1, 0.1), (0.0, 31.0)),
+    "rolling, 45 to 75 deg": ((-0.1, 0.1), (31.0, 76.0)),
+    "rolling, 90 deg": ((-0.1, 0.1), (76.0, 91.0)),
+    "driving, 0 to 30 deg": ((0.1, 1.1), (0.0, 31.0)),
+    "driving, 45 to 75 deg": ((0.1, 1.1), (31.0, 76.0)),
+    "driving, 90 deg": ((0.1, 1.1), (76.0, 91.0)),
+}
+"""Ranges of slip and of the slip angle's size in degrees, by which misfits are shown."""
+
+
+class Misfit(NamedTuple):
+    """Root mean square errors: of both forces over the load, and of the sinkage in m; NaN of no trial."""
+
+    n_trials: int
+    pull_ratio: float
+    side_ratio: float
+    sinkage_m: float
+
+    @property
+    def forces(self) -> str:
+        """The errors of traction and side force, in words."""
+        return f"{100.0 * self.pull_ratio:.1f} % and {100.0 * self.side_ratio:.1f} %"
+
+
+Predictor = Callable[[Trials, Trials], dict[str, Prediction]]
+"""From training trials (means of settings) and tested trials to predictions by what is given."""
+
+
+def law_predictor(law: Law, wheel: Wheel) -> Predictor:
+    """Return what fits a law to the first trials and predicts the second, by each of :data:`GIVEN`."""
+
+    def predictions(training: Trials, tested: Trials) -> dict[str, Prediction]:
+        fit = fit_law(law, training, wheel)
+        return {given: predict(fit, tested, given) for given in GIVEN}
+
+    return predictions
+
+
+def held_out_predictions(
+    trials: Trials, predictor: Predictor, held_out: str, on_fold: Callable[[], None] = lambda: None
+) -> dict[str, Prediction]:
+    """Return predictions of all trials, each by a fit without its slip or its angle.
+
+    Parameters
+    ----------
+    trials : single ones
+    predictor : fits and predicts
+    held_out : ``slip`` or ``angle``
+    on_fold : called after each fit
+
+    Raises
+    ------
+    DataError
+        if too few settings are left to fit.
+    """
+    found: dict[str, list[Array]] = {}
+    for training, tested in folds(getattr(trials, HELD_OUT[held_out])):
+        for given, part in predictor(setting_means(trials.chosen(training)), trials.chosen(tested)).items():
+            whole = found.setdefault(given, [np.full(len(trials), np.nan) for _ in part])
+            for all_trials, these in zip(whole, part, strict=True):
+                all_trials[tested] = these
+        on_fold()
+    return {given: Prediction(*whole) for given, whole in found.items()}
+
+
+def misfit(trials: Trials, prediction: Prediction, rows: Array | None = None) -> Misfit:
+    """Return the errors of a prediction of trials, or of those of a mask (n,)."""
+    rows = np.ones(len(trials), dtype=bool) if rows is None else rows
+    if not rows.any():
+        return Misfit(0, np.nan, np.nan, np.nan)
+    errors = (
+        (prediction.pull_n - trials.pull_n) / trials.load_n,
+        (prediction.side_n - trials.side_n) / trials.load_n,
+        prediction.sinkage_m - trials.sinkage_m,
+    )
+    pull, side, sinkage = (float(np.sqrt(np.mean(error[rows] ** 2))) for error in errors)
+    return Misfit(int(rows.sum()), pull, side, sinkage)
+
+
+def regime_misfits(trials: Trials, prediction: Prediction) -> dict[str, Misfit]:
+    """Return the errors by :data:`REGIMES`, of those that have trials."""
+    angle = np.abs(trials.angle_setting)
+    rows = {
+        name: (trials.slip_ratio >= slow) & (trials.slip_ratio < fast) & (angle >= straight) & (angle < aside)
+        for name, ((slow, fast), (straight, aside)) in REGIMES.items()
+    }
+    return {name: misfit(trials, prediction, mask) for name, mask in rows.items() if mask.any()}
+
+
+def setting_misfits(trials: Trials, prediction: Prediction, held_out: str) -> dict[float, Misfit]:
+    """Return the errors by the setting that was held out."""
+    setting = getattr(trials, HELD_OUT[held_out])
+    return {
+        float(value): misfit(trials, prediction, setting == value) for value in np.unique(setting).tolist()
+    }
+
+
+DEGREE = 4
+
+
+def polynomial_predictions(training: Trials, tested: Trials) -> dict[str, Prediction]:
+    """Return forces over the load and sinkage by ridge regression on a polynomial of slip and angle.
+
+    The strength of the ridge is chosen by leave-one-out on the training part.
+
+    Parameters
+    ----------
+    training : means of settings
+    tested : trials
+    """
+    from sklearn.linear_model import RidgeCV
+    from sklearn.pipeline import make_pipeline
+    from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+
+    targets = np.column_stack(
+        [training.pull_n / training.load_n, training.side_n / training.load_n, training.sinkage_m * 10.0]
+    )
+    model = make_pipeline(
+        StandardScaler(),
+        PolynomialFeatures(DEGREE),
+        StandardScaler(),
+        RidgeCV(alphas=np.logspace(-4, 3, 29), alpha_per_target=True),
+    )
+    slips, tested_slips = (
+        np.column_stack([own.slip_ratio, own.slip_angle_rad]) for own in (training, tested)
+    )
+    pull, side, depth = model.fit(slips, targets).predict(tested_slips).T
+    unknown = np.full(len(tested), np.nan)
+    return {"load": Prediction(pull * tested.load_n, side * tested.load_n, depth / 10.0, unknown)}
+
 
 BAR_RATIO = 0.15
 """Root mean square error of each force over the load, on slips or angles left out, that is aimed at."""
@@ -136,7 +279,7 @@ class WheelResult:
     deeper_than_axle: int
     laws: tuple[LawRow, ...]
     law: str
-    parameters: Mapping[str, Parameter]
+    parameters: Mapping[str, SoilParameter]
     by_slip: Mapping[float, Misfit]
     by_angle: Mapping[float, Misfit]
     regimes: Mapping[str, Misfit]
@@ -179,7 +322,7 @@ def compare_laws(
     trials : single ones of one wheel
     further : trials that the last law predicts, fitted to all of ``trials``; None without any
     wheel : of the trials
-    laws : names of :data:`~terrain.soil_identification.laws.LAWS`, and ``simulator``
+    laws : names of :data:`~terrain.soil_identification.fit.LAWS`, and ``simulator``
     draws, seed : of the bootstrap over settings
     progress : gets the task, how many fits are done, and how many there are
 
@@ -224,8 +367,8 @@ def compare_laws(
         wheel=wheel.name,
         n_trials=len(raw),
         n_settings=len(setting_means(raw)),
-        load_range_n=_range(raw.load_n),
-        sinkage_range_m=_range(raw.sinkage_m),
+        load_range_n=(float(raw.load_n.min()), float(raw.load_n.max())),
+        sinkage_range_m=(float(raw.sinkage_m.min()), float(raw.sinkage_m.max())),
         coupling=coupling,
         deeper_than_axle=int((raw.sinkage_m > wheel.tip_radius_m).sum()),
         laws=tuple(rows),
@@ -306,7 +449,7 @@ def _checked(fit: LawFit, further: Trials) -> Checked:
 
 
 def _not_identified(
-    parameters: Mapping[str, Parameter],
+    parameters: Mapping[str, SoilParameter],
     cohesion: Sequence[CohesionRow],
     modulus: ModulusSpread,
     coupling: Coupling,
@@ -333,7 +476,3 @@ def _not_identified(
     if unknown:
         sentences.append(f"Narrowed to no less than half of the prior, or at a bound: {', '.join(unknown)}.")
     return sentences
-
-
-def _range(values: Array) -> tuple[float, float]:
-    return float(values.min()), float(values.max())

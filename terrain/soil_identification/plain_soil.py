@@ -1,4 +1,4 @@
-"""The soil of the simulator's own law, fitted to trials.
+"""The soil of the simulator's own law, fitted to trials, and its file as ``data/soils`` describes soils.
 
 ``terrain simulate`` has one number for the limit of the thrust, one for its rise and Bekker's sinkage, with
 the force along the resultant slip (:func:`~terrain.terramechanics.traction.wheel_ground`).  Of one wheel
@@ -9,23 +9,26 @@ Cohesion is taken as 0, kc as 0 (it needs wheels of two widths) and the exponent
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+import yaml
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.errors import DataError
+from terrain.identify import Parameter, identify
 from terrain.records import Array
-from terrain.soil_identification.fit import FORCE_MISFIT_RATIO
-from terrain.soil_identification.laws import Prediction
+from terrain.soil_identification.fit import FORCE_MISFIT_RATIO, Prediction, SoilParameter
 from terrain.soil_identification.trials import Trials, Wheel
-from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import ground_record, wheel_ground
 
 PARAMETERS = ("friction_angle_rad", "shear_modulus_m", "kphi_npmn2", "slip_sinkage_ratio")
-_START = np.array([0.5, 0.01, 1e6, 0.5])
-_LOW, _HIGH = np.array([0.05, 1e-4, 1e3, 1e-3]), np.array([1.1, 0.5, 1e9, 5.0])
+_START, _LOW, _HIGH = (
+    np.log(row) for row in ([0.5, 0.01, 1e6, 0.5], [0.05, 1e-4, 1e3, 1e-3], [1.1, 0.5, 1e9, 5.0])
+)
+"""They are identified by their logarithms."""
+
 MAX_ANGLE_DEG, MIN_SLIP = 31.0, -0.6
 """Of trials that roll nearly straight, as a robot's wheels do."""
 
@@ -104,41 +107,93 @@ def fit_plain_soil(
     """
     if len(trials) < len(PARAMETERS):
         raise DataError(f"trials have {len(trials)} settings, the simulator's law needs {len(PARAMETERS)}")
-    fixed = 0 if math.isnan(friction_angle_rad) else 1
-    start = _START.copy()
-    if fixed:
-        start[0] = friction_angle_rad
-    best = _fitted(trials, wheel, np.ones(len(trials)), start, fixed)
-    draws = [
-        _fitted(trials, wheel, np.sqrt(counts), best, fixed)
-        for counts in bootstrap_counts(len(trials), n_draws, seed)
+    given = _START.copy()
+    if not math.isnan(friction_angle_rad):
+        given[0] = math.log(friction_angle_rad)
+    free = slice(0 if math.isnan(friction_angle_rad) else 1, None)
+    parameters = [
+        Parameter(name, *bounds)
+        for name, *bounds in zip(PARAMETERS[free], given[free], _LOW[free], _HIGH[free], strict=True)
     ]
-    columns = np.array(draws).T if draws else np.full((len(PARAMETERS), 1), np.nan)
-    intervals = [
-        percentile_interval(column) if draws and place >= fixed else (math.nan, math.nan)
-        for place, column in enumerate(columns)
-    ]
+
+    def identified(weight: Array, start: Array) -> Array:
+        """Return the logarithms (4,) that fit trials with weights (n,) best."""
+
+        def misfit(free_logs: Array) -> Array:
+            given[free] = free_logs
+            found = plain_prediction(plain_soil(np.exp(given), "fit"), trials, wheel)
+            forces = found.pull_n - trials.pull_n, found.side_n - trials.side_n
+            misses = [force / trials.load_n / FORCE_MISFIT_RATIO for force in forces]
+            return np.concatenate(
+                [weight * miss for miss in (*misses, (found.sinkage_m - trials.sinkage_m) / SINKAGE_M)]
+            )
+
+        own = identify(misfit, parameters, starts=[start[free]], max_nfev=60).value
+        return np.concatenate([given[: len(given) - len(own)], own])
+
+    best = identified(np.ones(len(trials)), given.copy())
+    counts = bootstrap_counts(len(trials), n_draws, seed)
+    draws = np.exp([identified(np.sqrt(count), best) for count in counts]).reshape(-1, len(PARAMETERS))
+    intervals = dict.fromkeys(PARAMETERS, (math.nan, math.nan))
+    if n_draws:
+        intervals |= zip(PARAMETERS[free], map(percentile_interval, draws.T[free]), strict=True)
     return PlainFit(
-        dict(zip(PARAMETERS, best.tolist(), strict=True)),
-        dict(zip(PARAMETERS, intervals, strict=True)),
-        int(trials.n_trials.sum()),
+        dict(zip(PARAMETERS, np.exp(best).tolist(), strict=True)), intervals, int(trials.n_trials.sum())
     )
 
 
-def _fitted(trials: Trials, wheel: Wheel, weight: Array, start: Array, fixed: int) -> Array:
-    def whole(scaled: Array) -> Array:
-        return np.concatenate([start[:fixed], np.exp(scaled)])
+UNITS = {
+    "friction_angle_rad": "rad",
+    "shear_modulus_m": "m",
+    "kphi_npmn2": "npmn2",
+    "slip_sinkage_ratio": "ratio",
+}
+DIGITS = 4
 
-    def misfit(scaled: Array) -> Array:
-        found = plain_prediction(plain_soil(whole(scaled), "fit"), trials, wheel)
-        return np.concatenate(
-            [
-                weight * (found.pull_n - trials.pull_n) / trials.load_n / FORCE_MISFIT_RATIO,
-                weight * (found.side_n - trials.side_n) / trials.load_n / FORCE_MISFIT_RATIO,
-                weight * (found.sinkage_m - trials.sinkage_m) / SINKAGE_M,
-            ]
-        )
 
-    low, high = np.log(_LOW[fixed:]), np.log(_HIGH[fixed:])
-    begin = np.clip(np.log(start[fixed:]), low + 1e-6, high - 1e-6)
-    return whole(least_squares(misfit, begin, bounds=(low, high), max_nfev=60).x)
+def soil_yaml(name: str, wheel: str, dataset: str, fit: PlainFit, friction: SoilParameter, law: str) -> str:
+    """Return the text of a soil file.
+
+    Parameters
+    ----------
+    name : of the soil
+    wheel, dataset : of the trials
+    fit : of the simulator's law
+    friction : tangent of the friction angle, of the law of stresses ``law``
+    law : its name
+    """
+    described: dict[str, Any] = {"name": name, "law": "janosi"}
+    described["rolling_resistance_ratio"] = _entry(
+        0.0, "ratio", "assumed: a rigid wheel has no loss of its own"
+    )
+    described["slip_sinkage_ratio"] = _measured("slip_sinkage_ratio", wheel, dataset, fit)
+    borrowed = load_soil("dry_sand").roughness_m3
+    described["roughness_m3"] = _entry(borrowed, "m3", "assumed: that of dry_sand; a testbed has none")
+    described["cohesion_pa"] = _entry(
+        0.0, "pa", "assumed: under one load cohesion cannot be separated from friction"
+    )
+    low, high = (math.atan(bound) for bound in friction.interval)
+    source = (
+        f"terrain calibrate on {dataset}, {wheel} wheel, law {law}; 95 % over settings of slip and angle: "
+        f"{low:.3f} to {high:.3f} rad"
+    )
+    described["friction_angle_rad"] = _entry(math.atan(friction.value), "rad", source)
+    described["shear_modulus_m"] = _measured("shear_modulus_m", wheel, dataset, fit)
+    described["kc_npmn1"] = _entry(0.0, "npmn1", "assumed: one width of wheel says nothing of it")
+    described["kphi_npmn2"] = _measured("kphi_npmn2", wheel, dataset, fit)
+    described["sinkage_exponent_ratio"] = _entry(1.0, "ratio", "assumed: one load says nothing of it")
+    head = f"# Dry sand of a wheel testbed, identified from {fit.n_trials} trials of the {wheel} wheel.\n"
+    return head + yaml.safe_dump(described, sort_keys=False, width=1000, allow_unicode=True)
+
+
+def _measured(parameter: str, wheel: str, dataset: str, fit: PlainFit) -> dict[str, Any]:
+    low, high = fit.intervals[parameter]
+    source = (
+        f"terrain calibrate on {dataset}, {fit.n_trials} trials of the {wheel} wheel, nearly straight, law of "
+        f"the simulator; 95 % over settings: {low:.4g} to {high:.4g}"
+    )
+    return _entry(fit.values[parameter], UNITS[parameter], source)
+
+
+def _entry(value: float, unit: str, source: str) -> dict[str, Any]:
+    return {"value": float(f"{value:.{DIGITS}g}"), "unit": unit, "source": source}

@@ -24,9 +24,8 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.records import TargetStatus
 from terrain.robots import Robot, load_robot
 from terrain.simulation.slip_sweep import LEARNING_DRIVES, Drive, learning_runs
-from terrain.slip_learning.curve import N_BOOTSTRAP
+from terrain.slip_learning.curve import N_BOOTSTRAP, Peak, PeakStatus, net_peak
 from terrain.slip_learning.learn import learn_terrain, terrain_runs
-from terrain.slip_learning.peak import Peak, PeakStatus, net_peak
 from terrain.terramechanics.soil import load_soil, soil_names
 from terrain.terramechanics.traction import net_pull
 

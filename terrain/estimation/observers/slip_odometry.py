@@ -356,7 +356,7 @@ def slip_odometry_observer(
     Parameters
     ----------
     robot : its tracks
-    model : slip on this ground, as :func:`terrain.calibration.slip_model.identify_slip_model` finds it
+    model : slip on this ground, as ``terrain calibrate --what odometry`` finds it
     settings : noise and limits
 
     Raises

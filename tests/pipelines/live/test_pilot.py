@@ -22,7 +22,7 @@ from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
-from terrain.slip_learning.laws import LAW_PARAMETERS
+from terrain.slip_learning.curve import LAW_PARAMETERS
 
 ROBOT, TABLE = load_robot("agrimaro"), load_slip_table()
 DT_S = 0.02

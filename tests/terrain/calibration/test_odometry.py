@@ -5,19 +5,26 @@ import math
 import numpy as np
 import pytest
 
-from terrain.calibration.adaptive_legs import dead_reckoning, of_body, of_point
-from terrain.calibration.odometry_fit import (
+from terrain.calibration.odometry import (
     ENCODER,
     ENDO,
     GYRODOMETRY,
     SLIP,
+    Leg,
+    composed,
+    dead_reckoning,
     fit_odometry,
+    held_out_ends,
+    legs_of_poses,
+    legs_of_windows,
     level,
+    of_body,
+    of_point,
     predict_ends,
+    relative,
+    score_legs,
     without_tilt,
 )
-from terrain.calibration.odometry_judge import held_out_ends, score_legs
-from terrain.calibration.odometry_legs import Leg, composed, legs_of_poses, legs_of_windows, relative
 from terrain.errors import DataError
 from terrain.logs.drive_poses import WindowPoses
 from terrain.robots import load_robot

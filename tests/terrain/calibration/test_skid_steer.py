@@ -147,18 +147,6 @@ def test_without_turns_or_gyro_it_is_unknown_and_not_zero():
     assert found[LIDAR_DELAY].low < 0.25 < found[LIDAR_DELAY].high  # behind the wheels: 0.3 - 0.05
 
 
-def test_the_command_writes_the_section_and_the_robot_reads_it(tmp_path):
-    for i in range(8):
-        write_run(driven(0.29, 1.8, 0.3, 0.05, i), tmp_path / "runs")
-    out = tmp_path / "mine.yaml"
-    result = calibrate.run(calibrate.Settings(data=tmp_path / "runs", robot="warthog", out=out), silent)
-    robot = load_robot(out)
-    row = next(f for f in result.findings if f.parameter == TRACK)
-    assert robot.identified["effective_track_m"] == pytest.approx(row.value, rel=1e-3)
-    assert robot.identified["effective_track_m"] == pytest.approx(1.8, abs=0.1)
-    assert (robot.track_m, robot.wheel_radius_m) == (1.08, 0.3)
-
-
 def test_runs_without_a_lidar_are_one_sentence(tmp_path):
     run = driven(0.29, 1.8, 0.3, 0.05, 0)
     write_run(replace(run, streams={n: s for n, s in run.streams.items() if n != "lidar"}), tmp_path / "runs")

@@ -3,8 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from terrain.calibration.steady import direction_of, steady_stretches, why_none
-from terrain.calibration.wheels import reduction_ratio, steering_zeros
+from terrain.calibration.wheels import (
+    direction_of,
+    reduction_ratio,
+    steady_stretches,
+    steering_zeros,
+    why_none,
+)
 from terrain.records import RunLog
 from terrain.simulation.conditions import Conditions
 

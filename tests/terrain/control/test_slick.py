@@ -4,7 +4,7 @@ import pytest
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.aims import DECELERATION_RATIO, LOCKED_RATIO, SLICK_RATIO, braking_by_slip
 from terrain.control.slip_table import CurveEntry
-from terrain.slip_learning.laws import LAW_PARAMETERS, traction_ratio
+from terrain.slip_learning.curve import LAW_PARAMETERS, traction_ratio
 
 
 def curve(law, *parameters, resistance=0.02):

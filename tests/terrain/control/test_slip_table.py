@@ -17,7 +17,7 @@ from terrain.control.slip_table import (
 from terrain.errors import ConfigError, TerrainError
 from terrain.files.resources import data_folder
 from terrain.records import SlipTarget
-from terrain.slip_learning.laws import LAW_BOUNDS, LAW_PARAMETERS
+from terrain.slip_learning.curve import LAW_BOUNDS, LAW_PARAMETERS
 
 
 def table_with(**number):

@@ -5,9 +5,8 @@ import pytest
 
 from terrain.errors import DataError
 from terrain.kinematics import omni
-from terrain.measured_slip.rollers import roller_findings, surface_of_windows
+from terrain.measured_slip.rollers import distance_bound, roller_findings, surface_of_windows
 from terrain.measured_slip.slips import measured_slip
-from terrain.measured_slip.wheel_distance import distance_bound
 from terrain.simulation.planar.omni_contact import steady_twist
 
 LOADS = {"": np.array([0.25, 0.45, 0.30]), "loaded": np.array([0.40, 0.35, 0.25])}

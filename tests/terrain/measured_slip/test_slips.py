@@ -5,11 +5,16 @@ import pytest
 
 from terrain.errors import ConfigError, DataError
 from terrain.measured_slip.delay import DelayStatus, estimate_delay
-from terrain.measured_slip.rates import window_rates
-from terrain.measured_slip.slips import measured_slip, rolled_twists, spinning_wheels
-from terrain.measured_slip.steps import slip_step
+from terrain.measured_slip.ground_changes import slip_step
+from terrain.measured_slip.slips import (
+    measured_slip,
+    outside_source,
+    rolled_twists,
+    spinning_wheels,
+    travelled,
+    window_rates,
+)
 from terrain.measured_slip.surfaces import surface_slip
-from terrain.measured_slip.travelled import outside_source, travelled
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.planar.run import simulate_planar

@@ -11,10 +11,14 @@ from terrain.simulation.conditions import Conditions
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.run import simulate_run
 from terrain.simulation.slip_sweep import Drive, SlipSweep, scenario_of
-from terrain.slip_learning.balance import body_balance
-from terrain.slip_learning.contacts import contact_slip
-from terrain.slip_learning.forces import ground_thrust, wheel_forces, wheel_loads
-from terrain.slip_learning.samples import traction_samples
+from terrain.slip_learning.forces import (
+    body_balance,
+    contact_slip,
+    ground_thrust,
+    traction_samples,
+    wheel_forces,
+    wheel_loads,
+)
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import net_pull
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from terrain.calibration.track_motion import odometry_rows
+from terrain.calibration.odometry import odometry_rows
 from terrain.errors import ConfigError
 from terrain.estimation.observers.family import ObserverStatus, observe
 from terrain.estimation.observers.slip_learning import (

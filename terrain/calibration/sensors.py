@@ -1,0 +1,492 @@
+r"""Sensors of a robot that stands or is held still: stretches found by the log, biases, scales, noise; and the camera.
+
+**Gyro biases** are means over standing stretches (Danzi, AgriMaRo thesis, 3.3.3).
+
+**Accelerometer in six positions** (thesis 3.3.3): held still, in any orientation, it measures gravity only.  With
+``a = k f + b`` an axis, the means of the stretches fulfil::
+
+    |(a - b) / k| = g
+
+six unknowns, for which six positions with each axis up and down once are enough, however crooked they are.
+
+**Noise** of the standing robot, and the variances that a filter makes of it (thesis 4.4.3).  *Corrected*: (4.39) takes
+the variance about the mean of ten minutes, so that a walking bias, and the heading that it turns, pass for noise.
+Here it is the variance within batches of a second about a straight line.
+
+**Motion** as the camera saw it is given without what a camera makes up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from terrain.angles import unwrapped
+from terrain.calibration.finding import Finding, around, biases, undetermined
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import DataError
+from terrain.estimation.measurements.cleaning import MIN_CONFIDENCE_RATIO
+from terrain.identify import Parameter, half_width, identify, std_interval
+from terrain.kinematics.camera import CHANNELS, body_motion
+from terrain.kinematics.wheel_velocity import TWIST, point_velocity
+from terrain.logs.schema import IMU_CHANNELS
+from terrain.records import Array, RunLog, Stream
+from terrain.robots import Robot
+
+MIN_STANDING_S = 5.0
+"""Shorter stops are passed over: the robot still swings, and noise averages out too little."""
+
+BLOCK_S = 0.2
+"""Length over which the IMU is judged to be quiet."""
+
+QUIET_FACTOR = 5.0
+"""A quiet sensor scatters at most this many times as much as its description says, which may be a poor
+guess."""
+
+MAX_BIAS_RADPS = 0.06
+"""A steady rate above this is a rotation: the BNO055's zero-rate offset is within 3 deg/s (Bosch data
+sheet)."""
+
+STANDING_MPS = 0.01
+"""Largest circumferential speed of a standing wheel: a single step of its Hall sensor reads as more after
+the low-pass of the motor driver."""
+
+BATCH_S = 1.0
+"""Means over batches of this length are as good as independent."""
+
+NO_STANDING = f"no run has a standing stretch of {MIN_STANDING_S:g} s: let the robot stand, switched on"
+
+GYRO, ACCEL = IMU_CHANNELS[:3], IMU_CHANNELS[3:6]
+
+
+class Stretch(NamedTuple):
+    """A stretch of a run, ``[start_s, end_s)``; all of it by default."""
+
+    run: RunLog
+    start_s: float = -math.inf
+    end_s: float = math.inf
+
+    def of(self, stream: str, channels: Sequence[str]) -> Stream | None:
+        """Return the known samples of some channels, None where there are not even two."""
+        whole = self.run.streams.get(stream)
+        if whole is None or not set(channels) <= set(whole.channels):
+            return None
+        first, end = np.searchsorted(whole.time_s, [self.start_s, self.end_s])
+        values = np.column_stack([whole.channel(channel)[first:end] for channel in channels])
+        known = np.isfinite(values).all(axis=1)
+        if known.sum() < 2:
+            return None
+        return Stream(whole.time_s[first:end][known], values[known], tuple(channels))
+
+
+def standing(run: RunLog, robot: Robot, min_s: float = MIN_STANDING_S) -> list[Stretch]:
+    """Return the stretches, of at least ``min_s``, in which nothing moves.
+
+    The wheels stand, where the log has any; the IMU is there, scatters about its noise, turns by no more
+    than a bias can, and is not frozen.  What is returned is short of the motion at either end by a block.
+
+    Parameters
+    ----------
+    run : with the stream ``imu``
+    robot : with all sections
+    min_s : least length
+    """
+    _, motors, _, _, sensors = robot.equipment
+    imu = Stretch(run).of("imu", GYRO + ACCEL)
+    if imu is None:
+        return []
+    size = max(round(BLOCK_S * imu.rate_hz), 3)
+    n = len(imu) // size
+    values, time_s = imu.values[: n * size].reshape(n, size, 6), imu.time_s[: n * size].reshape(n, size)
+    scatter = values.std(axis=1)
+    limit = QUIET_FACTOR * np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
+    quiet = ((scatter > 0) & (scatter < limit)).all(axis=1) & (np.ptp(time_s, axis=1) < 1.5 * BLOCK_S)
+    quiet &= (np.abs(values[:, :, :3].mean(axis=1)) < MAX_BIAS_RADPS).all(axis=1)
+    wheels = Stretch(run).of("wheels", [f"motor_{wheel}_radps" for wheel in robot.wheels])
+    if wheels is not None:
+        wheel_speed_mps = np.abs(wheels.values).max(axis=1) / motors.reduction_ratio * robot.wheel_radius_m
+        moving_s = wheels.time_s[wheel_speed_mps > STANDING_MPS]
+        quiet &= np.searchsorted(moving_s, time_s[:, 0]) == np.searchsorted(moving_s, time_s[:, -1])
+        quiet &= (time_s[:, 0] >= wheels.time_s[0]) & (time_s[:, -1] <= wheels.time_s[-1] + BLOCK_S)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(int), [0]]))).reshape(-1, 2)
+    # Nearly a block at either end shares its block with a motion; one more is left away for what swings on.
+    return [
+        Stretch(run, float(time_s[first + 1, 0]), float(time_s[end - 1, 0]))
+        for first, end in edges
+        if end - first > 2 and (end - first + 2) * BLOCK_S >= min_s
+    ]
+
+
+def batches(stream: Stream, length_s: float = BATCH_S) -> Iterator[Array]:
+    """Yield the values (k, channels) of whole consecutive batches of a stream."""
+    size = max(round(length_s * stream.rate_hz), 3)
+    for first in range(0, len(stream) - size + 1, size):
+        yield stream.values[first : first + size]
+
+
+def gyro_bias(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
+    """Return the biases of the three gyros and how much they differ from one power-on to the next.
+
+    Parameters
+    ----------
+    stretches : standing, of any runs; each run is taken for a power-on
+    robot : with sensors described
+
+    Notes
+    -----
+    The error of a mean is that of the means over :data:`BATCH_S`: the colour of the noise, and a bias that
+    walks, count as far as they show within a run.
+    """
+    names = [f"sensors.gyro_bias_{axis}_radps" for axis in "xyz"]
+    of_run: dict[str, list[Stream]] = {}
+    for stretch in stretches:
+        if stream := stretch.of("imu", GYRO):
+            of_run.setdefault(stretch.run.run_id, []).append(stream)
+    if not of_run:
+        return undetermined([*names, "sensors.gyro_bias_std_radps"], NO_STANDING)
+    parts = [
+        np.array([batch.mean(axis=0) for stream in streams for batch in batches(stream)])
+        for streams in of_run.values()
+    ]
+    found = np.array([part.mean(axis=0) for part in parts])
+    variance = np.array([part.var(axis=0, ddof=1) / len(part) for part in parts])
+    n = sum(len(stream) for streams in of_run.values() for stream in streams)
+    described = robot.equipment.sensors.gyro_bias_std_radps
+    std_name = "sensors.gyro_bias_std_radps"
+    return biases(names, std_name, found, variance, described, n, "samples", tuple(of_run))
+
+
+JUMP_S = 0.075
+"""Width of the running median that a relocalisation of the camera stands out from."""
+
+JUMP = (0.1, 0.1, 0.1, 0.05)
+"""By more than this, in m/s of both speeds, rad/s and rad; driving and noise stay below."""
+
+MAX_GAP_S = 0.1
+"""Over a longer gap nothing is interpolated."""
+
+SEEN = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
+
+
+def seen_motion(stretch: Stretch, robot: Robot) -> Stream | None:
+    """Return speeds of the camera point, yaw rate and yaw by the camera, with its latency taken off.
+
+    Samples of low confidence, and those of a relocalisation (wrong speeds for a few samples), are left out.
+    None where the camera saw nothing.
+    """
+    odometry = stretch.of("odometry", CHANNELS)
+    if odometry is None or not robot.describes("camera"):
+        return None
+    camera = robot.camera
+    seen = body_motion(odometry, camera)
+    values = np.column_stack([seen.speed_mps, seen.yaw_rate_radps, seen.yaw_rad])
+    confident = np.isfinite(values).all(axis=1) & (
+        odometry.channel("confidence_ratio") >= MIN_CONFIDENCE_RATIO
+    )
+    if not confident.any():
+        return None
+    time_s, values = seen.time_s[confident] - camera.latency_s, values[confident]
+    width = 2 * round(JUMP_S * odometry.rate_hz / 2) + 1
+    kept = (np.abs(values - median_filter(values, size=(width, 1), mode="nearest")) <= JUMP).all(axis=1)
+    return Stream(time_s[kept], values[kept], SEEN) if kept.any() else None
+
+
+def origin_twist(stretch: Stretch, robot: Robot) -> Stream | None:
+    """Return the twist of the robot's origin by the camera, or None where it saw nothing."""
+    seen = seen_motion(stretch, robot)
+    if seen is None:
+        return None
+    camera = robot.camera
+    x_mps, y_mps, turn_radps = seen.values[:, :3].T
+    origin = point_velocity(x_mps, y_mps, turn_radps, -camera.lever_x_m, -camera.lever_y_m)
+    return Stream(seen.time_s, np.column_stack([*origin, turn_radps]), TWIST)
+
+
+def at_times(stream: Stream, time_s: Array) -> Array:
+    """Return a stream's values (n, channels) at other times; NaN outside it and within its long gaps."""
+    after = np.searchsorted(stream.time_s, time_s)
+    inside = (after > 0) & (after < len(stream))
+    inside[inside] = stream.time_s[after[inside]] - stream.time_s[after[inside] - 1] <= MAX_GAP_S
+    values = np.full((len(time_s), len(stream.channels)), np.nan)
+    for i, column in enumerate(stream.values.T):
+        values[inside, i] = np.interp(time_s[inside], stream.time_s, column)
+    return values
+
+
+MIN_POSITION_S = 2.0
+"""Of a position: "a couple of seconds" (thesis 3.3.3)."""
+
+UPRIGHT_SHARE = 0.8
+"""An axis points up or down where it carries that much of gravity: within 37 degrees."""
+
+POSITION_BATCH_S = 0.5
+"""Means over batches of this length are as good as independent: an accelerometer at rest has little
+colour."""
+
+PASSES = 3
+"""Each takes the errors of the positions from the fit before; they hardly depend on it."""
+
+LEVEL_ONLY = (
+    "level standing alone cannot tell: along z a bias looks like a scale, along x and y like a tilt; "
+    "hold the IMU still in six positions, each axis up and down, in one log"
+)
+
+GRAVITY = f"gravity taken for {GRAVITY_MPS2} m/s^2; on Earth it is within 0.3 % of that"
+
+
+def fit_gravity(means_mps2: Array, variance: Array) -> tuple[Array, Array, Array]:
+    """Return what makes gravity of the means of resting stretches.
+
+    Parameters
+    ----------
+    means_mps2 : (n, 3) mean of the accelerometer in each of n positions
+    variance : (n, 3) variance of the errors of the means
+
+    Returns
+    -------
+    bias_mps2, scale_ratio : (3,)
+    cov : (6, 6) of both, in that order
+
+    Raises
+    ------
+    DataError
+        if an axis was never turned both up and down.
+
+    Examples
+    --------
+    >>> up = GRAVITY_MPS2 * np.vstack([np.eye(3), -np.eye(3)])
+    >>> bias, scale, _ = fit_gravity(1.02 * up + 0.1, np.full((6, 3), 1e-6))
+    >>> bias.round(3), scale.round(3)
+    (array([0.1, 0.1, 0.1]), array([1.02, 1.02, 1.02]))
+    """
+    share = means_mps2 / np.linalg.norm(means_mps2, axis=1)[:, None]
+    for i, axis in enumerate("xyz"):
+        if share[:, i].max() < UPRIGHT_SHARE or share[:, i].min() > -UPRIGHT_SHARE:
+            raise DataError(f"axis {axis} was not turned both up and down: six positions are needed")
+    values = np.concatenate([(means_mps2.max(axis=0) + means_mps2.min(axis=0)) / 2, np.ones(3)])
+    parameters = [
+        Parameter(f"{name}_{axis}", v) for name, v in (("bias", 0.0), ("scale", 1.0)) for axis in "xyz"
+    ]
+
+    def residual(values: Array, std: Array | float = 1.0) -> Array:
+        return np.asarray(
+            (GRAVITY_MPS2 - np.linalg.norm((means_mps2 - values[:3]) / values[3:], axis=1)) / std
+        )
+
+    for _ in range(PASSES):
+        force = (means_mps2 - values[:3]) / values[3:]
+        towards = force / np.linalg.norm(force, axis=1)[:, None] / values[3:]  # d|f|/da
+        std = np.sqrt((towards**2 * variance).sum(axis=1))
+        fit = identify(partial(residual, std=std), parameters, starts=[values])
+        values = fit.value
+    dof = len(means_mps2) - 6
+    spread = max(float(fit.residual @ fit.residual) / dof, 1.0) if dof else 1.0
+    return values[:3], values[3:], spread * fit.cov
+
+
+def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
+    """Return biases and scales of the accelerometer, and how much the biases differ between power-ons.
+
+    Parameters
+    ----------
+    stretches : standing, of at least :data:`MIN_POSITION_S`, of any runs; a run counts that has six positions
+    robot : with sensors described
+    """
+    bias_names = [f"sensors.accel_bias_{axis}_mps2" for axis in "xyz"]
+    scale_names = [f"sensors.accel_scale_{axis}_ratio" for axis in "xyz"]
+    std_name = "sensors.accel_bias_std_mps2"
+    of_run: dict[str, list[Array]] = {}
+    for stretch in stretches:
+        if stream := stretch.of("imu", ACCEL):
+            means = np.array([batch.mean(axis=0) for batch in batches(stream, POSITION_BATCH_S)])
+            of_run.setdefault(stretch.run.run_id, []).append(means)
+    fits = {}
+    for run_id, positions in of_run.items():
+        spare = sum(len(means) - 1 for means in positions)
+        squares = sum(((means - means.mean(axis=0)) ** 2).sum(axis=0) for means in positions)
+        try:
+            fits[run_id] = fit_gravity(
+                np.array([means.mean(axis=0) for means in positions]),
+                np.array([squares / spare / len(means) for means in positions]),
+            )
+        except DataError:
+            continue
+    if not fits:
+        return undetermined([*bias_names, *scale_names, std_name], LEVEL_ONLY)
+    runs = tuple(fits)
+    n = sum(len(of_run[run_id]) for run_id in runs)
+    bias, scale, cov = (np.array(part) for part in zip(*fits.values(), strict=True))
+    variance = np.diagonal(cov, axis1=1, axis2=2)
+    described = robot.equipment.sensors.accel_bias_std_mps2
+    half = half_width(np.sqrt(variance[:, 3:].mean(axis=0) / len(runs)), math.inf)
+    mean = scale.mean(axis=0)
+    return [
+        *biases(bias_names, std_name, bias, variance[:, :3], described, n, "positions", runs),
+        *(
+            around(name, mean[i], half[i], n, "positions", runs, GRAVITY)
+            for i, name in enumerate(scale_names)
+        ),
+    ]
+
+
+NO_NOISE_SHARE = 0.01
+"""Of the described standard deviation: a channel with less shows no noise at rest."""
+
+MIN_NOISE_STEPS = 0.4
+"""Noise under this share of an encoder's step hides in the step; above, step^2/12 taken off is right
+(Sheppard)."""
+
+LAGS = 10
+"""Lags over which noise is looked at for colour."""
+
+NOISE_FLOOR = 1e-5
+"""Least variance of a measurement, in its squared natural unit: no filter shall take a sensor for perfect
+(4.4.3)."""
+
+
+def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
+    """Return the standard deviation of the noise of each kind of sensor at rest.
+
+    Parameters
+    ----------
+    stretches : standing, of any runs
+    robot : swerve robot with all sections
+
+    Notes
+    -----
+    The interval is that of chi square with ``n / (1 + 2 sum rho_k^2)`` degrees of freedom, ``rho_k`` the
+    autocorrelation.  Of the steering angle, the variance of its steps, ``step^2/12``, is taken off: the
+    description has the steps by themselves.
+    """
+    signals: dict[str, list[tuple[str, Stream]]] = {}
+    for stretch in stretches:
+        for parameter, stream in _signals(stretch, robot).items():
+            signals.setdefault(parameter, []).append((stretch.run.run_id, stream))
+    if not stretches:
+        return undetermined(_PARAMETERS, NO_STANDING)
+    return [_noise(parameter, signals.get(parameter, []), robot) for parameter in _PARAMETERS]
+
+
+def measurement_variances(robot: Robot, floor: float = NOISE_FLOOR) -> dict[str, float]:
+    """Return the variance of each row that a filter measures, in its squared natural unit.
+
+    Parameters
+    ----------
+    robot : swerve robot with all sections
+    floor : least variance
+
+    Notes
+    -----
+    These are the sensors' own, sample by sample and at rest: thesis 4.4.3 with the floor of its (4.40).  A
+    low-pass before the filter makes them smaller, driving over rough ground makes those of the
+    accelerations larger.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> variances = measurement_variances(load_robot("agrimaro"))
+    >>> variances["camera_speed_x_mps"], round(variances["accel_x_mps2"], 6)
+    (1e-05, 0.000135)
+    """
+    _, motors, _, camera, sensors = robot.equipment
+    steering = sensors.steering_std_rad**2 + (2 * math.pi / sensors.steering_steps_ratio) ** 2 / 12
+    variances = {
+        **{f"wheel_{i}_radps": (sensors.motor_std_radps / motors.reduction_ratio) ** 2 for i in robot.wheels},
+        "accel_x_mps2": (sensors.accel_std_mps2 / sensors.accel_scale_x_ratio) ** 2,
+        "accel_y_mps2": (sensors.accel_std_mps2 / sensors.accel_scale_y_ratio) ** 2,
+        "gyro_z_radps": sensors.gyro_std_radps**2,
+        "imu_yaw_rad": sensors.yaw_std_rad**2,
+        **{f"steer_{i}_rad": steering for i in robot.wheels},
+        "camera_speed_x_mps": camera.speed_std_mps**2,
+        "camera_speed_y_mps": camera.speed_std_mps**2,
+        "camera_yaw_rate_radps": camera.yaw_rate_std_radps**2,
+        "camera_yaw_rad": camera.yaw_std_rad**2,
+    }
+    return {row: max(variance, floor) for row, variance in variances.items()}
+
+
+_PARAMETERS = (
+    "sensors.gyro_std_radps",
+    "sensors.accel_std_mps2",
+    "sensors.yaw_std_rad",
+    "sensors.motor_std_radps",
+    "sensors.current_std_a",
+    "sensors.steering_std_rad",
+    "camera.speed_std_mps",
+    "camera.yaw_rate_std_radps",
+    "camera.yaw_std_rad",
+)
+
+
+def _signals(stretch: Stretch, robot: Robot) -> dict[str, Stream]:
+    """Return the signals of a standing stretch by the parameter that is their noise."""
+    channels: Mapping[str, tuple[str, Sequence[str]]] = {
+        "sensors.gyro_std_radps": ("imu", GYRO),
+        "sensors.accel_std_mps2": ("imu", ACCEL),
+        "sensors.yaw_std_rad": ("imu", ("yaw_rad",)),
+        "sensors.motor_std_radps": ("wheels", [f"motor_{i}_radps" for i in robot.wheels]),
+        "sensors.current_std_a": ("wheels", [f"current_{i}_a" for i in robot.wheels]),
+        "sensors.steering_std_rad": ("steering", [f"angle_{i}_rad" for i in robot.wheels]),
+    }
+    found = {name: stream for name, place in channels.items() if (stream := stretch.of(*place))}
+    for name, stream in found.items():
+        if name.endswith("_rad"):
+            turned = np.column_stack([unwrapped(column) for column in stream.values.T])
+            found[name] = Stream(stream.time_s, turned, stream.channels)
+    seen = seen_motion(stretch, robot)
+    if seen is not None:
+        for name, columns in (
+            ("camera.speed_std_mps", [0, 1]),
+            ("camera.yaw_rate_std_radps", [2]),
+            ("camera.yaw_std_rad", [3]),
+        ):
+            found[name] = Stream(
+                seen.time_s, seen.values[:, columns], tuple(seen.channels[i] for i in columns)
+            )
+    return found
+
+
+def _noise(parameter: str, signals: Sequence[tuple[str, Stream]], robot: Robot) -> Finding:
+    section, _, name = parameter.partition(".")
+    described = getattr(getattr(robot.equipment, section), name)
+    residuals = [_about_a_line(batch) for _, stream in signals for batch in batches(stream)]
+    if not residuals:
+        return undetermined([parameter], "no standing stretch has this signal")[0]
+    squares = float(sum((part**2).sum() for part in residuals))
+    if squares < sum(part.size for part in residuals) * (NO_NOISE_SHARE * described) ** 2:
+        return undetermined([parameter], "no noise at rest")[0]
+    correlation = np.array([_correlation(residuals, lag) for lag in range(1, LAGS + 1)])
+    # A line takes two samples' worth of white noise with it, and more of coloured noise.
+    taken = 2 * max(1 + 2 * correlation.sum(), 1.0)
+    dof = sum((len(part) - taken) * part.shape[1] for part in residuals)
+    variance = squares / dof
+    dof /= 1 + 2 * (correlation**2).sum()
+    low, high = std_interval(variance, dof)
+    step_variance = 0.0
+    if parameter == "sensors.steering_std_rad":
+        step = 2 * math.pi / robot.equipment.sensors.steering_steps_ratio
+        step_variance = step**2 / 12
+        if variance - step_variance < (MIN_NOISE_STEPS * step) ** 2:
+            return undetermined([parameter], f"the noise hides below the encoder's step of {step:.2g} rad")[0]
+    value, low, high = (math.sqrt(max(x - step_variance, 0.0)) for x in (variance, low**2, high**2))
+    n = sum(len(stream) for _, stream in signals)
+    runs = tuple(dict.fromkeys(run_id for run_id, _ in signals))
+    return Finding(parameter, value, low, high, n, "samples", runs)
+
+
+def _about_a_line(batch: Array) -> Array:
+    """Return a batch (k, channels) without the straight line that fits each channel best."""
+    x = np.linspace(-1.0, 1.0, len(batch))[:, None]
+    centred = batch - batch.mean(axis=0)
+    return np.asarray(centred - x * (x * centred).sum(axis=0) / (x**2).sum())
+
+
+def _correlation(residuals: Sequence[Array], lag: int) -> float:
+    """Return the autocorrelation over all batches and channels at one lag."""
+    together = sum(float((part[lag:] * part[:-lag]).sum()) for part in residuals if len(part) > lag)
+    return together / sum(float((part**2).sum()) for part in residuals)

@@ -1,0 +1,275 @@
+r"""One identification: least squares over named parameters, with intervals that hold for what was not measured.
+
+Of residuals r (n,) over their standard deviation, with weak priors of the parameters p,
+
+.. math:: \hat p = \arg\min_p \sum_i \rho(r_i(p)^2) + \sum_j \big((p_j - p_{0j}) / s_j\big)^2 ,
+
+the covariance is, with the Jacobian J and :math:`A = J^T J + \mathrm{diag}(s^{-2})`, either :math:`A^{-1}` (the
+residuals are independent and as large as stated) or, where residuals of one cluster g of G (a run, a session)
+belong together, the sandwich of Liang and Zeger (Biometrika 73, 1986),
+
+.. math:: C = \tfrac{G}{G - 1} \sum_g u_g u_g^T, \qquad u_g = A^{-1} J_g^T r_g ,
+
+whose intervals are those of Student's t with G - 1 degrees of freedom.  Where a fit is not linear in what
+clusters differ by, :func:`jackknife` leaves each out in turn and :mod:`terrain.bootstrap` draws them with
+replacement.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+from scipy import stats
+from scipy.optimize import least_squares
+
+from terrain.bootstrap import LEVEL
+from terrain.records import Array
+
+IDENTIFIED_RATIO = 0.5
+"""Standard deviation with the measurements over that of the prior, below which they identify a parameter."""
+
+EDGE = 1e-3
+"""In units of the search: a value so near to its bound stands at it."""
+
+UNSEEN = 1e-6
+"""Part of a parameter in directions of no curvature from which on it is not identified."""
+
+_Candidate = TypeVar("_Candidate")
+
+
+class Parameter(NamedTuple):
+    """A number that is identified.
+
+    Parameters
+    ----------
+    name : ends in its unit
+    nominal : where the search begins, and the mean of its prior
+    low, high : bounds
+    prior_std : standard deviation of the prior; infinite of none
+    step : size of a usual change, the unit of the search; by default that of the prior, or 1
+    """
+
+    name: str
+    nominal: float
+    low: float = -math.inf
+    high: float = math.inf
+    prior_std: float = math.inf
+    step: float = math.nan
+
+    @property
+    def unit(self) -> float:
+        """Unit of the search."""
+        if math.isfinite(self.step):
+            return self.step
+        return self.prior_std if math.isfinite(self.prior_std) else 1.0
+
+
+class Fit(NamedTuple):
+    """Parameters that were identified.
+
+    Parameters
+    ----------
+    parameters : k of them
+    value, cov : (k,) and (k, k)
+    interval : (2, k) lower and upper ends, 95 %
+    identified : (k,) whether the measurements narrow the prior to less than half, away from a bound
+    at_bound : (k,)
+    influence : (G, k) :math:`u_g`, what each cluster moves the values by; (0, k) without clusters
+    residual : (n,) of the measurements, at the values
+    cost : half of the sum that is minimised
+    """
+
+    parameters: tuple[Parameter, ...]
+    value: Array
+    cov: Array
+    interval: Array
+    identified: Array
+    at_bound: Array
+    influence: Array
+    residual: Array
+    cost: float
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (k,)."""
+        return np.asarray(np.sqrt(np.diag(self.cov)))
+
+
+def identify(
+    residual: Callable[[Array], Array],
+    parameters: Sequence[Parameter],
+    clusters: Array | None = None,
+    robust: str = "linear",
+    starts: Sequence[Array] = (),
+    **search: Any,
+) -> Fit:
+    """Identify parameters.
+
+    Parameters
+    ----------
+    residual : gives the residuals (n,), or (n, m) of n measurements of m numbers, of values (k,)
+    parameters : k of them
+    clusters : (n,) number of the cluster of each measurement, 0 to G - 1; None where all are independent
+    robust : loss rho, as :func:`scipy.optimize.least_squares` names it; of the residuals and the priors
+    starts : values (k,) to begin at, of which the best end counts; the nominal ones by default
+    search : further arguments of :func:`scipy.optimize.least_squares`
+
+    Examples
+    --------
+    >>> x = np.arange(12.0)
+    >>> line = [Parameter("intercept_m", 0.0), Parameter("slope_ratio", 1.0)]
+    >>> fit = identify(lambda p: p[0] + p[1] * x - (2 + 3 * x), line, clusters=np.arange(12) // 3)
+    >>> fit.value.round(6), fit.interval[:, 1].round(6)
+    (array([2., 3.]), array([3., 3.]))
+    """
+    nominal, low, high, prior_std = (np.array([p[i] for p in parameters]) for i in range(1, 5))
+    unit = np.array([p.unit for p in parameters])
+    held = np.isfinite(prior_std)
+    bounds = (low - nominal) / unit, (high - nominal) / unit
+
+    def whole(scaled: Array) -> Array:
+        values = nominal + unit * scaled
+        return np.concatenate([np.ravel(residual(values)), ((values - nominal) / prior_std)[held]])
+
+    best = None
+    for start in starts if len(starts) else [nominal]:
+        inside = np.clip((start - nominal) / unit, bounds[0] + 1e-6, bounds[1] - 1e-6)
+        found = least_squares(whole, inside, bounds=bounds, loss=robust, **search)
+        if best is None or found.cost < best.cost:
+            best = found
+    assert best is not None
+    n = len(best.fun) - int(held.sum())
+    value, left, by = nominal + unit * best.x, best.fun[:n], best.jac[:n]
+    normal = by.T @ by + np.diag((unit / prior_std) ** 2)
+    inverse = np.linalg.pinv(normal, hermitian=True)
+    cov, influence, dof = inverse * np.outer(unit, unit), np.empty((0, len(value))), math.inf
+    if clusters is not None:
+        rows = np.repeat(clusters, n // len(clusters))
+        influence = cluster_scores(by * left[:, None], rows) @ inverse * unit
+        cov, dof = sandwich(influence), len(influence) - 1
+    at_bound = np.minimum(value - low, high - value) < EDGE * unit
+    unseen = np.diag(np.eye(len(value)) - inverse @ normal) > UNSEEN  # nothing that is measured depends on it
+    std = np.where(unseen, math.inf, np.sqrt(np.diag(cov)))
+    half = half_width(std, dof)
+    identified = ~at_bound & ~unseen & ~(std >= IDENTIFIED_RATIO * prior_std)
+    interval = np.stack([value - half, value + half])
+    return Fit(
+        tuple(parameters), value, cov, interval, identified, at_bound, influence, left, float(best.cost)
+    )
+
+
+def cluster_scores(scores: Array, clusters: Array) -> Array:
+    """Return the sums (G, k) over clusters of the derivatives (n, k) of each error times the error."""
+    total = np.zeros((int(clusters.max()) + 1, scores.shape[1]))
+    np.add.at(total, clusters, scores)
+    return total
+
+
+def sandwich(influence: Array) -> Array:
+    """Return the covariance (k, k) of a fit by what each cluster moves it by (G, k)."""
+    n = len(influence)
+    return np.asarray(n / max(n - 1, 1) * influence.T @ influence)
+
+
+def half_width(std: Array | float, dof: float, level: float = LEVEL) -> Array:
+    """Return half the interval of a normal number whose standard deviation has ``dof`` degrees of freedom.
+
+    Examples
+    --------
+    >>> half_width(1.0, 10.0).round(2), half_width(1.0, float("inf")).round(2)
+    (np.float64(2.23), np.float64(1.96))
+    """
+    return np.float64(stats.t.ppf((1 + level) / 2, dof)) * np.asarray(std)
+
+
+def std_interval(variance: float, dof: float, level: float = LEVEL) -> tuple[float, float]:
+    """Return the interval of a standard deviation whose variance was found with ``dof`` degrees of freedom.
+
+    Examples
+    --------
+    >>> low, high = std_interval(4.0, 100.0)
+    >>> round(low, 2), round(high, 2)
+    (1.76, 2.32)
+    """
+    low, high = stats.chi2.ppf([(1 - level) / 2, (1 + level) / 2], dof)
+    return math.sqrt(variance * dof / high), math.sqrt(variance * dof / low)
+
+
+def jackknife(estimate: Callable[[Array], float], n: int) -> float:
+    """Return the standard deviation of an estimate by leaving out each of n clusters in turn.
+
+    Parameters
+    ----------
+    estimate : of the clusters whose numbers (n - 1,) it gets
+    n : clusters; the deviation has n - 1 degrees of freedom
+
+    Examples
+    --------
+    >>> values = np.array([1.0, 2.0, 3.0, 6.0])
+    >>> bool(np.isclose(jackknife(lambda some: values[some].mean(), 4), values.std(ddof=1) / 2))
+    True
+    """
+    left_out = np.array([estimate(np.delete(np.arange(n), i)) for i in range(n)])
+    return math.sqrt((n - 1) / n * float(((left_out - left_out.mean()) ** 2).sum()))
+
+
+def folds(fold: Array) -> Iterator[tuple[Array, Array]]:
+    """Yield the places of training and of tested members for each distinct value of ``fold`` (n,) in turn.
+
+    Examples
+    --------
+    >>> [test.tolist() for _, test in folds(np.array([0, 1, 0]))]
+    [[0, 2], [1]]
+    """
+    for value in np.unique(fold):
+        yield np.flatnonzero(fold != value), np.flatnonzero(fold == value)
+
+
+def deal(clusters: Array, n_folds: int, rng: np.random.Generator) -> Array:
+    """Return the fold (n,) of each member, whole clusters dealt at random into folds of about equal number.
+
+    Examples
+    --------
+    >>> deal(np.array(["a", "a", "b", "c"]), 3, np.random.default_rng(0)).tolist()
+    [2, 2, 0, 1]
+    """
+    names, number = np.unique(clusters, return_inverse=True)
+    return np.asarray((rng.permutation(len(names)) % n_folds)[number])
+
+
+def select(
+    score: Callable[[_Candidate, Array, Array], Array],
+    candidates: Sequence[_Candidate],
+    fold: Array,
+    errors: float = 1.0,
+) -> tuple[_Candidate, Mapping[_Candidate, Array]]:
+    """Return the candidate that predicts clusters best which its fit did not have, and the scores of each.
+
+    Parameters
+    ----------
+    score : of a candidate fitted to some clusters, for each of others: larger is better
+    candidates : the plainest first; a later one is taken where it is better than the one taken before by
+        more than ``errors`` standard errors of the difference
+    fold : (G,) of each cluster
+    errors : 0 where candidates do not contain each other
+
+    Examples
+    --------
+    >>> values = np.array([1.0, 1.2, 0.9, 1.1])
+    >>> miss = lambda power, train, test: -(values[test] - (values[train] ** power).mean()) ** 2
+    >>> select(miss, [0, 1, 8], np.arange(4), 0.0)[0]
+    0
+    """
+    scores: dict[_Candidate, Array] = {}
+    taken = candidates[0]
+    for candidate in candidates:
+        scores[candidate] = np.empty(len(fold))
+        for train, test in folds(fold):
+            scores[candidate][test] = score(candidate, train, test)
+        gain = scores[candidate] - scores[taken]
+        if gain.mean() > errors * gain.std(ddof=1) / math.sqrt(len(gain)):
+            taken = candidate
+    return taken, scores

@@ -1,0 +1,275 @@
+"""Sensors at rest: biases, scales and noise that are hidden in simulated logs come back within their intervals."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from terrain.calibration.sensors import (
+    ACCEL,
+    GYRO,
+    MIN_POSITION_S,
+    accelerometer,
+    fit_gravity,
+    gyro_bias,
+    measurement_variances,
+    sensor_noise,
+    standing,
+)
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.measurements.table import ROWS_OF_DRIVE
+from terrain.records import RunLog, Stream
+from terrain.simulation.bench import six_positions_log
+
+N_SEEDS = 20
+
+
+def with_imu(run, change):
+    """Return a run whose IMU's values (n, channels) went through ``change(time_s, values)``."""
+    imu = run.streams["imu"]
+    changed = Stream(imu.time_s, change(imu.time_s, np.array(imu.values)), imu.channels)
+    return RunLog(run.run_id, run.robot, {**run.streams, "imu": changed}, run.labels)
+
+
+def noise_run(nominal, rng, smoothness, bias_radps=0.0, duration_s=20.0):
+    """Return a standing IMU whose noise keeps ``smoothness`` of itself from sample to sample."""
+    n, sensors = round(100 * duration_s), nominal.sensors
+    white = rng.standard_normal((n + 200, 7)) * math.sqrt(1 - smoothness**2)
+    std = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2, 0.002], [3, 3, 1])
+    values = lfilter([1.0], [1.0, -smoothness], white, axis=0)[200:] * std
+    values += [bias_radps] * 3 + [0.0, 0.0, 9.80665, 0.0]
+    return RunLog(
+        "noise", nominal.name, {"imu": Stream(np.arange(n) / 100, values, (*GYRO, *ACCEL, "yaw_rad"))}
+    )
+
+
+def test_standing_stretches_contain_no_motion(drive, nominal):
+    (whole,) = standing(drive("stand", 1), nominal)
+    assert whole.start_s < 1.0
+    assert whole.end_s > 19.0
+    run = drive("straight", 1, duration_s=20.0)  # stands for a second
+    assert standing(run, nominal) == []
+    (short,) = standing(run, nominal, min_s=1.0)
+    assert short.end_s <= 1.0
+    starts = drive("starts", 1, duration_s=60.0)
+    truth = starts.streams["truth"]
+    for stretch in standing(starts, nominal, min_s=1.0):
+        rows = (truth.time_s >= stretch.start_s) & (truth.time_s <= stretch.end_s)
+        assert np.abs(truth.channel("speed_x_mps")[rows]).max() < 0.01
+
+
+def test_a_knock_ends_a_stretch_and_a_dead_sensor_has_none(drive, nominal):
+    run = drive("stand", 2)
+
+    def knock(time_s, values):
+        values[(time_s > 9.0) & (time_s < 9.3), 3] += 0.5 * (-1) ** np.arange(29)
+        return values
+
+    first, second = standing(with_imu(run, knock), nominal)
+    assert first.end_s <= 9.0
+    assert second.start_s >= 9.3
+    frozen = with_imu(run, lambda _, values: np.tile(values[0], (len(values), 1)))
+    assert standing(frozen, nominal) == []
+    turned = with_imu(run, lambda _, values: values + np.eye(values.shape[1])[2] * 0.1)
+    assert standing(turned, nominal) == []  # 6 deg/s is no bias
+    assert standing(RunLog("r", "agrimaro", {"wheels": run.streams["wheels"]}), nominal) == []
+
+
+def test_wheels_that_turn_slowly_do_not_stand(drive, nominal):
+    run = drive("stand", 3)
+    wheels = run.streams["wheels"]
+    values = np.array(wheels.values)
+    values[500:, 1] = 1.0  # 2 cm/s
+    creeping = RunLog(
+        "r", run.robot, {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}
+    )
+    (stretch,) = standing(creeping, nominal)
+    assert stretch.end_s <= 10.0
+
+
+@pytest.mark.parametrize("n_runs", [1, 4])
+def test_gyro_biases_come_back(n_runs, drive, nominal, hidden, coverage):
+    # One power-on leans on the described scatter, so that has to be the true one.
+    described = nominal.with_parts(
+        sensors=replace(nominal.sensors, gyro_bias_std_radps=hidden.sensors.gyro_bias_std_radps)
+        if n_runs == 1
+        else nominal.sensors,
+    )
+    found = []
+    for seed in range(N_SEEDS):
+        runs = [drive("stand", 10 * seed + i, duration_s=6.0) for i in range(n_runs)]
+        found.append(gyro_bias([s for run in runs for s in standing(run, described)], described))
+    held = coverage(found)
+    assert len(held) == (3 if n_runs == 1 else 4)  # the scatter too
+    assert min(held.values()) >= 0.8
+    if n_runs == 1:
+        assert "power-ons" in found[0][3].note
+
+
+def test_coloured_noise_widens_the_interval(nominal):
+    still = nominal.with_parts(sensors=replace(nominal.sensors, gyro_bias_std_radps=0.0))
+    rng = np.random.default_rng(0)
+    inside, naive = [], []
+    for _ in range(30):
+        stretches = standing(noise_run(still, rng, 0.95, bias_radps=0.003), still)
+        finding = gyro_bias(stretches, still)[2]
+        inside.append(finding.low <= 0.003 <= finding.high)
+        naive.append(abs(finding.value - 0.003) < 1.96 * still.sensors.gyro_std_radps / np.sqrt(finding.n))
+    assert np.mean(inside) >= 0.8
+    assert np.mean(naive) < 0.6  # what independent samples would have had
+
+
+def test_without_a_standing_stretch_no_bias_is_determined(nominal):
+    findings = gyro_bias([], nominal)
+    assert len(findings) == 4
+    assert not any(finding.determined for finding in findings)
+    assert {finding.note for finding in findings} == {
+        "no run has a standing stretch of 5 s: let the robot stand, switched on"
+    }
+
+
+def noise_of(runs, robot):
+    found = sensor_noise([stretch for run in runs for stretch in standing(run, robot)], robot)
+    return {finding.parameter: finding for finding in found}
+
+
+def test_noise_comes_back(drive, nominal, coverage):
+    found = [noise_of([drive("stand", seed, duration_s=15.0)], nominal) for seed in range(N_SEEDS)]
+    held = coverage([findings.values() for findings in found])
+    assert len(held) == 8
+    assert min(held.values()) >= 0.8
+    for finding in found[0].values():  # and narrow: 5 % of each
+        assert not finding.determined or finding.high - finding.low < 0.1 * finding.value
+    motor = found[0]["sensors.motor_std_radps"]
+    assert not motor.determined
+    assert motor.note == "no noise at rest"  # a Hall sensor that sees no step
+
+
+def test_noise_is_separated_from_slow_drift_and_from_jumps(drive, nominal):
+    biased = nominal.with_parts(sensors=replace(nominal.sensors, gyro_bias_z_radps=0.02))
+    run = drive("stand", 1, robot=biased)
+    plain = noise_of([run], nominal)
+    assert plain["sensors.yaw_std_rad"].value == pytest.approx(nominal.sensors.yaw_std_rad, rel=0.05)
+    odometry = run.streams["odometry"]
+    values = np.array(odometry.values)
+    values[1000:1004, 7:10] += 2.0
+    jumped = RunLog(
+        "r", run.robot, {**run.streams, "odometry": Stream(odometry.time_s, values, odometry.channels)}
+    )
+    for name, finding in noise_of([jumped], nominal).items():
+        if finding.determined:
+            assert finding.value == pytest.approx(plain[name].value, rel=0.01)
+
+
+def test_the_interval_of_coloured_noise_is_wider(nominal):
+    rng, imu = np.random.default_rng(1), {}
+    for smoothness in (0.0, 0.6):
+        found = [
+            noise_of([noise_run(nominal, rng, smoothness)], nominal)["sensors.yaw_std_rad"] for _ in range(40)
+        ]
+        imu[smoothness] = np.mean([(f.low <= 0.002 <= f.high, f.high - f.low) for f in found], axis=0)
+    assert imu[0.0][0] >= 0.85
+    assert imu[0.6][0] >= 0.8
+    assert imu[0.6][1] > 1.3 * imu[0.0][1]
+
+
+def test_noise_below_the_encoder_step_is_undetermined(drive, nominal):
+    fine = nominal.with_parts(sensors=replace(nominal.sensors, steering_std_rad=0.0004))
+    finding = noise_of([drive("stand", 1, robot=fine)], nominal)["sensors.steering_std_rad"]
+    assert not finding.determined
+    assert "step" in finding.note or finding.note == "no noise at rest"
+
+
+def test_a_missing_sensor_has_undetermined_noise(drive, nominal):
+    run = drive("stand", 1)
+    bare = RunLog("r", run.robot, {name: run.streams[name] for name in ("imu", "wheels")})
+    found = noise_of([bare], nominal)
+    assert found["sensors.gyro_std_radps"].determined
+    assert found["camera.speed_std_mps"].note == "no standing stretch has this signal"
+    assert not any(finding.determined for finding in sensor_noise([], nominal))
+
+
+def test_variances_of_the_filters_rows(nominal):
+    variances = measurement_variances(nominal)
+    assert set(variances) == set(ROWS_OF_DRIVE["swerve"][:14])
+    assert min(variances.values()) == 1e-5  # thesis 4.4.3
+    bare = measurement_variances(nominal, floor=0.0)
+    assert bare["wheel_2_radps"] == pytest.approx(0.005**2)
+    assert bare["steer_1_rad"] == pytest.approx(0.001**2 + (2 * math.pi / 4096) ** 2 / 12)
+    assert bare["camera_speed_y_mps"] == pytest.approx(3e-6, rel=0.01)  # thesis 6.1.1
+    assert all(variances[row] == max(variance, 1e-5) for row, variance in bare.items())
+
+
+def calibrated(runs, robot):
+    return accelerometer([s for run in runs for s in standing(run, robot, MIN_POSITION_S)], robot)
+
+
+@pytest.mark.parametrize("n_logs", [1, 3])
+def test_bias_and_scale_come_back(n_logs, nominal, hidden, coverage):
+    found = [
+        calibrated(
+            [six_positions_log(hidden, 10 * s + i, hold_s=3.0, run_id=f"b{i}") for i in range(n_logs)],
+            nominal,
+        )
+        for s in range(N_SEEDS)
+    ]
+    held = coverage(found)
+    assert len(held) == (6 if n_logs == 1 else 7)
+    assert min(held.values()) >= 0.8
+    for finding in found[0]:
+        if "scale" in finding.parameter:
+            assert finding.high - finding.low < 0.001
+
+
+def test_more_and_crooked_positions_fit_too():
+    rng = np.random.default_rng(0)
+    up = rng.standard_normal((14, 3))
+    up = np.vstack([up / np.linalg.norm(up, axis=1)[:, None], np.eye(3), -np.eye(3)])
+    bias, scale, std = np.array([0.3, -0.2, 0.5]), np.array([1.05, 0.96, 1.01]), 1e-3
+    pulls = []
+    for _ in range(60):
+        seen = scale * GRAVITY_MPS2 * up + bias + std * rng.standard_normal(up.shape)
+        b, k, cov = fit_gravity(seen, np.full(up.shape, std**2))
+        pulls.append((np.concatenate([b - bias, k - scale])) / np.sqrt(np.diag(cov)))
+    assert np.std(pulls) == pytest.approx(1.0, abs=0.15)
+    assert np.abs(np.mean(pulls, axis=0)).max() < 4 / np.sqrt(60)
+
+
+def test_square_positions_have_a_closed_form():
+    up = GRAVITY_MPS2 * np.vstack([np.eye(3), -np.eye(3)])
+    scale, bias = np.array([1.02, 0.97, 1.0]), np.array([0.1, -0.3, 0.0])
+    seen = scale * up + bias
+    b, k, _ = fit_gravity(seen, np.full((6, 3), 1e-6))
+    np.testing.assert_allclose(b, (seen.max(axis=0) + seen.min(axis=0)) / 2, atol=0.02)
+    np.testing.assert_allclose(np.abs(((seen - b) / k) ** 2).sum(axis=1), GRAVITY_MPS2**2, rtol=1e-9)
+
+
+def test_level_standing_alone_is_not_enough(drive, nominal, hidden):
+    findings = calibrated([drive("stand", 1)], nominal)
+    assert len(findings) == 7
+    assert not any(finding.determined for finding in findings)
+    assert all("like a tilt" in finding.note for finding in findings)
+    up = GRAVITY_MPS2 * np.vstack([np.eye(3), -np.eye(3)])
+    with pytest.raises(DataError, match="axis y was not turned both up and down"):
+        fit_gravity(up[[0, 1, 2, 3, 5]], np.full((5, 3), 1e-6))
+
+
+def test_the_bench_is_a_power_on_like_any_other(nominal, hidden):
+    log = six_positions_log(hidden, 3, hold_s=6.0)
+    again = six_positions_log(hidden, 3, hold_s=6.0)
+    assert log.streams["imu"].values.tobytes() == again.streams["imu"].values.tobytes()
+    held = standing(log, nominal)
+    assert len(held) == 6
+    assert gyro_bias(held, nominal)[0].determined
+    imu = log.streams["imu"]
+    roll, pitch = (imu.channel(name) for name in ("roll_rad", "pitch_rad"))
+    vertical = np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
+    scales = [getattr(hidden.sensors, f"accel_scale_{axis}_ratio") for axis in "xyz"]
+    biases = [getattr(hidden.sensors, f"accel_bias_{axis}_mps2") for axis in "xyz"]
+    error = imu.values[:, 3:6] - biases - scales * vertical * GRAVITY_MPS2
+    assert np.abs(error.mean(axis=0)).max() < 4 * hidden.sensors.accel_bias_std_mps2
+    with pytest.raises(ConfigError, match="hold_s is 0"):
+        six_positions_log(hidden, 3, hold_s=0)
