@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -19,8 +20,17 @@ from terrain.classify.metrics import run_bootstrap
 from terrain.classify.stiffness import StiffnessLevel, cost_matrix, least_cost_class
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
-from terrain.control.pid import Gains
+from terrain.control.danzi_pid import (
+    LOW_SPEED_MPS,
+    POWER_THRESHOLD_WPKG,
+    ThesisSettings,
+    WheelPid,
+    conditioned_slip,
+    desired_slip,
+    power_state,
+    wheel_step,
+)
+from terrain.control.pid import Gains, pid_step
 from terrain.estimation.ekf.filter import run_filter
 from terrain.estimation.ekf.model import FilterSettings
 from terrain.estimation.enriched import enriched
@@ -718,15 +728,15 @@ def traction_control(trial: Trial) -> Finding:
     cases = trial.each["single_step"]
     single, remaining, steps = [], [], {}
     for case in cases:
-        (error,), (rate,) = _iterate(case, "printed", 1.0, 1)
+        (error,), (rate,) = _iterate(case, printed_step, 1.0, 1)
         desired = float(np.sign(case["v"])) * TARGETS[int(case["braking"])]
         found = {"slip": desired - error, "desired": desired, "error": error}
         digits = [round(value, 3) for value in (*found.values(), rate)]
         single.append(Numbers(rate, beside=found, values={"three_digits": digits}))
         if case["braking"]:
-            left = _iterate(case, "printed", 1.0, N_STEPS)[0]
+            left = _iterate(case, printed_step, 1.0, N_STEPS)[0]
             remaining.append(abs(left[-1] / left[0]))
-        errors = np.array(_iterate(case, "normalised", GAIN, N_EARLY)[0])
+        errors = np.array(_iterate(case, normalised_step, GAIN, N_EARLY)[0])
         steps[case["case"]] = errors[1:] / errors[:-1]
     braking, traction = (
         np.concatenate([steps[case["case"]] for case in cases if case["braking"] is kind])
@@ -742,20 +752,47 @@ def traction_control(trial: Trial) -> Finding:
     )
 
 
+TableStep = Callable[[WheelPid, float, float, float, float], tuple[float, float, WheelPid]]
+"""From state, gain, rate, speed and acceleration of a wheel to its correction, its desired slip and the next state."""
+
+
+def printed_step(
+    state: WheelPid, gain: float, rate: float, speed: float, accel: float
+) -> tuple[float, float, WheelPid]:
+    """Return the printed step: the direction is sgn(v), and the PID on the error, a ratio, is added as rad/s.
+
+    Examples
+    --------
+    >>> [round(value, 3) for value in printed_step(WheelPid(), 1.0, 0.7, 0.6, 1.0)[:2]]  # case 1A
+    [-0.043, 0.1]
+    """
+    slip, _ = conditioned_slip(rate, speed, LOW_SPEED_MPS)
+    drive_state = power_state(accel, speed, POWER_THRESHOLD_WPKG)
+    desired = desired_slip(drive_state, float(np.sign(speed)), TARGETS)
+    added, pid, _ = pid_step(Gains(gain, 0.0, 0.0, limit=10.0), state.pid, desired - slip, 0.02)
+    return added, desired, WheelPid(pid)
+
+
+def normalised_step(
+    state: WheelPid, gain: float, rate: float, speed: float, accel: float
+) -> tuple[float, float, WheelPid]:
+    """Return what the controller of this package does, by which an error is worth the same at any speed."""
+    settings = ThesisSettings(1.0, Gains(gain, 0.0, 0.0, limit=10.0))
+    step, after = wheel_step(settings, state, rate, rate, speed, accel, abs(speed), TARGETS, 0.02)
+    return step.correction_radps, step.desired_ratio, after
+
+
 def _iterate(
-    case: Mapping[str, Any], form: str, gain: float, n_steps: int
+    case: Mapping[str, Any], step: TableStep, gain: float, n_steps: int
 ) -> tuple[list[float], list[float]]:
     """Return slip error and commanded rate (n,) of steps, each from the rate of the previous one."""
-    settings = thesis_settings(1.0, Gains(gain, 0.0, 0.0, limit=10.0), form)
-    state, speed = new_state(1), np.array([case["v"]])
-    accel = np.copysign(ACCEL_MPS2, -speed if case["braking"] else speed)
-    rate, errors, rates = np.array([case["w"]]), [], []
+    state, speed, rate = WheelPid(), float(case["v"]), float(case["w"])
+    accel = math.copysign(ACCEL_MPS2, -speed if case["braking"] else speed)
+    errors, rates = [], []
     for _ in range(n_steps):
-        slip = (rate - speed) / np.maximum(np.abs(rate), np.abs(speed))
-        added, desired, _, _, state = thesis_step(
-            settings, state, rate, rate, speed, accel, abs(case["v"]), np.array(TARGETS), 0.02
-        )
-        rate = rate + added
-        errors.append(float(desired[0] - slip[0]))
-        rates.append(float(rate[0]))
+        slip = (rate - speed) / max(abs(rate), abs(speed))
+        added, desired, state = step(state, gain, rate, speed, accel)
+        rate += added
+        errors.append(desired - slip)
+        rates.append(rate)
     return errors, rates

@@ -8,13 +8,12 @@ from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
+from car_scenarios import GRIP_RATIO, STOP, Course, slope_course, stop_course
 from claims import Finding, Numbers, Trial
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.control.car_following import CarFollower, SlipSource
-from terrain.control.car_scenarios import GRIP_RATIO, STOP, Course, slope_course, stop_course
 from terrain.control.path_drive import FollowedDrive, followed_drive
-from terrain.control.paths import X, Y
 from terrain.estimation.observers.family import Observer
 from terrain.estimation.observers.sideslip_dynamic import DynamicSettings, sideslip_dynamic_observer
 from terrain.estimation.observers.sideslip_forces import C_LOW_NPR
@@ -282,7 +281,7 @@ def grip_preview(trial: Trial) -> Finding:
 def map_figure(shown: Drives, course: str, title: str) -> Figure:
     """Draw the path and where robots were."""
     path = course_of(course).path
-    lines = [Line("path", path.rows[:, X], path.rows[:, Y], 6, dashed=True)]
+    lines = [Line("path", path.x_m, path.y_m, 6, dashed=True)]
     lines += [Line(name, *drive.position_m.T) for name, drive in shown.items()]
     return Figure(title, (Panel(tuple(lines), "y [m]", equal=True),), x_label="x [m]")
 

@@ -10,12 +10,12 @@ import numpy as np
 from claims import Finding, Numbers, Trial
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
+from tracked_speed import TrackSpeedSettings, track_speed_step
 from tracks import janosi_slip
 
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.tracked_speed import track_speed_params, track_speed_step
 from terrain.estimation.observers.family import ObserverStatus, ObserverTrack, observe
 from terrain.estimation.observers.rows import feed_of, rows_of
 from terrain.estimation.observers.track_efficiency import measured_efficiency
@@ -589,7 +589,7 @@ def closed_loop(seed: np.random.SeedSequence, duration_s: float, compensated: bo
     robot, rng = orchard_ugv(), np.random.default_rng(seed)
     grounds = np.array([contact_array(robot, load_soil(name)) for name in SOILS])
     given, until_m, level = np.zeros((2, 7)), np.array([FIRST_M, np.inf]), np.array(LEVEL)
-    params, observer = track_speed_params(robot), tracked_observer(robot, NORMALISED)
+    settings, observer = TrackSpeedSettings(), tracked_observer(robot, NORMALISED)
     memory, used, state, belts = np.array(observer.start), np.ones(2), np.zeros(STATE_SIZE), np.zeros(2)
     noise = np.array([NOISY.gnss_m, NOISY.gnss_m, NOISY.compass_rad])
     keep, n = np.exp(-STEP_S / NOISY.belt_lag_s), round(duration_s / TICK_S)
@@ -597,7 +597,7 @@ def closed_loop(seed: np.random.SeedSequence, duration_s: float, compensated: bo
     for k in range(n):
         reading = observer.read(observer.params, memory)
         eta, std = (reading.mean[5:7], reading.std[5:7]) if compensated else (np.ones(2), np.zeros(2))
-        command = track_speed_step(params, used, *DESIRED, eta, std, TICK_S)
+        command = track_speed_step(robot, settings, used, DESIRED, eta, std, TICK_S)
         used = command.eta
         for _ in range(round(TICK_S / STEP_S)):
             belts = keep * belts + (1.0 - keep) * np.array([command.left_mps, command.right_mps])

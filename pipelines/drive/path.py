@@ -26,7 +26,7 @@ from terrain.control.path_drive import (
     path_figures,
     tick_statuses,
 )
-from terrain.control.paths import ReferencePath, X, Y, path_warnings, read_path
+from terrain.control.paths import ReferencePath, path_warnings, read_path
 from terrain.errors import ConfigError
 from terrain.files.atomic import atomic_write
 from terrain.robots import BicycleRobot, as_drive, load_robot
@@ -199,9 +199,9 @@ def _lateral_figure(result: PathResult) -> Figure:
 
 
 def _map(result: PathResult) -> Iterator[Part]:
-    rows, drive = result.reference.rows, result.drive
+    path, drive = result.reference, result.drive
     marks = [
-        Line("path", rows[:, X], rows[:, Y], 6, dashed=True),
+        Line("path", path.x_m, path.y_m, 6, dashed=True),
         Line("rear axle", drive.position_m[:, 0], drive.position_m[:, 1], 0),
     ]
     seen = Panel(marks, "y [m]", x_label="x [m]", equal=True)

@@ -176,7 +176,7 @@ class LivePilot(Chain):
             taken = Sample(time_s, desired, readings, terrain if isinstance(terrain, str) else "")
             output = self._believe(taken, estimates)
             if self.belief.terrain != before:
-                self.control.forget_terrain()
+                self.control.reset_terrain()
         command, self.belief = self.control.step(
             time_s, dt_s, desired, self.estimate, self.belief, output, holds=self.source.certain
         )

@@ -10,15 +10,15 @@ load, has more.  Of three measured values the middle one counts, not a spike.
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
-from numba import boolean, float64, int64, njit, types, void
 
-from terrain.entry_point import entry_point
 from terrain.records import Array, Reading
 
-N_KEPT = 32
-_OFF, _ON, _SMOOTH, _SLOW, _LAST, _BEFORE, _STILL = range(7)
+N_COMMANDS = 32
+"""Of the last steps, which are compared."""
+
 WINDOW_S, PERSISTS_S, SETTLED_S, SMOOTH_S = 0.4, 0.06, 0.1, 0.04
 """Time within which a command is followed; for which a deviation has to last; for which there must be none
 for it to be over; low-pass of what is measured, against the ripple of the Hall steps."""
@@ -33,102 +33,62 @@ SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 """Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle."""
 
 
-_V, _M = float64[::1], float64[:, ::1]
-_IN = types.Array(float64, 1, "A", readonly=True)
-
-
-def actuation_memory() -> tuple[Array, Array]:
-    """Return the memory before the first step.
-
-    Commands (32, 7) by time; and (7, 6): how long each is off and on, measured values behind two low-passes,
-    the two values before, and for how long it has repeated itself.
-    """
-    lasting = np.full((7, 6), np.nan)
-    lasting[_OFF], lasting[_ON], lasting[_STILL] = 0.0, SETTLED_S, 0.0
-    return np.full((N_KEPT, 7), np.nan), lasting
-
-
-@njit(cache=True, error_model="numpy")
-def _middle(i: int, measured: float, step_s: float, lasting: Array) -> float:
-    """Take a value; return the middle one of the last three, or this one where there are fewer."""
-    last, before = lasting[_LAST, i], lasting[_BEFORE, i]
-    lasting[_STILL, i] = lasting[_STILL, i] + step_s if measured == last else 0.0
-    lasting[_LAST, i], lasting[_BEFORE, i] = measured, last
-    if math.isnan(measured + last + before):
-        return measured
-    return float(max(min(measured, last), min(max(measured, last), before)))
-
-
-@njit(cache=True, error_model="numpy")
-def _low_passed(i: int, value: float, step_s: float, lasting: Array) -> tuple[float, float]:
-    """Put a value behind both low-passes; an unknown one leaves nothing there."""
-    for row, memory_s in ((_SMOOTH, SMOOTH_S), (_SLOW, SLOW_S)):
-        before = lasting[row, i]
-        unknown = math.isnan(before + value)
-        lasting[row, i] = value if unknown else before + (value - before) * -math.expm1(-step_s / memory_s)
-    return lasting[_SMOOTH, i], lasting[_SLOW, i]
-
-
-@njit(
-    void(float64, float64, int64, _V, _IN, float64, _IN, _M, _M, boolean[::1]),
-    cache=True,
-    error_model="numpy",
-)
-def follow(
-    now_s: float,
-    step_s: float,
-    slot: int,
-    command: Array,
-    rates: Array,
-    mps_per_radps: float,
-    steer_rad: Array,
-    kept: Array,
-    lasting: Array,
-    off: Array,
-) -> None:
-    """Write which (6,) of three wheel speeds and three steering angles are off their commands.
+class Follower:
+    """A wheel's speed, or a steering angle, against its command.
 
     Parameters
     ----------
-    now_s, step_s : time, and since the step before
-    slot : place in ``kept`` of this step: the number of the step modulo :data:`N_KEPT`
-    command : (6,) speeds in m/s and angles in rad that were in force until now; NaN for none
-    rates, mps_per_radps : of the motors, first of (c,), NaN where unknown, and the speed of a wheel by them
-    steer_rad : (3,) measured, NaN where unknown
-    kept, lasting : as :func:`actuation_memory` returns them; changed
-    off : (6,) is written
+    tolerance, ratio : a constant, and a part of the command
+    still_s : time within which a value that repeats itself has to change as the command does
+
+    Attributes
+    ----------
+    is_off : whether it does not do what it was commanded
     """
-    kept[slot, 0] = now_s
-    kept[slot, 1:] = command
-    for i in range(6):
-        low, high = math.inf, -math.inf
-        measured = rates[i] * mps_per_radps if i < 3 else steer_rad[i - 3]
-        middle = _middle(i, measured, step_s, lasting)
-        window_s = STILL_S if i < 3 and lasting[_STILL, i] >= STILL_S else WINDOW_S
-        for k in range(N_KEPT):
-            if kept[k, 0] >= now_s - window_s and not math.isnan(kept[k, 1 + i]):
-                low, high = min(low, kept[k, 1 + i]), max(high, kept[k, 1 + i])
-        slack = STEER_RAD if i >= 3 else SPEED_MPS + SPEED_RATIO * max(abs(low), abs(high))
-        smooth, slow = _low_passed(i, middle, step_s, lasting)
-        known = low <= high and not math.isnan(smooth)
-        if known and (smooth < low - slack and smooth > slow + APPROACH):
-            continue
-        if known and (smooth > high + slack and smooth < slow - APPROACH):
-            continue
-        if known and not low - slack <= smooth <= high + slack:
-            lasting[_OFF, i] += step_s
-            lasting[_ON, i] = 0.0
-        else:
-            lasting[_OFF, i] = 0.0
-            lasting[_ON, i] += step_s
-        if lasting[_OFF, i] >= PERSISTS_S:
-            off[i] = True
-        elif lasting[_ON, i] >= SETTLED_S:
-            off[i] = False
+
+    def __init__(self, tolerance: float, ratio: float = 0.0, still_s: float = math.inf) -> None:
+        self._tolerance, self._ratio, self._still_s = tolerance, ratio, still_s
+        self._commands: deque[tuple[float, float]] = deque(maxlen=N_COMMANDS)
+        self._last = self._before = self._smooth = self._slow = math.nan
+        self._repeated_s, self._off_s, self._on_s = 0.0, 0.0, SETTLED_S
+        self.is_off = False
+
+    def update(self, now_s: float, step_s: float, command: float, measured: float) -> None:
+        """Take the command that was in force until now, and what is measured; NaN for none."""
+        self._commands.append((now_s, command))
+        middle = self._middle(measured, step_s)
+        self._smooth = _low_passed(self._smooth, middle, step_s / SMOOTH_S)
+        self._slow = _low_passed(self._slow, middle, step_s / SLOW_S)
+        smooth, since_s = self._smooth, now_s - (STILL_S if self._repeated_s >= self._still_s else WINDOW_S)
+        commands = [value for time_s, value in self._commands if time_s >= since_s and not math.isnan(value)]
+        deviates = False
+        if commands and not math.isnan(smooth):
+            low, high = min(commands), max(commands)
+            slack = self._tolerance + self._ratio * max(abs(low), abs(high))
+            below, above = smooth < low - slack, smooth > high + slack
+            if (below and smooth > self._slow + APPROACH) or (above and smooth < self._slow - APPROACH):
+                return
+            deviates = below or above
+        self._off_s = self._off_s + step_s if deviates else 0.0
+        self._on_s = 0.0 if deviates else self._on_s + step_s
+        if self._off_s >= PERSISTS_S:
+            self.is_off = True
+        elif self._on_s >= SETTLED_S:
+            self.is_off = False
+
+    def _middle(self, measured: float, step_s: float) -> float:
+        """Return the middle one of the last three values, or this one where there are fewer."""
+        last, before = self._last, self._before
+        self._repeated_s = self._repeated_s + step_s if measured == last else 0.0
+        self._last, self._before = measured, last
+        if math.isnan(measured + last + before):
+            return measured
+        return max(min(measured, last), min(max(measured, last), before))
 
 
-_follow = entry_point(follow)
-_UNKNOWN = np.full(3, math.nan)
+def _low_passed(before: float, value: float, step_ratio: float) -> float:
+    """Return a value behind a low-pass; an unknown one leaves nothing there."""
+    return value if math.isnan(before + value) else before + (value - before) * -math.expm1(-step_ratio)
 
 
 class Actuation:
@@ -145,21 +105,21 @@ class Actuation:
 
     def __init__(self, mps_per_radps: float) -> None:
         self._mps_per_radps = mps_per_radps
-        self._command = np.full(6, math.nan)
-        self._kept, self._lasting = actuation_memory()
-        self._slot = 0
+        self._command = [math.nan] * 6
+        self._followers = [Follower(SPEED_MPS, SPEED_RATIO, STILL_S) for _ in range(3)]
+        self._followers += [Follower(STEER_RAD) for _ in range(3)]
         self.off = np.zeros(6, dtype=np.bool_)
 
     def commanded(self, wheel_mps: Array, steer_rad: Array) -> None:
         """Take the commands (3,), (3,) that are in force from now on."""
-        self._command[:3], self._command[3:] = wheel_mps, steer_rad
+        self._command = [*wheel_mps.tolist(), *steer_rad.tolist()]
 
     def measured(self, now_s: float, step_s: float, wheels: Reading | None, steer_rad: Array | None) -> None:
         """Compare the rates, first columns of the wheels, and steering angles (3,) with the commands."""
-        self._slot = (self._slot + 1) % N_KEPT
-        rates = _UNKNOWN if wheels is None else wheels.values[-1]
-        steer_rad = _UNKNOWN if steer_rad is None else steer_rad
-        _follow(
-            *(now_s, step_s, self._slot, self._command, rates, self._mps_per_radps, steer_rad),
-            *(self._kept, self._lasting, self.off),
-        )
+        unknown = [math.nan] * 3
+        rates = unknown if wheels is None else wheels.values[-1, :3].tolist()
+        angles = unknown if steer_rad is None else steer_rad.tolist()
+        measured = [*(rate * self._mps_per_radps for rate in rates), *angles]
+        for follower, command, value in zip(self._followers, self._command, measured, strict=True):
+            follower.update(now_s, step_s, command, value)
+        self.off = np.array([follower.is_off for follower in self._followers])

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.control.car_following import CarFollower, FollowedTick, SlipSource
-from terrain.control.paths import ROLL, PathStatus, ReferencePath, S, locate
+from terrain.control.paths import PathStatus, ReferencePath
 from terrain.control.steering_law import SteeringSettings, SteerStatus
 from terrain.estimation.observers.family import ObserverStatus
 from terrain.records import Array, RunLog
@@ -92,9 +92,9 @@ def followed_drive(run: RunLog, path: ReferencePath, ticks: Sequence[FollowedTic
     columns = {name: truth.channel(name)[::step][:n] for name in truth.channels}
     before, places = math.nan, np.empty((n, 2))
     for k in range(n):
-        pose = (float(columns[name][k]) for name in ("position_x_m", "position_y_m", "yaw_rad"))
-        before, places[k, 1], *_ = locate(path.rows, *pose, before)
-        places[k, 0] = before
+        x_m, y_m, yaw_rad = (float(columns[name][k]) for name in ("position_x_m", "position_y_m", "yaw_rad"))
+        place = path.locate(x_m, y_m, yaw_rad, before)
+        before, places[k] = place.distance_m, place[:2]
     true_slips = np.column_stack([columns["slip_front_rad"], columns["slip_rear_rad"]])
     forces = np.column_stack([columns["side_front_n"], columns["side_rear_n"]])
     shown = (np.abs(true_slips) > EXCITED_RAD) & (np.abs(columns["accel_y_mps2"]) > EXCITED_MPS2)[:, None]
@@ -164,9 +164,10 @@ def drive_along(
     seed : of the noise of the sensors
     """
     follower = CarFollower(robot, path, plan.source, SteeringSettings(offset_m=plan.offset_m))
-    at = path.rows[::10]
-    roll = np.where(np.isnan(at[:, ROLL]), plan.slope_rad, at[:, ROLL])
-    ground = Ground(at[:, S], np.full(len(at), plan.grip_ratio), roll)
+    assert path.roll_rad is not None
+    at, known = path.distance_m[::10], path.roll_rad[::10]
+    roll = np.where(np.isnan(known), plan.slope_rad, known)
+    ground = Ground(at, np.full(len(at), plan.grip_ratio), roll)
     stops = tuple((distance, STAND_S) for distance in plan.stops_m if distance < path.length_m)
     longest_s = 2.0 * path.length_m / plan.speed_mps + 30.0 + STAND_S * len(stops)
     x, y, heading = path.start

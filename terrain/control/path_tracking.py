@@ -28,8 +28,6 @@ Within the backlash a correction has no effect: with a proportional gain alone u
 heading error remains; the integral removes it within a few metres.  Integral and backlash together give a
 slow limit cycle; a proportional gain that is large beside it keeps that to milliradians, and to some
 centimetres of cross-track error.
-
-Settings of path tracking (:mod:`terrain.control.path_tracking`), and whether its loops are stable.
 """
 
 from __future__ import annotations
@@ -38,12 +36,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
 from scipy.linalg import expm
 
 from terrain.angles import wrapped
 from terrain.control.pid import LONGEST_STEP_S, Gains, PidState, PidStatus, pid_step
-from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, spectral_radius
+from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, closed_loop, spectral_radius
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -170,13 +167,13 @@ def _loop_matrix(
     over = expm(plant * dt_s)
     k, k_i, fastest_ps = gains
     slower = min(1.0, fastest_ps / max(k * speed_mps, 1e-9))
-    one, loop = np.eye(5 + n_delayed), np.zeros((5 + n_delayed, 5 + n_delayed))
-    loop[:4, :4] = over[:4, :4]
-    loop[:4] += np.outer(over[:4, 4], one[-1])
-    loop[4] = one[4] - slower * k_i * speed_mps * dt_s * one[3]
-    loop[5] = loop[4] - slower * k * one[3]
-    loop[6:] = one[5:-1]
-    return loop
+    *_, seen, integral = np.eye(5)
+    integral = integral - slower * k_i * speed_mps * dt_s * seen
+    return closed_loop(over[:4, :4], over[:4, 4], integral[None], integral - slower * k * seen, n_delayed)
+
+
+Twist = tuple[float, float, float]
+"""Forward, left and turn; or a pose."""
 
 
 class TrackStatus(StatusCode):
@@ -216,179 +213,167 @@ class TrackReport(NamedTuple):
     heading_error_rad : of the robot
     cross_track_m : distance from the path, positive to its left
     correction_rad : magnitude, as a steering angle
-    status : number of a :class:`TrackStatus`
+    status : whether the twist was corrected
     """
 
     heading_error_rad: float
     cross_track_m: float
     correction_rad: float
-    status: int
+    status: TrackStatus
 
 
+class TrackState(NamedTuple):
+    """What a step leaves to the next.
+
+    Parameters
+    ----------
+    reference : x, y and heading p* of the path; None where there is none, as at first
+    desired_once, desired : desired twist behind one and two low-passes
+    integral : of the errors along x, along y and of the heading, as corrections
+    last : x, y and heading of the robot
+    blind_s : time without a pose
+    """
+
+    reference: Twist | None = None
+    desired_once: Twist = (0.0, 0.0, 0.0)
+    desired: Twist = (0.0, 0.0, 0.0)
+    integral: Twist = (0.0, 0.0, 0.0)
+    last: Twist = (0.0, 0.0, 0.0)
+    blind_s: float = 0.0
+
+
+_NO_ERRORS = (0.0, 0.0, 0.0)
 _STAND_MPS = 0.02  # slower is standing: a tenth of the speed that counts as a drive
 _TURNED = 0.5  # cosine of 60 degrees
 _JUMP_M, _JUMP_RAD = 0.02, 0.02  # a filter moves its pose by less than a tenth of it beside the motion
 _BLIND_S = 0.5  # longer without a pose, and the reference is lost
 _BACK, _AHEAD = 1.0, 3.0  # limits of the reference's speed, in multiples of the desired one
 
-_POSE, _DELAYED, _INTEGRAL, _LAST, _BLIND, _ANCHORED = 0, 3, 9, 12, 15, 16
-STATE_SIZE = 17
 
-_F8 = types.float64
-_ROW = types.Array(_F8, 1, "A", readonly=True)
-_SETTINGS = types.NamedUniTuple(_F8, len(TrackSettings._fields), TrackSettings)
-_ESTIMATE = types.NamedUniTuple(_F8, len(PoseEstimate._fields), PoseEstimate)
-_REPORT = types.NamedTuple((_F8, _F8, _F8, types.int64), TrackReport)
+def _rotated(angle_rad: float, x: float, y: float) -> tuple[float, float]:
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    return cos * x - sin * y, sin * x + cos * y
 
 
-def initial_tracking() -> Array:
-    """Return the state (STATE_SIZE,) before the first step."""
-    return np.zeros(STATE_SIZE)
+def _seen_along(yaw_rad: float, x: float, y: float) -> tuple[float, float]:
+    """Return a vector of the world in axes of this heading."""
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    return cos * x + sin * y, cos * y - sin * x
 
 
-@njit(cache=True)
-def _pose_status(settings: TrackSettings, pose: PoseEstimate, ground_twist: Array) -> int:
+def _pose_status(settings: TrackSettings, pose: PoseEstimate, ground: Twist) -> TrackStatus:
     """Return whether a pose can be used."""
-    known = math.isfinite(pose.yaw_rad) and math.isfinite(pose.x_m) and math.isfinite(pose.y_m)
-    for j in range(3):
-        known = known and math.isfinite(ground_twist[j])
-    if not known:
-        return TrackStatus.NO_POSE.value
+    if not all(map(math.isfinite, (*pose[:3], *ground))):
+        return TrackStatus.NO_POSE
     if not pose.yaw_std_rad <= settings.yaw_std_max_rad:
-        return TrackStatus.UNCERTAIN.value
-    return TrackStatus.OK.value if pose.stale_s <= settings.stale_max_s else TrackStatus.STALE.value
+        return TrackStatus.UNCERTAIN
+    return TrackStatus.OK if pose.stale_s <= settings.stale_max_s else TrackStatus.STALE
 
 
-@njit(cache=True)
-def _follow_jump(state: Array, after: Array, pose: PoseEstimate, ground_twist: Array, dt_s: float) -> None:
-    """Move the reference with a pose that jumps away from the motion."""
-    middle = state[_LAST + 2] + 0.5 * dt_s * ground_twist[2]
-    cos, sin = math.cos(middle), math.sin(middle)
-    due_x = state[_LAST] + dt_s * (cos * ground_twist[0] - sin * ground_twist[1])
-    due_y = state[_LAST + 1] + dt_s * (sin * ground_twist[0] + cos * ground_twist[1])
-    jump = wrapped(pose.yaw_rad - state[_LAST + 2] - dt_s * ground_twist[2])
-    if abs(jump) > _JUMP_RAD or math.hypot(pose.x_m - due_x, pose.y_m - due_y) > _JUMP_M:
-        cos, sin = math.cos(jump), math.sin(jump)
-        off_x, off_y = after[_POSE] - due_x, after[_POSE + 1] - due_y
-        after[_POSE] = pose.x_m + cos * off_x - sin * off_y
-        after[_POSE + 1] = pose.y_m + sin * off_x + cos * off_y
-        after[_POSE + 2] += jump
+def _after_jump(reference: Twist, last: Twist, pose: PoseEstimate, ground: Twist, dt_s: float) -> Twist:
+    """Return the reference, which jumps with a pose that jumps away from the motion."""
+    forward, left, turn = ground
+    step_x, step_y = _rotated(last[2] + 0.5 * dt_s * turn, forward, left)
+    due_x, due_y = last[0] + dt_s * step_x, last[1] + dt_s * step_y
+    jump = float(wrapped(pose.yaw_rad - last[2] - dt_s * turn))
+    if not (abs(jump) > _JUMP_RAD or math.hypot(pose.x_m - due_x, pose.y_m - due_y) > _JUMP_M):
+        return reference
+    off_x, off_y = _rotated(jump, reference[0] - due_x, reference[1] - due_y)
+    return pose.x_m + off_x, pose.y_m + off_y, reference[2] + jump
 
 
-@njit(cache=True)
-def _delay_desired(
-    settings: TrackSettings,
-    after: Array,
-    desired_twist: Array,
-    size: float,
-    pose: PoseEstimate,
-    ground_twist: Array,
-    dt_s: float,
-) -> float:
-    """Delay the desired twist as the estimated motion is, and return the square of its size.
+def _delayed(settings: TrackSettings, state: TrackState, twist: Twist, dt_s: float) -> TrackState:
+    """Delay the desired twist as the estimated motion is."""
+    part = 1.0 - (math.exp(-2.0 * dt_s / settings.lag_s) if settings.lag_s > 0.0 else 0.0)
 
-    Where the direction has turned, or the robot does not move along it, the reference's position is reset.
-    """
-    keep = math.exp(-2.0 * dt_s / settings.lag_s) if settings.lag_s > 0.0 else 0.0
-    same, late2, ground2, moved = 0.0, 0.0, 0.0, 0.0
-    for j in range(3):
-        unit = settings.arm_m if j == 2 else 1.0
-        after[_DELAYED + 3 + j] += (1.0 - keep) * (desired_twist[j] - after[_DELAYED + 3 + j])
-        after[_DELAYED + j] += (1.0 - keep) * (after[_DELAYED + 3 + j] - after[_DELAYED + j])
-        same += unit * unit * after[_DELAYED + j] * desired_twist[j]
-        late2 += (unit * after[_DELAYED + j]) ** 2
-        moved += unit * unit * ground_twist[j] * desired_twist[j]
-        ground2 += (unit * ground_twist[j]) ** 2
-    turned = same < _TURNED * size * math.sqrt(late2)
-    if turned or (ground2 > MOVING_MPS**2 and moved < _TURNED * size * math.sqrt(ground2)):
-        after[_POSE], after[_POSE + 1] = pose.x_m, pose.y_m
-        after[_INTEGRAL] = after[_INTEGRAL + 1] = after[_INTEGRAL + 2] = 0.0
-        if turned:
-            for j in range(3):
-                after[_DELAYED + j] = after[_DELAYED + 3 + j] = desired_twist[j]
-            late2 = size * size
-    return late2
+    def low_passed(before: Twist, new: Twist) -> Twist:
+        x, y, turn = (late + part * (value - late) for late, value in zip(before, new, strict=True))
+        return x, y, turn
+
+    once = low_passed(state.desired_once, twist)
+    return state._replace(desired_once=once, desired=low_passed(state.desired, once))
 
 
-@njit(cache=True)
-def _advance_reference(
-    settings: TrackSettings, after: Array, pose: PoseEstimate, late2: float, dt_s: float
-) -> None:
-    """Move the reference along the delayed twist, to where it is nearest to the robot."""
-    arm = settings.arm_m
-    late_x, late_y, late_turn = after[_DELAYED], after[_DELAYED + 1], after[_DELAYED + 2]
-    cos, sin = math.cos(after[_POSE + 2]), math.sin(after[_POSE + 2])
-    off_x, off_y = pose.x_m - after[_POSE], pose.y_m - after[_POSE + 1]
-    ahead_s = (
-        (cos * off_x + sin * off_y) * late_x
-        + (cos * off_y - sin * off_x) * late_y
-        + arm * arm * wrapped(pose.yaw_rad - after[_POSE + 2]) * late_turn
-    ) / late2
+def _advanced(
+    settings: TrackSettings, state: TrackState, pose: PoseEstimate, late2: float, dt_s: float
+) -> Twist:
+    """Return the reference, moved along the delayed twist to where it is nearest to the robot."""
+    assert state.reference is not None
+    (x, y, yaw), (forward, left, turn), arm = state.reference, state.desired, settings.arm_m
+    ahead, beside = _seen_along(yaw, pose.x_m - x, pose.y_m - y)
+    turned = arm * arm * float(wrapped(pose.yaw_rad - yaw)) * turn
+    ahead_s = (ahead * forward + beside * left + turned) / late2
     ahead_s = min(max(ahead_s, -_BACK * dt_s), _AHEAD * dt_s)
-    middle = after[_POSE + 2] + 0.5 * ahead_s * late_turn
-    cos, sin = math.cos(middle), math.sin(middle)
-    after[_POSE] += ahead_s * (cos * late_x - sin * late_y)
-    after[_POSE + 1] += ahead_s * (sin * late_x + cos * late_y)
-    after[_POSE + 2] += ahead_s * late_turn
+    step_x, step_y = _rotated(yaw + 0.5 * ahead_s * turn, forward, left)
+    return x + ahead_s * step_x, y + ahead_s * step_y, yaw + ahead_s * turn
 
 
-@njit(cache=True)
-def _correct(
-    settings: TrackSettings, after: Array, command: Array, size: float, pose: PoseEstimate, dt_s: float
-) -> TrackReport:
-    """Correct the twist ``command`` in place by the errors across the desired motion.
+def _corrected(
+    settings: TrackSettings, state: TrackState, twist: Twist, size: float, pose: PoseEstimate, dt_s: float
+) -> tuple[Twist, Twist, TrackReport]:
+    """Return the twist corrected by the errors across the desired motion, and the integrals.
 
     Errors are along x, along y and L times heading, in metres.
     """
-    arm, status = settings.arm_m, TrackStatus.OK.value
-    cos, sin = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
-    off_x, off_y = pose.x_m - after[_POSE], pose.y_m - after[_POSE + 1]
-    error = np.array([cos * off_x + sin * off_y, cos * off_y - sin * off_x, 0.0])
-    error[2] = arm * wrapped(pose.yaw_rad - after[_POSE + 2])
-    along = np.array([command[0] / size, command[1] / size, arm * command[2] / size])
-    error -= along * (error[0] * along[0] + error[1] * along[1] + error[2] * along[2])
-    correction = np.empty(3)
-    for j in range(3):
-        if j == 2:
-            k, k_i, limit = settings.heading_pm, settings.heading_integral_pm2, settings.heading_max_rad
-            fastest = settings.heading_fastest_ps
-        else:
-            k, k_i, limit = settings.cross_pm, settings.cross_integral_pm2, settings.cross_max_rad
-            fastest = settings.cross_fastest_ps
+    assert state.reference is not None
+    (x, y, yaw), arm, status = state.reference, settings.arm_m, TrackStatus.OK
+    ahead, beside = _seen_along(pose.yaw_rad, pose.x_m - x, pose.y_m - y)
+    along = twist[0] / size, twist[1] / size, arm * twist[2] / size
+    error = _across((ahead, beside, arm * float(wrapped(pose.yaw_rad - yaw))), along)
+    cross = (
+        settings.cross_pm,
+        settings.cross_integral_pm2,
+        settings.cross_max_rad,
+        settings.cross_fastest_ps,
+    )
+    heading = (
+        *(settings.heading_pm, settings.heading_integral_pm2),
+        *(settings.heading_max_rad, settings.heading_fastest_ps),
+    )
+    added, integrals = [], []
+    for value, integral, (k, k_i, limit, fastest) in zip(
+        error, state.integral, (cross, cross, heading), strict=True
+    ):
         slower = min(1.0, fastest / max(k * size, 1e-9))
         gains = Gains(slower * k, slower * k_i, 0.0, limit, limit, 0.0)
-        memory = PidState(after[_INTEGRAL + j], math.nan)
-        correction[j], memory, pid = pid_step(gains, memory, -error[j], min(size * dt_s, LONGEST_STEP_S))
-        after[_INTEGRAL + j] = memory.integral
-        if pid != PidStatus.OK.value:
-            status = TrackStatus.CLAMPED.value
-    correction -= along * (correction[0] * along[0] + correction[1] * along[1] + correction[2] * along[2])
-    command[0] += size * correction[0]
-    command[1] += size * correction[1]
-    command[2] += size * correction[2] / arm
+        one, pid, found = pid_step(gains, PidState(integral), -value, min(size * dt_s, LONGEST_STEP_S))
+        added.append(one)
+        integrals.append(pid.integral)
+        if found is not PidStatus.OK:
+            status = TrackStatus.CLAMPED
+    to_x, to_y, to_turn = _across((added[0], added[1], added[2]), along)
+    command = twist[0] + size * to_x, twist[1] + size * to_y, twist[2] + size * to_turn / arm
     cross_m = math.copysign(math.hypot(error[0], error[1]), along[0] * error[1] - along[1] * error[0])
-    angle = math.sqrt(correction[0] ** 2 + correction[1] ** 2 + correction[2] ** 2)
-    return TrackReport(error[2] / arm, cross_m, angle, status)
+    angle = math.sqrt(to_x * to_x + to_y * to_y + to_turn * to_turn)
+    return (
+        command,
+        (integrals[0], integrals[1], integrals[2]),
+        TrackReport(error[2] / arm, cross_m, angle, status),
+    )
 
 
-@njit(types.Tuple((_F8[::1], _F8[::1], _REPORT))(_SETTINGS, _F8[::1], _ROW, _ESTIMATE, _ROW, _F8), cache=True)
+def _across(vector: Twist, along: Twist) -> Twist:
+    """Return a vector without its part along a unit vector."""
+    part = vector[0] * along[0] + vector[1] * along[1] + vector[2] * along[2]
+    return vector[0] - along[0] * part, vector[1] - along[1] * part, vector[2] - along[2] * part
+
+
 def track_step(
     settings: TrackSettings,
-    state: Array,
+    state: TrackState,
     desired_twist: Array,
     pose: PoseEstimate,
     ground_twist: Array,
     dt_s: float,
-) -> tuple[Array, Array, TrackReport]:
-    """Return the twist to drive, the next state, and why; compiled, the state is not changed.
+) -> tuple[Array, TrackState, TrackReport]:
+    """Return the twist to drive, the next state, and why.
 
     Parameters
     ----------
-    settings : as :func:`~terrain.control.path_tracking.check_tracking` gives them
-    state : :func:`initial_tracking` at first, then what the step before returned
+    settings : as :func:`check_tracking` gives them
+    state : ``TrackState()`` at first, then what the step before returned
     desired_twist : (3,) finite
-    pose : as estimated, its numbers floats
-    ground_twist : (3,) as estimated
+    pose, ground_twist : as estimated; (3,)
     dt_s : since the step before
 
     Returns
@@ -399,37 +384,55 @@ def track_step(
 
     Examples
     --------
-    >>> from terrain.control.path_tracking import SETTINGS
     >>> ahead = np.array([1.0, 0.0, 0.0])
     >>> at = PoseEstimate(0.0, 0.0, 0.0, yaw_std_rad=0.001, stale_s=0.0)
-    >>> _, state, _ = track_step(SETTINGS, initial_tracking(), ahead, at, ahead, 0.02)
+    >>> _, state, _ = track_step(SETTINGS, TrackState(), ahead, at, ahead, 0.02)
     >>> at = at._replace(x_m=0.02, yaw_rad=0.01)  # turned to the left
     >>> twist, state, report = track_step(SETTINGS, state, ahead, at, ahead, 0.02)
-    >>> twist.round(3), round(report.heading_error_rad, 3), TrackStatus(report.status).name
+    >>> twist.round(3), round(report.heading_error_rad, 3), report.status.name
     (array([ 1.  ,  0.  , -0.03]), 0.01, 'OK')
     """
-    command, after = np.empty(3), state.copy()
-    command[0], command[1], command[2] = desired_twist[0], desired_twist[1], desired_twist[2]
+    twist, ground = tuple(desired_twist.tolist()), tuple(ground_twist.tolist())
+
+    def uncorrected(status: TrackStatus) -> TrackReport:
+        return TrackReport(math.nan, math.nan, 0.0, status)
+
     if not 0.0 < dt_s <= LONGEST_STEP_S:
-        return command, after, TrackReport(math.nan, math.nan, 0.0, TrackStatus.BAD_TIME.value)
-    status = _pose_status(settings, pose, ground_twist)
-    if status != TrackStatus.OK.value:
-        after[_BLIND] = state[_BLIND] + dt_s
-        if after[_BLIND] > _BLIND_S:
-            after[_ANCHORED] = 0.0
-        return command, after, TrackReport(math.nan, math.nan, 0.0, status)
-    size = math.sqrt(command[0] ** 2 + command[1] ** 2 + (settings.arm_m * command[2]) ** 2)
-    if after[_ANCHORED] == 0.0 or size < _STAND_MPS:
-        after[:] = 0.0
-        after[_POSE], after[_POSE + 1], after[_POSE + 2] = pose.x_m, pose.y_m, pose.yaw_rad
-        after[_ANCHORED] = 1.0
-    elif after[_BLIND] == 0.0:
-        _follow_jump(state, after, pose, ground_twist, dt_s)
-    after[_BLIND] = 0.0
-    after[_LAST], after[_LAST + 1], after[_LAST + 2] = pose.x_m, pose.y_m, pose.yaw_rad
+        return np.array(twist), state, uncorrected(TrackStatus.BAD_TIME)
+    status = _pose_status(settings, pose, ground)
+    if status is not TrackStatus.OK:
+        blind_s = state.blind_s + dt_s
+        reference = None if blind_s > _BLIND_S else state.reference
+        return np.array(twist), state._replace(blind_s=blind_s, reference=reference), uncorrected(status)
+    arm, at = settings.arm_m, pose[:3]
+    size = math.sqrt(twist[0] * twist[0] + twist[1] * twist[1] + (arm * twist[2]) * (arm * twist[2]))
+    if state.reference is None or size < _STAND_MPS:
+        state = TrackState(reference=at)
+    elif state.blind_s == 0.0:
+        state = state._replace(reference=_after_jump(state.reference, state.last, pose, ground, dt_s))
+    state = state._replace(last=at, blind_s=0.0)
     if size < _STAND_MPS:
-        return command, after, TrackReport(math.nan, math.nan, 0.0, TrackStatus.STANDING.value)
-    late2 = _delay_desired(settings, after, desired_twist, size, pose, ground_twist, dt_s)
+        return np.array(twist), state, uncorrected(TrackStatus.STANDING)
+    state = _delayed(settings, state, twist, dt_s)
+    late2, same = _products(arm, state.desired, twist)
+    ground2, moves = _products(arm, ground, twist)
+    turned = same < _TURNED * size * math.sqrt(late2)
+    if turned or (ground2 > MOVING_MPS * MOVING_MPS and moves < _TURNED * size * math.sqrt(ground2)):
+        assert state.reference is not None
+        state = state._replace(reference=(*at[:2], state.reference[2]), integral=_NO_ERRORS)
+    if turned:
+        state, late2 = state._replace(desired_once=twist, desired=twist), size * size
     if late2 > 0.0:
-        _advance_reference(settings, after, pose, late2, dt_s)
-    return command, after, _correct(settings, after, command, size, pose, dt_s)
+        state = state._replace(reference=_advanced(settings, state, pose, late2, dt_s))
+    command, integral, report = _corrected(settings, state, twist, size, pose, dt_s)
+    return np.array(command), state._replace(integral=integral), report
+
+
+def _products(arm_m: float, one: Twist, other: Twist) -> tuple[float, float]:
+    """Return the square of a twist, and its product with another, in metres."""
+    square = product = 0.0
+    for j in range(3):
+        unit = arm_m if j == 2 else 1.0
+        square += (unit * one[j]) * (unit * one[j])
+        product += unit * unit * one[j] * other[j]
+    return square, product

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import csv
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.interpolate import splev, splprep
 
 from terrain.angles import unwrapped, wrapped
@@ -28,8 +27,6 @@ from terrain.status import StatusCode
 
 GRID_M = 0.05
 """Distance between the rows of a path."""
-S, X, Y, HEADING, CURVATURE, ROLL = range(6)
-"""Columns of :attr:`ReferencePath.rows`; the roll is NaN where it is not known."""
 _MERGED_M = 1e-3
 _LONGEST_M = 50_000.0
 
@@ -57,47 +54,116 @@ class Place(NamedTuple):
     lateral_m : y, of the robot to the left of the path
     angle_rad : theta~, heading of the robot less that of the path
     curvature_pm : c(s)
-    status : number of a :class:`PathStatus`
+    status : whether that is so
     """
 
     distance_m: float
     lateral_m: float
     angle_rad: float
     curvature_pm: float
-    status: int
+    status: PathStatus
+
+
+_WINDOW_M = 3.0
+_REACH_M = 5.0
+_AS_NEAR_M = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferencePath:
-    """A path.
+    """A path, at distances that rise by :data:`GRID_M` from 0.
 
     Parameters
     ----------
-    rows : (n, 6) by the places S, X, Y, HEADING, CURVATURE, ROLL; s rises by :data:`GRID_M` from 0
+    x_m, y_m, heading_rad, curvature_pm : (n,)
+    roll_rad : (n,) side slope, left side up > 0; NaN where it is not known, as without any
     n_merged : points that repeated the one before
     """
 
-    rows: Array
+    x_m: Array
+    y_m: Array
+    heading_rad: Array
+    curvature_pm: Array
+    roll_rad: Array | None = None
     n_merged: int = 0
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "rows", read_only(self.rows))
+        if self.roll_rad is None:
+            object.__setattr__(self, "roll_rad", np.full(len(self.x_m), np.nan))
+        for name in ("x_m", "y_m", "heading_rad", "curvature_pm", "roll_rad"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    @property
+    def distance_m(self) -> Array:
+        """Distances (n,) along the path."""
+        return np.arange(len(self.x_m)) * GRID_M
 
     @property
     def length_m(self) -> float:
         """Distance from its start to its end."""
-        return float(self.rows[-1, S])
+        return (len(self.x_m) - 1) * GRID_M
 
     @property
     def start(self) -> tuple[float, float, float]:
         """Pose at its start."""
-        return float(self.rows[0, X]), float(self.rows[0, Y]), float(self.rows[0, HEADING])
+        return float(self.x_m[0]), float(self.y_m[0]), float(self.heading_rad[0])
 
     def with_roll(self, distance_m: Array, roll_rad: Array) -> ReferencePath:
         """Return the path with side slopes (n,) over distance (n,), as a drive along it measured them."""
-        rows = self.rows.copy()
-        rows[:, ROLL] = np.interp(rows[:, S], distance_m, roll_rad)
-        return ReferencePath(rows, self.n_merged)
+        return replace(self, roll_rad=np.interp(self.distance_m, distance_m, roll_rad))
+
+    def row_at(self, distance_m: float) -> int:
+        """Return the number of the last row before a distance."""
+        return min(max(int(distance_m / GRID_M), 0), len(self.x_m) - 1)
+
+    def locate(self, x_m: float, y_m: float, yaw_rad: float, before_m: float = math.nan) -> Place:
+        """Return where a robot is.
+
+        Parameters
+        ----------
+        x_m, y_m, yaw_rad : pose of the robot
+        before_m : s at the step before; NaN at first, when all of the path is searched, and of places on a path
+            that comes back to itself the first is taken
+
+        Examples
+        --------
+        >>> ahead = path_from_curvature(np.array([0.0, 20.0]), np.zeros(2))
+        >>> place = ahead.locate(3.02, 0.1, 0.0)
+        >>> round(place.distance_m, 6), place.lateral_m, place.status.label
+        (3.02, 0.1, 'ok')
+        """
+        is_first, last = math.isnan(before_m), len(self.x_m) - 1
+        first = 0 if is_first else self.row_at(before_m)
+        if not (abs(x_m) < 1e9 and abs(y_m) < 1e9 and abs(yaw_rad) < 1e6):
+            s, curvature = 0.0 if is_first else before_m, float(self.curvature_pm[first])
+            return Place(s, math.nan, math.nan, curvature, PathStatus.NO_POSE)
+        near = slice(first, (last if is_first else min(first + int(_WINDOW_M / GRID_M), last)) + 1)
+        squares = (self.x_m[near] - x_m) ** 2 + (self.y_m[near] - y_m) ** 2
+        nearest = (
+            self._first_as_near(x_m, y_m, math.sqrt(squares.min())) if is_first else int(squares.argmin())
+        )
+        least, nearest = float(squares[nearest]), nearest + first
+        heading, curvature = float(self.heading_rad[nearest]), float(self.curvature_pm[nearest])
+        off_x, off_y = x_m - float(self.x_m[nearest]), y_m - float(self.y_m[nearest])
+        along = math.cos(heading) * off_x + math.sin(heading) * off_y
+        lateral = math.cos(heading) * off_y - math.sin(heading) * off_x
+        beside = 1.0 - curvature * lateral
+        along = min(max(along / max(beside, 0.2), -GRID_M), GRID_M) if nearest < last else along
+        s = nearest * GRID_M + along
+        s = min(max(s if is_first else max(s, before_m), 0.0), last * GRID_M)
+        heading += curvature * (s - nearest * GRID_M)
+        status = PathStatus.SINGULAR if beside < 0.2 else PathStatus.OK
+        if math.sqrt(least) > _REACH_M:
+            status = PathStatus.FAR
+        if nearest == last and along >= 0.0:
+            status = PathStatus.END
+        return Place(s, lateral, float(wrapped(yaw_rad - heading)), curvature, status)
+
+    def _first_as_near(self, x_m: float, y_m: float, least_m: float) -> int:
+        """Return the first row, closest among its neighbours, that is hardly further than the closest of all."""
+        away = np.hypot(self.x_m - x_m, self.y_m - y_m)
+        closest = (away[:-1] <= away[1:]) & (away[:-1] <= least_m + _AS_NEAR_M)
+        return int(closest.argmax()) if closest.any() else len(away) - 1
 
 
 def path_from_curvature(distance_m: Array, curvature_pm: Array) -> ReferencePath:
@@ -111,7 +177,7 @@ def path_from_curvature(distance_m: Array, curvature_pm: Array) -> ReferencePath
     Examples
     --------
     >>> circle = path_from_curvature(np.array([0.0, 2 * np.pi * 10]), np.array([0.1, 0.1]))
-    >>> bool(np.hypot(*circle.rows[-1, [X, Y]]) < 0.05)
+    >>> bool(np.hypot(circle.x_m[-1], circle.y_m[-1]) < 0.05)
     True
     """
     s = np.arange(0.0, distance_m[-1] + 1e-9, GRID_M)
@@ -120,7 +186,7 @@ def path_from_curvature(distance_m: Array, curvature_pm: Array) -> ReferencePath
     middle = 0.5 * (heading[1:] + heading[:-1])
     x = np.concatenate([[0.0], np.cumsum(np.cos(middle))]) * GRID_M
     y = np.concatenate([[0.0], np.cumsum(np.sin(middle))]) * GRID_M
-    return ReferencePath(np.column_stack([s, x, y, heading, curvature, np.full(s.size, np.nan)]))
+    return ReferencePath(x, y, heading, curvature)
 
 
 def path_from_points(points_m: Array, std_m: float = 0.0) -> ReferencePath:
@@ -141,7 +207,7 @@ def path_from_points(points_m: Array, std_m: float = 0.0) -> ReferencePath:
     --------
     >>> angle = np.linspace(0.0, np.pi, 60)
     >>> path = path_from_points(np.column_stack([10 * np.sin(angle), 10 - 10 * np.cos(angle)]))
-    >>> round(path.length_m, 1), path.rows[300, CURVATURE].round(3)
+    >>> round(path.length_m, 1), path.curvature_pm[300].round(3)
     (31.4, np.float64(0.1))
     """
     points = np.asarray(points_m, float)
@@ -163,10 +229,10 @@ def path_from_points(points_m: Array, std_m: float = 0.0) -> ReferencePath:
         raise DataError(
             f"path: turns back by {np.degrees(turns[back - 1]):.0f} degrees at {kept[back].tolist()}"
         )
-    return ReferencePath(_spline_rows(kept, steps, std_m), len(points) - len(kept))
+    return replace(_spline_path(kept, steps, std_m), n_merged=len(points) - len(kept))
 
 
-def _spline_rows(points: Array, steps: Array, std_m: float) -> Array:
+def _spline_path(points: Array, steps: Array, std_m: float) -> ReferencePath:
     along = np.concatenate([[0.0], np.cumsum(steps)])
     spline, _ = splprep(points.T, u=along, k=min(5, len(points) - 1), s=2 * len(points) * std_m**2)
     fine = np.linspace(0.0, along[-1], 1 + max(64, math.ceil(4 * along[-1] / GRID_M)))
@@ -177,8 +243,7 @@ def _spline_rows(points: Array, steps: Array, std_m: float) -> Array:
     x, y = splev(at, spline)
     (dx, dy), (ddx, ddy) = splev(at, spline, der=1), splev(at, spline, der=2)
     curvature = (dx * ddy - dy * ddx) / np.maximum(np.hypot(dx, dy), 1e-9) ** 3
-    heading = unwrapped(np.arctan2(dy, dx))
-    return np.column_stack([s, x, y, heading, curvature, np.full(s.size, np.nan)])
+    return ReferencePath(x, y, unwrapped(np.arctan2(dy, dx)), curvature)
 
 
 def path_warnings(path: ReferencePath, robot: BicycleRobot) -> tuple[str, ...]:
@@ -193,88 +258,15 @@ def path_warnings(path: ReferencePath, robot: BicycleRobot) -> tuple[str, ...]:
     """
     found = []
     reach = math.tan(robot.steering_max_rad) / robot.wheelbase_m
-    sharpest = int(np.abs(path.rows[:, CURVATURE]).argmax())
-    if abs(path.rows[sharpest, CURVATURE]) > reach:
+    sharpest = int(np.abs(path.curvature_pm).argmax())
+    if abs(curvature := path.curvature_pm[sharpest]) > reach:
         found.append(
-            f"curvature is {path.rows[sharpest, CURVATURE]:.3f} 1/m at {path.rows[sharpest, S]:.1f} m; "
+            f"curvature is {curvature:.3f} 1/m at {sharpest * GRID_M:.1f} m; "
             f"steering to {np.degrees(robot.steering_max_rad):.0f} degrees reaches {reach:.3f} 1/m"
         )
     if path.n_merged:
         found.append(f"{path.n_merged} points that repeat the one before were merged with it")
     return tuple(found)
-
-
-_WINDOW_M = 3.0
-_REACH_M = 5.0
-_AS_NEAR_M = 0.3
-
-
-@njit(cache=True)
-def _first_as_near(rows: Array, x_m: float, y_m: float, least_m: float) -> int:
-    """Return the first row, closest among its neighbours, that is hardly further than the closest of all."""
-    before = math.inf
-    for i in range(rows.shape[0]):
-        away = math.hypot(rows[i, X] - x_m, rows[i, Y] - y_m)
-        if before <= away and before <= least_m + _AS_NEAR_M:
-            return i - 1
-        before = away
-    return int(rows.shape[0] - 1)
-
-
-@njit(cache=True)
-def locate(
-    rows: Array, x_m: float, y_m: float, yaw_rad: float, before_m: float
-) -> tuple[float, float, float, float, int]:
-    """Return the fields of a :class:`Place`; compiled.
-
-    Parameters
-    ----------
-    rows : of a path
-    x_m, y_m, yaw_rad : pose of the robot
-    before_m : s at the step before; NaN at first, when all of the path is searched, and of places on a path
-        that comes back to itself the first is taken
-
-    Examples
-    --------
-    >>> ahead = path_from_curvature(np.array([0.0, 20.0]), np.zeros(2))
-    >>> Place(*locate(ahead.rows, 3.02, 0.1, 0.0, np.nan))._replace(status=0)
-    Place(distance_m=3.02, lateral_m=0.1, angle_rad=0.0, curvature_pm=0.0, status=0)
-    """
-    first, last = 0, rows.shape[0] - 1
-    if not math.isnan(before_m):
-        first = min(max(int(before_m / GRID_M), 0), last)
-        last = min(first + int(_WINDOW_M / GRID_M), last)
-    if not (abs(x_m) < 1e9 and abs(y_m) < 1e9 and abs(yaw_rad) < 1e6):
-        s = 0.0 if math.isnan(before_m) else before_m
-        return s, math.nan, math.nan, rows[first, CURVATURE], PathStatus.NO_POSE.value
-    nearest, least = first, math.inf
-    for i in range(first, last + 1):
-        square = (rows[i, X] - x_m) ** 2 + (rows[i, Y] - y_m) ** 2
-        if square < least:
-            nearest, least = i, square
-    if math.isnan(before_m):
-        nearest = _first_as_near(rows, x_m, y_m, math.sqrt(least))
-        least = (rows[nearest, X] - x_m) ** 2 + (rows[nearest, Y] - y_m) ** 2
-    heading = rows[nearest, HEADING]
-    off_x, off_y = x_m - rows[nearest, X], y_m - rows[nearest, Y]
-    along = math.cos(heading) * off_x + math.sin(heading) * off_y
-    lateral = math.cos(heading) * off_y - math.sin(heading) * off_x
-    curvature = rows[nearest, CURVATURE]
-    beside = 1.0 - curvature * lateral
-    along = min(max(along / max(beside, 0.2), -GRID_M), GRID_M) if nearest < rows.shape[0] - 1 else along
-    s = nearest * GRID_M + along
-    if not math.isnan(before_m):
-        s = max(s, before_m)
-    s = min(max(s, 0.0), (rows.shape[0] - 1) * GRID_M)
-    heading += curvature * (s - nearest * GRID_M)
-    status = PathStatus.OK.value
-    if beside < 0.2:
-        status = PathStatus.SINGULAR.value
-    if math.sqrt(least) > _REACH_M:
-        status = PathStatus.FAR.value
-    if nearest == rows.shape[0] - 1 and along >= 0.0:
-        status = PathStatus.END.value
-    return s, lateral, wrapped(yaw_rad - heading), curvature, status
 
 
 _X = ("x_m", "position_x_m", "x")

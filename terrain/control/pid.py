@@ -16,8 +16,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from numba import njit, types
-
 from terrain.errors import ConfigError
 from terrain.status import StatusCode
 
@@ -60,11 +58,6 @@ class PidState(NamedTuple):
     error: float = math.nan
 
 
-GAINS = types.NamedUniTuple(types.float64, len(Gains._fields), Gains)
-PID_STATE = types.NamedUniTuple(types.float64, len(PidState._fields), PidState)
-"""Numba types of the two for compiled signatures; their numbers have to be floats."""
-
-
 def check_gains(gains: Gains) -> Gains:
     """Return gains that can be used, as floats.
 
@@ -94,12 +87,8 @@ def check_gains(gains: Gains) -> Gains:
     return Gains(*(float(value) for value in gains))
 
 
-@njit(
-    types.Tuple((types.float64, PID_STATE, types.int64))(GAINS, PID_STATE, types.float64, types.float64),
-    cache=True,
-)
-def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[float, PidState, int]:
-    """Return output, next state and status of one step; compiled, callable from compiled code.
+def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[float, PidState, PidStatus]:
+    """Return output, next state and status of one step.
 
     Parameters
     ----------
@@ -113,22 +102,23 @@ def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[
     output : within the limit; 0 where there is no error (NaN or infinite) or the time step is not above 0 and
         up to :data:`LONGEST_STEP_S`
     state : then with its integral as it was, and without a memory of the error
-    status : number of a :class:`PidStatus`
+    status : whether it was computed
 
     Examples
     --------
     >>> gains = check_gains(Gains(kp=1.0, ki=0.5, kd=0.0, limit=1.0))
-    >>> pid_step(gains, PidState(), 0.4, 0.1)
-    (0.42000000000000004, PidState(integral=0.020000000000000004, error=0.4), 0)
-    >>> pid_step(gains, PidState(), 2.0, 0.1)
-    (1.0, PidState(integral=0.0, error=2.0), 1)
-    >>> pid_step(gains, PidState(0.2), float("nan"), 0.1)
-    (0.0, PidState(integral=0.2, error=nan), 3)
+    >>> pid_step(gains, PidState(), 0.4, 0.1)[:2]
+    (0.42000000000000004, PidState(integral=0.020000000000000004, error=0.4))
+    >>> output, state, status = pid_step(gains, PidState(), 2.0, 0.1)
+    >>> output, state.integral, status.label
+    (1.0, 0.0, 'clamped')
+    >>> pid_step(gains, PidState(0.2), float("nan"), 0.1)[1]
+    PidState(integral=0.2, error=nan)
     """
     if not 0.0 < dt_s <= LONGEST_STEP_S:
-        return 0.0, PidState(state.integral, math.nan), PidStatus.BAD_TIME.value
+        return 0.0, PidState(state.integral, math.nan), PidStatus.BAD_TIME
     if not math.isfinite(error):
-        return 0.0, PidState(state.integral, math.nan), PidStatus.NO_ERROR.value
+        return 0.0, PidState(state.integral, math.nan), PidStatus.NO_ERROR
     smooth, rate = error, 0.0
     if not math.isnan(state.error):
         tau_s = gains.derivative_time_constant_s
@@ -141,5 +131,5 @@ def pid_step(gains: Gains, state: PidState, error: float, dt_s: float) -> tuple[
         integral = state.integral
     desired = without + integral
     output = min(max(desired, -gains.limit), gains.limit)
-    status = PidStatus.OK.value if output == desired else PidStatus.CLAMPED.value
+    status = PidStatus.OK if output == desired else PidStatus.CLAMPED
     return output, PidState(integral, smooth), status

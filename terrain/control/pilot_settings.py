@@ -42,7 +42,7 @@ class PilotSettings:
     controller : one of :data:`CONTROLLERS`
     ramp_mps2 : largest rise of the speed of the fastest wheel, of ``ramp``
     traction, switching : of ``traction``
-    gains, form : of ``thesis``
+    gains : of ``thesis``
     delay_s : from a sample to the wheel; the loops have to be stable with it
     track : with path tracking; not with ``plain`` and ``ramp``, which estimate no pose
     tracking : its settings
@@ -55,7 +55,6 @@ class PilotSettings:
     traction: TractionSettings = SETTINGS
     switching: SwitchSettings = SWITCHING
     gains: Gains = THESIS_GAINS
-    form: str = "normalised"
     delay_s: float = 0.05
     track: bool = False
     tracking: TrackSettings = TRACKING
@@ -126,7 +125,7 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> Swer
     if settings.track and settings.controller in OPEN_LOOP:
         raise ConfigError(f"controller {settings.controller!r} estimates no pose: it has no path tracking")
     if settings.controller == "thesis":
-        check_stable(swerve, settings.gains, settings.form, settings.delay_s)
+        check_stable(swerve, settings.gains, settings.delay_s)
     return swerve
 
 
@@ -142,5 +141,5 @@ def wheel_controller(robot: Robot, settings: PilotSettings) -> WheelController:
     if settings.controller == "traction":
         return traction
     if settings.controller == "thesis":
-        return ThesisController(robot, settings.gains, settings.form, settings.traction.stale_max_s)
+        return ThesisController(robot, settings.gains, settings.traction.stale_max_s)
     return RampController(settings.ramp_mps2 if settings.controller == "ramp" else math.inf)

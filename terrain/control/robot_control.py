@@ -19,9 +19,9 @@ from terrain.control.aims import Aims
 from terrain.control.path_tracking import (
     PoseEstimate,
     TrackReport,
+    TrackState,
     TrackStatus,
     check_tracking,
-    initial_tracking,
     track_step,
 )
 from terrain.control.pilot_settings import PilotSettings, PilotStatus, wheel_controller
@@ -101,16 +101,16 @@ class RobotControl:
         # what a step leaves to the next
         self.health = [0] * len(SENSORS)
         self.steer_rad = np.zeros(3)
-        self.target_ratio, self._tilt_rad, self._tracking = math.nan, (0.0, 0.0), initial_tracking()
+        self.target_ratio, self._tilt_rad, self._tracking = math.nan, (0.0, 0.0), TrackState()
 
     def use(self, table: SlipTable) -> None:
         """Aim for the targets of a table from now on."""
         self._aims = Aims(table)
         self.terrains = {terrain: index for index, terrain in enumerate(table.targets)}
 
-    def forget_terrain(self) -> None:
+    def reset_terrain(self) -> None:
         """Drop what was learned of the terrain, as another one is believed."""
-        self._controller.forget_terrain()
+        self._controller.reset_terrain()
 
     def measured(
         self, time_s: float, dt_s: float, readings: dict[str, Reading], seen: LiveEstimate | None

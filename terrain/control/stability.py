@@ -18,10 +18,10 @@ target is not the balance slip, and no oscillation.
 
 The range: V from the low speed of the controller to the largest of the motors, traction and braking, and
 slopes of the thrust over slip from almost zero (a wheel that slides) to twice that of tiles.  By the first
-equation one rad/s changes the slip by r / V: the printed form's gain is K_P r / V and is largest at the
-lowest speed; the normalised form's is K_P.  For AgriMaRo with a delay of 0.05 s and K_P alone, the printed
-form is unstable from K_P = 0.38 rad/s on (at 0.05 m/s; at 0.5 m/s from 3.8, at 2 m/s from 15), the normalised
-one from 1.53 at any speed.
+equation one rad/s changes the slip by r / V, which the controller's normalised error makes up for: its gain is
+K_P at any speed.  For AgriMaRo with a delay of 0.05 s and K_P alone, the loop is unstable from K_P = 1.53 on.  Of
+the thesis' printed form, whose error is the slip, the gain is K_P r / V and is largest at the lowest speed: it
+is unstable from K_P = 0.38 rad/s on at 0.05 m/s, from 3.8 at 0.5 m/s and from 15 at 2 m/s.
 
 The body's friction with the ground, the limits of torque and output, and the falling branch beyond the peak
 of a thrust curve are not modelled.  Encoders and speed over ground are assumed to have the same low-pass,
@@ -38,7 +38,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.danzi_pid import FORMS, LOW_SPEED_MPS
+from terrain.control.danzi_pid import LOW_SPEED_MPS
 from terrain.control.pid import Gains, check_gains
 from terrain.errors import ConfigError
 from terrain.records import Array
@@ -64,11 +64,8 @@ SLOPES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 LARGEST_FACTOR = 1e3
 """A larger gain margin is given as infinite."""
 
-(RATE, SPEED, CONTACT, TORQUE, INTEGRAL, ESTIMATE, MEASURED_SLIP, COMMAND) = range(8)
 _HALVINGS, _TAYLOR_ORDER = 12, 8
 # All at once by a series, and squared: scipy's expm, matrix by matrix, takes seconds where cores are busy.
-
-_PID, _ERROR, _DELAYED = 7, 8, 9  # places after the plant's seven states
 
 
 class Stability(NamedTuple):
@@ -101,7 +98,6 @@ class _Point(NamedTuple):
 def check_stable(
     robot: Robot,
     gains: Gains,
-    form: str = "normalised",
     delay_s: float = DELAY_S,
     *,
     dt_s: float = SAMPLE_TIME_S,
@@ -113,7 +109,6 @@ def check_stable(
     ----------
     robot : with its sections
     gains : of :class:`terrain.control.pid.Gains`; the limits are not used
-    form : ``printed`` or ``normalised``, see :mod:`terrain.control.danzi_pid`
     delay_s : from measurement to command, beside the encoders' low-pass
     dt_s : sample time
     low_speed_mps : below which the controller is inactive
@@ -121,7 +116,7 @@ def check_stable(
     Raises
     ------
     ConfigError
-        if the loop is unstable at some speed, or a gain, the form, the delay or a time is not accepted.
+        if the loop is unstable at some speed, or a gain, the delay or a time is not accepted.
 
     Examples
     --------
@@ -130,17 +125,17 @@ def check_stable(
     >>> found = check_stable(robot, Gains(0.5, 0.5, 0.0, limit=5.0))
     >>> found.radius_ratio < 1, round(found.gain_margin_ratio, 1)
     (True, 3.0)
-    >>> check_stable(robot, Gains(1.0, 0.0, 0.0, limit=5.0), "printed")
+    >>> check_stable(robot, Gains(2.0, 0.0, 0.0, limit=5.0))
     Traceback (most recent call last):
-    terrain.errors.ConfigError: robot agrimaro: slip control (printed, kp 1, ki 0, kd 0) with a delay of
-    0.05 s is unstable from 0.05 to 0.131 m/s; it is stable up to 0.38 times these gains
+    terrain.errors.ConfigError: robot agrimaro: slip control (kp 2, ki 0, kd 0) with a delay of 0.05 s is
+    unstable from 0.05 to 2 m/s; it is stable up to 0.76 times these gains
     """
     gains = check_gains(gains)
     points = _points(robot, delay_s, dt_s, low_speed_mps)
 
     n_delayed = _n_delayed(delay_s, dt_s)
     without, loops = (
-        np.array([_closed(robot, given, form, n_delayed, dt_s, point) for point in points])
+        np.array([_closed(robot, given, n_delayed, dt_s, point) for point in points])
         for given in (gains._replace(kp=0.0, ki=0.0, kd=0.0), gains)
     )
 
@@ -152,7 +147,7 @@ def check_stable(
     if found.max() >= 1.0:
         speeds = [point.speed_mps for point, radius in zip(points, found, strict=True) if radius >= 1.0]
         raise ConfigError(
-            f"robot {robot.name}: slip control ({form}, kp {gains.kp:g}, ki {gains.ki:g}, kd {gains.kd:g}) "
+            f"robot {robot.name}: slip control (kp {gains.kp:g}, ki {gains.ki:g}, kd {gains.kd:g}) "
             f"with a delay of {delay_s:g} s is unstable from {min(speeds):.3g} to {max(speeds):.3g} m/s; "
             f"it is stable up to {margin:.2g} times these gains"
         )
@@ -163,7 +158,6 @@ def check_stable(
 def loop_matrix(
     robot: Robot,
     gains: Gains,
-    form: str,
     delay_s: float,
     speed_mps: float,
     slip_ratio: float,
@@ -175,7 +169,7 @@ def loop_matrix(
 
     Parameters
     ----------
-    robot, gains, form, delay_s, dt_s : as :func:`check_stable` takes them
+    robot, gains, delay_s, dt_s : as :func:`check_stable` takes them
     speed_mps : V, the larger of wheel circumferential speed and ground speed
     slip_ratio : s_0
     slope_ratio : c in loads
@@ -183,11 +177,11 @@ def loop_matrix(
     Raises
     ------
     ConfigError
-        if the form, a gain or a time is not accepted.
+        if a gain or a time is not accepted.
     """
     n_delayed = _n_delayed(delay_s, dt_s)
     (point,) = _sampled(robot, [(speed_mps, slip_ratio, slope_ratio)], dt_s)
-    return _closed(robot, check_gains(gains), form, n_delayed, dt_s, point)
+    return _closed(robot, check_gains(gains), n_delayed, dt_s, point)
 
 
 def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio: float) -> Array:
@@ -196,17 +190,17 @@ def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio:
     In the order of ``w, v, k, T, q, e, y, u`` of the module's equations.
     """
     body, motors, _, _, sensors = robot.equipment
-    radius_m, one = robot.wheel_radius_m, np.eye(8)
-    third_kg = robot.mass_kg / 3
+    radius_m, third_kg = robot.wheel_radius_m, robot.mass_kg / 3
+    rate, speed, contact, torque, integral, estimate, measured_slip, command = np.eye(8)
     slip = (
-        radius_m * (1 - slip_ratio) * one[RATE] - one[SPEED]
+        radius_m * (1 - slip_ratio) * rate - speed
         if slip_ratio > 0
-        else radius_m * one[RATE] - (1 + slip_ratio) * one[SPEED]
+        else radius_m * rate - (1 + slip_ratio) * speed
     ) / speed_mps
-    build_up = (slip - one[CONTACT]) * speed_mps / body.relaxation_length_m
-    thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (one[CONTACT] + DEFLECTION_DAMPING_S * build_up)
-    speed_error = one[COMMAND] - one[ESTIMATE]
-    desired = motors.speed_gain_nmspr * speed_error + one[INTEGRAL]
+    build_up = (slip - contact) * speed_mps / body.relaxation_length_m
+    thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (contact + DEFLECTION_DAMPING_S * build_up)
+    speed_error = command - estimate
+    desired = motors.speed_gain_nmspr * speed_error + integral
     # no lag is shorter than the simulator's step, as there
     torque_s, estimate_s, encoder_s = (
         max(lag_s, STEP_S)
@@ -216,15 +210,42 @@ def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio:
             sensors.encoder_time_constant_s,
         )
     )
-    change = np.zeros((8, 8))
-    change[RATE] = (one[TORQUE] - radius_m * thrust) / body.wheel_inertia_kgm2
-    change[SPEED] = thrust / third_kg
-    change[CONTACT] = build_up
-    change[TORQUE] = (desired - one[TORQUE]) / torque_s
-    change[INTEGRAL] = motors.speed_integral_nmpr * speed_error
-    change[ESTIMATE] = (one[RATE] - one[ESTIMATE]) / estimate_s
-    change[MEASURED_SLIP] = (slip - one[MEASURED_SLIP]) / encoder_s
-    return change
+    return np.array(
+        [
+            (torque - radius_m * thrust) / body.wheel_inertia_kgm2,
+            thrust / third_kg,
+            build_up,
+            (desired - torque) / torque_s,
+            motors.speed_integral_nmpr * speed_error,
+            (rate - estimate) / estimate_s,
+            (slip - measured_slip) / encoder_s,
+            np.zeros(8),
+        ]
+    )
+
+
+def closed_loop(keep: Array, drive: Array, controller: Array, output: Array, n_delayed: int) -> Array:
+    """Return a sampled loop: plant, controller, and commands on their way to the plant.
+
+    Parameters
+    ----------
+    keep, drive : (n, n) and (n,) of the plant, from sample to sample, and by its command
+    controller : (m, n + m) next states of the controller, by those of plant and controller
+    output : (n + m,) of the controller
+    n_delayed : samples until the plant has it
+    """
+    n, known = len(keep), len(output)
+    size = known + n_delayed
+    loop, applied = np.zeros((size, size)), np.zeros(size)
+    loop[:n, :n] = keep
+    loop[n:known, :known] = controller
+    applied[:known] = output
+    if n_delayed:
+        loop[known] = applied
+        loop[known + 1 :] = np.eye(size)[known:-1]
+        applied = np.eye(size)[-1]
+    loop[:n] += np.outer(drive, applied)
+    return loop
 
 
 def spectral_radius(matrix: Array) -> float:
@@ -258,10 +279,7 @@ def _sampled(robot: Robot, places: Sequence[tuple[float, float, float]], dt_s: f
         moved = one + short @ moved / order
     for _ in range(_HALVINGS):
         moved = moved @ moved
-    return [
-        _Point(*place, over[:COMMAND, :COMMAND], over[:COMMAND, COMMAND])
-        for place, over in zip(places, moved, strict=True)
-    ]
+    return [_Point(*place, over[:-1, :-1], over[:-1, -1]) for place, over in zip(places, moved, strict=True)]
 
 
 def _n_delayed(delay_s: float, dt_s: float) -> int:
@@ -272,29 +290,19 @@ def _n_delayed(delay_s: float, dt_s: float) -> int:
     return math.ceil(delay_s / dt_s - 1e-9)
 
 
-def _closed(robot: Robot, gains: Gains, form: str, n_delayed: int, dt_s: float, point: _Point) -> Array:
+def _closed(robot: Robot, gains: Gains, n_delayed: int, dt_s: float, point: _Point) -> Array:
     """Return the loop of ``pid_step`` and the plant, with a delay of some samples."""
-    if form not in FORMS:
-        raise ConfigError(f"form {form!r} is unknown: use one of {', '.join(FORMS)}")
     radius_m, slip = robot.wheel_radius_m, point.slip_ratio
-    size = _DELAYED + n_delayed
-    one, loop = np.eye(size), np.zeros((size, size))
-    error = -one[MEASURED_SLIP] * (point.speed_mps / radius_m if form == "normalised" else 1.0)
+    *_, measured_slip, integral, filtered = np.eye(9)
+    error = -measured_slip * (point.speed_mps / radius_m)
     tau_s = gains.derivative_time_constant_s
-    change = (error - one[_ERROR]) * (-math.expm1(-dt_s / tau_s) if tau_s > 0 else 1.0)
-    loop[:_PID, :_PID] = point.keep
-    loop[_PID] = one[_PID] + gains.ki * dt_s * error
-    loop[_ERROR] = one[_ERROR] + change
-    output = gains.kp * error + loop[_PID] + gains.kd / dt_s * change
-    if n_delayed:
-        loop[_DELAYED] = output
-        loop[_DELAYED + 1 :] = one[_DELAYED:-1]
-        output = one[-1]
-    loop[:_PID] += np.outer(point.drive, output)
-    together = np.zeros(size)
-    together[[RATE, ESTIMATE, _PID]] = 1.0
-    together[_DELAYED:] = 1.0
-    together[SPEED] = radius_m * (1 - slip) if slip > 0 else radius_m / (1 + slip)
+    change = (error - filtered) * (-math.expm1(-dt_s / tau_s) if tau_s > 0 else 1.0)
+    controller = np.array([integral + gains.ki * dt_s * error, filtered + change])
+    output = gains.kp * error + controller[0] + gains.kd / dt_s * change
+    loop = closed_loop(point.keep, point.drive, controller, output, n_delayed)
+    rolls = radius_m * (1 - slip) if slip > 0 else radius_m / (1 + slip)
+    # The speeds of wheel and robot, the estimate and commands shift together, in the order of plant and controller.
+    together = np.array([1.0, rolls, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, *np.ones(n_delayed)])
     # The loop on the complement of the direction that it maps to itself: its other eigenvalues.
     across = np.linalg.svd(together[None])[2][1:]
     return np.asarray(across @ loop @ across.T)

@@ -25,10 +25,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numba import njit
-
-from terrain.control.paths import CURVATURE, GRID_M
+from terrain.control.paths import GRID_M, Place, ReferencePath
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots.bicycle import BicycleRobot
@@ -73,27 +70,26 @@ class SteeringSettings(NamedTuple):
     slip_lag_s: float = 0.05
 
 
-BASE, STEER_MAX, K_P, K_D, OFFSET, DELAY, TAU, HORIZON, SLIP_LAG, FASTEST = range(10)
 _LEAST_BESIDE, _ACROSS_RAD = 0.2, 1.3
 _LONGEST_STEP_S = 0.5
-MODEL, LAST, FRONT, REAR = range(4)
-STATE_SIZE = 4
-"""Of the memory: the actuator's model, the last command, and slip angles behind their low-pass."""
 
 
-def steering_params(robot: BicycleRobot, settings: SteeringSettings) -> Array:
-    """Return the parameters (10,) of :func:`steer`.
+class SteerState(NamedTuple):
+    """The actuator's model m, the last command, and slip angles behind their low-pass."""
+
+    model_rad: float = 0.0
+    command_rad: float = 0.0
+    front_rad: float = 0.0
+    rear_rad: float = 0.0
+
+
+def check_steering(settings: SteeringSettings) -> SteeringSettings:
+    """Return settings that :func:`steer` accepts.
 
     Raises
     ------
     ConfigError
         if a gain is not above zero, or a time below it.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> steering_params(load_robot("adap2e"), SteeringSettings(delay_s=0.0))[DELAY]
-    np.float64(0.0)
     """
     if not (
         min(settings.position_pm2, settings.angle_pm, settings.fastest_ps) > 0
@@ -106,95 +102,97 @@ def steering_params(robot: BicycleRobot, settings: SteeringSettings) -> Array:
         and 0 <= settings.horizon_time_constants < 20.0
     ):
         raise ConfigError("a delay of 0 to 2 s and a horizon of 0 to 20 time constants are accepted")
-    tau_s = robot.steering_time_constant_s
-    return np.array(
-        [
-            *(robot.wheelbase_m, robot.steering_max_rad, settings.position_pm2, settings.angle_pm),
-            *(settings.offset_m, settings.delay_s, tau_s, settings.horizon_time_constants * tau_s),
-            *(settings.slip_lag_s, settings.fastest_ps),
-        ]
-    )
+    return settings
 
 
-@njit(cache=True)
-def law_17(params: Array, lateral: float, angle: float, curvature: float, front: float, rear: float) -> float:
-    """Return the steering angle of (17), not limited; compiled.
+def law_17(
+    settings: SteeringSettings,
+    base_m: float,
+    lateral: float,
+    angle: float,
+    curvature: float,
+    front: float,
+    rear: float,
+) -> float:
+    """Return the steering angle of (17), not limited.
 
     Examples
     --------
-    >>> from terrain.robots import load_robot
-    >>> params = steering_params(load_robot("adap2e"), SteeringSettings())
-    >>> round(law_17(params, 0.0, 0.0, 0.1, 0.0, 0.0), 4)  # atan(L c)
+    >>> round(law_17(SteeringSettings(), 1.2, 0.0, 0.0, 0.1, 0.0, 0.0), 4)  # atan(L c)
     0.1194
     """
     gamma = min(max(angle + rear, -_ACROSS_RAD), _ACROSS_RAD)
     beside = max(1.0 - curvature * lateral, _LEAST_BESIDE)
     tangent, cos = math.tan(gamma), math.cos(gamma)
-    pull = -params[K_P] * (lateral - params[OFFSET]) - params[K_D] * beside * tangent
+    pull = -settings.position_pm2 * (lateral - settings.offset_m) - settings.angle_pm * beside * tangent
     pull += curvature * beside * tangent * tangent
-    bend = curvature * cos / beside + pull * cos**3 / beside**2
-    return math.atan(math.tan(rear) + params[BASE] / math.cos(rear) * bend) - front
+    bend = curvature * cos / beside + pull * (cos * cos * cos) / (beside * beside)
+    return math.atan(math.tan(rear) + base_m / math.cos(rear) * bend) - front
 
 
-@njit(cache=True)
-def _curvature_at(rows: Array, distance_m: float) -> float:
-    at = min(max(distance_m / GRID_M, 0.0), rows.shape[0] - 1.001)
-    i = int(at)
-    return float(rows[i, CURVATURE] + (at - i) * (rows[i + 1, CURVATURE] - rows[i, CURVATURE]))
+def _curvature_at(path: ReferencePath, distance_m: float) -> float:
+    at = min(max(distance_m / GRID_M, 0.0), len(path.curvature_pm) - 1.001)
+    before, after = path.curvature_pm[int(at) : int(at) + 2].tolist()
+    return float(before + (at - int(at)) * (after - before))
 
 
-@njit(cache=True)
 def steer(
-    params: Array, memory: Array, rows: Array, place: Array, slips: Array, speed_mps: float, dt_s: float
-) -> tuple[float, Array, int]:
-    """Return the steering to command, the next memory and the status; compiled, the memory is not changed.
+    robot: BicycleRobot,
+    settings: SteeringSettings,
+    state: SteerState,
+    path: ReferencePath,
+    place: Place,
+    slips: Array,
+    speed_mps: float,
+    dt_s: float,
+) -> tuple[float, SteerState, SteerStatus]:
+    """Return the steering to command, the next state and the status.
 
     Parameters
     ----------
-    params : of :func:`steering_params`
-    memory : (STATE_SIZE,) zeros at first
-    rows : of a path
-    place : (4,) distance, lateral, angle and curvature of a :class:`~terrain.control.paths.Place`
+    robot, settings : that steers; accepted ones
+    state : ``SteerState()`` at first, then what the step before returned
+    path, place : that is followed, and where the robot is on it
     slips : (2,) of front and rear; NaN is taken as no slip
     speed_mps : of the robot
     dt_s : since the step before
     """
-    after = memory.copy()
-    if not (0.0 <= dt_s <= _LONGEST_STEP_S and abs(speed_mps) < 100.0 and abs(place[0]) < 1e9):
-        return memory[LAST], after, SteerStatus.BAD_INPUT.value
-    for i in range(2):
-        known = slips[i] if abs(slips[i]) < 1.0 else 0.0
-        after[FRONT + i] += (1.0 - math.exp(-dt_s / max(params[SLIP_LAG], 1e-9))) * (
-            known - memory[FRONT + i]
-        )
-    front, rear = after[FRONT], after[REAR]
-    status, lateral, angle = SteerStatus.OK.value, place[1], place[2]
-    curvature = place[3] if abs(place[3]) < 1e3 else 0.0
+    if not (0.0 <= dt_s <= _LONGEST_STEP_S and abs(speed_mps) < 100.0 and abs(place.distance_m) < 1e9):
+        return state.command_rad, state, SteerStatus.BAD_INPUT
+    part = 1.0 - math.exp(-dt_s / max(settings.slip_lag_s, 1e-9))
+    front, rear = (
+        before + part * ((slip if abs(slip) < 1.0 else 0.0) - before)
+        for before, slip in zip(state[2:], slips.tolist(), strict=True)
+    )
+    status, lateral, angle = SteerStatus.OK, place.lateral_m, place.angle_rad
+    curvature = place.curvature_pm if abs(place.curvature_pm) < 1e3 else 0.0
     if not (abs(lateral) < 1e6 and abs(angle) < 1e6):
-        status, lateral, angle = SteerStatus.HELD.value, params[OFFSET], -rear
+        status, lateral, angle = SteerStatus.HELD, settings.offset_m, -rear
     elif 1.0 - curvature * lateral < _LEAST_BESIDE or abs(angle + rear) > _ACROSS_RAD:
-        status = SteerStatus.SINGULAR.value
+        status = SteerStatus.SINGULAR
     gamma = min(max(angle + rear, -_ACROSS_RAD), _ACROSS_RAD)
     beside = max(1.0 - curvature * lateral, _LEAST_BESIDE)
-    along = params[BASE] * math.cos(gamma) / beside
+    along = robot.wheelbase_m * math.cos(gamma) / beside
     followed = math.atan(along * curvature)
-    slower = min(1.0, params[FASTEST] / max(abs(speed_mps) * math.sqrt(params[K_P]), 1e-9))
-    gains = params.copy()
-    gains[K_P] *= slower * slower
-    gains[K_D] *= slower
-    deviation = law_17(gains, lateral, angle, curvature, front, rear) - followed
-    ahead = followed
-    if params[HORIZON] > 0.0 and params[TAU] > 0.0:
-        reach = abs(speed_mps) * (params[DELAY] + params[HORIZON])
-        target = math.atan(along * _curvature_at(rows, place[0] + reach))
-        keep = math.exp(-params[HORIZON] / params[TAU])
-        ahead = (target - keep * memory[MODEL]) / (1.0 - keep)
-    ahead = min(max(ahead, -params[STEER_MAX]), params[STEER_MAX])
-    lag = -math.expm1(-dt_s / params[TAU]) if params[TAU] > 0.0 else 1.0
-    after[MODEL] += lag * (ahead - after[MODEL])
+    slower = min(1.0, settings.fastest_ps / max(abs(speed_mps) * math.sqrt(settings.position_pm2), 1e-9))
+    gains = settings._replace(
+        position_pm2=settings.position_pm2 * (slower * slower), angle_pm=settings.angle_pm * slower
+    )
+    deviation = law_17(gains, robot.wheelbase_m, lateral, angle, curvature, front, rear) - followed
+    ahead, tau_s, most = followed, robot.steering_time_constant_s, robot.steering_max_rad
+    horizon_s = settings.horizon_time_constants * tau_s
+    if horizon_s > 0.0:
+        reach = abs(speed_mps) * (settings.delay_s + horizon_s)
+        target = math.atan(along * _curvature_at(path, place.distance_m + reach))
+        keep = math.exp(-horizon_s / tau_s)
+        ahead = (target - keep * state.model_rad) / (1.0 - keep)
+    ahead = min(max(ahead, -most), most)
+    lag = -math.expm1(-dt_s / tau_s) if tau_s > 0.0 else 1.0
     command = ahead + deviation
-    if abs(command) > params[STEER_MAX]:
-        command = math.copysign(params[STEER_MAX], command)
-        status = max(status, SteerStatus.CLAMPED.value)
-    after[LAST] = command
-    return command, after, status
+    if abs(command) > most:
+        command, status = math.copysign(most, command), max(status, SteerStatus.CLAMPED)
+    return (
+        command,
+        SteerState(state.model_rad + lag * (ahead - state.model_rad), command, front, rear),
+        status,
+    )

@@ -32,11 +32,6 @@ its speed over ground along it, and s* the target slip::
 - Braking is left to the motor drivers, except on slick and hard ground: soil resists most where the wheels
   stop, hard ground where they slip a little.  There d falls no faster than ``q (1 - s_b)``, with q
   extrapolated over the lag by the deceleration that such ground can give.
-
-Everything is a step from a state to the next; :func:`traction_step` is compiled and allocates four small
-arrays.
-
-Settings of the traction controller (:mod:`terrain.control.traction`): defaults, checks, motor drivers.
 """
 
 from __future__ import annotations
@@ -45,7 +40,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
 
 from terrain.control.danzi_pid import DriveState
 from terrain.errors import ConfigError
@@ -218,7 +212,40 @@ class TractionReport(NamedTuple):
     status: int
 
 
-class _Observed(NamedTuple):
+class TractionState(NamedTuple):
+    """What a step leaves to the next; as it is at first, of a robot at rest on unknown terrain.
+
+    Parameters
+    ----------
+    driven_mps, desired_mps : d and w
+    reference_mps, constant_s : speed that is commanded without a change, and for how long it has been
+    slow_mps : q behind a low-pass
+    balance_ratio, floor_ratio : slip of steady motion, NaN until it was measured, and least s*
+    held_s : for how long d has been limited
+    braking_s, braked_from_mps : of a controlled braking: for how long, and the largest d in it
+    droop_nm : torque of each wheel behind its low-pass
+    rate_radpm : rate of each wheel at a w of 1 m/s, of the last command that was none to stop
+    """
+
+    driven_mps: float = 0.0
+    desired_mps: float = 0.0
+    reference_mps: float = 0.0
+    constant_s: float = 0.0
+    slow_mps: float = 0.0
+    balance_ratio: float = math.nan
+    floor_ratio: float = 0.0
+    held_s: float = 0.0
+    braking_s: float = 0.0
+    braked_from_mps: float = 0.0
+    droop_nm: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rate_radpm: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def on_other_terrain(self) -> TractionState:
+        """Return the state without what was learned of the terrain: for a change of the classified terrain."""
+        return self._replace(balance_ratio=math.nan, floor_ratio=0.0)
+
+
+class _Seen(NamedTuple):
     """Speed and acceleration over ground seen from the fastest wheel, slips, and whether they can be used."""
 
     ground_mps: float
@@ -243,221 +270,172 @@ _BRAKE_END_MPS = 0.05  # slower than that, stopping is a matter of a wheel's tur
 _BRAKE_LONGEST, _BRAKE_SPARE_S = 1.3, 0.3  # of the time that the planned deceleration takes: then wheels lock
 _BRAKE_MPS2 = 0.5  # a command that falls faster than the resistances slow the robot is a braking
 
-(
-    _DRIVEN,
-    _DESIRED,
-    _REFERENCE,
-    _CONSTANT,
-    _SLOW,
-    _BALANCE,
-    _FLOOR,
-    _HELD,
-    _BRAKING,
-    _BRAKED_FROM,
-    _DROOP,
-) = range(11)
-_PATTERN = _DROOP + 3
-STATE_SIZE = _PATTERN + 3
 
-_F8, _I8 = types.float64, types.int64
-_ROW = types.Array(_F8, 1, "A", readonly=True)
-_SETTINGS = types.NamedUniTuple(_F8, len(TractionSettings._fields), TractionSettings)
-_TARGET = types.NamedUniTuple(_F8, len(TractionTarget._fields), TractionTarget)
-_WHEELS = types.NamedUniTuple(_F8[::1], len(WheelMeasurements._fields), WheelMeasurements)
-_REPORT = types.NamedTuple((_F8, _F8, _F8, _F8, _I8, _I8), TractionReport)
-
-
-def initial_state() -> Array:
-    """Return the state (STATE_SIZE,) of a robot at rest, on unknown terrain."""
-    state = np.zeros(STATE_SIZE)
-    state[_BALANCE] = math.nan
-    return state
-
-
-def forget_terrain(state: Array) -> Array:
-    """Return the state without what was learned of the terrain: for a change of the classified terrain."""
-    state = state.copy()
-    state[_BALANCE], state[_FLOOR] = math.nan, 0.0
-    return state
-
-
-@njit(cache=True)
 def _observe(
     settings: TractionSettings,
-    state: Array,
-    after: Array,
+    state: TractionState,
     radius_m: float,
     wheels: WheelMeasurements,
     stale_s: float,
-) -> _Observed:
+) -> _Seen:
     """Return the motion over ground seen from the fastest wheel: the least that a wheel shows."""
-    n = wheels.slip_ratio.size
-    status = TractionStatus.OK.value
-    q, gain, slip, shared, std = math.inf, 0.0, -math.inf, 0.0, 0.0
-    for i in range(n):
-        sign = 1.0 if after[_PATTERN + i] >= 0.0 else -1.0
-        ratio = abs(after[_PATTERN + i]) * radius_m  # of the fastest wheel's speed
-        if not (
-            math.isfinite(wheels.slip_ratio[i])
-            and math.isfinite(wheels.slip_std[i])
-            and math.isfinite(wheels.speed_mps[i])
-            and math.isfinite(wheels.accel_mps2[i])
+    status = TractionStatus.OK
+    q, gain, largest, shared, uncertain = math.inf, 0.0, -math.inf, 0.0, 0.0
+    rows = (row.tolist() for row in wheels[:4])
+    for rate, speed, accel, slip, std in zip(state.rate_radpm, *rows, strict=True):
+        sign = 1.0 if rate >= 0.0 else -1.0
+        ratio = abs(rate) * radius_m  # of the fastest wheel's speed
+        if (
+            not math.isfinite(slip)
+            or not math.isfinite(std)
+            or not math.isfinite(speed)
+            or not math.isfinite(accel)
         ):
-            status = TractionStatus.NO_SLIP.value
+            status = TractionStatus.NO_SLIP
             continue
-        slip = max(slip, sign * wheels.slip_ratio[i])
-        shared += sign * wheels.slip_ratio[i] / n
-        fastest = abs(wheels.speed_mps[i]) / max(1.0 - max(sign * wheels.slip_ratio[i], 0.0), 0.05)
-        judged = max(fastest, _JUDGED * settings.launch_mps, state[_BRAKED_FROM])
-        std = max(std, wheels.slip_std[i] * fastest / judged)
-        if ratio >= _SLOWEST_WHEEL_RATIO:
-            seen = sign * wheels.speed_mps[i] / ratio
-            if seen < q:
-                q, gain = seen, sign * wheels.accel_mps2[i] / ratio
+        largest = max(largest, sign * slip)
+        shared += sign * slip / len(state.rate_radpm)
+        fastest = abs(speed) / max(1.0 - max(sign * slip, 0.0), 0.05)
+        judged = max(fastest, _JUDGED * settings.launch_mps, state.braked_from_mps)
+        uncertain = max(uncertain, std * fastest / judged)
+        if ratio >= _SLOWEST_WHEEL_RATIO and sign * speed / ratio < q:
+            q, gain = sign * speed / ratio, sign * accel / ratio
     if math.isinf(q):
         q, gain = 0.0, 0.0
-    if status == TractionStatus.OK.value and not stale_s <= settings.stale_max_s:
-        status = TractionStatus.STALE.value
-    if status == TractionStatus.OK.value and not std <= settings.std_max_ratio:
-        status = TractionStatus.UNCERTAIN.value
-    return _Observed(q, gain, slip, shared, status)
+    if status is TractionStatus.OK and not stale_s <= settings.stale_max_s:
+        status = TractionStatus.STALE
+    if status is TractionStatus.OK and not uncertain <= settings.std_max_ratio:
+        status = TractionStatus.UNCERTAIN
+    return _Seen(q, gain, largest, shared, status)
 
 
-@njit(cache=True)
-def _aimed_slip(state: Array, target_ratio: float, margin_ratio: float) -> float:
+def _aimed_slip(state: TractionState, target_ratio: float, margin_ratio: float) -> float:
     """Return s*: no more than the balance and its margin, no less than the floor."""
-    aimed = float(target_ratio)
-    if math.isfinite(state[_BALANCE]):
-        aimed = min(aimed, max(state[_BALANCE], 0.0) + margin_ratio)
-    return max(aimed, float(state[_FLOOR]))
+    if math.isfinite(state.balance_ratio):
+        target_ratio = min(target_ratio, max(state.balance_ratio, 0.0) + margin_ratio)
+    return max(target_ratio, state.floor_ratio)
 
 
-@njit(cache=True)
-def _commanded_state(state: Array, desired_mps: float, was_mps: float, dt_s: float) -> int:
-    """Return the drive state by the command."""
+def _commanded_state(before: TractionState, desired_mps: float, was_mps: float, dt_s: float) -> DriveState:
     if desired_mps > was_mps + 1e-9:
-        return DriveState.TRACTION.value
-    falling = state[_DESIRED] - desired_mps > _BRAKE_MPS2 * dt_s
-    if falling or (state[_BRAKING] > 0.0 and was_mps > desired_mps):
-        return DriveState.BRAKING.value
-    return DriveState.STEADY.value
+        return DriveState.TRACTION
+    falling = before.desired_mps - desired_mps > _BRAKE_MPS2 * dt_s
+    if falling or (before.braking_s > 0.0 and was_mps > desired_mps):
+        return DriveState.BRAKING
+    return DriveState.STEADY
 
 
-@njit(cache=True)
-def _driven_speed(
+def _drive(
     settings: TractionSettings,
-    state: Array,
-    after: Array,
+    state: TractionState,
     target: TractionTarget,
     aimed_ratio: float,
-    seen: _Observed,
-    drive_state: int,
-    command: tuple[float, float, float],
-) -> float:
-    """Return d; ``command`` is the desired speed, the d of the step before, and the time step."""
-    desired, was, dt_s = command
-    braking_s = 0.0
-    if seen.status != TractionStatus.OK.value:
-        driven = min(desired, was + settings.fade_mps2 * dt_s)
-        after[_HELD] = 0.0
-    elif drive_state == DriveState.TRACTION.value:
+    seen: _Seen,
+    drive_state: DriveState,
+    was_mps: float,
+    dt_s: float,
+) -> TractionState:
+    """Return the state with the next d, which was ``was_mps``."""
+    desired = driven = state.desired_mps
+    held_s = braking_s = 0.0
+    if seen.status != TractionStatus.OK:
+        driven = min(desired, was_mps + settings.fade_mps2 * dt_s)
+    elif drive_state is DriveState.TRACTION:
         ahead = seen.ground_mps + settings.lead_s * min(max(seen.accel_mps2, 0.0), settings.lead_max_mps2)
         cap = max(ahead, settings.launch_mps) / (1.0 - min(aimed_ratio, _FLOOR_MAX))
-        driven = min(desired, max(was, cap))
-        after[_HELD] = state[_HELD] + dt_s if driven < desired else 0.0
-    else:
-        driven = desired
-        after[_HELD] = 0.0
-        stops_in_s = state[_BRAKED_FROM] / max(target.braking_mps2, 1e-6)
-        overdue = state[_BRAKING] > _BRAKE_LONGEST * stops_in_s + _BRAKE_SPARE_S
-        if drive_state == DriveState.BRAKING.value and target.braking_mps2 > 0.0 and not overdue:
-            braking_s = state[_BRAKING] + dt_s
-            ahead = seen.ground_mps - target.braking_mps2 * min(braking_s, settings.brake_lead_s)
-            charge = settings.charge_mps_per_mps2 * math.exp(-braking_s / settings.charge_time_s)
-            ahead = ahead * (1.0 - target.braking_ratio)
-            driven = max(desired, min(was, ahead - charge * target.braking_mps2))
-            if ahead <= max(desired, _BRAKE_END_MPS):
-                driven, braking_s = desired, 0.0
-    after[_BRAKING] = braking_s
-    after[_BRAKED_FROM] = 0.0 if braking_s == 0.0 else max(state[_BRAKED_FROM], was)
-    return driven
+        driven = min(desired, max(was_mps, cap))
+        held_s = state.held_s + dt_s if driven < desired else 0.0
+    elif drive_state is DriveState.BRAKING and target.braking_mps2 > 0.0:
+        stops_in_s = state.braked_from_mps / max(target.braking_mps2, 1e-6)
+        time_s = state.braking_s + dt_s
+        ahead = seen.ground_mps - target.braking_mps2 * min(time_s, settings.brake_lead_s)
+        ahead *= 1.0 - target.braking_ratio
+        overdue = state.braking_s > _BRAKE_LONGEST * stops_in_s + _BRAKE_SPARE_S
+        if not overdue and not ahead <= max(desired, _BRAKE_END_MPS):
+            charge = settings.charge_mps_per_mps2 * math.exp(-time_s / settings.charge_time_s)
+            driven, braking_s = max(desired, min(was_mps, ahead - charge * target.braking_mps2)), time_s
+    return state._replace(
+        driven_mps=driven,
+        held_s=held_s,
+        braking_s=braking_s,
+        braked_from_mps=0.0 if braking_s == 0.0 else max(state.braked_from_mps, was_mps),
+    )
 
 
-@njit(cache=True)
 def _learn_balance(
     settings: TractionSettings,
-    state: Array,
-    after: Array,
-    seen: _Observed,
+    state: TractionState,
+    seen: _Seen,
     aimed_ratio: float,
     margin_ratio: float,
-    desired_mps: float,
     dt_s: float,
-) -> None:
+) -> TractionState:
     """Update the slip of steady motion, and raise the floor of s* where the robot gains no speed."""
-    driven, q = after[_DRIVEN], seen.ground_mps
-    after[_SLOW] = state[_SLOW] + (q - state[_SLOW]) * min(dt_s / _SLOW_S, 1.0)
-    gained = (q - after[_SLOW]) / _SLOW_S
-    if after[_HELD] > _HELD_S and gained < settings.gain_least_mps2:
-        after[_FLOOR] = min(aimed_ratio + settings.floor_rate_ratio * dt_s, _FLOOR_MAX)
-    if abs(driven - state[_REFERENCE]) > _CONSTANT_MPS:
-        after[_REFERENCE], after[_CONSTANT] = driven, 0.0
-    after[_CONSTANT] += dt_s
-    if after[_CONSTANT] > _CONSTANT_S and abs(gained) < _STEADY_MPS2 and q > _STEADY_MPS:
-        before = state[_BALANCE] if math.isfinite(state[_BALANCE]) else seen.mean_slip
-        after[_BALANCE] = before + (seen.mean_slip - before) * min(dt_s / _BALANCE_S, 1.0)
-        floor = min(max(after[_BALANCE], 0.0) + margin_ratio, _FLOOR_MAX)
-        after[_FLOOR] = floor if driven >= desired_mps else max(after[_FLOOR], floor)
+    driven, q = state.driven_mps, seen.ground_mps
+    slow = state.slow_mps + (q - state.slow_mps) * min(dt_s / _SLOW_S, 1.0)
+    gained = (q - slow) / _SLOW_S
+    balance, floor = state.balance_ratio, state.floor_ratio
+    if state.held_s > _HELD_S and gained < settings.gain_least_mps2:
+        floor = min(aimed_ratio + settings.floor_rate_ratio * dt_s, _FLOOR_MAX)
+    reference, constant_s = state.reference_mps, state.constant_s
+    if abs(driven - reference) > _CONSTANT_MPS:
+        reference, constant_s = driven, 0.0
+    constant_s += dt_s
+    if constant_s > _CONSTANT_S and abs(gained) < _STEADY_MPS2 and q > _STEADY_MPS:
+        before = balance if math.isfinite(balance) else seen.mean_slip
+        balance = before + (seen.mean_slip - before) * min(dt_s / _BALANCE_S, 1.0)
+        steady = min(max(balance, 0.0) + margin_ratio, _FLOOR_MAX)
+        floor = steady if driven >= state.desired_mps else max(floor, steady)
+    return state._replace(
+        slow_mps=slow,
+        reference_mps=reference,
+        constant_s=constant_s,
+        balance_ratio=balance,
+        floor_ratio=floor,
+    )
 
 
-@njit(cache=True)
 def _share_torque(
-    settings: TractionSettings, state: Array, after: Array, torque_nm: Array, seen: _Observed, dt_s: float
-) -> Array:
-    """Return the wheels' commands: one speed for all, less the droop by torque above the mean."""
-    n = torque_nm.size
-    driven = after[_DRIVEN]
-    mean = 0.0
+    settings: TractionSettings, state: TractionState, torque_nm: Array, seen: _Seen, dt_s: float
+) -> tuple[Array, tuple[float, ...]]:
+    """Return the wheels' commands, one speed for all less the droop by torque above the mean, and the torques."""
+    signs = [1.0 if rate >= 0.0 else -1.0 for rate in state.rate_radpm]
+    torques = torque_nm.tolist()
     # a torque that is not known must not count as 0 beside the others
-    measured = driven > _STEADY_MPS and np.isfinite(torque_nm).all()
+    measured = state.driven_mps > _STEADY_MPS and all(map(math.isfinite, torques))
     keep = math.exp(-dt_s / settings.droop_time_s)
-    for i in range(n):
-        sign = 1.0 if after[_PATTERN + i] >= 0.0 else -1.0
-        torque = sign * torque_nm[i] if measured else 0.0
-        after[_DROOP + i] = keep * state[_DROOP + i] + (1.0 - keep) * torque
-        mean += after[_DROOP + i] / n
+    filtered = tuple(
+        keep * before + (1.0 - keep) * (sign * torque if measured else 0.0)
+        for before, sign, torque in zip(state.droop_nm, signs, torques, strict=True)
+    )
+    mean = 0.0
+    for torque in filtered:
+        mean += torque / len(filtered)
     grip = min(max(2.0 - abs(seen.mean_slip) / _GRIP, 0.0), 1.0)
-    command = np.empty(n)
-    for i in range(n):
-        command[i] = after[_PATTERN + i] * driven
-        if seen.status == TractionStatus.OK.value:
+    command = [rate * state.driven_mps for rate in state.rate_radpm]
+    if seen.status == TractionStatus.OK:
+        for i, sign in enumerate(signs):
             limit = grip * settings.droop_max_ratio * abs(command[i])
-            droop = settings.droop_radps_per_nm * (after[_DROOP + i] - mean)
-            sign = 1.0 if after[_PATTERN + i] >= 0.0 else -1.0
+            droop = settings.droop_radps_per_nm * (filtered[i] - mean)
             command[i] -= sign * min(max(droop, -limit), limit)
-    return command
+    return np.array(command), filtered
 
 
-@njit(
-    types.Tuple((_F8[::1], _F8[::1], _REPORT))(_SETTINGS, _F8[::1], _TARGET, _F8, _ROW, _WHEELS, _F8, _F8),
-    cache=True,
-)
 def traction_step(
     settings: TractionSettings,
-    state: Array,
+    state: TractionState,
     target: TractionTarget,
     radius_m: float,
     wheel_radps: Array,
     wheels: WheelMeasurements,
     stale_s: float,
     dt_s: float,
-) -> tuple[Array, Array, TractionReport]:
-    """Return the wheels' commands, the next state, and why; compiled.
+) -> tuple[Array, TractionState, TractionReport]:
+    """Return the wheels' commands, the next state, and why.
 
     Parameters
     ----------
-    settings, state : as :data:`~terrain.control.traction.SETTINGS` and :func:`initial_state`; the
-        state is not changed
+    settings, state : as :data:`SETTINGS`; ``TractionState()`` at first, then what the step before returned
     target : slips to aim for
     radius_m : nominal radius of the wheels
     wheel_radps : (wheels,) desired
@@ -471,31 +449,35 @@ def traction_step(
     state : the next
     report : what was decided
     """
-    after = state.copy()
+    rates = wheel_radps.tolist()
     desired, along = 0.0, 0.0
-    for i in range(wheel_radps.size):
-        desired = max(desired, abs(wheel_radps[i]) * radius_m)
-        along += wheel_radps[i] * state[_PATTERN + i]
-    was = state[_DRIVEN] if along >= 0.0 else 0.0  # a reversal is a start from rest
+    for rate, before in zip(rates, state.rate_radpm, strict=True):
+        desired = max(desired, abs(rate) * radius_m)
+        along += rate * before
+    was = state.driven_mps if along >= 0.0 else 0.0  # a reversal is a start from rest
     if desired > 0.0:  # a command to stop keeps the directions of the last motion
-        for i in range(wheel_radps.size):
-            after[_PATTERN + i] = wheel_radps[i] / desired
-    if not (0.0 < dt_s <= MAX_STEP_S):
+        state = state._replace(rate_radpm=tuple(rate / desired for rate in rates))
+    if not 0.0 < dt_s <= MAX_STEP_S:
         driven = min(desired, was + settings.fade_mps2 * _USUAL_STEP_S)
-        after[_DRIVEN] = driven
-        command = after[_PATTERN : _PATTERN + wheel_radps.size] * driven
-        steady, bad_time = DriveState.STEADY.value, TractionStatus.BAD_TIME.value
-        report = TractionReport(driven, target.traction_ratio, state[_BALANCE], math.nan, steady, bad_time)
-        return command, after, report
-    seen = _observe(settings, state, after, radius_m, wheels, stale_s)
-    after[_DESIRED] = desired
+        report = TractionReport(
+            driven,
+            target.traction_ratio,
+            state.balance_ratio,
+            math.nan,
+            DriveState.STEADY,
+            TractionStatus.BAD_TIME,
+        )
+        command = np.array([rate * driven for rate in state.rate_radpm])
+        return command, state._replace(driven_mps=driven), report
+    seen = _observe(settings, state, radius_m, wheels, stale_s)
     margin = max(settings.balance_margin_ratio, target.margin_ratio)
     aimed = _aimed_slip(state, target.traction_ratio, margin)
     drive_state = _commanded_state(state, desired, was, dt_s)
-    driven = _driven_speed(settings, state, after, target, aimed, seen, drive_state, (desired, was, dt_s))
-    after[_DRIVEN] = driven
-    if seen.status == TractionStatus.OK.value:
-        _learn_balance(settings, state, after, seen, aimed, margin, desired, dt_s)
-    command = _share_torque(settings, state, after, wheels.torque_nm, seen, dt_s)
-    slip = math.nan if seen.status == TractionStatus.NO_SLIP.value else seen.largest_slip
-    return command, after, TractionReport(driven, aimed, after[_BALANCE], slip, drive_state, seen.status)
+    state = state._replace(desired_mps=desired)
+    state = _drive(settings, state, target, aimed, seen, drive_state, was, dt_s)
+    if seen.status == TractionStatus.OK:
+        state = _learn_balance(settings, state, seen, aimed, margin, dt_s)
+    command, torques = _share_torque(settings, state, wheels.torque_nm, seen, dt_s)
+    slip = math.nan if seen.status == TractionStatus.NO_SLIP else seen.largest_slip
+    report = TractionReport(state.driven_mps, aimed, state.balance_ratio, slip, drive_state, seen.status)
+    return command, state._replace(droop_nm=torques), report

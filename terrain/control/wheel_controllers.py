@@ -11,24 +11,21 @@ from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import boolean, float64, int64, njit, void
 
-from terrain.control.danzi_pid import DriveState, new_state, thesis_settings, thesis_step
+from terrain.control.danzi_pid import DriveState, ThesisSettings, WheelPid, check_thesis, thesis_step
 from terrain.control.pid import Gains
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.control.traction import (
     MAX_STEP_S,
     TractionSettings,
+    TractionState,
     TractionStatus,
     TractionTarget,
     WheelMeasurements,
     check_settings,
-    forget_terrain,
-    initial_state,
     traction_step,
     with_motor_driver,
 )
-from terrain.entry_point import entry_point
 from terrain.estimation.live.estimate import LiveEstimate
 from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTarget
@@ -42,9 +39,6 @@ PERIOD_S = 0.02
 def step_or_period(dt_s: float) -> float:
     """Return a time step, or :data:`PERIOD_S` where it is none of a control loop."""
     return dt_s if 0.0 < dt_s <= MAX_STEP_S else PERIOD_S
-
-
-_traction_step = entry_point(traction_step)
 
 
 class Observation(NamedTuple):
@@ -111,7 +105,7 @@ class WheelController(Protocol):
         """Return the commanded rates (wheels,) and what was decided."""
         ...
 
-    def forget_terrain(self) -> None:
+    def reset_terrain(self) -> None:
         """Drop what was learned of the terrain, as another one is classified."""
         ...
 
@@ -130,7 +124,7 @@ class WheelObserver:
         self._torque_per_amp_nm = (
             motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
         )
-        self._x_m, self._y_m = np.array(robot.wheel_positions_m).T.copy()
+        self._positions_m = robot.wheel_positions_m
         self._radius_m, self._steer_states = robot.wheel_radius_m, steer_states
 
     def observe(self, estimate: LiveEstimate | None, time_s: float) -> Observation:
@@ -138,81 +132,31 @@ class WheelObserver:
         if estimate is None:
             return UNOBSERVED
         stale_s = estimate_age(estimate, time_s)
-        found, wheel_radps = np.empty((5, 3)), np.empty(3)
-        _observe(
-            estimate.mean,
-            self._steer_states,
-            estimate.speed_x_mps,
-            estimate.speed_y_mps,
-            estimate.yaw_rate_radps,
-            estimate.accel_x_mps2,
-            estimate.accel_y_mps2,
-            self._x_m,
-            self._y_m,
+        seen = (
             estimate.wheel_speed_mps,
             estimate.slip_ratio,
             estimate.slip_std,
-            estimate.current_a,
-            self._radius_m,
-            self._torque_per_amp_nm,
-            math.isinf(stale_s),
-            found,
-            wheel_radps,
+            estimate.mean[self._steer_states],
         )
+        wheels = zip(self._positions_m, *(row.tolist() for row in seen), strict=True)
+        motion = estimate.speed_x_mps, estimate.speed_y_mps, estimate.yaw_rate_radps
+        columns = []
+        for (x_m, y_m), wheel_speed, slip, std, steer_rad in wheels:
+            cos, sin = math.cos(steer_rad), math.sin(steer_rad)
+            speed, _ = in_wheel_frame(*point_velocity(*motion, x_m, y_m), cos, sin)
+            accel = estimate.accel_x_mps2 * cos + estimate.accel_y_mps2 * sin
+            fastest = abs(speed) if abs(wheel_speed) <= abs(speed) else abs(wheel_speed)  # NaN too
+            # a wheel stands by the filter's rate, which differs a little from the measured one
+            standing = fastest < (2.0 if math.isnan(slip) else 1.0) * MIN_SPEED_MPS
+            slip = 0.0 if standing and not math.isinf(stale_s) else slip
+            columns.append((speed, accel, slip, 0.0 if standing else std))
+        torque_nm = estimate.current_a * self._torque_per_amp_nm
         chassis_mps = math.hypot(estimate.speed_x_mps, estimate.speed_y_mps)
-        return Observation(WheelMeasurements(*found), wheel_radps, chassis_mps, stale_s)
+        rates = estimate.wheel_speed_mps / self._radius_m
+        speed_mps, accel_mps2, slip_ratio, slip_std = np.array(columns).T
+        measured = WheelMeasurements(speed_mps, accel_mps2, slip_ratio, slip_std, torque_nm)
+        return Observation(measured, rates, chassis_mps, stale_s)
 
-
-_V, _M = float64[::1], float64[:, ::1]
-
-
-@njit(
-    void(
-        *(_V, int64[::1], float64, float64, float64, float64, float64, _V, _V, _V, _V, _V, _V),
-        *(float64, float64, boolean, _M, _V),
-    ),
-    cache=True,
-    error_model="numpy",
-)
-def _observe_wheels(
-    mean: Array,
-    steer_states: Array,
-    speed_x_mps: float,
-    speed_y_mps: float,
-    yaw_rate_radps: float,
-    accel_x_mps2: float,
-    accel_y_mps2: float,
-    x_m: Array,
-    y_m: Array,
-    wheel_speed_mps: Array,
-    slip_ratio: Array,
-    slip_std: Array,
-    current_a: Array,
-    radius_m: float,
-    torque_per_amp_nm: float,
-    never_seen: bool,
-    found: Array,
-    wheel_radps: Array,
-) -> None:
-    """Write speed, acceleration, slip, its standard deviation and torque (5, wheels), and rates (wheels,)."""
-    for i in range(steer_states.size):
-        steer_rad = mean[steer_states[i]]
-        cos, sin = math.cos(steer_rad), math.sin(steer_rad)
-        forward, left = point_velocity(speed_x_mps, speed_y_mps, yaw_rate_radps, x_m[i], y_m[i])
-        speed, _ = in_wheel_frame(forward, left, cos, sin)
-        fastest = abs(speed)
-        if not abs(wheel_speed_mps[i]) <= fastest:  # NaN too
-            fastest = abs(wheel_speed_mps[i])
-        # a wheel stands by the filter's rate, which differs a little from the measured one
-        standing = fastest < (2.0 if math.isnan(slip_ratio[i]) else 1.0) * MIN_SPEED_MPS
-        found[0, i], found[1, i] = speed, accel_x_mps2 * cos + accel_y_mps2 * sin
-        found[2, i] = 0.0 if standing and not never_seen else slip_ratio[i]
-        found[3, i] = 0.0 if standing else slip_std[i]
-        found[4, i] = current_a[i] * torque_per_amp_nm
-        wheel_radps[i] = wheel_speed_mps[i] / radius_m
-
-
-_observe = entry_point(_observe_wheels)
 
 UNOBSERVED = Observation(
     WheelMeasurements(*np.full((5, 3), math.nan)), np.full(3, math.nan), math.nan, math.inf
@@ -249,7 +193,7 @@ class RampController:
             self._driven_mps, unknown, unknown, unknown, DriveState.STEADY, TractionStatus.OK
         )
 
-    def forget_terrain(self) -> None:
+    def reset_terrain(self) -> None:
         """Do nothing: nothing is learned."""
 
 
@@ -264,12 +208,12 @@ class TractionController:
 
     def __init__(self, robot: Robot, settings: TractionSettings) -> None:
         self._settings = with_motor_driver(check_settings(settings), robot)
-        self._radius_m, self._state = robot.wheel_radius_m, initial_state()
+        self._radius_m, self._state = robot.wheel_radius_m, TractionState()
 
     def step(self, request: WheelRequest) -> tuple[Array, WheelReport]:
         """Return the commanded rates (wheels,) and what was decided."""
         observed = request.observed
-        command, self._state, report = _traction_step(
+        command, self._state, report = traction_step(
             self._settings,
             self._state,
             request.target,
@@ -281,9 +225,9 @@ class TractionController:
         )
         return command, WheelReport(*report)
 
-    def forget_terrain(self) -> None:
+    def reset_terrain(self) -> None:
         """Drop the balance of steady motion and the floor of the target."""
-        self._state = forget_terrain(self._state)
+        self._state = self._state.on_other_terrain()
 
 
 class ThesisController:
@@ -292,20 +236,19 @@ class ThesisController:
     Parameters
     ----------
     robot : swerve robot
-    gains, form : as :func:`terrain.control.danzi_pid.thesis_settings`
+    gains : of :class:`terrain.control.danzi_pid.ThesisSettings`
     stale_max_s : an older speed over ground is not used
     """
 
-    def __init__(self, robot: Robot, gains: Gains, form: str, stale_max_s: float) -> None:
-        self._settings = thesis_settings(robot.wheel_radius_m, gains, form)
-        self._radius_m, self._stale_max_s, self._state = robot.wheel_radius_m, stale_max_s, new_state()
+    def __init__(self, robot: Robot, gains: Gains, stale_max_s: float) -> None:
+        self._settings = check_thesis(ThesisSettings(robot.wheel_radius_m, gains))
+        self._stale_max_s, self._state = stale_max_s, [WheelPid()] * len(robot.wheels)
 
     def step(self, request: WheelRequest) -> tuple[Array, WheelReport]:
         """Return the commanded rates (wheels,) and what was decided."""
         wheel, observed, dt_s = request.wheel_radps, request.observed, request.dt_s
-        targets = np.array([request.slip_targets[state].slip_ratio for state in DRIVE_STATES])
         stale = observed.stale_s > self._stale_max_s
-        added, desired, drive_state, _, self._state = thesis_step(
+        wheels, self._state = thesis_step(
             self._settings,
             self._state,
             wheel,
@@ -313,17 +256,18 @@ class ThesisController:
             UNOBSERVED.wheels.speed_mps if stale else observed.wheels.speed_mps,
             observed.wheels.accel_mps2,
             observed.chassis_mps,
-            targets,
+            [request.slip_targets[state].slip_ratio for state in DRIVE_STATES],
             dt_s,
         )
+        desired = np.array([one.desired_ratio for one in wheels])
         status = TractionStatus.OK if np.isfinite(desired).all() else TractionStatus.NO_SLIP
         if not 0.0 < dt_s <= MAX_STEP_S:
             status = TractionStatus.BAD_TIME
-        command = wheel + added
-        driven_mps = float(np.abs(command).max()) * self._radius_m
+        command = wheel + np.array([one.correction_radps for one in wheels])
+        driven_mps = float(np.abs(command).max()) * self._settings.wheel_radius_m
         slip = observed.wheels.slip_ratio
         aimed, largest = (float(np.where(wheel < 0.0, -s, s).max()) for s in (desired, slip))
-        return command, WheelReport(driven_mps, aimed, math.nan, largest, int(drive_state[0]), status)
+        return command, WheelReport(driven_mps, aimed, math.nan, largest, wheels[0].drive_state, status)
 
-    def forget_terrain(self) -> None:
+    def reset_terrain(self) -> None:
         """Do nothing: nothing of the terrain is learned."""

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 
 from pipelines.live.pilot import LivePilot
-from terrain.control.danzi_pid import new_state, thesis_settings, thesis_step
+from terrain.control.danzi_pid import ThesisSettings, WheelPid, thesis_step
 from terrain.control.pid import Gains
 from terrain.control.pilot_settings import PilotSettings
-from terrain.control.traction import SETTINGS, TractionTarget, WheelMeasurements, initial_state, traction_step
+from terrain.control.traction import SETTINGS, TractionState, TractionTarget, WheelMeasurements, traction_step
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 
 N_STEPS = 2000
-MOST_US = {"traction": 30.0, "thesis": 60.0}
-"""Of a step called from the interpreter, which is most of it: a thousandth of a period of 20 ms."""
-MOST_PILOT_US = 200.0
-"""Of a whole step of the chain: a hundredth of its period."""
+MOST_US = {"traction": 60.0, "thesis": 60.0}
+"""Of a step: three thousandths of a period of 20 ms."""
+MOST_PILOT_US = 300.0
+"""Of a whole step of the chain: a part in 70 of its period."""
 ROBOT = load_robot("agrimaro")
 GAINS = Gains(0.5, 0.5, 0.0, 2.0)
 DT_S = 0.02
@@ -39,7 +39,7 @@ def rows():
 
 
 def with_traction(desired, rate, ground, accel, slip, torque):
-    state, std, aim = initial_state(), np.full(3, 0.005), TractionTarget(0.1)
+    state, std, aim = TractionState(), np.full(3, 0.005), TractionTarget(0.1)
     for u, v, a, s, t in zip(desired, ground, accel, slip, torque, strict=True):
         wheels = WheelMeasurements(v, a, s, std, t)
         command, state, _ = traction_step(SETTINGS, state, aim, 0.2, u, wheels, 0.0, DT_S)
@@ -47,10 +47,10 @@ def with_traction(desired, rate, ground, accel, slip, torque):
 
 
 def with_thesis(desired, rate, ground, accel, slip, torque):
-    settings, state, targets = thesis_settings(0.2, GAINS), new_state(), np.array([0.1, -0.15, 0.05])
+    settings, states, targets = ThesisSettings(0.2, GAINS), [WheelPid()] * 3, (0.1, -0.15, 0.05)
     for u, w, v, a in zip(desired, rate, ground, accel, strict=True):
-        added, _, _, _, state = thesis_step(settings, state, u, w, v, a, float(v[0]), targets, DT_S)
-    return u + added
+        wheels, states = thesis_step(settings, states, u, w, v, a, float(v[0]), targets, DT_S)
+    return u + np.array([wheel.correction_radps for wheel in wheels])
 
 
 def with_python(desired, rate, ground, accel, slip, torque):

@@ -6,7 +6,6 @@ import time
 import numpy as np
 import pytest
 
-from terrain.control.tracked_speed import track_speed_params, track_speed_step
 from terrain.estimation.observers.tracked import tracked_observer
 from terrain.robots import load_robot
 
@@ -70,9 +69,3 @@ def test_a_step_and_its_reading(benchmark, run):
     np.testing.assert_allclose(benchmark(run, given), [1.1, 0.8], atol=0.02)
     if benchmark.stats and run is with_compiled_observer:  # absent where benchmarks are off
         assert benchmark.stats.stats.min / N_STEPS * 1e6 < MOST_US
-
-
-@pytest.mark.benchmark(group="one step of the compensation of slip", timer=time.process_time)
-def test_a_step_of_the_compensation(benchmark):
-    params, eta, std = track_speed_params(ROBOT), np.array([1.1, 0.8]), np.array([0.01, 0.01])
-    assert benchmark(track_speed_step, params, eta, 0.5, 0.1, eta, std, DT_S).status == 0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from terrain.control.actuation import N_KEPT, Actuation, actuation_memory, follow
+from terrain.control.actuation import Actuation
 from terrain.records import Reading
 
 PERIOD_S = 0.02
@@ -140,25 +140,3 @@ def test_nothing_is_off_without_a_command():
         reading = Reading(np.array([k * PERIOD_S]), np.full((1, 6), 50.0))
         actuation.measured(k * PERIOD_S, PERIOD_S, reading, np.ones(3))
     assert not actuation.off.any()
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_compiled_form_gives_what_its_plain_form_gives(seed):
-    """Over random commands, of which some are none, and measurements that are wrong."""
-    rng = np.random.default_rng(seed)
-    compiled, plain = ((*actuation_memory(), np.zeros(6, dtype=np.bool_)) for _ in range(2))
-    time_s, n_off, command = 0.0, 0, np.zeros(6)
-    for k in range(300):
-        step_s = float(rng.choice([PERIOD_S, PERIOD_S, 0.1, 1e-6]))
-        time_s += step_s
-        if rng.random() < 0.05:
-            command = np.where(rng.random(6) < 0.1, math.nan, rng.uniform(-1.0, 1.0, 6))
-        measured = command + rng.choice([0.0, 0.05, 0.5], 6) * (k // 20 % 2)
-        measured[rng.random(6) < 0.05] = rng.choice([math.nan, 1e6, -3.0])
-        rates = measured[:3] / 0.01
-        for using, (kept, lasting, off) in ((follow, compiled), (follow.py_func, plain)):
-            using(time_s, step_s, k % N_KEPT, command, rates, 0.01, measured[3:], kept, lasting, off)
-        np.testing.assert_array_equal(compiled[2], plain[2])
-        np.testing.assert_allclose(compiled[1], plain[1], rtol=1e-12, equal_nan=True)
-        n_off += int(compiled[2].sum())
-    assert 0 < n_off < 6 * 300

@@ -11,9 +11,9 @@ from terrain.control.drive_metrics import distance_within, drive_history, final_
 from terrain.control.path_tracking import SETTINGS as TRACKING
 from terrain.control.path_tracking import (
     PoseEstimate,
+    TrackState,
     TrackStatus,
     check_tracking,
-    initial_tracking,
     track_step,
 )
 from terrain.control.pilot_settings import OPEN_LOOP
@@ -145,7 +145,7 @@ def off_the_path(scenario, terrain, seed, duration_s):
     pose = at(truth.time_s, [truth.channel(name) for name in ("position_x_m", "position_y_m", "yaw_rad")])
     ground = at(truth.time_s, [truth.channel(name) for name in TWIST])
     desired = at(situation.scenario.time_s, situation.scenario.twist.T)
-    settings, state, off_m = check_tracking(ROBOT, TRACKING, DELAY_S), initial_tracking(), []
+    settings, state, off_m = check_tracking(ROBOT, TRACKING, DELAY_S), TrackState(), []
     for place, twist, motion in zip(pose, desired, ground, strict=True):
         seen = PoseEstimate(*map(float, place), yaw_std_rad=0.0, stale_s=0.0)
         _, state, report = track_step(settings, state, twist.copy(), seen, motion.copy(), 0.02)

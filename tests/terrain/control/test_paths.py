@@ -5,76 +5,66 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrain.control.paths import (
-    CURVATURE,
-    HEADING,
-    PathStatus,
-    S,
-    X,
-    Y,
-    locate,
-    path_from_curvature,
-    path_from_points,
-    path_warnings,
-)
-from terrain.errors import DataError
+from terrain.control.paths import PathStatus, path_from_curvature, path_from_points, path_warnings, read_path
+from terrain.errors import DataError, TerrainError
 from terrain.robots import load_robot
 
 ARC = path_from_curvature(np.array([0.0, 10.0, 14.0, 30.0]), np.array([0.0, 0.0, 0.1, 0.1]))
 
 
+def points_of(path):
+    return np.column_stack([path.x_m, path.y_m])
+
+
 @pytest.mark.parametrize("spacing", [4, 20])
 def test_a_path_comes_back_from_its_points(spacing):
-    again = path_from_points(ARC.rows[::spacing, [X, Y]])
-    n = min(len(again.rows), len(ARC.rows)) - 20
-    assert again.rows[:n, [X, Y]] == pytest.approx(ARC.rows[:n, [X, Y]], abs=0.01)
-    inner = slice(40, n)
-    assert again.rows[inner, CURVATURE] == pytest.approx(ARC.rows[inner, CURVATURE], abs=0.01)
+    again = path_from_points(points_of(ARC)[::spacing])
+    n = min(len(again.x_m), len(ARC.x_m)) - 20
+    assert points_of(again)[:n] == pytest.approx(points_of(ARC)[:n], abs=0.01)
+    assert again.curvature_pm[40:n] == pytest.approx(ARC.curvature_pm[40:n], abs=0.01)
 
 
 def test_noise_of_driven_points_does_not_become_curvature():
-    rng, points = np.random.default_rng(2), ARC.rows[::10, [X, Y]]
+    rng, points = np.random.default_rng(2), points_of(ARC)[::10]
     noisy = path_from_points(points + rng.normal(0.0, 0.02, points.shape), std_m=0.02)
-    n = min(len(noisy.rows), len(ARC.rows)) - 40
-    assert noisy.rows[40:n, CURVATURE] == pytest.approx(ARC.rows[40:n, CURVATURE], abs=0.05)
-    assert noisy.rows[:n, [X, Y]] == pytest.approx(ARC.rows[:n, [X, Y]], abs=0.06)
+    n = min(len(noisy.x_m), len(ARC.x_m)) - 40
+    assert noisy.curvature_pm[40:n] == pytest.approx(ARC.curvature_pm[40:n], abs=0.05)
+    assert points_of(noisy)[:n] == pytest.approx(points_of(ARC)[:n], abs=0.06)
 
 
 def test_place_is_the_one_on_exact_arcs():
     for s in (3.0, 12.0, 20.0, 27.3):
-        row = ARC.rows[round(s / 0.05)]
+        i = round(s / 0.05)
+        heading = ARC.heading_rad[i]
         for lateral in (-1.0, 0.3, 2.0):
-            x = row[X] - lateral * np.sin(row[HEADING])
-            y = row[Y] + lateral * np.cos(row[HEADING])
-            found = locate(ARC.rows, x, y, row[HEADING] + 0.1, np.nan)
-            assert found[:4] == pytest.approx((row[S], lateral, 0.1, row[CURVATURE]), abs=0.01)
-            assert found[4] == PathStatus.OK
+            x, y = ARC.x_m[i] - lateral * np.sin(heading), ARC.y_m[i] + lateral * np.cos(heading)
+            found = ARC.locate(x, y, heading + 0.1)
+            assert found[:4] == pytest.approx((s, lateral, 0.1, ARC.curvature_pm[i]), abs=0.01)
+            assert found.status == PathStatus.OK
 
 
 def test_search_is_local_and_does_not_go_back():
     loop = path_from_curvature(np.array([0.0, 100.0]), np.array([0.1, 0.1]))  # passes each point 1.6 times
     s, found = np.nan, []
-    for row in loop.rows[:1900:7]:
-        s = locate(loop.rows, row[X] + 0.02, row[Y], row[HEADING], s)[0]
+    for i in range(0, 1900, 7):
+        s = loop.locate(loop.x_m[i] + 0.02, loop.y_m[i], loop.heading_rad[i], s).distance_m
         found.append(s)
-    assert found == pytest.approx(loop.rows[:1900:7, S], abs=0.06)
-    assert locate(loop.rows, loop.rows[600, X], loop.rows[600, Y], 0.0, 35.0)[0] == 35.0
+    assert found == pytest.approx(loop.distance_m[:1900:7], abs=0.06)
+    assert loop.locate(loop.x_m[600], loop.y_m[600], 0.0, 35.0).distance_m == 35.0
 
 
 def test_statuses_of_places():
-    rows = ARC.rows
-    heading, end = rows[-1, HEADING], rows[-1, [X, Y]]
+    heading, end = ARC.heading_rad[-1], points_of(ARC)[-1]
     beyond = end + 0.5 * np.array([np.cos(heading), np.sin(heading)])
-    assert locate(rows, *beyond, heading, 29.0)[4] == PathStatus.END
-    assert locate(rows, 3.0, 9.0, 0.0, 3.0)[4] == PathStatus.FAR
-    centre = rows[-1, [X, Y]] + 10.0 * np.array([-np.sin(heading), np.cos(heading)])
-    found = locate(path_from_curvature(np.array([0.0, 9.0]), np.array([0.3, 0.3])).rows, 0.0, 3.2, 0.0, 0.0)
-    assert found[4] == PathStatus.SINGULAR
+    assert ARC.locate(*beyond, heading, 29.0).status == PathStatus.END
+    assert ARC.locate(3.0, 9.0, 0.0, 3.0).status == PathStatus.FAR
+    centre = end + 10.0 * np.array([-np.sin(heading), np.cos(heading)])
+    found = path_from_curvature(np.array([0.0, 9.0]), np.array([0.3, 0.3])).locate(0.0, 3.2, 0.0, 0.0)
+    assert found.status == PathStatus.SINGULAR
     assert np.isfinite(found[:4]).all()
-    assert np.isfinite(locate(rows, *centre, 0.0, np.nan)[:4]).all()
-    lost = locate(rows, np.nan, 0.0, 0.0, 12.0)
-    assert lost[0] == 12.0
-    assert lost[4] == PathStatus.NO_POSE
+    assert np.isfinite(ARC.locate(*centre, 0.0)[:4]).all()
+    lost = ARC.locate(np.nan, 0.0, 0.0, 12.0)
+    assert (lost.distance_m, lost.status) == (12.0, PathStatus.NO_POSE)
 
 
 @pytest.mark.parametrize(
@@ -108,3 +98,46 @@ def test_repeated_points_are_merged_and_curvature_beyond_the_steering_is_named()
     assert "curvature is" in warnings[0]
     assert warnings[1].startswith("50 points")
     assert path_warnings(ARC, load_robot("adap2e")) == ()
+
+
+def bend(n=80, radius=12.0):
+    angle = np.linspace(0.0, 2.0, n)
+    return radius * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
+
+
+def test_roll_of_a_file_is_that_of_the_path(tmp_path):
+    file = tmp_path / "rolled.csv"
+    points = bend()
+    rows = np.column_stack([points, np.linspace(0.0, 0.2, len(points))])
+    np.savetxt(file, rows, delimiter=",", header="position_x_m,position_y_m,roll_rad", comments="")
+    path = read_path(file)
+    assert path.roll_rad[[0, -1]] == pytest.approx([0.0, 0.2], abs=0.005)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is empty"),
+        ("a,b\n1,2\n", "columns x_m and y_m"),
+        ("x_m,y_m\n0,0\n1,two\n", "row 3 has 'two'"),
+        ("x_m,y_m\n0,0\n1\n", "row 3 has 'nothing'"),
+        ("x_m,y_m\n0,0\n1,nan\n2,0\n3,0\n", "point 2"),
+        ("x_m,y_m\n0,0\n1,0\n", "2 different points"),
+        ("5\n6\n", "two columns"),
+        ("x_m,y_m,roll_rad\n0,0,0\n1,0,3\n2,0,0\n3,0,0\n", "roll_rad is beyond"),
+    ],
+)
+def test_a_file_that_is_no_path_is_one_sentence(tmp_path, text, message):
+    file = tmp_path / "path.csv"
+    file.write_text(text, encoding="utf-8")
+    with pytest.raises(TerrainError, match=message) as refused:
+        read_path(file)
+    assert str(file) in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_bytes_and_folders_are_no_path(tmp_path):
+    (tmp_path / "noise.csv").write_bytes(b"\xff\xfe\x00\x9f")
+    for place in (tmp_path, tmp_path / "noise.csv", tmp_path / "none.csv"):
+        with pytest.raises(TerrainError, match="cannot be read"):
+            read_path(place)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.danzi_pid import FORMS, new_state, thesis_settings, thesis_step
+from terrain.control.danzi_pid import ThesisSettings, WheelPid, thesis_step
 from terrain.control.pid import Gains, PidState, check_gains, pid_step
 from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrix, spectral_radius
 from terrain.errors import ConfigError
@@ -25,18 +25,18 @@ LOAD_N = ROBOT.mass_kg / 3 * GRAVITY_MPS2
 MOST_RADPS = 1e300
 
 
-def critical_gain(form, delay_s, *where, robot=ROBOT):
+def critical_gain(delay_s, *where):
     """The proportional gain from which on the loop is unstable, by halving."""
     low, high = 1e-3, 1e3
     while high / low > 1.0001:
         middle = math.sqrt(low * high)
         gains = Gains(middle, 0.0, 0.0, 1.0)
-        stable = spectral_radius(loop_matrix(robot, gains, form, delay_s, *where)) < 1
+        stable = spectral_radius(loop_matrix(ROBOT, gains, delay_s, *where)) < 1
         low, high = (middle, high) if stable else (low, middle)
     return low
 
 
-def small_changes(gains, form, n_delayed, speed_mps, slip_ratio, slope_ratio, n_samples):
+def small_changes(gains, n_delayed, speed_mps, slip_ratio, slope_ratio, n_samples):
     """Slip (n,) as seen at each sample after a change of the rate: the same loop by ``pid_step`` and Heun."""
     body, motors, sensors = ROBOT.body, ROBOT.motors, ROBOT.sensors
 
@@ -66,7 +66,7 @@ def small_changes(gains, form, n_delayed, speed_mps, slip_ratio, slope_ratio, n_
     x, pid, queue, found = np.array([0.01, 0, 0, 0, 0, 0, 0.0]), PidState(0.0, 0.0), [0.0] * n_delayed, []
     steps = 40
     for _ in range(n_samples):
-        error = -x[6] * (speed_mps / RADIUS_M if form == "normalised" else 1.0)
+        error = -x[6] * speed_mps / RADIUS_M
         output, pid, _ = pid_step(gains, pid, float(error), DT_S)
         queue.append(output)
         u = queue.pop(0)
@@ -78,20 +78,19 @@ def small_changes(gains, form, n_delayed, speed_mps, slip_ratio, slope_ratio, n_
 
 
 @pytest.mark.parametrize(
-    ("numbers", "form", "n_delayed", "where"),
+    ("numbers", "n_delayed", "where"),
     [
-        ((3.5, 1.0, 0.0, 0.0), "normalised", 3, (1.0, 0.13, 0.6)),
-        ((2.0, 0.5, 0.0, 0.0), "normalised", 2, (0.2, -0.2, 0.1)),
-        ((1.5, 0.0, 0.02, 0.1), "printed", 0, (0.05, 0.2, 0.3)),
-        ((0.3, 2.0, 0.0, 0.0), "printed", 3, (0.05, -0.1, 1.0)),
-        ((2.0, 2.0, 0.05, 0.05), "printed", 1, (0.1, 0.2, 3.0)),
+        ((3.5, 1.0, 0.0, 0.0), 3, (1.0, 0.13, 0.6)),
+        ((2.0, 0.5, 0.0, 0.0), 2, (0.2, -0.2, 0.1)),
+        ((6.0, 0.0, 0.08, 0.1), 0, (0.05, 0.2, 0.3)),
+        ((4.0, 4.0, 0.1, 0.05), 1, (0.1, 0.2, 3.0)),
     ],
 )
-def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, form, n_delayed, where):
+def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, n_delayed, where):
     kp, ki, kd, tau_s = numbers
     gains = check_gains(Gains(kp, ki, kd, MOST_RADPS, derivative_time_constant_s=tau_s))
-    matrix = loop_matrix(ROBOT, gains, form, n_delayed * DT_S, *where)
-    slip = np.abs(small_changes(gains, form, n_delayed, *where, 500))
+    matrix = loop_matrix(ROBOT, gains, n_delayed * DT_S, *where)
+    slip = np.abs(small_changes(gains, n_delayed, *where, 500))
     early, late = slip[150:250].max(), slip[400:500].max()  # a hundred samples hold a whole swing
     assert (late / early) ** (1 / 250) == pytest.approx(spectral_radius(matrix), rel=2e-3)
 
@@ -99,23 +98,15 @@ def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, form,
 def on_grass(settings, target, wheel_speed_mps, n_delayed, duration_s=14.0):
     """Slip at each sample; from 3 s on under control, at 5 s a kick. Truth behind the encoders' low-pass."""
     plant, profile = make_plant(ROBOT, Conditions()), uniform_profile(ROBOT, load_soil("grass"))
-    state, memory, record = start_state(np.zeros(3)), new_state(), np.zeros(20, BODY_ROW)
+    state, memory, record = start_state(np.zeros(3)), [WheelPid()] * 3, np.zeros(20, BODY_ROW)
     queue, found = [np.zeros(3)] * n_delayed, []
     rate, speed, share = np.zeros(3), 0.0, 0.001 / ROBOT.sensors.encoder_time_constant_s
     for k in range(round(duration_s / DT_S)):
         command, added = np.full(3, min(k * DT_S, 1.0) * wheel_speed_mps / RADIUS_M), np.zeros(3)
         if k >= 150:
-            added, *_, memory = thesis_step(
-                settings,
-                memory,
-                command,
-                rate,
-                np.full(3, speed),
-                np.zeros(3),
-                speed,
-                np.full(3, target),
-                DT_S,
-            )
+            seen = rate, np.full(3, speed), np.zeros(3), speed
+            wheels, memory = thesis_step(settings, memory, command, *seen, [target] * 3, DT_S)
+            added = np.array([wheel.correction_radps for wheel in wheels])
         queue.append(added + (0.2 * command if 250 <= k < 255 else 0.0))
         sent = (command + queue.pop(0))[None]
         advance(plant, profile, state, sent, np.zeros((1, 3)), 20, np.zeros((20, 3)), record)
@@ -126,20 +117,16 @@ def on_grass(settings, target, wheel_speed_mps, n_delayed, duration_s=14.0):
     return np.array(found)
 
 
-@pytest.mark.parametrize(
-    ("form", "wheel_speed_mps"), [("printed", 0.1), ("printed", 0.5), ("normalised", 1.0)]
-)
-def test_the_full_robot_on_grass_settles_below_the_critical_gain_and_oscillates_above_it(
-    form, wheel_speed_mps
-):
+@pytest.mark.parametrize("wheel_speed_mps", [0.5, 1.0])
+def test_the_full_robot_on_grass_settles_below_the_critical_gain_and_oscillates_above_it(wheel_speed_mps):
     soil, aside = load_soil("grass"), 1e-4
     balance = equilibrium_slip(soil, LOAD_N, 0.0, *GEOMETRY)
     below, above = net_pull(soil, LOAD_N, np.array([balance - aside, balance + aside]), *GEOMETRY)
     slope = (above - below) / (2 * aside) / LOAD_N
-    gain = critical_gain(form, 3 * DT_S, wheel_speed_mps, balance, slope)
+    gain = critical_gain(3 * DT_S, wheel_speed_mps, balance, slope)
     settled, swinging = (
         on_grass(
-            thesis_settings(RADIUS_M, Gains(factor * gain, 0.0, 0.0, 2 * wheel_speed_mps / RADIUS_M), form),
+            ThesisSettings(RADIUS_M, Gains(factor * gain, 0.0, 0.0, 2 * wheel_speed_mps / RADIUS_M)),
             balance,
             wheel_speed_mps,
             3,
@@ -151,18 +138,14 @@ def test_the_full_robot_on_grass_settles_below_the_critical_gain_and_oscillates_
     assert np.ptp(swinging) > 0.5
 
 
-def test_the_printed_form_loses_its_margin_with_speed_and_the_normalised_one_does_not():
-    """The figures in the module's docstring."""
-    least = {
-        (form, speed): min(critical_gain(form, DELAY_S, speed, -0.2, slope) for slope in SLOPES)
-        for form in FORMS
-        for speed in (0.05, 0.5, 2.0)
-    }
-    printed, normalised = ([least[form, speed] for speed in (0.05, 0.5, 2.0)] for form in FORMS)
-    assert printed == pytest.approx([0.38, 3.8, 15.3], rel=0.02)
-    assert normalised == pytest.approx([1.53] * 3, rel=0.02)
-    margin = check_stable(ROBOT, Gains(0.19, 0.0, 0.0, 5.0), "printed").gain_margin_ratio
-    assert margin == pytest.approx(least["printed", 0.05] / 0.19, rel=0.01)
+def test_the_margin_is_the_same_at_any_speed():
+    """The figure in the module's docstring; that of the printed form is this times V / r."""
+    speeds = (0.05, 0.5, 2.0)
+    least = [min(critical_gain(DELAY_S, speed, -0.2, slope) for slope in SLOPES) for speed in speeds]
+    assert least == pytest.approx([1.53] * 3, rel=0.02)
+    assert np.multiply(least, speeds) / RADIUS_M == pytest.approx([0.38, 3.8, 15.3], rel=0.02)
+    margin = check_stable(ROBOT, Gains(0.19, 0.0, 0.0, 5.0)).gain_margin_ratio
+    assert margin == pytest.approx(min(least) / 0.19, rel=0.01)
 
 
 def test_margins_shrink_with_gain_delay_and_sample_time():
@@ -174,7 +157,6 @@ def test_margins_shrink_with_gain_delay_and_sample_time():
     by_delay = [margin(delay_s=delay_s) for delay_s in (0.0, 0.05, 0.15)]
     assert by_delay == sorted(by_delay, reverse=True)
     assert margin(delay_s=0.0, dt_s=0.05) < margin(delay_s=0.0)
-    assert margin(form="printed", low_speed_mps=0.1) == pytest.approx(2 * margin(form="printed"), rel=0.02)
 
 
 def test_the_loop_is_stable_without_gains():
@@ -190,12 +172,7 @@ def test_the_loop_is_stable_without_gains():
             {"gains": Gains(2.0, 0.0, 0.0, 5.0)},
             r"unstable from 0\.05 to 2 m/s; it is stable up to 0\.76 times",
         ),
-        (
-            {"form": "printed"},
-            r"^robot agrimaro: slip control \(printed, kp 1, .* unstable from 0\.05 to 0\.1",
-        ),
         ({"gains": Gains(-1.0, 0.0, 0.0, 5.0)}, "^gain kp is -1"),
-        ({"form": "new"}, "^form 'new' is unknown: use one of printed, normalised"),
         ({"delay_s": math.nan}, "^delay_s is nan, 0 to 1 s is required"),
         ({"delay_s": -0.1}, "^delay_s is -0.1"),
         ({"dt_s": 0.0}, "^dt_s is 0.0"),

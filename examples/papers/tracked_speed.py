@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
 
 from terrain.errors import ConfigError
 from terrain.records import Array
@@ -65,51 +64,51 @@ class TrackSpeedCommand(NamedTuple):
     ----------
     left_mps, right_mps : circumferential speeds
     eta : (2,) of the left and the right track; the next step takes it
-    status : number of a :class:`TrackSpeedStatus`
+    status : whether the speeds are held
     """
 
     left_mps: float
     right_mps: float
     eta: Array
-    status: int
+    status: TrackSpeedStatus
 
 
 _FASTEST = 1e6  # in m/s and rad/s, of what can be desired
 _LONGEST_S = 0.5  # a longer step changes the efficiency by no more than this one
-_F8, _ROW = types.float64, types.Array(types.float64, 1, "A", readonly=True)
-_COMMAND = types.NamedTuple((_F8, _F8, _F8[::1], types.int64), TrackSpeedCommand)
-
-DEFAULT_SETTINGS = TrackSpeedSettings()
 
 
-def track_speed_params(robot: TrackedRobot, settings: TrackSpeedSettings = DEFAULT_SETTINGS) -> Array:
-    """Return the parameters (5,) of :func:`track_speed_step`.
+def check_track_speed(settings: TrackSpeedSettings) -> TrackSpeedSettings:
+    """Return settings that can be used.
 
     Raises
     ------
     ConfigError
         if a limit is not above zero and finite, or the floor above 1.
     """
-    limits = asdict(settings)
-    for name, value in limits.items():
+    for name, value in asdict(settings).items():
         if not 0 < value < math.inf:
             raise ConfigError(f"{name} is {value:g}, a finite number above zero is required")
     if settings.eta_floor_ratio > 1:
         raise ConfigError(f"eta_floor_ratio is {settings.eta_floor_ratio:g}, at most 1 is accepted")
-    return np.array([*limits.values(), robot.half_track_m])
+    return settings
 
 
-@njit(_COMMAND(_ROW, _ROW, _F8, _F8, _ROW, _ROW, _F8), cache=True)
 def track_speed_step(
-    params: Array, eta_used: Array, forward_mps: float, turn_radps: float, eta: Array, std: Array, dt_s: float
+    robot: TrackedRobot,
+    settings: TrackSpeedSettings,
+    eta_used: Array,
+    desired: tuple[float, float],
+    eta: Array,
+    std: Array,
+    dt_s: float,
 ) -> TrackSpeedCommand:
-    """Return the speeds of the tracks that give the desired motion; compiled, its arguments are not changed.
+    """Return the speeds of the tracks that give the desired motion.
 
     Parameters
     ----------
-    params : of :func:`track_speed_params`
+    robot, settings : whose tracks; accepted ones
     eta_used : (2,) what was compensated in the step before; ones at first
-    forward_mps, turn_radps : desired V and Omega
+    desired : V in m/s and Omega in rad/s
     eta, std : (2,) estimated efficiencies of the left and the right track, and their standard deviations; NaN
         where there is no estimate
     dt_s : since the step before
@@ -117,37 +116,32 @@ def track_speed_step(
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> params, eta = track_speed_params(load_robot("orchard_ugv")), np.array([1.1, 0.8])
-    >>> command = track_speed_step(params, eta, 0.5, 0.1, eta, np.array([0.0, 0.0]), 0.02)
-    >>> round(command.left_mps, 4), round(command.right_mps, 4), TrackSpeedStatus(command.status).name
+    >>> robot, eta = load_robot("orchard_ugv"), np.array([1.1, 0.8])
+    >>> command = track_speed_step(robot, TrackSpeedSettings(), eta, (0.5, 0.1), eta, np.zeros(2), 0.02)
+    >>> round(command.left_mps, 4), round(command.right_mps, 4), command.status.name
     (0.4091, 0.6875, 'OK')
     """
-    used = np.empty(2)
-    used[0], used[1] = eta_used[0], eta_used[1]
-    desired = abs(forward_mps) <= _FASTEST and abs(turn_radps) <= _FASTEST
-    if not (desired and 0.0 <= dt_s < math.inf):
-        return TrackSpeedCommand(0.0, 0.0, used, TrackSpeedStatus.BAD_INPUT.value)
-    most, floor, spread, half_track = params[0], params[1], params[2], params[4]
-    change = params[3] * min(dt_s, _LONGEST_S)
-    status = TrackSpeedStatus.OK.value
-    for j in range(2):
+    forward, turn = desired
+    used = eta_used.tolist()
+    if not (abs(forward) <= _FASTEST and abs(turn) <= _FASTEST and 0.0 <= dt_s < math.inf):
+        return TrackSpeedCommand(0.0, 0.0, np.array(used), TrackSpeedStatus.BAD_INPUT)
+    change = settings.eta_rate_ps * min(dt_s, _LONGEST_S)
+    status = TrackSpeedStatus.OK
+    for j, (known, uncertain) in enumerate(zip(eta.tolist(), std.tolist(), strict=True)):
         aim = 1.0
-        if math.isfinite(eta[j]) and 0.0 <= std[j] < math.inf:
-            aim += (eta[j] - 1.0) / (1.0 + (std[j] / spread) ** 2)
-            if aim < floor and status != TrackSpeedStatus.UNESTIMATED.value:
-                status = TrackSpeedStatus.FLOORED.value
+        if math.isfinite(known) and 0.0 <= uncertain < math.inf:
+            share = uncertain / settings.eta_spread_ratio
+            aim += (known - 1.0) / (1.0 + share * share)
+            if aim < settings.eta_floor_ratio and status is not TrackSpeedStatus.UNESTIMATED:
+                status = TrackSpeedStatus.FLOORED
         else:
-            status = TrackSpeedStatus.UNESTIMATED.value
-        if not floor <= used[j] < math.inf:
+            status = TrackSpeedStatus.UNESTIMATED
+        if not settings.eta_floor_ratio <= used[j] < math.inf:
             used[j] = 1.0
-        used[j] += min(max(max(aim, floor) - used[j], -change), change)
-    left = (forward_mps - half_track * turn_radps) / used[0]
-    right = (forward_mps + half_track * turn_radps) / used[1]
-    fastest = max(abs(left), abs(right))
+        used[j] += min(max(max(aim, settings.eta_floor_ratio) - used[j], -change), change)
+    left = (forward - robot.half_track_m * turn) / used[0]
+    right = (forward + robot.half_track_m * turn) / used[1]
+    fastest, most = max(abs(left), abs(right)), settings.track_speed_max_mps
     if fastest > most:
-        left, right, status = (
-            left * (most / fastest),
-            right * (most / fastest),
-            TrackSpeedStatus.SATURATED.value,
-        )
-    return TrackSpeedCommand(left, right, used, status)
+        left, right, status = left * (most / fastest), right * (most / fastest), TrackSpeedStatus.SATURATED
+    return TrackSpeedCommand(left, right, np.array(used), status)

@@ -1,17 +1,22 @@
 """Compensation of slip: with the observer in the loop the desired speeds are held."""
 
 import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from terrain.control.tracked_speed import (
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
+
+from tracked_speed import (
     TrackSpeedSettings,
     TrackSpeedStatus,
-    track_speed_params,
+    check_track_speed,
     track_speed_step,
 )
+
 from terrain.errors import ConfigError
 from terrain.estimation.observers.tracked import tracked_observer
 from terrain.estimation.observers.tracked_settings import TrackedSettings
@@ -19,14 +24,13 @@ from terrain.robots import load_robot
 
 ROBOT = load_robot("orchard_ugv")
 D, DT_S = ROBOT.half_track_m, 0.02
-PARAMS = track_speed_params(ROBOT)
+SETTINGS = TrackSpeedSettings()
 ONES, NONE = np.ones(2), np.zeros(2)
 
 
-def command(eta, std=NONE, forward=0.5, turn=0.1, used=None, dt_s=DT_S, params=PARAMS):
-    return track_speed_step(
-        params, np.array(eta if used is None else used), forward, turn, np.array(eta), std, dt_s
-    )
+def command(eta, std=NONE, forward=0.5, turn=0.1, used=None, dt_s=DT_S, settings=SETTINGS):
+    used = np.array(eta if used is None else used)
+    return track_speed_step(ROBOT, settings, used, (forward, turn), np.array(eta), std, dt_s)
 
 
 def closed_loop(true_eta, compensate, seed=0, forward=0.5, turn=0.1, lag_s=0.1):
@@ -40,7 +44,7 @@ def closed_loop(true_eta, compensate, seed=0, forward=0.5, turn=0.1, lag_s=0.1):
     for k, eta in enumerate(true_eta):
         reading = observer.read(observer.params, memory)
         known = (reading.mean[5:7], reading.std[5:7]) if compensate else (ONES, NONE)
-        asked = track_speed_step(PARAMS, used, forward, turn, *known, DT_S)
+        asked = track_speed_step(ROBOT, SETTINGS, used, (forward, turn), *known, DT_S)
         used = asked.eta
         ground = eta * tracks
         speed, rate = ground.mean(), (ground[1] - ground[0]) / (2 * D)
@@ -94,10 +98,10 @@ def test_too_fast_a_motion_keeps_its_curvature():
 
 def test_an_estimate_is_used_as_far_as_it_is_known():
     settled = {"dt_s": 0.5, "used": [0.8, 0.8]}
-    slow = track_speed_params(ROBOT, replace(TrackSpeedSettings(), eta_rate_ps=10.0))
-    used = [command([0.8, 0.8], np.full(2, std), params=slow, **settled).eta[0] for std in (0.0, 0.2, 1e3)]
+    slow = replace(SETTINGS, eta_rate_ps=10.0)
+    used = [command([0.8, 0.8], np.full(2, std), settings=slow, **settled).eta[0] for std in (0.0, 0.2, 1e3)]
     np.testing.assert_allclose(used, [0.8, 0.9, 1.0], atol=1e-6)
-    unknown = command([np.nan, 0.8], params=slow, **settled)
+    unknown = command([np.nan, 0.8], settings=slow, **settled)
     assert unknown.eta[0] == 1.0
     assert unknown.status == TrackSpeedStatus.UNESTIMATED
 
@@ -122,6 +126,6 @@ def test_whatever_comes_in_the_speeds_are_finite_and_within_limits():
 
 def test_settings_that_cannot_be():
     with pytest.raises(ConfigError, match="eta_rate_ps is 0"):
-        track_speed_params(ROBOT, TrackSpeedSettings(eta_rate_ps=0.0))
+        check_track_speed(TrackSpeedSettings(eta_rate_ps=0.0))
     with pytest.raises(ConfigError, match="at most 1"):
-        track_speed_params(ROBOT, TrackSpeedSettings(eta_floor_ratio=1.5))
+        check_track_speed(TrackSpeedSettings(eta_floor_ratio=1.5))

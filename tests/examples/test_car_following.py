@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import functools
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from terrain.control.car_following import LOST_STOP_S, CarFollower, SlipSource
-from terrain.control.car_scenarios import STOP, Course, slope_course, stop_course
-from terrain.control.grip_preview import GRIP, VARIANCE, GripSettings, grip_params, grip_step, preview_speed
-from terrain.control.paths import locate, path_from_curvature
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
+
+from car_scenarios import STOP, Course, slope_course, stop_course
+
+from terrain.control.car_following import (
+    LOST_STOP_S,
+    CarFollower,
+    GripSettings,
+    SlipSource,
+    first_grip,
+    grip_step,
+    preview_speed,
+)
+from terrain.control.paths import path_from_curvature
+from terrain.control.steering_law import SteeringSettings
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.simulation.bicycle.plant import Ground, level_ground, side_force
@@ -18,6 +31,7 @@ from terrain.simulation.bicycle.simulate import simulate_car
 
 ROBOT = load_robot("adap2e")
 SEEDS = (0, 1, 2)
+SETTINGS = GripSettings()
 
 
 def lateral_errors(run, path):
@@ -25,7 +39,7 @@ def lateral_errors(run, path):
     truth, s, found = run.streams["truth"], np.nan, []
     pose = np.column_stack([truth.channel(name) for name in ("position_x_m", "position_y_m", "yaw_rad")])
     for row in pose[::2]:
-        s, lateral, *_ = locate(path.rows, *row, s)
+        s, lateral, *_ = path.locate(*row, s)
         found.append((s, lateral))
     return np.array(found)
 
@@ -82,39 +96,38 @@ def test_preview_slows_down_before_the_bend_and_knows_the_grip():
     assert abs(last.grip_ratio - 0.7) < 3 * last.grip_std
 
 
-@pytest.mark.parametrize("grip", [0.35, 0.6, 0.8])
-def test_grip_comes_back_within_its_error(grip):
+@pytest.mark.parametrize("true_grip", [0.35, 0.6, 0.8])
+def test_grip_comes_back_within_its_error(true_grip):
     """Forces of the tyre over a sweep of slip that reaches nine tenths of the grip, b with noise."""
     rng = np.random.default_rng(4)
-    params, memory = grip_params(ROBOT, GripSettings())
+    grip = first_grip(SETTINGS)
     load = ROBOT.mass_kg * 9.80665 / 2
     for k in range(1500):
         slip = -0.16 * abs(np.sin(k / 100))
-        force = 2.0 * side_force(slip, ROBOT.front_cornering_npr, grip * load) / ROBOT.mass_kg
+        force = 2.0 * side_force(slip, ROBOT.front_cornering_npr, true_grip * load) / ROBOT.mass_kg
         seen = slip + rng.normal(0.0, 0.01, 2)
-        memory = grip_step(params, memory, force, seen, np.full(2, 0.01), 0.02)
-    assert abs(memory[GRIP] - grip) < 3 * np.sqrt(memory[VARIANCE])
-    assert np.sqrt(memory[VARIANCE]) < 0.1
+        grip = grip_step(ROBOT, SETTINGS, grip, force, seen, np.full(2, 0.01), 0.02)
+    assert abs(grip.ratio - true_grip) < 3 * np.sqrt(grip.variance)
+    assert np.sqrt(grip.variance) < 0.1
 
 
 def test_grip_stays_as_assumed_while_little_of_it_is_used_or_nothing_is_known():
-    params, memory = grip_params(ROBOT, GripSettings())
+    grip = first_grip(SETTINGS)
     for force, slip in ((0.5, -0.01), (np.nan, -0.1), (4.0, np.nan), (4.0, 0.1)):
-        after = grip_step(params, memory, force, np.full(2, slip), np.full(2, 0.01), 0.02)
-        assert after[GRIP] == memory[GRIP]
-        assert after[VARIANCE] >= memory[VARIANCE]
+        after = grip_step(ROBOT, SETTINGS, grip, force, np.full(2, slip), np.full(2, 0.01), 0.02)
+        assert after.ratio == grip.ratio
+        assert after.variance >= grip.variance
     for dt_s in (0.0, np.nan, -1.0, 1e9):
-        after = grip_step(params, memory, 4.0, np.full(2, -0.1), np.full(2, 0.01), dt_s)
-        assert (after == memory).all()
+        assert grip_step(ROBOT, SETTINGS, grip, 4.0, np.full(2, -0.1), np.full(2, 0.01), dt_s) == grip
 
 
 def test_allowed_speed_falls_with_slope_uphill_and_is_free_on_the_straight():
-    params, memory = grip_params(ROBOT, GripSettings())
-    bend = path_from_curvature(np.array([0.0, 40.0]), np.array([0.1, 0.1])).rows
-    level, uphill, downhill = (preview_speed(params, memory, bend, 5.0, roll) for roll in (0.0, 0.2, -0.2))
+    grip = first_grip(SETTINGS)
+    bend = path_from_curvature(np.array([0.0, 40.0]), np.array([0.1, 0.1]))
+    level, uphill, downhill = (preview_speed(SETTINGS, grip, bend, 5.0, roll) for roll in (0.0, 0.2, -0.2))
     assert uphill < downhill <= level
-    straight = path_from_curvature(np.array([0.0, 40.0]), np.zeros(2)).rows
-    assert preview_speed(params, memory, straight, 5.0, 0.2) > 100.0
+    straight = path_from_curvature(np.array([0.0, 40.0]), np.zeros(2))
+    assert preview_speed(SETTINGS, grip, straight, 5.0, 0.2) > 100.0
 
 
 def test_robot_stops_when_fixes_are_lost():
@@ -134,8 +147,6 @@ def test_robot_stops_when_fixes_are_lost():
 
 
 def test_an_offset_is_kept_to_the_left():
-    from terrain.control.steering_law import SteeringSettings
-
     path = path_from_curvature(np.array([0.0, 50.0]), np.zeros(2))
     follower = CarFollower(ROBOT, path, SlipSource.MULTI, SteeringSettings(offset_m=1.0))
     ground = Ground(np.zeros(1), np.array([0.7]), np.array([0.15]))
@@ -145,4 +156,4 @@ def test_an_offset_is_kept_to_the_left():
 
 def test_settings_of_the_preview_that_cannot_be_are_refused():
     with pytest.raises(ConfigError, match="used_part"):
-        grip_params(ROBOT, GripSettings(used_part=1.5))
+        first_grip(GripSettings(used_part=1.5))
