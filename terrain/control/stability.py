@@ -225,7 +225,7 @@ def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio:
 
 
 def closed_loop(keep: Array, drive: Array, controller: Array, output: Array, n_delayed: int) -> Array:
-    """Return a sampled loop: plant, controller, and commands on their way to the plant.
+    """Return a sampled loop: plant, controller, and delayed commands.
 
     Parameters
     ----------
