@@ -64,7 +64,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     import numpy as np
     import yaml
 
-    from terrain.discrepancy.extend import extended_effects
+    from terrain.discrepancy.diagnosed_runs import extended_effects
     from terrain.extension import extended_yaml
     from terrain.files.atomic import atomic_write, ensure_writable
     from terrain.robots import load_robot
@@ -142,8 +142,7 @@ def explain_runs(
     """
     from pipelines.explain.explanation import ExplainResult
     from pipelines.report.results import silent
-    from terrain.discrepancy.diagnosed_runs import diagnose_runs, held_out_gain
-    from terrain.discrepancy.extend import extended_effects
+    from terrain.discrepancy.diagnosed_runs import diagnose_runs, extended_effects, held_out_gain
     from terrain.discrepancy.next_drive import next_command
     from terrain.discrepancy.powertrain import powertrain_answer
     from terrain.discrepancy.robot_terms import in_robot_terms

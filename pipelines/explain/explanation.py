@@ -12,7 +12,6 @@ from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.results import Result, as_json, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 from pipelines.report.versions import versions
-from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain_answer import PowertrainAnswer
@@ -28,7 +27,13 @@ from terrain.discrepancy.sentences import (
     varying_text,
     verdict_text,
 )
-from terrain.discrepancy.statements import SESSION_COLUMNS, Statement, session_rows, split_ruled_out
+from terrain.discrepancy.statements import (
+    CHANNEL_WORDS,
+    SESSION_COLUMNS,
+    Statement,
+    session_rows,
+    split_ruled_out,
+)
 from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import effect_named
 from terrain.robots import Robot

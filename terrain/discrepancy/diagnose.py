@@ -11,30 +11,39 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.answers import (
-    cause_of,
-    limits_of,
-    residuals_of,
-    rival_values,
-    ruled_out_of,
-    values_of,
-)
-from terrain.discrepancy.constancy import values_by_session
-from terrain.discrepancy.evidence import Evidence, recentre
-from terrain.discrepancy.health import clocks_of
+from terrain.discrepancy.clocks import Shift, shifts_of
+from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of, values_by_session
+from terrain.discrepancy.evidence import Evidence, move_point, partial_information, recentre
+from terrain.discrepancy.faults import Fault, faults_of, repaired
+from terrain.discrepancy.latencies import Latencies, latencies_of, starting_values
 from terrain.discrepancy.next_drive import next_drive
-from terrain.discrepancy.preparation import MIN_RUNS, prepare
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
+from terrain.discrepancy.residuals import low_pass_of, measured_channels, rows_of
+from terrain.discrepancy.robot_terms import UNITS
 from terrain.discrepancy.search import Found, Problem, names_of, pooled, refit, search, with_rivals
-from terrain.discrepancy.selection import EXCITED_RATIO
+from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT, gain_interval
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.unfit import clocks_of, unfit_runs
 from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effects, with_conditions
-from terrain.discrepancy.verdict import Cause, Diagnosis, RuledOut, Unexplained, Varying, Verdict
-from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw, shown_beside
+from terrain.discrepancy.verdict import (
+    INTERVAL_T,
+    Cause,
+    Diagnosis,
+    Excluded,
+    Limit,
+    Residual,
+    RuledOut,
+    Unexplained,
+    Value,
+    Varying,
+    Verdict,
+)
+from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw, shown_beside, shown_channels
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect, effect_named
 from terrain.errors import DataError
 from terrain.records import RunLog
@@ -286,3 +295,198 @@ def _information_after(problem: Problem, found: Found, named: Sequence[Effect]) 
         if name in names_of(named):
             vector[INDEX[name]] += value
     return problem.at(vector, (), found.info.statistics)
+
+
+# -- What is done to runs before causes are searched: faults repaired, lags known, unfit runs excluded -----
+
+MIN_RUNS = 3
+"""Least number of runs: with fewer none is left to validate a fit."""
+
+REST_MPS = 0.02
+"""Fastest that a wheel turns, by its sensor's noise, in a run that does not drive."""
+
+
+class Prepared(NamedTuple):
+    """Runs that are fit to be compared.
+
+    Parameters
+    ----------
+    problem : of these runs, faults repaired
+    faults : that were found and repaired, in all runs that were given
+    excluded : runs that are unfit
+    seeds : lags of sensors, by parameter, that are so large that a search has to start from them
+    aligned : information of the runs with these lags built in
+    shift : clocks of the runs behind that
+    """
+
+    problem: Problem
+    faults: tuple[Fault, ...]
+    excluded: tuple[Excluded, ...]
+    seeds: Mapping[str, float]
+    aligned: Evidence
+    shift: Shift
+
+
+def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequence[Effect]) -> Prepared:
+    """Return runs without faults, without unfit ones, and the lags of their sensors.
+
+    Raises
+    ------
+    DataError
+        if too few runs are fit, or their clocks are further apart than is searched.
+    """
+    low_pass = low_pass_of(signals)
+    plain = [
+        rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass) for run in signals
+    ]
+    latencies = latencies_of(signals, simulation)
+    faults = faults_of(signals, plain, simulation, low_pass, latencies=latencies)
+    runs = repaired(signals, faults)
+    if faults:
+        latencies = latencies_of(runs, simulation)
+    problem = Problem(runs, simulation, low_pass, tuple(library))
+    seeds, aligned, shift = _aligned(problem, latencies)
+    excluded = unfit_runs(runs, aligned, shift)
+    if excluded:
+        gone = {run.run_id for run in excluded}
+        kept = tuple(run for run in runs if run.run_id not in gone)
+        if len(kept) < MIN_RUNS:
+            reasons = "; ".join(f"{run.run_id}: {run.reason}" for run in excluded[:3])
+            raise DataError(f"runs: only {len(kept)} of {len(signals)} are fit to be compared ({reasons})")
+        problem = problem._replace(signals=kept)
+        seeds, aligned, shift = _aligned(problem, latencies_of(kept, simulation))
+    if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in problem.signals):
+        n = len(problem.signals)
+        raise DataError(f"runs: in all {n} the wheels are at rest; runs that drive are required")
+    return Prepared(problem, faults, excluded, seeds, aligned, shift)
+
+
+def _aligned(problem: Problem, latencies: Latencies) -> tuple[dict[str, float], Evidence, Shift]:
+    """Return lags to start from, the information of the runs with them built in, and their clocks there."""
+    values = starting_values(latencies)
+    seeds = {name: value for name, value in values.items() if name in problem.parameters}
+    there = move_point(problem.simulation.vector, tuple(seeds), np.array(list(seeds.values())))
+    aligned = problem.at(there)
+    return seeds, aligned, shifts_of(aligned)
+
+
+# -- What a diagnosis states of what was found: causes, rivals, limits, what is ruled out, and residuals ---
+
+POWER_Z = 1.28
+"""Added to the threshold, so that nine in ten are detected."""
+
+
+def values_of(found: Found, effect: Effect) -> tuple[Value, ...]:
+    """Return the fitted values of a cause."""
+    values = []
+    for parameter in effect.parameters:
+        at = found.names.index(parameter.name)
+        half = INTERVAL_T * float(np.sqrt(found.cov[at, at] * found.tried[effect.name].inflation))
+        value = float(found.change[at])
+        values.append(Value(parameter.name, value, parameter.unit, value - half, value + half))
+    return tuple(values)
+
+
+def cause_of(found: Found, effect: Effect) -> Cause:
+    """Return what is stated of a cause that is named."""
+    own = found.tried[effect.name]
+    size = float(found.info.c.sum())
+    low, high = gain_interval(own.gain)
+    return Cause(
+        effect.name,
+        effect.aliases,
+        values_of(found, effect),
+        float(own.gain.sum()) / size,
+        low / size,
+        high / size,
+        shown_channels(found, effect),
+        own.z,
+        own.dispersion,
+        caveat_of(found, effect),
+    )
+
+
+def caveat_of(found: Found, effect: Effect) -> str:
+    """Return what the value of a cause depends on, in words; empty where it is one number."""
+    names = [p.name for p in effect.parameters]
+    constant = constancy_of(found.info, found.names, names, found.change, found.tried[effect.name].inflation)
+    caveats = [constant.caveat] if constant.caveat else []
+    value = abs(float(found.change[found.names.index(names[0])]))
+    scatter = run_scatter(found, names[0])
+    if len(names) == 1 and scatter > CAVEAT_RATIO * value:
+        unit = effect.parameters[0].unit
+        caveats.append(f"it differs from run to run by {scatter:.2g} {UNITS.get(unit, unit)}".strip())
+    return "; ".join(caveats)
+
+
+def rival_values(found: Found, sets: Sequence[tuple[str, ...]]) -> dict[str, tuple[Value, ...]]:
+    """Return the values that every member of an ambiguous set would have."""
+    values = {cause.name: values_of(found, cause) for cause in found.causes}
+    for rivals in found.rivals.values():
+        for rival in rivals:
+            half = INTERVAL_T * rival.std
+            values.setdefault(
+                rival.effect.name,
+                tuple(
+                    Value(p.name, float(x), p.unit, float(x - h), float(x + h))
+                    for p, x, h in zip(rival.effect.parameters, rival.change, half, strict=True)
+                ),
+            )
+    return {name: values[name] for names in sets for name in names}
+
+
+def limits_of(found: Found, library: Sequence[Effect]) -> list[Limit]:
+    """Return the detection limit of every effect beside what was found."""
+    info, limits = found.info, []
+    a = info.a.sum(axis=0)
+    for effect in library:
+        others = [name for name in found.names if name not in names_of([effect])]
+        base = info.places(others)
+        for parameter in effect.parameters:
+            own = info.places([parameter.name])
+            free = float(partial_information(a, base, own)[1][0, 0])
+            known = free > 1e-9 * max(a[own[0], own[0]], 1e-12)
+            value = (Z_EFFECT + POWER_Z) / float(np.sqrt(free)) if known else np.inf
+            limits.append(Limit(parameter.name, value, parameter.unit, effect.needs))
+    return limits
+
+
+def ruled_out_of(
+    found: Found,
+    named: Sequence[Effect],
+    sets: Sequence[tuple[str, ...]],
+    withdrawn: Mapping[str, RuledOut],
+    library: Sequence[Effect],
+) -> list[RuledOut]:
+    """Return the effects that are not the answer, those that were withdrawn first."""
+    answered = {effect.name for effect in named} | {name for names in sets for name in names}
+    out = list(withdrawn.values())
+    for effect in library:
+        if effect.name in answered or effect.name in withdrawn:
+            continue
+        own = found.tried[effect.name]
+        values: tuple[Value, ...] = ()
+        if effect in found.causes:
+            reason = "it is not significant beside the other causes"
+            values = values_of(found, effect)
+        elif not own.inside:
+            reason = "the fitted value is out of its bounds"
+        elif own.z <= Z_EFFECT:
+            reason = "it is not significant beside what was found"
+        else:
+            reason = "it does not reduce the residual of runs left out, or differs from run to run"
+        out.append(RuledOut(effect.name, reason, own.z, values))
+    return out
+
+
+def residuals_of(info: Evidence, start: Evidence) -> dict[str, Residual]:
+    """Return how far measured and simulated are apart, by channel."""
+    out = {}
+    for channel in measured_channels(info.rows):
+        c = CHANNELS.index(channel)
+        left = np.concatenate([run.residual[:, c] for run in info.rows])
+        rms = float(np.sqrt(np.nanmean(left**2)))
+        noise = float(start.noise.std[c])
+        systematic = max(1.0 - (noise / rms) ** 2, 0.0) if rms > 0 else 0.0
+        out[channel] = Residual(rms, noise, systematic)
+    return out

@@ -10,17 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
+from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.discrepancy.evidence import N_BLOCKS, Evidence, evidence_at
-from terrain.discrepancy.health import unfit_runs
-from terrain.discrepancy.health.faults import Fault, without
-from terrain.discrepancy.health.runs import Excluded
-from terrain.discrepancy.preparation import MIN_RUNS
+from terrain.discrepancy.faults import Fault, without
 from terrain.discrepancy.residuals import LowPass, low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.verdict import finite
+from terrain.discrepancy.unfit import unfit_runs
+from terrain.discrepancy.verdict import Excluded
 from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.estimation.estimate import Estimate, estimate_run
@@ -126,6 +125,10 @@ class Reduction(NamedTuple):
         """Whether no gain can be claimed: the interval includes zero, or lies below."""
         return not self.low > 0.0
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        return {"reduction": self.ratio, "ci": (self.low, self.high), "refused": self.refused}
+
 
 class ChannelGain(NamedTuple):
     """Measured minus simulated in one channel, before and after.
@@ -142,6 +145,11 @@ class ChannelGain(NamedTuple):
     white_before: float
     white_after: float
     reduction: Reduction
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        named = self._asdict()
+        return {**named.pop("reduction").as_json(), **named}
 
 
 class Gain(NamedTuple):
@@ -168,21 +176,9 @@ class Gain(NamedTuple):
         return self.reduction.refused
 
     def as_json(self) -> dict[str, Any]:
-        """Return the gain as JSON has it; what is not known is null."""
-        return {
-            "runs": list(self.run_ids),
-            "excluded_runs": [run._asdict() for run in self.excluded],
-            "clusters": self.clusters,
-            **_reduction_json(self.reduction),
-            "channels": {
-                name: {
-                    key: finite(getattr(found, key))
-                    for key in ("rms_before", "rms_after", "white_before", "white_after")
-                }
-                | _reduction_json(found.reduction)
-                for name, found in self.channels.items()
-            },
-        }
+        """Return the fields as JSON names them."""
+        own = {"runs": self.run_ids, "excluded_runs": self.excluded, "clusters": self.clusters}
+        return {**own, **self.reduction.as_json(), "channels": self.channels}
 
 
 def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], seed: int = 0) -> Gain:
@@ -318,14 +314,6 @@ def _reduction(before: Array, after: Array, weights: Array) -> Reduction:
     if not np.isfinite(ratios).any():
         return Reduction(float("nan"), float("nan"), float("nan"))
     return Reduction(float(ratio), *percentile_interval(ratios))
-
-
-def _reduction_json(found: Reduction) -> dict[str, Any]:
-    return {
-        "reduction": finite(found.ratio),
-        "ci": [finite(found.low), finite(found.high)],
-        "refused": found.refused,
-    }
 
 
 # -- What an extension gains for the robot's filter, against the truth of runs that have one ---------------

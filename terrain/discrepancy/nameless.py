@@ -17,11 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
-from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.compared import ComparedRun, channels_of
 from terrain.discrepancy.held_out import N_BOOTSTRAP
 from terrain.discrepancy.selection import MIN_CLUSTERS
-from terrain.discrepancy.verdict import finite
+from terrain.discrepancy.statements import CHANNEL_WORDS, listed
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
@@ -58,6 +57,12 @@ class Learned(NamedTuple):
     named_ratio: float
     left_low: float
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        removed = {"reduction": self.ratio, "named_reduction": self.named_ratio}
+        rms = {"rms_before": self.rms_before, "rms_after": self.rms_after}
+        return {**rms, **removed, "left_to_find_from": self.left_low}
+
 
 class Nameless(NamedTuple):
     """What a black-box reference reaches, beside the named causes.
@@ -92,7 +97,7 @@ class Nameless(NamedTuple):
             CHANNEL_WORDS[name][0] for name, each in self.channels.items() if each.left_low > LITTLE_LEFT
         ]
         if channels:
-            judged = f"more is left to find in {_listed(channels)}"
+            judged = f"more is left to find in {listed(channels)}"
         elif left > LITTLE_LEFT:
             judged = f"{self.n_runs} runs are too few to state more"
         elif left < -LITTLE_LEFT:
@@ -107,22 +112,9 @@ class Nameless(NamedTuple):
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the comparison as JSON has it; what is not known is null."""
-        return {
-            "n_runs": self.n_runs,
-            "reduction": finite(self.ratio),
-            "named_reduction": finite(self.named_ratio),
-            "channels": {
-                name: {
-                    "rms_before": finite(each.rms_before),
-                    "rms_after": finite(each.rms_after),
-                    "reduction": finite(each.ratio),
-                    "named_reduction": finite(each.named_ratio),
-                    "left_to_find_from": finite(each.left_low),
-                }
-                for name, each in self.channels.items()
-            },
-        }
+        """Return the fields as JSON names them."""
+        own = {"n_runs": self.n_runs, "reduction": self.ratio, "named_reduction": self.named_ratio}
+        return {**own, "channels": self.channels}
 
 
 def nameless_gain(
@@ -167,10 +159,6 @@ def nameless_gain(
         if noise.get(name, math.nan) > 0:
             total += squares / noise[name] ** 2
     return Nameless(len(held_out), channels, *_ratios(total))
-
-
-def _listed(words: Sequence[str]) -> str:
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _left_low(before: Array, more: Array, of_run: Array, seed: int) -> float:

@@ -33,7 +33,7 @@ from terrain.discrepancy.command_response import (
     squared_errors,
     traces_of,
 )
-from terrain.discrepancy.health import Fault
+from terrain.discrepancy.faults import Fault
 from terrain.discrepancy.powertrain_answer import Part, PartStatus, Powertrain, PowertrainAnswer
 from terrain.errors import DataError
 from terrain.records import Array, RunLog

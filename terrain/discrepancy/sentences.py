@@ -7,10 +7,9 @@ import re
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from terrain.discrepancy.channel_words import CHANNEL_WORDS
 from terrain.discrepancy.held_out import Gain
 from terrain.discrepancy.robot_terms import quantity
-from terrain.discrepancy.statements import listed
+from terrain.discrepancy.statements import CHANNEL_WORDS, listed
 from terrain.discrepancy.verdict import Diagnosis, Limit, Value, Varying
 from terrain.effects import PARAMETER, TRACKED
 

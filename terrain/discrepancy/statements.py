@@ -8,17 +8,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.channel_words import CHANNEL_WORDS, off_by
 from terrain.discrepancy.compared import ComparedRun, channels_of, compare_runs, rms_of
 from terrain.discrepancy.held_out import Gain
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.response_slopes import Slope, slopes_of
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.terrain_match import TerrainMatch
-from terrain.discrepancy.verdict import Diagnosis, RuledOut, finite
-from terrain.effects import CHANNELS, PARAMETER, effect_named
+from terrain.discrepancy.verdict import Diagnosis, RuledOut
+from terrain.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    PARAMETER,
+    SPEED_X,
+    SPEED_Y,
+    TURNING_CURRENT,
+    effect_named,
+)
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -62,17 +71,12 @@ class Statement(NamedTuple):
     found: bool
 
     def as_json(self) -> dict[str, Any]:
-        """Return the statement as JSON has it; what is not known is null."""
-        return {
-            "channel": self.channel,
-            "measured_over_simulated": finite(self.slope.ratio),
-            "measured_minus_simulated": finite(self.slope.level),
-            "causes": list(self.causes),
-            "rms_before": finite(self.rms_before),
-            "rms_after": finite(self.rms_after),
-            "runs": self.where,
-            "text": self.text,
+        """Return the fields as JSON names them."""
+        named = {
+            name: getattr(self, name) for name in ("channel", "causes", "rms_before", "rms_after", "text")
         }
+        apart = {"measured_over_simulated": self.slope.ratio, "measured_minus_simulated": self.slope.level}
+        return {**named, **apart, "runs": self.where}
 
 
 def statements_of(
@@ -325,3 +329,202 @@ def notes_of(
                 "value for all of them is a mean."
             )
     return tuple(notes)
+
+
+# -- What sentences call channels, and what a simulation does that is off in one ---------------------------
+
+CHANNEL_WORDS = {
+    GYRO: ("yaw rate (gyro)", "rad/s"),
+    SPEED_X: ("speed ahead", "m/s"),
+    SPEED_Y: ("speed to the left", "m/s"),
+    ACCEL: ("accelerometer ahead", "m/s²"),
+    CURRENT: ("sum of the currents", "A"),
+    TURNING_CURRENT: ("right minus left current", "A"),
+    HEADING: ("heading rate (no gyro)", "rad/s"),
+}
+"""What a channel is called, and its unit."""
+
+INPUT_LABELS = {
+    "speed_mps": "speed [m/s]",
+    "turn_mps": "turn [m/s]",
+    "steer_rad": "steering [rad]",
+    "grade_rad": "grade [rad]",
+    "roll_rad": "roll [rad]",
+    "force_ratio": "force [weight]",
+    "sideways_mps": "speed to the left [m/s]",
+    "time_s": "time [s]",
+}
+"""Inputs of the simulation as axes call them."""
+
+TIMES, MOST_TIMES = 1.5, 20.0
+"""A factor from the first is stated as "2.5 times", below it in percent; over the second it is not stated."""
+
+
+class _Words(NamedTuple):
+    """What a simulation does with too much of it, and too little."""
+
+    verb: str
+    more: str
+    less: str
+
+
+_WORDS = {
+    GYRO: _Words("the simulation turns", "fast", "slowly"),
+    HEADING: _Words("the simulation turns", "fast", "slowly"),
+    SPEED_X: _Words("the simulation drives", "fast", "slowly"),
+    SPEED_Y: _Words("simulated, it is", "large", "small"),
+    ACCEL: _Words("simulated, it is", "large", "small"),
+    CURRENT: _Words("simulated, it is", "large", "small"),
+    TURNING_CURRENT: _Words("simulated, it is", "large", "small"),
+}
+
+
+def off_by(channel: str, slope: Slope) -> str:
+    """Return by which factor or level the simulation is off in a channel; empty where neither is clear.
+
+    Examples
+    --------
+    >>> off_by("yaw_rate_radps", Slope(0.4, 0.01)), off_by("speed_x_mps", Slope(1.05, 0.01))
+    ('the simulation turns 2.5 times too fast', 'the simulation drives 4.8 % too slowly')
+    >>> off_by("current_a", Slope(math.nan, math.nan, 1.98, 0.1))
+    'simulated, it is 2 A too small throughout'
+    """
+    words, unit = _WORDS[channel], CHANNEL_WORDS[channel][1]
+    if math.isfinite(slope.ratio):
+        if slope.ratio < 0.0:
+            return f"{words.verb} of the wrong sign" if words.more == "large" else f"{words.verb} backward"
+        more = slope.ratio < 1.0
+        times = 1.0 / max(slope.ratio, 1e-9) if more else slope.ratio
+        if times > MOST_TIMES:
+            size = f"more than {MOST_TIMES:g} times"
+        elif times >= TIMES:
+            size = f"{times:.2g} times"
+        else:
+            size = f"{100.0 * abs(1.0 / slope.ratio - 1.0):.2g} %"
+        return f"{words.verb} {size} too {words.more if more else words.less}"
+    if math.isfinite(slope.level):
+        low, high = ("small", "large") if words.more == "large" else ("slow", "fast")
+        verb = words.verb if words.more == "large" else "the simulation is"
+        if channel in (GYRO, HEADING, SPEED_Y):  # a level to one side is no lack of turning
+            side = "left" if slope.level > 0 else "right"
+            return f"measured is {abs(slope.level):.2g} {unit} more to the {side} throughout"
+        return f"{verb} {abs(slope.level):.2g} {unit} too {low if slope.level > 0 else high} throughout"
+    return ""
+
+
+# -- By which factor, or level, measured and simulated are apart in a channel: a slope through zero, robust --
+
+CLEAR_STDS = 3.0
+"""A factor or a level is stated where it is off by so many standard deviations over runs."""
+
+OUTLIER_STDS = 3.0
+"""Distance of a run from the others, in their standard deviations, beyond which it is far out."""
+
+LEAST_OFF = 0.03
+"""Least ratio by which a factor is off: below it a sentence has nothing to state."""
+
+EXPLAINS = 0.15
+"""Least part of the absolute residual that a factor or a level has to remove, to describe it."""
+
+LEVEL_RATIO = 0.3
+"""Least ratio of the residual's root mean square that a level has to be."""
+
+
+class Slope(NamedTuple):
+    """Measured over simulated.
+
+    Parameters
+    ----------
+    ratio, std : of the slope through zero, and its standard deviation over runs; NaN where it is not clear
+        from 1, or does not describe the residual
+    level, level_std : of measured minus simulated, in the channel's unit; NaN where a factor is stated, or no
+        level is clear
+    """
+
+    ratio: float
+    std: float
+    level: float = math.nan
+    level_std: float = math.nan
+
+
+def slope_through_zero(simulated: Array, measured: Array) -> float:
+    """Return the slope ``b`` that minimises ``sum |measured - b simulated|``; NaN where nothing is simulated.
+
+    It is the median of ``measured / simulated``, each weighted by ``|simulated|``.
+
+    Parameters
+    ----------
+    simulated, measured : (n,) rows without NaN
+
+    Examples
+    --------
+    >>> x = np.array([1.0, -2.0, 3.0, 4.0])
+    >>> slope_through_zero(x, 0.4 * x + np.array([0.0, 0.0, 9.0, 0.0]))
+    0.4
+    """
+    weight = np.abs(simulated)
+    seen = weight > 0.0
+    if not seen.any():
+        return math.nan
+    ratio, weight = measured[seen] / simulated[seen], weight[seen]
+    order = np.argsort(ratio, kind="stable")
+    total = np.cumsum(weight[order])
+    return float(ratio[order][np.searchsorted(total, total[-1] / 2.0)])
+
+
+def slopes_of(runs: Sequence[ComparedRun], extended: bool = False) -> dict[str, Slope]:
+    """Return the slope of measured on simulated by channel, over all rows of some runs.
+
+    Parameters
+    ----------
+    runs : compared
+    extended : whether with the causes built in
+    """
+    slopes = {}
+    for c, channel in enumerate(CHANNELS):
+        pairs = [_known(run, c, extended) for run in runs]
+        pairs = [(x, y) for x, y in pairs if x.size]
+        if pairs:
+            slopes[channel] = _slope(pairs)
+    return slopes
+
+
+def _known(run: ComparedRun, c: int, extended: bool) -> tuple[Array, Array]:
+    simulated = run.after if extended else run.before
+    assert simulated is not None
+    x, y = simulated[:, c], run.measured[:, c]
+    seen = np.isfinite(x) & np.isfinite(y)
+    return x[seen], y[seen]
+
+
+def _slope(pairs: Sequence[tuple[Array, Array]]) -> Slope:
+    x, y = (np.concatenate([pair[i] for pair in pairs]) for i in range(2))
+    ratio = slope_through_zero(x, y)
+    each = np.array([slope_through_zero(*pair) for pair in pairs])
+    std = _std_of_mean(each - ratio, np.array([np.abs(pair[0]).sum() for pair in pairs]))
+    left = np.abs(y - x).sum()
+    off = abs(ratio - 1.0)
+    scaled = np.abs(y - ratio * x).sum() < (1.0 - EXPLAINS) * left
+    if off > max(CLEAR_STDS * std, LEAST_OFF) and scaled:
+        return Slope(ratio, std)
+    level = float(np.median(y - x))
+    means = np.array([float(np.median(pair[1] - pair[0])) for pair in pairs])
+    level_std = _std_of_mean(means - level, np.array([float(pair[0].size) for pair in pairs]))
+    rms = float(np.sqrt(np.mean((y - x) ** 2)))
+    moved = np.abs(y - x - level).sum() < (1.0 - EXPLAINS) * left
+    if abs(level) > max(CLEAR_STDS * level_std, LEVEL_RATIO * rms) and moved:
+        return Slope(math.nan, math.nan, level, level_std)
+    return Slope(math.nan, math.nan)
+
+
+def _std_of_mean(off: Array, weight: Array) -> float:
+    """Return the standard deviation of a weighted mean by how far runs (n,) are from it.
+
+    A run that is far out, as a stalled one, hardly moves a median, and counts as one at the edge.
+    """
+    known = np.isfinite(off) & (weight > 0.0)
+    if known.sum() < 2:
+        return math.inf
+    edge = OUTLIER_STDS * 1.48 * float(np.median(np.abs(off[known])))
+    off = np.clip(off, -edge, edge)
+    return float(np.sqrt(((weight * off)[known] ** 2).sum()) / weight[known].sum())

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any, NamedTuple
 
-from terrain.discrepancy.health.faults import Fault
-from terrain.discrepancy.health.runs import Clock, Excluded
+from terrain.discrepancy.faults import Fault
 from terrain.records import Array
 
 AGREE_P = 0.01
@@ -45,6 +43,10 @@ class Value(NamedTuple):
     low: float
     high: float
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        return {"name": self.name, "value": self.value, "unit": self.unit, "ci": (self.low, self.high)}
+
 
 class Cause(NamedTuple):
     """An effect that the measured runs have and the simulation lacks.
@@ -71,6 +73,14 @@ class Cause(NamedTuple):
     dispersion: float
     caveat: str = ""
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        own = {
+            name: getattr(self, name) for name in ("name", "aliases", "channels", "z", "dispersion", "caveat")
+        }
+        interval = self.gain_low, self.gain_high
+        return {**own, "parameters": self.values, "held_out_gain": self.gain, "gain_ci": interval}
+
 
 class RunGroup(NamedTuple):
     """Runs in which a parameter has one value, and the standard deviation of that."""
@@ -78,6 +88,10 @@ class RunGroup(NamedTuple):
     value: float
     std: float
     run_ids: tuple[str, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        return {"value": self.value, "std": self.std, "runs": self.run_ids}
 
 
 class Varying(NamedTuple):
@@ -122,6 +136,11 @@ class SessionValue(NamedTuple):
     std: float
     text: str
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        named = {"session": self.session, "runs": self.n_runs, "value": self.value}
+        return {**named, "ci": (self.low, self.high), "text": self.text}
+
 
 class BySession(NamedTuple):
     """A parameter of a named cause by session, of the sessions of one terrain.
@@ -146,6 +165,11 @@ class BySession(NamedTuple):
         """Whether sessions may have one value; one session does."""
         return not self.p < AGREE_P
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        named = self._asdict()
+        return {"name": named.pop("parameter"), **named, "agree": self.agree}
+
 
 class Unexplained(NamedTuple):
     """A channel whose residual depends on an input, without an effect that explains it.
@@ -162,6 +186,11 @@ class Unexplained(NamedTuple):
     z: float
     ratio: float
 
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        named = self._asdict()
+        return {"residual_ratio": named.pop("ratio"), **named}
+
 
 class Limit(NamedTuple):
     """The smallest value of an effect that these runs would have revealed nine times in ten."""
@@ -170,6 +199,11 @@ class Limit(NamedTuple):
     value: float
     unit: str
     needs: str
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        named = self._asdict()
+        return {"detection_limit": named.pop("value"), **named}
 
 
 class RuledOut(NamedTuple):
@@ -187,6 +221,11 @@ class RuledOut(NamedTuple):
     reason: str
     z: float
     values: tuple[Value, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        named = self._asdict()
+        return {"parameters": named.pop("values"), **named}
 
 
 class Residual(NamedTuple):
@@ -210,6 +249,21 @@ class NextDrive(NamedTuple):
     scenario: str
     grade_deg: float
     reason: str
+
+
+class Excluded(NamedTuple):
+    """A run that is excluded as unfit, and why."""
+
+    run_id: str
+    reason: str
+
+
+class Clock(NamedTuple):
+    """Delay of the IMU's and the camera's logger behind the wheels' in a run, and its standard deviation."""
+
+    run_id: str
+    offset_s: float
+    std_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -265,118 +319,11 @@ class Diagnosis:
         return {value.name: value.value for cause in self.causes for value in cause.values}
 
     def as_json(self) -> dict[str, Any]:
-        """Return the answer as JSON has it; what is not known is null."""
-        limits = [
-            {"name": x.name, "detection_limit": finite(x.value), "unit": x.unit, "needs": x.needs}
-            for x in self.limits
-        ]
-        missed = {x.name for x in self.not_excited}
+        """Return the fields by name, the covariance with the names of its rows."""
+        named = {each.name: getattr(self, each.name) for each in fields(self)}
+        parameters, cov, limits = (named.pop(name) for name in ("parameters", "cov", "limits"))
         return {
-            "robot": self.robot,
-            "verdict": self.verdict.value,
-            "causes": [
-                {
-                    "name": cause.name,
-                    "aliases": list(cause.aliases),
-                    "parameters": [_value(value) for value in cause.values],
-                    "held_out_gain": finite(cause.gain),
-                    "gain_ci": [finite(cause.gain_low), finite(cause.gain_high)],
-                    "channels": list(cause.channels),
-                    "z": finite(cause.z),
-                    "dispersion": finite(cause.dispersion),
-                    "caveat": cause.caveat,
-                }
-                for cause in self.causes
-            ],
-            "covariance": {"parameters": list(self.parameters), "matrix": self.cov.tolist()},
-            "ambiguous_sets": [list(names) for names in self.ambiguous_sets],
-            "ambiguous_values": {
-                name: [_value(value) for value in values] for name, values in self.ambiguous_values.items()
-            },
-            "unexplained": [
-                {"channel": x.channel, "input": x.input, "z": finite(x.z), "residual_ratio": finite(x.ratio)}
-                for x in self.unexplained
-            ],
-            "faults": [_fault(each) for each in self.faults],
-            "varying": [_varying(each) for each in self.varying],
-            "by_session": [_by_session(each) for each in self.by_session],
-            "not_excited": [limit for limit in limits if limit["name"] in missed],
+            **named,
+            "covariance": {"parameters": parameters, "matrix": cov},
             "detection_limits": limits,
-            "ruled_out": [
-                {
-                    "name": x.name,
-                    "reason": x.reason,
-                    "z": finite(x.z),
-                    "parameters": [_value(value) for value in x.values],
-                }
-                for x in self.ruled_out
-            ],
-            "excluded_runs": [x._asdict() for x in self.excluded_runs],
-            "clocks": [
-                {"run_id": x.run_id, "offset_s": finite(x.offset_s), "std_s": finite(x.std_s)}
-                for x in self.clocks
-            ],
-            "next_drive": None if self.next_drive is None else self.next_drive._asdict(),
-            "residual_before": {name: _residual(x) for name, x in self.residual_before.items()},
-            "residual_after": {name: _residual(x) for name, x in self.residual_after.items()},
-            "n_runs": self.n_runs,
         }
-
-
-def _value(value: Value) -> dict[str, Any]:
-    return {
-        "name": value.name,
-        "value": finite(value.value),
-        "unit": value.unit,
-        "ci": [finite(value.low), finite(value.high)],
-    }
-
-
-def _fault(fault: Fault) -> dict[str, Any]:
-    return {
-        "kind": fault.kind.value,
-        "column": fault.column.value,
-        "runs": list(fault.run_ids),
-        "factor": finite(fault.factor),
-        "sentence": fault.sentence,
-        "repair": fault.repair,
-    }
-
-
-def _varying(each: Varying) -> dict[str, Any]:
-    groups = [
-        {"value": finite(group.value), "std": finite(group.std), "runs": list(group.run_ids)}
-        for group in each.groups
-    ]
-    plain = each._asdict() | {"rivals": list(each.rivals), "groups": groups}
-    return plain | {key: finite(plain[key]) for key in ("mean", "scatter", "z")}
-
-
-def _by_session(each: BySession) -> dict[str, Any]:
-    sessions = [
-        {
-            "session": own.session,
-            "runs": own.n_runs,
-            "value": finite(own.value),
-            "ci": [finite(own.low), finite(own.high)],
-            "text": own.text,
-        }
-        for own in each.sessions
-    ]
-    numbers = {"p": finite(each.p), "between_std": finite(each.between_std), "agree": each.agree}
-    return {
-        "name": each.parameter,
-        "unit": each.unit,
-        "terrain": each.terrain,
-        "sessions": sessions,
-        **numbers,
-    }
-
-
-def _residual(residual: Residual) -> dict[str, Any]:
-    return {name: finite(value) for name, value in residual._asdict().items()}
-
-
-def finite(value: float) -> float | None:
-    """Return a number as JSON can hold it: None where it is not finite."""
-    return float(value) if math.isfinite(value) else None

@@ -18,7 +18,7 @@ from pipelines.report.tree import Column, Report, Table, Text
 from studies.blind_trials.hidden import Case, Row, cases_of
 from studies.blind_trials.scoring import FOUND_TRIALS, Score, found_from, table_of
 from studies.blind_trials.trial import Trial, run_trial
-from terrain.discrepancy.preparation import MIN_RUNS
+from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.errors import ConfigError
 
 EXAMPLE = "python tests/studies trials --n 100 --seed 2211 --rows none,strong"

@@ -11,9 +11,9 @@ from pipelines.report.terminal import terminal_text
 from terrain.discrepancy import verdict
 from terrain.discrepancy.compared import channels_of
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
-from terrain.discrepancy.health.runs import Clock, Excluded
 from terrain.discrepancy.held_out import Change, ChannelGain, Comparison, Gain, Reduction
 from terrain.discrepancy.nameless import Learned, Nameless
+from terrain.discrepancy.verdict import Clock, Excluded
 from terrain.robots import load_robot
 
 HUSKY = load_robot("husky")

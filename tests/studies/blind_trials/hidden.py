@@ -15,7 +15,7 @@ import numpy as np
 
 from studies.blind_trials.drives import STEP_HZ, Drives
 from studies.blind_trials.limits import Limits, Sensing, confusable_class
-from terrain.discrepancy.health import Column, FaultKind
+from terrain.discrepancy.faults import Column, FaultKind
 from terrain.effects import (
     BOTH,
     BOUNDS,
@@ -544,7 +544,7 @@ class WrittenFault(NamedTuple):
     drives : of robots whose logs show it
     stream : that has it
     write : gives the stream with the fault, of a robot
-    kind, column : of the statement, as :class:`terrain.discrepancy.health.Fault` has them
+    kind, column : of the statement, as :class:`terrain.discrepancy.faults.Fault` has them
     word : in the sentence
     """
 

@@ -18,9 +18,8 @@ from studies.blind_trials.scoring import (
     wrong_names,
 )
 from studies.blind_trials.trial import CLOCK_STATED_S, Trial, Varying, run_trial
-from terrain.discrepancy.health import Column, FaultKind
-from terrain.discrepancy.health.runs import Clock
-from terrain.discrepancy.verdict import RunGroup, Value, Verdict
+from terrain.discrepancy.faults import Column, FaultKind
+from terrain.discrepancy.verdict import Clock, RunGroup, Value, Verdict
 
 RIGHT = Trial(
     row=Row.SHORT,

@@ -35,8 +35,7 @@ from studies.blind_trials.hidden import (
 from studies.blind_trials.limits import POWER, TEST_SIZE, Limits, confusable_class, limits_of
 from studies.blind_trials.scoring import table_of
 from studies.blind_trials.trial import GROSS, run_trial, simulation_of, stage_of
-from terrain.discrepancy.answers import POWER_Z
-from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.diagnose import POWER_Z, diagnose
 from terrain.discrepancy.selection import Z_EFFECT
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import BOUNDS, effect_named, library_of

@@ -12,8 +12,8 @@ from studies.blind_trials.limits import confusable_class, limits_of
 from studies.blind_trials.trial import simulation_of
 
 import terrain.discrepancy.diagnose as diagnose_module
-from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.preparation import MIN_RUNS
+from pipelines.report.results import as_json
+from terrain.discrepancy.diagnose import MIN_RUNS, diagnose
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import GYRO, HEADING, effect_named
 from terrain.errors import DataError
@@ -86,7 +86,7 @@ def test_where_nothing_is_hidden_nothing_is_named(worlds):
         # what is apart is noise, and what scatters from run to run: biases of the gyro
         apart = {channel: residual.systematic for channel, residual in found.residual_before.items()}
         assert all(ratio < 0.4 for channel, ratio in apart.items() if channel != GYRO), apart
-        assert json.loads(json.dumps(found.as_json(), allow_nan=False))["verdict"] == Verdict.NONE
+        assert json.loads(json.dumps(as_json(found), allow_nan=False))["verdict"] == Verdict.NONE
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_an_unfit_run_is_excluded_and_the_rest_is_diagnosed(worlds):
 def test_the_same_runs_give_the_same_answer(worlds):
     world = worlds["husky"]
     runs = world.runs(world.hidden("camera_yaw"))
-    one, other = (diagnose(runs, world.simulation).as_json() for _ in range(2))
+    one, other = (as_json(diagnose(runs, world.simulation)) for _ in range(2))
     assert json.dumps(one) == json.dumps(other)
 
 

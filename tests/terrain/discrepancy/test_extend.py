@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrain.discrepancy.extend import extend, extended_effects
+from terrain.discrepancy.diagnosed_runs import extend, extended_effects
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import INTERVAL_T, Cause, Diagnosis, Value, Verdict
 from terrain.errors import ConfigError

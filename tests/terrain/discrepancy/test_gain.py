@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pipelines.report.results import as_json
 from terrain.discrepancy.held_out import accuracy_change, gain
 from terrain.discrepancy.simulation import Simulation
 from terrain.errors import ConfigError, DataError
@@ -72,8 +73,8 @@ def test_few_runs_are_cut_into_thirds_and_the_same_seed_gives_the_same_gain(long
     few = gain(simulation(), simulation(LONGER), longer[:2], seed=3)
     assert few.clusters == "thirds of runs"
     assert not few.refused
-    assert few.as_json() == gain(simulation(), simulation(LONGER), longer[:2], seed=3).as_json()
-    assert few.as_json()["ci"] != gain(simulation(), simulation(LONGER), longer[:2], seed=4).as_json()["ci"]
+    assert as_json(few) == as_json(gain(simulation(), simulation(LONGER), longer[:2], seed=3))
+    assert as_json(few)["ci"] != as_json(gain(simulation(), simulation(LONGER), longer[:2], seed=4))["ci"]
 
 
 def test_a_gain_without_held_out_runs_or_of_another_robot_is_refused(longer):

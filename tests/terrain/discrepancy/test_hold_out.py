@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from terrain.discrepancy.health.faults import Change, Column, Fault, FaultKind
+from terrain.discrepancy.faults import Change, Column, Fault, FaultKind
 from terrain.discrepancy.held_out import repair_held_out, split_runs
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import signals_of

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from pipelines.report.results import as_json
 from terrain.discrepancy.compared import (
     ComparedRun,
     example_stretch,
@@ -79,7 +80,7 @@ def test_of_few_runs_no_more_is_stated_than_they_hold():
 def test_without_runs_held_out_there_is_no_comparison_and_json_has_no_nan():
     assert nameless_gain([a_run(1)], [], {}) is None
     found, _ = learned(0.0, named=None)
-    assert found.as_json()["channels"][CHANNEL]["named_reduction"] is None
+    assert as_json(found)["channels"][CHANNEL]["named_reduction"] is None
 
 
 def test_the_strongest_input_is_the_one_that_acts():

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.command_response import ABSENT, NAMES, STEP_S, follow
-from terrain.discrepancy.health import Column, Fault, FaultKind
-from terrain.discrepancy.health.faults import Change
+from terrain.discrepancy.faults import Change, Column, Fault, FaultKind
 from terrain.discrepancy.powertrain import powertrain_answer, powertrain_of
 from terrain.discrepancy.powertrain_answer import PartStatus
 from terrain.errors import DataError

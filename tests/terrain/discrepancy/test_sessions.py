@@ -8,6 +8,7 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
+from pipelines.report.results import as_json
 from terrain.discrepancy.constancy import agreement
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.statements import SESSION_COLUMNS, notes_of, session_rows
@@ -51,7 +52,7 @@ def test_sessions_that_are_alike_agree_and_each_holds_the_truth():
     rows = session_rows(found)
     assert {len(row) for row in rows} == {len(SESSION_COLUMNS)}
     assert (rows[0][-1], rows[1][-1]) == ("agree", "")
-    shown = found.as_json()["by_session"][0]
+    shown = as_json(found)["by_session"][0]
     assert shown["agree"] is True
     assert [each["runs"] for each in shown["sessions"]] == [N_RUNS] * 3
 

@@ -5,18 +5,20 @@ import math
 import numpy as np
 import pytest
 
-from terrain.discrepancy.channel_words import off_by
 from terrain.discrepancy.compared import ComparedRun, compare_runs
 from terrain.discrepancy.held_out import ChannelGain, Gain, Reduction
 from terrain.discrepancy.next_drive import next_command
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.response_slopes import Slope, slope_through_zero, slopes_of
 from terrain.discrepancy.robot_terms import in_robot_terms
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.statements import (
+    Slope,
     acting_causes,
     notes_of,
+    off_by,
+    slope_through_zero,
+    slopes_of,
     split_ruled_out,
     statements_of,
     terrains_apart,

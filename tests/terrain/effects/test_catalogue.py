@@ -203,7 +203,7 @@ from terrain.simulation.dynamic.simulate import _built
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"
 for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_ONLY, effects.ONE_SIDED,
               effects.INDEX, residuals.STEPS, residuals.SENSED_ONLY, residuals.ONE_SIDED,
-              information.PRIOR_STD, effects.nuisances_of("swerve")):
+              evidence.PRIOR_STD, effects.nuisances_of("swerve")):
     assert name in table
 assert name not in effects.nuisances_of("skid_steer")
 assert effects.read_effects_of(["worn=0.05"], "swerve") == {name: 0.05}

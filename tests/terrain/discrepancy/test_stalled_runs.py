@@ -8,11 +8,11 @@ import pytest
 from studies.blind_trials.trial import simulation_of
 
 from pipelines.data.datasets import load_runs
-from terrain.discrepancy.health.common import common_gains, odd_runs, stalled_runs
-from terrain.discrepancy.health.response import Response, responses_of
+from terrain.discrepancy.faults import Response, responses_of
 from terrain.discrepancy.latencies import latencies_of
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.unfit import common_gains, odd_runs, stalled_runs
 from terrain.effects import CHANNELS, GYRO, SPEED_X
 from terrain.records import RunLog
 from terrain.robots import load_robot

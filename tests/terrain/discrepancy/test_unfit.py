@@ -9,12 +9,12 @@ from numpy.testing import assert_allclose
 
 from terrain.discrepancy.clocks import shifts_of
 from terrain.discrepancy.evidence import Evidence
-from terrain.discrepancy.health import clocks_of, unfit_runs
-from terrain.discrepancy.health.runs import Excluded
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.unfit import clocks_of, unfit_runs
+from terrain.discrepancy.verdict import Excluded
 from terrain.errors import DataError
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import load_robot

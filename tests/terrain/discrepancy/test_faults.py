@@ -12,11 +12,24 @@ from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
 from pipelines.data.datasets import load_runs
-from terrain.discrepancy.health import Column, Fault, FaultKind, faults_of, repaired
-from terrain.discrepancy.health.faults import Change
-from terrain.discrepancy.health.response import AMPS, A, G, X
-from terrain.discrepancy.health.signs import reading_of
-from terrain.discrepancy.health.units import KEYS, SWERVE_TURN, _best, _middle, _options
+from terrain.discrepancy.faults import (
+    AMPS,
+    KEYS,
+    SWERVE_TURN,
+    A,
+    Change,
+    Column,
+    Fault,
+    FaultKind,
+    G,
+    X,
+    _best,
+    _middle,
+    _options,
+    faults_of,
+    reading_of,
+    repaired,
+)
 from terrain.discrepancy.latencies import latencies_of
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import Signals, signals_of
@@ -306,7 +319,7 @@ def test_a_reading_that_is_not_clear_leaves_the_channel_out():
 
 def test_a_reading_mends_no_channel_that_a_run_does_not_show(monkeypatch):
     """Straight ahead a gyro says nothing; with a wheel turned the simulation turns, and its noise may fit."""
-    monkeypatch.setattr("terrain.discrepancy.health.signs.fits", lambda run: run)
+    monkeypatch.setattr("terrain.discrepancy.faults.fits", lambda run: run)
     change = Change(SIGN, Column.WHEELS, -1.0, 2)
 
     def fitted(gyro, likelihood):
