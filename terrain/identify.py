@@ -34,6 +34,10 @@ IDENTIFIED_RATIO = 0.5
 EDGE = 1e-3
 """In units of the search: a value so near to its bound stands at it."""
 
+REGULAR = 1e-6
+"""Least weight of a nominal value, over that of a unit of the search: where nothing that is measured depends on a
+parameter, a search by trust regions would stop anywhere."""
+
 UNSEEN = 1e-6
 """Part of a parameter in directions of no curvature from which on it is not identified."""
 
@@ -127,12 +131,12 @@ def identify(
     """
     nominal, low, high, prior_std = (np.array([p[i] for p in parameters]) for i in range(1, 5))
     unit = np.array([p.unit for p in parameters])
-    held = np.isfinite(prior_std)
     bounds = (low - nominal) / unit, (high - nominal) / unit
 
+    held = np.maximum(unit / prior_std, REGULAR)
+
     def whole(scaled: Array) -> Array:
-        values = nominal + unit * scaled
-        return np.concatenate([np.ravel(residual(values)), ((values - nominal) / prior_std)[held]])
+        return np.concatenate([np.ravel(residual(nominal + unit * scaled)), held * scaled])
 
     best = None
     for start in starts if len(starts) else [nominal]:
@@ -141,7 +145,7 @@ def identify(
         if best is None or found.cost < best.cost:
             best = found
     assert best is not None
-    n = len(best.fun) - int(held.sum())
+    n = len(best.fun) - len(parameters)
     value, left, by = nominal + unit * best.x, best.fun[:n], best.jac[:n]
     normal = by.T @ by + np.diag((unit / prior_std) ** 2)
     inverse = np.linalg.pinv(normal, hermitian=True)

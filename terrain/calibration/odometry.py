@@ -115,8 +115,7 @@ def legs_of_windows(
 
     Parameters
     ----------
-    run : of the command
-    number : of the run
+    run, number : of the command
     windows : its poses
     robot : that drove
     delay_s : of the poses behind the gyro and the tracks
@@ -131,18 +130,34 @@ def legs_of_windows(
         for window in windows
     )
     single = [leg for leg in found if leg is not None]
-    moved = np.zeros(3)
-    for k, window in enumerate(windows):
-        if k > 0:
-            gap = motion_over_gap(run, windows[k - 1].time_s[-1], window.time_s[0])
-            if gap is None:
-                return single, None
-            moved = composed(moved, gap)
-        moved = composed(moved, window.pose[-1])
-    if len(windows) < 2:
+    origins = window_origins(run, windows)
+    if len(origins) < 2:
         return single, None
-    ends = windows[0].time_s[0], windows[-1].time_s[-1]
-    return single, _leg(run, number, moved, ends, robot, delay_s)
+    moved, ends_s = (
+        composed(origins[-1], windows[-1].pose[-1]),
+        (windows[0].time_s[0], windows[-1].time_s[-1]),
+    )
+    return single, _leg(run, number, moved, ends_s, robot, delay_s)
+
+
+def window_origins(run: RunLog, windows: Sequence[WindowPoses]) -> list[Array]:
+    """Return the pose (3,) at the start of each window, from the first; none where a gap is not known.
+
+    Over the gap from one window to the next a robot drives as fast as its lidar shows around it.
+    """
+    lidar, origins = run.streams.get("lidar"), [np.zeros(3)][: len(windows)]
+    for before, after in itertools.pairwise(windows):
+        from_s, to_s = before.time_s[-1], after.time_s[0]
+        if lidar is None or not 0.0 <= to_s - from_s <= MAX_WINDOW_GAP_S:
+            return []
+        near = np.abs(lidar.time_s - 0.5 * (from_s + to_s)) < 2.0 * MAX_WINDOW_GAP_S
+        near &= np.isfinite(lidar.values).all(axis=1)
+        if near.sum() < 3:
+            return []
+        speed_x, speed_y, rate = lidar.values[near].mean(axis=0) * (to_s - from_s)
+        gap = composed(np.array([0.0, 0.0, 0.5 * rate]), np.array([speed_x, speed_y, 0.5 * rate]))
+        origins.append(composed(composed(origins[-1], before.pose[-1]), gap))
+    return origins
 
 
 def legs_of_poses(
@@ -239,20 +254,6 @@ def _has_gap(time_s: Array, from_s: float, to_s: float) -> bool:
     )
 
 
-def motion_over_gap(run: RunLog, from_s: float, to_s: float) -> Array | None:
-    """Return the change of pose between two times by the speeds that a lidar shows around them."""
-    lidar = run.streams.get("lidar")
-    if lidar is None or not 0.0 <= to_s - from_s <= MAX_WINDOW_GAP_S:
-        return None
-    known = np.isfinite(lidar.values).all(axis=1)
-    near = known & (np.abs(lidar.time_s - 0.5 * (from_s + to_s)) < 2.0 * MAX_WINDOW_GAP_S)
-    if near.sum() < 3:
-        return None
-    speed_x, speed_y, rate = lidar.values[near].mean(axis=0) * (to_s - from_s)
-    half = 0.5 * rate
-    return composed(np.array([0.0, 0.0, half]), np.array([speed_x, speed_y, half]))
-
-
 MOUNT = (
     Parameter("lever_x_m", 0.0, prior_std=0.3),
     Parameter("lever_y_m", 0.0, prior_std=0.3),
@@ -276,14 +277,7 @@ FLAT_RAD = 0.02
 
 
 class Kind(NamedTuple):
-    """A kind of odometry.
-
-    Parameters
-    ----------
-    name : as reports have it
-    free : places of the slip model that are fitted
-    by_gyro : whether the yaw rate is the gyro's; else that of the tracks
-    """
+    """A kind of odometry: its free places of the slip model, and whether its yaw rate is the gyro's or the tracks'."""
 
     name: str
     free: tuple[int, ...]
@@ -293,11 +287,7 @@ class Kind(NamedTuple):
 ENCODER = Kind("encoder odometry", (COMPACTION, TRACK_RATIO), False)
 GYRODOMETRY = Kind("gyrodometry", (COMPACTION,), True)
 ENDO = Kind("Endo", (COMPACTION, EXPONENT), True)
-SLIP = Kind(
-    "slip-compensated",
-    tuple(place for place in range(N_MODEL) if place != TRACK_RATIO),
-    True,
-)
+SLIP = Kind("slip-compensated", tuple(k for k in range(N_MODEL) if k != TRACK_RATIO), True)
 KINDS = (ENCODER, GYRODOMETRY, ENDO, SLIP)
 """Encoder odometry has the best single effective track."""
 
@@ -561,37 +551,33 @@ def score_legs(legs: Sequence[Leg], ends: Mapping[str, Array], seed: int) -> Leg
     """
     measured = np.array([leg.moved for leg in legs])
     runs, number = np.unique([leg.run for leg in legs], return_inverse=True)
-    squares = {name: ((end[:, :2] - measured[:, :2]) ** 2).sum(axis=1) for name, end in ends.items()}
-    per_run = {name: np.bincount(number, square) for name, square in squares.items()}
     counts, legs_of_run = bootstrap_counts(len(runs), DRAWS, seed), np.bincount(number)
-    drawn = {name: np.sqrt((counts @ sums) / (counts @ legs_of_run)) for name, sums in per_run.items()}
+    squares = {name: ((end[:, :2] - measured[:, :2]) ** 2).sum(axis=1) for name, end in ends.items()}
     rmse = {name: math.sqrt(square.mean()) for name, square in squares.items()}
+    drawn = {
+        name: np.sqrt((counts @ np.bincount(number, square)) / (counts @ legs_of_run))
+        for name, square in squares.items()
+    }
 
     def gain(name: str, against: Kind) -> tuple[float, tuple[float, float]]:
         over = 1.0 - drawn[name] / drawn[against.name]
         return 1.0 - rmse[name] / rmse[against.name], percentile_interval(over)
 
-    scores = []
-    for name, end in ends.items():
-        by_encoder, by_gyro = gain(name, ENCODER), gain(name, GYRODOMETRY)
-        scores.append(
-            KindScore(
-                name,
-                rmse[name],
-                percentile_interval(drawn[name]),
-                float(np.median(np.sqrt(squares[name]))),
-                math.sqrt(np.mean((end[:, 2] - measured[:, 2]) ** 2)),
-                *by_encoder,
-                *by_gyro,
-            )
+    scores = tuple(
+        KindScore(
+            name,
+            rmse[name],
+            percentile_interval(drawn[name]),
+            float(np.median(np.sqrt(squares[name]))),
+            math.sqrt(np.mean((end[:, 2] - measured[:, 2]) ** 2)),
+            *gain(name, ENCODER),
+            *gain(name, GYRODOMETRY),
         )
-    return LegScores(
-        float(np.mean([leg.length_s for leg in legs])),
-        len(legs),
-        len(runs),
-        math.sqrt((measured[:, :2] ** 2).sum(axis=1).mean()),
-        tuple(scores),
+        for name, end in ends.items()
     )
+    length_s = float(np.mean([leg.length_s for leg in legs]))
+    path_m = math.sqrt((measured[:, :2] ** 2).sum(axis=1).mean())
+    return LegScores(length_s, len(legs), len(runs), path_m, scores)
 
 
 SETTINGS = TrackedSettings(
@@ -609,77 +595,50 @@ def efficiencies_before(
 
     Parameters
     ----------
-    run : of the command
-    windows : its poses
-    robot : that drove
-    delay_s : of the poses behind the gyro and the tracks
-    mount : (3,) of :class:`~terrain.calibration.odometry.FittedOdometry`
+    run, windows, robot, delay_s : as :func:`legs_of_windows` takes them
+    mount : (3,) of :class:`FittedOdometry`
     """
-    if len(windows) < 2:
+    origins = window_origins(run, windows)
+    if len(origins) < 2:
         return None
     time_s, own = odometry_rows(run, robot)
     rows = np.full((len(time_s), len(ROWS)), np.nan)
     rows[:, :2], rows[:, 5] = own[:, :2], own[:, 2]
-    origin = np.zeros(3)
-    for k, window in enumerate(windows[:-1]):
-        if k > 0:
-            gap = motion_over_gap(run, windows[k - 1].time_s[-1], window.time_s[0])
-            if gap is None:
-                return None
-            origin = composed(origin, gap)
+    for origin, window in zip(origins[:-1], windows, strict=False):
         for stamp_s, pose in zip(window.time_s - delay_s, window.pose, strict=True):
             tick = int(np.argmin(np.abs(time_s - stamp_s)))
             if abs(time_s[tick] - stamp_s) < 0.5 * (time_s[1] - time_s[0]) + 1e-9:
                 rows[tick, 2:5] = of_body(composed(origin, pose), mount)
-        origin = composed(origin, window.pose[-1])
     until = int(np.searchsorted(time_s, windows[-2].time_s[-1] - delay_s, side="right"))
     if until < 2:
         return None
     track = observe(tracked_observer(robot, SETTINGS), time_s[:until], rows[:until])
     if track.status[-1] == ObserverStatus.STARTING:
         return None
-    eta = track.mean[-1, [track.states.index(f"eta_{side}_ratio") for side in ("left", "right")]]
-    return np.asarray(eta)
+    return np.array([track.state(f"eta_{side}_ratio")[-1] for side in ("left", "right")])
 
 
 def of_body(pose: Array, mount: Array) -> Array:
-    """Return the pose (3,) of the body where that of the observed point is measured, both from 0.
-
-    Examples
-    --------
-    >>> mount = np.array([-0.05, 0.01, 0.02])
-    >>> of_body(of_point(np.array([1.0, 0.5, 0.8]), mount), mount).round(6).tolist()
-    [1.0, 0.5, 0.8]
-    """
+    """Return the pose (3,) of the body where that of the observed point is measured, both from 0."""
     lever = complex(mount[0], mount[1])
     seen = complex(pose[0], pose[1]) * np.exp(1j * mount[2])
     body = seen + lever - lever * np.exp(1j * pose[2])
     return np.array([body.real, body.imag, pose[2]])
 
 
-def of_point(pose: Array, mount: Array) -> Array:
-    """Return the pose (3,) of the observed point, for that of the body: the inverse of :func:`of_body`."""
-    lever = complex(mount[0], mount[1])
-    seen = (complex(pose[0], pose[1]) + lever * np.exp(1j * pose[2]) - lever) * np.exp(-1j * mount[2])
-    return np.array([seen.real, seen.imag, pose[2]])
-
-
-def dead_reckoning(leg: Leg, eta: Array, robot: TrackedRobot) -> Array:
-    """Return the change of pose (3,) of the body over a leg with efficiencies (2,): Tazzari (5).
+def end_by_efficiencies(leg: Leg, eta: Array, mount: Array, robot: TrackedRobot) -> Array:
+    """Return the change of pose (3,) of the observed point over a leg with efficiencies (2,): Tazzari (5).
 
     Examples
     --------
     >>> from terrain.robots import load_robot
     >>> speeds, still = np.full((20, 2), 0.5), np.zeros(20)
     >>> leg = Leg(0, np.zeros(3), 0.1, speeds, still, np.zeros((20, 2)), 2.0)
-    >>> dead_reckoning(leg, np.array([0.9, 0.9]), load_robot("marmotte")).round(3).tolist()
+    >>> end_by_efficiencies(leg, np.array([0.9, 0.9]), np.zeros(3), load_robot("marmotte")).round(3).tolist()
     [0.9, 0.0, 0.0]
     """
-    left, right = (leg.speeds_mps * eta).T
-    turned = (right - left) / robot.track_m * leg.step_s
-    yaw = np.cumsum(turned) - 0.5 * turned
-    ahead = 0.5 * (left + right) * leg.step_s
-    return np.array([(ahead * np.cos(yaw)).sum(), (ahead * np.sin(yaw)).sum(), turned.sum()])
+    slipping = leg._replace(speeds_mps=leg.speeds_mps * eta)
+    return np.asarray(_ends(_packed([slipping]), SlipModel().vector, mount, robot, by_gyro=False)[0])
 
 
 SHORT_RATIO = 0.8
@@ -821,7 +780,7 @@ def _adaptive(
         eta = efficiencies_before(run, windows.get(run.run_id, ()), robot, delay_s, mount)
         if eta is not None and number in last_of:
             chosen.append(last_of[number])
-            predicted.append(of_point(dead_reckoning(single[last_of[number]], eta, robot), mount))
+            predicted.append(end_by_efficiencies(single[last_of[number]], eta, mount, robot))
     if len(chosen) < 2:
         return None
     compared = {kind.name: ends[kind.name]["window"][chosen] for kind in (ENCODER, GYRODOMETRY)}

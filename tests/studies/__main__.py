@@ -25,6 +25,7 @@ STUDIES: dict[str, tuple[str, str]] = {
         "studies.slip_peaks",
         "coverage of the interval of a learned slip peak, over simulated terrains",
     ),
+    "intervals": ("studies.intervals", "coverage of the intervals of all that is identified"),
     "labels": ("studies.labels", "what chosen questions and self-training gain, from few labels"),
     "trials": (
         "studies.trials",

@@ -3,6 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from studies.intervals import HIDDEN, NOMINAL, drive_hidden
 
 from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
@@ -11,37 +12,12 @@ from terrain.estimation.measurements.batch import measurement_table
 from terrain.logs.write import write_run
 from terrain.robots import description_file, load_robot
 from terrain.simulation.bench import six_positions_log
-from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.make import make_scenario
-from terrain.terramechanics.soil import load_soil
 
-NOMINAL = load_robot("agrimaro")
 SOURCE = description_file("agrimaro").read_text(encoding="utf-8")
-HIDDEN = NOMINAL.with_parts(
-    steering=replace(NOMINAL.steering, zero_1_rad=0.03, zero_2_rad=-0.02, zero_3_rad=0.015),
-    motors=replace(NOMINAL.motors, reduction_ratio=9.4),
-    camera=replace(NOMINAL.camera, time_constant_s=0.02),
-    sensors=replace(
-        NOMINAL.sensors,
-        encoder_time_constant_s=0.08,
-        gyro_bias_z_radps=0.006,
-        accel_bias_x_mps2=0.1,
-        accel_scale_x_ratio=1.02,
-        accel_scale_z_ratio=0.99,
-    ),
-)
 
 
 def calibrate(data, robot, out=None):
     return run(Settings(data=data, robot=robot, out=out), silent)
-
-
-SOILS = {name: load_soil(name) for name in ("tiles", "grass")}
-
-
-def driven(scenario, seed, terrain="tiles", duration_s=None):
-    drive = make_scenario(scenario, HIDDEN, terrain, duration_s, seed=seed)
-    return simulate(HIDDEN, drive, SOILS, seed, run_id=f"{scenario}_{seed:02d}")
 
 
 @pytest.fixture(scope="module")
@@ -49,9 +25,9 @@ def calibrated(tmp_path_factory):
     """A data set of the hidden robot, its calibration, and the file that it wrote."""
     folder = tmp_path_factory.mktemp("calibrate")
     runs = [
-        *(driven("stand", seed, duration_s=10.0) for seed in range(3)),
-        *(driven("starts", seed) for seed in range(2)),
-        *(driven("complex", seed) for seed in range(2)),
+        *(drive_hidden("stand", seed, duration_s=10.0) for seed in range(3)),
+        *(drive_hidden("starts", seed) for seed in range(2)),
+        *(drive_hidden("complex", seed) for seed in range(2)),
         six_positions_log(HIDDEN, 7),
     ]
     for each in runs:
@@ -101,7 +77,7 @@ def test_the_file_is_a_description_that_people_can_read(calibrated):
 
 def test_what_filters_are_given_is_right_afterwards(calibrated):
     _, out, _ = calibrated
-    turning = driven("complex", 50)
+    turning = drive_hidden("complex", 50)
     truth = turning.streams["truth"]
     steer = [f"steer_{i}_rad" for i in (1, 2, 3)]
     errors = []
@@ -113,7 +89,7 @@ def test_what_filters_are_given_is_right_afterwards(calibrated):
         errors.append(np.abs(np.nanmean(table.columns(steer) - true, axis=0)).max())
     assert errors[0] > 0.015
     assert errors[1] < 0.003
-    cruise = measurement_table(driven("straight", 52), load_robot(out))
+    cruise = measurement_table(drive_hidden("straight", 52), load_robot(out))
     rates = cruise.columns([f"wheel_{i}_radps" for i in (1, 2, 3)])
     camera = cruise.columns(["camera_speed_x_mps"])
     assert rates[500:].mean() * 0.2 == pytest.approx(camera[500:].mean(), rel=0.01)
@@ -131,7 +107,7 @@ def test_a_calibrated_file_can_be_calibrated_again(calibrated, tmp_path):
 @pytest.mark.parametrize("kept", ["stand alone", "no camera"])
 def test_runs_tell_what_they_can_and_why_not_the_rest(tmp_path, kept):
     for scenario in ("stand",) if kept == "stand alone" else ("stand", "complex"):
-        each = driven(scenario, 1)
+        each = drive_hidden(scenario, 1)
         blind = {name: stream for name, stream in each.streams.items() if name != "odometry"}
         write_run(each if kept == "stand alone" else replace(each, streams=blind), tmp_path)
     result = calibrate(tmp_path, "agrimaro")
@@ -145,7 +121,7 @@ def test_runs_tell_what_they_can_and_why_not_the_rest(tmp_path, kept):
 
 
 def test_what_is_refused(tmp_path):
-    write_run(driven("straight", 1, "grass", 8.0), tmp_path / "runs")
+    write_run(drive_hidden("straight", 1, "grass", 8.0), tmp_path / "runs")
     taken, other = tmp_path / "taken.yaml", tmp_path / "rover.yaml"
     taken.write_text("mine")
     other.write_text(SOURCE.replace("name: agrimaro", "name: rover"))

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from studies.intervals import tracked_arcs
 
 from terrain.calibration.odometry import (
     ENCODER,
@@ -12,14 +13,13 @@ from terrain.calibration.odometry import (
     SLIP,
     Leg,
     composed,
-    dead_reckoning,
+    end_by_efficiencies,
     fit_odometry,
     held_out_ends,
     legs_of_poses,
     legs_of_windows,
     level,
     of_body,
-    of_point,
     predict_ends,
     relative,
     score_legs,
@@ -29,21 +29,21 @@ from terrain.errors import DataError
 from terrain.logs.drive_poses import WindowPoses
 from terrain.robots import load_robot
 from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import QUIET, simulate_tracked
+from terrain.simulation.tracked.run import QUIET
 
 PATAKO = load_robot("patako")
 GIVEN = GivenSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)
 
 
-def drives(given=GIVEN, n=12, seed=0, sensors=None):
-    """Return runs of arcs of several radii with poses of cameras around."""
-    rng, runs = np.random.default_rng(seed), []
-    for k in range(n):
-        speeds = rng.uniform(-0.15, 0.15, 2)
-        belts = np.tile(speeds, (401, 1))
-        also = {} if sensors is None else {"sensors": sensors}
-        runs.append(simulate_tracked(PATAKO, given, belts, 100 * seed + k, run_id=f"run_{k}", **also))
-    return runs
+def drives(n=12, **options):
+    return tracked_arcs(PATAKO, GIVEN, n, **options)
+
+
+def of_point(pose, mount):
+    """Return the pose (3,) of the observed point, for that of the body."""
+    lever = complex(mount[0], mount[1])
+    seen = (complex(pose[0], pose[1]) + lever * np.exp(1j * pose[2]) - lever) * np.exp(-1j * mount[2])
+    return np.array([seen.real, seen.imag, pose[2]])
 
 
 @pytest.fixture(scope="module")
@@ -125,10 +125,10 @@ def test_windows_are_chained_over_their_gaps():
     assert legs_of_windows(run, 0, [], PATAKO, 0.0) == ([], None)
 
 
-def test_dead_reckoning_with_efficiencies_is_the_arc_of_the_paper():
+def test_efficiencies_give_the_arc_of_the_paper():
     speeds = np.tile([0.4, 0.6], (200, 1))
     leg = Leg(0, np.zeros(3), 0.01, speeds, np.zeros(200), np.zeros((200, 2)), 2.0)
-    x, y, yaw = dead_reckoning(leg, np.array([1.1, 0.8]), PATAKO)
+    x, y, yaw = end_by_efficiencies(leg, np.array([1.1, 0.8]), np.zeros(3), PATAKO)
     turn = (0.48 - 0.44) / PATAKO.track_m
     assert yaw == pytest.approx(2.0 * turn)
     radius = 0.46 / turn

@@ -14,7 +14,6 @@ from terrain.records import RunLog
 from terrain.simulation.conditions import Conditions
 
 HARD = ("tiles", "asphalt")
-N_SEEDS = 20
 
 
 def stretches_of(runs, robot, hard=HARD):
@@ -25,33 +24,17 @@ def zeros_of(runs, robot):
     return np.array([finding.value for finding in steering_zeros(stretches_of(runs, robot), robot)])
 
 
-@pytest.fixture(scope="module")
-def found(drive, nominal):
-    """Findings and plain means of one complex run for each of many seeds."""
-    out = []
-    for seed in range(N_SEEDS):
+def test_side_slip_is_no_noise_that_averages_out(drive, nominal, truth):
+    """The plain mean of angle less direction is off, and alike in every run."""
+    zeros, errors, plain = [truth(f"steering.zero_{i}_rad") for i in (1, 2, 3)], [], []
+    for seed in range(3):
         stretches = stretches_of([drive("complex", seed)], nominal)
-        findings = [*steering_zeros(stretches, nominal), reduction_ratio(stretches, nominal)]
-        out.append((findings, np.mean([stretch.off_rad for stretch in stretches], axis=0)))
-    return out
-
-
-def test_zeros_and_ratio_come_back(found, coverage, truth):
-    held = coverage([findings for findings, _ in found])
-    assert len(held) == 4
-    assert min(held.values()) >= 0.8
-    zeros = [truth(f"steering.zero_{i}_rad") for i in (1, 2, 3)]
-    errors = np.array([[finding.value for finding in findings[:3]] for findings, _ in found]) - zeros
+        found = steering_zeros(stretches, nominal)
+        assert all(finding.high - finding.low < 0.006 for finding in found)
+        errors.append([finding.value for finding in found] - np.array(zeros))
+        plain.append(np.mean([stretch.off_rad for stretch in stretches], axis=0) - zeros)
     assert np.abs(errors).max() < 0.0015
-    # Side slip is no noise: the plain mean of angle less direction is off, and alike in every run.
-    plain = np.array([mean for _, mean in found]) - zeros
-    assert np.abs(plain.mean(axis=0)).max() > 5 * np.abs(errors.mean(axis=0)).max()
-    assert np.abs(plain.mean(axis=0)).max() > 0.003
-    ratios = [findings[3].value for findings, _ in found]
-    assert np.mean(ratios) == pytest.approx(truth("motors.reduction_ratio"), rel=6e-4)
-    for findings, _ in found:
-        assert all(finding.high - finding.low < 0.006 for finding in findings[:3])
-        assert findings[3].high - findings[3].low < 0.02 * findings[3].value
+    assert np.abs(np.mean(plain, axis=0)).max() > max(5 * np.abs(np.mean(errors, axis=0)).max(), 0.003)
 
 
 def test_forward_and_backward_driving_agree_on_a_side_slope(drive, nominal, truth):

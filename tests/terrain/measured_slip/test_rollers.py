@@ -18,39 +18,6 @@ def place_of(robot):
     return robot.wheel_positions_m, robot.wheel_directions_rad
 
 
-def test_free_rollers_drive_what_the_wheels_roll(robotino):
-    twist = np.array([[0.1, 0.2, 0.5], [-0.3, 0.0, 0.0]])
-    wheels = omni.inverse(*place_of(robotino), twist)
-    np.testing.assert_allclose(steady_twist(wheels, *place_of(robotino), LOADS[""], 0.0), twist, atol=1e-12)
-    half = steady_twist(wheels, *place_of(robotino), LOADS[""], 0.0, 0.5)
-    np.testing.assert_allclose(half, twist / 2, atol=1e-12)
-
-
-def test_slip_depends_on_the_direction_and_not_on_the_speed(robotino):
-    wheels = omni.inverse(*place_of(robotino), np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]))
-    slow = steady_twist(wheels, *place_of(robotino), LOADS[""], 0.5)
-    np.testing.assert_allclose(steady_twist(3 * wheels, *place_of(robotino), LOADS[""], 0.5), 3 * slow)
-    assert slow[0, 0] < slow[1, 1]  # the wheel that carries most rolls across, driving ahead
-    even = steady_twist(wheels, *place_of(robotino), np.full(3, 1 / 3), 0.5)
-    assert even[0, 0] == pytest.approx(even[1, 1])
-    assert even[0, 0] == pytest.approx(0.1 / 1.5)
-
-
-def test_the_balance_of_forces_holds(robotino):
-    """The other route: forces of each wheel by the law, summed, are none."""
-    positions, direction = place_of(robotino)
-    wheels = np.array([[0.05, -0.08, 0.02]])
-    twist = steady_twist(wheels, positions, direction, LOADS[""], 0.7)[0]
-    total = np.zeros(3)
-    for i, (x, y) in enumerate(positions):
-        along = np.array([np.cos(direction[i]), np.sin(direction[i])])
-        across = np.array([-along[1], along[0]])
-        centre = twist[:2] + twist[2] * np.array([-y, x])
-        force = LOADS[""][i] * ((wheels[0, i] - along @ centre) * along - 0.7 * (across @ centre) * across)
-        total += [*force, x * force[1] - y * force[0]]
-    np.testing.assert_allclose(total, 0.0, atol=1e-15)
-
-
 def slips_of(make_omni_run, robot, rng, surface, group, n=24):
     """Return measured runs of a robot that moves by the law, each at one speed and direction."""
     found = []

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from studies.intervals import SPEEDS_MMPS, wheel_trials
 
 from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
@@ -20,16 +21,13 @@ from terrain.soil_identification.fit import (
     cohesion_profile,
     fit_law,
     force_vector,
-    forces_of,
     modulus_spread,
     parameters_of,
     predict,
-    sinkage_of,
 )
 from terrain.soil_identification.plain_soil import fit_plain_soil, plain_prediction, plain_soil
 from terrain.soil_identification.trials import (
     WHEELS,
-    Trials,
     calibration_rows,
     setting_means,
     side_coupling,
@@ -41,36 +39,13 @@ from terrain.terramechanics.travel_sinkage import TRAVEL
 
 WHEEL = WHEELS["testbed_smooth"]
 LAW = LAWS["inflow"]
-SPEEDS_MMPS = (0.0, 3.0, 5.0, 8.0, 10.0, 12.0, 20.0, 40.0, 100.0)
 HIDDEN = {"tan_friction": 0.65, "shear_modulus_m": 0.016, "side_pressure_ratio": 19.0}
 SHALLOW = {"rolling_m": 0.017, "slip_ratio": 0.6}
 
 
-def simulated(seed, noise_ratio=0.03):
-    """Trials of a wheel that the law with hidden numbers describes, with noise of forces and depth."""
-    wheel_mps, angle = (
-        grid.ravel() * 1.0 for grid in np.meshgrid(np.array(SPEEDS_MMPS) / 1e3, np.arange(0.0, 91.0, 15.0))
-    )
-    n = len(wheel_mps)
-    travel = np.full(n, 0.01)
-    slip = (wheel_mps - travel) / np.maximum(wheel_mps, travel)
-    blank = np.zeros(n)
-    trials = Trials(
-        wheel_mps / WHEEL.radius_m,
-        *(travel, np.radians(angle), slip, np.full(n, 22.0), blank, blank, blank),
-        *(wheel_mps * 1e3, angle, np.ones(n)),
-    )
-    rng = np.random.default_rng(seed)
+def simulated(seed):
     depth = np.array([SHALLOW.get(name, value) for name, (value, _) in TRAVEL.items()])
-    force = np.array([HIDDEN.get(name, FORCE[name][0]) for name in LAW.free])
-    found = forces_of(LAW, force, trials, WHEEL, sinkage_of(LAW, depth, trials, WHEEL))
-    spread = noise_ratio * trials.load_n
-    return replace(
-        trials,
-        pull_n=found.pull_n + spread * rng.standard_normal(n),
-        side_n=found.side_n + spread * rng.standard_normal(n),
-        sinkage_m=found.sinkage_m + 5e-4 * rng.standard_normal(n),
-    )
+    return wheel_trials(LAW, depth, HIDDEN, seed)
 
 
 def test_hidden_numbers_come_back_within_their_intervals():

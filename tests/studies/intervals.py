@@ -1,0 +1,361 @@
+"""Coverage of the intervals of what is identified, over simulated repeats: soils, slip curves, sensors, robots.
+
+A use draws data with numbers that it hides, identifies them, and looks whether the intervals contain them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+
+from pipelines.report.results import Progress, Result, described, silent
+from pipelines.report.settings import Settings as BaseSettings
+from pipelines.report.settings import setting
+from pipelines.report.tree import Column, Report, Table
+from studies.slip_peaks import clopper_pearson
+from terrain.calibration.description import find
+from terrain.calibration.odometry import SLIP, fit_odometry, legs_of_poses, level
+from terrain.calibration.sensors import fit_gravity
+from terrain.calibration.skid_steer import identify as identify_skid
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError
+from terrain.files.documents import read_yaml
+from terrain.identify import Parameter, half_width, identify
+from terrain.kinematics import omni
+from terrain.measured_slip.rollers import roller_findings
+from terrain.records import Array, Label, RunLog, Stream
+from terrain.robots import description_file, load_robot
+from terrain.simulation.bench import six_positions_log
+from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.planar.omni_contact import steady_twist
+from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.tracked.given_slip import GivenSlip
+from terrain.simulation.tracked.run import simulate_tracked
+from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio
+from terrain.slip_learning.forces import RunBins
+from terrain.soil_identification.fit import LAWS, SINKAGES, Law, fit_law, forces_of, parameters_of, sinkage_of
+from terrain.soil_identification.trials import WHEELS, Trials
+from terrain.terramechanics.inflow_wheel import FORCE
+from terrain.terramechanics.soil import load_soil
+
+EXAMPLE = "python tests/studies intervals --repeats 200 --seed 0"
+WHEEL = WHEELS["testbed_smooth"]
+SPEEDS_MMPS = (0.0, 3.0, 5.0, 8.0, 10.0, 12.0, 20.0, 40.0, 100.0)
+NOMINAL_M = 0.3
+"""Wheel radius by which logs of a skid-steer robot are made."""
+
+
+class Interval(NamedTuple):
+    """What was stated of a number, and the number."""
+
+    name: str
+    low: float
+    high: float
+    truth: float
+
+
+class Covered(NamedTuple):
+    """Coverage of one number in one use."""
+
+    use: str
+    name: str
+    n: int
+    coverage: float
+    interval: tuple[float, float]
+    stated: float
+
+
+NOMINAL = load_robot("agrimaro")
+HIDDEN = NOMINAL.with_parts(
+    steering=replace(NOMINAL.steering, zero_1_rad=0.03, zero_2_rad=-0.02, zero_3_rad=0.015),
+    motors=replace(NOMINAL.motors, reduction_ratio=9.4),
+    camera=replace(NOMINAL.camera, time_constant_s=0.02, speed_std_mps=0.003),
+    sensors=replace(
+        NOMINAL.sensors,
+        encoder_time_constant_s=0.08,
+        gyro_bias_x_radps=0.004,
+        gyro_bias_y_radps=-0.003,
+        gyro_bias_z_radps=0.006,
+        gyro_bias_std_radps=0.0015,
+        gyro_std_radps=0.002,
+        accel_std_mps2=0.015,
+        accel_bias_x_mps2=0.1,
+        accel_bias_y_mps2=-0.08,
+        accel_bias_z_mps2=0.15,
+        accel_scale_x_ratio=1.02,
+        accel_scale_y_ratio=0.98,
+        accel_scale_z_ratio=1.01,
+        current_std_a=0.2,
+        steering_std_rad=0.0012,
+    ),
+)
+SOILS = {name: load_soil(name) for name in ("tiles", "grass")}
+
+
+def drive_hidden(scenario, seed, terrain="tiles", duration_s=None, robot=HIDDEN, **options):
+    drive = make_scenario(scenario, robot, terrain, duration_s, seed=seed)
+    return simulate(robot, drive, SOILS, seed, run_id=f"{scenario}_{seed:03d}", **options)
+
+
+def skid_run(radius_m, track_m, lidar_s, wheels_s, seed, terrain="asphalt", slip=0.01, n_steps=8, session=""):
+    """A run of a robot whose radius, track and delays are known; lidar at 10 Hz, gyro at 50, wheels at 20."""
+    rng = np.random.default_rng(seed)
+    kernel = np.exp(-np.arange(60) / 15.0)
+    speed = np.repeat(rng.uniform(-1.5, 1.5, n_steps), 300)
+    turn = np.repeat(rng.uniform(-0.8, 0.8, n_steps) * rng.integers(0, 2, n_steps), 300)
+    speed, turn = (np.convolve(signal, kernel / kernel.sum())[: len(signal)] for signal in (speed, turn))
+    t = np.arange(len(speed)) / 100.0
+
+    def late(signal, at_s, delay_s):
+        return np.interp(at_s - delay_s, t, signal)
+
+    imu_s, wheels_at_s, lidar_at_s = (np.arange(0.0, t[-1], step) for step in (0.02, 0.05, 0.1))
+    rolled = speed / (1.0 - slip)
+    # a nominal radius makes of a smaller one's turns a higher speed; the track is one of these speeds
+    sides = [
+        late(rolled * NOMINAL_M / radius_m + sign * turn * track_m / 2, wheels_at_s, wheels_s)
+        for sign in (-1, 1)
+    ]
+    wheels = np.column_stack(sides) + rng.normal(0.0, 0.01, (len(wheels_at_s), 2))
+    lidar = np.column_stack(
+        [late(speed, lidar_at_s, lidar_s), 0.0 * lidar_at_s, late(turn, lidar_at_s, lidar_s)]
+    )
+    lidar += rng.normal(0.0, 0.03, lidar.shape)
+    gyro = late(turn, imu_s, 0.0) + rng.normal(0.0, 0.01, len(imu_s))
+    streams = {
+        "wheels": Stream(wheels_at_s, wheels, ("speed_left_mps", "speed_right_mps")),
+        "imu": Stream(imu_s, gyro[:, None], ("gyro_z_radps",)),
+        "lidar": Stream(lidar_at_s, lidar, ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")),
+    }
+    labels = (Label(0.0, float(t[-1]), terrain),) if terrain else ()
+    return RunLog(f"run_{seed:03d}", "warthog", streams, labels, session=session)
+
+
+def drawn_runs(law, theta, rng, n=6, noise=0.01, run_std=0.1, offset_std=0.003, reach=0.6):
+    """Return bins of runs whose factor, offset and shape differ as runs do."""
+    runs = []
+    for number in range(n):
+        slip = np.linspace(0.005, reach * rng.uniform(0.8, 1.0), 18)
+        factor = np.exp(run_std * rng.standard_normal())
+        mu = factor * traction_ratio(law, theta, slip + offset_std * rng.standard_normal())
+        mu = mu + noise * rng.standard_normal(len(mu))
+        runs.append(RunBins(f"run {number}", slip, np.full(18, 0.003), mu, np.full(18, noise)))
+    return runs
+
+
+def wheel_trials(law: Law, depth: Array, hidden: Mapping[str, float], seed: int, noise_ratio=0.03) -> Trials:
+    """Trials of a wheel that a law with hidden numbers describes, with noise of forces and depth."""
+    wheel_mps, angle = (
+        grid.ravel() * 1.0 for grid in np.meshgrid(np.array(SPEEDS_MMPS) / 1e3, np.arange(0.0, 91.0, 15.0))
+    )
+    n = len(wheel_mps)
+    travel, blank = np.full(n, 0.01), np.zeros(n)
+    slip = (wheel_mps - travel) / np.maximum(wheel_mps, travel)
+    trials = Trials(
+        wheel_mps / WHEEL.radius_m,
+        *(travel, np.radians(angle), slip, np.full(n, 22.0), blank, blank, blank),
+        *(wheel_mps * 1e3, angle, np.ones(n)),
+    )
+    rng = np.random.default_rng(seed)
+    force = np.array([hidden.get(name, FORCE[name][0]) for name in law.free])
+    found = forces_of(law, force, trials, WHEEL, sinkage_of(law, depth, trials, WHEEL))
+    spread = noise_ratio * trials.load_n
+    return replace(
+        trials,
+        pull_n=found.pull_n + spread * rng.standard_normal(n),
+        side_n=found.side_n + spread * rng.standard_normal(n),
+        sinkage_m=found.sinkage_m + 5e-4 * rng.standard_normal(n),
+    )
+
+
+def tracked_arcs(robot, given, n=12, seed=0, **sensors):
+    """Return runs of arcs of several radii with poses of cameras around."""
+    rng, runs = np.random.default_rng(seed), []
+    for k in range(n):
+        belts = np.tile(rng.uniform(-0.15, 0.15, 2), (401, 1))
+        runs.append(simulate_tracked(robot, given, belts, 100 * seed + k, run_id=f"run_{k}", **sensors))
+    return runs
+
+
+# -- uses --------------------------------------------------------------------------------------------------
+
+
+def _regression(seed: int) -> Iterator[Interval]:
+    """A line over runs that differ by an offset of their own."""
+    rng, run = np.random.default_rng(seed), np.repeat(np.arange(15), 20)
+    x = np.repeat(rng.normal(size=15), 20)
+    y = 0.5 - 2.0 * x + 0.3 * np.repeat(rng.normal(size=15), 20) + 0.1 * rng.normal(size=300)
+    line = [Parameter("intercept", 0.0), Parameter("slope", 0.0)]
+    fit = identify(lambda p: p[0] + p[1] * x - y, line, run)
+    for p, low, high, truth in zip(line, *fit.interval, (0.5, -2.0), strict=True):
+        yield Interval(p.name, low, high, truth)
+
+
+def _six_positions(seed: int) -> Iterator[Interval]:
+    rng, bias, scale, std = np.random.default_rng(seed), [0.1, -0.08, 0.15], [1.02, 0.98, 1.01], 1e-3
+    up = rng.normal(0.0, 0.1, (12, 3)) + np.tile(np.vstack([np.eye(3), -np.eye(3)]), (2, 1))
+    up /= np.linalg.norm(up, axis=1)[:, None]
+    means = np.array(scale) * GRAVITY_MPS2 * up + bias + std * rng.standard_normal(up.shape)
+    *found, cov = fit_gravity(means, np.full(up.shape, std**2))
+    half = half_width(np.sqrt(np.diag(cov)), np.inf)
+    for k, (value, truth) in enumerate(zip(np.concatenate(found), bias + scale, strict=True)):
+        name = ("bias" if k < 3 else "scale") + f"_{'xyz'[k % 3]}"
+        yield Interval(name, value - half[k], value + half[k], truth)
+
+
+def _swerve(seed: int) -> Iterator[Interval]:
+    runs = [drive_hidden("stand", 10 * seed + k, duration_s=8.0) for k in range(3)]
+    runs += [drive_hidden(name, seed) for name in ("complex", "starts")]
+    runs += [six_positions_log(HIDDEN, 10 * seed + k, hold_s=3.0, run_id=f"bench_{k}") for k in range(3)]
+    description = read_yaml(description_file("agrimaro"))
+    for finding in find(runs, description, NOMINAL, ("tiles",)):
+        section, _, name = finding.parameter.partition(".")
+        if finding.determined and name:
+            yield Interval(name, finding.low, finding.high, getattr(getattr(HIDDEN, section), name))
+
+
+def _skid_steer(seed: int) -> Iterator[Interval]:
+    hidden = {
+        "rolling_radius_m": 0.29,
+        "effective_track_m": 1.8,
+        "lidar_delay_s": 0.3,
+        "wheels_delay_s": 0.05,
+    }
+    runs = [skid_run(*hidden.values(), 1000 * seed + k, n_steps=4) for k in range(8)]
+    for finding in identify_skid(runs, NOMINAL_M, ("asphalt",))[1:]:  # the radius' holds all of an assumption
+        name = finding.parameter.partition(".")[2]
+        yield Interval(name, finding.low, finding.high, hidden[name])
+
+
+def _soil(seed: int) -> Iterator[Interval]:
+    law, hidden = LAWS["wong_reece"], {"tan_friction": 0.65, "shear_modulus_m": 0.016}
+    depth = np.array([mean for mean, _ in SINKAGES[law.sinkage].values()])
+    trials = wheel_trials(law, depth, hidden, seed)
+    found = parameters_of(fit_law(law, trials, WHEEL), trials, 40, seed)
+    for name, truth in hidden.items():
+        yield Interval(name, *found[name].interval, truth)
+
+
+def _rollers(seed: int) -> Iterator[Interval]:
+    robot, rng, ratio = load_robot("robotino"), np.random.default_rng(seed), {"cork": 0.1, "moss": 0.6}
+    place, load, runs = (
+        (robot.wheel_positions_m, robot.wheel_directions_rad),
+        np.array([0.25, 0.45, 0.30]),
+        [],
+    )
+    for surface, rho in ratio.items():
+        for k in range(24):
+            angle = 2 * np.pi * k / 24
+            ahead = np.array([np.cos(angle), np.sin(angle)])
+            wheels = omni.inverse(*place, 0.1 * np.array([[*ahead, 0.0]]))
+            twist = steady_twist(wheels, *place, load, rho, 0.06)[0, :2] + rng.normal(0.0, 0.002, 2)
+            side = (ahead[0] * twist[1] - ahead[1] * twist[0]) / 0.1
+            slip = SimpleNamespace(
+                steady=np.ones(1, bool),
+                body_slip=np.array([1.0 - twist @ ahead / 0.1]),
+                body_side=np.array([side]),
+                wheel_speed_mps=wheels,
+            )
+            runs.append((slip, surface))
+    found = roller_findings([slip for slip, _ in runs], [name for _, name in runs], robot, list(ratio), seed)
+    for k, (interval, truth) in enumerate(zip(found.load_interval, load.tolist(), strict=True), start=1):
+        yield Interval(f"load_{k}_ratio", *interval, truth)
+    yield Interval("scale_ratio", *found.scale_interval, 0.06)
+    for name, truth in ratio.items():
+        yield Interval(f"roller_{name}_ratio", *found.roller_interval[name], truth)
+
+
+def _odometry(seed: int) -> Iterator[Interval]:
+    robot = load_robot("patako")
+    given = GivenSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)
+    runs = enumerate(tracked_arcs(robot, given, seed=seed))
+    legs = [leg for k, run in runs for leg in legs_of_poses(run, k, robot, 2.0)]
+    fit = fit_odometry(level(SLIP), legs, robot).fit
+    truth = {"turning_exponent": 0.7, "compaction_slip_ratio": 0.08, "lever_x_m": 0.0, "lever_y_m": 0.0}
+    for p, low, high in zip(fit.parameters, *fit.interval, strict=True):
+        if p.name in truth:
+            yield Interval(p.name, low, high, truth[p.name])
+
+
+def _slip_curve(seed: int) -> Iterator[Interval]:
+    for name, law, theta, rho in (
+        ("sand", "janosi", (0.6, 0.16), 0.1),
+        ("snow", "magic", (5.0, 2.0, 0.3, 1.0), 0.04),
+    ):
+        rng = np.random.default_rng(seed)
+        runs = drawn_runs(law, theta, rng)
+        curve = learn_curve(runs, Resistances(np.full(len(runs), rho), np.full(len(runs), 0.01)), rng, 60)
+        true = net_peak(lambda s: traction_ratio(law, theta, s) - rho, *curve.slip_range)  # noqa: B023
+        yield Interval(f"peak_{name}", *curve.peak_interval, true.slip_ratio)
+
+
+USES: dict[str, tuple[Callable[[int], Iterator[Interval]], float]] = {
+    "regression": (_regression, 0.95),
+    "six-positions": (_six_positions, 0.95),
+    "swerve": (_swerve, 0.95),
+    "skid-steer": (_skid_steer, 0.95),
+    "rollers": (_rollers, 0.95),
+    "odometry": (_odometry, 0.95),
+    "soil": (_soil, 0.95),
+    "slip-curve": (_slip_curve, 0.9),
+}
+"""By name: what draws and identifies, and the probability that its intervals state."""
+
+
+class Settings(BaseSettings):
+    """Which uses are repeated, and how often."""
+
+    repeats: int = setting(200, "Data sets of each use.", ge=2)
+    seed: int = setting(0, "Of the first data set.", ge=0)
+    uses: str = setting(",".join(USES), "Names, separated by commas.")
+
+
+@dataclass(frozen=True)
+class IntervalsResult(Result):
+    """Coverage of every number in every use."""
+
+    repeats: int = described("data sets of each use")
+    seed: int = described("of the first")
+    rows: tuple[Covered, ...] = described("one a number and use")
+
+
+def run(settings: Settings, progress: Progress = silent) -> IntervalsResult:
+    """Draw, identify and count."""
+    rows = []
+    for use in settings.uses.split(","):
+        if use not in USES:
+            raise ConfigError(f"--uses: there is no use {use!r}; there are {', '.join(USES)}")
+        draw, stated = USES[use]
+        hits: dict[str, list[bool]] = {}
+        for k in range(settings.repeats):
+            for name, low, high, truth in draw(settings.seed + k):
+                hits.setdefault(name, []).append(bool(low <= truth <= high))
+            progress(use, k + 1, settings.repeats)
+        rows += [
+            Covered(use, name, len(each), float(np.mean(each)), clopper_pearson(sum(each), len(each)), stated)
+            for name, each in hits.items()
+        ]
+    return IntervalsResult(settings.repeats, settings.seed, tuple(rows))
+
+
+def report(result: IntervalsResult) -> Report:
+    """Return the coverage of each number."""
+    low, high = (f(row.coverage - row.stated for row in result.rows) for f in (min, max))
+    columns = (
+        "use",
+        "number",
+        "repeats",
+        Column("coverage", ".3f"),
+        Column("95 %", ".3f"),
+        Column("stated", ".2f"),
+    )
+    return Report(
+        "Intervals of what is identified",
+        f"Of {result.repeats} data sets each, intervals contain what is hidden {100 * low:+.0f} to {100 * high:+.0f} "
+        "points from as often as they state.",
+        parts=(Table(columns, tuple(tuple(row) for row in result.rows)),),
+    )
