@@ -9,8 +9,7 @@ from terrain.estimation.observers.choice import make_observer
 from terrain.estimation.observers.live import LiveObserver
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
-from terrain.simulation.tracked.run import Stretch, simulate_tracked
-from terrain.simulation.tracked.slope import Slope
+from terrain.simulation.tracked import Slope, Stretch, simulate_tracked
 from terrain.terramechanics.soil import load_soil
 
 

@@ -37,6 +37,17 @@ def record(fields: Mapping[str, Any]) -> np.dtype[Any]:
     )
 
 
+def numbers(names: str) -> dict[str, Any]:
+    """Return the fields of a record that are one number each, from their names in a row.
+
+    Examples
+    --------
+    >>> record(numbers("x_m y_m") | {"n": int}).names
+    ('x_m', 'y_m', 'n')
+    """
+    return dict.fromkeys(names.split(), float)
+
+
 def filled(fields: np.dtype[Any], value: float = 0.0, **values: Any) -> Array:
     """Return a structured array (1,) of one record, for a compiled function to take its element 0.
 

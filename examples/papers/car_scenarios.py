@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.control.paths import ReferencePath, path_from_curvature
-from terrain.simulation.bicycle.plant import Ground, level_ground
-from terrain.simulation.bicycle.simulate import CarDrive, SpeedProfile
+from terrain.simulation.car import CarDrive, Ground, SpeedProfile, level_ground
 
 GRIP_RATIO = 0.7
 """Of soil and grass; assumed."""

@@ -24,7 +24,7 @@ from terrain.estimation.observers.sideslip_multi import (
 )
 from terrain.records import Array
 from terrain.robots import BicycleRobot, as_drive, load_robot
-from terrain.simulation.bicycle.simulate import simulate_car
+from terrain.simulation.car import simulate_car
 
 RUNS, FEW_RUNS = 5, 2
 """Drives that a figure is a mean of, and the number with ``quick``."""

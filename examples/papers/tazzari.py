@@ -29,21 +29,20 @@ from terrain.estimation.observers.tracked_stability import (
 )
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
-from terrain.simulation.tracked.contact import (
-    COHESION,
-    EXPONENT,
-    KC,
-    KPHI,
-    ROLLING,
-    TAN_FRICTION,
-    WIDTH,
-    contact_array,
-    sinkage_of,
+from terrain.simulation.tracked import (
+    COMMANDS_HZ,
+    LEVEL,
+    NOISY,
+    QUIET,
+    STATE,
+    STEP_S,
+    PrescribedSlip,
+    TrackedSensors,
+    drive,
+    rut_depth,
+    simulate_tracked,
+    tracks_on,
 )
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.motion import STATE_SIZE, STEP_S, VX, YAW, W, X, advance
-from terrain.simulation.tracked.run import COMMANDS_HZ, NOISY, QUIET, TrackedSensors, simulate_tracked
-from terrain.simulation.tracked.slope import LEVEL
 from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import compaction_resistance, friction_limit
 
@@ -111,7 +110,7 @@ def orchard_ugv() -> TrackedRobot:
 
 
 def observed(
-    ground: Soil | GivenSlip,
+    ground: Soil | PrescribedSlip,
     speeds_mps: Array,
     seed: int | np.random.SeedSequence,
     settings: TrackedSettings = PAPER,
@@ -141,7 +140,7 @@ def observed(
     pose = np.column_stack([truth.channel(name)[at] for name in ("position_x_m", "position_y_m", "yaw_rad")])
     forward, turn = (truth.channel(name)[at] for name in ("speed_x_mps", "yaw_rate_radps"))
     eta = measured_efficiency(forward, turn, rows[:, 0], rows[:, 1], robot.half_track_m)
-    if isinstance(ground, GivenSlip):
+    if isinstance(ground, PrescribedSlip):
         eta = np.tile([ground.eta_left_ratio, ground.eta_right_ratio], (len(time_s), 1))
     return ObservedRun(run, observe(observer, time_s, rows), rows, pose, eta)
 
@@ -160,7 +159,7 @@ def observed_motion(
 ) -> ObservedRun:
     """Observe a motion with its constant efficiencies."""
     speeds = constant_speeds(motion, duration_s)
-    return observed(GivenSlip(*motion.eta_ratio), speeds, seed, settings, sensors)
+    return observed(PrescribedSlip(*motion.eta_ratio), speeds, seed, settings, sensors)
 
 
 def seeds(trial: Trial) -> list[np.random.SeedSequence]:
@@ -472,14 +471,14 @@ def on_soils(trial: Trial) -> Finding:
 def _inverse(soil: Soil, run: ObservedRun) -> Numbers:
     """Return the slip in straight motion by inverting (7) for the resistance of a track."""
     robot = orchard_ugv()
-    contact = contact_array(robot, soil)
+    tracks = tracks_on(robot, soil)[0]
     load_n = 0.5 * robot.mass_kg * GRAVITY_MPS2
-    resistance_n = contact[ROLLING] * load_n
-    if contact[KPHI] > 0.0:
-        modulus = contact[KC] + contact[WIDTH] * contact[KPHI]
-        resistance_n += compaction_resistance(sinkage_of(contact, load_n), modulus, contact[EXPONENT])
+    resistance_n = tracks["rolling_ratio"] * load_n
+    if tracks["kphi_npmn2"] > 0.0:
+        modulus = tracks["kc_npmn1"] + tracks["width_m"] * tracks["kphi_npmn2"]
+        resistance_n += compaction_resistance(rut_depth(tracks, load_n), modulus, tracks["exponent_ratio"])
     area_m2 = robot.contact_length_m * robot.track_width_m
-    limit_n = friction_limit(load_n, area_m2, contact[COHESION], contact[TAN_FRICTION])
+    limit_n = friction_limit(load_n, area_m2, tracks["cohesion_pa"], tracks["tan_friction"])
     slip = float(janosi_slip(resistance_n, limit_n, robot.contact_length_m, soil.shear_modulus_m))
     vehicle = float(np.mean(1.0 - run.eta[-1]))
     return Numbers(slip, beside={"simulated vehicle": vehicle}, values={"vehicle": vehicle})
@@ -492,7 +491,7 @@ LOST_S, STAND_S = (40.0, 50.0), (60.0, 660.0)
 
 def missing_fixes(trial: Trial) -> Finding:
     """Lose the fixes for 10 s on the circle, and stand for 10 minutes after a straight run."""
-    speeds, slip = constant_speeds(CIRCLE, 80.0), GivenSlip(*CIRCLE.eta_ratio)
+    speeds, slip = constant_speeds(CIRCLE, 80.0), PrescribedSlip(*CIRCLE.eta_ratio)
     lost = [observed(slip, speeds, each, lost_s=LOST_S) for each in seeds(trial)]
     off_m, stated_m, resets = [], [], 0
     for run in lost:
@@ -503,7 +502,7 @@ def missing_fixes(trial: Trial) -> Finding:
     beside = {"standard deviation stated by the observer": float(np.mean(stated_m))}
     stop = constant_speeds(STRAIGHT, STAND_S[1] / (5.0 if trial.quick else 1.0))
     stop[np.arange(len(stop)) * 0.02 >= STAND_S[0]] = 0.0
-    stood = observed(GivenSlip(*STRAIGHT.eta_ratio), stop, trial.seed)
+    stood = observed(PrescribedSlip(*STRAIGHT.eta_ratio), stop, trial.seed)
     longest_s = PAPER.longest_interval_s
     numbers = {
         "lost": Numbers.over(off_m, beside, resets=resets, n_runs=len(lost), longest=longest_s),
@@ -587,10 +586,10 @@ def closed_loop(seed: np.random.SeedSequence, duration_s: float, compensated: bo
     compensated : whether the estimated efficiencies are used; else they are taken for 1
     """
     robot, rng = orchard_ugv(), np.random.default_rng(seed)
-    grounds = np.array([contact_array(robot, load_soil(name)) for name in SOILS])
-    given, until_m, level = np.zeros((2, 7)), np.array([FIRST_M, np.inf]), np.array(LEVEL)
+    grounds = zip(SOILS, (FIRST_M, np.inf), strict=True)
+    tracks = np.concatenate([tracks_on(robot, load_soil(name), until_m) for name, until_m in grounds])
     settings, observer = TrackSpeedSettings(), tracked_observer(robot, NORMALISED)
-    memory, used, state, belts = np.array(observer.start), np.ones(2), np.zeros(STATE_SIZE), np.zeros(2)
+    memory, used, state, belts = np.array(observer.start), np.ones(2), np.zeros(2, STATE), np.zeros(2)
     noise = np.array([NOISY.gnss_m, NOISY.gnss_m, NOISY.compass_rad])
     keep, n = np.exp(-STEP_S / NOISY.belt_lag_s), round(duration_s / TICK_S)
     speed, etas = np.empty((n, 2)), np.empty((n, 2))
@@ -601,12 +600,14 @@ def closed_loop(seed: np.random.SeedSequence, duration_s: float, compensated: bo
         used = command.eta
         for _ in range(round(TICK_S / STEP_S)):
             belts = keep * belts + (1.0 - keep) * np.array([command.left_mps, command.right_mps])
-            state = advance(grounds, given, until_m, robot.half_track_m, level, state, belts, STEP_S)
+            drive(tracks, np.array(LEVEL), np.array([belts, belts]), state, STEP_S)
+            state[0] = state[1]
         row = np.full(6, np.nan)
         row[:2] = belts + NOISY.encoder_mps * rng.standard_normal(2)
-        row[5] = state[W] + NOISY.gyro_radps * rng.standard_normal()
+        row[5] = state["yaw_rate_radps"][0] + NOISY.gyro_radps * rng.standard_normal()
         if k % FIX_TICKS == 0:
-            row[2:5] = state[X : YAW + 1] + noise * rng.standard_normal(3)
+            row[2:5] = state[["position_x_m", "position_y_m", "yaw_rad"]][0].tolist()
+            row[2:5] += noise * rng.standard_normal(3)
         memory = observer.step(observer.params, memory, row, TICK_S)
-        speed[k], etas[k] = state[[VX, W]], used
+        speed[k], etas[k] = state[["speed_x_mps", "yaw_rate_radps"]][0].tolist(), used
     return ClosedLoop(TICK_S * np.arange(1, n + 1), speed, etas)

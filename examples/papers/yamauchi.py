@@ -54,9 +54,7 @@ from terrain.estimation.observers.slip_model import (
 from terrain.estimation.observers.slip_odometry import slip_odometry_observer
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import simulate_tracked
-from terrain.simulation.tracked.slope import Slope
+from terrain.simulation.tracked import PrescribedSlip, Slope, simulate_tracked
 from terrain.terramechanics.soil import Soil, load_soil, scattered
 from terrain.terramechanics.traction import bekker_pressure, mobilised_ratio, plate_sinkage
 
@@ -375,7 +373,7 @@ def _hidden(trial: Trial) -> Numbers:
     """Return how well a given n comes back: the simulator follows Endo's law."""
     errors, robot, rates = {}, patako(), (10.0, 16.0, 20.0, 30.0)
     for place, n in enumerate(EXPONENTS[:: 2 if trial.quick else 1]):
-        ground, runs = GivenSlip(turning_loss_ratio=HIDDEN_LOSS, turning_exponent=n), []
+        ground, runs = PrescribedSlip(turning_loss_ratio=HIDDEN_LOSS, turning_exponent=n), []
         for k in range(16):
             w = np.radians(rates[k % 4])
             half = robot.half_track_m * w

@@ -8,7 +8,7 @@ fix for three seconds, or further from the path than its search reaches; at the 
 Speed and steering ahead of bends, by the grip that the estimated cornering stiffness shows.
 
 An axle under the load N carries |F| = f N.  With the cornering stiffness C_0 that the tyre has at small slip,
-the force that saturates at the grip mu is, as in :mod:`terrain.simulation.bicycle.plant`::
+the force that saturates at the grip mu is, as in :mod:`terrain.simulation.car`::
 
     f = mu (1 - exp(-q / mu)),   q = C_0 |b| / N
 
@@ -51,7 +51,7 @@ from terrain.estimation.observers.sideslip_pose import (
 )
 from terrain.records import Array
 from terrain.robots.bicycle import BicycleRobot
-from terrain.simulation.bicycle.simulate import CarCommand, CarSample
+from terrain.simulation.car import CarCommand, CarSample
 
 REACH_TIME_CONSTANTS = 1.0
 """Of the steering, by which the sideslip expected ahead is steered before it comes, beside the dead time."""
@@ -268,7 +268,7 @@ class FollowedTick(NamedTuple):
 
 
 class CarFollower:
-    """Controller of a drive along a path, for :func:`terrain.simulation.bicycle.simulate.simulate_car`.
+    """Controller of a drive along a path, for :func:`terrain.simulation.car.simulate_car`.
 
     Parameters
     ----------

@@ -18,8 +18,7 @@ from terrain.control.steering_law import SteeringSettings, SteerStatus
 from terrain.estimation.observers.family import ObserverStatus
 from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot
-from terrain.simulation.bicycle.plant import Ground
-from terrain.simulation.bicycle.simulate import CarDrive, SpeedProfile, simulate_car
+from terrain.simulation.car import CarDrive, Ground, SpeedProfile, simulate_car
 from terrain.status import StatusCode
 
 EXCITED_MPS2, EXCITED_RAD = 1.5, 0.02

@@ -2,7 +2,7 @@
 
 This entry picks the plant by the robot's drive: swerve robots are simulated by the dynamic plant
 (:mod:`terrain.simulation.dynamic.simulate`), tracked ones on ground that shears by the forces under their
-tracks (:mod:`terrain.simulation.tracked.run`), all others, and whatever has effects, by the planar one
+tracks (:mod:`terrain.simulation.tracked`), all others, and whatever has effects, by the planar one
 (:mod:`terrain.simulation.planar.run`).
 """
 
@@ -33,8 +33,7 @@ from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.sensors import Gnss, is_lost, with_raw_fixes
 from terrain.simulation.slip_sweep import learning_run
-from terrain.simulation.tracked.run import COMMANDS_HZ, simulate_tracked
-from terrain.simulation.tracked.slope import Slope
+from terrain.simulation.tracked import COMMANDS_HZ, Slope, simulate_tracked
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"

@@ -24,7 +24,7 @@ from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.kernels import record
+from terrain.kernels import numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera, turned
 from terrain.kinematics.wheel_velocity import point_velocity
@@ -38,26 +38,19 @@ STEP_S = 0.001
 sixth of a radian a step."""
 
 WHEEL_ROW = record(
-    dict.fromkeys(
-        (
-            *("wheel_radps", "steer_rad", "slip_ratio", "slip_angle_rad", "normal_n", "traction_n"),
-            *("torque_nm", "sinkage_m", "reported_radps", "patch_ratio", "side_n"),
-        ),
-        float,
+    numbers(
+        "wheel_radps steer_rad slip_ratio slip_angle_rad normal_n traction_n torque_nm sinkage_m "
+        "reported_radps patch_ratio side_n"
     )
 )
 """A wheel.  Steering angles are true headings in the body; traction and side force are those of the contact,
 along the wheel and to its left, so that it takes up ``traction (w r - v_along) - side v_across``."""
 
 BODY_ROW = record(
-    dict.fromkeys(
-        (
-            *("position_x_m", "position_y_m", "yaw_rad", "speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
-            *("accel_x_mps2", "accel_y_mps2", "grade_x_ratio", "grade_y_ratio"),
-            *("ride_z_mps2", "ride_roll_rad", "ride_pitch_rad", "ride_roll_radps2", "ride_pitch_radps2"),
-            *("path_m", "leg_rad"),
-        ),
-        float,
+    numbers(
+        "position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps accel_x_mps2 "
+        "accel_y_mps2 grade_x_ratio grade_y_ratio ride_z_mps2 ride_roll_rad ride_pitch_rad "
+        "ride_roll_radps2 ride_pitch_radps2 path_m leg_rad"
     )
     | {"wheels": (WHEEL_ROW, 3), "encoder_rad": (float, 3)}
 )
@@ -454,6 +447,29 @@ def imu_samples(
     """
     errors = draw_imu_errors(sensors, len(time_s), rng)
     values = imu_values(errors, slice(None), force_mps2, rate_radps, tilt_rad, yaw_rad)
+    return Stream(time_s, values, IMU_CHANNELS)
+
+
+def white_imu(
+    time_s: Array, rate_radps: Array, accel_mps2: Array, attitude_rad: Array, noise: Array
+) -> Stream:
+    """Return the samples of an IMU whose errors are white noise and what its rates and attitude already have.
+
+    Parameters
+    ----------
+    time_s : (n,)
+    rate_radps : (n, 3) of the body
+    accel_mps2 : (n, 2) of the IMU's place along the axes of the body, in the plane of the ground
+    attitude_rad : (n, 3) roll, pitch and yaw
+    noise : (n, 9) in the order of ``IMU_CHANNELS``
+    """
+    roll, pitch, _ = attitude_rad.T
+    level = np.cos(pitch)
+    force = np.column_stack([-np.sin(pitch), np.sin(roll), np.cos(roll)]) * GRAVITY_MPS2
+    force[:, 1:] *= level[:, None]
+    force[:, :2] += accel_mps2
+    values = np.hstack([rate_radps, force, attitude_rad]) + noise
+    values[:, 8] = wrapped(values[:, 8])
     return Stream(time_s, values, IMU_CHANNELS)
 
 

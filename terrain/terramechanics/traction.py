@@ -36,20 +36,15 @@ import numpy as np
 from numba import njit
 from scipy.optimize import brentq
 
-from terrain.kernels import filled, record
+from terrain.kernels import filled, numbers, record
 from terrain.records import Array
 from terrain.terramechanics.soil import Soil
 
 GROUND = record(
-    dict.fromkeys(
-        (
-            *("wheel_radius_m", "tyre_width_m", "contact_length_m"),
-            *("cohesion_pa", "tan_friction", "shear_modulus_m"),
-            *("stiffness_ratio", "shape_ratio", "peak_friction_ratio", "curvature_ratio"),
-            *("sinkage_modulus", "sinkage_exponent_ratio"),
-            *("rolling_resistance_ratio", "slip_sinkage_ratio"),
-        ),
-        float,
+    numbers(
+        "wheel_radius_m tyre_width_m contact_length_m cohesion_pa tan_friction shear_modulus_m "
+        "stiffness_ratio shape_ratio peak_friction_ratio curvature_ratio sinkage_modulus "
+        "sinkage_exponent_ratio rolling_resistance_ratio slip_sinkage_ratio"
     )
     | {"hard": bool}
 )

@@ -26,8 +26,7 @@ from terrain.control.paths import path_from_curvature
 from terrain.control.steering_law import SteeringSettings
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.bicycle.plant import Ground, level_ground, side_force
-from terrain.simulation.bicycle.simulate import simulate_car
+from terrain.simulation.car import Ground, level_ground, side_force, simulate_car
 
 ROBOT = load_robot("adap2e")
 SEEDS = (0, 1, 2)

@@ -11,8 +11,7 @@ from scipy.integrate import quad
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.tracked.run import QUIET, simulate_tracked
-from terrain.simulation.tracked.slope import Slope
+from terrain.simulation.tracked import QUIET, Slope, simulate_tracked
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import bekker_pressure, janosi_force, mobilised_ratio
 

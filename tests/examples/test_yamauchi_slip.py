@@ -25,9 +25,7 @@ from terrain.errors import DataError
 from terrain.estimation.observers.slip_model import PARAMETERS
 from terrain.identify import Parameter, identify
 from terrain.robots import load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import simulate_tracked
-from terrain.simulation.tracked.slope import LEVEL, Slope
+from terrain.simulation.tracked import LEVEL, PrescribedSlip, Slope, simulate_tracked
 from terrain.terramechanics.soil import load_soil
 
 ROBOT = load_robot("patako")
@@ -54,7 +52,7 @@ def straights(ground, seed, slopes_rad=(0.0, 0.1, 0.2, 0.3)):
 
 @pytest.mark.parametrize("n", [0.3, 0.5, 0.7, 0.847, 1.0, 1.15, 1.3])
 def test_the_exponent_is_found_within_two_hundredths(n):
-    ground = GivenSlip(turning_loss_ratio=0.36, turning_exponent=n)
+    ground = PrescribedSlip(turning_loss_ratio=0.36, turning_exponent=n)
     runs = [run for seed in range(4) for run in turns(ground, 10 * seed + 1, (10, 16, 20, 30))]
     found = fit_turning(slip_samples(runs, ROBOT).turning, D)
     assert found.exponent == pytest.approx(n, abs=0.02)
@@ -63,7 +61,7 @@ def test_the_exponent_is_found_within_two_hundredths(n):
 
 
 def test_all_numbers_of_given_slip_come_back_within_their_intervals():
-    ground = GivenSlip(1.0, 1.0, 0.08, 0.4, 0.6, 0.35, 0.8)
+    ground = PrescribedSlip(1.0, 1.0, 0.08, 0.4, 0.6, 0.35, 0.8)
     runs = straights(ground, 1)
     for k, slope in enumerate((0.0, 0.09, 0.17, 0.26)):
         runs += turns(ground, 20 + k, (10, 16, 20), Slope(slope, math.pi / 2 * (-1) ** k))

@@ -54,7 +54,7 @@ from scipy.signal import lfilter
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import PlantPart, in_plant, parameters_of
 from terrain.errors import ConfigError
-from terrain.kernels import filled, record
+from terrain.kernels import filled, numbers, record
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions
@@ -97,44 +97,32 @@ PLANT = record(
         "linked": bool,
         "hidden": bool,
         "steer_delay_steps": int,
-        **dict.fromkeys(
-            (
-                *("com_height_m", "mass_kg", "yaw_inertia_kgm2", "wheel_inertia_kgm2"),
-                *("relaxation_m", "contact_length_m", "ride_stiffness_npm", "ride_damping_nspm"),
-                *("torque_max_nm", "speed_max_radps", "torque_time_constant_s", "friction_nm"),
-                *("speed_gain", "speed_integral", "estimate_time_constant_s", "hall_steps"),
-                *("report_time_constant_s", "steer_rate_max_radps", "steer_accel_max_radps2", "backlash_rad"),
-                *("leg_backlash_rad", "undulation_ratio", "undulation_length_m", "steer_backlash_rad"),
-                *("weight_n", "force_slip_ratio", "shear_slip_ratio", "slip_resistance_ratio"),
-                *("rolling_ratio", "drag_nspm", "side_hill_ratio"),
-            ),
-            float,
-        ),
+        **numbers(
+        "com_height_m mass_kg yaw_inertia_kgm2 wheel_inertia_kgm2 relaxation_m contact_length_m "
+        "ride_stiffness_npm ride_damping_nspm torque_max_nm speed_max_radps torque_time_constant_s "
+        "friction_nm speed_gain speed_integral estimate_time_constant_s hall_steps "
+        "report_time_constant_s steer_rate_max_radps steer_accel_max_radps2 backlash_rad "
+        "leg_backlash_rad undulation_ratio undulation_length_m steer_backlash_rad weight_n "
+        "force_slip_ratio shear_slip_ratio slip_resistance_ratio rolling_ratio drag_nspm "
+        "side_hill_ratio"
+    ),
     }
 )
 """All numbers of one simulated run that do not change while it is driven."""
 
 WHEEL_STATE = record(
-    dict.fromkeys(
-        (
-            *("rate_radps", "angle_rad", "steer_rad", "steer_motor_rad", "steer_motor_radps"),
-            *("deflection_x_m", "deflection_y_m", "torque_nm", "integral_nm"),
-            *("estimate_radps", "reported_radps", "hall_count"),
-            *("ride_m", "ride_mps", "ride_mps2", "road_m", "contact_m"),
-            *("heading_rad", "creep_ratio"),
-        ),
-        float,
+    numbers(
+        "rate_radps angle_rad steer_rad steer_motor_rad steer_motor_radps deflection_x_m "
+        "deflection_y_m torque_nm integral_nm estimate_radps reported_radps hall_count ride_m "
+        "ride_mps ride_mps2 road_m contact_m heading_rad creep_ratio"
     )
 )
 """A wheel; its heading is that in the play of its linkage, and its creep is over the slip of the ground."""
 
 STATE = record(
-    dict.fromkeys(
-        (
-            *("position_x_m", "position_y_m", "yaw_rad", "speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
-            *("path_m", "accel_x_mps2", "accel_y_mps2", "leg_rad"),
-        ),
-        float,
+    numbers(
+        "position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps path_m accel_x_mps2 "
+        "accel_y_mps2 leg_rad"
     )
     | {"wheels": (WHEEL_STATE, 3), "n_steps": int, "late_rad": (float, (MAX_DELAY_STEPS, 3))}
 )

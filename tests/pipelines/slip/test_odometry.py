@@ -9,8 +9,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.estimation.observers.slip_model_file import read_slip_model
 from terrain.logs.write import write_run
 from terrain.robots import load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import simulate_tracked
+from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 
 
 def judged(folder, **also):
@@ -20,7 +19,7 @@ def judged(folder, **also):
 @pytest.fixture(scope="module")
 def turns(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("turns"), np.random.default_rng(3)
-    given = GivenSlip(slip_ratio=0.1, turning_loss_ratio=0.5, turning_exponent=0.6)
+    given = PrescribedSlip(slip_ratio=0.1, turning_loss_ratio=0.5, turning_exponent=0.6)
     for k in range(6):
         belts = np.tile(rng.uniform(-0.1, 0.15, 2), (501, 1))
         write_run(simulate_tracked(load_robot("patako"), given, belts, k, run_id=f"run_{k}"), folder)

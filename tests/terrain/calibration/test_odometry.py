@@ -28,11 +28,10 @@ from terrain.calibration.odometry import (
 from terrain.errors import DataError
 from terrain.logs.drive_poses import WindowPoses
 from terrain.robots import load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import QUIET
+from terrain.simulation.tracked import QUIET, PrescribedSlip
 
 PATAKO = load_robot("patako")
-GIVEN = GivenSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)
+GIVEN = PrescribedSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)
 
 
 def drives(n=12, **options):

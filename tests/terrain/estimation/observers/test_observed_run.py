@@ -18,8 +18,7 @@ from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import simulate_tracked
+from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 
 UGV, CAR, HUSKY = (load_robot(name) for name in ("orchard_ugv", "adap2e", "husky"))
 ROBOTS = {name: UGV if name in observers_of(UGV) else CAR for name in OBSERVERS}
@@ -27,7 +26,7 @@ ROBOTS = {name: UGV if name in observers_of(UGV) else CAR for name in OBSERVERS}
 
 @pytest.fixture(scope="module")
 def straight():
-    return simulate_tracked(UGV, GivenSlip(0.85, 0.85), np.tile([0.6, 0.6], (2001, 1)), 0)
+    return simulate_tracked(UGV, PrescribedSlip(0.85, 0.85), np.tile([0.6, 0.6], (2001, 1)), 0)
 
 
 @pytest.mark.parametrize("name", OBSERVERS)

@@ -12,8 +12,7 @@ from terrain.estimation.observers.live import LiveObserver
 from terrain.estimation.observers.rows import CHANNELS, ROWS, RowFeed, feed_of, ticks
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import QUIET, simulate_tracked
+from terrain.simulation.tracked import QUIET, PrescribedSlip, simulate_tracked
 
 UGV = load_robot("orchard_ugv")
 NAMES = tuple(name for name in ROWS if "rear" not in name and "front" not in name)
@@ -30,7 +29,7 @@ def without(run, *names):
 
 @pytest.fixture(scope="module")
 def run():
-    return simulate_tracked(UGV, GivenSlip(0.9, 0.8), np.tile([0.4, 0.6], (301, 1)), 0, sensors=QUIET)
+    return simulate_tracked(UGV, PrescribedSlip(0.9, 0.8), np.tile([0.4, 0.6], (301, 1)), 0, sensors=QUIET)
 
 
 def test_rows_hold_what_sensors_without_noise_measured(run):

@@ -21,13 +21,13 @@ from terrain.estimation.observers.sideslip_multi import (
     sideslip_multi_observer,
 )
 from terrain.robots import load_robot
-from terrain.simulation.bicycle.plant import level_ground
-from terrain.simulation.bicycle.simulate import (
+from terrain.simulation.car import (
     CAR_ROWS,
     CarCommand,
     CarDrive,
     SensorNoise,
     SpeedProfile,
+    level_ground,
     simulate_car,
 )
 

@@ -16,12 +16,10 @@ from terrain.estimation.observers.slip_learning import (
 )
 from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel
 from terrain.robots import load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import simulate_tracked
-from terrain.simulation.tracked.slope import Slope
+from terrain.simulation.tracked import PrescribedSlip, Slope, simulate_tracked
 
 ROBOT = load_robot("patako")
-HIDDEN = GivenSlip(1.0, 1.0, 0.08, 0.5, 0.6, 0.35, 0.7)
+HIDDEN = PrescribedSlip(1.0, 1.0, 0.08, 0.5, 0.6, 0.35, 0.7)
 TRUE = {
     "turning_exponent": 0.7,
     "compaction_slip_ratio": 0.08,

@@ -17,9 +17,7 @@ from terrain.estimation.observers.slip_learning import slip_learning_observer
 from terrain.estimation.observers.slip_model import N_MODEL, N_PARAMETERS, SlipModel, body_velocity, model_of
 from terrain.estimation.observers.slip_odometry import ROWS, OdometrySettings, slip_odometry_observer
 from terrain.robots import load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import QUIET, simulate_tracked
-from terrain.simulation.tracked.slope import Slope
+from terrain.simulation.tracked import QUIET, PrescribedSlip, Slope, simulate_tracked
 
 ROBOT = load_robot("patako")
 D = ROBOT.half_track_m
@@ -89,7 +87,7 @@ def test_a_steady_turn_is_exact_in_one_step():
 
 @pytest.mark.parametrize("slope", [Slope(), Slope(0.15, np.pi / 2), Slope(0.15, 0.3)])
 def test_given_slip_is_followed_to_the_millimetre(slope):
-    given = GivenSlip(1.0, 1.0, 0.1, 0.3, 0.4, 0.35, 0.8)
+    given = PrescribedSlip(1.0, 1.0, 0.1, 0.3, 0.4, 0.35, 0.8)
     belts = np.tile([0.08, 0.1], (700, 1))
     belts[300:] = (0.1, 0.1)
     run = simulate_tracked(ROBOT, given, belts, 0, slope=slope, sensors=QUIET)

@@ -8,31 +8,36 @@ from scipy.integrate import solve_ivp
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
+from terrain.kernels import is_finite
 from terrain.robots import load_robot
-from terrain.simulation.bicycle import plant
+from terrain.simulation import car
 
 ROBOT = load_robot("adap2e")
 
 
 def drive(steer_rad, speed_mps, seconds, ground, start=None, **settings):
-    """Return rows (n, N_OUT) at 100 Hz and the state at the end."""
-    numbers = plant.plant_numbers(ROBOT, plant.PlantSettings(**settings))
-    rows = np.empty((round(seconds * 100), plant.N_OUT))
-    state = plant.initial_state(speed_mps=speed_mps) if start is None else start
-    after = plant.advance(numbers, plant.ground_grid(ground), state, steer_rad, speed_mps, rows, 10)
-    return rows, after
+    """Return bodies (n,) at 100 Hz and the state at the end."""
+    rows = np.empty(round(seconds * 100), car.CAR_BODY)
+    state = car.initial_state(speed_mps=speed_mps) if start is None else start
+    numbers = car.car_record(ROBOT, car.PlantSettings(**settings))
+    car.advance(numbers, car.ground_grid(ground), state, steer_rad, speed_mps, rows, 10)
+    return rows, state
+
+
+def columns(rows, *names):
+    return np.column_stack([rows[name] for name in names])
 
 
 @pytest.mark.parametrize(("steer_rad", "speed_mps", "roll_deg"), [(0.1, 4.0, 0.0), (-0.05, 5.0, 12.0)])
 def test_steady_cornering_balances_forces_and_moments(steer_rad, speed_mps, roll_deg):
-    rows, _ = drive(steer_rad, speed_mps, 12.0, plant.level_ground(0.8, np.deg2rad(roll_deg)))
+    rows, _ = drive(steer_rad, speed_mps, 12.0, car.level_ground(0.8, np.deg2rad(roll_deg)))
     end = rows[-1]
-    front = end[plant.SIDE_FRONT] * np.cos(end[plant.STEER])
-    push = speed_mps * end[plant.YAW_RATE] + GRAVITY_MPS2 * np.sin(np.deg2rad(roll_deg))
-    assert front + end[plant.SIDE_REAR] == pytest.approx(ROBOT.mass_kg * push, rel=1e-6)
-    assert ROBOT.com_behind_front_m * front == pytest.approx(ROBOT.com_ahead_m * end[plant.SIDE_REAR])
-    at_rear = end[plant.SIDE_SPEED] - ROBOT.com_ahead_m * end[plant.YAW_RATE]
-    assert end[plant.SLIP_REAR] == pytest.approx(np.arctan(at_rear / speed_mps), rel=1e-6)
+    front = end["side_front_n"] * np.cos(end["steer_rad"])
+    push = speed_mps * end["yaw_rate_radps"] + GRAVITY_MPS2 * np.sin(np.deg2rad(roll_deg))
+    assert front + end["side_rear_n"] == pytest.approx(ROBOT.mass_kg * push, rel=1e-6)
+    assert ROBOT.com_behind_front_m * front == pytest.approx(ROBOT.com_ahead_m * end["side_rear_n"])
+    at_rear = end["side_speed_mps"] - ROBOT.com_ahead_m * end["yaw_rate_radps"]
+    assert end["slip_rear_rad"] == pytest.approx(np.arctan(at_rear / speed_mps), rel=1e-6)
 
 
 def test_plant_agrees_with_an_integration_of_its_equations():
@@ -62,45 +67,45 @@ def test_plant_agrees_with_an_integration_of_its_equations():
             (at_rear - speed * rear) / 0.3,
         ]
 
-    start = plant.initial_state(speed_mps=speed)
-    start[plant.STEER] = steer
+    start = car.initial_state(speed_mps=speed)
+    start["body"]["steer_rad"] = steer
     rows, _ = drive(
-        steer, speed, 3.0, plant.level_ground(grip, roll), start, steering_delay_s=0.0, damping_ratio=0.0
+        steer, speed, 3.0, car.level_ground(grip, roll), start, steering_delay_s=0.0, damping_ratio=0.0
     )
     exact = solve_ivp(rates, (0.0, 3.0), np.zeros(7), rtol=1e-9, atol=1e-10).y[:, -1]
-    assert rows[-1, [plant.X, plant.Y]] == pytest.approx(exact[:2], abs=0.01)
-    assert rows[-1, [plant.SIDE_SPEED, plant.YAW_RATE]] == pytest.approx(exact[3:5], rel=2e-3)
+    assert columns(rows, "position_x_m", "position_y_m")[-1] == pytest.approx(exact[:2], abs=0.01)
+    assert columns(rows, "side_speed_mps", "yaw_rate_radps")[-1] == pytest.approx(exact[3:5], rel=2e-3)
 
 
 def test_side_force_rises_by_the_stiffness_and_saturates():
     slip = np.linspace(-1.4, 1.4, 101)
-    force = np.array([plant.side_force(b, 15000.0, 1400.0) for b in slip])
+    force = np.array([car.side_force(b, 15000.0, 1400.0) for b in slip])
     assert (np.abs(force) <= 1400.0).all()
     assert (np.diff(force) <= 0.0).all()
-    assert plant.side_force(1e-6, 15000.0, 1400.0) == pytest.approx(-0.015, rel=1e-3)
+    assert car.side_force(1e-6, 15000.0, 1400.0) == pytest.approx(-0.015, rel=1e-3)
 
 
 def test_robot_stops_exactly_and_holds_on_a_slope_without_creep():
-    ground = plant.level_ground(0.7, np.deg2rad(15.0))
+    ground = car.level_ground(0.7, np.deg2rad(15.0))
     _, state = drive(0.1, 3.0, 3.0, ground)
-    numbers, grid = plant.plant_numbers(ROBOT, plant.PlantSettings()), plant.ground_grid(ground)
-    rows = np.empty((1500, plant.N_OUT))
-    plant.advance(numbers, grid, state, 0.1, 0.0, rows, 10)
-    assert (rows[500:, plant.SPEED] == 0.0).all()
-    assert np.ptp(rows[500:, [plant.X, plant.Y, plant.YAW]], axis=0) == pytest.approx(0.0, abs=1e-6)
-    held = rows[-1, plant.SIDE_FRONT] * np.cos(rows[-1, plant.STEER]) + rows[-1, plant.SIDE_REAR]
+    rows, _ = drive(0.1, 0.0, 15.0, ground, state)
+    assert (rows["speed_mps"][500:] == 0.0).all()
+    poses = columns(rows[500:], "position_x_m", "position_y_m", "yaw_rad")
+    assert np.ptp(poses, axis=0) == pytest.approx(0.0, abs=1e-6)
+    end = rows[-1]
+    held = end["side_front_n"] * np.cos(end["steer_rad"]) + end["side_rear_n"]
     assert held == pytest.approx(ROBOT.mass_kg * GRAVITY_MPS2 * np.sin(np.deg2rad(15.0)), rel=1e-6)
 
 
 def test_robot_at_rest_slides_down_what_grip_does_not_hold():
-    rows, _ = drive(0.0, 0.0, 3.0, plant.level_ground(0.2, np.deg2rad(15.0)))
-    assert rows[-1, plant.Y] < -1.0
-    assert np.isfinite(rows).all()
+    rows, _ = drive(0.0, 0.0, 3.0, car.level_ground(0.2, np.deg2rad(15.0)))
+    assert rows["position_y_m"][-1] < -1.0
+    assert is_finite(rows)
 
 
 def test_steering_has_dead_time_rate_and_limit():
-    rows, _ = drive(1.0, 2.0, 2.0, plant.level_ground(), steering_delay_s=0.1)
-    steer = rows[:, plant.STEER]
+    rows, _ = drive(1.0, 2.0, 2.0, car.level_ground(), steering_delay_s=0.1)
+    steer = rows["steer_rad"]
     assert (steer[:9] == 0.0).all()
     assert np.diff(steer).max() <= ROBOT.steering_rate_radps * 0.01 + 1e-9
     assert steer[-1] == pytest.approx(ROBOT.steering_max_rad, rel=1e-3)
@@ -118,10 +123,10 @@ def test_steering_has_dead_time_rate_and_limit():
 )
 def test_ground_that_cannot_be_is_refused(distance, grip, roll):
     with pytest.raises(ConfigError, match="ground"):
-        plant.ground_grid(plant.Ground(np.array(distance), np.array(grip), np.array(roll)))
+        car.ground_grid(car.Ground(np.array(distance), np.array(grip), np.array(roll)))
 
 
 def test_settings_that_cannot_be_are_refused():
     for bad in ({"steering_delay_s": 1.0}, {"relaxation_m": 0.0}, {"acceleration_mps2": -1.0}):
         with pytest.raises(ConfigError):
-            plant.plant_numbers(ROBOT, plant.PlantSettings(**bad))
+            car.car_record(ROBOT, car.PlantSettings(**bad))

@@ -8,12 +8,12 @@ import pytest
 from terrain.errors import ConfigError
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, unit_of
 from terrain.robots import load_robot
-from terrain.simulation.bicycle.plant import level_ground
-from terrain.simulation.bicycle.simulate import (
+from terrain.simulation.car import (
     CarCommand,
     CarDrive,
     SensorNoise,
     SpeedProfile,
+    level_ground,
     open_loop,
     simulate_car,
 )

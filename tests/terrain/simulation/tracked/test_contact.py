@@ -9,17 +9,18 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.kernels import filled
 from terrain.robots import load_robot
-from terrain.simulation.tracked.contact import (
-    HALF,
-    INERTIA,
-    MASS,
-    contact_array,
+from terrain.simulation.tracked import (
+    STATE,
+    _residual,
+    drive,
+    tilt_at,
     track_forces,
     track_loads,
+    tracks_on,
+    twist_on_soil,
 )
-from terrain.simulation.tracked.motion import STATE_SIZE, VX, VY, W, _residual, drive, twist_on_soil
-from terrain.simulation.tracked.slope import tilt_at
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import compaction_resistance, mobilised_ratio, plate_sinkage
 
@@ -30,23 +31,24 @@ FIRM = replace(SAND, rolling_resistance_ratio=0.0, kc_npmn1=math.nan, kphi_npmn2
 
 def forces(soil, belts, twist, grade=0.0, roll=0.0, heap=0.0):
     out = np.empty(3)
-    track_forces(contact_array(PATAKO, soil), np.array(belts), np.array(twist), grade, roll, heap, out)
+    track_forces(tracks_on(PATAKO, soil)[0], np.array(belts), np.array(twist), grade, roll, heap, out)
     return out
 
 
 def steady(soil, belts, slope_rad=0.0, uphill_rad=0.0, seconds=1.0, robot=PATAKO):
     """Return the twist once belts have turned for a while from rest."""
-    states = drive(
-        contact_array(robot, soil)[None],
-        np.zeros((1, 7)),
-        np.array([np.inf]),
-        robot.half_track_m,
-        np.array([slope_rad, uphill_rad]),
-        np.zeros(STATE_SIZE),
-        np.tile(np.array(belts, dtype=float), (round(seconds / 0.01), 1)),
-        0.01,
-    )
-    return states[-1, VX : W + 1]
+    belt_mps = np.tile(np.array(belts, dtype=float), (round(seconds / 0.01), 1))
+    return twist_of(driven(belt_mps, soil, [slope_rad, uphill_rad], 0.01, robot)[-1])
+
+
+def driven(belt_mps, soil, slope, dt_s, robot=PATAKO):
+    states = np.zeros(len(belt_mps), STATE)
+    drive(tracks_on(robot, soil), np.array(slope), belt_mps, states, dt_s)
+    return states
+
+
+def twist_of(state):
+    return np.array([state[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
 
 
 @pytest.mark.parametrize("slip", [0.02, 0.2, 0.8])
@@ -78,16 +80,16 @@ def test_forces_mirror_with_the_turn_and_with_the_direction_of_travel():
 
 def test_friction_takes_energy_from_any_motion():
     rng = np.random.default_rng(0)
-    contact = contact_array(PATAKO, SAND)
+    tracks = tracks_on(PATAKO, SAND)[0]
     for _ in range(500):
         twist, out = rng.normal(size=3) * [0.1, 0.1, 0.5], np.empty(3)
-        track_forces(contact, np.zeros(2), twist, 0.0, 0.0, rng.uniform(0, 1e-3), out)
+        track_forces(tracks, np.zeros(2), twist, 0.0, 0.0, rng.uniform(0, 1e-3), out)
         assert out @ twist < 0.0
 
 
 def test_loads_carry_the_weight_and_balance_the_moment_of_gravity():
     grade, roll = tilt_at(math.radians(15.0), math.radians(50.0), 0.0)
-    left, right, ahead = track_loads(contact_array(PATAKO, SAND), grade, roll)
+    left, right, ahead = track_loads(tracks_on(PATAKO, SAND)[0], grade, roll)
     weight = PATAKO.mass_kg * GRAVITY_MPS2
     assert left + right == pytest.approx(weight * math.cos(math.radians(15.0)))
     across, along = -weight * math.sin(roll) * math.cos(grade), -weight * math.sin(grade)
@@ -132,17 +134,14 @@ def test_a_robot_at_rest_stays_on_a_slope():
 def test_a_step_from_any_motion_reaches_the_balance():
     """At a kink, where an element starts to slide back, at most 2 mm/s are left for the step after."""
     rng, missing, off = np.random.default_rng(0), np.empty(3), []
-    contact = contact_array(PATAKO, SAND)
-    mass = contact[[MASS, MASS, INERTIA]]
-    size = contact[MASS] * np.array([1.0, 1.0, contact[HALF]])
+    tracks, names = tracks_on(PATAKO, SAND)[0], ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
     for k in range(1500):
-        state = np.zeros(STATE_SIZE)
-        state[VX : W + 1] = rng.normal(0.0, [0.1, 0.02, 0.2]) if k % 3 else 0.0
+        before = rng.normal(0.0, [0.1, 0.02, 0.2]) if k % 3 else np.zeros(3)
+        state = filled(STATE, **dict(zip(names, before, strict=True)))[0]
         belts = rng.choice([-0.2, -0.1, 0.0, 0.1, 0.2, 0.5], 2)
         tilt = tilt_at(math.radians(rng.choice([0, 5, 10, 15])), math.radians(45 * rng.integers(8)), 0.0)
-        twist = twist_on_soil(contact, state, belts, *tilt, 0.01)
-        before = state[VX : W + 1].copy()
-        off.append(_residual(contact, belts, twist, before, mass, size, *tilt, state, 0.01, missing))
+        twist = twist_on_soil(tracks, state, belts, *tilt, 0.01)
+        off.append(_residual(tracks, belts, twist, before, (*tilt, 0.0), 0.01, missing))
     assert max(off) < 0.2
     assert np.mean(np.array(off) < 1e-4) > 0.99
 
@@ -157,9 +156,6 @@ def test_bulldozing_resists_turning_and_grows_with_what_is_swept():
 def test_any_step_gives_the_same_motion():
     def after(dt):
         belts = np.tile([0.02, 0.12], (round(2.0 / dt) + 1, 1))
-        contact = contact_array(PATAKO, SAND)[None]
-        forever, slope = np.array([np.inf]), np.array([0.2, 0.5])
-        return drive(contact, np.zeros((1, 7)), forever, 0.1965, slope, np.zeros(STATE_SIZE), belts, dt)[-1]
+        return list(driven(belts, SAND, [0.2, 0.5], dt)[-1])[:5]
 
-    assert after(0.01)[:3] == pytest.approx(after(0.0025)[:3], abs=1e-3)
-    assert after(0.01)[VX : VY + 1] == pytest.approx(after(0.0025)[VX : VY + 1], abs=1e-3)
+    assert after(0.01) == pytest.approx(after(0.0025), abs=1e-3)

@@ -1,6 +1,7 @@
 """Logs of a simulated tracked robot: streams that agree with the truth, given slip, bad input."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +9,16 @@ import pytest
 from terrain.angles import wrapped
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.tracked.given_slip import GivenSlip, slipped_twist
-from terrain.simulation.tracked.run import QUIET, Stretch, TrackedSensors, simulate_tracked
-from terrain.simulation.tracked.slope import Slope
+from terrain.simulation.tracked import (
+    QUIET,
+    PrescribedSlip,
+    Slope,
+    Stretch,
+    TrackedSensors,
+    simulate_tracked,
+    slipped_twist,
+    tracks_on,
+)
 from terrain.terramechanics.soil import load_soil
 
 UGV, PATAKO = load_robot("orchard_ugv"), load_robot("patako")
@@ -21,9 +29,9 @@ def channel(run, stream, name):
     return found.values[:, found.channels.index(name)]
 
 
-def test_given_slip_moves_the_robot_as_the_paper_states():
+def test_prescribed_slip_moves_the_robot_as_the_paper_states():
     belts = np.tile([0.4, 0.6], (501, 1))
-    run = simulate_tracked(UGV, GivenSlip(1.1, 0.8), belts, 0, sensors=QUIET)
+    run = simulate_tracked(UGV, PrescribedSlip(1.1, 0.8), belts, 0, sensors=QUIET)
     assert channel(run, "truth", "speed_x_mps")[1:] == pytest.approx(np.full(1000, (0.44 + 0.48) / 2))
     assert channel(run, "truth", "yaw_rate_radps")[1:] == pytest.approx(np.full(1000, 0.48 - 0.44))
     assert channel(run, "truth", "slip_right_ratio")[-1] == pytest.approx(0.2)
@@ -34,22 +42,24 @@ def test_given_slip_moves_the_robot_as_the_paper_states():
 
 @pytest.mark.parametrize("power", [0.3, 0.847, 1.0, 1.3])
 @pytest.mark.parametrize("belts", [(0.02, 0.1), (-0.03, 0.1), (-0.1, -0.02), (0.05, -0.2)])
-def test_given_turning_slip_is_endos_law(power, belts):
+def test_prescribed_turning_slip_is_endos_law(power, belts):
     left, right = belts
-    given = np.array(GivenSlip(turning_loss_ratio=0.3, turning_exponent=power))
-    v_x, _, w = slipped_twist(given, 0.2, *belts, 0.0, 0.0)
+    slip = PrescribedSlip(turning_loss_ratio=0.3, turning_exponent=power)
+    tracks = tracks_on(replace(PATAKO, track_m=0.4), slip)[0]
+    v_x, _, w = slipped_twist(tracks, *belts, 0.0, 0.0)
     slip_left, slip_right = 1 - (v_x - 0.2 * w) / left, 1 - (v_x + 0.2 * w) / right
     assert slip_left / slip_right == pytest.approx(-np.sign(left * right) * abs(right / left) ** power)
     assert w == pytest.approx(0.7 * (right - left) / 0.4)
 
 
 @pytest.mark.parametrize("power", [0.5, 1.0, 1.5])
-def test_given_turning_slip_is_continuous_where_a_track_stops(power):
-    given = np.array(GivenSlip(turning_loss_ratio=0.3, turning_exponent=power))
+def test_prescribed_turning_slip_is_continuous_where_a_track_stops(power):
+    slip = PrescribedSlip(turning_loss_ratio=0.3, turning_exponent=power)
+    tracks = tracks_on(replace(PATAKO, track_m=0.4), slip)[0]
     for stopped in ((0.0, 0.1), (0.1, 0.0), (0.0, 0.0)):
-        at = np.array(slipped_twist(given, 0.2, *stopped, 0.0, 0.0))
+        at = np.array(slipped_twist(tracks, *stopped, 0.0, 0.0))
         for nudge in (-1e-12, 1e-12):
-            beside = slipped_twist(given, 0.2, *(v or nudge for v in stopped), 0.0, 0.0)
+            beside = slipped_twist(tracks, *(v or nudge for v in stopped), 0.0, 0.0)
             assert beside == pytest.approx(at, abs=2e-6)
 
 
@@ -89,7 +99,7 @@ def test_soil_changes_where_a_stretch_ends_and_labels_say_so():
 
 def test_same_seed_same_bytes_and_another_seed_other_noise():
     belts = np.full((101, 2), 0.1)
-    one, same, other = (simulate_tracked(PATAKO, GivenSlip(), belts, seed) for seed in (4, 4, 5))
+    one, same, other = (simulate_tracked(PATAKO, PrescribedSlip(), belts, seed) for seed in (4, 4, 5))
     for name, stream in one.streams.items():
         assert stream.values.tobytes() == same.streams[name].values.tobytes()
     assert one.streams["imu"].values.tobytes() != other.streams["imu"].values.tobytes()
@@ -99,8 +109,8 @@ def test_same_seed_same_bytes_and_another_seed_other_noise():
     ("ground", "speeds", "message"),
     [
         (load_soil("asphalt"), np.zeros((5, 2)), "soil 'asphalt' has the law 'magic'"),
-        (GivenSlip(), np.zeros((5, 3)), "track_speed_mps has shape"),
-        (GivenSlip(), np.full((5, 2), np.nan), "finite numbers"),
+        (PrescribedSlip(), np.zeros((5, 3)), "track_speed_mps has shape"),
+        (PrescribedSlip(), np.full((5, 2), np.nan), "finite numbers"),
         ([], np.zeros((5, 2)), "no stretch is given"),
     ],
 )

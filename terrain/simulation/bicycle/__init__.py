@@ -1,1 +1,0 @@
-"""Car-like robots on side slopes, simulated with tyres whose side force saturates."""

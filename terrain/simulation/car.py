@@ -1,0 +1,560 @@
+"""Drives of a car-like robot: an extended dynamic bicycle in steps of a millisecond, and the log of a run.
+
+At each tick of the wheels (50 Hz) a controller gets what the sensors measured and the speed that the drive
+asks for, and commands a steering angle and a speed; the simulator knows no controller.  Sensors are as on the
+robot of Deremetz et al. 2017: receiver and IMU above the middle of the rear axle.
+
+With the speed u of the rear axle along the body, the lateral velocity w of the centre of mass, the yaw rate
+r, the steering angle d and the roll a of the ground (left side up positive)::
+
+    x' = u cos(yaw) - (w - L_R r) sin(yaw)        m w' = F_F cos d + F_R - m g sin a - m u r
+    y' = u sin(yaw) + (w - L_R r) cos(yaw)        I_z r' = L_F F_F cos d - L_R F_R
+    F = -mu N (1 - exp(-C |b| / (mu N))) sgn b    N_F = m g cos a L_R / L,  N_R = m g cos a L_F / L
+    l t' = v_side - |v_ahead| t,  b = atan t      for each wheel, with the relaxation length l
+
+The side force saturates at the grip mu times the load, less what the drive takes of the friction circle.  The
+slip angle b of a tyre follows its contact over the relaxation length: at rest the tyre is a spring, nothing
+is divided by a speed, and static friction holds the robot on a slope without creep.  A damping of the
+carcass, which fades above 0.5 m/s, brings it to rest.  Speed follows its command at a bounded acceleration
+and reaches 0 exactly; the steering is a dead time, a first-order lag, and limits of rate and angle.
+
+The dynamics are (3) of Deremetz et al. 2017 with the sign of line 2 corrected, and forces that saturate
+instead of (1).  Relaxation: Pacejka, Tyre and Vehicle Dynamics, chapter 7.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from terrain.angles import wrapped
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError
+from terrain.kernels import filled, numbers, record
+from terrain.logs.schema import GNSS_CHANNELS
+from terrain.records import Array, RunLog, Stream
+from terrain.robots.bicycle import BicycleRobot
+from terrain.simulation.sensors import BODY_TRUTH, white_imu
+from terrain.slip import slip_angle
+
+STEP_S = 0.001
+"""Length of a step."""
+LONGEST_DELAY_S = 0.3
+"""Of the dead time of the steering."""
+
+TICK_S, FIX_S, TRUTH_S = 0.02, 0.1, 0.01
+"""Times between ticks of wheels and steering, between fixes, and between rows of the IMU and of the truth."""
+
+CAR_ROWS: tuple[str, ...] = (
+    *("speed_rear_mps", "steer_front_rad", "position_x_m", "position_y_m", "yaw_rad"),
+    *("yaw_rate_radps", "roll_rad", "accel_y_mps2"),
+)
+"""Rows (8,) of :attr:`CarSample.measured`, as observers of sideslip take them."""
+
+TRUTH_CHANNELS: tuple[str, ...] = (
+    *BODY_TRUTH,
+    *("slip_front_rad", "slip_rear_rad", "side_front_n", "side_rear_n", "steer_front_rad", "distance_m"),
+)
+"""Channels of the stream ``truth``: ``speed_y_mps``, ``accel_x_mps2`` and the specific force ``accel_y_mps2``
+are of the centre of mass, the pose and ``speed_x_mps`` of the rear axle; slip is NaN at rest."""
+
+CAR = record(
+    numbers(
+        "mass_kg yaw_inertia_kgm2 com_ahead_m com_behind_front_m front_cornering_npr "
+        "rear_cornering_npr steering_max_rad steering_rate_radps steering_time_constant_s "
+        "acceleration_mps2 relaxation_m damping_ratio"
+    )
+    | {"delay_steps": int}
+)
+"""A robot with its :class:`PlantSettings`."""
+
+CAR_BODY = record(
+    numbers(
+        "position_x_m position_y_m yaw_rad speed_mps side_speed_mps yaw_rate_radps steer_rad "
+        "distance_m roll_rad accel_x_mps2 accel_y_mps2 slip_front_rad slip_rear_rad side_front_n "
+        "side_rear_n roll_rate_radps yaw_accel_radps2"
+    )
+)
+"""Pose of the rear axle, speed along the body, lateral velocity of the centre of mass, yaw rate, steering angle,
+distance travelled, roll; acceleration along the body, lateral specific force of the centre of mass; slip angle of
+the tyres' carcass and side force of the axles; rates."""
+
+CAR_STATE = record({"body": CAR_BODY, "place": int, "commands_rad": (float, round(LONGEST_DELAY_S / STEP_S))})
+"""A body, and the commands of the steering that are still to come."""
+
+
+class Ground(NamedTuple):
+    """Ground along the drive.
+
+    Parameters
+    ----------
+    distance_m : (n,) rising distances travelled; before the first and beyond the last, their values hold
+    grip_ratio : (n,) largest side force over load, above 0
+    roll_rad : (n,) side slope, left side up positive
+    """
+
+    distance_m: Array
+    grip_ratio: Array
+    roll_rad: Array
+
+
+def level_ground(grip_ratio: float = 0.7, roll_rad: float = 0.0) -> Ground:
+    """Return ground that is the same everywhere.
+
+    Examples
+    --------
+    >>> level_ground(0.5).grip_ratio
+    array([0.5])
+    """
+    return Ground(np.zeros(1), np.array([grip_ratio]), np.array([roll_rad]))
+
+
+class PlantSettings(NamedTuple):
+    """What a description of a robot does not have.
+
+    Parameters
+    ----------
+    steering_delay_s : dead time of the steering, up to :data:`LONGEST_DELAY_S`
+    acceleration_mps2 : bound of the acceleration of the drive
+    relaxation_m : relaxation length of the tyres; about half to once a wheel's radius
+    damping_ratio : of the tyre's carcass at rest
+    """
+
+    steering_delay_s: float = 0.05
+    acceleration_mps2: float = 1.5
+    relaxation_m: float = 0.3
+    damping_ratio: float = 0.7
+
+
+_GRID_M = 0.05
+_FADE_MPS = 0.5
+
+
+def car_record(robot: BicycleRobot, settings: PlantSettings) -> Array:
+    """Return the parameters of :func:`advance`, (1,) of :data:`CAR`.
+
+    Raises
+    ------
+    ConfigError
+        if a setting is out of its range.
+    """
+    if not 0.0 <= settings.steering_delay_s <= LONGEST_DELAY_S:
+        raise ConfigError(
+            f"steering_delay_s is {settings.steering_delay_s:g}, 0 to {LONGEST_DELAY_S:g} s is accepted"
+        )
+    if not (settings.acceleration_mps2 > 0 and settings.relaxation_m > 0 and settings.damping_ratio >= 0):
+        raise ConfigError(
+            "acceleration and relaxation length above zero, and a damping from zero, are needed"
+        )
+    described = {name: getattr(robot, name) for name in CAR.names or () if hasattr(robot, name)}
+    given = {name: value for name, value in settings._asdict().items() if name in (CAR.names or ())}
+    return filled(CAR, **described, **given, delay_steps=round(settings.steering_delay_s / STEP_S))
+
+
+def ground_grid(ground: Ground) -> Array:
+    """Return grip and roll (n, 2) on the grid that :func:`advance` looks them up on.
+
+    Raises
+    ------
+    ConfigError
+        if arrays differ in length, distances do not rise, or grip or roll cannot be.
+    """
+    distance, grip, roll = (np.atleast_1d(np.asarray(values, float)) for values in ground)
+    if not distance.shape == grip.shape == roll.shape or distance.ndim != 1 or not distance.size:
+        raise ConfigError("ground: distance, grip and roll are needed in equal numbers")
+    if not np.isfinite([distance, grip, roll]).all() or (np.diff(distance) <= 0).any():
+        raise ConfigError("ground: distances have to rise, and all numbers to be finite")
+    if grip.min() <= 0 or np.abs(roll).max() > np.deg2rad(45.0):
+        raise ConfigError("ground: a grip above 0 and a roll of at most 45 degrees are accepted")
+    at = np.arange(0.0, max(distance[-1], 0.0) + 2 * _GRID_M, _GRID_M)
+    return np.column_stack([np.interp(at, distance, grip), np.interp(at, distance, roll)])
+
+
+def initial_state(x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float = 0.0, speed_mps: float = 0.0) -> Array:
+    """Return the state, (1,) of :data:`CAR_STATE`, of a robot that drives straight at a pose."""
+    body = filled(CAR_BODY, position_x_m=x_m, position_y_m=y_m, yaw_rad=yaw_rad, speed_mps=speed_mps)
+    return filled(CAR_STATE, body=body)
+
+
+@njit(cache=True)
+def side_force(slip_rad: float, stiffness_npr: float, limit_n: float) -> float:
+    """Return the side force of an axle at a slip angle, opposed to it and never over its limit.
+
+    Examples
+    --------
+    >>> round(side_force(0.001, 15000.0, 1400.0), 1), round(side_force(-1.0, 15000.0, 1400.0))
+    (-14.9, 1400)
+    """
+    return -math.copysign(limit_n * -math.expm1(-stiffness_npr * abs(slip_rad) / limit_n), slip_rad)
+
+
+@njit(cache=True)
+def _axle(
+    car: Any, slip: float, ahead: float, side: float, stiffness: float, limit: float, mass: float
+) -> tuple[float, float]:
+    """Return the next slip angle of the carcass, and the side force, of an axle."""
+    length, carcass = car.relaxation_m, math.tan(slip)
+    carcass = (carcass + STEP_S * side / length) / (1.0 + STEP_S * abs(ahead) / length)
+    slides = math.tan(min(8.0 * limit / stiffness, 1.4))
+    carcass = min(max(carcass, -slides), slides)
+    force = side_force(math.atan(carcass), stiffness, limit)
+    damping = 2.0 * car.damping_ratio * math.sqrt(stiffness / length * mass)
+    force -= damping * side * math.exp(-((ahead / _FADE_MPS) ** 2))
+    return math.atan(carcass), min(max(force, -limit), limit)
+
+
+@njit(cache=True)
+def step(car: Any, grid: Array, state: Any, steer_command: float, speed_command: float) -> None:
+    """Advance the state in place by :data:`STEP_S`."""
+    body, command = state.body, steer_command
+    if car.delay_steps > 0:
+        command = state.commands_rad[state.place]
+        state.commands_rad[state.place] = steer_command
+        state.place = (state.place + 1) % car.delay_steps
+    steer_max, rate = car.steering_max_rad, car.steering_rate_radps * STEP_S
+    command = min(max(command, -steer_max), steer_max)
+    turn = -math.expm1(-STEP_S / max(car.steering_time_constant_s, 1e-6)) * (command - body.steer_rad)
+    steer = body.steer_rad + min(max(turn, -rate), rate)
+    hardest = car.acceleration_mps2 * STEP_S
+    gained = min(max(speed_command - body.speed_mps, -hardest), hardest)
+    speed = body.speed_mps + gained
+    where = min(max(body.distance_m / _GRID_M, 0.0), grid.shape[0] - 1.001)
+    cell = int(where)
+    grip = grid[cell, 0] + (where - cell) * (grid[cell + 1, 0] - grid[cell, 0])
+    roll = grid[cell, 1] + (where - cell) * (grid[cell + 1, 1] - grid[cell, 1])
+    mass, ahead, behind = car.mass_kg, car.com_ahead_m, car.com_behind_front_m
+    base, press = ahead + behind, GRAVITY_MPS2 * math.cos(roll)
+    drive = gained / STEP_S / press
+    grip = math.sqrt(max(grip * grip - drive * drive, 0.01 * grip * grip))
+    side, turning, cos, sin = body.side_speed_mps, body.yaw_rate_radps, math.cos(steer), math.sin(steer)
+    at_front = side + behind * turning
+    m_front, m_rear = mass * ahead / base, mass * behind / base
+    v_side, v_ahead = at_front * cos - speed * sin, speed * cos + at_front * sin
+    front, f_front = _axle(
+        car, body.slip_front_rad, v_ahead, v_side, car.front_cornering_npr, grip * m_front * press, m_front
+    )
+    at_rear, c_rear = side - ahead * turning, car.rear_cornering_npr
+    rear, f_rear = _axle(car, body.slip_rear_rad, speed, at_rear, c_rear, grip * m_rear * press, m_rear)
+    f_ahead = f_front * cos
+    body.yaw_accel_radps2 = (behind * f_ahead - ahead * f_rear) / car.yaw_inertia_kgm2
+    body.accel_y_mps2 = (f_ahead + f_rear) / mass
+    body.side_speed_mps += STEP_S * (body.accel_y_mps2 - GRAVITY_MPS2 * math.sin(roll) - speed * turning)
+    body.yaw_rate_radps += STEP_S * body.yaw_accel_radps2
+    middle = body.yaw_rad + 0.5 * STEP_S * body.yaw_rate_radps
+    at_rear = body.side_speed_mps - ahead * body.yaw_rate_radps
+    cos, sin = math.cos(middle), math.sin(middle)
+    body.position_x_m += STEP_S * (speed * cos - at_rear * sin)
+    body.position_y_m += STEP_S * (speed * sin + at_rear * cos)
+    body.yaw_rad += STEP_S * body.yaw_rate_radps
+    body.distance_m += STEP_S * math.hypot(speed, at_rear)
+    body.speed_mps, body.steer_rad, body.accel_x_mps2 = speed, steer, gained / STEP_S
+    body.roll_rate_radps, body.roll_rad = (roll - body.roll_rad) / STEP_S, roll
+    body.slip_front_rad, body.slip_rear_rad = front, rear
+    body.side_front_n, body.side_rear_n = f_front, f_rear
+
+
+@njit(cache=True)
+def advance(
+    car: Array, grid: Array, state: Array, steer_rad: float, speed_mps: float, rows: Array, each: int
+) -> None:
+    """Advance the state in place by steps under constant commands.
+
+    Parameters
+    ----------
+    car : of :func:`car_record`
+    grid : of :func:`ground_grid`
+    state : (1,) of :data:`CAR_STATE`
+    steer_rad, speed_mps : commanded
+    rows : (k,) of :data:`CAR_BODY` that is filled with the body after every ``each`` steps
+    each : steps a row
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> car, state = car_record(load_robot("adap2e"), PlantSettings()), initial_state()
+    >>> rows = np.empty(200, CAR_BODY)
+    >>> advance(car, ground_grid(level_ground()), state, 0.1, 1.0, rows, 10)
+    >>> float(state["body"]["speed_mps"][0]), round(float(state["body"]["steer_rad"][0]), 3)
+    (1.0, 0.1)
+    """
+    for row in range(rows.shape[0]):
+        for _ in range(each):
+            step(car[0], grid, state[0], steer_rad, speed_mps)
+        rows[row] = state[0].body
+
+
+class SensorNoise(NamedTuple):
+    """Standard deviations of white noise of each sample."""
+
+    speed_mps: float = 0.02
+    steer_rad: float = 0.002
+    gyro_radps: float = 0.003
+    accel_mps2: float = 0.1
+    tilt_rad: float = 0.003
+    position_m: float = 0.02
+    yaw_rad: float = 0.005
+
+
+class SpeedProfile(NamedTuple):
+    """Speed along a drive.
+
+    Parameters
+    ----------
+    speed_mps : away from stops
+    stops : (distance travelled in m, time to stand in s) of each, in their order
+    """
+
+    speed_mps: float
+    stops: tuple[tuple[float, float], ...] = ()
+
+
+class CarSample(NamedTuple):
+    """What a controller is given at a tick.
+
+    Parameters
+    ----------
+    time_s : of the tick
+    measured : (8,) of :data:`CAR_ROWS`; NaN where a sensor gave nothing at this tick
+    speed_desired_mps : by the profile, stops included
+    """
+
+    time_s: float
+    measured: Array
+    speed_desired_mps: float
+
+
+class CarCommand(NamedTuple):
+    """What a controller commands; ``finished`` ends the drive."""
+
+    steer_rad: float
+    speed_mps: float
+    finished: bool = False
+
+
+Controller = Callable[[CarSample], CarCommand]
+
+
+class CarDrive(NamedTuple):
+    """Where and how a car drives.
+
+    Parameters
+    ----------
+    ground : along the drive
+    profile : of its speed
+    duration_s : longest time
+    start : (x in m, y in m, yaw in rad) of the rear axle at rest
+    """
+
+    ground: Ground
+    profile: SpeedProfile
+    duration_s: float = 60.0
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def open_loop(time_s: Array, steer_rad: Array) -> Controller:
+    """Return a controller that plays a steering angle (n,) over time (n,), at the speed of the profile.
+
+    Examples
+    --------
+    >>> straight = open_loop(np.zeros(1), np.zeros(1))
+    >>> straight(CarSample(0.0, np.zeros(8), 2.0))
+    CarCommand(steer_rad=0.0, speed_mps=2.0, finished=False)
+    """
+    return lambda sample: CarCommand(
+        float(np.interp(sample.time_s, time_s, steer_rad)), sample.speed_desired_mps
+    )
+
+
+class _Stops:
+    """The desired speed of a profile, of what was driven so far."""
+
+    def __init__(self, profile: SpeedProfile, acceleration_mps2: float) -> None:
+        self._profile, self._brakes, self._next, self._stood_s = profile, acceleration_mps2, 0, 0.0
+
+    def desired(self, distance_m: float, speed_mps: float) -> float:
+        stops = self._profile.stops
+        if self._next < len(stops):
+            where_m, stand_s = stops[self._next]
+            if distance_m + speed_mps**2 / (2 * self._brakes) >= where_m:
+                self._stood_s += TICK_S if speed_mps == 0.0 else 0.0
+                if self._stood_s <= stand_s:
+                    return 0.0
+                self._next, self._stood_s = self._next + 1, 0.0
+        return self._profile.speed_mps
+
+
+def simulate_car(
+    robot: BicycleRobot,
+    drive: CarDrive,
+    controller: Controller,
+    rng: np.random.Generator,
+    noise: SensorNoise = SensorNoise(),  # noqa: B008
+    settings: PlantSettings = PlantSettings(),  # noqa: B008
+    run_id: str = "car",
+) -> RunLog:
+    """Drive, and return the log with its truth.
+
+    Parameters
+    ----------
+    robot : car-like
+    drive : ground, speed, duration and start
+    controller : called at each tick
+    rng : of the noise
+    noise : of the sensors
+    settings : of the plant
+    run_id : of the log
+
+    Raises
+    ------
+    ConfigError
+        if settings, ground or profile are not accepted, or the controller commands no finite numbers.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> drive = CarDrive(level_ground(), SpeedProfile(2.0), duration_s=3.0)
+    >>> straight = open_loop(np.zeros(1), np.zeros(1))
+    >>> run = simulate_car(load_robot("adap2e"), drive, straight, np.random.default_rng(1))
+    >>> sorted(run.streams)
+    ['commands', 'compass', 'gnss', 'imu', 'steering', 'truth', 'wheels']
+    """
+    car, grid = car_record(robot, settings), ground_grid(drive.ground)
+    profile = drive.profile
+    if not 0.0 <= profile.speed_mps <= robot.speed_max_mps:
+        raise ConfigError(
+            f"speed is {profile.speed_mps:g} m/s, 0 to {robot.speed_max_mps:g} is the robot's range"
+        )
+    stops, state = _Stops(profile, settings.acceleration_mps2), initial_state(*drive.start)
+    per_tick, n_ticks = round(TICK_S / TRUTH_S), max(2, int(drive.duration_s / TICK_S))
+    rows, steps = np.empty(1 + n_ticks * per_tick, CAR_BODY), round(TRUTH_S / STEP_S)
+    body = state["body"][0]
+    body["roll_rad"] = grid[0, 1]
+    rows[0] = body
+    ticks, commands = _Measured(rng, noise, n_ticks, robot.com_ahead_m), np.empty((n_ticks, 2))
+    for k in range(n_ticks):
+        desired = stops.desired(float(body["distance_m"]), float(body["speed_mps"]))
+        asked = controller(CarSample(k * TICK_S, ticks.measure(k, body), desired))
+        if not np.isfinite(asked[:2]).all():
+            raise ConfigError(f"the controller commands {asked[:2]} after {k * TICK_S:.2f} s")
+        commands[k] = asked[:2]
+        part = rows[1 + k * per_tick : 1 + (k + 1) * per_tick]
+        advance(car, grid, state, asked.steer_rad, asked.speed_mps, part, steps)
+        if asked.finished and k:
+            n_ticks = k + 1
+            break
+    time_s, measured = np.arange(n_ticks) * TICK_S, ticks.rows[:n_ticks]
+    rows = rows[: n_ticks * per_tick]
+    fixed = np.isfinite(measured[:, 2])
+    streams = {
+        "wheels": Stream(time_s, measured[:, :1], ("speed_rear_mps",)),
+        "steering": Stream(time_s, measured[:, 1:2], ("angle_front_rad",)),
+        "gnss": _gnss(time_s[fixed], measured[fixed], rows[::per_tick][fixed], robot, noise, rng),
+        "compass": Stream(time_s[fixed], measured[fixed, 4:5], ("yaw_rad",)),
+        "imu": _imu(rows, measured, per_tick, robot, noise, rng),
+        "commands": Stream(time_s, commands[:n_ticks], ("steer_front_rad", "speed_x_mps")),
+        "truth": _truth(rows, robot),
+    }
+    return RunLog(run_id, robot.name, streams, source="terrain.simulation.car")
+
+
+class _Measured:
+    """Samples at the ticks; noise is drawn at first, so that it is the same for all controllers."""
+
+    def __init__(
+        self, rng: np.random.Generator, noise: SensorNoise, n_ticks: int, com_ahead_m: float
+    ) -> None:
+        std = [noise.speed_mps, noise.steer_rad, noise.position_m, noise.position_m, noise.yaw_rad]
+        std += [noise.gyro_radps, noise.tilt_rad, noise.accel_mps2]
+        self.rows, self._ahead = rng.standard_normal((n_ticks, len(CAR_ROWS))) * std, com_ahead_m
+
+    def measure(self, tick: int, body: Array) -> Array:
+        row = self.rows[tick]
+        names = [
+            "speed_mps",
+            "steer_rad",
+            "position_x_m",
+            "position_y_m",
+            "yaw_rad",
+            "yaw_rate_radps",
+            "roll_rad",
+        ]
+        row += (*(body[name] for name in names), _lateral(body, self._ahead))
+        if body["speed_mps"] == 0.0:
+            row[0] = 0.0  # the encoder of a wheel that stands counts nothing
+        row[4] = wrapped(float(row[4]))
+        if tick % round(FIX_S / TICK_S):
+            row[2:5] = np.nan
+        return np.array(row)
+
+
+def _lateral(rows: Array, com_ahead_m: float) -> Array:
+    """Return the lateral specific force above the rear axle."""
+    return np.asarray(rows["accel_y_mps2"] - com_ahead_m * rows["yaw_accel_radps2"])
+
+
+def _rear_velocity(rows: Array, robot: BicycleRobot) -> Array:
+    """Return the velocity (n, 2) of the rear axle, ahead and to the left."""
+    left = rows["side_speed_mps"] - robot.com_ahead_m * rows["yaw_rate_radps"]
+    return np.column_stack([rows["speed_mps"], left])
+
+
+def _truth(rows: Array, robot: BicycleRobot) -> Stream:
+    ahead, left = _rear_velocity(rows, robot).T
+    at_front, steer = left + robot.wheelbase_m * rows["yaw_rate_radps"], rows["steer_rad"]
+    cos, sin = np.cos(steer), np.sin(steer)
+    columns = [
+        *(rows["position_x_m"], rows["position_y_m"], wrapped(rows["yaw_rad"]), rows["roll_rad"]),
+        *(0.0 * ahead, ahead, rows["side_speed_mps"], rows["yaw_rate_radps"]),
+        *(rows["accel_x_mps2"], rows["accel_y_mps2"]),
+        slip_angle(ahead * cos + at_front * sin, at_front * cos - ahead * sin),
+        slip_angle(ahead, left),
+        *(rows["side_front_n"], rows["side_rear_n"], steer, rows["distance_m"]),
+    ]
+    return Stream(np.arange(len(rows)) * TRUTH_S, np.column_stack(columns), TRUTH_CHANNELS)
+
+
+def _imu(
+    rows: Array,
+    measured: Array,
+    per_tick: int,
+    robot: BicycleRobot,
+    noise: SensorNoise,
+    rng: np.random.Generator,
+) -> Stream:
+    """Return gyro, specific force and attitude; at the ticks they are what the controller got."""
+    std = np.repeat([noise.gyro_radps, noise.accel_mps2, noise.tilt_rad], 3)
+    none, turn, roll = np.zeros(len(rows)), rows["yaw_rate_radps"], rows["roll_rad"]
+    lateral = _lateral(rows, robot.com_ahead_m) - GRAVITY_MPS2 * np.sin(roll)
+    accel = np.column_stack([rows["accel_x_mps2"] - rows["side_speed_mps"] * turn, lateral])
+    drawn = white_imu(
+        np.arange(len(rows)) * TRUTH_S,
+        np.column_stack([rows["roll_rate_radps"], none, turn]),
+        accel,
+        np.column_stack([roll, none, rows["yaw_rad"]]),
+        rng.standard_normal((len(rows), 9)) * std,
+    )
+    values = np.array(drawn.values)
+    values[::per_tick, [2, 6, 4]] = measured[:, 5:]
+    return Stream(drawn.time_s, values, drawn.channels)
+
+
+def _gnss(
+    time_s: Array,
+    measured: Array,
+    rows: Array,
+    robot: BicycleRobot,
+    noise: SensorNoise,
+    rng: np.random.Generator,
+) -> Stream:
+    """Return fixes: positions as the controller got them, velocity over ground, their accuracy."""
+    ahead, left = _rear_velocity(rows, robot).T
+    cos, sin = np.cos(rows["yaw_rad"]), np.sin(rows["yaw_rad"])
+    velocity = np.column_stack([cos * ahead - sin * left, sin * ahead + cos * left])
+    velocity += rng.standard_normal(velocity.shape) * noise.position_m / FIX_S
+    known = np.ones((len(rows), 1))
+    values = np.column_stack([measured[:, 2:4], velocity, noise.position_m * known, known])
+    return Stream(time_s, values, GNSS_CHANNELS)

@@ -1,0 +1,767 @@
+r"""Tracked robots on an even slope: forces under two tracks, or slip that is prescribed, and the log of a run.
+
+Speeds of the tracks go in, an ordinary run log with its truth comes out.  The belts follow the commanded speeds
+with a lag; the motion is that on soils or with prescribed slip, one after the other; sensors add noise.  Poses are
+those of cameras around the field, positions of satellites are raw, and a compass shows the heading.
+
+**Forces.** A body moves by :math:`(V_x, V_y, w)`; a track at :math:`y = \pm d` with the belt speed v touches
+down at its front, :math:`x = l/2`, where v > 0, and at its rear where v < 0.  An element that lies :math:`\xi` behind
+that end has been on the ground for :math:`t = \xi / |v|`; it slides with :math:`s` and has slid :math:`j`:
+
+.. math::
+    s = (v - V_x + w y,\; -(V_y + w x)), \qquad
+    j = t\,(v - V_x + w y,\; -(V_y + w \bar x)),
+
+:math:`\bar x` being the middle of where it has been.  The shear stress has the direction of s and the size
+
+.. math:: \tau = (c + p \tan\varphi)(1 - e^{-|j|/K})
+
+(Wong and Chiang, A general theory for skid steering of tracked vehicles on firm ground, 2001; Janosi and
+Hanamoto 1961).  In straight motion the sum over a track is Tazzari (7) and the right form of Yamauchi (17).
+
+The pressure p is linear along a track and differs from track to track: gravity on a slope acts at the height
+of the centre of mass.  Each track presses a rut (compaction, Bekker), rolls against its own friction, and
+pushes soil aside with its sides at their depth z: passive earth pressure
+:math:`\gamma z^2 K_p / 2 + 2 c z \sqrt{K_p}` on each metre that slides sideways, mobilised by how far it has.
+**Bulldozing on the inner side**: what a turning robot sweeps into the turn lies beside the inner track (of a
+turn in place, half beside each) and adds to its depth there, :math:`z^2 + 2 A`; the cross-section A of that
+heap grows by what is swept and is left behind as the robot moves on,
+:math:`dA/dt = z |w| l / 4 - A |V_x| / l` (this project's; Yamauchi et al. describe the heap, fig. 19, and do
+not model it).
+
+What is assumed: loads follow gravity alone, not accelerations; a belt that does not turn counts as creeping
+with :data:`CREEP_MPS`, so that a stopped track is dragged at its full friction; unit weight of soil and
+mobilisation of the earth pressure are constants.
+
+**Motion** is a balance of forces with inertia, stepped implicitly,
+
+.. math:: M (V^+ - V)/h + M\,(-w V_y,\; w V_x,\; 0) = F(V^+),
+
+F being the forces.  They change with the slip over the belt's speed, within a millimetre of travel, which no
+explicit step of a hundredth of a second follows; the implicit one is solved by Newton's method with a numerical
+Jacobian, halved where the residual grows, and stands still on a slope without inertia of its own.
+
+**Prescribed slip** stands in place of a soil: what papers assume, with numbers that an estimator has to find.
+With the belts' speeds :math:`v_l, v_r`, the grade g along the motion and the roll h,
+
+.. math::
+    \alpha &= a_0 + a_1 g, \qquad v_i' = \eta_i (1 - \alpha)\, v_i, \\
+    D &= k\,(v_r' - v_l'), \qquad u_r = D\,\frac{a}{a + b}, \quad u_l = -D\,\frac{b}{a + b}, \\
+    V_x &= \tfrac12 (v_r' - u_r + v_l' - u_l), \quad
+    w = \frac{v_r' - v_l' - D}{2 d}, \quad V_y = -|V_x|\, c\, h,
+
+with :math:`a = |v_r'|^{1-n}`, :math:`b = |v_l'|^{1-n}` for :math:`n \le 1` and
+:math:`a = |v_l'|^{n-1}, b = |v_r'|^{n-1}` beyond: Tazzari (5), Yamauchi (22) and (26), and Endo's law
+(Yamauchi (27)) written without its singular points.  k is how much of the difference is lost in turning.
+
+**Slope.** Positions and headings are those in the plane of the slope.  With its angle s and the heading q of uphill, a
+body at the heading h has ``sin(grade) = sin s cos(h - q)``, uphill positive, and, as ZYX angles,
+``sin(roll) = -sin s sin(h - q) / cos(grade)``, left side up positive; then ``cos(roll) cos(grade) = cos s``,
+Yamauchi (29).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+
+from terrain.angles import wrapped
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError
+from terrain.kernels import filled, numbers, record
+from terrain.logs.schema import POSE_CHANNELS
+from terrain.records import Array, Label, RunLog, Stream
+from terrain.robots import TrackedRobot
+from terrain.simulation.sensors import (
+    BODY_TRUTH,
+    COMPASS_STD_RAD,
+    GYRO_BIAS,
+    RAW_HZ,
+    RAW_STD_M,
+    raw_fixes,
+    wheel_channels,
+    white_imu,
+)
+from terrain.slip import slip_angle, slip_ratio
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import compaction_resistance, plate_sinkage
+
+COMMANDS_HZ, WHEELS_HZ = 50.0, 50.0
+"""Rates of the commands and of the wheels' logger."""
+
+STEP_S = 0.01
+"""From step to step; no sensor is sampled faster."""
+
+ITERATIONS, HALVINGS, TOLERANCE = 60, 40, 1e-8
+"""Newton steps, halvings of each, and the residual over the weight at which the balance is reached."""
+
+NUDGE = 1e-7
+"""Change of a speed, in m/s, over which the Jacobian is taken."""
+
+ELEMENTS = 16
+"""Elements along a track: forces are within 1 % of those of 200."""
+
+CREEP_MPS = 1e-3
+"""Belt speed that a stopped track counts as having."""
+
+SLIDING_MPS = 1e-5
+"""Sliding speed below which friction has no direction of its own."""
+
+ROLLING_MPS = 2e-3
+"""Speed over which resistances against motion take their full size."""
+
+UNIT_WEIGHT_NPM3 = 15000.0
+"""Of loose dry sand: 14 to 16 kN/m^3 (Terzaghi, Peck and Mesri, Soil Mechanics in Engineering Practice)."""
+
+MOBILISED_M = 0.02
+"""Sideways distance over which the earth pressure builds up; assumed, as the shear modulus of loose sand."""
+
+
+class PrescribedSlip(NamedTuple):
+    """Slip of the two tracks; none by default.
+
+    Parameters
+    ----------
+    eta_left_ratio, eta_right_ratio : ground speed over belt speed
+    slip_ratio : a_0, of straight motion on the level, positive in traction
+    grade_slip_ratio : a_1, a rad of grade along the motion
+    side_slip_ratio : c, slip angle a rad of roll
+    turning_loss_ratio : k
+    turning_exponent : n of Endo's law
+    """
+
+    eta_left_ratio: float = 1.0
+    eta_right_ratio: float = 1.0
+    slip_ratio: float = 0.0
+    grade_slip_ratio: float = 0.0
+    side_slip_ratio: float = 0.0
+    turning_loss_ratio: float = 0.0
+    turning_exponent: float = 1.0
+
+
+TRACKS = record(
+    numbers(
+        "half_m length_m width_m height_m mass_kg inertia_kgm2 area_m2 cohesion_pa tan_friction "
+        "shear_modulus_m kc_npmn1 kphi_npmn2 exponent_ratio rolling_ratio passive_ratio "
+        "bulldozing_ratio until_m"
+    ) | dict.fromkeys(PrescribedSlip._fields, float)
+    | {"sheared": bool}
+)
+"""A robot on a ground: its numbers, those of a soil that is sheared or of prescribed slip, and the distance
+travelled at which the ground ends."""
+
+STATE = record(
+    numbers(
+        "position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps heap_m2 travelled_m"
+    )
+)
+"""Pose in the plane of the slope, twist, cross-section of the heap beside the inner track, and distance."""
+
+
+class Slope(NamedTuple):
+    """An even slope, level by default.
+
+    Parameters
+    ----------
+    angle_rad : against the horizontal
+    uphill_rad : heading of uphill in the plane of the slope
+    """
+
+    angle_rad: float = 0.0
+    uphill_rad: float = 0.0
+
+
+LEVEL = Slope()
+"""No slope."""
+
+
+@njit(cache=True)
+def tilt_at(angle_rad: float, uphill_rad: float, yaw_rad: float) -> tuple[float, float]:
+    """Return grade and roll of a body on a slope.
+
+    Examples
+    --------
+    >>> grade, roll = tilt_at(0.2, 0.0, 0.0)
+    >>> round(grade, 6), abs(round(roll, 6))
+    (0.2, 0.0)
+    >>> grade, roll = tilt_at(0.2, math.pi / 2, 0.0)  # uphill is to the left: the left side is up
+    >>> abs(round(grade, 6)), round(roll, 6)
+    (0.0, 0.2)
+    """
+    grade = math.asin(math.sin(angle_rad) * math.cos(yaw_rad - uphill_rad))
+    side = -math.sin(angle_rad) * math.sin(yaw_rad - uphill_rad) / math.cos(grade)
+    return grade, math.asin(min(max(side, -1.0), 1.0))
+
+
+def tracks_on(
+    robot: TrackedRobot,
+    ground: Soil | PrescribedSlip,
+    until_m: float = math.inf,
+    bulldozing_ratio: float = 1.0,
+) -> Array:
+    """Return a robot on a ground, (1,) of :data:`TRACKS`.
+
+    Parameters
+    ----------
+    robot : its yaw inertia is that of an even plate over the tracks
+    ground : a soil that shears, without Bekker's numbers no rut is pressed and nothing is pushed aside; or the
+        slip itself
+    until_m : distance travelled at which the ground ends
+    bulldozing_ratio : factor on what sides push; 0 for none
+
+    Raises
+    ------
+    ConfigError
+        if the soil does not shear.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.terramechanics.soil import load_soil
+    >>> tracks_on(load_robot("patako"), load_soil("dry_sand"))["half_m"].round(4)
+    array([0.1965])
+    """
+    across_m = robot.track_m + robot.track_width_m
+    tracks = filled(
+        TRACKS,
+        half_m=robot.half_track_m,
+        length_m=robot.contact_length_m,
+        width_m=robot.track_width_m,
+        height_m=robot.com_height_m,
+        mass_kg=robot.mass_kg,
+        inertia_kgm2=robot.mass_kg * (robot.contact_length_m**2 + across_m**2) / 12.0,
+        area_m2=robot.contact_length_m * robot.track_width_m,
+        until_m=until_m,
+    )
+    if isinstance(ground, PrescribedSlip):
+        for name, value in ground._asdict().items():
+            tracks[name] = value
+        return tracks
+    if ground.law != "janosi":
+        raise ConfigError(
+            f"soil {ground.name!r} has the law {ground.law!r}: a tracked robot is simulated on ground that "
+            "shears, the law 'janosi'"
+        )
+    tracks["sheared"] = True
+    tracks["cohesion_pa"], tracks["tan_friction"] = ground.cohesion_pa, math.tan(ground.friction_angle_rad)
+    tracks["shear_modulus_m"], tracks["rolling_ratio"] = (
+        ground.shear_modulus_m,
+        ground.rolling_resistance_ratio,
+    )
+    tracks["passive_ratio"] = math.tan(math.pi / 4 + ground.friction_angle_rad / 2) ** 2
+    if math.isfinite(ground.kphi_npmn2):
+        tracks["kc_npmn1"], tracks["kphi_npmn2"] = ground.kc_npmn1, ground.kphi_npmn2
+        tracks["exponent_ratio"], tracks["bulldozing_ratio"] = ground.sinkage_exponent_ratio, bulldozing_ratio
+    return tracks
+
+
+@njit(cache=True)
+def track_loads(tracks: Any, grade_rad: float, roll_rad: float) -> tuple[float, float, float]:
+    """Return the loads of the left and the right track, and how far ahead of the middle they act.
+
+    A track that would lift carries nothing, and the load acts within the middle third, so that no pressure
+    is negative.
+    """
+    weight = tracks.mass_kg * GRAVITY_MPS2
+    normal = weight * math.cos(grade_rad) * math.cos(roll_rad)
+    along, across = -weight * math.sin(grade_rad), -weight * math.sin(roll_rad) * math.cos(grade_rad)
+    shift = across * tracks.height_m / (2.0 * tracks.half_m)
+    left = min(max(0.5 * normal + shift, 0.0), normal)
+    ahead = along * tracks.height_m / max(normal, 1e-9)
+    third = tracks.length_m / 6.0
+    return left, normal - left, min(max(ahead, -third), third)
+
+
+@njit(cache=True)
+def rut_depth(tracks: Any, load_n: float) -> float:
+    """Return the depth of a track's rut; 0 on ground that has no numbers of sinkage."""
+    if tracks.kphi_npmn2 == 0.0:
+        return 0.0
+    pressure = load_n / tracks.area_m2
+    return float(
+        plate_sinkage(pressure, tracks.width_m, tracks.kc_npmn1, tracks.kphi_npmn2, tracks.exponent_ratio)
+    )
+
+
+@njit(cache=True)
+def track_forces(
+    tracks: Any,
+    belt_mps: Array,
+    twist: Array,
+    grade_rad: float,
+    roll_rad: float,
+    heap_m2: float,
+    out: Array,
+) -> None:
+    """Write the force along x, that along y and the moment (3,) of the ground and of gravity on the body.
+
+    Parameters
+    ----------
+    tracks : a record of :data:`TRACKS`
+    belt_mps : (2,) speeds of the belts, left and right
+    twist : (3,) speeds of the body's origin in body axes and yaw rate
+    grade_rad, roll_rad : of the body, uphill and left side up positive
+    heap_m2 : cross-section of the soil beside the inner track
+    out : (3,)
+    """
+    weight = tracks.mass_kg * GRAVITY_MPS2
+    out[0], out[1] = -weight * math.sin(grade_rad), -weight * math.sin(roll_rad) * math.cos(grade_rad)
+    out[2] = 0.0
+    left, right, ahead = track_loads(tracks, grade_rad, roll_rad)
+    for side in range(2):
+        load = left if side == 0 else right
+        y = tracks.half_m if side == 0 else -tracks.half_m
+        heap = inner_share(twist, y) * heap_m2
+        _add_track(tracks, belt_mps[side], twist, load, ahead, y, heap, out)
+
+
+@njit(cache=True)
+def inner_share(twist: Array, y: float) -> float:
+    """Return how far the track at y is the inner one of a turn, from 0 to 1; half of it in turning in place.
+
+    Examples
+    --------
+    >>> inner_share(np.array([0.1, 0.0, 0.0]), 0.2), inner_share(np.array([0.0, 0.0, 0.5]), 0.2)
+    (0.5, 0.5)
+    >>> round(inner_share(np.array([1.0, 0.0, 0.5]), 0.2), 3)  # to the left
+    0.955
+    """
+    turning = abs(twist[2] * y)
+    if turning == 0.0:
+        return 0.5
+    side = twist[0] * twist[2] * y
+    tight = abs(twist[0]) / (abs(twist[0]) + turning)
+    return 0.5 * (1.0 + math.copysign(tight, side))
+
+
+@njit(cache=True)
+def _add_track(
+    tracks: Any,
+    belt_mps: float,
+    twist: Array,
+    load_n: float,
+    ahead_m: float,
+    y: float,
+    heap_m2: float,
+    out: Array,
+) -> None:
+    """Add the forces of one track."""
+    length, width, modulus = tracks.length_m, tracks.width_m, tracks.shear_modulus_m
+    step = length / ELEMENTS
+    front = 0.5 * length if belt_mps >= 0.0 else -0.5 * length
+    creep = max(abs(belt_mps), CREEP_MPS)
+    along = belt_mps - twist[0] + twist[2] * y
+    depth = rut_depth(tracks, load_n)
+    flank = _earth_pressure(tracks, depth, 0.0)
+    heaped = _earth_pressure(tracks, depth, heap_m2)
+    for i in range(ELEMENTS):
+        x = 0.5 * length - (i + 0.5) * step
+        age = abs(front - x) / creep
+        across = -(twist[1] + twist[2] * x)
+        slid_x, slid_y = along * age, -(twist[1] + twist[2] * 0.5 * (x + front)) * age
+        pressure = load_n / tracks.area_m2 * (1.0 + 12.0 * ahead_m * x / (length * length))
+        stress = tracks.cohesion_pa + pressure * tracks.tan_friction
+        stress *= -math.expm1(-math.hypot(slid_x, slid_y) / modulus)
+        per_speed = stress * width * step / math.sqrt(along * along + across * across + SLIDING_MPS**2)
+        force_x, force_y = per_speed * along, per_speed * across
+        if flank > 0.0:
+            pushed = heaped if across * y < 0.0 else flank  # the inner track's side that faces the turn
+            share = -math.expm1(-abs(slid_y) / MOBILISED_M)
+            force_y += pushed * share * step * across / math.sqrt(across * across + SLIDING_MPS**2)
+        out[0] += force_x
+        out[1] += force_y
+        out[2] += x * force_y - y * force_x
+    moving = twist[0] - twist[2] * y
+    resists = tracks.rolling_ratio * load_n
+    if depth > 0.0:
+        modulus_b = tracks.kc_npmn1 + tracks.width_m * tracks.kphi_npmn2
+        resists += compaction_resistance(depth, modulus_b, tracks.exponent_ratio)
+    resists *= moving / math.sqrt(moving * moving + ROLLING_MPS**2)
+    out[0] -= resists
+    out[2] += y * resists
+
+
+@njit(cache=True)
+def _earth_pressure(tracks: Any, depth_m: float, heap_m2: float) -> float:
+    """Return the force on each metre of a side that pushes soil of a depth, and of a heap on it."""
+    if tracks.bulldozing_ratio == 0.0:
+        return 0.0
+    square = depth_m * depth_m + 2.0 * heap_m2
+    passive = tracks.passive_ratio
+    cohesive = 2.0 * tracks.cohesion_pa * depth_m * math.sqrt(passive)
+    return float(tracks.bulldozing_ratio * (0.5 * UNIT_WEIGHT_NPM3 * square * passive + cohesive))
+
+
+@njit(cache=True)
+def slipped_twist(
+    tracks: Any, left_mps: float, right_mps: float, grade_rad: float, roll_rad: float
+) -> tuple[float, float, float]:
+    """Return V_x, V_y and w of belts that turn at speeds, with prescribed slip.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> tracks = tracks_on(load_robot("patako"), PrescribedSlip(0.9, 0.9))
+    >>> slipped_twist(tracks[0], 1.0, 1.0, 0.0, 0.0)
+    (0.9, -0.0, 0.0)
+    """
+    ahead = left_mps + right_mps
+    along = grade_rad * (1.0 if ahead > 0.0 else -1.0 if ahead < 0.0 else 0.0)
+    straight = 1.0 - tracks.slip_ratio - tracks.grade_slip_ratio * along
+    left, right = tracks.eta_left_ratio * straight * left_mps, tracks.eta_right_ratio * straight * right_mps
+    lost, power = tracks.turning_loss_ratio * (right - left), tracks.turning_exponent
+    if power <= 1.0:
+        a, b = math.pow(abs(right), 1.0 - power), math.pow(abs(left), 1.0 - power)
+    else:
+        a, b = math.pow(abs(left), power - 1.0), math.pow(abs(right), power - 1.0)
+    share = a / (a + b) if a + b > 0.0 else 0.5
+    left, right = left + lost * (1.0 - share), right - lost * share
+    v_x = 0.5 * (left + right)
+    return v_x, -abs(v_x) * tracks.side_slip_ratio * roll_rad, (right - left) / (2.0 * tracks.half_m)
+
+
+@njit(cache=True)
+def twist_on_soil(
+    tracks: Any, state: Any, belt_mps: Array, grade_rad: float, roll_rad: float, dt_s: float
+) -> Array:
+    """Return the twist (3,) after a step on a soil.
+
+    Parameters
+    ----------
+    tracks, state : records of :data:`TRACKS`, and of :data:`STATE` before the step
+    belt_mps : (2,) speeds of the belts
+    grade_rad, roll_rad : of the body
+    dt_s : step
+    """
+    before = np.array([state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps])
+    twist, residual = before.copy(), np.empty(3)
+    tilt_and_heap = grade_rad, roll_rad, state.heap_m2
+    error = _residual(tracks, belt_mps, twist, before, tilt_and_heap, dt_s, residual)
+    jacobian, tried, changed = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for _ in range(ITERATIONS):
+        if error < TOLERANCE:
+            break
+        for j in range(3):
+            tried[:] = twist
+            tried[j] += NUDGE
+            _residual(tracks, belt_mps, tried, before, tilt_and_heap, dt_s, changed)
+            for i in range(3):
+                jacobian[i, j] = (changed[i] - residual[i]) / NUDGE
+        newton = np.linalg.solve(jacobian, residual)
+        part, lower, improved = 1.0, error, False
+        for _ in range(HALVINGS):
+            for i in range(3):
+                tried[i] = twist[i] - part * newton[i]
+            lower = _residual(tracks, belt_mps, tried, before, tilt_and_heap, dt_s, changed)
+            if lower < error:
+                improved = True
+                break
+            part *= 0.5
+        if not improved:
+            break
+        twist[:], residual[:], error = tried, changed, lower
+    return twist
+
+
+@njit(cache=True)
+def _residual(
+    tracks: Any,
+    belt_mps: Array,
+    twist: Array,
+    before: Array,
+    tilt_and_heap: tuple[float, float, float],
+    dt_s: float,
+    out: Array,
+) -> float:
+    """Write what is missing to the balance, over the mass, and return its size in m/s^2."""
+    track_forces(tracks, belt_mps, twist, *tilt_and_heap, out)
+    turning = (-twist[2] * twist[1], twist[2] * twist[0], 0.0)
+    mass = (tracks.mass_kg, tracks.mass_kg, tracks.inertia_kgm2)
+    size = (tracks.mass_kg, tracks.mass_kg, tracks.mass_kg * tracks.half_m)
+    total = 0.0
+    for i in range(3):
+        out[i] = (mass[i] * ((twist[i] - before[i]) / dt_s + turning[i]) - out[i]) / size[i]
+        total += out[i] * out[i]
+    return math.sqrt(total)
+
+
+@njit(cache=True)
+def step(tracks: Any, slope: Array, state: Any, belt_mps: Array, after: Any, dt_s: float) -> None:
+    """Write the state a step later.
+
+    Parameters
+    ----------
+    tracks : a record of :data:`TRACKS`
+    slope : (2,) its angle and the heading of uphill
+    state, after : records of :data:`STATE`
+    belt_mps : (2,) speeds of the belts at the end of the step
+    dt_s : step
+    """
+    grade, roll = tilt_at(slope[0], slope[1], state.yaw_rad)
+    after.heap_m2 = state.heap_m2
+    if tracks.sheared:
+        twist = twist_on_soil(tracks, state, belt_mps, grade, roll, dt_s)
+        after.speed_x_mps, after.speed_y_mps, after.yaw_rate_radps = twist
+        load = min(track_loads(tracks, grade, roll)[:2])
+        swept = rut_depth(tracks, load) * abs(after.yaw_rate_radps) * tracks.length_m / 4.0
+        left_behind = abs(after.speed_x_mps) / tracks.length_m
+        after.heap_m2 = (state.heap_m2 + dt_s * swept) / (1.0 + dt_s * left_behind)
+    else:
+        after.speed_x_mps, after.speed_y_mps, after.yaw_rate_radps = slipped_twist(
+            tracks, belt_mps[0], belt_mps[1], grade, roll
+        )
+    turned = 0.5 * dt_s * (state.yaw_rate_radps + after.yaw_rate_radps)
+    middle = state.yaw_rad + 0.5 * turned
+    x, y = 0.5 * (state.speed_x_mps + after.speed_x_mps), 0.5 * (state.speed_y_mps + after.speed_y_mps)
+    after.position_x_m = state.position_x_m + dt_s * (x * math.cos(middle) - y * math.sin(middle))
+    after.position_y_m = state.position_y_m + dt_s * (x * math.sin(middle) + y * math.cos(middle))
+    after.yaw_rad = state.yaw_rad + turned
+    after.travelled_m = state.travelled_m + dt_s * math.hypot(x, y)
+
+
+@njit(cache=True)
+def drive(tracks: Array, slope: Array, belt_mps: Array, states: Array, dt_s: float) -> None:
+    """Write all states of a drive but the first, which is its start.
+
+    Parameters
+    ----------
+    tracks : (k,) of :data:`TRACKS`, one ground after the other; the last one goes on for ever
+    slope, dt_s : as :func:`step` has them
+    belt_mps : (n, 2)
+    states : (n,) of :data:`STATE`
+    """
+    for k in range(1, belt_mps.shape[0]):
+        which = 0
+        while which < tracks.size - 1 and states[k - 1].travelled_m >= tracks[which].until_m:
+            which += 1
+        step(tracks[which], slope, states[k - 1], belt_mps[k], states[k], dt_s)
+
+
+class TrackedSensors(NamedTuple):
+    """Rates and noise of a tracked robot's sensors: standard deviations of white noise, all assumed but one.
+
+    Parameters
+    ----------
+    encoder_mps : of each speed
+    gyro_radps, gyro_bias_radps : of each sample, and of the bias from run to run
+    accel_mps2, tilt_rad, yaw_rad : of the IMU; its heading is the integral of its gyro
+    gnss_hz, gnss_m : raw satellite fixes; 2 cm and 10 Hz, Deremetz et al., section VI
+    compass_rad : of the heading beside each fix
+    pose_hz, pose_m, pose_rad : cameras around the field
+    belt_lag_s : of the belts behind their commands
+    """
+
+    encoder_mps: float = 0.001
+    gyro_radps: float = 0.003
+    gyro_bias_radps: float = 0.0005
+    accel_mps2: float = 0.05
+    tilt_rad: float = 0.002
+    yaw_rad: float = 0.001
+    gnss_hz: float = RAW_HZ
+    gnss_m: float = RAW_STD_M
+    compass_rad: float = COMPASS_STD_RAD
+    pose_hz: float = 100.0
+    pose_m: float = 0.001
+    pose_rad: float = 0.002
+    belt_lag_s: float = 0.1
+
+
+NOISY = TrackedSensors()
+"""Ordinary sensors."""
+
+QUIET = TrackedSensors(**{name: 0.0 for name in TrackedSensors._fields if not name.endswith("_hz")})
+"""Sensors without noise, and belts without a lag."""
+
+
+class Stretch(NamedTuple):
+    """A stretch of one ground.
+
+    Parameters
+    ----------
+    ground : a soil that shears, or the slip itself
+    length_m : distance travelled on it; the last one of a run goes on for ever
+    """
+
+    ground: Soil | PrescribedSlip
+    length_m: float = math.inf
+
+
+def simulate_tracked(
+    robot: TrackedRobot,
+    ground: Soil | PrescribedSlip | Sequence[Stretch],
+    track_speed_mps: Array,
+    seed: int | np.random.SeedSequence,
+    *,
+    slope: Slope = LEVEL,
+    yaw_rad: float = 0.0,
+    sensors: TrackedSensors = NOISY,
+    run_id: str = "run",
+) -> RunLog:
+    """Drive the tracks of a robot and return what its loggers wrote, with the truth beside it.
+
+    Parameters
+    ----------
+    robot : tracked
+    ground : one for the whole run, or stretches of several
+    track_speed_mps : (n, 2) commanded speeds of the left and the right track at 50 Hz, from rest
+    seed : of the noise; the same gives the same bytes
+    slope : an even one, level by default
+    yaw_rad : heading at the start, in the plane of the slope
+    sensors : rates and noise; :data:`QUIET` has none
+    run_id : of the run; its label is the soil's name
+
+    Returns
+    -------
+    RunLog
+        streams wheels (speeds of the tracks), imu, pose (cameras around the field), gnss and compass,
+        commands and truth, with ``slip_left_ratio``, ``slip_right_ratio`` by each track's own middle, and
+        the slip angle of the body ``slip_body_rad``
+
+    Raises
+    ------
+    ConfigError
+        if speeds are not (n, 2) finite numbers, a soil does not shear, or no stretch is given.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.terramechanics.soil import load_soil
+    >>> run = simulate_tracked(load_robot("patako"), load_soil("dry_sand"), np.full((200, 2), 0.05), 0)
+    >>> sorted(run.streams)
+    ['commands', 'compass', 'gnss', 'imu', 'pose', 'truth', 'wheels']
+    >>> round(float(run.streams["truth"].values[-1, BODY_TRUTH.index("speed_x_mps")]), 3)
+    0.05
+    """
+    commands = np.asarray(track_speed_mps, dtype=float)
+    if commands.ndim != 2 or commands.shape[1] != 2 or len(commands) < 2 or not np.isfinite(commands).all():
+        raise ConfigError(
+            f"track_speed_mps has shape {commands.shape}, (n, 2) finite numbers with two rows are required"
+        )
+    stretches = [Stretch(ground)] if isinstance(ground, Soil | PrescribedSlip) else list(ground)
+    if not stretches:
+        raise ConfigError("ground: no stretch is given, one at least is required")
+    belts = _followed(commands, sensors.belt_lag_s)
+    ends_m = np.cumsum([length_m for _, length_m in stretches])
+    tracks = np.concatenate(
+        [tracks_on(robot, part.ground, end_m) for part, end_m in zip(stretches, ends_m, strict=True)]
+    )
+    states = np.zeros(len(belts), STATE)
+    states["yaw_rad"][0] = yaw_rad
+    drive(tracks, np.array(slope), belts, states, STEP_S)
+    rngs = [np.random.default_rng(child) for child in np.random.SeedSequence(_entropy(seed)).spawn(5)]
+    bias_radps = sensors.gyro_bias_radps * rngs[0].standard_normal()
+    tilt = np.array([tilt_at(slope.angle_rad, slope.uphill_rad, yaw) for yaw in states["yaw_rad"]])
+    every = round(1.0 / (WHEELS_HZ * STEP_S))
+    wheels = belts[::every] + sensors.encoder_mps * rngs[1].standard_normal((len(belts[::every]), 2))
+    streams = {
+        "wheels": Stream(np.arange(len(wheels)) / WHEELS_HZ, wheels, robot.rate_channels),
+        "imu": _imu(states, tilt, bias_radps, sensors, rngs[2]),
+        "pose": _pose(states, sensors, rngs[3]),
+        **_satellites(states, sensors, rngs[4]),
+        "commands": Stream(np.arange(len(commands)) / COMMANDS_HZ, commands, robot.rate_channels),
+        "truth": _truth(robot, states, tilt, belts, bias_radps),
+    }
+    return RunLog(
+        run_id, robot.name, streams, _labels(stretches, ends_m, states), source="simulated, tracked"
+    )
+
+
+def _entropy(seed: int | np.random.SeedSequence) -> list[int]:
+    """Return the words of a seed; a sequence is left as it is."""
+    sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    return [int(word) for word in sequence.generate_state(4)]
+
+
+def _followed(commands: Array, lag_s: float) -> Array:
+    """Return the speeds of the belts (m, 2) at every step: those commanded, with a lag."""
+    every = round(1.0 / (COMMANDS_HZ * STEP_S))
+    belts = np.repeat(commands, every, axis=0)[: (len(commands) - 1) * every + 1]
+    keep = math.exp(-STEP_S / lag_s) if lag_s > 0.0 else 0.0
+    followed = np.empty_like(belts)
+    followed[0] = 0.0 if lag_s > 0.0 else belts[0]
+    for k in range(1, len(belts)):
+        followed[k] = keep * followed[k - 1] + (1.0 - keep) * belts[k]
+    return followed
+
+
+def _labels(stretches: Sequence[Stretch], ends_m: Array, states: Array) -> tuple[Label, ...]:
+    """Return the soils by time; slip that is prescribed has no name."""
+    which = np.minimum(np.searchsorted(ends_m, states["travelled_m"], side="right"), len(stretches) - 1)
+    labels = []
+    for k, (ground, _) in enumerate(stretches):
+        steps = np.flatnonzero(which == k)
+        if steps.size and isinstance(ground, Soil):
+            labels.append(Label(float(steps[0] * STEP_S), float(steps[-1] * STEP_S), ground.name))
+    return tuple(label for label in labels if label.end_s > label.start_s)
+
+
+def _imu(
+    states: Array, tilt: Array, bias_radps: float, sensors: TrackedSensors, rng: np.random.Generator
+) -> Stream:
+    """Return gyro, specific force and attitude; on an even slope the body turns about its z axis alone."""
+    n, turn = len(states), states["yaw_rate_radps"]
+    noise = [
+        std * rng.standard_normal((n, k)) for std, k in ((sensors.gyro_radps, 3), (sensors.accel_mps2, 3))
+    ]
+    noise += [std * rng.standard_normal((n, k)) for std, k in ((sensors.tilt_rad, 2), (sensors.yaw_rad, 1))]
+    rate = np.column_stack([np.zeros((n, 2)), turn + bias_radps])
+    accel = np.column_stack(_acceleration(states))
+    yaw = states["yaw_rad"] - states["yaw_rad"][0] + bias_radps * STEP_S * np.arange(n)
+    attitude = np.column_stack([tilt[:, 1], -tilt[:, 0], yaw])
+    return white_imu(np.arange(n) * STEP_S, rate, accel, attitude, np.hstack(noise))
+
+
+def _acceleration(states: Array) -> tuple[Array, Array]:
+    v_x, v_y, turn = states["speed_x_mps"], states["speed_y_mps"], states["yaw_rate_radps"]
+    return np.gradient(v_x, STEP_S) - turn * v_y, np.gradient(v_y, STEP_S) + turn * v_x
+
+
+def _poses(states: Array) -> Array:
+    """Return position and heading (n, 3)."""
+    return np.column_stack([states[name] for name in ("position_x_m", "position_y_m", "yaw_rad")])
+
+
+def _pose(states: Array, sensors: TrackedSensors, rng: np.random.Generator) -> Stream:
+    rows, time_s = _samples(len(states), sensors.pose_hz)
+    std = np.array([sensors.pose_m, sensors.pose_m, sensors.pose_rad])
+    seen = _poses(states[rows]) + std * rng.standard_normal((len(rows), 3))
+    seen[:, 2] = wrapped(seen[:, 2])
+    return Stream(time_s, seen, POSE_CHANNELS)
+
+
+def _satellites(states: Array, sensors: TrackedSensors, rng: np.random.Generator) -> dict[str, Stream]:
+    rows, time_s = _samples(len(states), sensors.gnss_hz)
+    at, std = states[rows], (sensors.gnss_m, sensors.compass_rad)
+    velocity = np.column_stack([at["speed_x_mps"], at["speed_y_mps"]])
+    return raw_fixes(time_s, _poses(at), velocity, std, rng)
+
+
+def _samples(n: int, rate_hz: float) -> tuple[Array, Array]:
+    """Return the steps and stamps of a sensor of a rate."""
+    if not 0.0 < rate_hz <= 1.0 / STEP_S:
+        raise ConfigError(
+            f"a sensor's rate is {rate_hz:g} Hz, above 0 and up to {1.0 / STEP_S:g} is required"
+        )
+    rows = np.arange(0, n, round(1.0 / (rate_hz * STEP_S)))
+    return rows, rows * STEP_S
+
+
+def _truth(robot: TrackedRobot, states: Array, tilt: Array, belts: Array, bias_radps: float) -> Stream:
+    x, y, yaw, v_x, v_y, turn, heap, _ = (states[name] for name in STATE.names or ())
+    grade, roll = tilt.T
+    along = v_x[:, None] - turn[:, None] * robot.wheel_positions_m[:, 1]
+    columns = [
+        *(x, y, wrapped(yaw), roll, -grade, v_x, v_y, turn, *_acceleration(states)),
+        belts / robot.wheel_radius_m,
+        slip_ratio(belts, along, min_speed_mps=0.005),
+        slip_angle(v_x, v_y, min_speed_mps=0.005),
+        np.full(len(states), bias_radps),
+        heap,
+    ]
+    tracks = (*wheel_channels("wheel_radps", robot.wheels), *wheel_channels("slip_ratio", robot.wheels))
+    channels = (*BODY_TRUTH, *tracks, "slip_body_rad", GYRO_BIAS, "heap_m2")
+    return Stream(np.arange(len(states)) * STEP_S, np.column_stack(columns), channels)
