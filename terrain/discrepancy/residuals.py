@@ -21,10 +21,9 @@ from terrain.discrepancy.signals import Signals
 from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SENSED_ONLY, STEPS
 from terrain.errors import DataError
 from terrain.records import Array
-from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import Planar
 from terrain.simulation.planar.motion import move
-from terrain.simulation.planar.replay import replay, undone
+from terrain.simulation.planar.replay import replay, sense, undone
 
 CUTOFF_HZ = 2.5
 """Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz."""

@@ -13,7 +13,7 @@ from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
 from terrain.extension import Basis, Origin, basis_of
 from terrain.robots import BicycleRobot, OmniRobot, Robot, TrackedRobot, as_drive
-from terrain.simulation.planar.skid_steer import SLIDING_RADPS
+from terrain.simulation.planar.motion import SLIDING_RADPS
 
 EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
 """The turn and the speed at which losses that grow with them are stated."""

@@ -57,7 +57,7 @@ from terrain.effects.types import (
     PlantPart,
     Wording,
 )
-from terrain.effects.vector import INDEX, PARAMETERS, vector_of
+from terrain.effects.vector import EFFECTS, INDEX, PARAMETERS, vector_of
 
 __all__ = [
     "ACCEL",
@@ -67,6 +67,7 @@ __all__ = [
     "CHANNELS",
     "CURRENT",
     "DEPRECATED",
+    "EFFECTS",
     "EVERY",
     "GYRO",
     "HEADING",

@@ -9,6 +9,7 @@ import numpy as np
 
 from terrain.effects.catalogue import PARAMETER, TILT_OFFSETS
 from terrain.errors import ConfigError
+from terrain.kernels import record
 from terrain.records import Array
 
 PARAMETERS: tuple[str, ...] = (*PARAMETER, *(p.name for p in TILT_OFFSETS))
@@ -16,6 +17,9 @@ PARAMETERS: tuple[str, ...] = (*PARAMETER, *(p.name for p in TILT_OFFSETS))
 
 INDEX: dict[str, int] = {name: i for i, name in enumerate(PARAMETERS)}
 """Place of each parameter in the vector."""
+
+EFFECTS = record(dict.fromkeys(PARAMETERS, float))
+"""The vector as a record: ``vector.view(EFFECTS)[0]`` has the parameters by name."""
 
 
 def vector_of(values: Mapping[str, float]) -> Array:

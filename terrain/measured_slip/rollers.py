@@ -1,6 +1,6 @@
 r"""What makes an omni robot slip, from runs whose motion was measured from outside: rollers, load, scale, distance.
 
-The steady law of :mod:`terrain.simulation.planar.omni_contact` is fitted to the median motion of each run,
+The steady law of :mod:`terrain.simulation.planar.omni` is fitted to the median motion of each run,
 slip along the direction that the wheels roll and speed across it: the sharing of the load and the scale are
 those of the robot, the friction of the rollers over traction is that of each surface.  Intervals are of draws
 of runs; what the law leaves is judged on every fifth run in turn, held out.  A group of runs that is not
@@ -30,7 +30,7 @@ from terrain.measured_slip.slips import MeasuredSlip
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.robots.omni import OmniRobot
-from terrain.simulation.planar.omni_contact import steady_twist
+from terrain.simulation.planar.omni import steady_twist
 
 N_FOLDS = 5
 N_DRAWS = 100

@@ -26,10 +26,9 @@ from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot, load_
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.planar.ground import planar_ground
-from terrain.simulation.planar.hills import Hills
+from terrain.simulation.planar.model import planar_ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.sensors import Gnss, is_lost, with_raw_fixes
 from terrain.simulation.slip_sweep import learning_run

@@ -148,16 +148,15 @@ TRACKS = record(
         "half_m length_m width_m height_m mass_kg inertia_kgm2 area_m2 cohesion_pa tan_friction "
         "shear_modulus_m kc_npmn1 kphi_npmn2 exponent_ratio rolling_ratio passive_ratio "
         "bulldozing_ratio until_m"
-    ) | dict.fromkeys(PrescribedSlip._fields, float)
+    )
+    | dict.fromkeys(PrescribedSlip._fields, float)
     | {"sheared": bool}
 )
 """A robot on a ground: its numbers, those of a soil that is sheared or of prescribed slip, and the distance
 travelled at which the ground ends."""
 
 STATE = record(
-    numbers(
-        "position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps heap_m2 travelled_m"
-    )
+    numbers("position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps heap_m2 travelled_m")
 )
 """Pose in the plane of the slope, twist, cross-section of the heap beside the inner track, and distance."""
 

@@ -52,7 +52,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import PlantPart, in_plant, parameters_of
+from terrain.effects import EFFECTS, PlantPart, in_plant, parameters_of, vector_of
 from terrain.errors import ConfigError
 from terrain.kernels import filled, numbers, record
 from terrain.records import Array
@@ -95,20 +95,19 @@ PLANT = record(
         "grade_ratio": (float, 2),
         "steer_offset_rad": (float, 3),
         "linked": bool,
-        "hidden": bool,
-        "steer_delay_steps": int,
+        "yields": bool,
+        "effects": EFFECTS,
         **numbers(
-        "com_height_m mass_kg yaw_inertia_kgm2 wheel_inertia_kgm2 relaxation_m contact_length_m "
-        "ride_stiffness_npm ride_damping_nspm torque_max_nm speed_max_radps torque_time_constant_s "
-        "friction_nm speed_gain speed_integral estimate_time_constant_s hall_steps "
-        "report_time_constant_s steer_rate_max_radps steer_accel_max_radps2 backlash_rad "
-        "leg_backlash_rad undulation_ratio undulation_length_m steer_backlash_rad weight_n "
-        "force_slip_ratio shear_slip_ratio slip_resistance_ratio rolling_ratio drag_nspm "
-        "side_hill_ratio"
-    ),
+            "com_height_m mass_kg yaw_inertia_kgm2 wheel_inertia_kgm2 relaxation_m contact_length_m "
+            "ride_stiffness_npm ride_damping_nspm torque_max_nm speed_max_radps torque_time_constant_s "
+            "friction_nm speed_gain speed_integral estimate_time_constant_s hall_steps "
+            "report_time_constant_s steer_rate_max_radps steer_accel_max_radps2 backlash_rad "
+            "leg_backlash_rad undulation_ratio undulation_length_m weight_n"
+        ),
     }
 )
-"""All numbers of one simulated run that do not change while it is driven."""
+"""All numbers of one simulated run that do not change while it is driven; whether effects act in the linkages of
+the steering and where wheels touch the ground, and all effects."""
 
 WHEEL_STATE = record(
     numbers(
@@ -258,16 +257,9 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
         undulation_length_m=conditions.undulation_length_m,
         linked=any(effects[name] != 0.0 for name in in_plant(PlantPart.LINKAGE)),
         steer_offset_rad=[effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
-        steer_backlash_rad=effects["steering_backlash_rad"],
-        steer_delay_steps=round(effects["steering_delay_s"] / STEP_S),
-        hidden=any(effects[name] != 0.0 for name in in_plant(PlantPart.CONTACT)),
+        yields=any(effects[name] != 0.0 for name in in_plant(PlantPart.CONTACT)),
         weight_n=robot.mass_kg * GRAVITY_MPS2,
-        force_slip_ratio=effects["force_slip_ratio"],
-        shear_slip_ratio=effects["shear_slip_ratio"],
-        slip_resistance_ratio=effects["slip_resistance_ratio"],
-        rolling_ratio=effects["rolling_resistance_ratio"],
-        drag_nspm=effects["viscous_drag_nspm"],
-        side_hill_ratio=effects["side_hill_slip_ratio"],
+        effects=vector_of(effects).view(EFFECTS),
     )
 
 

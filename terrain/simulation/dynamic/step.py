@@ -160,7 +160,7 @@ def _wheel_force(
     heading = w.steer_rad
     row.encoder_rad[i] = w.steer_rad
     if plant.linked:
-        heading = linkage_heading(plant, state, i)
+        heading = linkage_heading(plant, state, i, dt)
     if i == 2 and plant.leg_backlash_rad > 0.0:
         heading += state.leg_rad
     # speed of the wheel's centre, along the wheel and across it
@@ -187,9 +187,9 @@ def _wheel_force(
     normal_n = max(normal_n + ride_n, 0.0)
     rate_x = wheel_speed - along - fastest / plant.relaxation_m * w.deflection_x_m
     rate_y = -across - fastest / plant.relaxation_m * w.deflection_y_m
-    if plant.hidden:
+    if plant.yields:
         rate_x -= w.creep_ratio * fastest / plant.relaxation_m * w.deflection_x_m
-        rate_y -= plant.side_hill_ratio * math.atan(grade_y) * abs(along)
+        rate_y -= plant.effects.side_hill_slip_ratio * math.atan(grade_y) * abs(along)
     slip_x = (w.deflection_x_m + DEFLECTION_DAMPING_S * rate_x) / plant.relaxation_m
     slip_y = (w.deflection_y_m + DEFLECTION_DAMPING_S * rate_y) / plant.relaxation_m
     thrust, side, resistance, sinkage = wheel_ground(ground, normal_n, min(max(slip_x, -1.0), 1.0), slip_y)
@@ -197,18 +197,20 @@ def _wheel_force(
     thrust *= profile.field[0, i, cell]
     side *= profile.field[0, i, cell]
     resistance *= profile.field[1, i, cell]
-    if plant.hidden:
+    if plant.yields:
         w.creep_ratio = _creep(plant, ground, normal_n, slip_x, thrust)
         slip = abs(slip_x) * (1.0 + w.creep_ratio)
-        resistance += (plant.rolling_ratio + plant.slip_resistance_ratio * slip) * normal_n
-        resistance = max(resistance + plant.drag_nspm * abs(along) / 3.0, 0.0)
+        resistance += (
+            plant.effects.rolling_resistance_ratio + plant.effects.slip_resistance_ratio * slip
+        ) * normal_n
+        resistance = max(resistance + plant.effects.viscous_drag_nspm * abs(along) / 3.0, 0.0)
     pull = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS)
     drive_wheel(plant, w, command_radps, thrust * radius_m, dt)
     # the contact follows with the wheel's new rate: semi-implicit
     rate_x = w.rate_radps * radius_m - along - fastest / plant.relaxation_m * w.deflection_x_m
     limit = plant.relaxation_m
     deflection = w.deflection_x_m + dt * rate_x
-    if plant.hidden:  # implicit: a contact that creeps fast is stiff
+    if plant.yields:  # implicit: a contact that creeps fast is stiff
         deflection /= 1.0 + dt * (w.creep_ratio * fastest / plant.relaxation_m)
     w.deflection_x_m = min(max(deflection, -limit), limit)
     w.deflection_y_m = min(max(w.deflection_y_m + dt * rate_y, -limit), limit)
@@ -274,13 +276,13 @@ def _creep(plant: Any, ground: Any, normal_n: float, slip: float, thrust_n: floa
     if abs(slip) < 1e-6 or normal_n <= 0.0:
         return 0.0
     force_ratio = 3.0 * thrust_n / plant.weight_n
-    creep = plant.force_slip_ratio * force_ratio
-    if plant.shear_slip_ratio != 0.0:
+    creep = plant.effects.force_slip_ratio * force_ratio
+    if plant.effects.shear_slip_ratio != 0.0:
         grip_ratio = ground.peak_friction_ratio
         if not ground.hard:
             area_m2 = ground.contact_length_m * ground.tyre_width_m
             grip_ratio = ground.tan_friction + ground.cohesion_pa * area_m2 / normal_n
-        creep += plant.shear_slip_ratio * shear_slip(force_ratio, grip_ratio)
+        creep += plant.effects.shear_slip_ratio * shear_slip(force_ratio, grip_ratio)
     return float(max(creep / slip, STIFFEST))
 
 
@@ -350,14 +352,18 @@ def steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
 
 
 @njit(cache=True)
-def linkage_heading(plant: Any, state: Any, i: int) -> float:
+def linkage_heading(plant: Any, state: Any, i: int, dt: float) -> float:
     """Return the heading of a wheel behind delay, play and offset of its linkage."""
     w = state.wheels[i]
     late = w.steer_rad
-    if plant.steer_delay_steps > 0:
-        place = state.n_steps % plant.steer_delay_steps
+    delay_steps, backlash_rad = (
+        round(plant.effects.steering_delay_s / dt),
+        plant.effects.steering_backlash_rad,
+    )
+    if delay_steps > 0:
+        place = state.n_steps % delay_steps
         late, state.late_rad[place, i] = state.late_rad[place, i], w.steer_rad
-    w.heading_rad = min(max(w.heading_rad, late - plant.steer_backlash_rad), late + plant.steer_backlash_rad)
+    w.heading_rad = min(max(w.heading_rad, late - backlash_rad), late + backlash_rad)
     return float(w.heading_rad + plant.steer_offset_rad[i])
 
 

@@ -21,30 +21,34 @@ absent.
 - **turning** of a skid-steer robot: its wheels' yaw rate and speed are reduced by turning slip and turn drag,
   lateral acceleration makes its track act narrower, and it slips sideways by ``T dv_y/dt + v_y = -c v w``;
 - **car-like robots** turn by the linear single-track model
-  (:mod:`~terrain.simulation.planar.bicycle`), and have no currents;
+  (:mod:`~terrain.simulation.planar.motion`), and have no currents;
 - **sensors**: gyro, accelerometer and camera with bias, scale, mounting, latency and their logger's clock.
 
 Load transfer and roughness are left out: what they do to a log is noise here.  Sources stand with the
 effects.
 
-This module holds what all of it shares: the terrain, the robot's numbers on it, and the columns of a motion.
-Motion is in :mod:`~terrain.simulation.planar.motion`, :mod:`~terrain.simulation.planar.skid_steer`,
-:mod:`~terrain.simulation.planar.swerve`, :mod:`~terrain.simulation.planar.omni` and
-:mod:`~terrain.simulation.planar.bicycle`, sensors without noise in
-:mod:`~terrain.simulation.planar.ideal_sensors`, and both together over a log in
-:mod:`~terrain.simulation.planar.replay`.
+This module holds what all of it shares: the terrain, the robot's numbers on it, the columns of a motion, and
+signals (n,) at even steps with their rates, delays and play.  Motion is in
+:mod:`~terrain.simulation.planar.motion` and :mod:`~terrain.simulation.planar.omni`, sensors without noise,
+and both together over a log, in :mod:`~terrain.simulation.planar.replay`.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError
 from terrain.kinematics.omni import rolling_matrix
 from terrain.kinematics.wheel_velocity import velocity_matrix
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import equilibrium_slip, ground_record, wheel_ground
 
 TRUTH: tuple[str, ...] = (
     "speed_x_mps",
@@ -68,6 +72,19 @@ SWERVE_WHEELS = 3
 
 IMU_LAG_S = 0.003
 """Lag of a swerve robot's IMU behind its latency: bandwidths of 47 and 62.5 Hz (Bosch BNO055 data sheet)."""
+
+SCRUB_SHARE = 0.4
+"""Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the
+distance."""
+
+WIDTH_RATIO, CONTACT_RATIO = 0.6, 0.6
+"""Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has
+no section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6."""
+
+_SLIPS = np.linspace(0.0, 1.0, 101)
+
+_MORE = 1.01
+"""Load for which growth with load is taken."""
 
 
 class Ground(NamedTuple):
@@ -95,6 +112,55 @@ class Ground(NamedTuple):
     load_ratio: float = 0.0
     effective_ratio: float = 1.0
     roller_ratio: float = 0.0
+
+
+def planar_ground(robot: Robot, soil: Soil) -> Ground:
+    """Return what a soil is to a robot that carries its weight on all tyres alike.
+
+    The thrust curve is that of one tyre with its share of the weight; ``slip_ratio`` is its chord through the
+    slip at which the robot drives steadily on the level.  How thrust grows with load is taken there, too.
+    Rollers of omni wheels turn freely where the soil does not say what it does to them.
+
+    Parameters
+    ----------
+    robot : a tyre that it does not describe has :data:`WIDTH_RATIO` and :data:`CONTACT_RATIO`
+    soil : the ground
+
+    Raises
+    ------
+    ConfigError
+        if the robot is stuck on that soil.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.terramechanics.soil import load_soil
+    >>> ground = planar_ground(load_robot("agrimaro"), load_soil("grass"))
+    >>> [round(number, 3) for number in ground[:4]], round(ground.load_ratio, 2)
+    ([1.569, 0.347, 0.08, 0.139], 0.76)
+    """
+    width_m, contact_m = WIDTH_RATIO * robot.wheel_radius_m, CONTACT_RATIO * robot.wheel_radius_m
+    if robot.describes("body"):
+        width_m, contact_m = robot.body.tyre_width_m, robot.body.contact_length_m
+    wheel = robot.wheel_radius_m, width_m, contact_m
+    normal_n = robot.mass_kg * GRAVITY_MPS2 / robot.n_tyres
+    slip = equilibrium_slip(soil, normal_n, 0.0, *wheel)
+    if math.isnan(slip):
+        raise ConfigError(f"robot {robot.name}: it gets stuck on terrain {soil.name!r}")
+    ground = ground_record(soil, *wheel)[0]
+    thrust_n = wheel_ground(ground, normal_n, max(slip, 1e-3), 0.0)[0]
+    more_n = wheel_ground(ground, _MORE * normal_n, max(slip, 1e-3), 0.0)[0]
+    thrusts = [wheel_ground(ground, normal_n, float(s), 0.0)[0] / normal_n for s in _SLIPS]
+    grip = max(thrusts)
+    return Ground(
+        slip_ratio=max(slip, 1e-3) * normal_n / thrust_n,
+        grip_ratio=grip,
+        rolling_ratio=wheel_ground(ground, normal_n, slip, 0.0)[2] / normal_n,
+        scrub_ratio=SCRUB_SHARE * grip,
+        thrust_ratio=tuple(thrusts),
+        load_ratio=(more_n / thrust_n - 1.0) / (_MORE - 1.0),
+        roller_ratio=float(np.nan_to_num(soil.roller_friction_ratio)),
+    )
 
 
 class Planar(NamedTuple):
@@ -233,3 +299,107 @@ def _slip_per_traction(ground: Ground) -> Array:
     ratio[1:] = slip[1:] / thrust[1:]
     ratio[0] = 2.0 * ratio[1] - ratio[2]
     return ratio
+
+
+@njit(cache=True)
+def slopes(values: Array, dt: float) -> Array:
+    """Return the rate (n,) of a signal, right to the fourth order where two neighbours are there.
+
+    Examples
+    --------
+    >>> round(float(slopes(np.sin(np.arange(9) * 0.2), 0.2)[4]) - math.cos(0.8), 5)
+    -4e-05
+    """
+    n = values.size
+    out = np.zeros(n)
+    for k in range(2, n - 2):
+        out[k] = (8.0 * (values[k + 1] - values[k - 1]) - (values[k + 2] - values[k - 2])) / (12.0 * dt)
+    for k in (0, 1, n - 2, n - 1):
+        before, after = max(k - 1, 0), min(k + 1, n - 1)
+        if after > before:
+            out[k] = (values[after] - values[before]) / ((after - before) * dt)
+    return out
+
+
+@njit(cache=True)
+def delayed(values: Array, late: float, rate: float) -> Array:
+    """Return a signal (n,) that shows at sample k what was at ``k - late - rate k``; its ends are held.
+
+    Between samples it runs along the cubic through the four nearest: straight lines would smooth it.
+
+    Examples
+    --------
+    >>> delayed(np.array([0.0, 1.0, 2.0, 3.0]), 0.5, 0.0)
+    array([0. , 0.5, 1.5, 2.5])
+    """
+    n = values.size
+    out = np.empty(n)
+    if rate == 0.0:  # the same weights everywhere but at the ends
+        whole = math.floor(-late)
+        x = -late - whole
+        first, last = min(max(1 - whole, 0), n), max(min(n - 2 - whole, n), 0)
+        if first < last:
+            a, b = -x * (x - 1.0) * (x - 2.0) / 6.0, (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0
+            c, d = -(x + 1.0) * x * (x - 2.0) / 2.0, (x + 1.0) * x * (x - 1.0) / 6.0
+            i = first + whole
+            m = last - first
+            out[first:last] = a * values[i - 1 : i - 1 + m] + b * values[i : i + m]
+            out[first:last] += c * values[i + 1 : i + 1 + m] + d * values[i + 2 : i + 2 + m]
+        else:
+            first = last = n
+        for k in range(first):
+            out[k] = _between(values, k - late)
+        for k in range(last, n):
+            out[k] = _between(values, k - late)
+        return out
+    for k in range(n):
+        out[k] = _between(values, k - late - rate * k)
+    return out
+
+
+@njit(cache=True)
+def _between(values: Array, at: float) -> float:
+    """Return a signal between its samples; its ends are held."""
+    n = values.size
+    at = min(max(at, 0.0), n - 1.0)
+    i = min(int(at), n - 2)
+    x = at - i
+    if 1 <= i < n - 2:
+        return float(
+            -x * (x - 1.0) * (x - 2.0) / 6.0 * values[i - 1]
+            + (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0 * values[i]
+            - (x + 1.0) * x * (x - 2.0) / 2.0 * values[i + 1]
+            + (x + 1.0) * x * (x - 1.0) / 6.0 * values[i + 2]
+        )
+    return float(values[i] + x * (values[i + 1] - values[i]))
+
+
+@njit(cache=True)
+def lagged(values: Array, tau_s: float, dt: float) -> Array:
+    """Return a signal (n,) behind a first-order lag, exact for what runs straight from sample to sample.
+
+    It starts at rest at its first value; without a time constant it is returned as it is.
+
+    Examples
+    --------
+    >>> lagged(np.array([0.0, 1.0, 2.0, 3.0]), 1e-3, 1.0).round(3)
+    array([0.   , 0.999, 1.999, 2.999])
+    """
+    if tau_s <= 0.0:
+        return values
+    out = np.empty(values.size)
+    keep = math.exp(-dt / tau_s)
+    out[0] = values[0]
+    for k in range(1, values.size):
+        lead = tau_s * (values[k] - values[k - 1]) / dt
+        out[k] = values[k] - lead + keep * (out[k - 1] - values[k - 1] + lead)
+    return out
+
+
+@njit(cache=True)
+def play(angle: Array, half: float) -> None:
+    """Let an angle follow itself through a play of half width ``half``, from the middle; in place."""
+    follower = angle[0]
+    for k in range(angle.size):
+        follower = min(max(follower, angle[k] - half), angle[k] + half)
+        angle[k] = follower

@@ -3,7 +3,7 @@ r"""Motion of an omni robot: each wheel pulls along its drive direction, and its
 Wheel i at :math:`p_i` carries the share :math:`n_i` of the weight W, turns with the circumferential speed
 :math:`u_i`, and with the twist V of the centre of mass its own centre moves by :math:`D_i V` along the
 direction that it drives and by :math:`E_i V` across it.  The forces on it are those of
-:mod:`~terrain.simulation.planar.omni_contact`, over the root mean square speed U of the wheels or, where that
+:func:`steady_twist`, over the root mean square speed U of the wheels or, where that
 is larger, of their centres,
 
 .. math::
@@ -18,25 +18,44 @@ slip of the wheels, over that slip, and r the friction of the rollers over the l
 
 A contact follows within :math:`U / (C g)`, some milliseconds: steps are implicit in V, which is stable at
 rest, too, and without inertia, resistance and slope is
-:func:`~terrain.simulation.planar.omni_contact.steady_twist`.
+:func:`steady_twist`.
 
 What is assumed: three wheels at even angles whose loads follow from the centre of mass and do not shift; one
 C and r for all wheels; friction of the rollers that grows with the speed across over U.
+
+**Steady motion.** Wheel i with the share :math:`n_i` of the weight drives along :math:`d_i` with the
+circumferential speed u_i and is rolled across, along :math:`e_i`, with the speed of its centre :math:`p_i'`.
+Traction grows with the slip speed, roller friction with the speed across, both in proportion to the load and
+over one speed:
+
+.. math:: F_i = n_i \left( c\,(u_i - d_i \cdot p_i')\,d_i - c\,\rho\,(e_i \cdot p_i')\,e_i \right)
+
+so that slip does not depend on the speed, as measured runs show.  In steady motion forces and moment are in
+balance, which is linear in the twist V: with the rows :math:`D_i = (d_i, p_i \times d_i)` and E_i alike,
+
+.. math:: \sum_i n_i \left(D_i^T D_i + \rho\,E_i^T E_i\right) V = \sum_i n_i D_i^T u_i .
+
+Without roller friction the wheels drive what they roll; with ever more of it the body stands.  A common
+factor :math:`1 - \kappa` on V stands for an effective radius, or a scale of what measures V, that is off: it
+slips alike in all directions, and no log of both distinguishes the two.
+
+What is assumed: a contact that is linear in its slip, no other resistance, one rho for all wheels.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import INDEX
+from terrain.effects import EFFECTS
+from terrain.kinematics.omni import rolling_matrix
 from terrain.records import Array
 from terrain.simulation.contact import softness
-from terrain.simulation.planar.model import AMPS, FORCE, N_TRUTH, SLIP, VX, VY, Planar, W
-from terrain.simulation.planar.signals import slopes
+from terrain.simulation.planar.model import AMPS, FORCE, N_TRUTH, SLIP, VX, VY, Planar, W, slopes
 
 ROLLING_MPS = 0.02
 """Speed below which slip is no more over the speed itself, and over which a resistance takes its full size;
@@ -48,18 +67,11 @@ STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
 SUBSTEPS = 4
 """Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond."""
 
-_RADIUS = INDEX["wheel_radius_ratio"]
-_PAYLOAD = INDEX["payload_ratio"]
-_FORCE_SLIP = INDEX["force_slip_ratio"]
-_ROLLERS = INDEX["roller_friction_ratio"]
-_DISTANCE = INDEX["wheel_distance_ratio"]
-_SHIFT_X, _SHIFT_Y = INDEX["load_shift_x_m"], INDEX["load_shift_y_m"]
-
 
 @njit(cache=True)
 def move_omni(
     planar: Planar,
-    p: Array,
+    vector: Array,
     dt: float,
     wheel_speed_mps: Array,
     grade_rad: Array,
@@ -71,21 +83,21 @@ def move_omni(
     Slip is that of the body, against the twist that the wheels would roll; the current is the sum of the
     magnitudes of the motors' (:func:`currents_of`).
     """
-    n = wheel_speed_mps.shape[0]
+    p, n = vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     out = np.zeros((n, N_TRUTH))
     along, across, load = placed(planar, p)
-    com_x, com_y = planar.com_x_m + p[_SHIFT_X], planar.com_y_m + p[_SHIFT_Y]
-    rollers = planar.roller_ratio + p[_ROLLERS]
+    com_x, com_y = planar.com_x_m + p.load_shift_x_m, planar.com_y_m + p.load_shift_y_m
+    rollers = planar.roller_ratio + p.roller_friction_ratio
     twist, before = np.zeros(3), np.zeros(3)
     matrix, pushed = np.empty((3, 3)), np.empty(3)
-    mass = planar.mass_kg * (1.0 + p[_PAYLOAD])
-    inertia = mass, mass, planar.yaw_inertia_kgm2 * (1.0 + p[_PAYLOAD])
+    mass = planar.mass_kg * (1.0 + p.payload_ratio)
+    inertia = mass, mass, planar.yaw_inertia_kgm2 * (1.0 + p.payload_ratio)
     weight, gravity = mass * GRAVITY_MPS2, GRAVITY_MPS2 * planar.effective_ratio
     step, size = dt / SUBSTEPS, 0.0
     for k in range(n):
         slope = (-mass * gravity * math.sin(grade_rad[k]), -mass * gravity * math.sin(roll_rad[k]), 0.0)
-        u = wheel_speed_mps[k] * (1.0 + p[_RADIUS])
-        last = wheel_speed_mps[max(k - 1, 0)] * (1.0 + p[_RADIUS])
+        u = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio)
+        last = wheel_speed_mps[max(k - 1, 0)] * (1.0 + p.wheel_radius_ratio)
         started_x, started_y = before[0], before[1]
         for part in range(SUBSTEPS):
             rolled = last + (u - last) * ((part + 1) / SUBSTEPS)
@@ -118,36 +130,36 @@ def move_omni(
         out[k, FORCE] = (
             mass * ((twist[0] - started_x) / dt - twist[2] * 0.5 * (twist[1] + started_y)) - slope[0]
         )
-    out[:, AMPS] = np.abs(currents_of(planar, p, dt, wheel_speed_mps, out)).sum(axis=1)
+    out[:, AMPS] = np.abs(currents_of(planar, vector, dt, wheel_speed_mps, out)).sum(axis=1)
     for k in range(n):  # what the ground adds to the motion takes no force
         if disturbance.shape[0] > 0:
             out[k, VX] *= 1.0 - disturbance[k, 0]
             out[k, VY] *= 1.0 - disturbance[k, 0]
-        u = wheel_speed_mps[k] * (1.0 + p[_RADIUS])
+        u = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio)
         out[k, SLIP] = _body_slip(planar, u, out[k, VX], out[k, VY])
     return out
 
 
 @njit(cache=True)
-def currents_of(planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, truth: Array) -> Array:
+def currents_of(planar: Planar, vector: Array, dt: float, wheel_speed_mps: Array, truth: Array) -> Array:
     """Return the current (n, wheels) of each motor along a motion: traction, its own inertia and friction.
 
     Parameters
     ----------
-    planar, p, dt, wheel_speed_mps : as :func:`move_omni` takes them
+    planar, vector, dt, wheel_speed_mps : as :func:`move_omni` takes them
     truth : (n, N_TRUTH) of the motion, without disturbance
     """
-    n, wheels = wheel_speed_mps.shape
+    p, (n, wheels) = vector.view(EFFECTS)[0], wheel_speed_mps.shape
     out = np.empty((n, wheels))
-    weight = planar.mass_kg * (1.0 + p[_PAYLOAD]) * GRAVITY_MPS2
-    radius_m, twist = planar.radius_m * (1.0 + p[_RADIUS]), np.empty(3)
+    weight = planar.mass_kg * (1.0 + p.payload_ratio) * GRAVITY_MPS2
+    radius_m, twist = planar.radius_m * (1.0 + p.wheel_radius_ratio), np.empty(3)
     along, _, load = placed(planar, p)
-    com_x, com_y = planar.com_x_m + p[_SHIFT_X], planar.com_y_m + p[_SHIFT_Y]
+    com_x, com_y = planar.com_x_m + p.load_shift_x_m, planar.com_y_m + p.load_shift_y_m
     spun = np.empty((n, wheels))
     for i in range(wheels):
         spun[:, i] = slopes(wheel_speed_mps[:, i].copy(), dt)
     for k in range(n):
-        u = wheel_speed_mps[k] * (1.0 + p[_RADIUS])
+        u = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio)
         twist[0] = truth[k, VX] - truth[k, W] * com_y
         twist[1] = truth[k, VY] + truth[k, W] * com_x
         twist[2] = truth[k, W]
@@ -165,7 +177,7 @@ def currents_of(planar: Planar, p: Array, dt: float, wheel_speed_mps: Array, tru
 
 
 @njit(cache=True)
-def placed(planar: Planar, p: Array) -> tuple[Array, Array, Array]:
+def placed(planar: Planar, p: Any) -> tuple[Array, Array, Array]:
     """Return ``along`` and ``across`` (wheels, 3) and the loads (wheels,) with wheels and load as p has them.
 
     With the distance d of the wheels, the directions along and across them and out to them, and the centre
@@ -174,9 +186,9 @@ def placed(planar: Planar, p: Array) -> tuple[Array, Array, Array]:
     the others then do not balance about c.
     """
     along, across, load = planar.along.copy(), planar.across.copy(), planar.wheel_load_ratio.copy()
-    shift_x, shift_y = p[_SHIFT_X], p[_SHIFT_Y]
-    distance = planar.wheel_distance_m * (1.0 + p[_DISTANCE])
-    if shift_x == 0.0 and shift_y == 0.0 and p[_DISTANCE] == 0.0:
+    shift_x, shift_y = p.load_shift_x_m, p.load_shift_y_m
+    distance = planar.wheel_distance_m * (1.0 + p.wheel_distance_ratio)
+    if shift_x == 0.0 and shift_y == 0.0 and p.wheel_distance_ratio == 0.0:
         return along, across, load
     com_x, com_y, total = planar.com_x_m + shift_x, planar.com_y_m + shift_y, 0.0
     for i in range(planar.n_wheels):
@@ -189,10 +201,10 @@ def placed(planar: Planar, p: Array) -> tuple[Array, Array, Array]:
 
 
 @njit(cache=True)
-def stiffness(planar: Planar, p: Array, slip_ratio: float) -> float:
+def stiffness(planar: Planar, p: Any, slip_ratio: float) -> float:
     """Return traction over load and slip of the ground, with the effect that makes it softer."""
     soft = max(softness(planar.soft_ratio, slip_ratio), STIFFEST_GROUND)
-    return float(1.0 / max(soft + p[_FORCE_SLIP], STIFFEST * soft))
+    return float(1.0 / max(soft + p.force_slip_ratio, STIFFEST * soft))
 
 
 @njit(cache=True)
@@ -246,3 +258,40 @@ def _body_slip(planar: Planar, wheel_speed_mps: Array, v_x: float, v_y: float) -
         return 0.0
     along = (v_x * x + v_y * y) / rolled
     return (rolled - along) / max(rolled, abs(along))
+
+
+def steady_twist(
+    wheel_speed_mps: Array,
+    positions_m: Array,
+    direction_rad: Array,
+    load_ratio: Array,
+    roller_ratio: float,
+    scale_error: float = 0.0,
+) -> Array:
+    """Return the twist (n, 3) of a body whose wheels turn at steady speeds (n, wheels).
+
+    Parameters
+    ----------
+    wheel_speed_mps : (n, wheels) circumferential
+    positions_m, direction_rad : (wheels, 2) and (wheels,) of the wheels
+    load_ratio : (wheels,) shares of the weight, summing to 1
+    roller_ratio : rho, friction of the rollers over the stiffness of traction; 0 is free
+    scale_error : kappa
+
+    Examples
+    --------
+    A wheel that rolls across entirely, and carries most of the weight, brakes the more:
+
+    >>> from terrain.kinematics.omni import inverse, wheels_on_circle
+    >>> place = wheels_on_circle(0.125, np.radians([60.0, 180.0, 300.0]))
+    >>> ahead, left = (inverse(*place, np.array(v)) for v in ([0.1, 0, 0], [0, 0.1, 0]))
+    >>> load = np.array([0.25, 0.5, 0.25])
+    >>> steady_twist(np.array([ahead, left]), *place, load, 0.8)[:, :2].diagonal().round(4)
+    array([0.0429, 0.0652])
+    """
+    along = rolling_matrix(positions_m, direction_rad)
+    across = rolling_matrix(positions_m, np.asarray(direction_rad) + np.pi / 2)
+    balance = (along * load_ratio[:, None]).T @ along
+    balance = balance + roller_ratio * (across * load_ratio[:, None]).T @ across
+    driven = np.asarray(wheel_speed_mps) @ (along * load_ratio[:, None])
+    return np.asarray((1.0 - scale_error) * np.linalg.solve(balance, driven.T).T)

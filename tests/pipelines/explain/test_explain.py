@@ -18,9 +18,8 @@ from terrain.errors import ConfigError, TerrainError
 from terrain.extension import write_extended
 from terrain.logs.write import write_run
 from terrain.robots import description_file, load_robot
-from terrain.simulation.planar.drives import COMMANDS_HZ, DRIVE_S
 from terrain.simulation.planar.noise import load_noise
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import COMMANDS_HZ, DRIVE_S, simulate_planar
 from terrain.simulation.run import simulate_run
 from terrain.slip_learning.learn import terrain_runs
 

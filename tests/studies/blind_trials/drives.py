@@ -9,7 +9,7 @@ import numpy as np
 
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
-from terrain.simulation.planar.hills import Hills
+from terrain.simulation.planar.run import Hills
 
 DURATION_S = 60.0
 """Length of a run."""

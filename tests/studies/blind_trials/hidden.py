@@ -33,9 +33,8 @@ from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.noise import Scatter, load_noise, load_scatter
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 from terrain.simulation.run import simulate_run
 
 

@@ -41,7 +41,6 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.planar.ideal_sensors import sense
 from terrain.simulation.planar.model import SWERVE_WHEELS, Ground, Planar, make_planar
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import (
@@ -55,6 +54,7 @@ from terrain.simulation.planar.noise import (
     load_noise,
     load_scatter,
 )
+from terrain.simulation.planar.replay import sense
 from terrain.simulation.planar.run import simulate_planar, with_silent_parts
 
 TEST_SIZE = 0.02

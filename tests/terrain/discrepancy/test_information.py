@@ -25,9 +25,8 @@ from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import BOUNDS, CHANNELS, INDEX, SPEED_X, vector_of
 from terrain.robots import load_robot
-from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 
 HUSKY = load_robot("husky")
 SCATTER = load_scatter()

@@ -14,9 +14,8 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit, NextDrive
 from terrain.records import RunLog
 from terrain.robots import load_robot
-from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 
 SCATTER = load_scatter()._asdict()

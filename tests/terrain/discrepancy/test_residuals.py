@@ -35,10 +35,9 @@ from terrain.effects import (
 )
 from terrain.errors import DataError
 from terrain.robots import load_robot
-from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.noise import load_noise
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 
 ROBOTS = {"husky": load_robot("husky"), "agrimaro": load_robot("agrimaro")}
 HIDDEN = {

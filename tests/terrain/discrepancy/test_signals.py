@@ -20,8 +20,7 @@ from terrain.effects import (
 from terrain.errors import DataError
 from terrain.records import Label, Stream
 from terrain.robots import load_robot
-from terrain.simulation.planar.hills import Hills
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 

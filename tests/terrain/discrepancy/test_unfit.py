@@ -18,10 +18,9 @@ from terrain.discrepancy.verdict import Excluded
 from terrain.errors import DataError
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")

@@ -28,7 +28,7 @@ from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.planar.ground import planar_ground
+from terrain.simulation.planar.model import planar_ground
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil

@@ -7,7 +7,7 @@ from terrain.errors import DataError
 from terrain.kinematics import omni
 from terrain.measured_slip.rollers import distance_bound, roller_findings, surface_of_windows
 from terrain.measured_slip.slips import measured_slip
-from terrain.simulation.planar.omni_contact import steady_twist
+from terrain.simulation.planar.omni import steady_twist
 
 LOADS = {"": np.array([0.25, 0.45, 0.30]), "loaded": np.array([0.40, 0.35, 0.25])}
 RATIO = {"cork": 0.05, "moss": 0.6}

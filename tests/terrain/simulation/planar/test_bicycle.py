@@ -14,12 +14,10 @@ from terrain.effects import CHANNELS, GYRO, SPEED_X, SPEED_Y, library_of, vector
 from terrain.extension import apply_homes, corrected_log
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.planar.bicycle import LEAST_RATIO
-from terrain.simulation.planar.hills import Hills
 from terrain.simulation.planar.model import VX, VY, Ground, W, make_planar
-from terrain.simulation.planar.motion import move
+from terrain.simulation.planar.motion import LEAST_RATIO, move
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 
 CAR = replace(load_robot("adap2e"), com_ahead_m=0.5, front_cornering_npr=12000.0, rear_cornering_npr=18000.0)
 FREE = Ground(slip_ratio=0.0, rolling_ratio=0.0)

@@ -23,14 +23,16 @@ from terrain.effects import (
 from terrain.kinematics.swerve import inverse
 from terrain.robots import load_robot
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
-from terrain.simulation.planar.along import STANDSTILL_MPS, direction
-from terrain.simulation.planar.ideal_sensors import sense
-from terrain.simulation.planar.model import TRUTH, Ground, make_planar
-from terrain.simulation.planar.motion import move
-from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.signals import delayed, lagged
-from terrain.simulation.planar.skid_steer import ENDO_POWER, SLIDING_RADPS
-from terrain.simulation.planar.swerve import ROLLING_MPS
+from terrain.simulation.planar.model import TRUTH, Ground, delayed, lagged, make_planar
+from terrain.simulation.planar.motion import (
+    ENDO_POWER,
+    ROLLING_MPS,
+    SLIDING_RADPS,
+    STANDSTILL_MPS,
+    direction,
+    move,
+)
+from terrain.simulation.planar.replay import replay, sense
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 ROBOTS = {"skid_steer": HUSKY, "swerve": AGRIMARO}

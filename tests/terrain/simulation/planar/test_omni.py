@@ -13,12 +13,10 @@ from terrain.measured_slip.rollers import roller_findings
 from terrain.measured_slip.slips import measured_slip
 from terrain.robots import load_robot
 from terrain.simulation.contact import softness
-from terrain.simulation.planar.ground import planar_ground
-from terrain.simulation.planar.model import AMPS, SLIP, VX, VY, Ground, W, make_planar
+from terrain.simulation.planar.model import AMPS, SLIP, VX, VY, Ground, W, make_planar, planar_ground
 from terrain.simulation.planar.motion import move
 from terrain.simulation.planar.noise import load_noise
-from terrain.simulation.planar.omni import ROLLING_MPS, SUBSTEPS, currents_of
-from terrain.simulation.planar.omni_contact import steady_twist
+from terrain.simulation.planar.omni import ROLLING_MPS, SUBSTEPS, currents_of, steady_twist
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.run import simulate_run
 from terrain.simulation.scenario.make import make_scenario

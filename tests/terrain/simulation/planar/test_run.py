@@ -25,12 +25,10 @@ from terrain.kinematics.camera import body_motion
 from terrain.kinematics.true_slip import wheel_and_ground_speed
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.robots import load_robot
-from terrain.simulation.planar.ground import planar_ground
-from terrain.simulation.planar.hills import Hills
-from terrain.simulation.planar.model import Ground, make_planar
+from terrain.simulation.planar.model import Ground, make_planar, planar_ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.run import Hills, simulate_planar
 from terrain.simulation.scenario.make import make_scenario
 from terrain.terramechanics.soil import load_soil
 
