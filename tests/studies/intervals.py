@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
+from terrain.simulation.planar.omni_contact import steady_twist
 
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
@@ -31,10 +32,8 @@ from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import description_file, load_robot
 from terrain.simulation.bench import six_positions_log
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.planar.omni_contact import steady_twist
 from terrain.simulation.scenario.make import make_scenario
-from terrain.simulation.tracked.given_slip import GivenSlip
-from terrain.simulation.tracked.run import simulate_tracked
+from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio
 from terrain.slip_learning.forces import RunBins
 from terrain.soil_identification.fit import LAWS, SINKAGES, Law, fit_law, forces_of, parameters_of, sinkage_of
@@ -271,7 +270,7 @@ def _rollers(seed: int) -> Iterator[Interval]:
 
 def _odometry(seed: int) -> Iterator[Interval]:
     robot = load_robot("patako")
-    given = GivenSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)
+    given = PrescribedSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)
     runs = enumerate(tracked_arcs(robot, given, seed=seed))
     legs = [leg for k, run in runs for leg in legs_of_poses(run, k, robot, 2.0)]
     fit = fit_odometry(level(SLIP), legs, robot).fit
