@@ -11,7 +11,7 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
-from terrain.simulation.planar.omni_contact import steady_twist
+from terrain.simulation.planar.omni import steady_twist
 
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
