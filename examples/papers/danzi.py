@@ -31,16 +31,15 @@ from terrain.control.danzi_pid import (
     wheel_step,
 )
 from terrain.control.pid import Gains, pid_step
-from terrain.estimation.ekf.filter import run_filter
-from terrain.estimation.ekf.model import FilterSettings
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import THESIS_EMA_ALPHA, THESIS_SAMPLE_TIME_S, Estimate, estimate_run
+from terrain.estimation.filter import FilterSettings, run_filter
 from terrain.estimation.filters.swerve import make_filter
 from terrain.estimation.filters.swerve_noise import adaptive_noise, thesis_noise
-from terrain.estimation.measurements.batch import measurement_table
 from terrain.estimation.reference import lagged_slip, lagged_slip_at
 from terrain.estimation.slip_figures import STEADY_SPEED_MPS, slip_figures
 from terrain.estimation.summary import summarize
+from terrain.estimation.table import measurement_table
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
 from terrain.kinematics.swerve import forward, wheel_velocities

@@ -28,9 +28,10 @@ from terrain.control.switching import (
     update,
 )
 from terrain.control.traction import TractionStatus
-from terrain.estimation.ekf.resident import BIASES, ResidentFilter
-from terrain.estimation.live.choice import Estimate, Filter
-from terrain.estimation.live.clocks import Clocks, ClockWatch
+from terrain.estimation.choice import Estimate, Estimator
+from terrain.estimation.clocks import Clocks, ClockWatch
+from terrain.estimation.filter import Filter
+from terrain.estimation.live import BIASES
 from terrain.records import Command, Sample
 
 COMMAND_VALID_S = 0.25
@@ -113,7 +114,7 @@ class Chain:
 
     name = ""
     source: TerrainSource
-    _filter: Filter | None = None
+    _filter: Estimator | None = None
 
     def __init__(
         self, robot_name: str, table: SlipTable, switching: SwitchSettings, clocks: Clocks | ClockWatch
@@ -176,8 +177,8 @@ class Chain:
 
     def state(self, now_s: float) -> LiveState:
         """Return what is worth keeping over a restart, at a time in seconds since 1970."""
-        resident, name = self._kept_filter
-        known = {} if resident is None else resident.known(BIASES)
+        session, name = self._session
+        known = {} if session is None else session.known(BIASES)
         biases = {
             state: Bias(mean, std)
             for state, (mean, std) in known.items()
@@ -194,13 +195,13 @@ class Chain:
         DataError
             if the filter has run already.
         """
-        resident, name = self._kept_filter
+        session, name = self._session
         fresh = restorable(state, self.robot_name, name, now_s)
-        if resident is not None:
-            resident.begin_from(fresh.biases, max(now_s - state.saved_s, 0.0))
+        if session is not None:
+            session.begin_from(fresh.biases, max(now_s - state.saved_s, 0.0))
         self.belief = TerrainBelief(fresh.terrain, fresh.probability)
         return fresh
 
     @property
-    def _kept_filter(self) -> tuple[ResidentFilter | None, str]:
-        return (None, "") if self._filter is None else (self._filter.resident, self._filter.name)
+    def _session(self) -> tuple[Filter | None, str]:
+        return (None, "") if self._filter is None else (self._filter.filter, self._filter.name)

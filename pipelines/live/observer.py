@@ -15,8 +15,8 @@ from pipelines.live.model import TerrainModel
 from pipelines.live.windows import live_estimator
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import SWITCHING, SwitchSettings, TerrainBelief, check_switching, drive_on
-from terrain.estimation.live.choice import Estimate
-from terrain.estimation.live.clocks import ClockWatch, last_stamp_s
+from terrain.estimation.choice import Estimate
+from terrain.estimation.clocks import ClockWatch, last_stamp_s
 from terrain.kinematics.wheel_speed import speed_columns
 from terrain.records import Reading, Sample
 from terrain.robots import Robot
@@ -118,8 +118,7 @@ class Observer(Chain):
         estimates: Sequence[Estimate] = ()
         if self._filter is not None:
             estimates = self._filter.step(samples)
-            if estimates:
-                self.estimate = estimates[-1]
+            self.estimate = self._filter.latest
         if self._clocks.was_set(samples):  # what was believed stays, and its outputs begin anew
             self.source.restart()
             self.belief = TerrainBelief(self.belief.terrain, self.belief.probability)

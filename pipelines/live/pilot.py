@@ -25,11 +25,9 @@ from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.control.wheel_controllers import PERIOD_S
-from terrain.estimation.live.clocks import Clocks, finite_twist
-from terrain.estimation.live.estimate import LiveEstimate
-from terrain.estimation.live.estimator import CHANNELS, LiveEstimator
-from terrain.estimation.live.health import SENSORS, Health
-from terrain.estimation.live.rows import places_among
+from terrain.estimation.clocks import Clocks, finite_twist
+from terrain.estimation.health import SENSORS, Health
+from terrain.estimation.live import CHANNELS, LiveEstimate, LiveFilter, places_among
 from terrain.extension import correct_live
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import Robot
@@ -65,7 +63,7 @@ class LivePilot(Chain):
 
     name = "pilot"
     estimate: LiveEstimate | None
-    _filter: LiveEstimator | None
+    _filter: LiveFilter | None
     _clocks: Clocks
 
     def __init__(
@@ -81,7 +79,7 @@ class LivePilot(Chain):
         super().__init__(robot.name, table, settings.switching, Clocks())
         self.source = TerrainSource() if source is None else source
         if settings.controller not in OPEN_LOOP:
-            self._filter = LiveEstimator(driven, PILOT_FILTER, correction=correction)
+            self._filter = LiveFilter(driven, PILOT_FILTER, correction=correction)
         states = () if self._filter is None else self._filter.states
         self.control = RobotControl(driven, table, settings, states)
         self._steering_zeros_rad = np.array(driven.steering_zeros_rad)

@@ -27,10 +27,9 @@ from pipelines.live.state import LiveState
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.live.arrivals import Inbox, StreamHealth, as_numbers
-from terrain.estimation.live.clocks import SessionClock
-from terrain.estimation.live.estimate import LiveEstimate
-from terrain.estimation.live.skid_live import LiveSkidEstimate
+from terrain.estimation.arrivals import Inbox, StreamHealth, as_numbers
+from terrain.estimation.clocks import SessionClock
+from terrain.estimation.live import LiveEstimate
 from terrain.records import Sample
 from terrain.robots import Robot
 
@@ -321,9 +320,7 @@ class RobotSession:
             for name, channel in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
                 known[name] = self._streams.last("wheels", [channel.format(wheel) for wheel in self._wheels])
             known |= dict.fromkeys(MOTION, math.nan)
-            if isinstance(seen, LiveSkidEstimate):
-                known |= {"speed_x_mps": seen.speed_mps, "yaw_rate_radps": seen.yaw_rate_radps}
-            elif seen is not None and len(seen.slip) == len(self._wheels):
+            if seen is not None and len(seen.slip) == len(self._wheels):
                 known |= {"slip_ratio": seen.slip, "slip_std": seen.slip_std}
         sensors = self.chain.health or self._streams.health(time_s)
         if math.isnan(time_s):

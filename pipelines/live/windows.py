@@ -21,9 +21,9 @@ from features.windows import (
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.terrain_filter import TerrainFilter, check_filter
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.live.choice import (
+from terrain.estimation.choice import (
     LIVE_FILTERS,
-    Filter,
+    Estimator,
     estimated_channels,
     make_live_filter,
 )
@@ -62,7 +62,7 @@ def live_filter(info: ModelInfo, robot: Robot) -> str:
 
 def live_estimator(
     info: ModelInfo, robot: Robot, channels: Mapping[str, Sequence[str]]
-) -> tuple[Filter | None, Robot]:
+) -> tuple[Estimator | None, Robot]:
     """Return the filter whose estimates a model needs, or None, and the robot as filters take it."""
     driven, correction = correct_live(robot)
     if not needs_filter(info, channels):
@@ -146,6 +146,8 @@ def windows_of_log(
     for sample in replay(RunLog(run.run_id, run.robot, streams)):
         estimates = [] if estimator is None else estimator.step(sample.readings)
         found += feed.push(sample.readings, estimates)
+    if estimator is not None:
+        found += feed.push({}, estimator.settle(all_of_them=True))
     windows = join_windows(found)
     labelled = replace(
         windows,

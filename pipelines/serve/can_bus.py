@@ -40,7 +40,7 @@ from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import step_or_period
 from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics, corrections, last_samples
 from terrain.errors import ConfigError, one_line
-from terrain.estimation.live.clocks import SessionClock
+from terrain.estimation.clocks import SessionClock
 from terrain.records import Array, Sample
 from terrain.robots import SwerveRobot, as_drive, load_robot
 

@@ -26,7 +26,7 @@ from pipelines.serve.guard import bearer
 from pipelines.serve.hub import Hub
 from pipelines.serve.serve import LONGEST_TOKEN
 from pipelines.serve.wire import WireError, decode, encode
-from terrain.estimation.live.clocks import number
+from terrain.estimation.clocks import number
 from terrain.files.documents import first_fault
 
 MAX_NOTES = 1000

@@ -25,7 +25,7 @@ from pipelines.serve.serve import Settings, loaded, required_token
 from pipelines.serve.wire import WireError
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
-from terrain.estimation.live.estimator import CHANNELS
+from terrain.estimation.live import CHANNELS
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.records import Reading, Sample
 from terrain.robots import Robot, load_robot, robot_named

@@ -28,7 +28,7 @@ from pipelines.serve.serve import Settings, loaded, stopping
 from terrain.control.pilot_settings import PilotSettings, check_table
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.live.estimator import CHANNELS
+from terrain.estimation.live import CHANNELS
 from terrain.files.names import printable
 from terrain.logs.replay import SENSORS, replay
 from terrain.records import RunLog

@@ -27,7 +27,7 @@ from scipy.optimize import minimize_scalar
 
 from terrain.calibration.finding import Finding, undetermined
 from terrain.calibration.sensors import MAX_GAP_S, Stretch, at_times, origin_twist
-from terrain.estimation.measurements.resampling import low_pass
+from terrain.estimation.resampling import low_pass
 from terrain.identify import half_width
 from terrain.kinematics.swerve import forward
 from terrain.records import Array, RunLog, Stream

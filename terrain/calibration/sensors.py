@@ -30,7 +30,7 @@ from terrain.angles import unwrapped
 from terrain.calibration.finding import Finding, around, biases, undetermined
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
-from terrain.estimation.measurements.cleaning import MIN_CONFIDENCE_RATIO
+from terrain.estimation.feed import MIN_CONFIDENCE_RATIO
 from terrain.identify import Parameter, half_width, identify, std_interval
 from terrain.kinematics.camera import CHANNELS, body_motion
 from terrain.kinematics.wheel_velocity import TWIST, point_velocity

@@ -80,8 +80,8 @@ class PilotStatus(NamedTuple):
     driven_mps, desired_mps : commanded and desired speed of the fastest wheel
     heading_error_rad, cross_track_m : of path tracking
     track_status_code : :class:`terrain.control.path_tracking.TrackStatus`
-    sensor_code : place in :data:`terrain.estimation.live.health.SENSORS` of the least sound; -1 for none
-    health_code : its :class:`terrain.estimation.live.health.Health`
+    sensor_code : place in :data:`terrain.estimation.health.SENSORS` of the least sound; -1 for none
+    health_code : its :class:`terrain.estimation.health.Health`
     output_code : of the terrain source in this step, :class:`terrain.control.switching.OutputStatus`
     """
 

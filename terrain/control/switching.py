@@ -198,7 +198,7 @@ def approach(now: float, desired: float, rate: float, dt_s: float) -> float:
 
 
 if TYPE_CHECKING:
-    from terrain.estimation.live.choice import Estimate
+    from terrain.estimation.choice import Estimate
 
 
 class TerrainEstimate(NamedTuple):

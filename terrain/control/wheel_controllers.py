@@ -26,7 +26,7 @@ from terrain.control.traction import (
     traction_step,
     with_motor_driver,
 )
-from terrain.estimation.live.estimate import LiveEstimate
+from terrain.estimation.live import LiveEstimate
 from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTarget
 from terrain.robots import Robot

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.special import ndtri
 
-from terrain.estimation.ekf.consistency import consistency_report
+from terrain.estimation.consistency import consistency_report
 from terrain.estimation.estimate import Estimate
 from terrain.estimation.reference import lagged_slip_at
 

@@ -9,19 +9,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf.filter import run_filter
-from terrain.estimation.ekf.innovations import Innovations, innovations
-from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterModel, FilterSettings, Noise
-from terrain.estimation.filters.skid import make_skid_filter, skid_noise, within_bounds
+from terrain.estimation.consistency import Innovations, innovations
+from terrain.estimation.feed import GNSS_ROWS
+from terrain.estimation.filter import (
+    GATE_PROBABILITY,
+    REOPEN_AFTER_S,
+    FilterModel,
+    FilterSettings,
+    Noise,
+    run_filter,
+)
+from terrain.estimation.filters.skid import WHEELS_AND_GYRO, make_skid_filter, skid_noise, within_bounds
 from terrain.estimation.filters.swerve import make_filter
 from terrain.estimation.filters.swerve_noise import default_noise, scheduled, thesis_noise
-from terrain.estimation.measurements.batch import measurement_table
-from terrain.estimation.measurements.heading import gnss_heading
-from terrain.estimation.measurements.skid_rows import WHEELS_AND_GYRO
-from terrain.estimation.measurements.table import GNSS_ROWS, MeasurementTable
 from terrain.estimation.reference import true_states
 from terrain.estimation.slip_figures import SlipFigures, slip_figures
 from terrain.estimation.stuck import motion_track
+from terrain.estimation.table import MeasurementTable, gnss_heading, measurement_table
 from terrain.estimation.wheel_slip import blind_slip, wheel_slip
 from terrain.extension import check_corrected, correct
 from terrain.records import Array, RunLog, SlipTrack, StateTrack

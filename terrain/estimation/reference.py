@@ -1,6 +1,6 @@
 """The truth of a simulated run, in the states of a filter.
 
-A filter's inputs come behind one low-pass (``terrain.estimation.measurements``), so what it estimates is the
+A filter's inputs come behind one low-pass (``terrain.estimation.table``), so what it estimates is the
 motion behind that low-pass.  It is judged against the truth behind the same one: else every ramp of 1 m/s^2
 would count 5 cm/s of known delay as an error.
 """
@@ -11,7 +11,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
 from terrain.errors import DataError
-from terrain.estimation.measurements.resampling import low_pass
+from terrain.estimation.resampling import low_pass
 from terrain.kinematics.true_slip import true_slip, wheel_and_ground_speed
 from terrain.records import Array, RunLog, StateTrack, Stream
 from terrain.robots import Robot

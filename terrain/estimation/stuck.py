@@ -27,8 +27,7 @@ from enum import IntEnum
 import numpy as np
 from numba import boolean, float64, int64, njit
 
-from terrain.estimation.measurements.sample_hold import TICK_S
-from terrain.estimation.measurements.skid_rows import REST_S, STANDING_MPS
+from terrain.estimation.feed import REST_S, STANDING_MPS, TICK_S
 from terrain.records import Array
 
 MEAN_S = 1.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrain.estimation.ekf.consistency import consistency_report, nees
+from terrain.estimation.consistency import consistency_report, nees
 from terrain.estimation.estimate import Estimate
 from terrain.estimation.reference import true_slip_at
 from terrain.estimation.stuck import StuckInterval, motion_seconds, stuck_intervals

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from terrain.errors import DataError
-from terrain.estimation.ekf.model import Noise
 from terrain.estimation.estimate import model_and_noise
+from terrain.estimation.filter import Noise
 from terrain.estimation.filters.tuning import NoiseGroup, TuningStatus, tune_noise
-from terrain.estimation.measurements.batch import measurement_table
+from terrain.estimation.table import measurement_table
 from terrain.extension import corrected, corrected_log
 from terrain.records import RunLog
 from terrain.robots import Robot, packaged_robot

@@ -5,22 +5,23 @@ The definition of the slip ratio is :func:`terrain.slip.slip_ratio`.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from numba import float64, int64, njit, void
+from numba import njit
 
 from terrain.errors import DataError
-from terrain.estimation.measurements.table import MeasurementTable
+from terrain.estimation.feed import UNMEASURED_AFTER_S
+from terrain.estimation.filter import Filter
+from terrain.estimation.table import MeasurementTable
 from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTrack, StateTrack
 from terrain.robots import Robot
-from terrain.slip import MIN_SPEED_MPS, slip_ratio
+from terrain.slip import MIN_SPEED_MPS
 
 STALE_AFTER_S = 0.15
 """Age of the last speed over ground beyond which slip counts as stale: one and a half periods of GNSS, at 10
 Hz the slowest sensor of it, so that no sound one is called so; a 1 m/s^2 start gains 0.15 m/s unseen."""
-
-UNMEASURED_AFTER_S = 0.5
-"""After this time without a rate or an angle, the motion of a wheel is unknown."""
 
 
 def wheel_slip(
@@ -55,7 +56,7 @@ def wheel_slip(
     """
     slip = _slip(track, table, robot, wheel_speed_std_mps)
     unseen = np.isinf(track.reference_age_s)
-    if not _has_slip_speed(track, robot):
+    if f"slip_speed_{robot.wheels[0]}_mps" not in track.states:
         unseen = unseen | slip.stale
     unknown = unseen[:, None] | _unmeasured(table, robot)
     ratio, std = (np.where(unknown, np.nan, v) for v in (slip.slip_ratio, slip.slip_std))
@@ -82,10 +83,6 @@ def blind_slip(track: StateTrack, table: MeasurementTable, robot: Robot) -> Slip
     return _slip(track, table, robot, None, from_encoders=True)
 
 
-def _has_slip_speed(track: StateTrack, robot: Robot) -> bool:
-    return f"slip_speed_{robot.wheels[0]}_mps" in track.states
-
-
 def _slip(
     track: StateTrack,
     table: MeasurementTable,
@@ -96,100 +93,81 @@ def _slip(
     """Slip and its standard deviation, measured over ground or not."""
     if not np.array_equal(track.time_s, table.time_s):
         raise DataError("the track and the measurements are not on one clock: filter this table")
-    in_state = _has_slip_speed(track, robot) and not from_encoders
-    ratio, std = np.full((2, track.time_s.size, len(robot.wheels)), np.nan)
-    for i, wheel in enumerate(robot.wheels):
-        ground, d_ground = _ground_speed(track, robot, i)
-        if in_state:
-            slip_speed = _state(track, f"slip_speed_{wheel}_mps")
-            wheel_speed, d_wheel_speed, wheel_speed_variance = ground + slip_speed, d_ground.copy(), 0.0
-            d_wheel_speed[:, track.states.index(f"slip_speed_{wheel}_mps")] += 1.0
-        else:
-            wheel_speed, d_wheel_speed = _wheel_speed(table, robot, i), np.zeros_like(d_ground)
-            wheel_speed_variance = (
-                wheel_speed_scatter_mps(robot) if wheel_speed_std_mps is None else wheel_speed_std_mps
-            ) ** 2
-        ratio[:, i] = slip_ratio(wheel_speed, ground)
-        by_wheel_speed, by_ground = _slopes(wheel_speed, ground)
-        gradient = by_wheel_speed[:, None] * d_wheel_speed + by_ground[:, None] * d_ground
-        variance = (
-            np.einsum("ni,nij,nj->n", gradient, track.cov, gradient)
-            + by_wheel_speed**2 * wheel_speed_variance
-        )
-        std[:, i] = np.sqrt(np.maximum(variance, 0.0))
-    return SlipTrack(track.time_s, ratio, std, robot.wheels, track.reference_age_s > STALE_AFTER_S)
+    places = _places(robot, track.states, from_encoders)
+    wheel_speed = robot.wheel_speeds_mps(table.columns(list(robot.wheel_rows)))
+    std_mps = wheel_speed_scatter_mps(robot) if wheel_speed_std_mps is None else wheel_speed_std_mps
+    slip = np.empty((track.time_s.size, 2, len(robot.wheels)))
+    positions = np.array(robot.wheel_positions_m)
+    _slips(np.array(track.mean), np.array(track.cov), positions, places, wheel_speed, std_mps**2, slip)
+    stale = track.reference_age_s > STALE_AFTER_S
+    return SlipTrack(track.time_s, slip[:, 0], slip[:, 1], robot.wheels, stale)
 
 
-def _state(track: StateTrack, name: str) -> Array:
-    if name not in track.states:
-        raise DataError(f"the track has no state {name!r}, only {', '.join(track.states)}")
-    return track.state(name)
+class SlipOfInstant:
+    """The slip of each wheel at the last step of a filter: :func:`wheel_slip`, live.
+
+    Parameters
+    ----------
+    robot : with its wheels
+    states : of the filter
+    """
+
+    def __init__(self, robot: Robot, states: tuple[str, ...]) -> None:
+        self._robot, self._positions_m = robot, np.array(robot.wheel_positions_m)
+        self._has_slip_speed = f"slip_speed_{robot.wheels[0]}_mps" in states
+        self._places = _places(robot, states) if robot.steered else np.empty(0, np.int64)
+        self._variance = wheel_speed_scatter_mps(robot) ** 2
+
+    def at(self, time_s: float, session: Filter, row: Array, feed: Array) -> tuple[Array, Array]:
+        """Return slip and standard deviation (wheels,) at a tick, of a row of a feed and its memory."""
+        slip, age_s = np.full((2, len(self._robot.wheels)), np.nan), session.reference_age_s
+        if not math.isinf(age_s) and (age_s <= STALE_AFTER_S or self._has_slip_speed):
+            speeds = self._robot.wheel_speeds_mps(row["wheel_radps"][0])
+            cov = np.ascontiguousarray(session.cov)
+            _instant_slip(session.mean, cov, self._positions_m, self._places, speeds, self._variance, slip)
+            received_s = np.minimum(feed["rate_received_s"][0], feed["steer_received_s"][0])
+            slip[:, time_s - received_s > UNMEASURED_AFTER_S] = np.nan
+        return slip[0], slip[1]
 
 
-def _ground_speed(track: StateTrack, robot: Robot, wheel: int) -> tuple[Array, Array]:
-    """Return the speed (n,) of a wheel's centre along it, (7.3)-(7.5), and its slopes (n, d) by the state."""
-    x, y = robot.wheel_positions_m[wheel]
-    speed_name = "speed_mps" if "speed_mps" in track.states else "speed_x_mps"
-    steer_name = f"steer_{robot.wheels[wheel]}_rad"
-    zero = np.zeros(track.time_s.size)
-    across = _state(track, "speed_y_mps") if robot.steered else zero
-    steer = _state(track, steer_name) if steer_name in robot.steer_rows else zero
-    turn = _state(track, "yaw_rate_radps")
-    ahead, left = point_velocity(_state(track, speed_name), across, turn, x, y)
-    cos, sin = np.cos(steer), np.sin(steer)
-    along, sideways = in_wheel_frame(ahead, left, cos, sin)
-    slopes = {
-        speed_name: cos,
-        "speed_y_mps": sin,
-        "yaw_rate_radps": x * sin - y * cos,
-        steer_name: sideways,
-    }
-    gradient = np.zeros((track.time_s.size, len(track.states)))
-    for name, slope in slopes.items():
-        if name in track.states:
-            gradient[:, track.states.index(name)] = slope
-    return along, gradient
+def _places(robot: Robot, states: tuple[str, ...], from_encoders: bool = False) -> Array:
+    """Return where speeds, yaw rate, steering angles and slip speeds stand among states, -1 for what is none."""
+    speed = "speed_mps" if "speed_mps" in states else "speed_x_mps"
+    needed = [speed, "yaw_rate_radps", *(["speed_y_mps"] if robot.steered else []), *robot.steer_rows]
+    for name in needed:
+        if name not in states:
+            raise DataError(f"the track has no state {name!r}, only {', '.join(states)}")
+    slips = [f"slip_speed_{wheel}_mps" for wheel in robot.wheels]
+    names = [speed, "speed_y_mps", "yaw_rate_radps", *(f"steer_{wheel}_rad" for wheel in robot.wheels)]
+    names += ["" if from_encoders else name for name in slips]
+    return np.array([states.index(name) if name in states else -1 for name in names])
 
 
-def _slopes(wheel_speed: Array, ground: Array) -> tuple[Array, Array]:
-    """Return the derivatives of the slip ratio by the wheel speed and by the speed over ground."""
-    traction = np.abs(wheel_speed) >= np.abs(ground)
-    fastest = np.where(traction, wheel_speed, ground)
-    fastest = np.where(np.abs(fastest) < MIN_SPEED_MPS, np.nan, fastest)
-    sign = np.sign(fastest)
-    by_wheel_speed = np.where(traction, sign * ground / fastest**2, 1.0 / np.abs(fastest))
-    by_ground = np.where(traction, -1.0 / np.abs(fastest), -sign * wheel_speed / fastest**2)
-    return by_wheel_speed, by_ground
-
-
-@njit(
-    void(float64[::1], float64[:, ::1], float64[:, ::1], int64[::1], float64[::1], float64, float64[:, ::1]),
-    cache=True,
-    error_model="numpy",
-)
-def instant_slip(
+@njit(cache=True, error_model="numpy")
+def _instant_slip(
     mean: Array,
     cov: Array,
-    places_m: Array,
-    at: Array,
+    positions_m: Array,
+    places: Array,
     wheel_speed_mps: Array,
     wheel_speed_variance: float,
     slip: Array,
 ) -> None:
-    """Write ratio and standard deviation (2, wheels) of the slip of one instant: :func:`wheel_slip`, live.
+    """Write ratio and standard deviation (2, wheels) of the slip of one instant.
 
-    ``at`` says where in the state stand speed_x, speed_y, yaw rate, the steering angles and the slip speeds,
-    the latter -1 where the state has none and ``wheel_speed_mps`` (wheels,) holds.
+    ``places`` say where the state has what :func:`_places` names; where it has no slip speeds,
+    ``wheel_speed_mps`` (wheels,) holds.
     """
-    n = places_m.shape[0]
+    n = positions_m.shape[0]
     states, slopes = np.empty(5, np.int64), np.empty(5)
-    states[:3] = at[:3]
+    states[:3] = places[:3]
     for i in range(n):
-        states[3], states[4] = at[3 + i], at[3 + n + i]
-        x, y = places_m[i, 0], places_m[i, 1]
-        turn = mean[at[2]]
-        ahead, left = point_velocity(mean[at[0]], mean[at[1]], turn, x, y)
-        cos, sin = np.cos(mean[states[3]]), np.sin(mean[states[3]])
+        states[3], states[4] = places[3 + i], places[3 + n + i]
+        x, y = positions_m[i, 0], positions_m[i, 1]
+        across = mean[states[1]] if states[1] >= 0 else 0.0
+        steer = mean[states[3]] if states[3] >= 0 else 0.0
+        ahead, left = point_velocity(mean[states[0]], across, mean[states[2]], x, y)
+        cos, sin = np.cos(steer), np.sin(steer)
         ground, sideways = in_wheel_frame(ahead, left, cos, sin)
         in_state = states[4] >= 0
         wheel_speed = ground + mean[states[4]] if in_state else wheel_speed_mps[i]
@@ -201,21 +179,33 @@ def instant_slip(
         size, sign = abs(fastest), np.sign(fastest)
         by_wheel_speed = sign * ground / fastest**2 if traction else 1.0 / size
         by_ground = -1.0 / size if traction else -sign * wheel_speed / fastest**2
-        along = (
-            by_wheel_speed + by_ground if in_state else by_ground
-        )  # the wheel speed follows from the state's ground speed too
+        # a wheel speed that is in the state follows from the state's ground speed, too
+        along = by_wheel_speed + by_ground if in_state else by_ground
         slopes[0], slopes[1], slopes[2] = along * cos, along * sin, along * (x * sin - y * cos)
         slopes[3], slopes[4] = along * sideways, by_wheel_speed
         variance = 0.0 if in_state else by_wheel_speed**2 * wheel_speed_variance
-        for j in range(4 + in_state):
-            for k in range(4 + in_state):
-                variance += slopes[j] * cov[states[j], states[k]] * slopes[k]
+        for j in range(5):
+            for k in range(5):
+                if states[j] >= 0 and states[k] >= 0:
+                    variance += slopes[j] * cov[states[j], states[k]] * slopes[k]
         slip[0, i] = min(max((wheel_speed - ground) / size, -1.0), 1.0)
         slip[1, i] = np.sqrt(max(variance, 0.0))
 
 
-def _wheel_speed(table: MeasurementTable, robot: Robot, wheel: int) -> Array:
-    return robot.wheel_speeds_mps(table.columns([robot.wheel_rows[wheel]])[:, 0])
+@njit(cache=True, error_model="numpy")
+def _slips(
+    mean: Array,
+    cov: Array,
+    positions_m: Array,
+    places: Array,
+    wheel_speed_mps: Array,
+    wheel_speed_variance: float,
+    slip: Array,
+) -> None:
+    """Write the slip (n, 2, wheels) of each instant."""
+    for n in range(mean.shape[0]):
+        speeds = wheel_speed_mps[n]
+        _instant_slip(mean[n], cov[n], positions_m, places, speeds, wheel_speed_variance, slip[n])
 
 
 def wheel_speed_scatter_mps(robot: Robot) -> float:

@@ -40,8 +40,8 @@ from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
-from terrain.estimation.measurements.resampling import on_clock
-from terrain.estimation.measurements.table import MeasurementTable
+from terrain.estimation.resampling import on_clock
+from terrain.estimation.table import MeasurementTable
 from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack, read_only
 from terrain.robots import Robot

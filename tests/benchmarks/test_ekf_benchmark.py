@@ -11,9 +11,7 @@ import pytest
 from filterpy.kalman import ExtendedKalmanFilter
 from threadpoolctl import threadpool_limits
 
-from terrain.estimation.ekf.filter import filter_step, run_filter
-from terrain.estimation.ekf.model import FilterSettings
-from terrain.estimation.ekf.state import initial_state
+from terrain.estimation.filter import Filter, FilterSettings, run_filter
 from terrain.estimation.filters.swerve import make_filter
 from terrain.estimation.filters.swerve_noise import default_noise
 from terrain.robots import load_robot
@@ -102,14 +100,14 @@ def test_the_filter_sample_by_sample(benchmark, vio12):
     model, noise, time_s, z = vio12
 
     def walk():
-        state = initial_state(model, noise)
+        session = Filter(model, noise)
         for k in range(N_STEPS):
-            state = filter_step(model, noise, state, time_s[k], z[k])
-        return state
+            session.step(time_s[k], z[k])
+        return session
 
-    state = benchmark(walk)
+    session = benchmark(walk)
     per_step(benchmark, N_STEPS)
-    np.testing.assert_array_equal(state.mean, run_filter(model, noise, time_s, z).mean[-1])
+    np.testing.assert_array_equal(session.mean, run_filter(model, noise, time_s, z).mean[-1])
 
 
 @pytest.mark.benchmark(group=f"{N_STEPS} steps of 12 states by 14 measurements", timer=time.process_time)

@@ -19,7 +19,7 @@ from websockets.asyncio.client import connect
 from terrain.errors import TerrainError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import estimate_run
-from terrain.estimation.live.estimator import CHANNELS
+from terrain.estimation.live import CHANNELS
 from terrain.logs.replay import replay
 from terrain.records import Array, RunLog
 from terrain.robots import load_robot

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.measurements.batch import measurement_table
-from terrain.estimation.measurements.table import GNSS_ROWS, ROWS_OF_DRIVE, MeasurementTable
+from terrain.estimation.feed import GNSS_ROWS, ROWS_OF_DRIVE
 from terrain.estimation.slip_figures import slip_figures
+from terrain.estimation.table import MeasurementTable, measurement_table
 from terrain.estimation.wheel_slip import STALE_AFTER_S, blind_slip, instant_slip, wheel_slip
 from terrain.kinematics.camera import odometry_stream
 from terrain.records import ABSENT, RunLog, SlipTrack, StateTrack, Stream

@@ -23,7 +23,7 @@ the wheels measure the yaw rate with white noise of q T / a: a is how much they 
 
 a is taken as a constant of each step, as the weights of a robust regression are.  Wheels that spin without
 turning the robot thus say nothing on the gyro's bias, which its own prior, driving straight and standing
-still (:mod:`terrain.estimation.measurements.skid_rows`) determine.  Without a gyro w still follows the
+still (:mod:`terrain.estimation.feed`) determine.  Without a gyro w still follows the
 wheels, as slowly as they are believed.
 
 What is missing is the slip that both sides share: v is the speed of the wheels.  The filter has no reference
@@ -37,9 +37,8 @@ import math
 import numpy as np
 from numba import njit
 
-from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
-from terrain.estimation.ekf.model import FilterModel, Noise
-from terrain.estimation.measurements.skid_rows import REST_ROW, WHEELS_AND_GYRO
+from terrain.estimation.feed import REST_ROW, SIDE_ROWS
+from terrain.estimation.filter import OBSERVE, PROPAGATE, FilterModel, Noise
 from terrain.records import Array
 from terrain.robots import Robot, SkidSteerRobot, as_drive
 
@@ -69,6 +68,9 @@ _STATES = (
     *("position_x_m", "position_y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"),
     *("effective_track_m", "gyro_bias_radps", "wheel_difference_mps"),
 )
+WHEELS_AND_GYRO = (*SIDE_ROWS, "gyro_z_radps")
+"""Rows of the table that the filter takes beside that of rest."""
+
 _ROWS = (*WHEELS_AND_GYRO, REST_ROW)
 _X, _Y, _YAW, _V, _W, _TRACK, _BIAS, _DIFFERENCE = range(8)
 

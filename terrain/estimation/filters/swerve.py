@@ -65,7 +65,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf.model import FilterModel
+from terrain.estimation.feed import CAMERA_ROWS, DERIVED_ROWS, GNSS_ROWS
+from terrain.estimation.filter import FilterModel
 from terrain.estimation.filters.swerve_model import (
     observe_slip_ratio,
     observe_slip_speed,
@@ -73,7 +74,6 @@ from terrain.estimation.filters.swerve_model import (
     propagate,
     propagate_slip_speed,
 )
-from terrain.estimation.measurements.table import CAMERA_ROWS, DERIVED_ROWS, GNSS_ROWS
 from terrain.records import Array
 from terrain.robots import Robot, SwerveRobot, as_drive
 

@@ -1,6 +1,6 @@
 """The equations of the swerve filters, as :mod:`terrain.estimation.filters.swerve` writes and sources them.
 
-Compiled for :class:`~terrain.estimation.ekf.model.FilterModel`: each writes the predicted values and their
+Compiled for :class:`~terrain.estimation.filter.FilterModel`: each writes the predicted values and their
 Jacobian.
 """
 
@@ -10,7 +10,7 @@ import math
 
 from numba import njit
 
-from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
+from terrain.estimation.filter import OBSERVE, PROPAGATE
 from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
 from terrain.records import Array
 

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
 
 import numpy as np
-from numba import float64, int64, njit, types, void
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf.model import FilterModel, Noise
+from terrain.estimation.feed import DERIVED_ROWS, UNSEEN_AFTER_S
+from terrain.estimation.filter import FilterModel, Noise
 from terrain.estimation.filters.swerve import LAYOUTS, MOTION, initial_std, kind_of, layout_of, rows_of
 from terrain.estimation.filters.swerve_model import WHEELS
-from terrain.estimation.measurements.derived import UNSEEN_AFTER_S
-from terrain.estimation.measurements.table import DERIVED_ROWS, ROWS_OF_DRIVE, MeasurementTable
+from terrain.estimation.table import MeasurementTable
 from terrain.records import Array
 from terrain.robots import Robot
 
-_V, _I = float64[::1], int64[::1]
+Columns = Callable[[Sequence[str]], Array]
+"""From names of rows to their measurements (n, k)."""
 
 # of how far a state walks within a second,
 _WALK_STD = {
@@ -83,7 +83,7 @@ def _described_std(robot: Robot) -> dict[str, float]:
 _SHAKEN_S, _CHANGED_RATIO, _UNSEEN_RATIO, _SHAKEN_TURN_S = 0.09, 0.4, 1.0 / 3.0, 0.02
 
 
-def slip_walk(model: FilterModel, table: MeasurementTable) -> Array | None:
+def slip_walk(model: FilterModel, columns: Columns) -> Array | None:
     """Return the variances (n, d) a second by which states of vio15 walk beside their process noise.
 
     The slip of a wheel changes with the ground under it, which shows as vibration a_z, and with its thrust,
@@ -104,64 +104,55 @@ def slip_walk(model: FilterModel, table: MeasurementTable) -> Array | None:
     Parameters
     ----------
     model : a filter
-    table : with the rows of :mod:`terrain.estimation.measurements.derived`
+    columns : measurements (n, k) by name, as of :meth:`~terrain.estimation.table.MeasurementTable.columns`
     """
     slips = [state for state in model.states if kind_of(state) == "slip_speed_mps"]
     if not slips:
         return None
-    found = np.zeros((len(table.time_s), len(model.states)))
-    shaken, *changed = np.nan_to_num(table.columns((DERIVED_ROWS[0], *DERIVED_ROWS[4:7]))).T
-    unseen = ~(table.columns(("camera_age_s",))[:, 0] <= UNSEEN_AFTER_S)
-    for state, change in zip(slips, changed, strict=True):
-        found[:, model.states.index(state)] = walk_of(shaken, change, unseen)
-    found[:, model.states.index("yaw_rate_radps")] = turn_walk_of(shaken, sum(changed), square_arms_m2(model))
-    return found
-
-
-def square_arms_m2(model: FilterModel) -> float:
-    """Return the sum over the wheels of their squared distances from the origin."""
-    return float((model.params[WHEELS] ** 2).sum())
-
-
-@njit(cache=True)
-def turn_walk_of(vibration_mps2: Any, changes_m2ps3: Any, square_arms_m2: float) -> Any:
-    """Return the variance of the yaw rate a second of :func:`slip_walk`, from sums over the wheels."""
-    shaken = 3.0 * (_SHAKEN_TURN_S * vibration_mps2) ** 2
-    return (shaken + 2.0 * _CHANGED_RATIO**2 * changes_m2ps3) / square_arms_m2
-
-
-@njit(cache=True)
-def walk_of(vibration_mps2: Any, change_m2ps3: Any, unseen: Any) -> Any:
-    """Return the variance a second of :func:`slip_walk`."""
+    shaken, *changed = np.nan_to_num(columns((DERIVED_ROWS[0], *DERIVED_ROWS[4:7]))).T
+    walk = np.zeros((len(shaken), len(model.states)))
+    unseen = ~(columns(("camera_age_s",))[:, 0] <= UNSEEN_AFTER_S)
     shaken_s = _SHAKEN_S * (1.0 - (1.0 - _UNSEEN_RATIO) * unseen)
-    return (shaken_s * vibration_mps2) ** 2 + 2.0 * _CHANGED_RATIO**2 * change_m2ps3
+    for state, change in zip(slips, changed, strict=True):
+        walk[:, model.states.index(state)] = (shaken_s * shaken) ** 2 + 2.0 * _CHANGED_RATIO**2 * change
+    square_arms_m2 = float((model.params[WHEELS] ** 2).sum())
+    turned = 3.0 * (_SHAKEN_TURN_S * shaken) ** 2 + 2.0 * _CHANGED_RATIO**2 * sum(changed)
+    walk[:, model.states.index("yaw_rate_radps")] = turned / square_arms_m2
+    return walk
 
 
-_DERIVED = ROWS_OF_DRIVE["swerve"].index(DERIVED_ROWS[0])
 # Scatter of an accelerometer by vibration, as a part of the vertical one
 _SHAKEN_ACCEL_RATIO = 0.5
 UNKNOWN_MPS2 = 1.4
 """Vibration where it is not known: that of rough ground."""
 
 
-def accel_variance(model: FilterModel, noise: Noise, table: MeasurementTable) -> Array:
-    """Return the measurement variances (n, m) of a noise with those of the accelerometer by vibration.
+def accel_variance(model: FilterModel, measurement_variance: Array, columns: Columns) -> Array:
+    """Return measurement variances (n, m) with those of the accelerometer by vibration.
 
     ``R = R_quiet + (0.5 a_z)^2`` with the vertical vibration a_z; as on rough ground where that is unknown.
     """
-    shaken = table.columns(DERIVED_ROWS[:1])[:, 0]
-    variance = np.array(np.broadcast_to(noise.measurement_variance, (len(shaken), len(model.rows))))
+    shaken = columns(DERIVED_ROWS[:1])[:, 0]
+    variance = np.array(np.broadcast_to(measurement_variance, (len(shaken), len(model.rows))))
     for row in (row for row in model.rows if kind_of(row) == "accel_mps2"):
-        variance[:, model.rows.index(row)] += shaken_variance(
-            np.where(np.isnan(shaken), UNKNOWN_MPS2, shaken)
-        )
+        known = np.where(np.isnan(shaken), UNKNOWN_MPS2, shaken)
+        variance[:, model.rows.index(row)] += (_SHAKEN_ACCEL_RATIO * known) ** 2
     return variance
 
 
-@njit(cache=True)
-def shaken_variance(vibration_mps2: Any) -> Any:
-    """Return the part of an accelerometer's variance that is by vibration."""
-    return (_SHAKEN_ACCEL_RATIO * vibration_mps2) ** 2
+def schedule(
+    model: FilterModel, measurement_variance: Array, columns: Columns
+) -> tuple[Array, Array | None, Array]:
+    """Return what changes from tick to tick: variances (n, m), walks (n, d) and inputs (n, k) of the process.
+
+    Parameters
+    ----------
+    model : a filter with inputs
+    measurement_variance : (m,) or (n, m), physical
+    columns : as of :func:`slip_walk`
+    """
+    variance = accel_variance(model, measurement_variance, columns)
+    return variance, slip_walk(model, columns), np.nan_to_num(columns(model.inputs))
 
 
 def scheduled(model: FilterModel, noise: Noise, table: MeasurementTable) -> tuple[Noise, Array | None]:
@@ -175,70 +166,8 @@ def scheduled(model: FilterModel, noise: Noise, table: MeasurementTable) -> tupl
     """
     if not model.inputs:
         return noise, None
-    variance, walk = accel_variance(model, noise, table), slip_walk(model, table)
-    found = replace(noise, measurement_variance=variance, walk_variance=walk)
-    return found, np.nan_to_num(table.columns(model.inputs))
-
-
-class ScheduleArrays(NamedTuple):
-    """What :func:`schedule_tick` is given of a filter.
-
-    Parameters
-    ----------
-    variance : (m,) of the noise, of rows that are not scheduled
-    slips, turn : places of the slip speeds, none where nothing is scheduled, and of the yaw rate among the
-        states
-    square_arms_m2 : as :func:`square_arms_m2`
-    accels, quiet : (2,) places of the accelerations among the rows, and their variances on quiet ground
-    """
-
-    variance: Array
-    slips: Array
-    turn: int
-    square_arms_m2: float
-    accels: Array
-    quiet: Array
-
-
-SCHEDULE_ARRAYS = types.NamedTuple((_V, _I, int64, float64, _I, _V), ScheduleArrays)
-"""Their type in compiled code."""
-
-
-def schedule_arrays(model: FilterModel, noise: Noise, scheduled: bool = True) -> ScheduleArrays:
-    """Return what :func:`schedule_tick` is given.
-
-    Parameters
-    ----------
-    model : filter
-    noise : of it, with one variance a row
-    scheduled : False for a noise that stays as it is, as for a model without slip speeds
-    """
-    slips = [i for i, s in enumerate(model.states) if kind_of(s) == "slip_speed_mps"]
-    accels = [i for i, row in enumerate(model.rows) if kind_of(row) == "accel_mps2"]
-    places = np.array(slips if scheduled else [], dtype=np.int64), np.array(accels, dtype=np.int64)
-    arms_m2 = square_arms_m2(model) if slips else math.nan
-    variance = np.array(noise.measurement_variance)
-    turn = model.states.index("yaw_rate_radps")
-    return ScheduleArrays(variance, places[0], turn, arms_m2, places[1], variance[places[1]])
-
-
-@njit(void(_V, SCHEDULE_ARRAYS, _V, _V, _V), cache=True)
-def schedule_tick(z: Array, fixed: ScheduleArrays, variance: Array, walk: Array, inputs: Array) -> None:
-    """Write variances, walks and inputs of a tick: what :func:`scheduled` gives of a whole table."""
-    slips, accels = fixed.slips, fixed.accels
-    shaken = z[_DERIVED]
-    for i in range(accels.size):
-        variance[accels[i]] = fixed.quiet[i] + shaken_variance(UNKNOWN_MPS2 if math.isnan(shaken) else shaken)
-    known = 0.0 if math.isnan(shaken) else shaken
-    changes = 0.0
-    for i in range(3):
-        growth, change = z[_DERIVED + 1 + i], z[_DERIVED + 4 + i]
-        unseen = not z[_DERIVED + 7] <= UNSEEN_AFTER_S
-        change = 0.0 if math.isnan(change) else change
-        changes += change
-        walk[slips[i]] = walk_of(known, change, 1.0 if unseen else 0.0)
-        inputs[i] = 0.0 if math.isnan(growth) else growth
-    walk[fixed.turn] = turn_walk_of(known, changes, fixed.square_arms_m2)
+    variance, walk, inputs = schedule(model, noise.measurement_variance, table.columns)
+    return replace(noise, measurement_variance=variance, walk_variance=walk), inputs
 
 
 def _process_variance(states: tuple[str, ...], robot: Robot) -> Array:

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.ekf.filter import log_likelihood
-from terrain.estimation.ekf.model import FilterModel, Noise
+from terrain.estimation.filter import FilterModel, Noise, log_likelihood
 from terrain.records import Array
 
 WIDEST_SCALE = 1e4

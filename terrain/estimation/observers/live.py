@@ -63,8 +63,9 @@ class LiveObserver:
         self._memory = np.array(observer.start)
         self._last_s = math.nan
         self._unreadable: dict[str, int] = {}
+        self.latest: LiveObserverEstimate | None = None
 
-    resident: None = None
+    filter: None = None
     """No memory of it is kept over a restart: it starts from its first samples."""
 
     @property
@@ -101,7 +102,14 @@ class LiveObserver:
         found = (
             self._tick(time_s, values) for time_s, values in zip(wheels[0].tolist(), wheels[1], strict=True)
         )
-        return [estimate for estimate in found if estimate is not None]
+        estimates = [estimate for estimate in found if estimate is not None]
+        if estimates:
+            self.latest = estimates[-1]
+        return estimates
+
+    def settle(self, *, all_of_them: bool = False) -> list[LiveObserverEstimate]:
+        """Return nothing: every estimate has settled when it is returned."""
+        return []
 
     def _arrays(self, name: str, reading: Reading) -> tuple[Array, Array] | None:
         """Return stamps and values; None, counted, where they are no samples of the stream."""

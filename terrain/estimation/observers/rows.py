@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.measurements.sample_hold import TICK_S
+from terrain.estimation.feed import TICK_S
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 

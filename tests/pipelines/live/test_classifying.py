@@ -19,7 +19,7 @@ from pipelines.live.classifying import (
     classify_window,
 )
 from pipelines.live.observer import Observer
-from terrain.estimation.live.estimator import LiveEstimator
+from terrain.estimation.live import LiveFilter
 from terrain.kinematics.wheel_speed import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.logs.schema import ESTIMATOR_CHANNELS
@@ -33,7 +33,7 @@ ROBOT = load_robot("agrimaro")
 
 def estimated(run):
     """The run with the streams that ``enriched`` adds, of the estimator on the robot."""
-    estimator = LiveEstimator(ROBOT)
+    estimator = LiveFilter(ROBOT)
     estimates = [estimate for sample in replay(run) for estimate in estimator.step(sample.readings)]
     time_s = [estimate.time_s for estimate in estimates]
     motion = [[getattr(estimate, name) for name in ESTIMATOR_CHANNELS] for estimate in estimates]
@@ -53,7 +53,7 @@ def test_live_windows_and_outputs_equal_those_of_the_enriched_log(swerve_model, 
         return classify_window(model, window)
 
     monkeypatch.setattr("pipelines.live.classifying.classify_window", classify)
-    classifier, estimator = Classifier(swerve_model, ROBOT), LiveEstimator(ROBOT)
+    classifier, estimator = Classifier(swerve_model, ROBOT), LiveFilter(ROBOT)
     for sample in replay(survey):
         new = classifier.update(sample, estimator.step(sample.readings))
         found += new

@@ -17,7 +17,7 @@ from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainEstimate, TerrainSource
 from terrain.control.traction import SETTINGS, TractionStatus
 from terrain.errors import ConfigError
-from terrain.estimation.live.health import SENSORS, Health
+from terrain.estimation.health import SENSORS, Health
 from terrain.logs.replay import replay
 from terrain.records import Reading, Sample
 from terrain.robots import load_robot

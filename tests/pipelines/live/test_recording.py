@@ -24,7 +24,7 @@ from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread, SessionRecorder
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import LogError
-from terrain.estimation.live.estimator import CHANNELS as OF_SWERVE
+from terrain.estimation.live import CHANNELS as OF_SWERVE
 from terrain.logs.replay import replay
 from terrain.logs.run_topics import APART, DEAD_STREAM, SHORT_STREAM
 from terrain.logs.samples import BAD_TIME, DEAD_CHANNEL

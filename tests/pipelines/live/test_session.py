@@ -13,7 +13,7 @@ from pipelines.live.pilot import LivePilot
 from pipelines.live.session import TWIST_FRESH_S, Hello, RobotSession, Served
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.live.estimator import CHANNELS
+from terrain.estimation.live import CHANNELS
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 

@@ -20,7 +20,7 @@ from terrain.calibration.sensors import (
 )
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.measurements.table import ROWS_OF_DRIVE
+from terrain.estimation.feed import ROWS_OF_DRIVE
 from terrain.records import RunLog, Stream
 from terrain.simulation.bench import six_positions_log
 

@@ -22,7 +22,7 @@ from terrain.control.situations import SituationOptions, make_situation, simulat
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import OutputStatus, TerrainBelief
 from terrain.control.traction import TractionStatus
-from terrain.estimation.live.estimator import LiveEstimator
+from terrain.estimation.live import LiveFilter
 from terrain.logs.replay import TWIST
 from terrain.robots import load_robot
 
@@ -34,7 +34,7 @@ class Loop:
 
     def __init__(self, name):
         controller = make_controller(name, TABLE, DELAY_S)
-        self.filter = None if controller.pilot.controller in OPEN_LOOP else LiveEstimator(ROBOT)
+        self.filter = None if controller.pilot.controller in OPEN_LOOP else LiveFilter(ROBOT)
         states = () if self.filter is None else self.filter.states
         self.control = RobotControl(ROBOT, controller.table, controller.pilot, states)
         self.belief, self.seen, self.time_s = TerrainBelief(controller.known_terrain, 1.0), None, math.nan

@@ -15,7 +15,7 @@ from terrain.control.path_tracking import (
     track_step,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.live.estimator import LiveEstimator
+from terrain.estimation.live import LiveFilter
 from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
 from terrain.records import Command
 from terrain.robots import load_robot
@@ -259,7 +259,7 @@ class Tracker:
     """The live filter, the tracking, and the kinematics."""
 
     def __init__(self, settings=SETTINGS):
-        self.estimator, self.settings, self.state = LiveEstimator(ROBOT), settings, TrackState()
+        self.estimator, self.settings, self.state = LiveFilter(ROBOT), settings, TrackState()
         self.pose = [
             self.estimator.states.index(name) for name in ("position_x_m", "position_y_m", "yaw_rad")
         ]

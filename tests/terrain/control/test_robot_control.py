@@ -8,8 +8,8 @@ import pytest
 from terrain.control.pilot_settings import DEFAULT_SETTINGS
 from terrain.control.robot_control import RobotControl, uphill_mps2
 from terrain.control.slip_table import load_slip_table
-from terrain.estimation.live.estimator import LiveEstimator
-from terrain.estimation.live.health import SENSORS, Health
+from terrain.estimation.health import SENSORS, Health
+from terrain.estimation.live import LiveFilter
 from terrain.records import Reading
 from terrain.robots import load_robot
 
@@ -19,7 +19,7 @@ ROBOT = load_robot("agrimaro")
 @pytest.fixture(scope="module")
 def standing():
     """The estimate of a robot that stands, and the states of its filter."""
-    estimator = LiveEstimator(ROBOT)
+    estimator = LiveFilter(ROBOT)
     (seen,) = estimator.step({"wheels": Reading(np.array([0.0]), np.zeros((1, 6)))})
     return seen, estimator.states
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from terrain.errors import DataError
-from terrain.estimation.measurements.resampling import low_pass
 from terrain.estimation.reference import lagged_slip, true_states
+from terrain.estimation.resampling import low_pass
 from terrain.kinematics.true_slip import wheel_and_ground_speed
 from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot

@@ -12,8 +12,8 @@ import terrain
 from terrain.effects import parameters_of
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import filter_run
-from terrain.estimation.live.estimator import LiveEstimator
-from terrain.estimation.measurements.batch import measurement_table
+from terrain.estimation.live import LiveFilter
+from terrain.estimation.table import measurement_table
 from terrain.extension import (
     Correction,
     apply_homes,
@@ -304,7 +304,7 @@ def test_corrections_are_applied_at_the_edge_and_filters_refuse_what_is_not_corr
             found.add(path.relative_to(root).as_posix())
     assert found == EDGES
     robot, run = extended(camera_yaw_rad=0.1), run_of("straight", 5.0)
-    for refused in (lambda: filter_run(run, robot, "vio15"), lambda: LiveEstimator(robot)):
+    for refused in (lambda: filter_run(run, robot, "vio15"), lambda: LiveFilter(robot)):
         with pytest.raises(ConfigError, match="camera_yaw_rad is not corrected"):
             refused()
     check_corrected(extended(force_slip_ratio=0.1))  # which filters do not model
@@ -315,14 +315,14 @@ def test_corrections_are_applied_at_the_edge_and_filters_refuse_what_is_not_corr
 
 def live_estimator(robot, channels):
     believed, correction = correct_live(robot)
-    return LiveEstimator(believed, "vio15", channels, correction=correction)
+    return LiveFilter(believed, "vio15", channels, correction=correction)
 
 
 def test_live_is_live_on_the_corrected_log():
     effects = {name: EVERY[name] for name in EVERY if not name.startswith("clock")}
     run, robot = run_of("straight", 12.0, effects), extended(**effects)
     channels = {name: run.streams[name].channels for name in ("wheels", "steering", "imu", "odometry")}
-    raw, plain = live_estimator(robot, channels), LiveEstimator(corrected(robot), "vio15", channels)
+    raw, plain = live_estimator(robot, channels), LiveFilter(corrected(robot), "vio15", channels)
     unshifted = replace(robot, effects={n: v for n, v in effects.items() if n != "steering_delay_s"})
     raw_now = live_estimator(unshifted, channels)
     found, desired = [], []

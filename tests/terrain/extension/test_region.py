@@ -9,7 +9,7 @@ import yaml
 
 from terrain.errors import ConfigError, OutsideRegionWarning
 from terrain.estimation.estimate import estimate_run
-from terrain.estimation.live.estimator import LiveEstimator
+from terrain.estimation.live import LiveFilter
 from terrain.extension import correct_live, extended_yaml, region_of, warn_outside
 from terrain.logs.replay import replay
 from terrain.robots import Region, load_robot, robot_from
@@ -95,7 +95,7 @@ def test_a_live_filter_warns_once(fastest_mps, n):
     robot, correction = correct_live(
         extended("agrimaro", Region((-fastest_mps, fastest_mps), (-3.0, 3.0), None, ()))
     )
-    estimator = LiveEstimator(robot, correction=correction)
+    estimator = LiveFilter(robot, correction=correction)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for sample in replay(run):

@@ -6,15 +6,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from terrain.estimation.ekf.kernel import HELD_S
-from terrain.estimation.ekf.model import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Given
-from terrain.estimation.ekf.resident import ResidentFilter
+from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S
+from terrain.estimation.filter import GATE_PROBABILITY, HELD_S, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise, schedule_arrays, schedule_tick, scheduled
-from terrain.estimation.live.estimator import LiveEstimator
-from terrain.estimation.measurements.batch import measurement_table
-from terrain.estimation.measurements.derived import REST_AFTER_S
-from terrain.estimation.measurements.table import DERIVED_ROWS
+from terrain.estimation.filters.swerve_noise import default_noise, schedule, scheduled
+from terrain.estimation.live import LiveFilter
+from terrain.estimation.table import measurement_table
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.replay import replay
 from terrain.logs.schema import IMU_CHANNELS
@@ -42,15 +39,14 @@ def parts():
 
 
 def schedule_of(model, noise):
-    """Return what gives the noise of a tick by its rows."""
-    fixed = schedule_arrays(model, noise)
-    given = Given(fixed.variance, np.zeros(len(model.states)), np.zeros(len(model.inputs)))
+    """Return what gives variance, walk and inputs of a tick by its rows."""
+    rows = parts()[2].rows
 
-    def schedule(z):
-        schedule_tick(np.array(z), fixed, *given)
-        return given
+    def of_row(z):
+        columns = lambda names: np.array([[z[rows.index(name)] for name in names]])  # noqa: E731
+        return [part[0] for part in schedule(model, noise.measurement_variance, columns)]
 
-    return schedule
+    return of_row
 
 
 def test_the_schedule_of_a_tick_is_that_of_a_table():
@@ -60,14 +56,14 @@ def test_the_schedule_of_a_tick_is_that_of_a_table():
     unknown = rng.random((len(z), len(DERIVED_ROWS))) < 0.05
     places = [table.rows.index(row) for row in DERIVED_ROWS]
     z[:, places] = np.where(unknown, np.nan, z[:, places])
-    table = replace(table, z=z)
-    varied, inputs = scheduled(model, noise, table)
-    schedule = schedule_of(model, noise)
+    varied, inputs = scheduled(model, noise, replace(table, z=z))
     for n, row in enumerate(z):
-        given = schedule(row)
-        np.testing.assert_allclose(given.measurement_variance, varied.measurement_variance[n], rtol=1e-13)
-        np.testing.assert_allclose(given.walk_variance, varied.walk_variance[n], rtol=1e-13)
-        np.testing.assert_array_equal(given.inputs, inputs[n])
+        for part, expected in zip(
+            schedule_of(model, noise)(row),
+            (varied.measurement_variance[n], varied.walk_variance[n], inputs[n]),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(part, expected)
     assert np.ptp(varied.walk_variance, axis=0).max() > 0.0
 
 
@@ -81,7 +77,7 @@ def test_slip_walks_more_where_it_shakes_where_wheels_accelerate_and_less_withou
         z = np.zeros(len(names))
         for row, value in rows.items():
             z[names.index(row)] = value
-        return np.array(schedule_of(model, noise)(z).walk_variance)
+        return schedule_of(model, noise)(z)[1]
 
     still, shaken, unseen = walk(), walk(vibration_mps2=1.0), walk(vibration_mps2=1.0, camera_age_s=1.0)
     assert still[slip] == 0.0
@@ -97,8 +93,8 @@ def gated_until(name, amount, duration_s=4.0):
     """Return uses of a sensor, tick by tick, whose rows are off by an amount from 6 s on."""
     model, noise, table = parts()
     sensors = dict(model.sensors)
-    resident, schedule, uses, times_s = (
-        ResidentFilter(model, noise, SETTINGS),
+    session, schedule_row, uses, times_s = (
+        Filter(model, noise, SETTINGS),
         schedule_of(model, noise),
         [],
         [],
@@ -109,8 +105,8 @@ def gated_until(name, amount, duration_s=4.0):
     for n, time_s in enumerate(table.time_s):
         if time_s > 6.0 + duration_s:
             break
-        resident.step(float(time_s), z[n], schedule(table.z[n]))
-        uses.append(int(resident.use[model.sensor_names.index(name)]))
+        session.step(float(time_s), z[n], *schedule_row(table.z[n]))
+        uses.append(int(session.use[model.sensor_names.index(name)]))
         times_s.append(time_s)
     return np.array(times_s), np.array(uses)
 
@@ -133,7 +129,7 @@ def driven(motion_of, duration_s=60.0):
 
     The camera gives nothing but in the first two seconds, in which the robot stands; IMU at 100 Hz.
     """
-    rng, estimator, found = np.random.default_rng(4), LiveEstimator(ROBOT), []
+    rng, estimator, found = np.random.default_rng(4), LiveFilter(ROBOT), []
     for k in range(round(duration_s / PERIOD_S)):
         time_s = k * PERIOD_S
         wheel_radps, accel_mps2 = motion_of(time_s)
@@ -197,7 +193,7 @@ def test_the_offset_of_the_imus_yaw_follows_its_drift_and_the_yaw_stays():
     drive = simulate_run(ROBOT, "grass", "straight", 3, duration_s=80.0, faults=Faults(by_chance=False))
 
     def estimated(drift_radps):
-        estimator = LiveEstimator(ROBOT)
+        estimator = LiveFilter(ROBOT)
         places = [estimator.states.index(state) for state in ("imu_yaw_offset_rad", "yaw_rad")]
         times_s, found = [], []
         for sample in replay(drive):

@@ -3,8 +3,8 @@ import pytest
 
 from terrain.angles import wrapped
 from terrain.errors import ConfigError
-from terrain.estimation.ekf.filter import run_filter
 from terrain.estimation.estimate import estimate_run
+from terrain.estimation.filter import run_filter
 from terrain.estimation.filters.skid import (
     FOLLOWS_S,
     MAX_BIAS_RADPS,

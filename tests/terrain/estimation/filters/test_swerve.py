@@ -6,10 +6,8 @@ from numba import njit
 from scipy.stats import chi2
 
 from terrain.errors import ConfigError
-from terrain.estimation.ekf.consistency import nees, sample_from_model
-from terrain.estimation.ekf.filter import run_filter
-from terrain.estimation.ekf.kernel import OBSERVE, PROPAGATE
-from terrain.estimation.ekf.model import FilterSettings, Noise
+from terrain.estimation.consistency import nees, sample_from_model
+from terrain.estimation.filter import OBSERVE, PROPAGATE, FilterSettings, Noise, run_filter
 from terrain.estimation.filters.swerve import FILTERS, make_filter
 from terrain.estimation.filters.swerve_model import (
     observe_slip_ratio,

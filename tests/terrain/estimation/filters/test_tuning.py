@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.ekf.consistency import consistency_report, sample_from_model
-from terrain.estimation.ekf.filter import run_filter
-from terrain.estimation.ekf.model import Noise
+from terrain.estimation.consistency import consistency_report, sample_from_model
+from terrain.estimation.filter import Noise, run_filter
 from terrain.estimation.filters.swerve import make_filter
 from terrain.estimation.filters.swerve_noise import default_noise
 from terrain.estimation.filters.tuning import NoiseGroup, tune_noise

@@ -19,7 +19,7 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.measurements.resampling import low_pass
+from terrain.estimation.resampling import low_pass
 from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.true_slip import wheel_and_ground_speed

@@ -1,0 +1,1005 @@
+"""From samples of sensors to the row of measurements at each tick of the wheels, on one clock and with one delay.
+
+The clock is that of the wheels, whose rates pass the low-pass of the motor driver.  A ground speed that
+is ahead of them makes the slip of a start look negative (Danzi, AgriMaRo thesis, 7.2.2), so every other
+signal goes through a low-pass too, and its own lag and the filter's together are the encoders'.  In order:
+
+1. calibration, gravity and the camera's axes are removed, angles are unwrapped;
+2. channels that repeat themselves to the last bit on a robot that moves are left out, and jumps;
+3. a low-pass, at each sensor's own rate;
+4. at each tick the last sample at or before it, unless it is too old; the low-pass runs on to the tick with
+   that sample as its input, which leaves no delay of the holding;
+5. rows that follow from others: vibration, changes of the wheels' speeds, rest; of a robot that skids the
+   gyro's mean since the last tick.
+
+A whole log (:mod:`terrain.estimation.table`) and the live chain (:mod:`terrain.estimation.live`) take
+the same steps: :func:`take_sample` for each sample, :func:`take_tick` for each tick.
+
+The low-pass
+------------
+With x the samples and m the slope between two of them, dt apart, it is ``tau y' + y = x``, exact for an input
+that is straight from sample to sample: with ``a = exp(-dt/tau)``::
+
+    y_1 = x_1 - tau m + a (y_0 - x_0 + tau m)
+
+so that a ramp is delayed by tau at any rate.  (The usual ``y_1 = a y_0 + (1 - a) x_1`` falls short of it by
+half a step: 10 ms at 50 Hz.)
+
+Rows that follow from others
+----------------------------
+- ``vibration_mps2``: root mean square of the vertical acceleration over the last 0.3 s;
+- ``wheel_<i>_growth_per_s`` and ``wheel_<i>_change_m2ps3``: ``w w' / (w^2 + w_0^2)`` and ``|w w'|`` of a
+  wheel's circumferential speed w behind two low-passes of 0.15 s, with w_0 = 0.1 m/s: what keeps the ratio of
+  a slip speed to w, and what w^2 changes by; without a camera the latter decays within 0.5 s, peaks held;
+- ``camera_age_s``: since the camera last measured a speed;
+- ``rest_speed_*``, ``rest_yaw_rate``: zero, where the robot is at rest: for half a second the wheels have
+  stood, gyro and accelerometer have measured nothing, and a camera, if it measures, no speed.  Locked wheels
+  that slide decelerate the robot: on ice (0.05 of its weight) by more than what counts as nothing.
+
+Of a robot that skids, wheels at 6 Hz leave 15 samples of a gyro at 100 Hz between two ticks.  One of them is
+the yaw rate with all of its vibration; their mean is what the heading changed by.  So the row is the integral
+of the low-passed samples, straight from one to the next, over its time; and where no sample came since, the
+value held.  At rest the yaw rate is zero, and a gyro reads its bias.  Rest is wheels that stand for
+:data:`REST_S` and a gyro that is steady all the while: that of a robot that slides, or is towed with its
+wheels held, is not.  ``rest_gyro`` is its mean over all of that time, once, so that a turn that just begins is
+a small part of it.
+
+A yaw row is ``initial_yaw_rad`` on average while the robot is at rest at the start, or at its first sample.
+A camera that starts late takes the IMU's yaw of that instant instead, and after a loss the turn nearest to
+it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from terrain.angles import wrapped
+from terrain.constants import GRAVITY_MPS2
+from terrain.kernels import filled, record
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.kinematics.camera import QUATERNION_TOLERANCE
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS
+from terrain.records import Array
+from terrain.robots import Robot
+
+TICK_S = 1e-9
+"""Stamps that differ by less are the same instant, rounded differently by two clocks."""
+
+MAX_AGE_PERIODS = 1.5
+"""A value is held until the next one is due and half a period more, of the slower of sensor and clock."""
+
+GAP_PERIODS = 5.5
+"""After a longer gap the low-pass starts anew: its memory is not the recent past of the next sample.  Steps
+are whole periods, so that half of one between two of them leaves nothing to how stamps are rounded, nor to
+whether the period is that of a description (live) or the median of a log (batch)."""
+
+BELIEVED_S = 0.1
+"""A value that has jumped and stays is accepted after this long: it is left to the filter's gate."""
+
+PASSING, LATCHED, SUBTRACTED = range(3)
+"""What becomes of a value that jumped: it is accepted after a while; it is left out until it jumps back, as a
+speed over ground cannot have jumped; its jump is taken off, as a heading counts from anywhere."""
+
+JUMPS: dict[str, tuple[float, float, int]] = {
+    "accel_mps2": (20.0, 1000.0, PASSING),
+    "gyro_z_radps": (0.5, 20.0, PASSING),
+    "imu_yaw_rad": (0.1, 4.0, PASSING),
+    "steer_rad": (0.1, 5.0, PASSING),
+    "camera_speed_mps": (0.1, 5.0, LATCHED),
+    "camera_yaw_rate_radps": (0.2, 20.0, PASSING),
+    "camera_yaw_rad": (0.1, 4.0, SUBTRACTED),
+    "tilt_rad": (0.05, 3.0, LATCHED),
+}
+"""Largest change of a row between two samples: noise, and a second what a robot can do: half a g of speed,
+two thirds of a turn, twice the fastest steering; an accelerometer on rough terrain sees several g; roll and
+pitch turn by 3 rad/s at the most, and a jump tilts gravity.  Then what becomes of a value that jumped."""
+
+NO_JUMP = (math.inf, math.inf, PASSING)
+"""Of a row whose changes are not judged."""
+
+MIN_CONFIDENCE_RATIO = 0.34
+"""The camera tells 0, 1/3, 2/3 or 1; at 1/3 (low) and below it has lost its features."""
+
+MAX_RATE_FACTOR = 2.0
+"""Wheel rates above this multiple of the motor's maximum are discarded."""
+
+LATE_S = 0.5
+"""A camera whose first sample comes later than this after the clock's may have missed a turn."""
+
+STANDING_S = 1.0
+"""Longest stretch, before the wheels turn, over which the heading at the start is averaged."""
+
+STANDING_SPEED_MPS = 0.05
+"""Wheel circumferential speed below which a wheel counts as standing (thesis 7.2.1)."""
+
+GNSS_LATENCY_S = 0.1
+"""Age of a position when it arrives; assumed, as in the simulated receiver."""
+
+GNSS_STD_M = {True: 0.02, False: 0.5}
+"""Position's standard deviation with a fix (RTK, thesis 5.1.1) and with a float solution (assumed)."""
+
+GNSS_SPEED_STD_MPS = 0.03
+"""Of the Doppler speed; assumed, as in the simulated receiver."""
+
+GNSS_PERIOD_S = 0.1
+"""Between two positions; no robot's description tells it."""
+
+VIBRATION_S, CHANGE_S = 0.3, 0.15
+"""Memory of the vibration; low-passes of the wheels' speeds.  Behind one of them, the change of a speed would
+correlate with the noise of the speed itself, and slip speeds that grow by it would drift."""
+
+MOVING_MPS = 0.05
+"""A wheel that turns faster moves, and shakes what is mounted on the robot."""
+
+RIPPLE_MPS = 0.03
+"""A wheel's speed is that far from its low-passed one by the ripple of the Hall steps, a saw-tooth: what grew
+by it would drift."""
+
+WAVERING_MPS = 0.02
+"""By so much the two low-passed speeds of a wheel differ in steady motion."""
+
+CRAWL_MPS = 0.1
+"""w_0: well below it a slip speed no longer follows the speed of its wheel."""
+
+REST_AFTER_S = 0.5
+"""Time for which nothing has to move."""
+
+REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.01, 0.03, 0.4, 0.05
+"""What counts as nothing, of a wheel's low-passed speed, the gyro, the accelerometer and the camera: biases
+and noise at rest stay below, as does a wheel that is held to and fro on soft ground."""
+
+UNSEEN_AFTER_S = 0.15
+"""Age of the camera's speed from which on there is none."""
+
+HELD_S = 0.5
+"""Without a camera a change of a wheel's speed counts for so long: the body, and slip, follow it late."""
+
+REST_S = 1.0
+"""So long wheels and gyro have to be steady: a robot that stops still rocks for half of it."""
+
+STANDING_MPS = 0.01
+"""Wheel circumferential speed below which a side stands: a few steps of an encoder in a sample."""
+
+STEADY_RADPS = 0.02
+"""Largest range of a gyro that is at rest.  Measured at rest its samples scatter by 0.002 rad/s (Husky on
+snow); an engine or wind that shakes the robot by more makes it unknown whether it rests."""
+
+MAX_READING_RADPS = 0.1
+"""No gyro has a larger bias: a robot on a turntable is not at rest."""
+
+REPEATED_IMU = np.array([10.0] * 6 + [15.0] * 3)
+"""Repetitions from which on a channel counts as frozen: 0.1 s of a rate, 0.15 s of an attitude."""
+
+REPEATED_CAMERA = np.array([np.inf] * 3 + [20.0] * 4 + [10.0] * 6 + [np.inf])
+"""Of the camera, at 200 Hz: 0.1 s of the quaternion, 0.05 s of a velocity; its position is not used."""
+
+REPEATED_SPEED = np.full(2, 10.0)
+REPEATED_WHEELS = np.full(3, 5.0)
+"""Of the camera's speed in the body's axes, and of the rate of each motor."""
+
+LONGER, LIVELY = 4.0, 2.0
+"""A coarse channel repeats itself by nature: what counts as frozen is four times the longest run that has
+ended in motion.  Wheels are compared with each other: where all of them turn evenly, their rates may be
+rounded; one is frozen while another has repeated itself twice at most."""
+
+SAME = 1e-12
+"""Values that differ by less are the same, turned into other axes and back."""
+
+UNMEASURED_AFTER_S = 0.5
+"""After this time without a rate or an angle, the motion of a wheel is unknown."""
+
+STREAMS = {
+    "steering": STEERING_CHANNELS,
+    "imu": IMU_CHANNELS,
+    "odometry": CAMERA_CHANNELS,
+    "gnss": GNSS_CHANNELS,
+}
+"""Channels of each stream but the wheels, in the order in which the kernels know streams and channels."""
+
+STEERING, IMU, ODOMETRY, GNSS = range(len(STREAMS))
+"""Number of each stream."""
+
+N_CHANNELS = max(map(len, STREAMS.values()))
+
+NOISY = {"imu": slice(0, 6), "odometry": slice(3, 13)}
+"""Channels that never repeat themselves all at once, of streams that are left out where they do."""
+
+CAMERA_ROWS = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
+GNSS_ROWS = ("gnss_position_x_m", "gnss_position_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps")
+DERIVED_ROWS = (
+    "vibration_mps2",
+    *(f"wheel_{i}_growth_per_s" for i in (1, 2, 3)),
+    *(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)),
+    "camera_age_s",
+    *("rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
+)
+SIDE_ROWS = ("wheel_left_mps", "wheel_right_mps")
+REST_ROW = "rest_gyro_radps"
+ROWS = (
+    *(f"wheel_{i}_radps" for i in (1, 2, 3)),
+    "accel_x_mps2",
+    "accel_y_mps2",
+    "gyro_z_radps",
+    "imu_yaw_rad",
+    *(f"steer_{i}_rad" for i in (1, 2, 3)),
+    *CAMERA_ROWS,
+    *GNSS_ROWS,
+    *DERIVED_ROWS,
+    *SIDE_ROWS,
+    REST_ROW,
+)
+"""Names of all numbers of a :data:`ROW`, in its order."""
+
+_SIDES = (*SIDE_ROWS, "gyro_z_radps", *GNSS_ROWS, REST_ROW)
+ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {
+    "swerve": ROWS[:-3],
+    "skid_steer": _SIDES,
+    "tracked": _SIDES,
+}
+"""Rows that a drive measures, of a swerve robot in the order of (6.3).
+
+Positions and GNSS speeds are in the world frame, east and north from where the antenna first was; yaw counts
+from east once the heading at the start is given; all else is in body axes."""
+
+_SIGNALS = {
+    "steer_rad": "steering",
+    "accel_mps2": "imu",
+    "gyro_z_radps": "imu",
+    "imu_yaw_rad": "imu",
+    "tilt_rad": "imu",
+    "camera_speed_mps": "odometry",
+    "camera_yaw_rate_radps": "odometry",
+    "camera_yaw_rad": "odometry",
+    "gnss_position_m": "gnss",
+    "gnss_speed_mps": "gnss",
+}
+"""What is behind a low-pass and held, by the stream that measures it."""
+
+_SIZES = {
+    "steer_rad": 3,
+    **dict.fromkeys(("accel_mps2", "tilt_rad", "camera_speed_mps", "gnss_position_m", "gnss_speed_mps"), 2),
+}
+
+ROW = record(
+    {
+        "wheel_radps": (float, 3),
+        "accel_mps2": (float, 2),
+        "gyro_z_radps": float,
+        "imu_yaw_rad": float,
+        "steer_rad": (float, 3),
+        "camera_speed_mps": (float, 2),
+        "camera_yaw_rate_radps": float,
+        "camera_yaw_rad": float,
+        "gnss_position_m": (float, 2),
+        "gnss_speed_mps": (float, 2),
+        "vibration_mps2": float,
+        "growth_per_s": (float, 3),
+        "change_m2ps3": (float, 3),
+        "camera_age_s": float,
+        "rest_twist": (float, 3),
+        "side_mps": (float, 2),
+        "rest_gyro_radps": float,
+        "gnss_variance": (float, 4),
+    }
+)
+"""What is measured at a tick, NaN where nothing is: the numbers of :data:`ROWS`, and the variances of
+:data:`GNSS_ROWS`."""
+
+LIMIT = record(
+    {
+        **dict.fromkeys(("time_constant_s", "gap_s", "age_s", "jump", "jump_per_s"), float),
+        "once": bool,
+        "policy": int,
+    }
+)
+"""What is constant of a signal: low-pass, longest step, oldest value, the largest change between two samples
+(a constant, and a part per second), whether a sample is given at one tick only, and what becomes of a jump."""
+
+LINE = record(
+    {
+        **dict.fromkeys(("value", "instant_s", "came_s", "low_passed"), float),
+        "was_given": bool,
+        **dict.fromkeys(("judged", "judged_s", "jumping_s"), float),
+        **dict.fromkeys(("raw", "raw_s", "jumped_by", "jumped_s"), float),
+        "is_followed": bool,
+    }
+)
+"""Memory of a signal: value, instant, arrival and low-pass output of the last sample, whether it was given at a
+tick; value and instant that jumps are judged against, since when values have been jumping; and of a signal
+that is not passing the last sample, taken or not, its instant, the sum of its jumps, since when that is not 0,
+and whether a sample before it is known to be right."""
+
+CHANNEL = record({**dict.fromkeys(("last", "repeated", "longest"), float), "began_in_motion": bool})
+"""Of a channel that may freeze: last value, number of repetitions, longest run, and whether this one began in
+motion."""
+
+TURN = record({"last_rad": float, "turned_rad": float})
+"""Of an unwrapped angle the last one, and the turns so far."""
+
+AVERAGE = record({"sum": float, "n": int, "mean": float})
+
+SETTINGS = record(
+    {
+        **{name: (LIMIT, _SIZES.get(name, ())) for name in _SIGNALS},
+        "latency_s": (float, len(STREAMS)),
+        "is_steered": bool,
+        **dict.fromkeys(("reduction_ratio", "fastest_radps", "wheel_radius_m", "initial_yaw_rad"), float),
+        "steering_zeros_rad": (float, 3),
+        "gyro_bias_radps": float,
+        **dict.fromkeys(("accel_bias_mps2", "accel_scale_ratio"), (float, 3)),
+    }
+)
+"""What is constant of a robot's feed."""
+
+FEED = record(
+    {
+        **{name: (LINE, _SIZES.get(name, ())) for name in _SIGNALS},
+        "steer_turns": (TURN, 3),
+        **dict.fromkeys(("imu_turns", "camera_turns"), TURN),
+        "camera_yaw_0_rad": float,
+        "imu_channels": (CHANNEL, 9),
+        "camera_channels": (CHANNEL, 14),
+        "speed_channels": (CHANNEL, 2),
+        "wheel_channels": (CHANNEL, 3),
+        "before": (float, (2, N_CHANNELS)),
+        "last_s": (float, len(STREAMS)),
+        "gnss_origin_m": (float, 2),
+        "gnss_variance": float,
+        **dict.fromkeys(("vibration_square", "vibration_s", "tick_s", "rest_since_s", "camera_s"), float),
+        **dict.fromkeys(("wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3"), (float, 3)),
+        **dict.fromkeys(("rate_received_s", "steer_received_s"), (float, 3)),
+        "start_s": float,
+        "has_moved": bool,
+        "camera_has_started": bool,
+        "camera_offset_rad": float,
+        **dict.fromkeys(("imu_yaw_start", "camera_yaw_start"), AVERAGE),
+        **dict.fromkeys(("gyro_angle_rad", "gyro_time_s"), float),
+        **dict.fromkeys(("standing_s", "gyro_low_radps", "gyro_high_radps", "gyro_sum_radps"), float),
+        "n_gyro": int,
+        **dict.fromkeys(("frozen", "low_confidence", "no_rotation", "jumps"), (int, len(STREAMS))),
+        **dict.fromkeys(("wheels_not_finite", "wheels_beyond"), int),
+    }
+)
+"""All that is remembered of the samples: a copy is a snapshot.
+
+The signals; turns of angles; channels that may freeze; the last complete sample of IMU and camera, and of each
+stream the last stamp taken; positions' origin and variance; what the derived rows need; what each wheel was
+measured by last; the yaw at the start; the gyro since the last tick, and at rest; and counts of what was left
+out."""
+
+_kernel = njit(cache=True, error_model="numpy")
+
+
+def feed_settings(
+    robot: Robot,
+    initial_yaw_rad: float,
+    latency_s: Sequence[float],
+    lag_s: Mapping[str, float],
+    period_s: Mapping[str, float],
+    tick_s: float,
+) -> Array:
+    """Return what is constant of a robot's feed.
+
+    Parameters
+    ----------
+    robot : neutral values stand for what it does not have
+    initial_yaw_rad : heading of the start
+    latency_s : of each of :data:`STREAMS`
+    lag_s, period_s : time constant of the low-pass on each stream, and its period; NaN without one
+    tick_s : period of the wheels
+    """
+    motors, sensors = robot.completed.motors, robot.completed.sensors
+    zeros = robot.steering_zeros_rad.tolist()
+    settings = filled(
+        SETTINGS,
+        latency_s=latency_s,
+        is_steered=robot.steered,
+        reduction_ratio=motors.reduction_ratio,
+        fastest_radps=MAX_RATE_FACTOR * motors.speed_max_radps,
+        wheel_radius_m=robot.wheel_radius_m,
+        initial_yaw_rad=initial_yaw_rad,
+        steering_zeros_rad=(zeros + [0.0] * 3)[:3],
+        gyro_bias_radps=sensors.gyro_bias_z_radps,
+        accel_bias_mps2=[getattr(sensors, f"accel_bias_{axis}_mps2") for axis in "xyz"],
+        accel_scale_ratio=[getattr(sensors, f"accel_scale_{axis}_ratio") for axis in "xyz"],
+    )
+    for name, stream in _SIGNALS.items():
+        judged = robot.steered or name in ("gyro_z_radps", "tilt_rad")
+        jump = JUMPS.get(name, NO_JUMP) if judged else NO_JUMP
+        period = period_s.get(stream, math.nan)
+        if name == "tilt_rad":
+            settings[name] = signal_limits(0.0, 0.02, 0.0, jump)
+        else:
+            settings[name] = signal_limits(lag_s.get(stream, 0.0), period, tick_s, jump)
+    return settings
+
+
+def signal_limits(
+    time_constant_s: float, period_s: float, tick_s: float, jump: tuple[float, float, int] = NO_JUMP
+) -> Array:
+    """Return the :data:`LIMIT` (1,) of a signal.
+
+    Parameters
+    ----------
+    time_constant_s : of its low-pass; 0 for none
+    period_s, tick_s : of its sensor, and of the clock
+    jump : largest change between two samples: a constant, a part per second, and what becomes of a jump
+    """
+    return filled(
+        LIMIT,
+        time_constant_s=time_constant_s,
+        gap_s=GAP_PERIODS * period_s,
+        age_s=MAX_AGE_PERIODS * np.fmax(period_s, tick_s),
+        once=period_s > MAX_AGE_PERIODS * tick_s + TICK_S,
+        jump=jump[0],
+        jump_per_s=jump[1],
+        policy=jump[2],
+    )
+
+
+def new_feed() -> Array:
+    """Return the memory before the first sample."""
+    feed = filled(
+        FEED, np.nan, last_s=-np.inf, rate_received_s=-np.inf, steer_received_s=-np.inf, camera_offset_rad=0.0
+    )
+    feed["gyro_angle_rad"] = feed["gyro_time_s"] = 0.0
+    for name in ("imu_channels", "camera_channels", "speed_channels", "wheel_channels"):
+        feed[name]["repeated"] = feed[name]["longest"] = 0.0
+    for name in ("imu_yaw_start", "camera_yaw_start"):
+        feed[name] = 0
+    return feed
+
+
+@_kernel
+def low_pass_step(value: float, before: float, smooth: float, step_s: float, time_constant_s: float) -> float:
+    """Return y_1 of the equation above: from x_0 = ``before`` and y_0 = ``smooth`` to x_1 = ``value``."""
+    lead = time_constant_s * (value - before) / step_s
+    return value - lead + math.exp(-step_s / time_constant_s) * (smooth - before + lead)
+
+
+@_kernel
+def sum_of_jumps(value: float, instant_s: float, line: Any, limit: Any) -> float:
+    """Return the sum of a signal's jumps: 0 after one that jumped back, and for a latched one after a gap."""
+    step_s, change = instant_s - line.raw_s, value - line.raw
+    line.raw, line.raw_s = value, instant_s
+    before = line.jumped_by
+    if math.isnan(step_s) or (limit.policy == LATCHED and step_s > limit.gap_s):
+        line.jumped_by, line.is_followed = 0.0, False
+    else:
+        if abs(change) > limit.jump + limit.jump_per_s * step_s and line.is_followed:
+            line.jumped_by += change  # of the first sample after a gap it was that one that was wrong
+            if abs(line.jumped_by) <= 0.5 * limit.jump:
+                line.jumped_by = 0.0
+        line.is_followed = True
+    if line.jumped_by == 0.0:
+        line.jumped_s = np.nan
+    elif before == 0.0:
+        line.jumped_s = instant_s
+    return float(line.jumped_by)
+
+
+@_kernel
+def take(value: float, instant_s: float, came_s: float, line: Any, limit: Any) -> bool:
+    """Put a sample behind the low-pass of its signal; return True, and do not, where it jumped."""
+    if math.isnan(value):
+        return False
+    if limit.policy != PASSING:
+        jumped_by = sum_of_jumps(value, instant_s, line, limit)
+        if limit.policy == LATCHED and jumped_by != 0.0:
+            return True
+        value -= jumped_by
+    elif abs(value - line.judged) > limit.jump + limit.jump_per_s * (instant_s - line.judged_s):
+        if math.isnan(line.jumping_s):
+            line.jumping_s = instant_s
+        if instant_s - line.jumping_s < BELIEVED_S - TICK_S:
+            return True
+    line.judged, line.judged_s, line.jumping_s = value, instant_s, np.nan
+    step_s, smooth = instant_s - line.instant_s, value
+    if limit.time_constant_s > 0.0 and step_s <= limit.gap_s:
+        smooth = low_pass_step(value, line.value, line.low_passed, step_s, limit.time_constant_s)
+    line.value, line.instant_s, line.came_s, line.low_passed = value, instant_s, came_s, smooth
+    line.was_given = False
+    return False
+
+
+@_kernel
+def at_tick(time_s: float, line: Any, limit: Any) -> float:
+    """Return a signal's value at a tick, the low-pass run on to it; NaN where too old or given before.
+
+    From the sample to the tick its input is held, and the held value adds no delay: the tick's value is the
+    sample's plus what the low-pass is still behind it, ``(y - x) exp(-dt/tau)``.
+    """
+    given = limit.once and line.was_given
+    line.was_given = True
+    if given or not time_s - line.came_s <= limit.age_s + TICK_S:
+        return np.nan
+    behind = line.low_passed - line.value
+    if limit.time_constant_s > 0.0:
+        behind *= math.exp((line.instant_s - time_s) / limit.time_constant_s)
+    return float(line.value + behind)
+
+
+@_kernel
+def repeats(channel: Any, most: float) -> bool:
+    """Say whether a channel has repeated itself for longer than it does by nature."""
+    return bool(channel.repeated >= max(most, LONGER * channel.longest))
+
+
+@_kernel
+def mask_frozen(sample: Array, most: Array, moving: bool, channels: Any) -> Array:
+    """Return a sample (c,) with NaN where a channel is frozen, and count its repetitions."""
+    masked = sample.copy()
+    for c in range(most.size):
+        channel = channels[c]
+        if abs(sample[c] - channel.last) <= SAME:
+            channel.repeated += 1.0
+        elif not np.isnan(sample[c]):
+            if moving and channel.began_in_motion:
+                channel.longest = max(channel.longest, channel.repeated)
+            channel.repeated, channel.began_in_motion = 0.0, moving
+        if not np.isnan(sample[c]):
+            channel.last = sample[c]
+        if moving and repeats(channel, most[c]):
+            masked[c] = np.nan
+    return masked
+
+
+@_kernel
+def is_moving(feed: Any) -> bool:
+    """Say whether a wheel turns faster than a crawl, by the low-passed speeds."""
+    moving = False
+    for i in range(3):
+        moving |= abs(feed.wheel_once_mps[i]) > MOVING_MPS
+    return bool(moving)
+
+
+@_kernel
+def _unwrap(angle_rad: float, turn: Any) -> float:
+    """Return the angle without jumps of a turn."""
+    if math.isnan(angle_rad):
+        return np.nan
+    step = angle_rad - turn.last_rad
+    if math.isnan(step):
+        turn.turned_rad = 0.0
+    elif abs(step) >= np.pi:
+        short = (step + np.pi) % (2 * np.pi) - np.pi
+        if short == -np.pi and step > 0:
+            short = np.pi
+        turn.turned_rad += short - step
+    turn.last_rad = angle_rad
+    return float(angle_rad + turn.turned_rad)
+
+
+@_kernel
+def _take_steering(sample: Array, came_s: float, settings: Any, feed: Any) -> bool:
+    """Steering angles without their zeros; the first one lies within half a turn."""
+    jumped = False
+    for i in range(3):
+        angle = _unwrap(wrapped(sample[i] - settings.steering_zeros_rad[i]), feed.steer_turns[i])
+        jumped |= take(angle, came_s, came_s, feed.steer_rad[i], settings.steer_rad[i])
+    return bool(jumped)
+
+
+@_kernel
+def _take_gyro(gyro_radps: float, instant_s: float, came_s: float, settings: Any, feed: Any) -> bool:
+    """Take the yaw rate, and add it to the angle since the last tick."""
+    before_s, before_radps = feed.gyro_z_radps.instant_s, feed.gyro_z_radps.low_passed
+    if take(gyro_radps, instant_s, came_s, feed.gyro_z_radps, settings.gyro_z_radps):
+        return True
+    step_s = feed.gyro_z_radps.instant_s - before_s
+    if 0.0 < step_s <= settings.gyro_z_radps.gap_s:
+        feed.gyro_angle_rad += 0.5 * (before_radps + feed.gyro_z_radps.low_passed) * step_s
+        feed.gyro_time_s += step_s
+    return False
+
+
+@_kernel
+def _take_vibration(accel_z_mps2: float, instant_s: float, feed: Any) -> None:
+    """Take the vertical acceleration of an IMU sample, without gravity, into the mean square."""
+    if math.isnan(accel_z_mps2):
+        return
+    step_s = instant_s - feed.vibration_s
+    feed.vibration_s = instant_s
+    square = accel_z_mps2 * accel_z_mps2
+    if not step_s > 0.0 or math.isnan(feed.vibration_square):
+        feed.vibration_square = square
+        return
+    feed.vibration_square += (square - feed.vibration_square) * -math.expm1(-step_s / VIBRATION_S)
+
+
+@_kernel
+def _take_imu(sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any) -> bool:
+    """Calibrated yaw rate, acceleration of the body without gravity, and yaw.
+
+    A sample is ``scale * truth + bias``.  The specific force at rest is g times the world's vertical in body
+    axes, ``g (-sin pitch, sin roll cos pitch, cos roll cos pitch)``: with the nose up (pitch negative) it
+    points forward too, with the left side up (roll positive) to the left.
+    """
+    gyro_z = sample[2]
+    roll, pitch, yaw = sample[6], sample[7], sample[8]
+    for i in range(2):
+        if not math.isnan(sample[6 + i]):
+            line, limit = feed.tilt_rad[i], settings.tilt_rad[i]
+            if sum_of_jumps(sample[6 + i], instant_s, line, limit) != 0.0:
+                roll = pitch = np.nan
+    bias, scale = settings.accel_bias_mps2, settings.accel_scale_ratio
+    accel_x = (sample[3] - bias[0]) / scale[0] + GRAVITY_MPS2 * math.sin(pitch)
+    level_y = GRAVITY_MPS2 * math.sin(roll) * math.cos(pitch)
+    accel_y = (sample[4] - bias[1]) / scale[1] - level_y
+    jumped = take(accel_x, instant_s, came_s, feed.accel_mps2[0], settings.accel_mps2[0])
+    jumped |= take(accel_y, instant_s, came_s, feed.accel_mps2[1], settings.accel_mps2[1])
+    jumped |= _take_gyro(gyro_z - settings.gyro_bias_radps, instant_s, came_s, settings, feed)
+    yaw = _unwrap(yaw, feed.imu_turns)
+    jumped |= take(yaw, instant_s, came_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
+    level_z = GRAVITY_MPS2 * math.cos(roll) * math.cos(pitch)
+    _take_vibration((sample[5] - bias[2]) / scale[2] - level_z, instant_s, feed)
+    return bool(jumped)
+
+
+@_kernel
+def _take_odometry(
+    sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any, moving: bool
+) -> bool:
+    """Speed of the camera point, yaw rate and yaw: ``kinematics.camera.body_motion`` of one sample."""
+    # the camera's axes renamed to the body's: (-z, -x, y), of vectors and of the quaternion's vector alike
+    x, y, z, w = -sample[5], -sample[3], sample[4], sample[6]
+    v_x, v_y, v_z = -sample[9], -sample[7], sample[8]
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    if not abs(norm - 1.0) <= QUATERNION_TOLERANCE:
+        feed.no_rotation[ODOMETRY] += not math.isnan(norm)
+        return False
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    r_00, r_11 = x * x - y * y - z * z + w * w, -x * x + y * y - z * z + w * w
+    r_01, r_10 = 2.0 * (x * y - z * w), 2.0 * (x * y + z * w)
+    r_20, r_21 = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w)
+    yaw = _unwrap(math.atan2(r_10, r_00), feed.camera_turns)
+    if math.isnan(feed.camera_yaw_0_rad):
+        feed.camera_yaw_0_rad = yaw
+    speed_x = r_00 * v_x + r_10 * v_y + r_20 * v_z
+    speed_y = r_01 * v_x + r_11 * v_y + r_21 * v_z
+    speed = mask_frozen(np.array([speed_x, speed_y]), REPEATED_SPEED, moving, feed.speed_channels)
+    turned_by = feed.camera_yaw_rad.jumped_by
+    yaw -= feed.camera_yaw_0_rad
+    jumped = take(yaw, instant_s, came_s, feed.camera_yaw_rad, settings.camera_yaw_rad)
+    turned = (
+        feed.camera_yaw_rad.jumped_by != turned_by
+    )  # that turns the speeds: they have not jumped themselves
+    for i in range(2):
+        line = feed.camera_speed_mps[i]
+        if turned:
+            line.raw = speed[i]
+        jumped |= take(speed[i], instant_s, came_s, line, settings.camera_speed_mps[i])
+    line, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
+    jumped |= take(sample[11], instant_s, came_s, line, limit)
+    return bool(jumped)
+
+
+@_kernel
+def _take_gnss(sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any) -> None:
+    """Position from the origin, by default the first one, and speed; the position's variance is kept."""
+    std = sample[4]
+    if not std > 0.0:
+        std = _FIX_STD_M if sample[5] >= 0.5 else _FLOAT_STD_M
+    if not (math.isnan(sample[0]) or math.isnan(sample[1])):
+        if math.isnan(feed.gnss_origin_m[0]):
+            feed.gnss_origin_m[0], feed.gnss_origin_m[1] = sample[0], sample[1]
+        feed.gnss_variance = std * std
+        for i in range(2):
+            value = sample[i] - feed.gnss_origin_m[i]
+            take(value, instant_s, came_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
+    for i in range(2):
+        take(sample[2 + i], instant_s, came_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
+
+
+_FIX_STD_M, _FLOAT_STD_M = GNSS_STD_M[True], GNSS_STD_M[False]
+
+
+@_kernel
+def take_sample(
+    stream: int, sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any
+) -> None:
+    """Take a sample (channels,) of any stream but the wheels, that was measured and arrived at two instants."""
+    moving, jumped = is_moving(feed), False
+    if stream == STEERING:
+        jumped = _take_steering(sample, came_s, settings, feed)
+    elif stream == IMU:
+        sample = mask_frozen(sample, REPEATED_IMU, moving, feed.imu_channels)
+        jumped = _take_imu(sample, instant_s, came_s, settings, feed)
+    elif stream == ODOMETRY:
+        sample = mask_frozen(sample, REPEATED_CAMERA, moving, feed.camera_channels)
+        jumped = _take_odometry(sample, instant_s, came_s, settings, feed, moving)
+    else:
+        _take_gnss(sample, instant_s, came_s, settings, feed)
+    feed.jumps[stream] += jumped
+
+
+@_kernel
+def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
+    """Write the rates (3,) of the wheels, or the speeds (2,) of the sides."""
+    for i in range(3):
+        row.wheel_radps[i] = np.nan
+    if not settings.is_steered:
+        row.side_mps[0], row.side_mps[1] = wheels[0], wheels[1]
+        return
+    moving, lively, finite, beyond = is_moving(feed), False, True, False
+    mask_frozen(wheels, REPEATED_WHEELS, moving, feed.wheel_channels)
+    for i in range(3):
+        lively |= feed.wheel_channels[i].repeated <= LIVELY
+    for i in range(3):
+        frozen = moving and lively and repeats(feed.wheel_channels[i], REPEATED_WHEELS[i])
+        rate = wheels[i] / settings.reduction_ratio
+        known = math.isfinite(rate)
+        too_fast = known and abs(rate) > settings.fastest_radps
+        finite &= known
+        beyond |= too_fast
+        row.wheel_radps[i] = np.nan if too_fast or not known or frozen else rate
+    feed.wheels_not_finite += not finite
+    feed.wheels_beyond += beyond
+
+
+@_kernel
+def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
+    """Write the rows that follow from others."""
+    step_s = time_s - feed.tick_s
+    feed.tick_s = time_s
+    row.vibration_mps2 = math.sqrt(feed.vibration_square)
+    still = True
+    keep = math.exp(-step_s / CHANGE_S) if step_s > 0.0 else 0.0
+    if not math.isnan(row.camera_speed_mps[0]):
+        feed.camera_s = time_s
+    unseen = not time_s - feed.camera_s <= UNSEEN_AFTER_S
+    for i in range(3):
+        speed = row.wheel_radps[i] * settings.wheel_radius_m
+        once, twice = feed.wheel_once_mps[i], feed.wheel_twice_mps[i]
+        still &= abs(twice) <= REST_WHEEL_MPS and abs(speed) <= MOVING_MPS
+        rise = once - twice
+        change = twice * math.copysign(max(abs(rise) - WAVERING_MPS, 0.0), rise) / CHANGE_S
+        row.growth_per_s[i] = change / (twice * twice + CRAWL_MPS * CRAWL_MPS)
+        ahead = max(abs(speed - once) - RIPPLE_MPS, 0.0)
+        change = (abs(speed) + CRAWL_MPS) * ahead / CHANGE_S
+        held = feed.wheel_change_m2ps3[i] * math.exp(-step_s / HELD_S) if step_s > 0.0 else np.nan
+        feed.wheel_change_m2ps3[i] = change if math.isnan(held) or change > held else held
+        row.change_m2ps3[i] = feed.wheel_change_m2ps3[i] if unseen else change
+        if math.isnan(once) or not step_s > 0.0:
+            feed.wheel_once_mps[i] = feed.wheel_twice_mps[i] = speed
+        elif not math.isnan(speed):
+            feed.wheel_twice_mps[i] = once + (twice - once) * keep
+            feed.wheel_once_mps[i] = speed + (once - speed) * keep
+    still &= abs(row.gyro_z_radps) <= REST_TURN_RADPS
+    for i in range(2):
+        still &= abs(row.accel_mps2[i]) <= REST_ACCEL_MPS2
+        still &= not abs(row.camera_speed_mps[i]) > REST_SEEN_MPS
+    if not still:
+        feed.rest_since_s = np.nan
+    elif math.isnan(feed.rest_since_s):
+        feed.rest_since_s = time_s
+    row.camera_age_s = time_s - feed.camera_s
+    rests = time_s - feed.rest_since_s >= REST_AFTER_S
+    for i in range(3):
+        row.rest_twist[i] = 0.0 if rests else np.nan
+    if rests:
+        for i in range(2):  # at rest a camera that measures none is right again
+            line = feed.camera_speed_mps[i]
+            if abs(line.raw) <= REST_SEEN_MPS:
+                line.jumped_by, line.jumped_s = 0.0, np.nan
+
+
+@_kernel
+def rest_at(time_s: float, left_mps: float, right_mps: float, gyro_radps: float, feed: Any) -> float:
+    """Return the mean of the gyro over the last :data:`REST_S` at rest, once for each such time; else NaN.
+
+    Parameters
+    ----------
+    time_s : increasing; a stamp that was set back starts anew
+    left_mps, right_mps, gyro_radps : measurements, NaN where there is none
+    feed : memory, which is moved
+    """
+    stands = abs(left_mps) < STANDING_MPS and abs(right_mps) < STANDING_MPS
+    if not (stands and abs(gyro_radps) < MAX_READING_RADPS):
+        feed.standing_s = np.nan
+        return np.nan
+    low, high = min(feed.gyro_low_radps, gyro_radps), max(feed.gyro_high_radps, gyro_radps)
+    if not (high - low <= STEADY_RADPS and time_s > feed.standing_s):
+        feed.standing_s, feed.n_gyro = time_s, 1
+        feed.gyro_low_radps = feed.gyro_high_radps = feed.gyro_sum_radps = gyro_radps
+        return np.nan
+    feed.gyro_low_radps, feed.gyro_high_radps = low, high
+    feed.gyro_sum_radps += gyro_radps
+    feed.n_gyro += 1
+    if time_s - feed.standing_s < REST_S - TICK_S:
+        return np.nan
+    mean_radps = feed.gyro_sum_radps / feed.n_gyro
+    feed.standing_s, feed.gyro_sum_radps, feed.n_gyro = time_s, 0.0, 0
+    return float(mean_radps)
+
+
+@_kernel
+def take_tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
+    """Write the row of a tick but for its yaw, which :func:`refer_yaw` counts from the start.
+
+    ``wheels`` are the rates (3,) of the motors, or the speeds (2,) of the sides.
+    """
+    _take_wheels(wheels, settings, feed, row)
+    for i in range(2):
+        row.accel_mps2[i] = at_tick(time_s, feed.accel_mps2[i], settings.accel_mps2[i])
+        row.camera_speed_mps[i] = at_tick(time_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
+        row.gnss_position_m[i] = at_tick(time_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
+        row.gnss_speed_mps[i] = at_tick(time_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
+        unknown = math.isnan(row.gnss_position_m[i])
+        row.gnss_variance[i] = np.nan if unknown else feed.gnss_variance
+        row.gnss_variance[2 + i] = np.nan if math.isnan(row.gnss_speed_mps[i]) else GNSS_SPEED_STD_MPS**2
+    for i in range(3):
+        row.steer_rad[i] = at_tick(time_s, feed.steer_rad[i], settings.steer_rad[i])
+    row.gyro_z_radps = at_tick(time_s, feed.gyro_z_radps, settings.gyro_z_radps)
+    row.imu_yaw_rad = at_tick(time_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
+    line, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
+    row.camera_yaw_rate_radps = at_tick(time_s, line, limit)
+    row.camera_yaw_rad = at_tick(time_s, feed.camera_yaw_rad, settings.camera_yaw_rad)
+    row.rest_gyro_radps = np.nan
+    if settings.is_steered:
+        row.side_mps[0] = row.side_mps[1] = np.nan
+    elif not math.isnan(row.gyro_z_radps) and feed.gyro_time_s > 0.0:
+        row.gyro_z_radps = feed.gyro_angle_rad / feed.gyro_time_s
+    feed.gyro_angle_rad = feed.gyro_time_s = 0.0
+    _derive(time_s, settings, feed, row)
+    if not settings.is_steered:
+        row.rest_gyro_radps = rest_at(time_s, row.side_mps[0], row.side_mps[1], row.gyro_z_radps, feed)
+    for i in range(3):
+        if not math.isnan(row.wheel_radps[i]):
+            feed.rate_received_s[i] = time_s
+        if not math.isnan(row.steer_rad[i]):
+            feed.steer_received_s[i] = time_s
+
+
+@_kernel
+def average_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
+    """Take a tick into the averages of the yaw rows at the start."""
+    if math.isnan(feed.start_s):
+        feed.start_s = time_s
+    if time_s > feed.start_s + STANDING_S:
+        feed.has_moved = True
+    for i in range(3):
+        if abs(row.wheel_radps[i] * settings.wheel_radius_m) > STANDING_SPEED_MPS:
+            feed.has_moved = True
+    _average(row.imu_yaw_rad, feed.has_moved, feed.imu_yaw_start)
+    _average(row.camera_yaw_rad, feed.has_moved, feed.camera_yaw_start)
+
+
+@_kernel
+def _average(yaw_rad: float, has_moved: bool, average: Any) -> None:
+    if not math.isnan(yaw_rad) and (not has_moved or average.n == 0):
+        average.sum += yaw_rad
+        average.n += 1
+        average.mean = average.sum / average.n
+
+
+@_kernel
+def refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
+    """Count the yaw rows of a tick from the averages."""
+    initial = settings.initial_yaw_rad
+    row.imu_yaw_rad = imu = row.imu_yaw_rad - feed.imu_yaw_start.mean + initial
+    row.camera_yaw_rad = seen = row.camera_yaw_rad - feed.camera_yaw_start.mean + initial
+    if math.isnan(seen):
+        return
+    if not feed.camera_has_started:
+        feed.camera_has_started = True
+        if not math.isnan(imu) and time_s > feed.start_s + LATE_S:
+            feed.camera_offset_rad = imu - initial
+    seen += feed.camera_offset_rad
+    if not math.isnan(imu):
+        seen += 2 * np.pi * np.rint((imu - seen) / (2 * np.pi))
+    row.camera_yaw_rad = seen
+
+
+@_kernel
+def _repeats_all(sample: Array, first: int, last: int, before: Array) -> bool:
+    """Say whether channels are those of the sample before to the last bit, and keep them."""
+    same, n_known = True, 0
+    for c in range(first, last):
+        if not math.isnan(sample[c]):
+            n_known += 1
+            same &= sample[c] == before[c]
+        before[c] = sample[c]
+    return same and n_known > 0
+
+
+@_kernel
+def take_live(stream: int, sample: Array, complete: bool, came_s: float, settings: Any, feed: Any) -> None:
+    """Take a sample as it came, without a look ahead: unless it repeats the one before, or is not confident."""
+    settings, feed = settings[0], feed[0]
+    feed.last_s[stream] = came_s
+    first, last = (0, 6) if stream == IMU else (3, 13)
+    noisy = stream in (IMU, ODOMETRY) and complete
+    if noisy and _repeats_all(sample, first, last, feed.before[stream - IMU]):
+        feed.frozen[stream] += 1
+        _count_frozen(stream, feed)
+        return
+    if stream == ODOMETRY and sample[13] < MIN_CONFIDENCE_RATIO:
+        feed.low_confidence[stream] += 1
+        return
+    take_sample(stream, sample, came_s - settings.latency_s[stream], came_s, settings, feed)
+
+
+@_kernel
+def _count_frozen(stream: int, feed: Any) -> None:
+    """Count a repetition of every channel of a stream."""
+    if stream == IMU:
+        for c in range(9):
+            feed.imu_channels[c].repeated += 1.0
+    else:
+        for c in range(14):
+            feed.camera_channels[c].repeated += 1.0
+
+
+@_kernel
+def tick_live(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
+    """Write the row of a tick, yaw counted from the averages so far."""
+    settings, feed, row = settings[0], feed[0], row[0]
+    take_tick(time_s, wheels, settings, feed, row)
+    if settings.is_steered:
+        average_yaw(time_s, settings, feed, row)
+        refer_yaw(time_s, settings, feed, row)
+
+
+@_kernel
+def run_feed(
+    clock: Array,
+    wheels: Array,
+    came_s: tuple[Array, ...],
+    instant_s: tuple[Array, ...],
+    samples: tuple[Array, ...],
+    settings: Any,
+    feed: Any,
+    rows: Any,
+) -> None:
+    """Write the rows (n,) of all ticks of a log but for their yaw; samples by stream, as :data:`STREAMS`."""
+    settings, feed = settings[0], feed[0]
+    due = np.zeros(len(came_s), np.int64)
+    for n in range(clock.size + 1):
+        time_s = clock[n] + TICK_S if n < clock.size else np.inf  # what comes after the last tick is counted
+        for stream in range(len(came_s)):
+            k = due[stream]
+            while k < came_s[stream].size and came_s[stream][k] <= time_s:
+                take_sample(
+                    stream, samples[stream][k], instant_s[stream][k], came_s[stream][k], settings, feed
+                )
+                k += 1
+            due[stream] = k
+        if n < clock.size:
+            take_tick(clock[n], wheels[n], settings, feed, rows[n])
+
+
+@_kernel
+def refer_all(clock: Array, causal: bool, settings: Any, feed: Any, rows: Any) -> None:
+    """Count the yaw rows from the start: from the averages of all ticks, or ``causal`` of those so far."""
+    settings, feed = settings[0], feed[0]
+    if not causal:
+        for n in range(clock.size):
+            average_yaw(clock[n], settings, feed, rows[n])
+    for n in range(clock.size):
+        if causal:
+            average_yaw(clock[n], settings, feed, rows[n])
+        refer_yaw(clock[n], settings, feed, rows[n])
+
+
+def forget_times(feed: Any) -> None:
+    """Begin anew after a clock was set back: what is remembered of its other time is of no use."""
+    fresh = new_feed()
+    names = set(_SIGNALS) | {"before", "last_s", "rate_received_s", "steer_received_s"}
+    names |= {"vibration_square", "vibration_s", "tick_s", "rest_since_s", "camera_s"}
+    names |= {"wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3", "gyro_angle_rad", "gyro_time_s"}
+    for name in names:
+        feed[name] = fresh[name]
+    for name in ("imu_channels", "camera_channels", "speed_channels", "wheel_channels"):
+        feed[name]["repeated"] = 0.0
+
+
+def measurements(rows: Any) -> Array:
+    """Return rows (n,) as numbers (n, m) in the order of :data:`ROWS`; a view."""
+    numbers: Array = rows.view(np.float64).reshape(len(rows), -1)[:, : len(ROWS)]
+    return numbers

@@ -1,1 +1,0 @@
-"""Estimation sample by sample, on memory of a fixed size."""

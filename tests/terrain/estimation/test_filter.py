@@ -1,0 +1,495 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numba import njit
+
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.consistency import sample_from_model
+from terrain.estimation.filter import (
+    OBSERVE,
+    PROPAGATE,
+    Filter,
+    FilterModel,
+    FilterSettings,
+    Noise,
+    log_likelihood,
+    run_filter,
+)
+from terrain.records import ABSENT, GATED, REOPENED, USED
+
+DT_S = 0.02
+ALL_BELIEVED = FilterSettings(gate_probability=1.0)
+
+
+@njit(PROPAGATE)
+def fly(x, dt, params, x_next, f):
+    """Position, heading and speed in the plane: p <- p + v (cos, sin) dt."""
+    cos, sin = np.cos(x[2]), np.sin(x[2])
+    x_next[:] = x
+    x_next[0] += dt * x[3] * cos
+    x_next[1] += dt * x[3] * sin
+    x_next[2] += dt * x[4]
+    for i in range(5):
+        f[i, i] = 1.0
+    f[0, 2], f[0, 3] = -dt * x[3] * sin, dt * cos
+    f[1, 2], f[1, 3] = dt * x[3] * cos, dt * sin
+    f[2, 4] = dt
+
+
+@njit(OBSERVE)
+def see(x, params, z_hat, h):
+    """A beacon's range, squared, and bearing; speed and turn of the wheels."""
+    east, north = params[0] - x[0], params[1] - x[1]
+    square = east**2 + north**2
+    z_hat[0] = square
+    h[0, 0], h[0, 1] = -2 * east, -2 * north
+    z_hat[1] = np.arctan2(north, east) - x[2]
+    h[1, 0], h[1, 1], h[1, 2] = north / square, -east / square, -1.0
+    z_hat[2] = x[3]
+    h[2, 3] = 1.0
+    z_hat[3] = x[3] * x[4]
+    h[3, 3], h[3, 4] = x[4], x[3]
+    z_hat[4] = x[0]
+    h[4, 0] = 1.0
+
+
+def flight():
+    return FilterModel(
+        name="flight",
+        states=("position_x_m", "position_y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"),
+        rows=("square_m", "bearing_rad", "speed_mps", "accel_mps2", "position_x_m"),
+        sensors=(
+            ("beacon", ("square_m", "bearing_rad")),
+            ("wheels", ("accel_mps2", "speed_mps")),
+            ("fix", ("position_x_m",)),
+        ),
+        propagate=fly,
+        observe=see,
+        params=np.array([30.0, 10.0]),
+        initial_std=np.array([0.5, 0.5, 0.1, 0.3, 0.2]),
+        initial_mean=np.array([0.0, 0.0, 0.0, 1.0, 0.0]),
+        references=("fix",),
+        positions=("position_x_m", "position_y_m"),
+        angle_states=("yaw_rad",),
+        angle_rows=("bearing_rad",),
+    )
+
+
+FLIGHT = flight()
+WALK = np.diag([1e-3, 1e-3, 1e-2, 0.05, 0.1]) ** 2
+WALK[3, 4] = WALK[4, 3] = 0.5 * 0.05 * 0.1
+FLIGHT_NOISE = Noise(WALK, np.array([0.5, 0.01, 0.05, 0.05, 0.1]) ** 2)
+
+
+@pytest.fixture(scope="module")
+def flown():
+    return sample_from_model(FLIGHT, FLIGHT_NOISE, 600, DT_S, np.random.default_rng(0))
+
+
+def dense_filter(model, noise, time_s, z, wrapped=()):
+    """The textbook: all rows at once, in Joseph form; NaN left out.  Yields x, P, NIS and log likelihood."""
+    d, m = len(model.states), len(model.rows)
+    x, p = model.initial_mean.copy(), np.diag(model.initial_std**2)
+    params = model.params.copy()
+    r_of = np.broadcast_to(noise.measurement_variance, z.shape)
+    for n, now in enumerate(time_s):
+        if n:
+            dt = now - time_s[n - 1]
+            x_next, f = np.zeros(d), np.zeros((d, d))
+            model.propagate(x, dt, params, x_next, f)
+            x, p = x_next, f @ p @ f.T + noise.process_variance * dt
+        z_hat, h = np.zeros(m), np.zeros((m, d))
+        model.observe(x, params, z_hat, h)
+        rows = np.flatnonzero(np.isfinite(z[n]))
+        nu = z[n] - z_hat
+        for i in wrapped:
+            nu[i] = np.angle(np.exp(1j * nu[i]))
+        nu, h, r = nu[rows], h[rows], np.diag(r_of[n, rows])
+        s = h @ p @ h.T + r
+        k = np.linalg.solve(s, h @ p).T
+        x = x + k @ nu
+        left = np.eye(d) - k @ h
+        p = left @ p @ left.T + k @ r @ k.T
+        nis = nu @ np.linalg.solve(s, nu)
+        yield x, p, nis, -0.5 * (nis + np.linalg.slogdet(2 * np.pi * s)[1])
+
+
+@pytest.mark.parametrize("share_missing", [0.0, 0.3])
+def test_rows_one_by_one_equal_the_textbook_all_at_once(flown, share_missing):
+    time_s, _, z = flown
+    rng = np.random.default_rng(1)
+    z = np.where(rng.random(z.shape) < share_missing, np.nan, z)
+    time_s = time_s + rng.uniform(0, 0.9 * DT_S, time_s.size)  # irregular
+    track = run_filter(FLIGHT, FLIGHT_NOISE, time_s, z, ALL_BELIEVED)
+    x, p, nis, likelihood = zip(*dense_filter(FLIGHT, FLIGHT_NOISE, time_s, z, wrapped=[1]), strict=True)
+    np.testing.assert_allclose(track.mean, x, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(track.cov, p, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(np.nansum(track.nis, axis=1), nis, rtol=1e-9)
+    assert track.log_likelihood == pytest.approx(sum(likelihood), rel=1e-9)
+    assert log_likelihood(FLIGHT, FLIGHT_NOISE, time_s, z) == track.log_likelihood
+    assert (track.cov == track.cov.transpose(0, 2, 1)).all()
+    np.testing.assert_array_equal(track.nis_dof.sum(axis=1), np.isfinite(z).sum(axis=1))
+    np.testing.assert_array_equal(track.use == ABSENT, track.nis_dof == 0)
+
+
+@njit(PROPAGATE)
+def drift(x, dt, params, x_next, f):
+    x_next[0], x_next[1] = x[0] + dt * x[1], x[1]
+    f[0, 0], f[0, 1], f[1, 1] = 1.0, dt, 1.0
+
+
+@njit(OBSERVE)
+def fix(x, params, z_hat, h):
+    z_hat[0], z_hat[1] = x[0], x[1]
+    h[0, 0], h[1, 1] = 1.0, 1.0
+
+
+def carriage(**changes):
+    """A line, and a sensor for either state."""
+    return dataclasses.replace(
+        FilterModel(
+            name="carriage",
+            states=("position_m", "speed_mps"),
+            rows=("place_m", "rate_mps"),
+            sensors=(("place", ("place_m",)), ("rate", ("rate_mps",))),
+            propagate=drift,
+            observe=fix,
+            params=np.zeros(1),
+            initial_std=np.array([1.0, 1.0]),
+            references=("rate",),
+            positions=("position_m",),
+        ),
+        **changes,
+    )
+
+
+CARRIAGE = carriage()
+CARRIAGE_NOISE = Noise(np.array([1e-3, 0.1]) ** 2, np.array([0.05, 0.05]) ** 2)
+
+
+def ridden(n=400, seed=0):
+    return sample_from_model(CARRIAGE, CARRIAGE_NOISE, n, DT_S, np.random.default_rng(seed))
+
+
+def test_on_a_linear_model_it_is_the_least_squares_answer():
+    """The Kalman filter's last mean is that of all data at once, solved without any recursion."""
+    time_s, _, z = ridden(60)
+    n, q = time_s.size, np.array([1e-3, 0.1])
+    rows, values = [np.eye(2 * n)[:2]], [np.zeros(2)]  # x_0 = 0 +- 1
+    for k in range(n):
+        at, pick = np.zeros((2, 2 * n)), np.zeros((2, 2 * n))
+        pick[:, 2 * k : 2 * k + 2] = np.eye(2) / 0.05
+        rows, values = [*rows, pick], [*values, z[k] / 0.05]
+        if k:
+            at[:, 2 * k - 2 : 2 * k] = [[-1, -DT_S], [0, -1]]
+            at[:, 2 * k : 2 * k + 2] = np.eye(2)
+            rows, values = [*rows, at / (q * np.sqrt(DT_S))[:, None]], [*values, np.zeros(2)]
+    a = np.vstack(rows)
+    solved = np.linalg.lstsq(a, np.concatenate(values), rcond=None)[0]
+    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z, ALL_BELIEVED)
+    np.testing.assert_allclose(track.mean[-1], solved[-2:], rtol=1e-8)
+    np.testing.assert_allclose(track.cov[-1], np.linalg.inv(a.T @ a)[-2:, -2:], rtol=1e-7)
+
+
+def spoilt(seed=0):
+    """A ride on which everything goes wrong that can."""
+    time_s, _, z = ridden(1500, seed)
+    z[40:50] = np.nan
+    z[60, 0], z[61, 1], z[62] = np.inf, -np.inf, 1e300
+    z[100:240, 0] += 3.0  # rejected, then believed
+    z[300, 1] = 50.0
+    time_s[400:] += 3600.0
+    time_s[500:] -= 3590.0
+    time_s[600] += 50.0
+    time_s[700] = time_s[699]
+    time_s[800] = time_s[790]
+    time_s[900] = np.nan
+    return time_s, z
+
+
+def test_sample_by_sample_equals_batch_bit_for_bit():
+    time_s, z = spoilt()
+    r = np.tile(CARRIAGE_NOISE.measurement_variance, (time_s.size, 1))
+    r[::3, 0] *= 4
+    r[7, 1] = np.nan
+    by_sample = Noise(CARRIAGE_NOISE.process_variance, r)
+    track = run_filter(CARRIAGE, by_sample, time_s, z)
+    session, taken = Filter(CARRIAGE, by_sample), []
+    for k in range(time_s.size):
+        if session.step(time_s[k], z[k], r[k]) and (not taken or time_s[k] > taken[-1][0]):
+            state = session.state[0].copy()
+            taken.append((time_s[k], *(state[name] for name in ("x", "p", "nis", "nis_dof", "use"))))
+    for column, name in enumerate(("time_s", "mean", "cov", "nis", "nis_dof", "use")):
+        expected = [np.ravel(row[column]) for row in taken] if column != 2 else None
+        if column == 2:
+            expected = [row[2][:2, :2].ravel() for row in taken]
+        values = getattr(track, name).reshape(len(taken), -1)
+        np.testing.assert_array_equal(values, [row[: values.shape[1]] for row in expected])
+    assert track.log_likelihood == session.state["log_likelihood"][0]
+    assert {kind: n for kind, n in track.dropped.items() if kind != "clock set back"} == session.dropped
+    assert {USED, GATED, REOPENED, ABSENT} == set(np.unique(track.use))
+
+
+@pytest.mark.parametrize("stamp_s", [np.inf, -np.inf, np.nan])
+def test_a_stamp_that_is_no_number_is_no_leap_of_the_clock(stamp_s):
+    session = Filter(CARRIAGE, CARRIAGE_NOISE)
+    for time_s in (0.0, stamp_s, 0.02):
+        session.step(time_s, np.zeros(2))
+    assert session.dropped == {"time did not advance": 1}
+    assert session.state["time_s"][0] == 0.02
+
+
+def test_every_fault_is_counted_by_its_name():
+    time_s, z = spoilt()
+    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    assert np.isfinite(track.mean).all()
+    assert np.isfinite(track.cov).all()
+    assert (np.diff(track.time_s) > 0).all()
+    dropped = dict(track.dropped)
+    assert dropped.pop("place gated") == (track.use[:, 0] == GATED).sum() > 60
+    assert dropped.pop("rate gated") >= 1
+    assert dropped == {
+        "place not finite": 2,
+        "rate not finite": 2,
+        "time did not advance": 3,  # repeated, a little back, NaN
+        "clock jump": 3,  # an hour on, most of it back, and a lone stamp
+        "clock set back": 1000 - 5,  # the rest of the log, but for rows that were bad themselves
+    }
+
+
+def test_a_lone_bad_stamp_costs_its_own_row_only():
+    time_s, _, z = ridden()
+    for bad in (1e9, -1e9, 30.0, np.nan, np.inf):
+        stamps = time_s.copy()
+        stamps[200] = bad
+        track = run_filter(CARRIAGE, CARRIAGE_NOISE, stamps, z)
+        np.testing.assert_array_equal(track.time_s, np.delete(time_s, 200))
+        whole = run_filter(CARRIAGE, CARRIAGE_NOISE, np.delete(time_s, 200), np.delete(z, 200, axis=0))
+        np.testing.assert_array_equal(track.mean, whole.mean)
+        assert sum(track.dropped.values()) - sum(whole.dropped.values()) == 1
+
+
+def test_a_gap_is_not_integrated_over_and_leaves_positions_where_they_were():
+    time_s, _, z = ridden()
+    z[300:, 0] = np.nan  # nothing tells the place afterwards
+    time_s[300:] += 100.0
+    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    assert track.dropped["clock jump"] == 1
+    np.testing.assert_array_equal(track.time_s, np.delete(time_s, 300))
+    assert track.mean[300, 0] == track.mean[299, 0]
+    assert track.std("position_m")[300] == pytest.approx(100.0 * 1.0, rel=0.01)  # 1 m/s, unknown, for 100 s
+    assert track.std("speed_mps")[300] == pytest.approx(0.05, rel=0.01)  # the prior, and one measurement
+    assert track.reference_age_s[300] == 0.0
+
+
+def test_a_clock_that_was_set_back_goes_on_live():
+    time_s, truth, z = ridden()
+    time_s[200:] -= 3600.0
+    session = Filter(CARRIAGE, CARRIAGE_NOISE)
+    for k in range(time_s.size):
+        session.step(time_s[k], z[k])
+    assert session.state["time_s"][0] == time_s[-1]
+    assert np.abs(session.mean - truth[-1]).max() < 4 * np.sqrt(session.cov.diagonal().max())
+    assert session.dropped == {"clock jump": 1}
+    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    assert track.dropped == {"clock jump": 1, "clock set back": 199}
+    assert len(track.time_s) == 200
+
+
+def test_two_consecutive_outlier_stamps_cost_two_rows():
+    time_s, _, z = ridden()
+    time_s[200], time_s[201] = 1e5, 1.5e5
+    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    assert len(track.time_s) == time_s.size - 2
+    assert track.time_s[-1] == time_s[-1]
+
+
+def test_a_sensor_that_was_rejected_is_believed_once_a_second():
+    time_s, _, z = ridden(600)
+    z[100:300, 1] += 2.0  # 40 standard deviations, for 4 s
+    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    use = track.use[:, 1]
+    reopened = np.flatnonzero(use == REOPENED)
+    assert (use[100:150] == GATED).all()
+    assert reopened[0] == 150
+    assert np.diff(track.time_s[reopened]).min() > 1 - 1e-9
+    assert track.mean[150, 1] - track.mean[149, 1] == pytest.approx(2.0, abs=0.3)
+    assert (use[400:] == USED).mean() > 0.99
+    np.testing.assert_allclose(track.reference_age_s[100:150], DT_S * np.arange(1, 51))
+    assert track.reference_age_s[150] == 0.0
+
+
+def test_the_age_of_the_reference_is_infinite_before_the_first():
+    time_s, _, z = ridden(50)
+    z[:20, 1] = np.nan
+    age_s = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z).reference_age_s
+    assert np.isinf(age_s[:20]).all()
+    assert (age_s[20:] == 0).all()
+    without = carriage(references=())
+    assert np.isinf(run_filter(without, CARRIAGE_NOISE, time_s, z).reference_age_s).all()
+
+
+def test_angles_meet_across_the_seam():
+    time_s, truth, z = sample_from_model(
+        dataclasses.replace(FLIGHT, initial_mean=np.array([0.0, 0, 3.1, 1.0, 0.6])),
+        FLIGHT_NOISE,
+        600,
+        DT_S,
+        np.random.default_rng(3),
+    )
+    model = dataclasses.replace(FLIGHT, initial_mean=np.array([0.0, 0, -3.1, 1.0, 0.5]))
+    track = run_filter(model, FLIGHT_NOISE, time_s, z)
+    assert (np.abs(track.state("yaw_rad")) <= np.pi).all()
+    error = np.angle(np.exp(1j * (track.state("yaw_rad") - truth[:, 2])))
+    assert np.abs(error[50:]).max() < 0.1
+
+
+def test_a_measurement_beside_which_the_noise_is_lost_leaves_a_variance():
+    """P0 = 1e16 R: s = h P h' + R is h P h' in double precision, and P - K s K' would be zero."""
+    model = carriage(initial_std=np.array([1e6, 1e6]))
+    noise = Noise(np.zeros(2), np.array([1e-2, 1e-2]) ** 2)
+    track = run_filter(model, noise, np.arange(3.0) / 50, np.ones((3, 2)))
+    np.testing.assert_allclose(track.std("speed_mps"), 1e-2 / np.sqrt([1, 2, 3]), rtol=1e-3)
+    assert track.dropped == {}
+
+
+garbage = st.one_of(
+    st.floats(width=64),
+    st.sampled_from([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e9, -1e9, 5e-324, 0.0]),
+    st.floats(-5, 5),
+)
+
+
+@settings(max_examples=150)
+@given(
+    rows=st.lists(
+        st.tuples(st.tuples(*[garbage] * 5), st.one_of(garbage, st.just(DT_S))), min_size=1, max_size=40
+    ),
+    repeats=st.integers(1, 80),
+    gate=st.sampled_from([0.9999, 1.0]),
+)
+def test_estimates_stay_finite_for_arbitrary_measurements(rows, repeats, gate):
+    z = np.repeat([row for row, _ in rows], repeats, axis=0)
+    time_s = np.repeat([dt for _, dt in rows], repeats)
+    with np.errstate(all="ignore"):
+        time_s = np.cumsum(np.where(np.isfinite(time_s), time_s, DT_S)) + np.arange(len(z)) * DT_S
+    track = run_filter(FLIGHT, FLIGHT_NOISE, time_s, z, FilterSettings(gate_probability=gate))
+    assert np.isfinite(track.mean).all()
+    assert np.isfinite(track.cov).all()
+    assert (track.cov.diagonal(axis1=1, axis2=2) > 0).all()
+    assert np.isfinite(track.log_likelihood)
+    assert not (track.nis < 0).any()
+    assert (np.diff(track.time_s) > 0).all()
+
+
+def test_after_garbage_the_filter_finds_back_within_two_reopenings():
+    time_s, truth, z = ridden(600)
+    z[100:220] = 1e9 * np.random.default_rng(0).uniform(-1, 1, (120, 2))
+    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z)
+    assert np.abs(track.mean[150:220, 0]).min() > 1e6  # it was believed
+    error, std = np.abs(track.mean - truth), np.sqrt(track.cov.diagonal(axis1=1, axis2=2))
+    assert (error[300:] < 5 * std[300:]).all()
+
+
+def test_a_log_may_be_empty_or_end_at_once():
+    none = run_filter(CARRIAGE, CARRIAGE_NOISE, np.zeros(0), np.zeros((0, 2)))
+    assert (none.mean.shape, none.log_likelihood) == ((0, 2), 0.0)
+    one = run_filter(CARRIAGE, CARRIAGE_NOISE, [5.0], [[np.nan, np.nan]])
+    np.testing.assert_array_equal(one.cov[0], np.eye(2))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"process_variance": np.ones((2, 3))}, r"process_variance has shape \(2, 3\), \(d,\) or \(d, d\)"),
+        ({"process_variance": [[1.0, 0.5], [0.0, 1.0]]}, "process_variance is not symmetric"),
+        ({"process_variance": [1.0, -1.0]}, "process_variance is not positive semidefinite"),
+        ({"process_variance": [1.0, np.inf]}, "process_variance holds a value that is not finite"),
+        ({"initial_variance": [1.0, 0.0]}, "initial_variance is not positive definite: its smallest"),
+        ({"measurement_variance": [1.0, 0.0]}, r"measurement_variance \[1.0, 0.0\] must be above zero"),
+        ({"measurement_variance": [[1.0, 0.5], [0.5, 2.0]]}, "rows are taken as independent, give"),
+        ({"measurement_variance": np.ones((1, 2, 2))}, r"measurement_variance has shape \(1, 2, 2\)"),
+    ],
+)
+def test_invalid_noise_is_refused(given, message):
+    fine = {"process_variance": np.zeros(2), "measurement_variance": np.ones(2)}
+    with pytest.raises(ConfigError, match=message):
+        Noise(**(fine | given))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"states": ("position_m", "speed")},
+            "filter carriage: state or row 'speed' does not end in a known unit",
+        ),
+        ({"initial_std": np.array([1.0, 0.0])}, "initial_std .* must be above zero"),
+        ({"initial_mean": np.zeros(3)}, r"initial_mean has shape \(3,\), \(2,\) is needed"),
+        ({"states": ("position_m", "position_m")}, "name one of them twice"),
+        ({"sensors": (("place", ("place_m",)),)}, "its sensors must hold every row once"),
+        ({"references": ("camera",)}, "references name 'camera', which is none of place, rate"),
+        ({"observe": drift}, r"observe must be compiled as @njit\(OBSERVE, cache=True\)"),
+        ({"propagate": print}, r"propagate must be compiled as @njit\(PROPAGATE, cache=True\)"),
+    ],
+)
+def test_invalid_models_are_refused(changes, message):
+    with pytest.raises(ConfigError, match=message):
+        carriage(**changes)
+
+
+@pytest.mark.parametrize(
+    ("noise", "z", "message"),
+    [
+        (CARRIAGE_NOISE, np.zeros((3, 4)), r"filter carriage: z has shape \(3, 4\), \(3, 2\) is needed"),
+        (Noise(np.ones(3), np.ones(2)), np.zeros((3, 2)), "process_variance is for 3 states, it has 2"),
+        (Noise(np.ones(2), np.ones(3)), np.zeros((3, 2)), "measurement_variance is for 3 rows, it has 2"),
+        (Noise(np.ones(2), np.ones((4, 2))), np.zeros((3, 2)), r"measurement_variance has shape \(4, 2\)"),
+    ],
+)
+def test_noise_and_measurements_of_another_size_are_refused(noise, z, message):
+    with pytest.raises(DataError, match=message):
+        run_filter(CARRIAGE, noise, np.arange(3.0), z)
+
+
+def test_invalid_settings_are_refused():
+    with pytest.raises(ConfigError, match="reopen_after_s is 0, seconds above zero are required"):
+        FilterSettings(reopen_after_s=0)
+
+
+stamp_steps = st.one_of(st.floats(-0.05, 0.1), st.sampled_from([0.0, 0.02, 3.0, -3.0, np.nan, np.inf, 1e300]))
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.lists(stamp_steps, min_size=1, max_size=30), st.integers(0, 9))
+def test_a_snapshot_goes_on_as_the_filter_it_was_taken_of(steps, seed):
+    model, rng = flight(), np.random.default_rng(seed)
+    noise = Noise(np.full(5, 0.01), np.full(5, 0.01))
+    session, other, last_s = Filter(model, noise), Filter(model, noise), 0.0
+    for step_s in steps:
+        time_s = last_s + step_s
+        last_s = time_s if abs(step_s) < 10.0 else last_s
+        z = np.where(rng.random(5) < 0.2, np.nan, rng.normal([1000.0, 0.3, 1.0, 0.0, 0.0], 0.1))
+        variance = rng.uniform(0.01, 0.1, 5) if rng.random() < 0.5 else None
+        other.state[:] = session.state
+        follows, before_s = session.follows(time_s), session.state["time_s"][0]
+        taken = session.step(time_s, z, variance)
+        assert taken == other.step(time_s, z, variance) == (follows != 0)
+        assert taken == (session.state["time_s"][0] == time_s and before_s != time_s)
+        assert not taken or (follows < 0) == (time_s < before_s)
+        assert session.state.tobytes() == other.state.tobytes()
+
+
+def test_a_filter_that_changes_its_noise_is_given_it_at_each_step():
+    session = Filter(flight(), Noise(np.ones(5), np.ones((3, 5))))
+    with pytest.raises(ValueError, match="could not broadcast"):
+        session.step(0.0, np.zeros(5))
+
+
+def test_more_states_than_there_is_room_for_are_refused():
+    states = tuple(f"place_{k}_m" for k in range(33))
+    with pytest.raises(ConfigError, match="there are 33 states, at most 32 are possible"):
+        carriage(states=states, initial_std=np.ones(33), initial_mean=np.zeros(33), positions=())

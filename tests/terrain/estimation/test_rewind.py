@@ -1,0 +1,174 @@
+"""Samples that come late: the numbers of samples in order, to the last bit, up to the rewind's reach."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from terrain.estimation.live import N_STEPS, REWIND_S, LiveFilter
+from terrain.logs.replay import replay
+from terrain.records import Reading
+from terrain.robots import load_robot
+from terrain.simulation.conditions import Faults
+from terrain.simulation.run import simulate_run
+
+ROBOT = load_robot("agrimaro")
+STREAMS = ("wheels", "steering", "imu", "odometry")
+PERIOD_S = 0.02
+FIRST, N_MIXED, N_AFTER = 100, 25, 15
+"""Steps before samples come late, with late ones, and after them."""
+
+MOST_STEPS = 11
+"""By so many steps a sample may be late: of 0.25 s, less a step and a period of the wheels."""
+
+
+@cache
+def samples():
+    run = simulate_run(ROBOT, "grass", "straight", 5, duration_s=6.0, faults=Faults(by_chance=False))
+    return list(replay(run))
+
+
+def bare(sample):
+    return {name: sample.readings[name] for name in STREAMS if name in sample.readings}
+
+
+def drive(steps, now=False):
+    """Return an estimator that was given readings step by step, and the time of each where `now` says so."""
+    estimator = LiveFilter(ROBOT)
+    for time_s, readings in steps:
+        estimator.step(readings, time_s if now else None)
+    return estimator
+
+
+def in_order():
+    return [(sample.time_s, bare(sample)) for sample in samples()[: FIRST + N_MIXED + N_AFTER]]
+
+
+def delayed(delays_of):
+    """Return steps whose readings come later, by stream a number of steps for each of the mixed ones.
+
+    What is late of the wheels keeps its order: the next sample comes no earlier.
+    """
+    steps = in_order()
+    arrivals = [(time_s, {name: [] for name in STREAMS}) for time_s, _ in steps]
+    last = dict.fromkeys(STREAMS, 0)
+    for k, (_, readings) in enumerate(steps):
+        for name, reading in readings.items():
+            mixed = name in delays_of and 0 <= k - FIRST < N_MIXED
+            at = k + delays_of[name][k - FIRST] if mixed else k
+            last[name] = max(at, last[name])
+            arrivals[last[name] if name == "wheels" else at][1][name].append(reading)
+    return [
+        (
+            time_s,
+            {
+                name: Reading(
+                    np.concatenate([reading.time_s for reading in came]),
+                    np.concatenate([reading.values for reading in came]),
+                )
+                for name, came in by_stream.items()
+                if came
+            },
+        )
+        for time_s, by_stream in arrivals
+    ]
+
+
+def assert_same(estimator, expected):
+    for one, other in zip(estimator.latest, expected.latest, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert estimator.health == expected.health
+    for one, other in zip(estimator._history._memories, expected._history._memories, strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+def shifted(steps, by_s):
+    return [
+        (time_s + by_s, {name: Reading(r.time_s + by_s, r.values) for name, r in readings.items()})
+        for time_s, readings in steps
+    ]
+
+
+def test_late_samples_after_a_clock_was_set_back_are_taken_among_those_of_the_new_time():
+    late = shifted(delayed({"imu": [3] * N_MIXED}), -50.0)
+    estimator, expected = (drive([*in_order(), *after]) for after in (late, shifted(in_order(), -50.0)))
+    assert estimator.dropped["came late"] > 0
+    assert_same(estimator, expected)
+
+
+def test_without_wheels_samples_do_not_pile_up():
+    estimator, imu = LiveFilter(ROBOT), samples()[50].readings["imu"]
+    for k in range(N_STEPS + 50):
+        time_s = imu.time_s + k * PERIOD_S
+        assert not estimator.step({"imu": Reading(time_s, imu.values)}, float(time_s[-1]))
+    assert len(estimator._history._samples) == N_STEPS
+    assert len(estimator.step(samples()[50].readings, samples()[50].time_s)) == 1
+
+
+@cache
+def undelayed(now=False):
+    return drive(in_order(), now)
+
+
+delays = st.lists(st.integers(0, MOST_STEPS), min_size=N_MIXED, max_size=N_MIXED)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.dictionaries(st.sampled_from(STREAMS[1:]), delays, min_size=1))
+def test_late_sensors_give_the_numbers_of_sensors_in_time(delays_of):
+    estimator = drive(delayed(delays_of))
+    assert_same(estimator, undelayed())
+
+
+@settings(deadline=None, max_examples=60)
+@given(delays, st.dictionaries(st.sampled_from(STREAMS[1:]), delays))
+def test_late_wheels_give_the_numbers_of_wheels_in_time(wheels, delays_of):
+    """Ticks without wheels, which were done for want of them, leave nothing behind."""
+    estimator = drive(delayed({**delays_of, "wheels": wheels}), now=True)
+    assert_same(estimator, undelayed(now=True))
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_what_comes_later_than_the_reach_is_counted_and_changes_nothing(name):
+    """Three readings that come 0.3 s late, or never."""
+    n_late = int(REWIND_S / PERIOD_S) + 3
+    steps = in_order()
+    without = [
+        (time_s, {other: r for other, r in readings.items() if other != name or not 0 <= k - FIRST < 3})
+        for k, (time_s, readings) in enumerate(steps)
+    ]
+    never, late, n_samples = drive(without), LiveFilter(ROBOT), 0
+    for k, (_, readings) in enumerate(without):
+        if 0 <= k - n_late - FIRST < 3:
+            before = late.latest
+            too_late = steps[k - n_late][1][name]
+            assert late.step({name: too_late}) == []
+            assert late.latest is before
+            n_samples += too_late.time_s.size
+        late.step(readings)
+    kind = "time did not advance" if name == "wheels" else f"{name}: stamp does not increase"
+    assert n_samples >= 3
+    assert late.dropped[kind] - never.dropped.get(kind, 0) == n_samples
+    for one, other in zip(late.latest, never.latest, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_without_wheels_ticks_go_on_by_the_callers_time_and_uncertainty_grows():
+    estimator, times_s, stds = LiveFilter(ROBOT), [], []
+    for sample in samples():
+        readings = bare(sample)
+        if sample.time_s > 2.0:
+            readings.pop("wheels", None)
+        estimator.step(readings, sample.time_s)
+        if estimator.latest is not None:
+            times_s.append(estimator.latest.time_s)
+            stds.append(estimator.latest.std[estimator.states.index("slip_speed_1_mps")])
+    times_s, stds = np.array(times_s), np.array(stds)
+    gone = times_s > 2.03
+    assert np.diff(times_s[gone]).max() < 2.1 * PERIOD_S
+    assert samples()[-1].time_s - times_s[-1] < 2.0 * PERIOD_S
+    assert estimator.dropped["ticks without wheels"] == len(set(times_s[gone]))
+    assert stds[-1] > 2.0 * stds[~gone][-1]
+    assert np.isnan(estimator.latest.motor_radps).all()

@@ -1,0 +1,202 @@
+"""Live estimation of a skid-steer robot: the batch's numbers to the last bit, and sense whatever comes."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from terrain.errors import ConfigError
+from terrain.estimation.estimate import estimate_run
+from terrain.estimation.feed import ROWS
+from terrain.estimation.live import N_STEPS, QUEUE, LiveFilter
+from terrain.estimation.stuck import Motion, stuck_intervals
+from terrain.logs.replay import replay
+from terrain.records import Reading, Stream
+from terrain.robots import load_robot
+from terrain.simulation.run import simulate_run
+
+HUSKY = load_robot("husky")
+
+
+@cache
+def log(scenario="survey", seed=31, soil="grass", duration_s=30.0):
+    return simulate_run(HUSKY, soil, scenario, seed, duration_s=duration_s)
+
+
+def live(run, rate_hz=50.0, **options):
+    channels = {name: run.streams[name].channels for name in ("wheels", "imu") if name in run.streams}
+    estimator = LiveFilter(HUSKY, "skid", channels, **options)
+    estimates = [e for sample in replay(run, rate_hz) for e in estimator.step(sample.readings)]
+    return estimator, estimates + estimator.settle(all_of_them=True)
+
+
+def column(estimates, name):
+    return np.array([getattr(estimate, name) for estimate in estimates], dtype=float)
+
+
+def assert_equal(run, **options):
+    """Compare everything at every tick, to the last bit; return both sides."""
+    estimator, estimates = live(run, **options)
+    found = estimate_run(run, HUSKY, "skid")
+    track = found.track
+    np.testing.assert_array_equal(column(estimates, "time_s"), track.time_s)
+    rows = column(estimates, "rows")[:, [ROWS.index(row) for row in found.model.rows]]
+    np.testing.assert_array_equal(rows, found.table.columns(found.model.rows))
+    np.testing.assert_array_equal(column(estimates, "mean"), track.mean)
+    std = np.column_stack([track.std(state) for state in track.states])
+    np.testing.assert_array_equal(column(estimates, "std"), std)
+    np.testing.assert_array_equal(column(estimates, "yaw_rate_radps"), track.state("yaw_rate_radps"))
+    np.testing.assert_array_equal(column(estimates, "speed_x_mps"), track.state("speed_mps"))
+    np.testing.assert_array_equal(column(estimates, "motion"), found.motion)
+    starts = {interval.start_s for interval in stuck_intervals(track.time_s, found.motion)}
+    since_s = column(estimates, "stuck_since_s")
+    np.testing.assert_array_equal(np.isfinite(since_s), found.motion == Motion.STUCK)
+    assert set(since_s[np.isfinite(since_s)].tolist()) == starts
+    return estimator, found
+
+
+@pytest.mark.parametrize(
+    ("scenario", "soil", "seed"),
+    [("survey", "grass", 31), ("complex", "tilled_loam", 32), ("straight", "snow", 33)],
+)
+def test_live_equals_batch(scenario, soil, seed):
+    assert_equal(log(scenario, seed, soil))
+
+
+def test_live_equals_batch_where_the_robot_is_stuck():
+    """The gyro of a robot that stands, on wheels that turn it on the spot."""
+    run = log()
+    wheels, imu = run.streams["wheels"], run.streams["imu"]
+    spins = (wheels.time_s > 8.0) & (wheels.time_s < 16.0)
+    sides = [wheels.channels.index(f"speed_{side}_mps") for side in ("left", "right")]
+    values, angular = np.array(wheels.values), np.array(imu.values)
+    values[np.ix_(spins, sides)] = [-0.2, 0.2]
+    still = (imu.time_s > 7.9) & (imu.time_s < 16.1)
+    angular[still, imu.channels.index("gyro_z_radps")] = np.random.default_rng(2).normal(0, 0.01, still.sum())
+    spinning = type(run)(
+        run.run_id,
+        run.robot,
+        {
+            "wheels": Stream(wheels.time_s, values, wheels.channels),
+            "imu": Stream(imu.time_s, angular, imu.channels),
+        },
+    )
+    _, found = assert_equal(spinning)
+    (interval,) = stuck_intervals(found.track.time_s, found.motion)
+    assert 8.0 <= interval.start_s < 11.0
+    assert interval.end_s == pytest.approx(16.0, abs=0.6)
+
+
+@pytest.mark.parametrize("rate_hz", [7.0, 211.0])
+def test_how_samples_are_bundled_does_not_matter(rate_hz):
+    _, plain = live(log())
+    _, bundled = live(log(), rate_hz)
+    for name in ("mean", "std", "rows", "motion"):
+        np.testing.assert_array_equal(column(bundled, name), column(plain, name))
+
+
+def test_live_equals_batch_on_measured_snow(datasets_dir):
+    from terrain.logs.borealtc import read_run
+
+    for number in ("03", "05", "14"):
+        run = read_run(datasets_dir / "borealtc" / "SNOW", number)
+        assert_equal(run, rate_hz={"wheels": 6.5, "imu": 100.0})
+
+
+WHEELS, IMU = np.array([0.3, 0.4]), np.zeros(9)
+WRONG = [
+    None,
+    0,
+    "wheels",
+    (),
+    {},
+    (None, None),
+    ("a", "b"),
+    ([0.1], [["x", "y"]]),
+    ([0.1], [[1.0]]),
+    ([[0.1]], [[1.0, 1.0]]),
+    ([0.1, 0.2], [[1.0, 1.0]]),
+    ([np.nan], [[1.0, 1.0]]),
+    ([np.inf], [[1.0, 1.0]]),
+    ([-1e300], [[1.0, 1.0]]),
+    ([0.1], [[np.nan, np.inf]]),
+    ([0.1], [[1e300, -1e300]]),
+    ([10**400], [[1.0, 1.0]]),
+    ([1j], [[1.0, 1.0]]),
+    (np.array([object()]), np.array([[1.0, 1.0]])),
+    (np.empty(0), np.empty((0, 2))),
+]
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["good", "back", *range(len(WRONG))]),
+            st.sampled_from(["good", "none", *range(len(WRONG))]),
+        ),
+        max_size=25,
+    )
+)
+def test_nothing_that_arrives_raises_or_makes_an_estimate_infinite(arrivals):
+    estimator, time_s = LiveFilter(HUSKY, "skid"), 0.0
+    for wheels, imu in arrivals:
+        time_s += -3.0 if wheels == "back" else 0.02
+        stamps = np.array([time_s])
+        usual = Reading(stamps, WHEELS[None])
+        readings = {"wheels": usual if isinstance(wheels, str) else WRONG[wheels]}
+        if imu != "none":
+            readings["imu"] = Reading(stamps, IMU[None]) if imu == "good" else WRONG[imu]
+        for estimate in estimator.step(readings):
+            assert np.isfinite(estimate.mean).all()
+            assert np.isfinite(estimate.std).all()
+            assert estimate.motion in Motion
+    estimate_s = time_s + 0.02
+    for _ in range(2):  # a leap is believed when the next stamp follows it
+        estimator.step({"wheels": Reading(np.array([estimate_s]), WHEELS[None])})
+        estimate_s += 0.02
+    assert np.isfinite(estimator.latest.mean).all()
+
+
+@pytest.mark.parametrize("readings", [None, [], "wheels", {}, {"camera": 1}])
+def test_what_is_no_reading_gives_no_estimate(readings):
+    assert LiveFilter(HUSKY, "skid").step(readings) == []
+
+
+def test_what_was_wrong_is_counted():
+    estimator = LiveFilter(HUSKY, "skid")
+    for wrong in WRONG:
+        estimator.step({"wheels": wrong, "imu": wrong})
+    counted = estimator.dropped
+    assert counted["wheels: unreadable"] > 5
+    assert counted["imu: unreadable"] > 5
+
+
+def test_memory_does_not_grow_while_the_wheels_are_silent():
+    estimator = LiveFilter(HUSKY, "skid")
+    for k in range(3000):
+        assert estimator.step({"imu": Reading(np.array([0.01 * k]), IMU[None])}) == []
+    assert len(estimator._queues["imu"]._waiting) <= QUEUE
+    assert len(estimator._history._samples) <= N_STEPS
+    assert estimator.dropped["imu: waited too long"] > 0
+
+
+@pytest.mark.parametrize(
+    ("robot", "options", "message"),
+    [
+        ("agrimaro", {}, "robot agrimaro has the drive 'swerve': this filter is for 'skid_steer'"),
+        ("husky", {"channels": {"wheels": ("speed_left_mps",)}}, "'speed_right_mps' must be among them"),
+        (
+            "husky",
+            {"channels": {"wheels": ("speed_left_mps", "speed_right_mps"), "imu": ("accel_x_mps2",)}},
+            "'gyro_z_radps' must be among them",
+        ),
+        ("husky", {"rate_hz": {"imu": 0.0}}, "rate of 'imu' is 0.0 Hz, a number above zero is required"),
+        ("husky", {"rate_hz": {"wheels": np.nan}}, "rate of 'wheels' is nan Hz"),
+    ],
+)
+def test_what_does_not_fit_is_refused(robot, options, message):
+    with pytest.raises(ConfigError, match=message):
+        LiveFilter(load_robot(robot), "skid", **options)

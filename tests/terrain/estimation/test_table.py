@@ -1,0 +1,632 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError, DataError
+from terrain.estimation.feed import CAMERA_ROWS, GNSS_ROWS, REST_ROW, ROWS_OF_DRIVE
+from terrain.estimation.resampling import low_pass
+from terrain.estimation.table import measurement_table
+from terrain.kinematics.camera import odometry_stream
+from terrain.records import RunLog, Stream
+from terrain.robots import load_robot
+
+ROBOT = load_robot("agrimaro")
+HUSKY = load_robot("husky")
+GYRO_BIAS = 0.003
+NOISE = 1e-4
+"""On all of camera and IMU: small, so that answers are plain; never none, so that nothing is frozen."""
+
+
+def bare(robot=ROBOT, *, camera=None, sensors=None, steering=None):
+    """Return the robot with ideal sensors except for the given values."""
+    ideal = {"latency_s": 0.0, "time_constant_s": 0.0}
+    return robot.with_parts(
+        camera=replace(robot.camera, **ideal | (camera or {})),
+        sensors=replace(
+            robot.sensors, **{"encoder_time_constant_s": 0.0, "imu_latency_s": 0.0} | (sensors or {})
+        ),
+        steering=replace(robot.steering, **steering or {}),
+    )
+
+
+def turning_run(duration_s=6.0, *, yaw_0=0.0, rate=0.4, speed=0.5, roll=0.0, pitch=0.0, seed=0):
+    """Return a run that drives an arc at constant rates; its sensors are ideal but for :data:`NOISE`."""
+    rng = np.random.default_rng(seed)
+
+    def clock(rate_hz):
+        return np.arange(round(duration_s * rate_hz)) / rate_hz
+
+    def noisy(columns):
+        plain = np.column_stack(np.broadcast_arrays(*columns))
+        return plain + NOISE * rng.standard_normal(plain.shape)
+
+    streams = {}
+    t = clock(50.0)
+    motor = np.full((t.size, 3), speed / ROBOT.wheel_radius_m * ROBOT.motors.reduction_ratio)
+    streams["wheels"] = Stream(t, motor, [f"motor_{i}_radps" for i in (1, 2, 3)])
+    steer = np.broadcast_to([0.1, -0.2, 3.1], (t.size, 3)) + 0.1 * np.sin(t)[:, None]
+    streams["steering"] = Stream(t, np.angle(np.exp(1j * steer)), [f"angle_{i}_rad" for i in (1, 2, 3)])
+    t = clock(100.0)
+    up = Rotation.from_euler("ZYX", [0.0, pitch, roll]).inv().apply([0.0, 0.0, GRAVITY_MPS2])
+    gyro = noisy([0 * t, 0.0, rate])
+    force = noisy([up[0] + 0 * t, up[1] + rate * speed, up[2]])
+    fused = noisy([roll + 0 * t, pitch, 0.7 + rate * t])
+    fused[:, 2] = np.angle(np.exp(1j * fused[:, 2]))
+    names = [f"gyro_{a}_radps" for a in "xyz"] + [f"accel_{a}_mps2" for a in "xyz"]
+    streams["imu"] = Stream(t, np.hstack([gyro, force, fused]), [*names, "roll_rad", "pitch_rad", "yaw_rad"])
+    t = clock(200.0)
+    yaw = yaw_0 + rate * t
+    position = speed / rate * np.column_stack([np.sin(yaw) - np.sin(yaw_0), np.cos(yaw_0) - np.cos(yaw)])
+    plain = noisy([*position.T, yaw, roll, pitch, speed, 0.0, rate]).T
+    streams["odometry"] = odometry_stream(
+        t, plain[:2].T, plain[[3, 4, 2]].T, plain[5:8].T, ROBOT.camera, yaw_0
+    )
+    t = clock(10.0)
+    yaw = yaw_0 + rate * t
+    position = speed / rate * np.column_stack([np.sin(yaw) - np.sin(yaw_0), np.cos(yaw_0) - np.cos(yaw)])
+    velocity = speed * np.column_stack([np.cos(yaw), np.sin(yaw)])
+    place = position + np.array([500.0, -80.0])
+    gnss = np.column_stack([place, velocity, np.zeros(t.size), np.ones(t.size)])
+    names = [
+        "position_x_m",
+        "position_y_m",
+        "velocity_x_mps",
+        "velocity_y_mps",
+        "std_position_m",
+        "fix_ratio",
+    ]
+    streams["gnss"] = Stream(t, gnss, names)
+    return RunLog("run", "agrimaro", streams)
+
+
+def change(run, name, edit):
+    """Return the run with one stream edited: ``edit(time_s, values, channels) -> (time_s, values)``."""
+    stream = run.streams[name]
+    time_s, values = edit(np.array(stream.time_s), np.array(stream.values), list(stream.channels))
+    return replace(run, streams={**run.streams, name: Stream(time_s, values, stream.channels)})
+
+
+def set_rows(rows, value, channel=None):
+    def edit(time_s, values, channels):
+        where = rows(time_s) if callable(rows) else rows
+        values[where, slice(None) if channel is None else channels.index(channel)] = value
+        return time_s, values
+
+    return edit
+
+
+def without(run, *names):
+    return replace(run, streams={name: s for name, s in run.streams.items() if name not in names})
+
+
+def rows_of(table, *names):
+    return table.columns(names)
+
+
+RUN = turning_run()
+
+
+def test_ideal_sensors_give_the_motion():
+    table = measurement_table(RUN, bare(), gnss_latency_s=0.0)
+    assert table.rows == ROWS_OF_DRIVE["swerve"]
+    assert table.dropped == {}
+    np.testing.assert_array_equal(table.time_s, RUN.streams["wheels"].time_s)
+    t = table.time_s
+    lever = np.array([ROBOT.camera.lever_x_m, ROBOT.camera.lever_y_m])
+    expected = {
+        **{f"wheel_{i}_radps": 0.5 / 0.2 for i in (1, 2, 3)},
+        "accel_x_mps2": 0.0,
+        "accel_y_mps2": 0.2,
+        "gyro_z_radps": 0.4,
+        "imu_yaw_rad": 0.4 * t,
+        "steer_1_rad": 0.1 + 0.1 * np.sin(t),
+        "steer_2_rad": -0.2 + 0.1 * np.sin(t),
+        "steer_3_rad": 3.1 + 0.1 * np.sin(t),
+        "camera_speed_x_mps": 0.5 - 0.4 * lever[1],
+        "camera_speed_y_mps": 0.4 * lever[0],
+        "camera_yaw_rate_radps": 0.4,
+        "camera_yaw_rad": 0.4 * t,
+    }
+    for name, value in expected.items():
+        within = 8 * NOISE * (GRAVITY_MPS2 if "accel" in name else 1)  # tilt moves gravity
+        np.testing.assert_allclose(rows_of(table, name)[:, 0], value, atol=within, err_msg=name)
+    fresh = np.arange(t.size) % 5 == 0  # a sensor slower than the clock gives each sample once
+    gnss = rows_of(table, *GNSS_ROWS)
+    assert np.isnan(gnss[~fresh]).all()
+    arc = np.column_stack([1.25 * np.sin(0.4 * t), 1.25 - 1.25 * np.cos(0.4 * t)])
+    np.testing.assert_allclose(gnss[fresh, :2], arc[fresh], atol=1e-9)
+    np.testing.assert_allclose(
+        gnss[fresh, 2:], 0.5 * np.column_stack([np.cos(0.4 * t), np.sin(0.4 * t)])[fresh], atol=1e-9
+    )
+    np.testing.assert_array_equal(np.isnan(table.gnss_variance), np.isnan(gnss))
+    np.testing.assert_allclose(table.gnss_variance[fresh, 0], 0.02**2)
+
+
+def test_columns_come_in_the_order_of_a_model():
+    table = measurement_table(RUN, bare())
+    swapped = rows_of(table, "gyro_z_radps", "wheel_2_radps")
+    np.testing.assert_array_equal(swapped, table.z[:, [5, 1]])
+    with pytest.raises(DataError, match="no measurement 'wheel_left_mps'; this robot gives wheel_1_radps, "):
+        table.columns(["gyro_z_radps", "wheel_left_mps"])
+
+
+@pytest.mark.parametrize(("roll", "pitch"), [(0.0, -0.3), (0.2, 0.0), (0.25, 0.2), (-0.1, -0.15)])
+def test_a_robot_at_rest_on_a_slope_does_not_accelerate(roll, pitch):
+    run = turning_run(1.0, rate=1e-9, speed=0.0, roll=roll, pitch=pitch)
+    force = (
+        run.streams["imu"].channel("accel_x_mps2").mean(),
+        run.streams["imu"].channel("accel_y_mps2").mean(),
+    )
+    # the specific force at rest points up: forward with the nose up, to the left with the left side up
+    assert np.sign(force[0]) == np.sign(-pitch) or abs(pitch) < 1e-9
+    assert np.sign(force[1]) == np.sign(roll) or abs(roll) < 1e-9
+    accel = rows_of(measurement_table(run, bare()), "accel_x_mps2", "accel_y_mps2")
+    assert np.abs(accel).max() < 6 * NOISE * GRAVITY_MPS2
+
+
+def test_described_sensor_errors_are_subtracted():
+    robot = bare(
+        sensors={
+            "gyro_bias_z_radps": GYRO_BIAS,
+            "accel_bias_x_mps2": 0.05,
+            "accel_scale_x_ratio": 1.02,
+            "accel_bias_y_mps2": -0.1,
+            "accel_scale_y_ratio": 0.97,
+        },
+        steering={"zero_1_rad": 0.3, "zero_2_rad": -2.0, "zero_3_rad": 2.5},
+    )
+
+    def raw(time_s, values, channels):
+        for axis, scale, bias in (("x", 1.02, 0.05), ("y", 0.97, -0.1)):
+            values[:, channels.index(f"accel_{axis}_mps2")] *= scale
+            values[:, channels.index(f"accel_{axis}_mps2")] += bias
+        values[:, channels.index("gyro_z_radps")] += GYRO_BIAS
+        return time_s, values
+
+    def with_zeros(time_s, values, _):
+        return time_s, np.angle(np.exp(1j * (values + np.array([0.3, -2.0, 2.5]))))
+
+    run = change(change(RUN, "imu", raw), "steering", with_zeros)
+    np.testing.assert_allclose(measurement_table(run, robot).z, measurement_table(RUN, bare()).z, atol=1e-9)
+
+
+# the low-pass
+
+
+def plain_low_pass(time_s, value, tau, gap):
+    """The low-pass's equation solved by an integrator, segment by segment."""
+    out = [value[0]]
+    for k in range(1, len(value)):
+        if time_s[k] - time_s[k - 1] > gap:
+            out.append(value[k])
+            continue
+        line = np.poly1d(np.polyfit(time_s[k - 1 : k + 1], value[k - 1 : k + 1], 1))
+        solved = solve_ivp(
+            lambda t, y, line=line: (line(t) - y) / tau,
+            time_s[k - 1 : k + 1],
+            [out[-1]],
+            rtol=1e-10,
+            atol=1e-12,
+        )
+        out.append(solved.y[0, -1])
+    return np.array(out)
+
+
+@pytest.mark.parametrize("tau", [0.005, 0.05, 0.4])
+def test_low_pass_solves_its_equation_on_any_stamps(tau):
+    rng = np.random.default_rng(3)
+    time_s = np.cumsum(rng.exponential(0.02, 40))
+    value = rng.standard_normal(40)
+    np.testing.assert_allclose(
+        low_pass(time_s, value, tau, 0.05), plain_low_pass(time_s, value, tau, 0.05), atol=1e-6
+    )
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    tau=st.floats(1e-3, 0.2),
+    gain=st.floats(-3, 3),
+    split=st.integers(1, 49),
+)
+def test_laws_of_the_low_pass(seed, tau, gain, split):
+    rng = np.random.default_rng(seed)
+    time_s = np.cumsum(rng.uniform(1e-4, 0.03, 50))
+    a, b = rng.standard_normal((2, 50))
+    far = np.inf
+
+    def smooth(value, time=time_s):
+        return low_pass(time, value, tau, far)
+
+    np.testing.assert_allclose(smooth(a + gain * b), smooth(a) + gain * smooth(b), atol=1e-9)  # linear
+    np.testing.assert_allclose(smooth(np.full(50, gain)), gain, atol=1e-12)  # keeps what stands
+    late = time_s[-1] - time_s[0]
+    ramp = smooth(time_s - time_s[0])
+    assert late - ramp[-1] == pytest.approx(tau * -np.expm1(-late / tau), rel=1e-6)  # delays a ramp by tau
+    # a sample that lies on the line between its neighbours changes nothing
+    time_2 = np.insert(time_s, split, time_s[split - 1 : split + 1].mean())
+    a_2 = np.insert(a, split, a[split - 1 : split + 1].mean())
+    np.testing.assert_allclose(np.delete(smooth(a_2, time_2), split), smooth(a), atol=1e-9)
+
+
+def test_all_signals_share_the_delay_of_the_encoders():
+    """One ramp in every signal comes out of every row by the encoder's lag late, at once with the wheels."""
+    encoder_s, camera_s = 0.05, 0.02
+    robot = bare(
+        camera={"time_constant_s": camera_s, "latency_s": 0.028, "lever_x_m": 0.0, "lever_y_m": 0.0},
+        sensors={"encoder_time_constant_s": encoder_s, "imu_latency_s": 0.005},
+    )
+    run = turning_run(rate=1e-6, speed=0.0)
+
+    def ramp(latency_s, lag_s, columns, factor=1.0):
+        def edit(time_s, values, channels):
+            settled = time_s - latency_s - lag_s  # of a long ramp: its start is forgotten
+            for channel in columns:
+                values[:, channels.index(channel)] += factor * settled
+            return time_s, values
+
+        return edit
+
+    run = change(run, "wheels", ramp(0.0, encoder_s, ["motor_1_radps"], 10.0))
+    run = change(run, "imu", ramp(0.005, 0.0, ["gyro_z_radps", "accel_x_mps2"]))
+    run = change(run, "imu", ramp(0.005, 0.0, ["yaw_rad"], 0.2))
+    run = change(run, "steering", ramp(0.0, 0.0, ["angle_1_rad"], 0.2))
+    run = change(run, "odometry", ramp(0.028, camera_s, ["velocity_z_mps"], -1.0))
+    table = measurement_table(run, robot)
+    late = (table.time_s > 1.0) & (table.time_s < 5.9)
+    wheel = rows_of(table, "wheel_1_radps")[late, 0]
+    np.testing.assert_allclose(wheel, table.time_s[late] - encoder_s, atol=1e-9)
+    for row, slope, start in (
+        ("gyro_z_radps", 1.0, 0.0),
+        ("accel_x_mps2", 1.0, 0.0),
+        ("camera_speed_x_mps", 1.0, 0.0),
+        ("steer_1_rad", 0.2, 0.1),
+    ):
+        signal = rows_of(table, row)[late, 0]
+        if row == "steer_1_rad":
+            signal = signal - 0.1 * np.sin(table.time_s[late] - encoder_s)
+        np.testing.assert_allclose(signal, start + slope * wheel, atol=1e-3, err_msg=row)
+    raw = measurement_table(run, robot, time_constant_s=0.0)
+    ahead = rows_of(raw, "gyro_z_radps")[late, 0] - wheel
+    np.testing.assert_allclose(
+        ahead, encoder_s - 0.005, atol=1e-3
+    )  # a raw sample is held over half its period
+    longer = measurement_table(run, robot, time_constant_s=0.2)
+    np.testing.assert_allclose(
+        rows_of(longer, "camera_speed_x_mps")[late, 0], table.time_s[late] - 0.22, atol=8e-3
+    )
+
+
+def test_smoothing_of_the_thesis_is_there_to_be_compared():
+    alpha = 0.2
+    raw = measurement_table(RUN, bare(), time_constant_s=0.0)
+    smooth = measurement_table(RUN, bare(sensors={"encoder_time_constant_s": 0.05}), ema_alpha=alpha)
+    expected = np.array(rows_of(raw, *CAMERA_ROWS))
+    for k in range(1, len(expected)):
+        expected[k] = alpha * expected[k - 1] + (1 - alpha) * expected[k]
+    # yaw is counted from its first row, which is the same here
+    np.testing.assert_allclose(rows_of(smooth, *CAMERA_ROWS), expected, atol=1e-12)
+    others = [row for row in raw.rows if row not in CAMERA_ROWS]
+    np.testing.assert_array_equal(smooth.columns(others), raw.columns(others))
+
+
+# faults
+
+
+@pytest.mark.parametrize(
+    ("stream", "rows"),
+    [
+        ("odometry", CAMERA_ROWS),
+        ("imu", ("accel_x_mps2", "accel_y_mps2", "gyro_z_radps", "imu_yaw_rad")),
+        ("steering", ("steer_1_rad", "steer_2_rad", "steer_3_rad")),
+        ("gnss", GNSS_ROWS),
+    ],
+)
+def test_a_stream_that_is_missing_or_ends_early_or_has_a_hole_is_unknown_there(stream, rows):
+    whole = measurement_table(RUN, bare(sensors={"encoder_time_constant_s": 0.05}))
+    robot = bare(sensors={"encoder_time_constant_s": 0.05})
+    gone = measurement_table(without(RUN, stream), robot)
+    assert np.isnan(gone.columns(rows)).all()
+    empty = change(RUN, stream, lambda t, v, c: (t[:0], v[:0]))
+    assert np.isnan(measurement_table(empty, robot).columns(rows)).all()
+    by_camera = ("camera_age_s", *(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)))
+    others = [row for row in whole.rows if row not in (*rows, "vibration_mps2", *by_camera)]
+    np.testing.assert_array_equal(gone.columns(others), whole.columns(others))
+
+    def hole(time_s, values, _):
+        kept = (time_s < 2.0) | ((time_s > 3.5) & (time_s < 5.0))
+        return time_s[kept], values[kept]
+
+    holed = measurement_table(change(RUN, stream, hole), robot)
+    t = holed.time_s
+    period = max(0.02, np.median(np.diff(RUN.streams[stream].time_s)))
+    for row in rows:
+        value, known = holed.columns([row])[:, 0], whole.columns([row])[:, 0]
+        assert np.isnan(value[(t > 2.0 + 1.5 * period) & (t < 3.5)]).all()
+        assert np.isnan(value[t > 5.0 + 1.5 * period]).all()
+        before, after = t < 1.9, (t > 4.2) & (t < 4.9)
+        np.testing.assert_array_equal(value[before], known[before])
+        # anew after the hole, the low-pass has settled again
+        np.testing.assert_allclose(value[after], known[after], atol=2e-3)
+        assert np.nanmax(np.abs(np.diff(value[(t > 3.6) & (t < 4.9)])), initial=0.0) < 0.02 + NOISE * 10
+
+
+def test_samples_that_are_no_numbers_are_left_out_and_counted():
+    run = change(RUN, "imu", set_rows([10, 11, 200], np.inf, "gyro_z_radps"))
+    run = change(run, "odometry", set_rows(lambda t: (t > 2) & (t < 3), np.nan))
+    run = change(run, "wheels", set_rows([7], np.nan, "motor_2_radps"))
+    table = measurement_table(run, bare())
+    assert table.dropped == {"imu: not finite": 3, "odometry: not finite": 199, "wheels: not finite": 1}
+    plain = measurement_table(RUN, bare())
+    changed = (table.z != plain.z) & ~(np.isnan(table.z) & np.isnan(plain.z))
+    assert set(np.array(table.rows)[changed.any(axis=0)]) == {
+        *("gyro_z_radps", "wheel_2_radps", "wheel_2_change_m2ps3", "camera_age_s"),
+        *CAMERA_ROWS,
+    }
+    assert np.flatnonzero(np.isnan(rows_of(table, "wheel_2_radps")[:, 0])).tolist() == [7]
+    assert np.isfinite(rows_of(table, "gyro_z_radps")).all()  # held over the two
+    lost = (table.time_s > 2.03) & (table.time_s < 2.99)
+    assert np.isnan(rows_of(table, *CAMERA_ROWS)[lost]).all()
+
+
+def test_an_invalid_quaternion_is_left_out_and_counted():
+    run = change(RUN, "odometry", set_rows(lambda t: t >= 4.0, 0.0, "quaternion_w_ratio"))
+    table = measurement_table(run, bare())
+    assert table.dropped == {"odometry: no rotation": 20}  # then the channel is frozen
+    assert np.isnan(rows_of(table, *CAMERA_ROWS)[table.time_s > 4.03]).all()
+
+
+def test_camera_samples_of_low_confidence_are_dropped():
+    run = change(RUN, "odometry", set_rows(lambda t: (t >= 2) & (t < 3), 1 / 3, "confidence_ratio"))
+    table = measurement_table(run, bare())
+    assert table.dropped == {"odometry: low confidence": 200}
+    assert np.isnan(rows_of(table, *CAMERA_ROWS)[(table.time_s > 2.03) & (table.time_s < 3)]).all()
+
+
+@pytest.mark.parametrize("stream", ["odometry", "imu"])
+def test_a_sensor_that_repeats_itself_is_frozen(stream):
+    def freeze(start, end):
+        def edit(time_s, values, _):
+            rows = (time_s >= start) & (time_s < end)
+            values[rows] = values[rows.argmax()]
+            return time_s, values
+
+        return edit
+
+    rows = CAMERA_ROWS if stream == "odometry" else ("gyro_z_radps", "accel_x_mps2", "imu_yaw_rad")
+    n_hz = 200 if stream == "odometry" else 100
+    table = measurement_table(change(RUN, stream, freeze(2.0, 3.0)), bare())
+    assert table.dropped == {f"{stream}: frozen": n_hz - 1}
+    frozen = (table.time_s > 2.04) & (table.time_s < 3.0)
+    assert np.isnan(rows_of(table, *rows)[frozen]).all()
+    assert np.isfinite(rows_of(table, *rows)[~frozen & (table.time_s < 2.0)]).all()
+    shorter = measurement_table(change(RUN, stream, freeze(2.0, 2.2)), bare())
+    assert shorter.dropped == {}  # a few equal samples may be a slow motor driver
+
+    stopped = change(RUN, "wheels", set_rows(lambda t: t > 1, 0.0))
+    stopped = change(stopped, "steering", set_rows(lambda t: t > 1, 0.1))
+    dropped = measurement_table(stopped, bare()).dropped
+    assert not any(kind.endswith("frozen") for kind in dropped)  # wheels may stand still
+
+
+def test_a_leap_is_taken_out_before_the_low_pass_smears_it():
+    plain = measurement_table(RUN, bare())
+    relocalised = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 2.02), 3.0, "velocity_z_mps"))
+    table = measurement_table(relocalised, bare())
+    assert table.dropped == {"odometry: leap": 4}
+    np.testing.assert_allclose(table.z, plain.z, atol=0.03)
+
+    jumped = change(RUN, "odometry", set_rows(lambda t: t >= 2.0, 3.0, "velocity_z_mps"))
+    table = measurement_table(jumped, bare())
+    late = table.time_s > 2.05
+    assert table.dropped["odometry: leap"] == 10  # then the channel is frozen
+    assert np.isnan(rows_of(table, "camera_speed_x_mps")[late]).all()  # a speed over ground cannot leap
+    assert np.isfinite(rows_of(table, "camera_yaw_rate_radps", "camera_yaw_rad")[late]).all()
+    back = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 3.0), 3.0, "velocity_z_mps"))
+    table = measurement_table(back, bare())
+    assert np.isfinite(rows_of(table, "camera_speed_x_mps")[table.time_s > 3.05]).all()
+
+
+def test_a_leap_of_the_camera_s_heading_is_taken_off():
+    def turned(time_s, values, channels):
+        late, q = time_s >= 3.0, [channels.index(f"quaternion_{a}_ratio") for a in "xyzw"]
+        # the camera's y axis points down: a turn to the left about it is negative
+        values[np.ix_(late, q)] = (
+            Rotation.from_euler("y", 0.3) * Rotation.from_quat(values[np.ix_(late, q)])
+        ).as_quat()
+        return time_s, values
+
+    plain, table = measurement_table(RUN, bare()), measurement_table(change(RUN, "odometry", turned), bare())
+    yaw = rows_of(table, "camera_yaw_rad") - rows_of(plain, "camera_yaw_rad")
+    assert np.nanmax(np.abs(yaw)) < 0.01
+
+
+def test_stamps_that_do_not_increase_cost_their_sample_only():
+    def spoil(time_s, values, _):
+        time_s[100] = time_s[99]  # a repeat
+        time_s[200] = time_s[150]  # back
+        time_s[250] = 1e6  # far ahead
+        time_s[270] = np.nan
+        return time_s, values
+
+    plain = measurement_table(RUN, bare())
+    for stream in ("imu", "odometry", "steering"):
+        table = measurement_table(change(RUN, stream, spoil), bare())
+        assert table.dropped == {f"{stream}: stamp does not increase": 4}
+        np.testing.assert_allclose(table.z, plain.z, atol=0.02)
+    table = measurement_table(change(RUN, "wheels", spoil), bare())
+    assert table.dropped == {"wheels: stamp does not increase": 4}
+    kept = np.isin(plain.time_s, table.time_s)
+    assert kept.sum() == plain.time_s.size - 4
+    np.testing.assert_array_equal(table.z[:, :3], plain.z[kept, :3])
+
+
+def test_a_clock_that_starts_anew_keeps_the_longer_part():
+    def reset(time_s, values, _):
+        time_s[200:] -= time_s[200]  # 4 s, then 2 s from zero again
+        return time_s, values
+
+    table = measurement_table(change(RUN, "wheels", reset), bare())
+    assert table.dropped["wheels: stamp does not increase"] == 100
+    assert table.time_s[-1] == pytest.approx(3.98)
+
+
+# yaw and position of the start
+
+
+def test_yaw_and_position_are_counted_from_the_start_in_the_world_frame():
+    run = turning_run(yaw_0=1.2)
+    table = measurement_table(run, bare(), initial_yaw_rad=1.2, gnss_latency_s=0.0)
+    t = table.time_s
+    for row in ("imu_yaw_rad", "camera_yaw_rad"):
+        np.testing.assert_allclose(rows_of(table, row)[:, 0], 1.2 + 0.4 * t, atol=1e-3)
+    gnss = rows_of(table, *GNSS_ROWS)[::5]
+    yaw = 1.2 + 0.4 * t[::5]
+    np.testing.assert_allclose(gnss[:, 2:], 0.5 * np.column_stack([np.cos(yaw), np.sin(yaw)]), atol=1e-9)
+    walked = 1.25 * np.column_stack([np.sin(yaw) - np.sin(1.2), np.cos(1.2) - np.cos(yaw)])
+    np.testing.assert_allclose(gnss[:, :2], walked, atol=1e-9)
+
+
+def test_heading_at_the_start_is_that_of_the_robot_while_it_stands():
+    rng = np.random.default_rng(1)
+    noise_rad = 0.01
+    offsets = []
+    for seed in range(20):
+        run = turning_run(3.0, rate=1e-6, speed=0.0, seed=seed)
+        run = change(run, "wheels", set_rows(lambda t: t > 1.5, 25.0))
+        run = change(run, "imu", lambda t, v, c: (t, v + noise_rad * rng.standard_normal(v.shape)))
+        table = measurement_table(run, bare())
+        offsets.append(np.mean(rows_of(table, "imu_yaw_rad")[table.time_s > 1.0]))
+    # 51 samples at the start and 99 after it: 0.0017; by one sample it would be 0.01
+    assert np.std(offsets) < 0.0017 * 1.6
+
+
+def test_a_camera_that_missed_a_turn_takes_the_yaw_of_the_imu():
+    def late(time_s, values, _):
+        return time_s[time_s > 3.0], values[time_s > 3.0]
+
+    run = change(RUN, "odometry", late)
+    table = measurement_table(run, bare(), initial_yaw_rad=0.5)
+    seen = table.time_s > 3.0
+    np.testing.assert_allclose(
+        rows_of(table, "camera_yaw_rad")[seen, 0], 0.5 + 0.4 * table.time_s[seen], atol=1e-3
+    )
+    alone = measurement_table(without(run, "imu"), bare())
+    assert np.nanmin(rows_of(alone, "camera_yaw_rad")) == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_camera_that_was_lost_through_a_turn_comes_back_on_the_right_one():
+    run = turning_run(10.0, rate=1.0)
+
+    def lose(time_s, values, _):
+        kept = (time_s < 2.0) | (time_s > 6.0)  # four radians unseen
+        return time_s[kept], values[kept]
+
+    table = measurement_table(change(run, "odometry", lose), bare())
+    seen = np.isfinite(rows_of(table, "camera_yaw_rad")[:, 0])
+    np.testing.assert_allclose(rows_of(table, "camera_yaw_rad")[seen, 0], table.time_s[seen], atol=0.03)
+
+
+def test_gnss_without_a_fix_has_a_larger_variance_and_is_late():
+    def float_first(time_s, values, channels):
+        values[time_s < 1.0, channels.index("fix_ratio")] = 0.0
+        values[time_s > 4.0, channels.index("std_position_m")] = 0.1
+        return time_s + 0.2, values
+
+    table = measurement_table(change(RUN, "gnss", float_first), bare(), gnss_latency_s=0.2)
+    t, position = table.time_s, rows_of(table, "gnss_position_x_m")[:, 0]
+    known = np.isfinite(position)
+    std = np.sqrt(table.gnss_variance)
+    np.testing.assert_allclose(std[known & (t < 0.99), 0], 0.5)
+    np.testing.assert_allclose(std[known & (t > 0.99) & (t < 4.01), 0], 0.02)
+    np.testing.assert_allclose(std[known & (t > 4.01), 0], 0.1)
+    np.testing.assert_allclose(position[known], 1.25 * (np.sin(0.4 * t) - np.sin(0.4))[known], atol=1e-9)
+
+
+# robots that skid, bad input
+
+
+def husky_run(*, gnss=False):
+    rng = np.random.default_rng(0)
+    t = np.arange(100) / 10
+    streams = {
+        "wheels": Stream(t, np.column_stack([t, 2 * t]), ("speed_left_mps", "speed_right_mps")),
+        "imu": Stream(
+            np.arange(1000) / 100,
+            0.3 + NOISE * rng.standard_normal((1000, 3)),
+            [f"gyro_{axis}_radps" for axis in "xyz"],
+        ),
+    }
+    if gnss:
+        streams["gnss"] = Stream(t[::2], np.column_stack([t, t])[::2], ("position_x_m", "position_y_m"))
+    return RunLog("skid", "husky", streams)
+
+
+def test_a_skid_steered_robot_has_sides_and_a_gyro():
+    table = measurement_table(husky_run(), HUSKY)
+    assert table.rows == ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps", *GNSS_ROWS, REST_ROW)
+    np.testing.assert_allclose(table.z[:, :2], np.column_stack([table.time_s, 2 * table.time_s]))
+    np.testing.assert_allclose(table.z[:, 2], 0.3, atol=6 * NOISE)
+    assert np.isnan(table.z[:, 3:]).all()
+    with_gnss = measurement_table(husky_run(gnss=True), HUSKY, gnss_latency_s=0.0)
+    np.testing.assert_allclose(with_gnss.z[::2, 3], with_gnss.time_s[::2])
+    assert np.isnan(with_gnss.z[:, 5:]).all()  # no speed in this stream
+    np.testing.assert_allclose(with_gnss.gnss_variance[::2, 0], 0.25)  # no fix was reported
+
+
+def test_logs_without_a_clock_are_refused():
+    with pytest.raises(DataError, match="run run: there is no stream 'wheels', which gives the clock"):
+        measurement_table(without(RUN, "wheels"), ROBOT)
+    with pytest.raises(DataError, match="the stream 'wheels', which gives the clock, is empty"):
+        measurement_table(change(RUN, "wheels", lambda t, v, c: (t[:0], v[:0])), ROBOT)
+    with pytest.raises(DataError, match="no channel 'speed_left_mps', which the robot husky should have"):
+        measurement_table(RUN, HUSKY)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"time_constant_s": -0.1}, "time_constant_s is -0.1"),
+        ({"time_constant_s": np.nan}, "time_constant_s is nan"),
+        ({"ema_alpha": 1.0}, "ema_alpha is 1, a number from 0 to below 1"),
+        ({"ema_alpha": 0.2, "time_constant_s": 0.1}, "not both"),
+        ({"gnss_latency_s": -1.0}, "gnss_latency_s is -1"),
+    ],
+)
+def test_invalid_options_are_refused(options, message):
+    with pytest.raises(ConfigError, match=message):
+        measurement_table(RUN, ROBOT, **options)
+
+
+def test_a_robot_has_to_describe_the_sensors_it_is_asked_of():
+    with pytest.raises(ConfigError, match="no section 'camera'"):
+        measurement_table(RUN, ROBOT.without("camera"))
+    blind = ROBOT.without("camera")
+    assert measurement_table(without(RUN, "odometry"), blind).time_s.size == 300
+
+
+def test_a_causal_table_does_not_depend_on_later_samples():
+    robot = bare(
+        sensors={"imu_latency_s": 0.005, "encoder_time_constant_s": 0.05}, camera={"latency_s": 0.006}
+    )
+    whole, plain = measurement_table(RUN, robot, causal=True), measurement_table(RUN, robot)
+    for end_s in (0.5, 1.5, 3.0):
+        cut = RUN
+        for name in RUN.streams:
+            cut = change(cut, name, lambda t, v, _, end_s=end_s: (t[t <= end_s], v[t <= end_s]))
+        table = measurement_table(cut, robot, causal=True)
+        n = table.time_s.size
+        np.testing.assert_allclose(table.z, whole.z[:n], rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(table.gnss_variance, whole.gnss_variance[:n])
+        ahead = (
+            rows_of(measurement_table(cut, robot), "camera_yaw_rad") != rows_of(plain, "camera_yaw_rad")[:n]
+        )
+        assert ahead.any()  # the other one does
+    within = 6 * NOISE + 0.4 * 0.02  # a latency and a period at 0.4 rad/s
+    apart = rows_of(whole, *CAMERA_ROWS)[60:] - rows_of(plain, *CAMERA_ROWS)[60:]
+    assert np.ptp(apart, axis=0).max() < within
