@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.model import TerrainModel
-from pipelines.live.state import Bias, LiveState, restorable
+from terrain.control.live_state import Bias, LiveState
 from terrain.control.pilot_settings import check_table
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import (
@@ -195,7 +195,7 @@ class Chain:
             if the filter has run already.
         """
         resident, name = self._kept_filter
-        fresh = restorable(state, self.robot_name, name, now_s)
+        fresh = state.usable(self.robot_name, name, now_s)
         if resident is not None:
             resident.begin_from(fresh.biases, max(now_s - state.saved_s, 0.0))
         self.belief = TerrainBelief(fresh.terrain, fresh.probability)
