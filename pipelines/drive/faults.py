@@ -173,8 +173,7 @@ def fault_loop(robot: Robot, slips: SlipTable) -> FaultLoop:
 
 
 def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
-    settings = PilotSettings(controller=controller, delay_s=DELAY_S)
-    return LivePilot(robot, slips, KnownTerrain(), settings)
+    return LivePilot(robot, slips, KnownTerrain(), PilotSettings(controller=controller))
 
 
 def fault_figure(loop: FaultLoop, case: FaultCase, references: References) -> Figure:

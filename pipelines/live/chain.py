@@ -121,12 +121,8 @@ class Chain:
         self.robot_name, self.switching, self._clocks = robot_name, switching, clocks
         self.belief: TerrainBelief = NO_BELIEF
         self.estimate: Estimate | None = None
-        self._check_table(table)
+        check_table(table, robot_name)
         self.table = table
-
-    def _check_table(self, table: SlipTable) -> None:
-        if self.robot_name:
-            check_table(table, self.robot_name)
 
     @property
     def target_ratio(self) -> float:
@@ -150,7 +146,7 @@ class Chain:
 
     def check(self, model: TerrainModel | None, table: SlipTable) -> None:
         """Raise what :meth:`replace` would."""
-        self._check_table(table)
+        check_table(table, self.robot_name)
         self.source.check(model)
 
     def replace(self, model: TerrainModel | None, table: SlipTable) -> None:
@@ -160,7 +156,7 @@ class Chain:
         otherwise its windows begin with the next sample.  ``ConfigError`` where the table is another robot's,
         ``DataError`` where the model does not suit what is measured and estimated, or is none.
         """
-        self._check_table(table)
+        check_table(table, self.robot_name)
         self.source.swap(model)
         self.table = table
 
