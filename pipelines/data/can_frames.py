@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -158,13 +158,13 @@ class Layout:
         return frozenset(signal.column for plan in self.by_stream.get(stream, ()) for signal in plan.signals)
 
 
-def load_layout(path: str | Path | None = None, streams: Iterable[str] = SIGNALS) -> Layout:
+def load_layout(path: str | Path | None = None, *, complete: bool = True) -> Layout:
     """Return what a DBC has of the signals that are used.
 
     Parameters
     ----------
     path : DBC file; AgriMaRo's by default
-    streams : that it must have, without the channels that may be lacking
+    complete : whether it must have what a pilot needs: all signals but those that may be lacking
 
     Raises
     ------
@@ -208,12 +208,8 @@ def load_layout(path: str | Path | None = None, streams: Iterable[str] = SIGNALS
                 f"a frame of classical CAN has at most {MAX_BYTES}"
             )
         by_stream.setdefault(carried[0], []).append(_message_plan(message, carried[0], signals))
-    missing = [
-        name
-        for name, (stream, _, channel) in places.items()
-        if name not in owner and stream in set(streams) and channel not in OPTIONAL
-    ]
-    if missing:
+    missing = [name for name, place in places.items() if name not in owner and place[2] not in OPTIONAL]
+    if complete and missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ConfigError(f"{path}: lacks the signal {missing[0]!r}{more}; docs/can.md lists those required")
     plans = [plan for of_stream in by_stream.values() for plan in of_stream]

@@ -210,7 +210,7 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
         from pipelines.data import can_frames
 
         name = CAN_ROBOT if robot is None else robot.name
-        return can_frames.find_runs(folder, can_frames.load_layout(mapping, ()), name)
+        return can_frames.find_runs(folder, can_frames.load_layout(mapping, complete=False), name)
     if mapping is not None and layout not in ("auto", "csv"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if mapping is not None:
@@ -230,19 +230,19 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
     }
     if layout == "auto" and robotino.find_root(folder) is not None:
         del finders["drive-recording"]  # files of a Robotino have its ending, and a camera's file above them
-    found = {name: find(folder) for name, find in finders.items() if layout in ("auto", name)}
-    names = [name for name, readers in found.items() if readers]
-    if len(names) > 1:
-        raise LogError(f"{folder}: mixes the layouts {' and '.join(names)}; choose one with --format")
-    if not names and layout == "auto":
+    asked = finders if layout == "auto" else {layout: finders[layout]}
+    found = {name: readers for name, find in asked.items() if (readers := find(folder))}
+    if len(found) > 1:
+        raise LogError(f"{folder}: mixes the layouts {' and '.join(found)}; choose one with --format")
+    if not found and layout == "auto":
         from pipelines.data import bag_runs
 
         return bag_runs.find_runs(folder, None, robot)
-    if names == ["drive"]:
+    if "drive" in found:
         return drive.find_runs(folder, drive_robot(robot))
-    if names == ["drive-recording"]:
+    if "drive-recording" in found:
         return drive_recording.find_runs(folder, lambda name: drive_robot(robot_named(name, robot)))
-    return found[names[0]] if names else []
+    return next(iter(found.values()), [])
 
 
 def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:
