@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,8 +54,7 @@ PICTURED = 3
 """Metrics of the first picture."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class DriveResult(Result):
+class DriveResult(Result, eq=False):
     """Controllers side by side, over the same seeds."""
 
     scenario: str = described("what was driven")

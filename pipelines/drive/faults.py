@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -67,8 +66,7 @@ FASTEST_MPS = 10.0
 """Estimates of the speed beyond this, as a fault may cause, are not drawn."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class FaultsResult(Result):
+class FaultsResult(Result, eq=False):
     """Sensor faults in the closed loop."""
 
     robot: str = described("that was driven")

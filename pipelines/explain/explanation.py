@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +50,7 @@ Z, PERCENT = ".1f", ".1%"
 WHY, NEEDS = Column("why", long=True), Column("driving that shows it", long=True)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ExplainResult(Result):
+class ExplainResult(Result, eq=False):
     """What the simulation of a robot gets wrong about runs, and what building that in gains.
 
     In JSON the fields of the diagnosis stand beside the others.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 POINTS = "+.1f"
 
 
-@dataclass(frozen=True, repr=False)
 class ComparisonResult(Result):
     """Several recipes on the same folds, or several models on the same runs; each compared with the first."""
 
@@ -54,8 +53,13 @@ def side_by_side(
     contenders: Sequence[tuple[str, WindowPipeline, Samples]],
     settings: EvaluationSettings,
     progress: Progress,
-) -> ComparisonResult:
-    """Evaluate recipes, each with the windows of its own signals, on the same folds.
+) -> CrossvalResult | ComparisonResult:
+    """Evaluate a recipe, or several, each with the windows of its own signals, on the same folds.
+
+    Parameters
+    ----------
+    contenders : name, recipe and samples of each
+    settings, progress : as of :func:`pipelines.learn.evaluate.evaluate_recipe`
 
     Raises
     ------
@@ -78,6 +82,8 @@ def side_by_side(
                 "different times: compare them on signal sets of the same streams"
             )
     found = [evaluate_recipe(recipe, name, each, settings, progress) for name, recipe, each in contenders]
+    if len(found) == 1:
+        return found[0][0]
     (_, held_out), motion, levels = found[0], window_motion(samples.windows), None
     if motion is not None and settings.protocol != "published":
         true_runs = held_out_support(held_out, samples.run_id, motion).true_runs

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from statistics import fmean
@@ -117,7 +117,6 @@ class WindowPrediction(NamedTuple):
     terrain_set: tuple[str, ...] | None
 
 
-@dataclass(frozen=True, repr=False)
 class Predictions(Result):
     """Predictions of a model for every window that its own rule keeps."""
 
@@ -126,7 +125,7 @@ class Predictions(Result):
     n_runs: int = described("runs that they are of")
     classes: tuple[str, ...] = described("terrains that the model has learned")
     accuracy: float | None = described(
-        "windows whose nearest terrain is their label; None without labels", "1", form=PERCENT
+        "windows whose nearest terrain is their label; None without labels", "1"
     )
     n_judged: int = described("windows whose label the model knows")
     training_runs: tuple[str, ...] = described(
@@ -141,9 +140,7 @@ class Predictions(Result):
         "target slips by terrain and drive state, and the entry of the table that they come from"
     )
     filtered: tuple[str, ...] = described("runs that the live chain filtered, as they had no estimates")
-    filtered_accuracy: float | None = described(
-        "as the accuracy, of the terrain filtered over time", "1", form=PERCENT
-    )
+    filtered_accuracy: float | None = described("as the accuracy, of the terrain filtered over time", "1")
     n_unknown: int = described("windows that are like no terrain that was learned")
     n_unsupported: int | None = described(
         "windows whose prediction no training run supports; None where not counted"

@@ -14,7 +14,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -316,7 +315,6 @@ def latency_of(times_s: Sequence[float]) -> dict[str, float]:
     return dict(zip(("median_ms", "p99_ms"), quantiles_ms.round(4).tolist(), strict=True))
 
 
-@dataclass(frozen=True, repr=False)
 class BridgeResult(Result):
     """What a bridge did, from its start to its stop."""
 

@@ -11,7 +11,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -189,7 +189,6 @@ def required_token(settings: ServiceSettings) -> str:
     return token
 
 
-@dataclass(frozen=True, repr=False)
 class ServiceResult(Result):
     """What a service serves, and what it did until its end."""
 
