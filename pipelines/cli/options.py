@@ -76,9 +76,8 @@ def _parameter(name: str, field: FieldInfo) -> click.Parameter:
         return click.Argument([name], required=False)
     if field.annotation is bool:
         names = f"{shown}/--no-{shown.removeprefix('--')}" if field.default else shown
-        return click.Option([names, name], is_flag=True, default=None, type=bool, help=_text(field))
-    metavar = _metavar(field.annotation)
-    return click.Option([shown, name], multiple=extra["repeated"], metavar=metavar, help=_text(field))
+        return click.Option([names, name], is_flag=True, default=None, type=bool)
+    return click.Option([shown, name], multiple=extra["repeated"])
 
 
 def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]:
@@ -87,7 +86,6 @@ def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]
     What has to be given comes first, then what is the command's own.
     """
     groups: dict[str, list[tuple[str, str]]] = {REQUIRED: []}
-    context = click.Context(click.Command(None))
     heading_of: dict[str, str] = {}
     for kind in model.__mro__:  # the first class that has a field is the last one here
         heading = (kind.__doc__ or "Options").strip().splitlines()[0].rstrip(".")
@@ -96,10 +94,17 @@ def described_options(model: type[Settings]) -> dict[str, list[tuple[str, str]]]
     for name, field in model.model_fields.items():
         if field.alias:
             heading = REQUIRED if field.is_required() else heading_of[name]
-            option = _parameter(name, field)
-            row = option.get_help_record(context) if isinstance(option, click.Option) else None
-            groups[heading].append(row or (field.alias, _text(field)))
+            groups[heading].append((_written(field, field.alias), _text(field)))
     return {heading: rows for heading, rows in groups.items() if rows}
+
+
+def _written(field: FieldInfo, option: str) -> str:
+    """Return an option with what stands for its value."""
+    if not option.startswith("-"):
+        return option
+    if field.annotation is bool:
+        return f"{option} / --no-{option.removeprefix('--')}" if field.default else option
+    return f"{option} {_metavar(field.annotation)}"
 
 
 def _metavar(kind: Any) -> str:

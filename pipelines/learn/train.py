@@ -115,7 +115,6 @@ class TrainResult(Registered, kw_only=True):
 def run(settings: Settings, progress: Progress = silent) -> Registered:
     """Read runs, or their cached features, train and register; or register a folder; errors as :func:`train`."""
     from pipelines.data.tracking import ensure_tracking
-    from pipelines.learn.cache import cached_data, loaders_of
     from pipelines.learn.parallel import computing
     from pipelines.learn.tracking import log_training
     from pipelines.learn.training_data import data_of_runs
@@ -129,6 +128,8 @@ def run(settings: Settings, progress: Progress = silent) -> Registered:
             runs, skipped = load(settings)
             data = data_of_runs(runs, asked)
         else:
+            from pipelines.learn.cache import cached_data, loaders_of
+
             data, skipped = cached_data(loaders_of(settings), asked, settings.cache, progress)
         found = train(data, asked, settings.dataset, progress)
     return replace(found, skipped=tuple(skipped))

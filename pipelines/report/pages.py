@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
 from pipelines.report.figure import Figure
@@ -42,7 +42,7 @@ MAX_SVG_BYTES = 300_000
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("pipelines.report", "templates"),
-        autoescape=lambda name: name != MARKDOWN,
+        autoescape=select_autoescape(["html.j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
