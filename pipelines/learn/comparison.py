@@ -191,7 +191,10 @@ def report(result: ComparisonResult) -> Report:
         ],
         details=[
             *(Section(f"{each.b} less {each.a}", partial(_paired, each)) for each in result.differences),
-            *(Section(f"{each.recipe} alone", partial(_alone, each)) for each in result.contenders),
+            *(
+                Section(f"{each.recipe} alone", [recall_table(each), *notes(*each.notes)])
+                for each in result.contenders
+            ),
         ],
         next_step=f"terrain train --data {result.data or 'DIR'} --recipe RECIPE --name NAME"
         if result.kind == "recipes"
@@ -207,10 +210,6 @@ def _points(found: Difference) -> tuple[float, tuple[float, float], str]:
     """Return a difference and its interval in percentage points, and its verdict."""
     low, high = found.interval
     return 100 * found.difference, (100 * low, 100 * high), str(found.verdict)
-
-
-def _alone(result: CrossvalResult) -> list[Part]:
-    return [recall_table(result), *notes(*result.notes)]
 
 
 def _paired(found: Comparison) -> list[Part]:

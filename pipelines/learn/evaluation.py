@@ -1,4 +1,7 @@
-"""What an evaluation on held-out windows finds, and its report."""
+"""What an evaluation on held-out windows finds, and its report.
+
+The types of its fields are imported for more than a type checker: the record of a training is read by them.
+"""
 
 from __future__ import annotations
 

@@ -241,8 +241,8 @@ def predict(
         n_windows=len(rows),
         n_runs=len(runs),
         classes=classes,
-        accuracy=_ratio([row.nearest == row.label for row in judged]),
-        filtered_accuracy=_ratio([row.filtered_terrain == row.label for row in judged]),
+        accuracy=fmean(row.nearest == row.label for row in judged) if judged else None,
+        filtered_accuracy=fmean(row.filtered_terrain == row.label for row in judged) if judged else None,
         n_judged=len(judged),
         training_runs=tuple(each.run_id for each in runs if data_digest([each]) in model.info.run_digests),
         repaired=dict(sum((Counter(each.dropped) for each in runs), Counter())),
@@ -255,10 +255,6 @@ def predict(
         n_unknown=sum(row.terrain != row.nearest for row in rows),
         n_unsupported=None if model.support is None else sum(row.supported is False for row in rows),
     )
-
-
-def _ratio(right: Sequence[bool]) -> float | None:
-    return sum(right) / len(right) if right else None
 
 
 def _predict_windows(windows: Windows, model: TerrainModel, table: SlipTable) -> list[WindowPrediction]:
