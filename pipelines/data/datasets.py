@@ -9,11 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipelines.data.runs import Runs
 from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
 from terrain.errors import ConfigError, LogError
 
 if TYPE_CHECKING:
+    from pipelines.data.runs import Runs
     from terrain.logs.checks import Check
     from terrain.logs.drive import DriveRobot
     from terrain.records import RunLog
@@ -105,6 +105,8 @@ def load_runs(folder: str | Path, *, robot: str | Path | None = None, **reading:
     LogError, ConfigError, DataError
         as :func:`load`.
     """
+    from pipelines.data.runs import Runs
+
     name = None if robot is None else str(robot)
     runs, skipped = load(AlignedRunsSettings(data=Path(folder), robot=name, **reading))
     for sentence in skipped:
