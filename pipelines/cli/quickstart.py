@@ -11,7 +11,6 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +47,6 @@ class Settings(JobsSettings):
     runs_a_terrain: int = setting(6, "Simulated runs of each terrain.", ge=2, option="--runs")
 
 
-@dataclass(frozen=True, repr=False)
 class QuickstartResult(Result):
     """Evaluation, model and predictions, and where they come from."""
 
@@ -204,13 +202,19 @@ def report(result: QuickstartResult) -> Report:
     """Return the accuracy and what was predicted first; evaluation, training and slip are folded."""
     evaluation, training, predicted = result.crossval.report, result.train.report, result.predict.report
     slip = [] if result.slip is None else [_slip(result.slip)]
+    predicted_runs = (
+        f"Predictions are those of {enumerated(result.held_out)}, held out: the model was neither trained nor "
+        "evaluated on them."
+        if result.held_out
+        else "The runs are too few to hold one out: predictions are those of training runs."
+    )
     return Report(
         f"From logs to slip: {result.dataset}",
         evaluation.answer,
         picture=evaluation.picture,
         lead=evaluation.lead,
         parts=[
-            Section("", [Text(training.answer), Text(_held_out_sentence(result)), Text(predicted.answer)]),
+            Section("", [Text(training.answer), Text(predicted_runs), Text(predicted.answer)]),
             *([slip[0].parts[0]] if slip else evaluation.parts[:1]),
             Text(f"report: {result.report_file}"),
         ],
@@ -222,15 +226,6 @@ def report(result: QuickstartResult) -> Report:
             Section("Step by step", [Text("\n".join(result.commands), "code")]),
         ],
         next_step=result.commands[-3],
-    )
-
-
-def _held_out_sentence(result: QuickstartResult) -> str:
-    if not result.held_out:
-        return "The runs are too few to hold one out: predictions are those of training runs."
-    return (
-        f"Predictions are those of {enumerated(result.held_out)}, held out: the model was neither trained nor "
-        "evaluated on them."
     )
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
@@ -28,21 +28,14 @@ import numpy as np
 
 from terrain import errors
 from terrain.errors import ConfigError, LogError, one_line
+from terrain.files.documents import read_yaml
 from terrain.files.resources import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.borealtc import whole_run_label
 from terrain.logs.mapping import check_unit
 from terrain.logs.parts import Assembler, Part
-from terrain.logs.replay import TWIST
 from terrain.logs.samples import checked_stream
-from terrain.logs.schema import (
-    IMU_CHANNELS,
-    STEERING_CHANNELS,
-    UNIT_SCALES,
-    WHEELS_CHANNELS,
-    canonical_unit,
-    unit_of,
-)
+from terrain.logs.schema import UNIT_SCALES, canonical_unit, unit_of
 from terrain.records import Reading, RunLog, Stream
 
 if TYPE_CHECKING:
@@ -61,37 +54,7 @@ BUS_OFF_BIT = 0x40
 COUNTER, CRC = "Counter", "Crc8"
 """Signals that any message may have: rises by one a sample; CRC-8 over identifier and data."""
 
-SIGNALS: Mapping[str, Mapping[str, str]] = {
-    stream: dict(zip(channels, names.split(), strict=True))
-    for stream, channels, names in (
-        (
-            "wheels",
-            WHEELS_CHANNELS,
-            "MotorRate1 MotorRate2 MotorRate3 MotorCurrent1 MotorCurrent2 MotorCurrent3",
-        ),
-        ("steering", STEERING_CHANNELS, "SteeringAngle1 SteeringAngle2 SteeringAngle3"),
-        ("imu", IMU_CHANNELS, "GyroX GyroY GyroZ AccelX AccelY AccelZ Roll Pitch Yaw"),
-        (
-            "odometry",
-            CAMERA_CHANNELS,
-            "CameraPositionX CameraPositionY CameraPositionZ "
-            "CameraQuaternionX CameraQuaternionY CameraQuaternionZ CameraQuaternionW "
-            "CameraVelocityX CameraVelocityY CameraVelocityZ CameraRateX CameraRateY CameraRateZ CameraConfidence",
-        ),
-        ("twist", TWIST, "DesiredSpeedX DesiredSpeedY DesiredYawRate"),
-        ("corrections", [f"correction_{i}_radps" for i in (1, 2, 3)], "Correction1 Correction2 Correction3"),
-    )
-} | {
-    "status": {
-        "terrain_code": "TerrainCode",
-        "probability_ratio": "TerrainProbability",
-        "target_ratio": "TargetSlip",
-        "status_code": "ControlStatus",
-        "bridge_code": "BridgeState",
-        "sensor_code": "SensorCode",
-        "health_code": "SensorHealth",
-    }
-}
+SIGNALS: Mapping[str, Mapping[str, str]] = read_yaml(data_folder("can") / "signals.yaml")
 """Signal of each channel, by stream; the channels are in the order of its columns."""
 
 RECEIVED = ("wheels", "steering", "imu", "odometry", "twist")
@@ -195,13 +158,13 @@ class Layout:
         return frozenset(signal.column for plan in self.by_stream.get(stream, ()) for signal in plan.signals)
 
 
-def load_layout(path: str | Path | None = None, streams: Iterable[str] = SIGNALS) -> Layout:
+def load_layout(path: str | Path | None = None, *, complete: bool = True) -> Layout:
     """Return what a DBC has of the signals that are used.
 
     Parameters
     ----------
     path : DBC file; AgriMaRo's by default
-    streams : that it must have, without the channels that may be lacking
+    complete : whether it must have what a pilot needs: all signals but those that may be lacking
 
     Raises
     ------
@@ -245,12 +208,8 @@ def load_layout(path: str | Path | None = None, streams: Iterable[str] = SIGNALS
                 f"a frame of classical CAN has at most {MAX_BYTES}"
             )
         by_stream.setdefault(carried[0], []).append(_message_plan(message, carried[0], signals))
-    missing = [
-        name
-        for name, (stream, _, channel) in places.items()
-        if name not in owner and stream in set(streams) and channel not in OPTIONAL
-    ]
-    if missing:
+    missing = [name for name, place in places.items() if name not in owner and place[2] not in OPTIONAL]
+    if complete and missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ConfigError(f"{path}: lacks the signal {missing[0]!r}{more}; docs/can.md lists those required")
     plans = [plan for of_stream in by_stream.values() for plan in of_stream]

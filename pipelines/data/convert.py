@@ -6,7 +6,6 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,7 +38,6 @@ class Settings(RunsSettings):
     )
 
 
-@dataclass(frozen=True)
 class ConvertResult(Result):
     """Runs that were written."""
 
@@ -50,7 +48,6 @@ class ConvertResult(Result):
     digest: str = described("SHA-256 of all runs; messages that are converted back have the same")
 
 
-@dataclass(frozen=True)
 class ImportResult(ConvertResult):
     """Run folders that were written."""
 
@@ -60,7 +57,6 @@ class ImportResult(ConvertResult):
     doubts: tuple[Doubt, ...] = described("checks that are doubtful or implausible", default=())
 
 
-@dataclass(frozen=True)
 class ExportResult(ConvertResult):
     """Files or bags for other programs that were written."""
 

@@ -9,11 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pipelines.data.runs import Runs
 from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
 from terrain.errors import ConfigError, LogError
 
 if TYPE_CHECKING:
+    from pipelines.data.runs import Runs
     from terrain.logs.checks import Check
     from terrain.logs.drive import DriveRobot
     from terrain.records import RunLog
@@ -105,6 +105,8 @@ def load_runs(folder: str | Path, *, robot: str | Path | None = None, **reading:
     LogError, ConfigError, DataError
         as :func:`load`.
     """
+    from pipelines.data.runs import Runs
+
     name = None if robot is None else str(robot)
     runs, skipped = load(AlignedRunsSettings(data=Path(folder), robot=name, **reading))
     for sentence in skipped:
@@ -210,7 +212,7 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
         from pipelines.data import can_frames
 
         name = CAN_ROBOT if robot is None else robot.name
-        return can_frames.find_runs(folder, can_frames.load_layout(mapping, ()), name)
+        return can_frames.find_runs(folder, can_frames.load_layout(mapping, complete=False), name)
     if mapping is not None and layout not in ("auto", "csv"):
         raise ConfigError(f"a mapping file is for CSV files, not for the layout {layout!r}")
     if mapping is not None:
@@ -230,19 +232,19 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
     }
     if layout == "auto" and robotino.find_root(folder) is not None:
         del finders["drive-recording"]  # files of a Robotino have its ending, and a camera's file above them
-    found = {name: find(folder) for name, find in finders.items() if layout in ("auto", name)}
-    names = [name for name, readers in found.items() if readers]
-    if len(names) > 1:
-        raise LogError(f"{folder}: mixes the layouts {' and '.join(names)}; choose one with --format")
-    if not names and layout == "auto":
+    asked = finders if layout == "auto" else {layout: finders[layout]}
+    found = {name: readers for name, find in asked.items() if (readers := find(folder))}
+    if len(found) > 1:
+        raise LogError(f"{folder}: mixes the layouts {' and '.join(found)}; choose one with --format")
+    if not found and layout == "auto":
         from pipelines.data import bag_runs
 
         return bag_runs.find_runs(folder, None, robot)
-    if names == ["drive"]:
+    if "drive" in found:
         return drive.find_runs(folder, drive_robot(robot))
-    if names == ["drive-recording"]:
+    if "drive-recording" in found:
         return drive_recording.find_runs(folder, lambda name: drive_robot(robot_named(name, robot)))
-    return found[names[0]] if names else []
+    return next(iter(found.values()), [])
 
 
 def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:

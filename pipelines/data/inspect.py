@@ -53,7 +53,6 @@ class InspectedRun:
     plausibility: tuple[Check, ...] = ()
 
 
-@dataclass(frozen=True)
 class Inspection(Result):
     """The quality of all runs."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from pipelines.report.numbers import plural
@@ -58,7 +57,6 @@ def _interval(text: str) -> tuple[float, float]:
     return start_s, end_s
 
 
-@dataclass(frozen=True)
 class SimulatedRuns(Result):
     """Run folders that were simulated."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -55,8 +55,7 @@ PICTURED = 3
 """Metrics of the first picture."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class DriveResult(Result):
+class DriveResult(Result, eq=False):
     """Controllers side by side, over the same seeds."""
 
     scenario: str = described("what was driven")
@@ -91,40 +90,34 @@ class DriveResult(Result):
 
 
 def run(settings: Settings, progress: Progress) -> DriveResult:
-    """Drive all controllers of the settings at the same seeds; what cannot be driven is refused before a training."""
+    """Drive all controllers of the settings at the same seeds, with their robots and table."""
     robot = load_robot(settings.robot)
     plant = None if settings.plant is None else load_robot(settings.plant)
-    inputs = DriveInputs(robot, load_slip_table(settings.table, robot.name), plant=plant)
-    check_drive(settings, inputs)
-    if settings.needs_model:
-        from pipelines.learn.model_file import read_model
-
-        given = settings.model
-        model = read_model(given) if given else train_classifier(robot, settings.first_seed, progress)
-        inputs = replace(inputs, model=model)
-    return compare(settings, inputs, progress)
+    table = load_slip_table(settings.table, robot.name)
+    return compare(settings, DriveInputs(robot, table, plant=plant), progress)
 
 
-def check_drive(settings: Settings, inputs: DriveInputs) -> list[Controller]:
-    """Return the controllers, once what cannot be driven is refused.
+def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent) -> DriveResult:
+    """Drive all controllers at the same seeds, and evaluate them.
+
+    A classifier that a controller needs and the inputs lack is read or trained.
 
     Raises
     ------
     ConfigError
-        if a controller does not exist on the robot or the table, or the situation does not.
+        before a training, if a controller does not exist on the robot or the table, or the situation does not.
     """
-    delay_s, ramp_mps2 = settings.delay_s, settings.ramp_mps2
-    controllers = [make_controller(name, inputs.table, delay_s, ramp_mps2) for name in settings.controllers]
+    names, table = settings.controllers, inputs.table
+    controllers = [make_controller(name, table, settings.delay_s, settings.ramp_mps2) for name in names]
     for controller in controllers:
         LivePilot(inputs.robot, controller.table, None, controller.pilot)
     _situation(settings, inputs, settings.first_seed)
-    return controllers
+    if settings.needs_model and inputs.model is None:
+        from pipelines.learn.model_file import read_model
 
-
-def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent) -> DriveResult:
-    """Drive all controllers at the same seeds, and evaluate them; a model is given where a controller needs one."""
-    names, table = settings.controllers, inputs.table
-    controllers = check_drive(settings, inputs)
+        given, seed = settings.model, settings.first_seed
+        model = read_model(given) if given else train_classifier(inputs.robot, seed, progress)
+        inputs = replace(inputs, model=model)
 
     def drive_all(
         task: str, controllers: Sequence[Controller], progress: Progress = progress

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -50,7 +49,6 @@ from terrain.control.switching import KnownTerrain
 from terrain.errors import ConfigError
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
 from terrain.simulation.faults.catalogue import fault_catalogue, select_faults
-from terrain.simulation.faults.fault import SensorFault
 
 if TYPE_CHECKING:
     from pipelines.drive.drive import Settings
@@ -72,8 +70,7 @@ FASTEST_MPS = 10.0
 """Estimates of the speed beyond this, as a fault may cause, are not drawn."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class FaultsResult(Result):
+class FaultsResult(Result, eq=False):
     """Sensor faults in the closed loop."""
 
     robot: str = described("that was driven")
@@ -95,52 +92,50 @@ class FaultsResult(Result):
 
 
 def run(settings: Settings, progress: Progress) -> FaultsResult:
-    """Drive each fault in each situation, once all that is named is known to exist.
+    """Drive each fault in each situation, with the robot and the table of the settings.
 
     Raises
     ------
     ConfigError
-        if a fault, a situation or a terrain is unknown, or the robot is no swerve robot with all sections.
+        if the robot is no swerve robot with all sections, or as :func:`drive_faults`.
     """
     refusal = "robot {name}: drive {drive!r} has no pilot, only 'swerve' has"
-    robot, places = as_drive(SwerveRobot, load_robot(settings.robot), refusal), _places(settings)
+    robot = as_drive(SwerveRobot, load_robot(settings.robot), refusal)
     robot.require(*robot.sections)
-    chosen = {fault.name for fault in _chosen_faults(settings, robot)}
-    drawn = {fault.name for fault in select_faults(fault_catalogue(robot), settings.draw)}
-    if settings.draw and not drawn <= chosen:
-        raise ConfigError(
-            f"--draw has {min(drawn - chosen)!r}, which is not among the faults that are driven"
-        )
-    for place in places:
-        make_fault_situation(place.situation, robot, place.terrain, place.seed)
-    if settings.table is not None:
-        slips = load_slip_table(settings.table, robot.name)
-    else:
-        terrains = dict.fromkeys(place.terrain for place in places)
-        slips = simulated_table(robot, list(terrains), LEARNING_SEED, partial(progress, "learn targets"))
+    slips = None if settings.table is None else load_slip_table(settings.table, robot.name)
     return drive_faults(settings, robot, slips, progress)
 
 
-def _chosen_faults(settings: Settings, robot: Robot) -> Sequence[SensorFault]:
-    return select_faults(fault_catalogue(robot), () if settings.faults == (ALL,) else settings.faults)
+def drive_faults(
+    settings: Settings, robot: Robot, slips: SlipTable | None, progress: Progress = silent
+) -> FaultsResult:
+    """Drive each fault of the settings in each situation with a robot, and evaluate the drives.
 
+    Without a table one is learned in simulation.
 
-def _places(settings: Settings) -> list[Place]:
-    """Return every situation on its terrains at each seed."""
-    terrains = [name.strip() for name in settings.terrain.split(",")]
-    return [
+    Raises
+    ------
+    ConfigError
+        before anything is driven, if a fault, a situation or a terrain is unknown.
+    """
+    catalogue, terrains = fault_catalogue(robot), [name.strip() for name in settings.terrain.split(",")]
+    chosen = select_faults(catalogue, () if settings.faults == (ALL,) else settings.faults)
+    abouts = {fault.name: fault.about for fault in chosen}
+    others = [each.name for each in select_faults(catalogue, settings.draw) if each.name not in abouts]
+    if settings.draw and others:
+        raise ConfigError(f"--draw has {min(others)!r}, which is not among the faults that are driven")
+    places = [
         Place(situation, terrain, seed)
         for seed in settings.all_seeds
         for situation in settings.situations
         for terrain in (settings.stop_terrains if situation == STOP else terrains)
     ]
-
-
-def drive_faults(
-    settings: Settings, robot: Robot, slips: SlipTable, progress: Progress = silent
-) -> FaultsResult:
-    """Drive each fault of the settings in each situation with a robot and its table, and evaluate the drives."""
-    chosen, places, loop = _chosen_faults(settings, robot), _places(settings), fault_loop(robot, slips)
+    for situation, terrain, seed in places:
+        make_fault_situation(situation, robot, terrain, seed)
+    if slips is None:
+        driven = list(dict.fromkeys(place.terrain for place in places))
+        slips = simulated_table(robot, driven, LEARNING_SEED, partial(progress, "learn targets"))
+    loop = fault_loop(robot, slips)
     of_places = [(place,) for place in places]
     made = parallel(drive_references, (loop,), of_places, settings.jobs, "drive without faults", progress)
     references: dict[Place, References] = dict(zip(places, made, strict=True))
@@ -162,7 +157,7 @@ def drive_faults(
         seeds=tuple(settings.all_seeds),
         delay_s=DELAY_S,
         limits=LIMITS,
-        abouts={fault.name: fault.about for fault in chosen},
+        abouts=abouts,
         clean=tuple(clean_drive(place, each) for place, each in references.items()),
         rows=tuple(rows),
         bars=count_bars([row.bars for row in rows]),
@@ -178,8 +173,7 @@ def fault_loop(robot: Robot, slips: SlipTable) -> FaultLoop:
 
 
 def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
-    settings = PilotSettings(controller=controller, delay_s=DELAY_S)
-    return LivePilot(robot, slips, KnownTerrain(), settings)
+    return LivePilot(robot, slips, KnownTerrain(), PilotSettings(controller=controller))
 
 
 def fault_figure(loop: FaultLoop, case: FaultCase, references: References) -> Figure:

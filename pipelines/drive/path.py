@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,8 +44,7 @@ SHOWN_M = 1.5
 """Lateral errors beyond this leave the figure."""
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class PathResult(Result):
+class PathResult(Result, eq=False):
     """A path that was followed, with the drive."""
 
     offset_m: float
@@ -71,9 +69,7 @@ class PathResult(Result):
     slip_error_rad: float = described(
         "root mean square error of the estimate; null without an observer", "rad"
     )
-    stiffness_error_ratio: float = described(
-        "cornering stiffness, median error over the secant", "1", form=".1%"
-    )
+    stiffness_error_ratio: float = described("cornering stiffness, median error over the secant", "1")
     grip_ratio: float = described("largest side force over load as known at the end, with the preview", "1")
     grip_std: float = described("its standard deviation", "1")
     statuses: Mapping[str, Mapping[str, int]] = described(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -54,7 +54,7 @@ class Settings(ExplainOptions, AlignedRunsSettings):
 
 
 def run(settings: Settings, progress: Progress) -> ExplainResult:
-    """Read runs, explain them as :func:`explain_runs`, and write the page, the extended robot and the next drive.
+    """Read runs, explain them as :func:`explain`, and write the page, the extended robot and the next drive.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     ensure_writable(out)
     description = model or settings.robot
     options = settings.model_dump(include=set(ExplainOptions.model_fields))
-    found = explain_runs(
+    found = explain(
         runs, tested, data=settings.dataset, description=description, progress=progress, **options
     )
     result = replace(
@@ -93,9 +93,9 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
         skipped=tuple(skipped),
         n_pictures=None if settings.pictures == "all" else int(settings.pictures),
         page=out / PAGE_FILE,
-        extended_file=None if found.extended is None else extended_file,
+        extended_file=extended_file if found.diagnosis.causes else None,
     )
-    if result.extended is not None:
+    if result.extended_file is not None:
         source = f"terrain explain, {result.diagnosis.n_runs} runs of {settings.dataset or 'a data set'}"
         effects = extended_effects(tested, result.diagnosis)
         atomic_write(extended_file, extended_yaml(description, *effects, source, result.extended.region))
@@ -108,8 +108,8 @@ def run(settings: Settings, progress: Progress) -> ExplainResult:
     return result
 
 
-def explain_runs(
-    runs: Sequence[RunLog],
+def explain(
+    runs: Iterable[RunLog],
     robot: Robot | str,
     *,
     data: str = "",
@@ -131,7 +131,8 @@ def explain_runs(
     Returns
     -------
     ExplainResult
-        ``report`` leads with the answer, ``extended`` is the robot with the named causes built in.
+        with ``report``, ``extended`` (the robot with the named causes built in; as it was where none was named)
+        and ``to_pandas()``
 
     Raises
     ------
@@ -153,7 +154,7 @@ def explain_runs(
     from terrain.logs.digest import data_digest
     from terrain.robots import load_robot
 
-    asked, progress = ExplainOptions(**options), progress or silent
+    asked, progress, runs = ExplainOptions(**options), progress or silent, list(runs)
     robot = load_robot(robot) if isinstance(robot, str) else robot
     description = description or robot.name
     names, seed = asked.effects, asked.seed
@@ -164,7 +165,7 @@ def explain_runs(
     progress("diagnose", 1, 1)
     gained = held_out_gain(diagnosed, robot, seed)
     progress("gain", 1, 1)
-    diagnosis, extended = diagnosed.diagnosis, None
+    diagnosis, extended = diagnosed.diagnosis, robot
     if diagnosed.extended is not None:
         if asked.classifier and diagnosed.held_out:
             from pipelines.explain.classifier import classifier_gain
@@ -191,20 +192,3 @@ def explain_runs(
         notes=notes_of(diagnosis, diagnosed.terrains, terrains_apart(diagnosis, diagnosed.compared)),
         powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
     )
-
-
-def explain(runs: Iterable[RunLog], robot: Robot | str, **options: Any) -> ExplainResult:
-    """Return what the simulation of a robot gets wrong about its runs, and the extended robot.
-
-    Parameters
-    ----------
-    runs, robot, options : as :func:`explain_runs`
-
-    Returns
-    -------
-    ExplainResult
-        with ``report``, ``extended`` (the robot with the named causes built in; as it was where none was named)
-        and ``to_pandas()``
-    """
-    found = explain_runs(list(runs), robot, **options)
-    return replace(found, extended=found.extended or found.robot)

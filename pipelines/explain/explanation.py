@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +55,7 @@ Z, PERCENT = ".1f", ".1%"
 WHY, NEEDS = Column("why", long=True), Column("driving that shows it", long=True)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ExplainResult(Result):
+class ExplainResult(Result, eq=False):
     """What the simulation of a robot gets wrong about runs, and what building that in gains.
 
     In JSON the fields of the diagnosis stand beside the others.
@@ -65,14 +64,14 @@ class ExplainResult(Result):
     ----------
     robot : as it was tested
     diagnosed : runs with their diagnosis, beside the simulation
-    extended : the robot with the causes built in; None where none was named
+    extended : the robot with the causes built in; as it was where none was named
     extended_file : of the extended robot, if it was written
     n_pictures : most runs that are drawn; None for all
     """
 
     robot: Robot
     diagnosed: DiagnosedRuns
-    extended: Robot | None
+    extended: Robot
     data: str = described("name of the data set")
     data_digest: str = described("digest of its runs")
     description: str = described("description of the robot as it was tested")
@@ -100,14 +99,14 @@ class ExplainResult(Result):
 
     def as_json(self) -> dict[str, Any]:
         """Return the described fields, those of the diagnosis, and what the runs were used for."""
-        runs, extended = self.diagnosed, self.extended
+        runs, extended = self.diagnosed, {"file": self.extended_file, "effects": self.extended.effects}
         beside = {
             **self.diagnosis.as_json(),
             "built_in": runs.simulation.effects,
             "terrain_matches": runs.terrains,
             "used": [run.run_id for run in runs.used],
             "held_out": [run.run_id for run in runs.held_out],
-            "extended": extended and {"file": self.extended_file, "effects": extended.effects},
+            "extended": extended if self.diagnosis.causes else None,
         }
         return {**super().as_json(), **as_json(beside)}
 

@@ -7,10 +7,8 @@ inspect MODEL`` shows it, and it lies beside the model as Markdown.
 from __future__ import annotations
 
 import math
-from collections import ChainMap
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from importlib import import_module, metadata
+from importlib import metadata
 from pathlib import Path
 from timeit import repeat
 from typing import TYPE_CHECKING, Any
@@ -83,19 +81,7 @@ class TrainingRecord(BaseModel):
         return dict(self)
 
 
-_MODULES = (
-    *("breakaway", "held_out", "learning_curve", "metrics", "next_drives", "sequence_figures", "slow_fast"),
-    *("stiffness", "unknown_figures"),
-)
-"""Of the types of an evaluation's fields, which its own module imports for a type checker alone."""
-
-TrainingRecord.model_rebuild(
-    _types_namespace=ChainMap(*(vars(import_module(f"terrain.classify.{name}")) for name in _MODULES))
-)
-
-
-@dataclass(frozen=True, repr=False, kw_only=True)
-class ModelResult(ModelInfo, Result):
+class ModelResult(Result, ModelInfo, kw_only=True):
     """What a model states of itself."""
 
     model: str = described("as it was asked for")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 POINTS = "+.1f"
 
 
-@dataclass(frozen=True, repr=False)
 class ComparisonResult(Result):
     """Several recipes on the same folds, or several models on the same runs; each compared with the first."""
 
@@ -54,8 +53,13 @@ def side_by_side(
     contenders: Sequence[tuple[str, WindowPipeline, Samples]],
     settings: EvaluationSettings,
     progress: Progress,
-) -> ComparisonResult:
-    """Evaluate recipes, each with the windows of its own signals, on the same folds.
+) -> CrossvalResult | ComparisonResult:
+    """Evaluate a recipe, or several, each with the windows of its own signals, on the same folds.
+
+    Parameters
+    ----------
+    contenders : name, recipe and samples of each
+    settings, progress : as of :func:`pipelines.learn.evaluate.evaluate_recipe`
 
     Raises
     ------
@@ -78,6 +82,8 @@ def side_by_side(
                 "different times: compare them on signal sets of the same streams"
             )
     found = [evaluate_recipe(recipe, name, each, settings, progress) for name, recipe, each in contenders]
+    if len(found) == 1:
+        return found[0][0]
     (_, held_out), motion, levels = found[0], window_motion(samples.windows), None
     if motion is not None and settings.protocol != "published":
         true_runs = held_out_support(held_out, samples.run_id, motion).true_runs
@@ -185,7 +191,10 @@ def report(result: ComparisonResult) -> Report:
         ],
         details=[
             *(Section(f"{each.b} less {each.a}", partial(_paired, each)) for each in result.differences),
-            *(Section(f"{each.recipe} alone", partial(_alone, each)) for each in result.contenders),
+            *(
+                Section(f"{each.recipe} alone", [recall_table(each), *notes(*each.notes)])
+                for each in result.contenders
+            ),
         ],
         next_step=f"terrain train --data {result.data or 'DIR'} --recipe RECIPE --name NAME"
         if result.kind == "recipes"
@@ -201,10 +210,6 @@ def _points(found: Difference) -> tuple[float, tuple[float, float], str]:
     """Return a difference and its interval in percentage points, and its verdict."""
     low, high = found.interval
     return 100 * found.difference, (100 * low, 100 * high), str(found.verdict)
-
-
-def _alone(result: CrossvalResult) -> list[Part]:
-    return [recall_table(result), *notes(*result.notes)]
 
 
 def _paired(found: Comparison) -> list[Part]:

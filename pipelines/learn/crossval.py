@@ -14,23 +14,21 @@ from pydantic import model_validator
 
 from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
-from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import ComputeSettings, computing
-from pipelines.learn.settings import CacheSettings, EvaluationSettings
+from pipelines.learn.settings import EvaluationSettings
 from pipelines.report.results import Progress, silent
 from terrain.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from features.protocols import Samples
-    from features.recipes import WindowPipeline
     from pipelines.learn.comparison import ComparisonResult
+    from pipelines.learn.evaluation import CrossvalResult
     from terrain.records import RunLog, Windows
 
 EXAMPLE = "terrain crossval --data runs/ --recipe svm"
-RESULTS = ("pipelines.learn.comparison",)
+RESULTS = ("pipelines.learn.evaluation", "pipelines.learn.comparison")
 
 
-class Settings(EvaluationSettings, CacheSettings, AlignedRunsSettings, ComputeSettings):
+class Settings(EvaluationSettings, AlignedRunsSettings, ComputeSettings):
     """What is evaluated, of which runs."""
 
     @model_validator(mode="after")
@@ -51,6 +49,8 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
     ConfigError, LogError, DataError
         if a setting is not accepted, a run cannot be read, or the data cannot answer.
     """
+    from pipelines.learn.evaluation import CrossvalResult
+
     found: CrossvalResult | ComparisonResult
     with computing(settings.compute):
         if settings.cache is not None:
@@ -88,6 +88,7 @@ def crossval(
         recipes cut different windows from them.
     """
     from features.protocols import samples_of
+    from pipelines.learn.comparison import side_by_side
     from pipelines.learn.recipes import recipe_of
 
     several, contenders = len(settings.recipes) > 1, []
@@ -104,23 +105,7 @@ def crossval(
             skip_short=settings.skip_short,
         )
         contenders.append((name, recipe, samples))
-    return _evaluated(contenders, settings, progress)
-
-
-def _evaluated(
-    contenders: Sequence[tuple[str, WindowPipeline, Samples]],
-    settings: EvaluationSettings,
-    progress: Progress,
-) -> CrossvalResult | ComparisonResult:
-    """Evaluate a recipe, of which name, recipe and samples are given, or compare several on the same folds."""
-    if len(contenders) > 1:
-        from pipelines.learn.comparison import side_by_side
-
-        return side_by_side(contenders, settings, progress)
-    from pipelines.learn.evaluate import evaluate_recipe
-
-    name, recipe, samples = contenders[0]
-    return evaluate_recipe(recipe, name, samples, settings, progress)[0]
+    return side_by_side(contenders, settings, progress)
 
 
 def cross_validate(
@@ -156,6 +141,7 @@ def cross_validate(
     from features.protocols import Samples
     from features.recipes import make_recipe
     from features.windows import overlap_of
+    from pipelines.learn.comparison import side_by_side
 
     functions = options.pop("functions", ())
     recipes = list(recipe) if isinstance(recipe, list | tuple) else [recipe]
@@ -172,4 +158,4 @@ def cross_validate(
         else:
             made = make_recipe(each, settings.signal_sets, gap=gap, seed=settings.seed, functions=functions)
         contenders.append((kind if isinstance(kind, str) else type(kind).__name__, made, samples))
-    return _evaluated(contenders, settings, progress)
+    return side_by_side(contenders, settings, progress)

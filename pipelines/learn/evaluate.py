@@ -22,6 +22,7 @@ from pipelines.report.results import Progress, silent
 from terrain.classify.breakaway import breakaways
 from terrain.classify.folds import Fold, single_run_classes
 from terrain.classify.held_out import Examples, HeldOut, fit_fold, held_out_figures, itself, set_figures
+from terrain.classify.importance import ChannelDrops
 from terrain.classify.learning_curve import drawn_folds, learning_curve
 from terrain.classify.next_drives import coverage_of
 from terrain.classify.sequence_figures import sequence_figures
@@ -86,7 +87,7 @@ def evaluate_recipe(
     settings: EvaluationSettings | RecipeSettings,
     progress: Progress = silent,
     computed: tuple[Array, Motion | None] | None = None,
-    ask: Callable[[Examples, Fold], Callable[[Any], Any] | None] | None = None,
+    channels: Sequence[str] = (),
 ) -> tuple[CrossvalResult, HeldOut]:
     """Evaluate a recipe on windows by the protocol of the settings; also return its held-out probabilities.
 
@@ -97,8 +98,8 @@ def evaluate_recipe(
     settings : protocol, repeats, seed, processes and extras; these are computed under ``grouped`` only
     progress : called as the work goes on
     computed : features (n, f) and motion of the windows, where they are there already
-    ask : gives for each fold what is called with its fitted classifier, which is then fitted on all windows, too;
-        not together with extras
+    channels : of each feature, where it is to be found what each channel is worth to the fits of the first repeat;
+        the classifier is then fitted on all windows, too; not together with extras
 
     Raises
     ------
@@ -115,9 +116,15 @@ def evaluate_recipe(
     asks: list[Any] | None = None
     if beside and samples.runs:
         asks = [*following(recipe[:-1], windows, samples.runs, settings.rule, folds, seed)]
-    elif ask is not None:
-        asks = [ask(examples, fold) for fold in folds]
-    held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, ask is not None)
+    elif channels:
+        truth = samples.terrain
+        asks = [
+            None
+            if fold.repeat
+            else ChannelDrops(features[fold.test], truth[fold.test], channels, seed, fold.number)
+            for fold in folds
+        ]
+    held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, bool(channels))
     found: dict[str, Any] = {}
     notes = []
     if beside and computed is None:

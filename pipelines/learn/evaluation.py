@@ -1,27 +1,28 @@
-"""What an evaluation on held-out windows finds, and its report."""
+"""What an evaluation on held-out windows finds, and its report.
+
+The types of its fields are imported for more than a type checker: the record of a training is read by them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from features.protocols import PROTOCOLS
 from pipelines.report.figure import Bars, Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_value, plural
 from pipelines.report.results import Result, described
-from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
-
-if TYPE_CHECKING:
-    from terrain.classify.breakaway import Breakaway
-    from terrain.classify.held_out import ConformalFigures, FoldFigures
-    from terrain.classify.learning_curve import LearningCurve
-    from terrain.classify.metrics import ClassFigures, CoverageFigures, ReliabilityBin, RunFigures
-    from terrain.classify.next_drives import NextDrive, PartFigures, SupportRow
-    from terrain.classify.sequence_figures import DelayFigures, SequenceFigures
-    from terrain.classify.slow_fast import SlowFast
-    from terrain.classify.stiffness import StiffnessFigures
-    from terrain.classify.unknown_figures import LeftOutTerrain
+from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text, value_at
+from terrain.classify.breakaway import Breakaway
+from terrain.classify.held_out import ConformalFigures, FoldFigures
+from terrain.classify.learning_curve import LearningCurve
+from terrain.classify.metrics import ClassFigures, CoverageFigures, ReliabilityBin, RunFigures
+from terrain.classify.next_drives import NextDrive, PartFigures, SupportRow
+from terrain.classify.sequence_figures import DelayFigures, SequenceFigures
+from terrain.classify.slow_fast import SlowFast
+from terrain.classify.stiffness import StiffnessFigures
+from terrain.classify.unknown_figures import LeftOutTerrain
 
 MAX_ROWS = 10
 PERCENT = ".1%"
@@ -32,7 +33,6 @@ WIDE_INTERVAL = 0.2
 optional = partial(described, optional=True)
 
 
-@dataclass(frozen=True, repr=False)
 class CrossvalResult(Result):
     """An evaluation on held-out windows: its figures, how they were obtained, and what to know of them.
 
@@ -44,16 +44,16 @@ class CrossvalResult(Result):
     n_windows: int = described("windows that were held out")
     n_runs: int = described("runs that they are of")
     repeats: int = described("fold assignments")
-    accuracy: float = described("windows classified correctly", "1", form=PERCENT)
-    accuracy_spread: float | None = described("standard deviation over the repeats", "1", form=PERCENT)
+    accuracy: float = described("windows classified correctly", "1")
+    accuracy_spread: float | None = described("standard deviation over the repeats", "1")
     accuracy_per_repeat: tuple[float, ...] = described("accuracy of each repeat", "1")
-    accuracy_ci: tuple[float, float] = described("interval of the accuracy", "1", form=PERCENT)
-    balanced_accuracy: float = described("mean recall of the terrains", "1", form=PERCENT)
+    accuracy_ci: tuple[float, float] = described("interval of the accuracy", "1")
+    balanced_accuracy: float = described("mean recall of the terrains", "1")
     macro_f1: float = described("mean F1 of the terrains", "1", form=".3f")
-    macro_run_accuracy: float = described("mean over terrains of the mean over runs", "1", form=PERCENT)
+    macro_run_accuracy: float = described("mean over terrains of the mean over runs", "1")
     per_class: Mapping[str, ClassFigures] = described("precision, recall and F1, all repeats together")
     confusion: tuple[tuple[int, ...], ...] = described("windows by true and predicted terrain, all repeats")
-    vote_accuracy: float = described("accuracy of a vote over 5 s", "1", form=PERCENT)
+    vote_accuracy: float = described("accuracy of a vote over 5 s", "1")
     vote_windows: float = described("windows of a vote, mean", form=".1f")
     ece: float = described("expected calibration error", "1", form=".3f")
     ece_ci: tuple[float, float] = described("interval of the calibration error", "1", form=".3f")
@@ -76,7 +76,7 @@ class CrossvalResult(Result):
     dropped: Mapping[str, int] = described("windows left out, by reason")
     repaired: Mapping[str, int] = described("what a repairing reader changed, by kind")
     notes: tuple[str, ...] = described("what a reader has to know")
-    speed_only_accuracy: float | None = optional("accuracy from wheel speed alone", "1", form=PERCENT)
+    speed_only_accuracy: float | None = optional("accuracy from wheel speed alone", "1")
     slow_fast: SlowFast | None = optional("slow runs train and fast ones test, and the reverse")
     learning_curve: LearningCurve | None = optional("accuracy by number of training runs")
     stiffness: StiffnessFigures | None = optional("accuracy by level of stiffness")
@@ -92,11 +92,9 @@ class CrossvalResult(Result):
     auroc_unknown_ci: tuple[float, float] | None = optional("interval of it", "1", form=".3f")
     auroc_unknown_10s: float | None = optional("the same of means over 10 s", "1", form=".3f")
     auroc_unknown_10s_ci: tuple[float, float] | None = optional("interval of it", "1", form=".3f")
-    unknown_accepted: float | None = optional("unknown windows taken for known", "1", form=PERCENT)
-    known_kept: float | None = optional("known windows not called unknown", "1", form=PERCENT)
-    known_kept_target: float | None = optional(
-        "known windows that the threshold is to keep", "1", form=PERCENT
-    )
+    unknown_accepted: float | None = optional("unknown windows taken for known", "1")
+    known_kept: float | None = optional("known windows not called unknown", "1")
+    known_kept_target: float | None = optional("known windows that the threshold is to keep", "1")
     unknown_by_terrain: Mapping[str, LeftOutTerrain] | None = optional("by terrain left out")
     support: tuple[SupportRow, ...] | None = optional("windows and accuracy by terrain and driving")
     accuracy_by_support: tuple[Mapping[str, str | float | tuple[float, float] | None], ...] | None = optional(
@@ -181,8 +179,6 @@ def notes(*texts: str) -> list[Text]:
 
 def held_out_words(protocol: str) -> str:
     """Return what a protocol holds out, in words."""
-    from features.protocols import PROTOCOLS
-
     return PROTOCOLS[protocol].held_out if protocol in PROTOCOLS else protocol
 
 
@@ -283,13 +279,9 @@ def _confidence(result: CrossvalResult) -> list[Part]:
 def _coverage(result: CrossvalResult) -> list[Part]:
     support = result.support or ()
     names = ("windows_ratio", "accuracy", "accuracy_ci", "errors_ratio")
-    parts = [(each["support"], each) for each in result.accuracy_by_support or ()]
-    for text, part in (
-        ("unsupported prediction", result.unsupported),
-        ("other predictions", result.supported),
-    ):
-        parts.append((text, part._asdict() if part is not None else {}))
-    rows = [(text, *(part.get(name) for name in names)) for text, part in parts]
+    parts: list[tuple[Any, Any]] = [(each["support"], each) for each in result.accuracy_by_support or ()]
+    parts += [("unsupported prediction", result.unsupported), ("other predictions", result.supported)]
+    rows = [(text, *(value_at(part, name) for name in names)) for text, part in parts]
     head = [Column(name, PERCENT) for name in ("windows", "accuracy", "95 % over runs", "of the errors")]
     cells = {(row.terrain, row.regime): row.accuracy for row in support}
     regimes = list(dict.fromkeys(row.regime for row in support))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from terrain.robots import load_robot
 MAX_ROWS = 12
 
 
-@dataclass(frozen=True, repr=False)
 class ChangesResult(Result):
     """Changes of all runs; ratios are NaN where no run has a step of slip."""
 

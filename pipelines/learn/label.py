@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -87,7 +87,6 @@ class Settings(BaseSettings):
         return self
 
 
-@dataclass(frozen=True)
 class DoubtfulResult(Result):
     """Windows of low confidence of all runs of a folder, in the order of the runs and of time."""
 
@@ -98,7 +97,6 @@ class DoubtfulResult(Result):
     windows: tuple[DoubtfulWindow, ...] = described("windows whose outputs do not count")
 
 
-@dataclass(frozen=True)
 class LabelResult(Result):
     """A run whose labels were changed."""
 
@@ -110,7 +108,6 @@ class LabelResult(Result):
     labels: tuple[Label, ...] = described("all labels of the run")
 
 
-@dataclass(frozen=True)
 class ProposalsResult(Result):
     """Proposals for the runs of a folder, and the file that waits for answers."""
 
@@ -122,7 +119,6 @@ class ProposalsResult(Result):
     proposals: tuple[Proposal, ...] = described("stretches with the terrain that the model proposes")
 
 
-@dataclass(frozen=True)
 class AnswersResult(Result):
     """Runs that were written with their labels."""
 

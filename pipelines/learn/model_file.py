@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -310,13 +311,14 @@ def _windows(info: ModelInfo, values: Mapping[str, Array]) -> Windows:
     return Windows(values, info.channels, info.rate_hz, info.window_s, np.zeros(n), unknown, unknown)
 
 
-class WindowProbabilities:
-    """What MLflow's ``pyfunc`` calls: a table of windows in, the probability of each terrain out."""
+def _load_pyfunc(path: str) -> Any:
+    """Return what MLflow loads by ``mlflow.pyfunc.load_model``: a table of windows in, probabilities out."""
+    import pandas as pd
 
-    def __init__(self, model: TerrainModel) -> None:
-        self.model = model
+    model = read_model(Path(path))
+    recipe, info = model.recipe, model.info
 
-    def predict(self, model_input: Any, params: Mapping[str, Any] | None = None) -> Any:
+    def predict(model_input: Any, params: Mapping[str, Any] | None = None) -> Any:
         """Return a table with a column a terrain.
 
         Parameters
@@ -325,9 +327,6 @@ class WindowProbabilities:
             holds the samples of that channel
         params : not used
         """
-        import pandas as pd
-
-        recipe, info = self.model.recipe, self.model.info
         values = {
             stream: np.stack(
                 [np.stack([*model_input[f"{stream}.{name}"]]).astype(float) for name in names], axis=1
@@ -336,10 +335,7 @@ class WindowProbabilities:
         }
         return pd.DataFrame(recipe.predict_proba(_windows(info, values)), columns=list(info.classes))
 
-
-def _load_pyfunc(path: str) -> WindowProbabilities:
-    """Return what MLflow loads by ``mlflow.pyfunc.load_model``."""
-    return WindowProbabilities(read_model(Path(path)))
+    return SimpleNamespace(predict=predict)
 
 
 def _network(recipe: WindowPipeline) -> Any:

@@ -21,10 +21,8 @@ from importlib.util import find_spec
 from itertools import islice, starmap
 from socket import create_connection
 from time import monotonic
-from typing import Any, NamedTuple, Self
+from typing import Any
 from urllib.parse import urlsplit
-
-from pydantic import model_validator
 
 from pipelines.report.results import Progress, silent
 from pipelines.report.settings import Settings, setting
@@ -93,66 +91,53 @@ class ComputeSettings(Settings):
 
     compute: str = setting(LOCAL, "local, or dask:HOST:PORT: the workers of a Dask scheduler.")
 
-    @model_validator(mode="after")
-    def _check_address(self) -> Self:
-        scheduler_address(self.compute)
-        return self
+
+def _in_cluster(
+    client: Any, function: Callable[..., Any], shared: Sequence[Any], each: Iterable[Sequence[Any]]
+) -> Iterator[Any]:
+    """Yield the result of each task in order.
+
+    ``shared`` travels as the result of a task of its own, so that it is sent to a worker once and, where
+    all workers that have it are lost, made again from what the scheduler holds.  Arguments are bound to
+    the functions: dask would look into tuples for tasks, and make lists of some.
+    """
+    waiting: deque[Any] = deque()
+    with _failures(client):
+        given = client.submit(partial(partial, function, *shared), pure=False)
+        tasks = (client.submit(partial(_call, *one), given, pure=False) for one in each)
+        try:
+            waiting.extend(islice(tasks, TASKS_A_THREAD * max(_n_threads(client), 1)))
+            while waiting:
+                yield _result(client, waiting[0])
+                waiting.popleft()
+                waiting.extend(islice(tasks, 1))
+        finally:
+            for future in waiting:
+                future.release()
 
 
-class _Cluster(NamedTuple):
-    """A client of a scheduler, and the scheduler's address."""
-
-    client: Any
-    address: str
-
-    def results(
-        self, function: Callable[..., Any], shared: Sequence[Any], each: Iterable[Sequence[Any]]
-    ) -> Iterator[Any]:
-        """Yield the result of each task in order.
-
-        ``shared`` travels as the result of a task of its own, so that it is sent to a worker once and, where
-        all workers that have it are lost, made again from what the scheduler holds.  Arguments are bound to
-        the functions: dask would look into tuples for tasks, and make lists of some.
-        """
-        waiting: deque[Any] = deque()
-        with _failures(self.address):
-            given = self.client.submit(partial(_bound, function, *shared), pure=False)
-            tasks = (self.client.submit(partial(_call, *one), given, pure=False) for one in each)
-            try:
-                waiting.extend(islice(tasks, TASKS_A_THREAD * max(self._n_threads(), 1)))
-                while waiting:
-                    yield self._wait(waiting[0])
-                    waiting.popleft()
-                    waiting.extend(islice(tasks, 1))
-            finally:
-                for future in waiting:
-                    future.release()
-
-    def _wait(self, future: Any) -> Any:
-        """Return a result; a scheduler that does not answer, or has no worker for long, ends the wait."""
-        with_worker_s = monotonic()
-        while True:
-            try:
-                return future.result(timeout=ANSWER_S)
-            except TimeoutError:
-                if future.status == "error":  # the task's own
-                    raise
-                if self._n_threads():
-                    with_worker_s = monotonic()
-                elif monotonic() - with_worker_s > NO_WORKER_S:
-                    raise TerrainError(
-                        f"no worker of {self.address} has taken a task for {NO_WORKER_S:.0f} s: they ended, "
-                        "or are out of memory"
-                    ) from None
-
-    def _n_threads(self) -> int:
-        """Return the threads of all workers, as the scheduler answers now."""
-        found = self.client.sync(self.client.scheduler.identity, callback_timeout=ANSWER_S)
-        return sum(int(worker["nthreads"]) for worker in found["workers"].values())
+def _result(client: Any, future: Any) -> Any:
+    """Return a result; a scheduler that does not answer, or has no worker for long, ends the wait."""
+    with_worker_s = monotonic()
+    while True:
+        try:
+            return future.result(timeout=ANSWER_S)
+        except TimeoutError:
+            if future.status == "error":  # the task's own
+                raise
+            if _n_threads(client):
+                with_worker_s = monotonic()
+            elif monotonic() - with_worker_s > NO_WORKER_S:
+                raise TerrainError(
+                    f"no worker of {client.scheduler.address} has taken a task for {NO_WORKER_S:.0f} s: they "
+                    "ended, or are out of memory"
+                ) from None
 
 
-def _bound(function: Callable[..., Any], *shared: Any) -> Callable[..., Any]:
-    return partial(function, *shared)
+def _n_threads(client: Any) -> int:
+    """Return the threads of all workers, as the scheduler answers now."""
+    found = client.sync(client.scheduler.identity, callback_timeout=ANSWER_S)
+    return sum(int(worker["nthreads"]) for worker in found["workers"].values())
 
 
 def _call(*one_and_function: Any) -> Any:
@@ -160,12 +145,15 @@ def _call(*one_and_function: Any) -> Any:
     return function(*one)
 
 
-_cluster: ContextVar[_Cluster | None] = ContextVar("cluster", default=None)
+_client: ContextVar[Any] = ContextVar("client", default=None)
 
 
 @contextmanager
 def computing(compute: str) -> Iterator[str]:
     """State where the tasks of a block are computed: ``local`` or the address of a scheduler is given.
+
+    What dask and tornado log and warn of stays off the screen: what matters becomes an error here.  The port is
+    tried first, as a client without a scheduler leaves its thread behind.
 
     Parameters
     ----------
@@ -182,12 +170,32 @@ def computing(compute: str) -> Iterator[str]:
     if address is None:
         yield LOCAL
         return
-    with _connected(address) as client:
-        token = _cluster.set(_Cluster(client, address))
+    if find_spec("distributed") is None:
+        raise ConfigError("--compute dask:... needs the package distributed: install terrain-slip[cluster]")
+    from distributed import Client
+
+    where, logged = urlsplit(address), logging.root.manager.disable
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        logging.disable(logging.CRITICAL)
         try:
+            create_connection((str(where.hostname), int(where.port or 0)), timeout=CONNECT_S).close()
+            client = Client(address, timeout=CONNECT_S, set_as_default=False)
+        except (OSError, TimeoutError, ValueError) as error:
+            logging.disable(logged)
+            raise TerrainError(
+                f"no Dask scheduler answers at {address}: start one there with 'dask scheduler', "
+                "and workers with 'dask worker'"
+            ) from error
+        token = _client.set(client)
+        try:
+            _check_workers(client)
             yield address
         finally:
-            _cluster.reset(token)
+            _client.reset(token)
+            client.close(timeout=PARENT_POLL_S)
+            gc.collect()  # tasks of dask that ended with it are logged when they are collected
+            logging.disable(logged)
 
 
 def parallel(
@@ -221,9 +229,9 @@ def parallel(
     >>> list(parallel(pow, (2,), [(3,), (5,)], 1))
     [8, 32]
     """
-    cluster, n_jobs = _cluster.get(), min(n_jobs, len(each))
-    if cluster is not None:
-        results = cluster.results(function, shared, each)
+    client, n_jobs = _client.get(), min(n_jobs, len(each))
+    if client is not None:
+        results = _in_cluster(client, function, shared, each)
     elif n_jobs > 1:
         results = _in_processes(function, shared, each, n_jobs)
     else:
@@ -269,48 +277,16 @@ def end_with_parent(parent: int) -> None:
     Thread(target=watch, name="end with parent", daemon=True).start()
 
 
-@contextmanager
-def _connected(address: str) -> Iterator[Any]:
-    """Give a client of a scheduler whose workers have the software of this process.
-
-    What dask and tornado log and warn of stays off the screen: what matters becomes an error here.  The port is
-    tried first, as a client without a scheduler leaves its thread behind.
-    """
-    if find_spec("distributed") is None:
-        raise ConfigError("--compute dask:... needs the package distributed: install terrain-slip[cluster]")
-    from distributed import Client
-
-    where, logged = urlsplit(address), logging.root.manager.disable
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        logging.disable(logging.CRITICAL)
-        try:
-            create_connection((str(where.hostname), int(where.port or 0)), timeout=CONNECT_S).close()
-            client = Client(address, timeout=CONNECT_S, set_as_default=False)
-        except (OSError, TimeoutError, ValueError) as error:
-            logging.disable(logged)
-            raise TerrainError(
-                f"no Dask scheduler answers at {address}: start one there with 'dask scheduler', "
-                "and workers with 'dask worker'"
-            ) from error
-        try:
-            _check_workers(client, address)
-            yield client
-        finally:
-            client.close(timeout=PARENT_POLL_S)
-            gc.collect()  # tasks of dask that ended with it are logged when they are collected
-            logging.disable(logged)
-
-
-def _check_workers(client: Any, address: str) -> None:
+def _check_workers(client: Any) -> None:
     """Raise ``TerrainError`` where no worker comes, or one computes with other software than this process."""
+    address = client.scheduler.address
     try:
         client.wait_for_workers(1, timeout=FIRST_WORKER_S)
     except TimeoutError as error:
         raise TerrainError(
             f"the Dask scheduler at {address} has no worker: start one with 'dask worker {address}'"
         ) from error
-    with _failures(address):
+    with _failures(client):
         answers = client.run(software, on_error="return")
     for worker, there in sorted(answers.items()):
         if not isinstance(there, Mapping):
@@ -324,13 +300,14 @@ def _check_workers(client: Any, address: str) -> None:
 
 
 @contextmanager
-def _failures(address: str) -> Iterator[None]:
+def _failures(client: Any) -> Iterator[None]:
     """Turn what dask raises of its own into one sentence each; what a task raises stays as it is."""
     from concurrent.futures import CancelledError
 
     from distributed import KilledWorker
     from distributed.comm import CommClosedError
 
+    address = client.scheduler.address
     try:
         yield
     except KilledWorker as error:

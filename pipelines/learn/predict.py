@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from statistics import fmean
@@ -117,7 +117,6 @@ class WindowPrediction(NamedTuple):
     terrain_set: tuple[str, ...] | None
 
 
-@dataclass(frozen=True, repr=False)
 class Predictions(Result):
     """Predictions of a model for every window that its own rule keeps."""
 
@@ -126,7 +125,7 @@ class Predictions(Result):
     n_runs: int = described("runs that they are of")
     classes: tuple[str, ...] = described("terrains that the model has learned")
     accuracy: float | None = described(
-        "windows whose nearest terrain is their label; None without labels", "1", form=PERCENT
+        "windows whose nearest terrain is their label; None without labels", "1"
     )
     n_judged: int = described("windows whose label the model knows")
     training_runs: tuple[str, ...] = described(
@@ -141,9 +140,7 @@ class Predictions(Result):
         "target slips by terrain and drive state, and the entry of the table that they come from"
     )
     filtered: tuple[str, ...] = described("runs that the live chain filtered, as they had no estimates")
-    filtered_accuracy: float | None = described(
-        "as the accuracy, of the terrain filtered over time", "1", form=PERCENT
-    )
+    filtered_accuracy: float | None = described("as the accuracy, of the terrain filtered over time", "1")
     n_unknown: int = described("windows that are like no terrain that was learned")
     n_unsupported: int | None = described(
         "windows whose prediction no training run supports; None where not counted"
@@ -244,8 +241,8 @@ def predict(
         n_windows=len(rows),
         n_runs=len(runs),
         classes=classes,
-        accuracy=_ratio([row.nearest == row.label for row in judged]),
-        filtered_accuracy=_ratio([row.filtered_terrain == row.label for row in judged]),
+        accuracy=fmean(row.nearest == row.label for row in judged) if judged else None,
+        filtered_accuracy=fmean(row.filtered_terrain == row.label for row in judged) if judged else None,
         n_judged=len(judged),
         training_runs=tuple(each.run_id for each in runs if data_digest([each]) in model.info.run_digests),
         repaired=dict(sum((Counter(each.dropped) for each in runs), Counter())),
@@ -258,10 +255,6 @@ def predict(
         n_unknown=sum(row.terrain != row.nearest for row in rows),
         n_unsupported=None if model.support is None else sum(row.supported is False for row in rows),
     )
-
-
-def _ratio(right: Sequence[bool]) -> float | None:
-    return sum(right) / len(right) if right else None
 
 
 def _predict_windows(windows: Windows, model: TerrainModel, table: SlipTable) -> list[WindowPrediction]:

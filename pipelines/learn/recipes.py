@@ -32,9 +32,7 @@ def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipe
         as :func:`make_recipe` and :func:`load_named`.
     """
     name, separator, sets = text.partition("@")
-    options: dict[str, Any] = {}
-    if ":" in name or settings.feature:
-        options["functions"] = [load_named(each) for each in settings.feature]
+    options: dict[str, Any] = {"functions": [load_named(each) for each in settings.feature]}
     if settings.params is not None and name not in WITHOUT_SVM:
         options["candidates"] = (read_params(settings.params),)
     return make_recipe(

@@ -109,6 +109,7 @@ class LearnSettings(WindowSettings, JobsSettings):
         repeated=True,
     )
     params: Path | None = setting(None, "Result of a search, in place of the SVM's own choice.")
+    cache: Path | None = setting(None, "Folder of cached features; one that was interrupted goes on.")
 
     @property
     def recipes(self) -> tuple[str, ...]:
@@ -117,20 +118,10 @@ class LearnSettings(WindowSettings, JobsSettings):
         return ((given,) if isinstance(given, str) else given) or (FEATURE_RECIPE,)
 
     @model_validator(mode="after")
-    def _check_params(self) -> Self:
+    def _check_learning(self) -> Self:
         for name in (text.partition("@")[0] for text in self.recipes):
             if self.params is not None and (name in WITHOUT_SVM or ":" in name):
                 raise ConfigError(f"--params has hyper-parameters of the SVM, which {name!r} does not have")
-        return self
-
-
-class CacheSettings(LearnSettings):
-    """Cached features, by which runs need not be read again."""
-
-    cache: Path | None = setting(None, "Folder of cached features; one that was interrupted goes on.")
-
-    @model_validator(mode="after")
-    def _check_cache(self) -> Self:
         if self.cache is not None:
             self.require_features("--cache")
             if self.merge_duplicates:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from contextlib import redirect_stderr
-from dataclasses import dataclass
 from importlib.metadata import version
 from io import StringIO
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipelines.data.tracking import log_run, mlflow_store
 from pipelines.report.results import Result, as_json, described
+from pipelines.report.tree import Report
 from terrain.errors import ModelError
 
 if TYPE_CHECKING:
@@ -25,15 +25,31 @@ METRICS = ("accuracy", "balanced_accuracy", "macro_f1", "vote_accuracy", "ece")
 REQUIREMENTS = ("terrain-slip", "scikit-learn", "numpy", "scipy", "numba", "skops")
 
 
-@dataclass(frozen=True, repr=False)
 class Registered(Result):
-    """A registered version of a model, and whether the alias ``champion`` moved to it."""
+    """A registered version of a model, and whether the alias ``champion`` moved to it.
+
+    Of a model that was kept in a folder when the tracking server had stopped: it becomes champion where there is
+    none, or where it is better on the same data; on other data the two cannot be compared any more.
+    """
 
     model_uri: str = described("of the registered version")
     version: str = described("its number")
     run_id: str = described("of the run in MLflow")
     alias_moved: bool = described("whether it is the champion now")
     alias_reason: str = described("why, or why not")
+    folder: Path | None = described("that it lay in, where it is registered without training", optional=True)
+
+    @property
+    def verdict(self) -> str:
+        """Where the model is, and whether it is champion."""
+        verdict = "champion" if self.alias_moved else "not champion"
+        return f"{self.model_uri} is registered, {verdict}: {self.alias_reason}"
+
+
+def report(result: Registered) -> Report:
+    """Return where the model is, and whether it is champion."""
+    next_step = f"terrain inspect {result.model_uri}"
+    return Report(f"Model of {result.folder}", f"{result.verdict}.", next_step=next_step)
 
 
 def log_training(
@@ -103,7 +119,8 @@ def log_training(
         if moved:
             client.set_registered_model_alias(name, CHAMPION, number)
         client.set_terminated(run_id)
-        return Registered(f"models:/{name}/{number}", number, run_id, moved, reason)
+        kept = folder if data is None else None
+        return Registered(f"models:/{name}/{number}", number, run_id, moved, reason, kept)
 
 
 def _log_model(mlflow: Any, name: str, folder: Path, info: ModelInfo, run_id: str) -> Any:

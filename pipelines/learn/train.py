@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Self
@@ -18,7 +18,7 @@ from pydantic import model_validator
 from pipelines.data.datasets import load
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.learn.parallel import ComputeSettings
-from pipelines.learn.settings import CacheSettings, RecipeSettings
+from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.tracking import Registered
 from pipelines.report.numbers import format_value, plural
 from pipelines.report.results import Progress, as_json, described, silent
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.search import SearchResult
     from pipelines.learn.training_data import TrainingData
-    from terrain.classify.folds import Fold
-    from terrain.classify.held_out import Examples
     from terrain.classify.importance import ChannelImportance
 
 EXAMPLE = "terrain train --data runs/ --name field"
@@ -46,7 +44,7 @@ PARAMS = ("recipe", "window_s", "stride_s", "steady", "seed", "repeats", "n_wind
 """What MLflow has of the evaluation's settings and counts as parameters."""
 
 
-class TrainingSettings(RecipeSettings, CacheSettings):
+class TrainingSettings(RecipeSettings):
     """Training: what is trained, and under which name it is registered."""
 
     name: str = setting(..., "Name of the registered model.")
@@ -86,8 +84,7 @@ class Settings(TrainingSettings, AlignedRunsSettings, ComputeSettings):
         return self
 
 
-@dataclass(frozen=True, repr=False)
-class TrainResult(Registered):
+class TrainResult(Registered, kw_only=True):
     """A trained and registered model, and the evaluation that it is judged by.
 
     ``ui``, what shows the store, and ``card`` are shown and not in JSON.
@@ -115,34 +112,24 @@ class TrainResult(Registered):
         return self.crossval.records()
 
 
-@dataclass(frozen=True, repr=False)
-class RegisterResult(Registered):
-    """A model that was kept in a folder when the tracking server had stopped, and is registered now.
-
-    It becomes champion where there is none, or where it is better on the same data; on other data the two
-    cannot be compared any more.
-    """
-
-    folder: str = described("that the model lay in")
-
-
-def run(settings: Settings, progress: Progress = silent) -> TrainResult | RegisterResult:
+def run(settings: Settings, progress: Progress = silent) -> Registered:
     """Read runs, or their cached features, train and register; or register a folder; errors as :func:`train`."""
     from pipelines.data.tracking import ensure_tracking
-    from pipelines.learn.cache import cached_data, loaders_of
     from pipelines.learn.parallel import computing
     from pipelines.learn.tracking import log_training
     from pipelines.learn.training_data import data_of_runs
 
     ensure_tracking()
     if settings.kept is not None:
-        return RegisterResult(**vars(log_training(settings.name, settings.kept)), folder=str(settings.kept))
+        return log_training(settings.name, settings.kept)
     asked = settings.with_(skip_short=settings.repair)
     with computing(settings.compute):
         if settings.cache is None:
             runs, skipped = load(settings)
             data = data_of_runs(runs, asked)
         else:
+            from pipelines.learn.cache import cached_data, loaders_of
+
             data, skipped = cached_data(loaders_of(settings), asked, settings.cache, progress)
         found = train(data, asked, settings.dataset, progress)
     return replace(found, skipped=tuple(skipped))
@@ -168,15 +155,17 @@ def train(
         if the data do not suffice, the model could not be stored, or the tracking store fails; a model that
         was trained by then is kept in a folder, which the message names.
     """
-    from features.motion import NO_MOTION
-    from pipelines.data.tracking import code_commit, ui_line
+    from pipelines.data.tracking import TrackingError, code_commit, ui_line
     from pipelines.learn.card import TrainingRecord, limits_of, write_training
     from pipelines.learn.champion import run_accuracies
+    from pipelines.learn.evaluate import evaluate_recipe
     from pipelines.learn.model_file import write_model
+    from pipelines.learn.tracking import log_training
     from pipelines.learn.training_data import info_of, with_limits
     from pipelines.report.drawing import figure_png
     from pipelines.report.tree import figures_of
     from pipelines.report.versions import versions
+    from terrain.classify.importance import channel_importance, channel_of
 
     _check_storable(data)
     searched, notes = None, []
@@ -192,17 +181,24 @@ def train(
             f"{plural(len(searched.held_out_runs), 'run')} that no trial saw it is {best}, by the default "
             f"choice {default}"
         )
-    evaluation, importance, fitted = _evaluated(data, settings, progress)
     recipe, samples = data.recipe, data.samples
-    recipe.steps[-1] = (recipe.steps[-1][0], fitted)
+    channels = [channel_of(str(name)) for name in recipe[0].get_feature_names_out()]
+    network = settings.recipe.partition("@")[0] in NETWORKS
+    asked = settings.with_(repeats=1) if network and settings.repeats is None else settings
+    computed = data.rows, data.motion
+    evaluation, held_out = evaluate_recipe(
+        recipe, settings.recipe, samples, asked, progress, computed, channels
+    )
+    drops = [each.found for each in held_out.results if each.found is not None]
+    importance = channel_importance(channels, drops)
+    recipe.steps[-1] = (recipe.steps[-1][0], held_out.fitted)
     info = info_of(data, settings, dataset)
     model, missing = with_limits(recipe, info, samples, data.features, data.motion)
-    unknown = (f"support: {NO_MOTION}",) if data.motion is None else ()
     evaluation = replace(
         evaluation,
         dataset=dataset,
         data_digest=data.digest,
-        notes=(*evaluation.notes, *missing, *unknown, *notes),
+        notes=(*evaluation.notes, *missing, *notes),
     )
     info = replace(model.info, commit=code_commit(), run_accuracy=run_accuracies(data, evaluation))
     record = TrainingRecord(
@@ -211,7 +207,7 @@ def train(
         runs=data.runs,
         evaluation=evaluation,
         importance=importance,
-        chosen=as_json(getattr(fitted, "best_", {})),
+        chosen=as_json(getattr(held_out.fitted, "best_", {})),
         limits=limits_of(info, samples.windows, data.motion, evaluation),
         versions=versions(),
     )
@@ -221,13 +217,21 @@ def train(
         folder = settings.out or Path(place)
         write_model(folder, model._replace(info=info))
         card = write_training(folder, settings.name, record)
-        registered = _registered(settings, folder, data, pictures)
+        try:
+            registered = log_training(settings.name, folder, data, pictures)
+        except TrackingError as error:
+            not_registered = Path(f"{settings.name}-not-registered")
+            kept = settings.out or shutil.copytree(folder, not_registered, dirs_exist_ok=True)
+            raise TrackingError(
+                f"{error}; the model is kept in {kept}: register it by "
+                f"terrain train --register {kept} --name {settings.name}"
+            ) from error
     return TrainResult(
         **vars(registered),
         dataset=dataset,
         data_digest=data.digest,
         commit=info.commit,
-        n_windows=len(data),
+        n_windows=len(samples.windows),
         chosen=record.chosen,
         importance=importance,
         crossval=evaluation,
@@ -261,61 +265,8 @@ def _check_storable(data: TrainingData) -> None:
         packed(clone(own.estimator).fit(np.nan_to_num(data.rows[rows]), terrain[rows]))
 
 
-def _registered(
-    settings: TrainingSettings, folder: Path, data: TrainingData, pictures: Mapping[str, bytes]
-) -> Registered:
-    """Register a model; where that fails, keep it in a folder and say how it is registered later."""
-    from pipelines.data.tracking import TrackingError
-    from pipelines.learn.tracking import log_training
-
-    try:
-        return log_training(settings.name, folder, data, pictures)
-    except TrackingError as error:
-        kept = settings.out
-        if kept is None:
-            kept = Path(f"{settings.name}-not-registered")
-            shutil.copytree(folder, kept, dirs_exist_ok=True)
-        raise TrackingError(
-            f"{error}; the model is kept in {kept}: register it by "
-            f"terrain train --register {kept} --name {settings.name}"
-        ) from error
-
-
-def _evaluated(
-    data: TrainingData, settings: TrainingSettings, progress: Progress
-) -> tuple[CrossvalResult, tuple[ChannelImportance, ...], Any]:
-    """Return the evaluation on held-out runs, what each channel is worth, and the classifier fitted on all runs.
-
-    One set of fits gives all three: channels are judged by those of the first repeat.
-    """
-    from pipelines.learn.evaluate import evaluate_recipe
-    from terrain.classify.importance import ChannelDrops, channel_importance, channel_of
-
-    channels = [channel_of(str(name)) for name in data.recipe[0].get_feature_names_out()]
-
-    def ask(examples: Examples, fold: Fold) -> Any:
-        if fold.repeat:
-            return None
-        tested = examples.features[fold.test], examples.terrain[fold.test]
-        return ChannelDrops(*tested, channels, settings.seed, fold.number)
-
-    if settings.repeats is None and settings.recipe.partition("@")[0] in NETWORKS:
-        settings = settings.with_(repeats=1)
-    computed = data.rows, data.motion
-    evaluation, held_out = evaluate_recipe(
-        data.recipe, settings.recipe, data.samples, settings, progress, computed, ask
-    )
-    drops = [each.found for each in held_out.results if each.found is not None]
-    return evaluation, channel_importance(channels, drops), held_out.fitted
-
-
-def report(result: TrainResult | RegisterResult) -> Report:
+def report(result: TrainResult) -> Report:
     """Return where the model is, and its card: how good it is on held-out runs, and what it is not for."""
-    verdict = "champion" if result.alias_moved else "not champion"
-    registered = f"{result.model_uri} is registered, {verdict}: {result.alias_reason}"
-    if isinstance(result, RegisterResult):
-        next_step = f"terrain inspect {result.model_uri}"
-        return Report(f"Model of {result.folder}", f"{registered}.", next_step=next_step)
     assert result.card is not None
     card, parts = result.card.report, [Text(f"tracked, to be seen by: {result.ui}")]
     if result.search is not None:
@@ -324,7 +275,7 @@ def report(result: TrainResult | RegisterResult) -> Report:
     return replace(
         card,
         title=f"Training on {result.dataset}",
-        answer=f"{registered}; {card.answer}",
+        answer=f"{result.verdict}; {card.answer}",
         parts=[
             *card.parts[:1],
             *parts,

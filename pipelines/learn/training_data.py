@@ -74,9 +74,6 @@ class TrainingData:
     runs: tuple[TrainedRun, ...]
     digest: str
 
-    def __len__(self) -> int:
-        return len(self.samples.windows)
-
     @property
     def features(self) -> Array:
         """Features (n, f) of the windows, which are the rows of most recipes."""

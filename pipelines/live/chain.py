@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.model import TerrainModel
-from pipelines.live.state import Bias, LiveState, restorable
+from terrain.control.live_state import Bias, LiveState
 from terrain.control.pilot_settings import check_table
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import (
@@ -122,12 +122,8 @@ class Chain:
         self.robot_name, self.switching, self._clocks = robot_name, switching, clocks
         self.belief: TerrainBelief = NO_BELIEF
         self.estimate: Estimate | None = None
-        self._check_table(table)
+        check_table(table, robot_name)
         self.table = table
-
-    def _check_table(self, table: SlipTable) -> None:
-        if self.robot_name:
-            check_table(table, self.robot_name)
 
     @property
     def target_ratio(self) -> float:
@@ -151,7 +147,7 @@ class Chain:
 
     def check(self, model: TerrainModel | None, table: SlipTable) -> None:
         """Raise what :meth:`replace` would."""
-        self._check_table(table)
+        check_table(table, self.robot_name)
         self.source.check(model)
 
     def replace(self, model: TerrainModel | None, table: SlipTable) -> None:
@@ -161,7 +157,7 @@ class Chain:
         otherwise its windows begin with the next sample.  ``ConfigError`` where the table is another robot's,
         ``DataError`` where the model does not suit what is measured and estimated, or is none.
         """
-        self._check_table(table)
+        check_table(table, self.robot_name)
         self.source.swap(model)
         self.table = table
 
@@ -196,7 +192,7 @@ class Chain:
             if the filter has run already.
         """
         session, name = self._session
-        fresh = restorable(state, self.robot_name, name, now_s)
+        fresh = state.usable(self.robot_name, name, now_s)
         if session is not None:
             session.begin_from(fresh.biases, max(now_s - state.saved_s, 0.0))
         self.belief = TerrainBelief(fresh.terrain, fresh.probability)

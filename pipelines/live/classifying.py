@@ -126,7 +126,7 @@ class Classifier(TerrainSource):
     -----
     Models and samples go through one queue, so that what was taken before a model is for the model before.
     Only :meth:`_work` touches the windows; where a thread runs it, both sides share queues whose ends are
-    atomic, and plain numbers.
+    atomic, plain numbers and counts.
     """
 
     def __init__(
@@ -144,19 +144,17 @@ class Classifier(TerrainSource):
         self._waiting: deque[tuple[Mapping[str, Reading], Sequence[Estimate]] | _Part] = deque()
         self._finished: deque[WindowOutput] = deque()
         self._part: _Part | None = None  # that is worked with
-        self._due_s, self._n_overrun = math.inf, 0
+        self._due_s = math.inf
         self._counts: Mapping[str, int] = {}
-        self._faults: Mapping[str, int] = {}
+        self._lost: Counter[str] = Counter()
         if model is not None:
             self._begin(model, self._feed_of(model))
 
     @property
     def dropped(self) -> Mapping[str, int]:
         """Windows and samples that were not used by the last window, as counts by kind."""
-        counts = dict(self._counts)
-        if self._n_overrun:
-            counts["steps: overrun"] = self._n_overrun
-        return counts | dict(self._faults) | {f"window: refused, {why}": n for why, n in self.failed.items()}
+        refused = {f"window: refused, {why}": n for why, n in self.failed.items()}
+        return {**self._counts, **self._lost, **refused}
 
     def _feed_of(self, model: TerrainModel) -> WindowFeed:
         """Return what cuts the windows of a model; ``DataError``, as of :func:`feed_of`, where it does not suit."""
@@ -211,8 +209,7 @@ class Classifier(TerrainSource):
         try:
             self._work()
         except Exception as error:  # of one window: the next are served
-            kind = f"window: lost to a fault, {type(error).__name__}"
-            self._faults = {**self._faults, kind: self._faults.get(kind, 0) + 1}
+            self._lost[f"window: lost to a fault, {type(error).__name__}"] += 1
 
     def take(self, readings: Mapping[str, Reading], estimates: Sequence[Estimate]) -> list[WindowOutput]:
         """Take readings and estimates; return the outputs of windows that are there by now."""
@@ -236,7 +233,7 @@ class Classifier(TerrainSource):
             if isinstance(oldest, _Part):
                 self._waiting.appendleft(oldest)
             else:
-                self._n_overrun += 1
+                self._lost["steps: overrun"] += 1
 
     def _work(self) -> None:
         """Cut and classify what waits."""

@@ -18,7 +18,7 @@ import numpy as np
 from pipelines.live.chain import Chain, CommandStatus, Step
 from pipelines.live.classifying import PILOT_FILTER
 from pipelines.live.model import TerrainModel
-from pipelines.live.state import LiveState
+from terrain.control.live_state import LiveState
 from terrain.control.pilot_settings import DEFAULT_SETTINGS, OPEN_LOOP, PilotSettings, check_pilot
 from terrain.control.robot_control import RobotControl
 from terrain.control.slip_table import SlipTable, load_slip_table

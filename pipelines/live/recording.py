@@ -245,16 +245,8 @@ class SessionRecorder:
 
 def recorded(output: WindowOutput) -> RecordedWindow:
     """Return what is recorded of a model's output for a window."""
-    probability = float(output.probability)
-    return RecordedWindow(
-        start_s=output.start_s,
-        end_s=output.end_s,
-        terrain=output.terrain,
-        probability=probability,
-        probabilities=dict(output.probabilities),
-        doubtful=not (output.terrain and probability >= SWITCHING.probability_least),
-        refused=output.refused,
-    )
+    accepted = output.terrain and output.probability >= SWITCHING.probability_least
+    return RecordedWindow(**output._asdict(), doubtful=not accepted)
 
 
 def _reason(error: OSError) -> str:

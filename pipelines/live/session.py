@@ -23,7 +23,7 @@ from pipelines.live.model import TerrainModel
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread, SessionRecorder
-from pipelines.live.state import LiveState
+from terrain.control.live_state import LiveState
 from terrain.control.pilot_settings import PilotSettings
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError

@@ -62,7 +62,8 @@ def draw(figure: Figure) -> Drawn:
         layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.05),
     )
     FigureCanvasAgg(drawn)
-    grid, names = drawn.add_gridspec(len(heights), 1, height_ratios=heights), strip_names(figure)
+    grid = drawn.add_gridspec(len(heights), 1, height_ratios=heights)
+    names: dict[str, int] = {}  # of intervals, in the order of their colours
     for i, panel in enumerate(figure.panels):
         axes = drawn.add_subplot(grid[i])
         _draw_panel(axes, panel, names)
@@ -84,13 +85,7 @@ def _height_in(panel: Panel) -> float:
     return 4.5 if panel.equal else PANEL_HEIGHT_IN
 
 
-def strip_names(figure: Figure) -> list[str]:
-    """Return the names of all intervals of a figure, each of which has one colour in all panels."""
-    marks = (mark for panel in figure.panels for mark in panel.marks if mark.kind == "strip")
-    return list(dict.fromkeys(name for mark in marks for _, _, name in mark.x))
-
-
-def _draw_panel(axes: Axes, panel: Panel, names: list[str]) -> None:
+def _draw_panel(axes: Axes, panel: Panel, names: dict[str, int]) -> None:
     n_bars = sum(mark.kind == "bars" for mark in panel.marks)
     for number, mark in enumerate(panel.marks):
         colour = COLOURS[(number if mark.colour is None else mark.colour) % len(COLOURS)]
@@ -120,12 +115,12 @@ def _draw_panel(axes: Axes, panel: Panel, names: list[str]) -> None:
         axes.legend(handles, labels, loc="lower left", bbox_to_anchor=above, **legend)
 
 
-def _draw_strip(axes: Axes, mark: Mark, names: list[str], thin: bool) -> None:
+def _draw_strip(axes: Axes, mark: Mark, names: dict[str, int], thin: bool) -> None:
     """Draw intervals in the colours of their names; where nothing else is drawn, without a vertical axis."""
     labelled: set[str] = set()
     for start, end, name in mark.x:
         style: dict[str, Any] = {
-            "color": COLOURS[names.index(name) % len(COLOURS)],
+            "color": COLOURS[names.setdefault(name, len(names)) % len(COLOURS)],
             "alpha": 0.75 if thin else 0.18,
             "lw": 0,
         }

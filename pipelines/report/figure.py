@@ -75,12 +75,10 @@ class Figure:
     title : above
     panels : from the top
     caption : below: what is to be seen
-    alt : in the place of a picture that cannot be seen; the caption by default
     x_label : of the last panel
     """
 
     title: str
     panels: Sequence[Panel]
     caption: str = ""
-    alt: str = ""
     x_label: str = ""

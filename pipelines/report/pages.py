@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
 from pipelines.report.figure import Figure
@@ -42,7 +42,7 @@ MAX_SVG_BYTES = 300_000
 def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("pipelines.report", "templates"),
-        autoescape=lambda name: name != MARKDOWN,
+        autoescape=select_autoescape(["html.j2"]),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -66,7 +66,7 @@ def html_page(report: Report) -> str:
     def picture(figure: Figure) -> Markup:
         figures.append(figure)
         holder = Markup('<div class="plot" role="img" aria-label="{}" data-figure="{}"></div>')
-        return holder.format(figure.alt or figure.caption or figure.title, len(figures) - 1)
+        return holder.format(figure.caption or figure.title, len(figures) - 1)
 
     body = _body(report, picture)
     data = json.dumps(figure_data(figures), separators=(",", ":"), allow_nan=False)
@@ -89,7 +89,7 @@ def html_fragment(report: Report) -> str:
         svg = figure_svg(figure).encode()
         kind, content = ("svg+xml", svg) if len(svg) <= MAX_SVG_BYTES else ("png", figure_png(figure))
         source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-        return Markup('<img src="{}" alt="{}">').format(source, figure.alt or figure.caption or figure.title)
+        return Markup('<img src="{}" alt="{}">').format(source, figure.caption or figure.title)
 
     return f'<div class="terrain-report">{_body(report, picture)}</div>'
 

@@ -6,10 +6,10 @@ import json
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, dataclass_transform
 
 from terrain.files.atomic import atomic_write
 
@@ -36,9 +36,10 @@ def described(
     text : what it is
     unit : in SI, ``1`` of a ratio, empty where there is none
     default : where it may be left out
-    form : how it is written, as :func:`pipelines.report.numbers.format_value` takes it
+    form : how it is written, as :func:`pipelines.report.numbers.format_value` takes it; a ratio in percent by default
     optional : None, and then left out of JSON, where it was not asked for or is not known
     """
+    form = form or (".1%" if unit == "1" else "")
     metadata = {"description": text, "unit": unit, "form": form, "optional": optional}
     return field(default=None if optional else default, metadata=metadata)
 
@@ -86,8 +87,9 @@ def write_json(path: Path, result: Any) -> None:
     atomic_write(path, json.dumps(as_json(result), indent=2, allow_nan=False) + "\n")
 
 
+@dataclass_transform(frozen_default=True)
 class Result:
-    """Base of the results of commands, which are frozen dataclasses.
+    """Base of the results of commands: what derives from it is a frozen dataclass by that, with the options of one.
 
     The module that defines a result has a function ``report(result)``; screen, page and notebook show what it
     returns.  The fields are the keys of ``--json``; one that is not :func:`described` is none of them, as the
@@ -95,9 +97,7 @@ class Result:
 
     Examples
     --------
-    >>> from dataclasses import dataclass
-    >>> @dataclass(frozen=True)
-    ... class Length(Result):
+    >>> class Length(Result):
     ...     length_m: float = described("of the path", "m")
     >>> Length(1.5).as_json()
     {'length_m': 1.5}
@@ -113,11 +113,10 @@ class Result:
 
     def as_json(self) -> Any:
         """Return the fields by name, as :func:`as_json` writes them."""
-        values = {name: (getattr(self, name), about["optional"]) for name, about in self.about().items()}
         return {
             name: as_json(value)
-            for name, (value, optional) in values.items()
-            if value is not None or not optional
+            for name, about in self.about().items()
+            if (value := getattr(self, name)) is not None or not about["optional"]
         }
 
     def pairs(self, *names: str) -> list[tuple[Any, ...]]:
@@ -145,8 +144,7 @@ class Result:
     @classmethod
     def about(cls) -> dict[str, Mapping[str, Any]]:
         """Return what :func:`described` was given for each field, by its name."""
-        named = {each.name: each.metadata for each in fields(cls)}  # type: ignore[arg-type]
-        return {name: about for name, about in named.items() if "description" in about}
+        return {each.name: each.metadata for each in fields(cls) if each.metadata}  # type: ignore[arg-type]
 
     @classmethod
     def schema(cls) -> dict[str, Any]:
@@ -167,5 +165,5 @@ class Result:
         return self.report._repr_html_()
 
     def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        cls.__repr__ = Result.__repr__  # type: ignore[method-assign]  # dataclass keeps what is defined
+        super().__init_subclass__()
+        dataclass(frozen=True, repr=False, **options)(cls)

@@ -14,13 +14,11 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pipelines.data.can_frames import (
-    OPTIONAL,
     RECEIVED,
     SIGNALS,
     Layout,
@@ -35,20 +33,17 @@ from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Pairs, Report, Table, sections
 from pipelines.serve.serve import Settings, loaded, stopping
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.pilot_settings import PilotSettings, check_pilot
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import step_or_period
 from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics, corrections, last_samples
 from terrain.errors import ConfigError, one_line
 from terrain.estimation.clocks import SessionClock
 from terrain.records import Array, Sample
-from terrain.robots import SwerveRobot, as_drive, load_robot
+from terrain.robots import SwerveRobot, load_robot
 
 if TYPE_CHECKING:
     from can import Message as Frame
-
-REQUIRED = tuple(name for name, channels in SIGNALS.items() if not set(channels) <= OPTIONAL)
-"""Streams without which a pilot makes no correction."""
 
 REOPEN_S = 0.5
 """Between two attempts to open a bus that failed."""
@@ -320,7 +315,6 @@ def latency_of(times_s: Sequence[float]) -> dict[str, float]:
     return dict(zip(("median_ms", "p99_ms"), quantiles_ms.round(4).tolist(), strict=True))
 
 
-@dataclass(frozen=True, repr=False)
 class BridgeResult(Result):
     """What a bridge did, from its start to its stop."""
 
@@ -347,18 +341,15 @@ class BridgeResult(Result):
 def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
     """Run a pilot on a bus until it is interrupted, or for the time of the settings."""
     interface, channel = bus_of(settings.can or "")
-    layout = load_layout(settings.dbc, REQUIRED)
-    robot = as_drive(
-        SwerveRobot,
-        load_robot(settings.robot or "agrimaro"),
-        "robot {name}: drive {drive!r} has no pilot, only 'swerve' has",
-    )
+    layout = load_layout(settings.dbc)
+    table, pilot = load_slip_table(settings.table), PilotSettings(controller=settings.controller)
+    robot = check_pilot(load_robot(settings.robot or "agrimaro"), table, pilot)
     chain = chain_of(
         robot,
         {name: tuple(SIGNALS[name]) for name in RECEIVED if name != "twist"},
         loaded(settings, settings.model),
-        load_slip_table(settings.table),
-        PilotSettings(controller=settings.controller),
+        table,
+        pilot,
         ThreadPoolExecutor(1, "classifier"),
     )
     bridge, link = Bridge(layout, robot, chain), Link(lambda: open_bus(interface, channel, settings.bitrate))

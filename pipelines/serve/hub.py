@@ -19,10 +19,10 @@ from pipelines.live.model import TerrainModel
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread
 from pipelines.live.session import Hello, RobotSession, Served
-from pipelines.live.state import LiveState, load_state, to_text
 from pipelines.serve.metrics import Metrics
 from pipelines.serve.serve import Settings, loaded, required_token
 from pipelines.serve.wire import WireError
+from terrain.control.live_state import LiveState, load_state, to_text
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError, LogError, TerrainError
 from terrain.estimation.live import CHANNELS
@@ -251,16 +251,14 @@ class Hub:
         """Write states to the folder, if there is one; one that cannot be written is named in ``trouble``."""
         if self.settings.state is None:
             return
-        failed = ""
+        failed: dict[str, str] = {}
         for name, state in states.items():
             try:
                 atomic_write(self.settings.state / f"{name}.json", to_text(state))
             except TerrainError as error:
-                failed = str(error)
-        if failed:
-            self.trouble["states"] = failed
-        else:
-            self.trouble.pop("states", None)
+                failed["states"] = str(error)
+        self.trouble.pop("states", None)
+        self.trouble.update(failed)
 
     def stop(self) -> None:
         """End the threads; recordings are written."""

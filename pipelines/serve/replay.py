@@ -132,8 +132,7 @@ class ReplayedRun(Replayed):
     windows: tuple[ObservedWindow, ...] = described("each window as the chain saw it")
 
 
-@dataclass(frozen=True)
-class ReplayResult(Replayed, Result):
+class ReplayResult(Result, Replayed):
     """All runs, and the same figures over all of them."""
 
     model: str | None = described("as it was named")

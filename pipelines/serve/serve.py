@@ -11,7 +11,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -189,7 +189,6 @@ def required_token(settings: ServiceSettings) -> str:
     return token
 
 
-@dataclass(frozen=True, repr=False)
 class ServiceResult(Result):
     """What a service serves, and what it did until its end."""
 
@@ -237,18 +236,16 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
 
 def report(result: ServiceResult) -> Report:
     """Return what a service serves, and what it did until its end."""
-    model = Pairs(result.pairs("classes", "table", "robots", "robot", "filter"))
+    parts = [Pairs(result.pairs("classes", "table", "robots", "robot", "filter"))]
     needs = [
         (f"{stream}, {result.rate_hz[stream]:g} Hz", enumerated(names))
         for stream, names in result.channels.items()
     ]
+    answer = f"{result.model} can be served: {enumerated(result.classes)}."
+    next_step = f"terrain serve --model {result.model}"
+    if (done := result.served) is not None:
+        answer = f"{plural(done['sessions'], 'session')} of robots served with {result.model}."
+        next_step = "terrain convert RECORDINGS --out RUNS makes runs of what was recorded"
+        parts.insert(0, Pairs([(name.replace("_", " "), n) for name, n in done.items()]))
     details = sections(("Channels that the model needs", [Pairs(needs)]))
-    if result.served is None:
-        answer = f"{result.model} can be served: {enumerated(result.classes)}."
-        next_step = f"terrain serve --model {result.model}"
-        return Report("Service", answer, parts=(model,), details=details, next_step=next_step)
-    done = result.served
-    answer = f"{plural(done['sessions'], 'session')} of robots served with {result.model}."
-    counts = Pairs([(name.replace("_", " "), n) for name, n in done.items()])
-    next_step = "terrain convert RECORDINGS --out RUNS makes runs of what was recorded"
-    return Report("Service", answer, parts=(counts, model), details=details, next_step=next_step)
+    return Report("Service", answer, parts=parts, details=details, next_step=next_step)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,8 +30,7 @@ LARGEST_THRUST_RATIO = 1.3
 """Thrust over load up to which curves are drawn."""
 
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class LearnedCurves(LearnedSlipTable):
+class LearnedCurves(LearnedSlipTable, eq=False, kw_only=True):
     """Slip curves and target slips of a swerve robot."""
 
     filter: str = described("by which slip was estimated", default=FILTER)

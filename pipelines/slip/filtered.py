@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -41,8 +40,7 @@ if TYPE_CHECKING:
     from pipelines.slip.estimate import EstimateOptions
 
 
-@dataclass(frozen=True, kw_only=True)
-class FilterResult(TracksResult):
+class FilterResult(TracksResult, kw_only=True):
     """Estimates of runs by a filter."""
 
     filter: str = described("which filter")

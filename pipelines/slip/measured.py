@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -35,8 +35,7 @@ UNLABELLED = "(no label)"
 SLIP, FINE = ".3f", ".4f"
 
 
-@dataclass(frozen=True, kw_only=True)
-class MeasuredSlipResult(TracksResult):
+class MeasuredSlipResult(TracksResult, kw_only=True):
     """Slip measured from outside."""
 
     rows: ClassVar[str] = "surfaces"

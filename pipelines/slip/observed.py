@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,8 +41,7 @@ LATE_S = 2.0
 """Time from the start that does not set the limits of an axis: estimates begin where nothing is known."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class ObserverResult(TracksResult):
+class ObserverResult(TracksResult, kw_only=True):
     """Estimates of runs by an observer."""
 
     filter: str = described("which observer")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,7 +27,6 @@ FLAT = "no slope was driven, or no tilt measured: what slopes do is not fitted"
 RMSE = ".3f"
 
 
-@dataclass(frozen=True)
 class OdometryResult(Result):
     """Odometry of one robot, judged on runs held out."""
 

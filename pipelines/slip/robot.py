@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pipelines.data.datasets import load_runs
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from pipelines.slip.calibrate import Settings
 
 
-@dataclass(frozen=True)
 class CalibrationResult(Result):
     """A calibrated description."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,7 +42,6 @@ LEFT_OUT = {"slip": "slips left out", "angle": "slip angles left out"}
 PANELS = (("pull_n", "traction [N]"), ("side_n", "side force [N]"), ("sinkage_m", "sinkage [mm]"))
 
 
-@dataclass(frozen=True)
 class SoilResult(Result):
     """Laws of a wheel in sand, compared on what their fits did not have."""
 

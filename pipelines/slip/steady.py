@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,8 +22,7 @@ from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
 
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class SteadyTargets(LearnedSlipTable):
+class SteadyTargets(LearnedSlipTable, eq=False, kw_only=True):
     """Targets of a robot by slip that was measured from outside.
 
     Runs that are counted have a slip, in whatever motion; those of each surface are in steady motion.

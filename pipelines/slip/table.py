@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,7 @@ TARGETS = tuple(Column(state, TARGET, of=f"targets.{state}.slip_ratio") for stat
 """Columns of the target slips of a terrain."""
 
 
-@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
-class LearnedSlipTable(Result, SlipTable):
+class LearnedSlipTable(Result, SlipTable, eq=False, kw_only=True):
     """A table of target slips, and what it was learned from."""
 
     table: Path | None = described("file that was written", default=None)

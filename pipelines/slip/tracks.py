@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -25,8 +25,7 @@ TRUTH_COLOUR = 6
 SLIP = "+.4f"
 
 
-@dataclass(frozen=True, kw_only=True)
-class TracksResult(Result):
+class TracksResult(Result, kw_only=True):
     """Estimates of runs."""
 
     rows: ClassVar[str] = "runs"

@@ -130,8 +130,8 @@ def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> Swer
 
 
 def check_table(table: SlipTable, robot: str) -> None:
-    """Raise ``ConfigError`` where a table is another robot's."""
-    if table.robot and table.robot != robot:
+    """Raise ``ConfigError`` where a table is another robot's; a robot without a name may have any."""
+    if robot and table.robot and table.robot != robot:
         raise ConfigError(f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot!r}")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from pipelines.report.numbers import format_value
@@ -139,7 +138,6 @@ class Settings(JobsSettings):
     )
 
 
-@dataclass(frozen=True)
 class Consistency(Result):
     """Consistency of a filter by terrain."""
 

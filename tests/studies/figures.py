@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,6 @@ class Settings(BaseSettings):
     root: Path = setting(ROOT, "Folder with docs/ and README.md.")
 
 
-@dataclass(frozen=True)
 class Figures(Result):
     """What was written."""
 

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
-from terrain.simulation.planar.omni import steady_twist
 
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
@@ -32,6 +31,7 @@ from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import description_file, load_robot
 from terrain.simulation.bench import six_positions_log
 from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.planar.omni import steady_twist
 from terrain.simulation.scenario.make import make_scenario
 from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio

@@ -8,7 +8,6 @@ self-training, pool runs that the model is certain of are labelled by it, and it
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -53,7 +52,6 @@ class Strategy(NamedTuple):
     accuracy: float
 
 
-@dataclass(frozen=True)
 class LabelStudy(Result):
     """The strategies side by side, and their differences paired by run."""
 

@@ -8,7 +8,6 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic, perf_counter, sleep
@@ -71,7 +70,6 @@ class SessionsLatency(NamedTuple):
     lost_samples: int
 
 
-@dataclass(frozen=True)
 class LiveLatencies(Result):
     """Latencies of the live chain and the service."""
 

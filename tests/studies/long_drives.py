@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -54,7 +53,6 @@ class LongDrive(NamedTuple):
     slip_coverage: float
 
 
-@dataclass(frozen=True)
 class LongDrives(Result):
     """Errors of all drives."""
 

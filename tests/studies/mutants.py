@@ -12,7 +12,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,7 +66,6 @@ class Outcome(NamedTuple):
     tests: str
 
 
-@dataclass(frozen=True)
 class Mutants(Result):
     """Which mutants the tests notice."""
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -81,7 +80,6 @@ class Point(NamedTuple):
     peak_mb: float
 
 
-@dataclass(frozen=True)
 class ScaleResult(Result):
     """Time and memory against the number of runs."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,7 +91,6 @@ class Coverage(NamedTuple):
     status_right: int
 
 
-@dataclass(frozen=True)
 class PeaksResult(Result):
     """Coverage over all learned cases and by terrain."""
 

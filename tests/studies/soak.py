@@ -9,7 +9,6 @@ import urllib.error
 import urllib.request
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import monotonic
@@ -73,7 +72,6 @@ class Settings(BaseSettings):
     out: Path | None = setting(None, "Folder of the service's states; a temporary one by default.")
 
 
-@dataclass(frozen=True)
 class Soak(Result):
     """What the service did under load and faults."""
 

@@ -6,7 +6,6 @@ The trials themselves are those of :mod:`studies.blind_trials`.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,7 +51,6 @@ class Seconds(NamedTuple):
     worst: float
 
 
-@dataclass(frozen=True)
 class TrialsResult(Result):
     """Scores of blind trials, with every single one."""
 

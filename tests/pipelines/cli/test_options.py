@@ -2,7 +2,6 @@
 
 import json
 import sys
-from dataclasses import dataclass
 from typing import Literal
 
 import pytest
@@ -36,7 +35,6 @@ class Settings(Folding):
     inner: int = setting(3, "Not on the command line.", option="")
 
 
-@dataclass(frozen=True)
 class Drawn(Result):
     settings: Settings = described("what was asked for")
     ratio: float = described("of nothing", "1")

@@ -29,6 +29,9 @@ from pipelines.data.can_frames import (
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError
 from terrain.files.resources import data_folder
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.logs.replay import TWIST
+from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.robots import load_robot
 
 from .foreign_bags import refused
@@ -157,6 +160,12 @@ def test_resolutions_are_far_below_the_noise_and_ranges_cover_the_robot():
     assert bounds("twist", 0)[1] > 1.5 * motors.speed_max_radps * ROBOT.wheel_radius_m
     for stream, names in SIGNALS.items():
         assert LAYOUT.columns(stream) == set(range(len(names))) - ({6} if stream == "odometry" else set())
+
+
+def test_the_signals_of_a_stream_are_in_the_order_of_its_columns():
+    columns = {"wheels": WHEELS_CHANNELS, "steering": STEERING_CHANNELS, "imu": IMU_CHANNELS, "twist": TWIST}
+    for stream, channels in (columns | {"odometry": CAMERA_CHANNELS}).items():
+        assert tuple(SIGNALS[stream]) == channels
 
 
 @given(q=st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 0.1))
@@ -304,7 +313,7 @@ SIG_VALTYPE_ 514 SteeringAngle1 : 1;
 def test_another_dbc_with_units_and_layouts_of_its_own_is_read(tmp_path):
     """Big-endian, an offset, rpm, an extended identifier, multiplexed currents in mA, a float in degrees."""
     (tmp_path / "own.dbc").write_text(OWN)
-    layout = load_layout(tmp_path / "own.dbc", ("wheels", "steering"))
+    layout = load_layout(tmp_path / "own.dbc", complete=False)
     receiver = Receiver(layout, ("wheels", "steering"))
     database = cantools.database.load_file(tmp_path / "own.dbc")
     sent = [("Fast", {"MotorRate1": 600, "MotorRate2": -1200.5, "MotorRate3": 0, "Alive": 0})]

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from pipelines.drive.comparison import compare
-from pipelines.drive.controllers import DriveInputs
-from pipelines.drive.drive import Settings
-from terrain.control.controllers import CONTROLLERS
+from pipelines.drive.controllers import DriveInputs, drive_once
+from terrain.control.controllers import CONTROLLERS, make_controller
+from terrain.control.situations import make_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
@@ -67,7 +66,8 @@ def test_what_cannot_be_driven_is_one_sentence(refused, place, sentence, words):
 
 
 def test_a_controller_that_needs_a_classifier_is_not_driven_without():
-    inputs = DriveInputs(load_robot("agrimaro"), load_slip_table())
+    robot, table = load_robot("agrimaro"), load_slip_table()
+    situation = make_situation("straight", robot, "grass", 0)
     for name in ("classified", "classified+track", "thesis:classified"):
         with pytest.raises(ConfigError, match=f"'{name.replace('+', '.')}' needs a classifier"):
-            compare(Settings(scenario="straight", controllers=("plain", name), seeds=1, n_jobs=1), inputs)
+            drive_once(DriveInputs(robot, table), make_controller(name, table, 0.05), situation)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from pipelines.explain.explain import explain_runs
+from pipelines.explain.explain import explain
 from terrain.robots import load_robot
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import simulate_planar
@@ -31,4 +31,4 @@ def a_run():
 @pytest.fixture(scope="session")
 def few():
     """Four runs explained by one effect, one of them held out."""
-    return explain_runs([simulated(i) for i in range(4)], "husky", effects=["camera_yaw"], hold_out=1, seed=3)
+    return explain([simulated(i) for i in range(4)], "husky", effects=["camera_yaw"], hold_out=1, seed=3)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from pipelines.explain.explain import EXTENDED_FILE, PAGE_FILE, explain_runs
+from pipelines.explain.explain import EXTENDED_FILE, PAGE_FILE, explain
 from pipelines.live.pilot import LivePilot
 from pipelines.report.results import as_json, silent
 from pipelines.report.terminal import terminal_text
@@ -95,7 +95,7 @@ def test_of_few_runs_none_is_held_out_by_default(a_run, few):
     text = terminal_text(few.report, details=True)
     assert "The wheel speeds are not compared with their commands: runs: 4 have" in text
     assert few.gain.gain is not None
-    bare = explain_runs([a_run(i) for i in range(4)], HUSKY, effects=["camera_yaw"])
+    bare = explain([a_run(i) for i in range(4)], HUSKY, effects=["camera_yaw"])
     assert "The gain on held-out runs was not measured: no run was held out" in bare.report.answer
 
 
@@ -133,7 +133,7 @@ def test_runs_that_cannot_be_compared_are_refused(a_run):
         (standing, "in all 3 the wheels are at rest; runs that drive are required"),
     ):
         with pytest.raises(TerrainError, match=sentence):
-            explain_runs(refused, HUSKY)
+            explain(refused, HUSKY)
 
 
 def test_a_model_without_covariance_is_refused_and_an_extended_description_not_overwritten(

@@ -21,7 +21,7 @@ from distributed.utils import open_port
 from features.windows import WindowRule
 from pipelines.learn import parallel as cluster
 from pipelines.learn.crossval import EvaluationSettings, crossval
-from pipelines.learn.parallel import ComputeSettings, computing, parallel, scheduler_address
+from pipelines.learn.parallel import computing, parallel, scheduler_address
 from pipelines.report.results import as_json
 from pipelines.report.versions import difference, software
 from terrain.errors import ConfigError, TerrainError
@@ -43,9 +43,9 @@ ROOT = Path(__file__).resolve().parents[3]
 def test_an_address_is_read_and_another_text_refused_in_one_sentence(compute, address):
     if address is ...:
         with pytest.raises(ConfigError, match="'local' or the address of a Dask scheduler"):
-            ComputeSettings(compute=compute)
+            computing(compute).__enter__()
     else:
-        assert scheduler_address(ComputeSettings(compute=compute).compute) == address
+        assert scheduler_address(compute) == address
 
 
 def test_results_of_two_processes_come_in_the_order_of_their_tasks():

@@ -249,7 +249,7 @@ def test_a_full_disk_ends_a_recording_and_keeps_what_was_written(recorder, monke
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     recorded(recorder)
-    until(lambda: not recorder._waiting)
+    until(lambda: recorder.files and recorder.files[0].stat().st_size)  # it is on the disk
     monkeypatch.setattr(recording.RunRecorder, "append", full)
     recorded(recorder, 10, 50)
     assert recorder.settled.wait(10.0)

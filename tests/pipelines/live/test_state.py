@@ -7,14 +7,13 @@ import pytest
 
 from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
-from pipelines.live.state import (
+from terrain.control.live_state import (
     BELIEF_FRESH_S,
     BIASES_FRESH_S,
     Bias,
     LiveState,
     from_text,
     load_state,
-    restorable,
     to_text,
 )
 from terrain.control.pilot_settings import PilotSettings
@@ -101,7 +100,7 @@ def test_a_bias_is_believed_less_with_time_and_never_less_than_without_it():
     ],
 )
 def test_only_what_is_fresh_is_used(age_s, whose, biases, belief):
-    found = restorable(STATE, *whose, STATE.saved_s + age_s)
+    found = STATE.usable(*whose, STATE.saved_s + age_s)
     assert bool(found.biases) is biases
     assert (found.terrain == "grass") is belief
     assert math.isfinite(found.target_ratio) is belief

@@ -158,7 +158,6 @@ class Pair(NamedTuple):
     high: float | None
 
 
-@dataclass(frozen=True)
 class Found(Result):
     name: str = described("of the robot")
     kind: Literal["a", "b"] = described("which")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -62,34 +61,27 @@ class LiveState:
     probability: Number = math.nan
     target_ratio: Number = math.nan
 
+    def usable(self, robot: str, filter_name: str, now_s: float) -> LiveState:
+        """Return it without what may not be used now: what is too old, or another robot's or filter's.
 
-def restorable(state: LiveState, robot: str, filter_name: str, now_s: float) -> LiveState:
-    """Return a state without what may not be used now: what is too old, or another robot's or filter's.
+        Parameters
+        ----------
+        robot, filter_name : that it is to be used for
+        now_s : seconds since 1970
 
-    Parameters
-    ----------
-    state : as saved
-    robot, filter_name : that it is to be used for
-    now_s : seconds since 1970
-
-    Examples
-    --------
-    >>> biases = {"gyro_bias_radps": Bias(0.01, 0.001)}
-    >>> state = LiveState("agrimaro", "vio15", 1000.0, biases, "grass", 0.9, 0.1)
-    >>> restorable(state, "agrimaro", "vio15", 1005.0).terrain
-    'grass'
-    >>> later = restorable(state, "agrimaro", "vio15", 1060.0)
-    >>> later.terrain, later.biases["gyro_bias_radps"].mean
-    ('', 0.01)
-    """
-    age_s = now_s - state.saved_s
-    suits = state.robot == robot and age_s >= -CLOCK_SLACK_S  # False for NaN
-    fresh_biases = suits and state.filter == filter_name and age_s <= BIASES_FRESH_S
-    fresh_belief = suits and age_s <= BELIEF_FRESH_S and state.terrain != UNKNOWN
-    biases = state.biases if fresh_biases else {}
-    if fresh_belief:
-        return replace(state, biases=biases)
-    return LiveState(state.robot, state.filter, state.saved_s, biases)
+        Examples
+        --------
+        >>> state = LiveState("agrimaro", "vio15", 1000.0, {"gyro": Bias(0.01, 0.001)}, "grass", 0.9, 0.1)
+        >>> later = state.usable("agrimaro", "vio15", 1060.0)
+        >>> state.usable("agrimaro", "vio15", 1005.0).terrain, later.terrain, later.biases["gyro"].mean
+        ('grass', '', 0.01)
+        """
+        age_s = now_s - self.saved_s
+        suits = self.robot == robot and age_s >= -CLOCK_SLACK_S  # False for NaN
+        fresh_biases = suits and self.filter == filter_name and age_s <= BIASES_FRESH_S
+        fresh_belief = suits and age_s <= BELIEF_FRESH_S and self.terrain != UNKNOWN
+        belief = (self.terrain, self.probability, self.target_ratio) if fresh_belief else ()
+        return LiveState(self.robot, self.filter, self.saved_s, self.biases if fresh_biases else {}, *belief)
 
 
 class _Document(BaseModel):
