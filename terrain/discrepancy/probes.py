@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -125,142 +126,117 @@ def probe_residuals(
     rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
     results: dict[tuple[str, str], ProbeResult] = {}
     inputs = [probe_inputs(run, rate_hz) for run in info.rows]
-    blocks = _blocks_of(info, names, change)
+    edges = [_block_edges(run) for run in info.rows]
     for c, channel in enumerate(CHANNELS):
         if not any(residual[:, c].any() for residual in info.white_residual):
             continue
-        columns = []
-        for run, given, residual in zip(info.rows, inputs, info.white_residual, strict=True):
-            columns.append(_white(info, run, c, np.array(list(given.values())), residual))
+        columns = [_white(info, i, c, np.array(list(given.values()))) for i, given in enumerate(inputs)]
         own = np.array([error.get((channel, name), 0.0) for name in inputs[0]])
-        for name, result in zip(inputs[0], _probe_results(info, names, blocks, c, columns, own), strict=True):
-            results[channel, name] = result
+        found = _probe_results(info, names, change, c, columns, edges, own)
+        results |= {(channel, name): result for name, result in zip(inputs[0], found, strict=True)}
         n_wheels = info.rows[0].inputs.shape[1] - len(INPUTS) + 1
         for wheel in range(n_wheels):
-            false = [_wave_statistics(info, c, _waves(info, c, wheel, times)) for times in PLACEBOS]
-            placebo = float(np.mean(np.concatenate(false))) / 2.0 if false[0].size else 1.0
+            false = np.concatenate([_wave_statistics(info, c, wheel, times) for times in PLACEBOS])
+            placebo = float(np.mean(false)) / 2.0 if false.size else 1.0
             for harmonic in HARMONICS:
                 name = f"wheel {wheel + 1} turn" + ("" if harmonic == 1 else f" x{harmonic}")
-                waves = _waves(info, c, wheel, harmonic)
-                results[channel, name] = _wheel_turn_probe(info, c, waves, placebo)
+                results[channel, name] = _wheel_turn_probe(
+                    _wave_statistics(info, c, wheel, harmonic), placebo
+                )
     return results
 
 
-def _waves(info: Evidence, c: int, wheel: int, times: float) -> list[Array]:
-    """Return cosine and sine (2, rows) of a multiple of a wheel's angle, whitened as channel c."""
-    pairs = []
-    for run, residual in zip(info.rows, info.white_residual, strict=True):
-        phase = times * run.inputs[:, len(INPUTS) - 1 + wheel]
-        pair = run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)])
-        pairs.append(_white(info, run, c, pair, residual))
-    return pairs
+def _block_edges(run: Rows) -> Array:
+    """Return the first rows of the blocks of a run, and the end."""
+    n_blocks = max(round(float(run.time_s[-1] - run.time_s[0]) / BLOCK_S), 1)
+    return np.linspace(0, len(run.time_s), n_blocks + 1).astype(int)
 
 
-def _white(info: Evidence, run: Rows, c: int, columns: Array, residual: Array) -> Array:
-    """Whiten columns (q, m) as channel c, 0 where its residual is not known."""
-    scaled = columns / info.noise.size(run.pace_mps)[:, c]
+def _white(info: Evidence, i: int, c: int, columns: Array) -> Array:
+    """Whiten columns (q, m) of a run as channel c, 0 where its residual is not known."""
+    scaled = columns / info.noise.size(info.rows[i].pace_mps)[:, c]
     white = whiten(info.noise.filters[c : c + 1], np.ascontiguousarray(scaled[:, :, None]))[:, :, 0]
-    return np.asarray(white * (residual[:, c] != 0.0))
+    return np.asarray(white * (info.white_residual[i][:, c] != 0.0))
 
 
-class _Blocks(NamedTuple):
-    """Blocks of all runs, and the information on the selected parameters in each of them.
+def _products(
+    info: Evidence, i: int, c: int, at: Sequence[int], columns: Array, edges: Sequence[int] | Array
+) -> Array:
+    """Return products (blocks, z, z) of columns of a run with the same, nuisances taken out of the second.
 
-    Parameters
-    ----------
-    edges : of each run, (blocks + 1,) rows
-    first : (runs,) number of the first block of each run
-    at : places of the k selected parameters
-    change : (k,) from where the residuals are taken to their fitted values
-    a, g : (blocks, k, k) and (blocks, k) information, and score at the fit
+    They are the sensitivities of some parameters, whitened columns (q, m) of channel c, and the residual.
     """
-
-    edges: tuple[Array, ...]
-    first: Array
-    at: list[int]
-    change: Array
-    a: Array
-    g: Array
-
-
-def _blocks_of(info: Evidence, names: Sequence[str], change: Array) -> _Blocks:
-    at = info.places(names)
-    change = change - info.away[at]
-    edges, a, g = [], [], []
-    for i, run in enumerate(info.rows):
-        n_blocks = max(round(float(run.time_s[-1] - run.time_s[0]) / BLOCK_S), 1)
-        edges.append(np.linspace(0, len(run.time_s), n_blocks + 1).astype(int))
-        own, n = info.white_change[i][at], info.white_change[i][info.nuisances]
-        free = own - np.tensordot(info.shift[i][:, at].T, n, axes=1)
-        residual = info.white_residual[i] - np.tensordot(info.shift[i][:, -1], n, axes=1)
-        both = np.einsum("jmc,kmc->mjk", own, free), np.einsum("jmc,mc->mj", own, residual)
-        gram, score = (np.add.reduceat(each, edges[-1][:-1], axis=0) for each in both)
-        a.append((gram + gram.transpose(0, 2, 1)) / 2.0)
-        g.append(score - a[-1] @ change)
-    first = np.cumsum([0, *(len(each) - 1 for each in edges[:-1])])
-    return _Blocks(tuple(edges), first, at, change, np.concatenate(a), np.concatenate(g))
+    nuisances, residual = info.white_change[i][info.nuisances], info.white_residual[i]
+    in_channel = np.zeros((len(columns), *residual.shape))
+    in_channel[:, :, c] = columns
+    every = np.concatenate([info.white_change[i][at], in_channel, residual[None]])
+    coefficients = info.inner[i] @ np.tensordot(nuisances, every, axes=((1, 2), (1, 2)))
+    free, z = every - np.tensordot(coefficients.T, nuisances, axes=1), len(every)
+    return np.array(
+        [every[:, a:b].reshape(z, -1) @ free[:, a:b].reshape(z, -1).T for a, b in pairwise(edges)]
+    )
 
 
 def _probe_results(
-    info: Evidence, names: Sequence[str], blocks: _Blocks, c: int, columns: list[Array], error: Array
+    info: Evidence,
+    names: Sequence[str],
+    change: Array,
+    c: int,
+    columns: Sequence[Array],
+    edges: Sequence[Array],
+    error: Array,
 ) -> list[ProbeResult]:
-    """Return the results of columns (q, m) a run, in channel c, where the simulation has an error (q,)."""
-    at, q = blocks.at, columns[0].shape[0]
-    sums: list[tuple[Array, ...]] = []
-    power = np.zeros(len(at))
-    for i, x in enumerate(columns):
-        j, r = info.white_change[i][:, :, c], info.white_residual[i][:, c]
-        n, shift = j[info.nuisances], info.shift[i]
-        power += (j[at] ** 2).sum(axis=1)
-        each = (
-            x * (x - (x @ n.T) @ info.inner[i] @ n),
-            x[:, None] * (j[at] - shift[:, at].T @ n),
-            x * (r - shift[:, -1] @ n),
-        )
-        sums.append(tuple(np.add.reduceat(s, blocks.edges[i][:-1], axis=-1) for s in each))
-    own, cross, score = (
-        np.moveaxis(np.concatenate(parts, axis=-1), -1, 0) for parts in zip(*sums, strict=True)
+    """Return the results of whitened columns (q, m) a run, in channel c, where the simulation has an error (q,).
+
+    The selected parameters go back where a probe goes ahead: what is left of each block's score, along that
+    direction and at the fit, is the evidence, and its scatter between blocks or runs the noise.
+    """
+    at, q = info.places(names), len(columns[0])
+    selected, probe = slice(0, len(at)), slice(len(at), len(at) + q)
+    products = np.concatenate(
+        [_products(info, i, c, at, x, e) for i, (x, e) in enumerate(zip(columns, edges, strict=True))]
     )
+    first = np.cumsum([0, *(len(each) - 1 for each in edges[:-1])])
+    fitted = change - info.away[at]
+    a = (products[:, selected, selected] + products[:, selected, selected].transpose(0, 2, 1)) / 2.0
+    g = products[:, selected, -1] - a @ fitted
+    own = np.diagonal(products[:, probe, probe], axis1=1, axis2=2)
+    cross, score = products[:, probe, selected], products[:, probe, -1]
     follow = np.zeros((0, q))
     if at:
-        follow = np.linalg.lstsq(blocks.a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
+        follow = np.linalg.lstsq(a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
     of_model = _of_model(info, at, c, columns, follow)
     free = own.sum(axis=0) - (cross.sum(axis=0) * follow.T).sum(axis=1)
-    sizes = (
-        own
-        - 2 * np.einsum("bqs,sq->bq", cross, follow)
-        + np.einsum("sq,bst,tq->bq", follow, blocks.a, follow)
-    )
-    part = score - cross @ blocks.change - np.einsum("bs,sq->bq", blocks.g, follow)
-    total = part.sum(axis=0)
+    sizes = own - 2 * (cross * follow.T).sum(axis=2) + ((a @ follow) * follow).sum(axis=1)
+    part = score - cross @ fitted - g @ follow
     enough = free > 1e-6 * np.maximum(own.sum(axis=0), 1e-12)
     free = np.where(enough, free, np.inf)
+    power = sum(((white[at][:, :, c] ** 2).sum(axis=1) for white in info.white_change), np.zeros(len(at)))
     both = np.sqrt(np.outer(own.sum(axis=0), power))
     alike = np.divide(np.abs(cross.sum(axis=0)), both, out=np.zeros_like(both), where=both > 1e-9)
-    alike = np.minimum(alike, 1.0)
-    answers = []
+    results = []
     for k in range(q):
         if not enough[k]:
-            answers.append(ProbeResult(0.0, 0.0))
+            results.append(ProbeResult(0.0, 0.0))
             continue
-        left = part[:, k] - sizes[:, k] * total[k] / free[k]
+        total = float(part[:, k].sum())
+        left = part[:, k] - sizes[:, k] * total / free[k]
         by_model = float(of_model[k] + (free[k] * error[k]) ** 2)
-        z = _z(float(total[k]), float(free[k]), left, sizes[:, k], blocks.first, by_model)
-        known = dict(zip(names, alike[k].tolist(), strict=True))
-        answers.append(ProbeResult(z, float(total[k] ** 2 / free[k]), known))
-    return answers
+        z = _z(total, float(free[k]), left, sizes[:, k], first, by_model)
+        known = dict(zip(names, np.minimum(alike[k], 1.0).tolist(), strict=True))
+        results.append(ProbeResult(z, float(total**2 / free[k]), known))
+    return results
 
 
-def _of_model(info: Evidence, at: list[int], c: int, columns: list[Array], follow: Array) -> Array:
+def _of_model(info: Evidence, at: list[int], c: int, columns: Sequence[Array], follow: Array) -> Array:
     """Return the variance (q,) of a probe's score by the simulation's own error.
 
     Of errors in units of several parameters the largest counts: each was measured as if it were alone.
     """
     doubtful = np.flatnonzero(info.model_std)
     shown = -follow.T @ info.a[:, at][:, :, doubtful].sum(axis=0)
-    for i, x in enumerate(columns):
-        j = info.white_change[i][:, :, c]
-        shown += x @ (j[doubtful] - info.shift[i][:, doubtful].T @ j[info.nuisances]).T
+    for x, white, shift in zip(columns, info.white_change, info.shift, strict=True):
+        shown += x @ (white[doubtful, :, c] - shift[:, doubtful].T @ white[info.nuisances, :, c]).T
     return np.asarray(((shown * info.model_std[doubtful]) ** 2).max(axis=1, initial=0.0))
 
 
@@ -285,29 +261,28 @@ def _variance(left: Array, sizes: Array, free: float) -> tuple[float, float]:
     return pooled_variance(left, np.clip(sizes / free, 0.0, 0.9), free)
 
 
-def _wheel_turn_probe(info: Evidence, c: int, pairs: list[Array], placebo: float) -> ProbeResult:
+def _wheel_turn_probe(statistics: Array, placebo: float) -> ProbeResult:
     """Return the result of a wave with a phase of its own in each run: two columns a run.
 
     ``placebo`` is the mean square of waves that no wheel makes: what they explain is no turn of a wheel.
     """
-    each = _wave_statistics(info, c, pairs)
-    if not each.size:
+    if not statistics.size:
         return ProbeResult(0.0, 0.0)
-    each = each / max(placebo, 1.0)
+    each = statistics / max(placebo, 1.0)
     z = z_of(float(chi2.logsf(each.sum(), 2 * each.size)))
     # the median of chi^2 with 2 degrees is 2 log 2
     in_most_runs = float(np.median(each)) > 2 * math.log(2.0) * 1.5
     return ProbeResult(z if in_most_runs else 0.0, float(each.sum()) - 2 * each.size)
 
 
-def _wave_statistics(info: Evidence, c: int, pairs: list[Array]) -> Array:
-    """Return what two columns explain of the residual of each run (runs,), as chi^2 with 2 degrees."""
+def _wave_statistics(info: Evidence, c: int, wheel: int, times: float) -> Array:
+    """Return what a multiple of a wheel's angle explains of each run (runs,), as chi^2 with 2 degrees."""
     each = []
-    for i, x in enumerate(pairs):
-        j, r = info.white_change[i][:, :, c], info.white_residual[i][:, c]
-        xn = x @ j[info.nuisances].T
-        own = x @ x.T - xn @ info.inner[i] @ xn.T
-        score = x @ r - xn @ info.shift[i][:, -1]
+    for i, run in enumerate(info.rows):
+        phase = times * run.inputs[:, len(INPUTS) - 1 + wheel]
+        waves = _white(info, i, c, run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)]))
+        (products,) = _products(info, i, c, [], waves, (0, len(phase)))
+        own, score = products[:2, :2], products[:2, 2]
         if np.linalg.eigvalsh(own)[0] > 1e-6:
             each.append(float(score @ np.linalg.solve(own, score)))
     return np.array(each)
