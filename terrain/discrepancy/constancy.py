@@ -18,7 +18,7 @@ from scipy.stats import t as student
 from terrain.discrepancy.evidence import N_BLOCKS, Evidence
 from terrain.discrepancy.robot_terms import value_in_robot_terms
 from terrain.discrepancy.search import Found
-from terrain.discrepancy.selection import pooled_variance
+from terrain.discrepancy.selection import clustered_variance
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.verdict import INTERVAL_T, BySession, Cause, SessionValue, Value
 from terrain.effects import PARAMETER, Effect
@@ -286,9 +286,7 @@ def _fitted(found: Found, runs: Sequence[int], parameter: str) -> tuple[float, f
     if not cov[own, own] * total[own, own] < 1.0 / SHOWN_RATIO or not total[own, own] > 1e-12:
         return None
     x, direction, size = cov @ g.sum(axis=0), cov[own], float(cov[own, own])
-    part = (g - a @ x) @ direction
-    fraction = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
-    variance, dof = pooled_variance(part, fraction, size)
+    variance, dof = clustered_variance(a, g, x, direction, size)
     # changes of the fit are counted from the simulation that was given, as those of all runs together
     return float(x[own]), math.sqrt(variance * size), dof
 

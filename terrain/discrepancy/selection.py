@@ -124,11 +124,23 @@ def _dispersion(
     if n:
         total, score = a.sum(axis=0), g.sum(axis=0)
         x[:n] = np.linalg.lstsq(total[:n, :n], score[:n] - total[:n, n:] @ change, rcond=1e-10)[0]
-    part = (g - a @ x) @ direction
-    fraction = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
-    variance, dof = pooled_variance(part, fraction, size)
+    variance, dof = clustered_variance(a, g, x, direction, size)
     of_model = (free @ change) * info.model_std[both[n:]]
     return variance + float((of_model**2).sum()) / size, dof
+
+
+def clustered_variance(a: Array, g: Array, x: Array, direction: Array, size: float) -> tuple[float, float]:
+    """Return the variance of a fit along a direction over that from the noise, and its degrees of freedom.
+
+    Parameters
+    ----------
+    a, g : (clusters, k, k) and (clusters, k) of the parameters fitted together
+    x, direction : (k,) their values, and along which the score is taken
+    size : information along it
+    """
+    part = (g - a @ x) @ direction
+    fraction = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
+    return pooled_variance(part, fraction, size)
 
 
 def pooled_variance(part: Array, fraction: Array, size: float) -> tuple[float, float]:
@@ -172,15 +184,20 @@ def held_out_gain(info: Evidence, base: list[int], both: list[int]) -> Array:
 
 
 def _held_out_loss(info: Evidence, at: list[int]) -> Array:
-    if not at:
-        return np.zeros(len(info.a))
-    a, g = info.a[:, at][:, :, at], info.g[:, at]
+    x = fits_without_each(info, at)
+    loss: Array = np.einsum("ki,kij,kj->k", x, info.a[:, at][:, :, at], x) - 2 * (x * info.g[:, at]).sum(
+        axis=1
+    )
+    return loss
+
+
+def fits_without_each(info: Evidence, at: Sequence[int]) -> Array:
+    """Return the change (runs, k) of parameters that fits all runs but each of them."""
+    a, g = info.clusters(at, by_run=True)
     # in standard deviations of each parameter; one without information in the other runs keeps its value
     unit = np.sqrt(np.maximum(np.einsum("kii->i", a), 1e-30))
     rest = (a.sum(axis=0) - a) / np.outer(unit, unit) + 1e-9 * np.eye(len(at))
-    x = np.linalg.solve(rest, ((g.sum(axis=0) - g) / unit)[:, :, None])[:, :, 0] / unit
-    loss: Array = np.einsum("ki,kij,kj->k", x, a, x) - 2 * (x * g).sum(axis=1)
-    return loss
+    return np.asarray(np.linalg.solve(rest, ((g.sum(axis=0) - g) / unit)[:, :, None])[:, :, 0] / unit)
 
 
 def gain_interval(gain: Array, seed: int = 0) -> tuple[float, float]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from terrain.discrepancy.constancy import Constancy, constancy_of
-from terrain.discrepancy.evidence import Evidence, move_point, partial_information, recentre
+from terrain.discrepancy.evidence import move_point, partial_information, recentre
 from terrain.discrepancy.probes import ProbeResult
 from terrain.discrepancy.search import Found, Problem
-from terrain.discrepancy.selection import fit_change
+from terrain.discrepancy.selection import fit_change, fits_without_each
 from terrain.effects import BOUNDS, CHANNELS, Effect
 from terrain.records import Array
 
@@ -166,40 +166,29 @@ def channel_effects(found: Found, cause: Effect) -> dict[str, ChannelEffect]:
     """
     info = found.info
     own = [p.name for p in cause.parameters]
-    every, others = info.places(found.names), info.places([n for n in found.names if n not in own])
-    fits = [_fits(info, places) for places in (others, every)]
-    squares = np.zeros((2, 2, len(CHANNELS)))
-    kept = ~np.isin(info.nuisances, info.places(own))
-    free, precision = info.nuisances[kept], np.diag(1.0 / info.nuisance_std[kept] ** 2)
-    for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
-        scatter = change[free].reshape(free.size, residual.size)
-        inner = np.linalg.inv(scatter @ scatter.T + precision)
-        shown = (change[free] ** 2).sum(axis=1)
-        cost = precision @ (shown / np.maximum(shown.sum(axis=1, keepdims=True), 1e-30))
-        for m, (places, (common, held_out)) in enumerate(zip((others, every), fits, strict=True)):
+    beside = ~np.isin(info.nuisances, info.places(own))
+    free, precision = info.nuisances[beside], np.diag(1.0 / info.nuisance_std[beside] ** 2)
+    squares = np.zeros((2, 2, len(CHANNELS)))  # without and with the cause, by all runs and by the others
+    for m, names in enumerate(([n for n in found.names if n not in own], found.names)):
+        places = info.places(names)
+        common, held_out = fit_change(info, names)[0], fits_without_each(info, places)
+        for i, (residual, change) in enumerate(zip(info.white_residual, info.white_change, strict=True)):
+            scatter = change[free].reshape(free.size, residual.size)
+            inner = np.linalg.inv(scatter @ scatter.T + precision)
+            shown = (change[free] ** 2).sum(axis=1)
+            cost = precision @ (shown / np.maximum(shown.sum(axis=1, keepdims=True), 1e-30))
             for kind, x in enumerate((common, held_out[i])):
-                moved = -info.away
-                moved[places] += x
-                left = residual - np.tensordot(moved, change, axes=1)
-                own_change = inner @ (scatter @ left.ravel())
-                left -= np.tensordot(own_change, change[free], axes=1)
-                squares[m, kind] += (left**2).sum(axis=0) + own_change**2 @ cost
+                fitted = -info.away
+                fitted[places] += x
+                left = residual - np.tensordot(fitted, change, axes=1)
+                deviation = inner @ (scatter @ left.ravel())
+                left -= np.tensordot(deviation, change[free], axes=1)
+                squares[m, kind] += (left**2).sum(axis=0) + deviation**2 @ cost
     return {
         CHANNELS[c]: ChannelEffect(squares[0, 0, c], squares[1, 0, c], squares[0, 1, c] - squares[1, 1, c])
         for c in range(len(CHANNELS))
         if squares[1, 0, c] > 0
     }
-
-
-def _fits(info: Evidence, places: Sequence[int]) -> tuple[Array, Array]:
-    """Return the fit (k,) of parameters to all runs, and to all but each run (runs, k)."""
-    a, g = info.a[:, places][:, :, places], info.g[:, places]
-    if not len(places):
-        return np.zeros(0), np.zeros((len(a), 0))
-    total, score = a.sum(axis=0), g.sum(axis=0)
-    ridge = 1e-9 * np.diag(np.diag(total))
-    common = np.linalg.solve(total + ridge, score)
-    return common, np.linalg.solve(total + ridge - a, (score - g)[:, :, None])[:, :, 0]
 
 
 def _slow_values(problem: Problem, found: Found) -> Array:
