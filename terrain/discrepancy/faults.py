@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
 from functools import partial
 from itertools import combinations
@@ -202,12 +202,13 @@ LOGGED: dict[Column, str] = {
 
 
 class Change(NamedTuple):
-    """What makes a log right again.
+    """What makes a log right again: a linear map of its columns.
 
     Parameters
     ----------
     kind, column : what is changed, and how
-    factor : by which samples are multiplied; 1 for columns that are exchanged
+    factor : by which samples are multiplied; 1 for columns that are exchanged, NaN for one that is left out,
+        since readings of it cannot be distinguished
     wheel : which wheel alone; -1 for all
     offset : that is added
     pair : wheels that are exchanged
@@ -227,87 +228,68 @@ class Change(NamedTuple):
 
     def measured(self, values: Array) -> Array:
         """Return measured channels (n, channels) as they are without the fault."""
-        changed = values.copy()
-        if self.kind is FaultKind.SWAPPED:
-            if self.column is Column.SPEED:
-                changed[:, [X, Y]] = values[:, [Y, X]]
-            elif self.column in (Column.CURRENTS, Column.SIDES):
-                changed[:, T] = -values[:, T]
-        elif self.kind is FaultKind.OFFSET:
-            c = CHANNELS_OF[self.column][0]
-            changed[:, c] = values[:, c] + self.offset
-        else:
-            for c in CHANNELS_OF[self.column]:
-                changed[:, c] = values[:, c] * self.factor
-        return changed
+        order, factor, offset = np.arange(len(CHANNELS)), np.ones(len(CHANNELS)), np.zeros(len(CHANNELS))
+        own = list(CHANNELS_OF[self.column])
+        if self.kind is not FaultKind.SWAPPED:
+            factor[own], offset[own] = self.factor, self.offset
+        elif self.column is Column.SPEED:
+            order[[X, Y]] = Y, X
+        elif self.column in (Column.CURRENTS, Column.SIDES):
+            factor[T] = -1.0
+        return np.asarray(values[:, order] * factor + offset)
 
     def applied(self, run: Signals) -> Signals:
         """Return a run without the fault."""
         measured = self.measured(run.measured)
         if not self.of_wheels:
             return replace(run, measured=measured)
-        wheel_speed = run.wheel_speed_mps.copy()
+        n = run.wheel_speed_mps.shape[1]
+        order, factor = np.arange(n), np.ones(n)
         if self.kind is FaultKind.SWAPPED:
-            wheel_speed[:, self.pair] = wheel_speed[:, self.pair[::-1]]
-        elif self.wheel >= 0:
-            wheel_speed[:, self.wheel] *= self.factor
+            order[list(self.pair)] = self.pair[::-1]
         else:
-            wheel_speed *= self.factor
-        return replace(run, measured=measured, wheel_speed_mps=wheel_speed)
+            factor[[self.wheel] if self.wheel >= 0 else slice(None)] = self.factor
+        return replace(run, measured=measured, wheel_speed_mps=run.wheel_speed_mps[:, order] * factor)
 
 
-@dataclass(frozen=True, slots=True)
-class Fault:
+class Fault(NamedTuple):
     """A fault of a column in some runs.
 
     Parameters
     ----------
-    kind : what is wrong
-    column : with what
+    change : that makes the log right
     run_ids : of the runs that have it
-    factor : by which its samples are to be multiplied, 1 for an exchange and an offset; NaN where it is left
-        out, since readings of it cannot be distinguished
     sentence : what is wrong, how that is seen, and what to do
     repair : what to do alone
-    change : that makes the log right
     """
 
-    kind: FaultKind
-    column: Column
+    change: Change
     run_ids: tuple[str, ...]
-    factor: float
     sentence: str
     repair: str
-    change: Change
+
+    @property
+    def kind(self) -> FaultKind:
+        """What is wrong."""
+        return self.change.kind
+
+    @property
+    def column(self) -> Column:
+        """With what."""
+        return self.change.column
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields as JSON names them."""
-        named = {name: getattr(self, name) for name in ("kind", "column", "factor", "sentence", "repair")}
-        return {**named, "runs": self.run_ids}
-
-    def measured(self, values: Array) -> Array:
-        """Return measured channels (n, channels) without the fault, NaN in those that are left out."""
-        if not np.isnan(self.factor):
-            return self.change.measured(values)
-        left = values.copy()
-        left[:, list(CHANNELS_OF[self.column])] = np.nan
-        return left
+        of_change = {"kind": self.kind, "column": self.column, "factor": self.change.factor}
+        return {**of_change, "runs": self.run_ids, "sentence": self.sentence, "repair": self.repair}
 
 
 def repaired(signals: Sequence[Signals], faults: Sequence[Fault]) -> tuple[Signals, ...]:
     """Return runs without faults, in the same order: changed, or left out where it is not clear how."""
     fixed = list(signals)
     for fault in faults:
-        ids = set(fault.run_ids)
-        fixed = [without(fault, run) if run.run_id in ids else run for run in fixed]
+        fixed = [fault.change.applied(run) if run.run_id in fault.run_ids else run for run in fixed]
     return tuple(fixed)
-
-
-def without(fault: Fault, run: Signals) -> Signals:
-    """Return a run without a fault, or without its channel where it is not clear how it should be."""
-    if np.isnan(fault.factor):
-        return replace(run, measured=fault.measured(run.measured))
-    return fault.change.applied(run)
 
 
 def session_of(run_id: str) -> str:
@@ -483,7 +465,7 @@ def sign_fault(
         words = " or ".join(_fault_words(rival.change, robot)[0] for rival in rivals)
         other = f" (these channels cannot distinguish it from another reading: {words})"
     sentence = f"{what} {where}: {seen}{other}; {repair}"
-    return Fault(change.kind, change.column, ids, change.factor, sentence, repair, change)
+    return Fault(change, ids, sentence, repair)
 
 
 def _evidence(change: Change, responses: Sequence[Response], shown: Sequence[int], best: Reading) -> str:
@@ -766,15 +748,15 @@ def _fault(
     repair = f"multiply {LOGGED[change.column]} by {change.factor:.4g} (mapping file: {hint})"
     sentence = f"{what} {in_runs(ids, every)}: {seen}"
     if not rivals:
-        return Fault(change.kind, change.column, ids, change.factor, f"{sentence}; {repair}", repair, change)
+        return Fault(change, ids, f"{sentence}; {repair}", repair)
     others = " or ".join(" and ".join(_words(each)[0] for each in reading) for reading in rivals)
     measured = next((each for reading in (changes, *rivals) for each in reading if not each.of_wheels), None)
     if measured is None:  # of the wheels in either case: without them there is nothing to compare
         sentence = f"{sentence}; another reading is as good ({others}); {repair}"
-        return Fault(change.kind, change.column, ids, change.factor, sentence, repair, change)
+        return Fault(change, ids, sentence, repair)
     left_out = f"{LOGGED[measured.column]} is left out; state the units that the logger has"
     sentence = f"{sentence}; another reading is as good ({others}), so that {left_out}"
-    return Fault(change.kind, measured.column, ids, math.nan, sentence, left_out, measured)
+    return Fault(measured._replace(factor=math.nan), ids, sentence, left_out)
 
 
 def _words(change: Change) -> tuple[str, str]:
@@ -838,8 +820,7 @@ def offset_faults(responses: Sequence[Response]) -> tuple[Fault, ...]:
         logged = LOGGED[column].split(" and ")[0]
         repair = f"subtract {offset:.3g} {unit} from {logged} (mapping file: offset: {-offset:.3g})"
         sentence = f"{what}, where a sensor's is below {largest:g}; {repair}"
-        change = Change(FaultKind.OFFSET, column, offset=-offset)
-        found.append(Fault(FaultKind.OFFSET, column, ids, 1.0, sentence, repair, change))
+        found.append(Fault(Change(FaultKind.OFFSET, column, offset=-offset), ids, sentence, repair))
     return tuple(found)
 
 
@@ -963,6 +944,6 @@ def _with_rows(
         if each.run_id not in ids
         else _simulated(fault.change.applied(run), simulation, low_pass)
         if fault.change.of_wheels
-        else each._replace(measured=fault.measured(each.measured))
+        else each._replace(measured=fault.change.measured(each.measured))
         for run, each in zip(runs, rows, strict=True)
     )

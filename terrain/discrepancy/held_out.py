@@ -12,7 +12,7 @@ import numpy as np
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.discrepancy.evidence import N_BLOCKS, Evidence, evidence_at
-from terrain.discrepancy.faults import Fault, without
+from terrain.discrepancy.faults import Fault
 from terrain.discrepancy.residuals import LowPass, low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.selection import MIN_CLUSTERS
@@ -91,10 +91,8 @@ def repair_held_out(
     fixed = []
     for run in signals:
         for fault in faults:
-            if math.isnan(fault.factor):
-                run = without(fault, run)
-            else:
-                run = min(run, fault.change.applied(run), key=misfit)
+            right = fault.change.applied(run)
+            run = right if math.isnan(fault.change.factor) else min(run, right, key=misfit)
         fixed.append(run)
     return tuple(fixed)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from terrain.discrepancy.verdict import Value
 from terrain.effects import PARAMETER, Wording, effect_named
@@ -231,13 +232,6 @@ def _late(values: Sequence[Value], total: Total, robot: Robot) -> str:
     return f"{who[0 if late_s > 0 else 1]} {rounded(abs(late_s), _half(value))} s late"
 
 
-def _camera_yaw(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    angle = total[value.name]
-    degrees = rounded(math.degrees(abs(angle)), math.degrees(_half(value)))
-    return f"the camera turned {degrees}° to the {'right' if angle > 0 else 'left'}"
-
-
 def _turn_drag(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
     lost = total[value.name] * EXAMPLE_RADPS**2
@@ -255,29 +249,6 @@ def _fast_turns(values: Sequence[Value], total: Total, robot: Robot) -> str:
     return f"a track that acts {percent:.2g} % narrower at {FAST_MPS:g} m/s and {radps:g} rad/s"
 
 
-def _side_slip(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    slide = total[value.name] * EXAMPLE_MPS * EXAMPLE_RADPS
-    number = rounded(abs(slide), _half(value) * EXAMPLE_MPS * EXAMPLE_RADPS)
-    side = "outside" if slide > 0 else "inside"
-    return f"a slide of {number} m/s to the {side} at {EXAMPLE_MPS:g} m/s and {EXAMPLE_RADPS:g} rad/s"
-
-
-def _gyro_scale(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    error = total[value.name]
-    number = rounded(100.0 * abs(error), 100.0 * _half(value))
-    return f"a gyro that reads {number} % too {'much' if error > 0 else 'little'}"
-
-
-def _one_sided(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    error = total[value.name]
-    number = rounded(100.0 * abs(error), 100.0 * _half(value))
-    what = "sprockets" if isinstance(robot, TrackedRobot) else "wheels"
-    return f"{what} that are {number} % {'larger' if error > 0 else 'smaller'} on the right than on the left"
-
-
 def _understeer(values: Sequence[Value], total: Total, robot: Robot) -> str:
     (value,) = values
     car = as_drive(BicycleRobot, robot, "robot {name}: drive {drive!r} has no understeer")
@@ -289,18 +260,33 @@ def _understeer(values: Sequence[Value], total: Total, robot: Robot) -> str:
     return f"an understeer of {number}, which turns it {percent:.2g} % {change} at {FAST_MPS:g} m/s"
 
 
+def _sided(
+    scale: float, text: str, sides: tuple[str, str], values: Sequence[Value], total: Total, robot: Robot
+) -> str:
+    """Return the size of a value, and whether it is above or below zero."""
+    (value,) = values
+    number = rounded(scale * abs(total[value.name]), scale * _half(value))
+    wheels = "sprockets" if isinstance(robot, TrackedRobot) else "wheels"
+    return text.format(number=number, side=sides[0 if total[value.name] > 0 else 1], wheels=wheels)
+
+
+_SLIDE = f"a slide of {{number}} m/s to the {{side}} at {EXAMPLE_MPS:g} m/s and {EXAMPLE_RADPS:g} rad/s"
+_SIDES = "{wheels} that are {number} % {side} on the right than on the left"
+
 TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
     Wording.TRACK: _track,
     Wording.MEASURED_POINT: _lever,
     Wording.CENTRE_OF_MASS: _centre_of_mass,
     Wording.WHEEL_DISTANCE: _wheel_distance,
     Wording.LATE: _late,
-    Wording.CAMERA_YAW: _camera_yaw,
+    Wording.CAMERA_YAW: partial(
+        _sided, math.degrees(1.0), "the camera turned {number}° to the {side}", ("right", "left")
+    ),
     Wording.FAST_TURNS: _fast_turns,
     Wording.LOSS_IN_TURNS: _turn_drag,
-    Wording.SIDE_SLIP: _side_slip,
-    Wording.GYRO_SCALE: _gyro_scale,
-    Wording.SIDES: _one_sided,
+    Wording.SIDE_SLIP: partial(_sided, EXAMPLE_MPS * EXAMPLE_RADPS, _SLIDE, ("outside", "inside")),
+    Wording.GYRO_SCALE: partial(_sided, 100.0, "a gyro that reads {number} % too {side}", ("much", "little")),
+    Wording.SIDES: partial(_sided, 100.0, _SIDES, ("larger", "smaller")),
     Wording.UNDERSTEER: _understeer,
 }
 """How the effects are worded whose numbers do not speak for themselves; the others by their home."""

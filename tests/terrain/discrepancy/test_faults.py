@@ -117,7 +117,7 @@ def test_a_fault_of_all_runs_is_named_and_its_repair_gives_the_log_back(written,
     (fault,) = faults(signals)
     assert (fault.kind, fault.column) == (kind, column)
     assert fault.run_ids == tuple(run.run_id for run in was)
-    assert fault.factor == pytest.approx(factor, rel=1e-4)
+    assert fault.change.factor == pytest.approx(factor, rel=1e-4)
     assert "in all 8 runs" in fault.sentence
     assert fault.sentence.endswith(fault.repair)
     assert "mapping file" in fault.repair
@@ -312,7 +312,7 @@ def test_one_run_alone_and_a_run_without_rows_are_no_special_case():
 def test_a_reading_that_is_not_clear_leaves_the_channel_out():
     (fault,) = faults(on_one_clock([WRITTEN["gyro in deg/s"][0](run) for run in sound()]))
     signals = on_one_clock(sound())
-    left = repaired(signals, [replace(fault, factor=float("nan"))])
+    left = repaired(signals, [fault._replace(change=fault.change._replace(factor=float("nan")))])
     assert all(np.isnan(run.measured[:, 0]).all() for run in left)
     assert_allclose(left[0].measured[:, 1:], signals[0].measured[:, 1:])
 

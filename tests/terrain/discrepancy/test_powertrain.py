@@ -186,11 +186,11 @@ def test_an_answer_leaves_out_what_is_no_command_or_a_wheel_speed_with_a_fault()
     )
     in_kmh = [replaced(run, 3.6) if i < 3 else run for i, run in enumerate(runs)]
     change = Change(FaultKind.UNIT, Column.WHEELS, 1 / 3.6)
-    fault = Fault(change.kind, change.column, ("run_0", "run_1", "run_2"), change.factor, "", "", change)
+    fault = Fault(change, ("run_0", "run_1", "run_2"), "", "")
     assert powertrain_answer(in_kmh, HUSKY, ()).powertrain.n_runs == len(runs)
     assert repr(powertrain_answer(in_kmh, HUSKY, (fault,)).powertrain) == repr(powertrain_of(runs[3:], HUSKY))
     gyro = Change(FaultKind.SIGN, Column.GYRO, -1.0)
-    turned = Fault(gyro.kind, gyro.column, fault.run_ids, -1.0, "", "", gyro)
+    turned = Fault(gyro, fault.run_ids, "", "")
     assert repr(powertrain_answer(runs, HUSKY, (turned,)).powertrain) == repr(powertrain_of(runs, HUSKY))
 
 
