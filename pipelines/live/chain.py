@@ -136,6 +136,12 @@ class Chain:
         return {}
 
     @property
+    def too_late(self) -> tuple[float, float]:
+        """When samples came last that were too late to be taken, and by how much, in s; minus infinity and NaN."""
+        filtered = (-math.inf, math.nan) if self._filter is None else self._filter.too_late
+        return max(self._clocks.too_late, filtered)
+
+    @property
     def dropped(self) -> dict[str, int]:
         """What was not used so far, and how often a clock was set, as counts by stream and kind."""
         filtered = {} if self._filter is None else self._filter.dropped

@@ -40,6 +40,9 @@ CONTROL_RATE_LEAST_HZ = 5.0
 """Of commands: a longer step than half a second is taken for a clock that was set, and a command holds for a
 quarter of a second."""
 
+LATE_SHOWN_S = 4.0
+"""Without a window for so long, late samples are what there is no terrain for."""
+
 _NO_TWIST = np.zeros(3)
 
 MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
@@ -143,6 +146,7 @@ class RobotSession:
     restored : what it was started from; None where it was not
     received_s : when its last message came, on the local clock that never goes back
     last : output of the last step; None before the first
+    late : that there is no terrain because samples come too late; empty where that is not so
 
     Raises
     ------
@@ -176,6 +180,8 @@ class RobotSession:
         self._n_steps = self._n_messages = 0
         self.received_s = monotonic()
         self.last: Step | None = None
+        self.late, self._too_late = "", self.chain.too_late
+        self._too_late_s, self._window_s = -math.inf, math.nan
         self.restored: LiveState | None = None
         self._recorder: SessionRecorder | None = None
         self._window: dict[str, Any] | None = None
@@ -219,6 +225,7 @@ class RobotSession:
             **{name: getattr(self.hello, name) for name in ("session", "robot", "control")},
             "terrain": self.chain.belief.terrain or None,
             "recording": self.recording,
+            "late": self.late or None,
             "dropped": self.dropped,
         }
 
@@ -292,6 +299,7 @@ class RobotSession:
         twist = self._twist if fresh else _NO_TWIST
         done = self.chain.take(Sample(time_s, twist, readings))
         self._n_steps += 1
+        self._judge_late(now_s, bool(done.windows))
         if done.windows:
             found = {name: getattr(done.windows[-1], name) for name in WINDOW}
             self._window = {name: None if value == "" else value for name, value in found.items()}
@@ -309,6 +317,15 @@ class RobotSession:
             latency_s=now_s - self._sampled_s + (monotonic() - begun_s),
         )
         return self.last
+
+    def _judge_late(self, now_s: float, has_window: bool) -> None:
+        """Say whether samples come so late that no window is whole."""
+        if has_window or self.served.model is None or math.isnan(self._window_s):
+            self._window_s = now_s
+        if (too_late := self.chain.too_late) != self._too_late:
+            self._too_late, self._too_late_s = too_late, now_s
+        is_late = now_s - self._window_s > LATE_SHOWN_S > now_s - self._too_late_s
+        self.late = f"no terrain: samples come late by {1e3 * self._too_late[1]:.0f} ms" if is_late else ""
 
     def _observation(self, time_s: float) -> dict[str, Any]:
         belief, seen = self.chain.belief, self.chain.estimate
@@ -337,6 +354,7 @@ class RobotSession:
             **known,
             "sensors": sensors,
             "served": self.served.number,
+            "late": self.late or None,
         }
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import sys
 from collections import Counter, deque
 from collections.abc import Mapping
 from contextlib import suppress
@@ -269,6 +270,7 @@ class Connection:
             metrics.stopped.labels(output.status.value).inc()
         if output.status is CommandStatus.FAILED:
             self._hub.trouble[f"session {self._session.hello.session}"] = output.failure
+        self._show_late()
         for window in output.windows:
             metrics.window_s.observe(window.took_s)
             metrics.windows.labels(window.terrain or "refused").inc()
@@ -276,6 +278,16 @@ class Connection:
             metrics.unsent.inc()
         self._step = output
         self._changed.set()
+
+    def _show_late(self) -> None:
+        """Name in the hub's trouble, and in the log once, that samples come too late for a terrain."""
+        late, name = self._session.late, f"late samples of {self._session.hello.session}"
+        if late and name not in self._hub.trouble:
+            print(f"{self._session.hello.session}: {late}", file=sys.stderr, flush=True)
+        if late:
+            self._hub.trouble[name] = late
+        else:
+            self._hub.trouble.pop(name, None)
 
     async def _send(self) -> None:
         """Send what is there, first the notes, then the newest step; end with a fatal note."""

@@ -187,6 +187,7 @@ class Hub:
         if self.sessions.get(name) is not opened:
             return
         del self.sessions[name]
+        self.trouble.pop(f"late samples of {name}", None)
         opened.end()
         self.metrics.sessions.set(len(self.sessions))
         self._left[name] = opened.state()

@@ -95,9 +95,11 @@ class _StreamClock:
     Parameters
     ----------
     counts : what was left out, by kind
+    too_late : when a reading came last that was too late, and by how much
     """
 
     def __init__(self) -> None:
+        self.too_late = -math.inf, math.nan
         self.offset_s, self.lateness_s = 0.0, 0.0
         self._stamp_s = self._now_s = math.nan
         self._due_s, self._n_due, self._leapt = math.nan, 0, True  # a first stamp may be of any time
@@ -124,6 +126,8 @@ class _StreamClock:
             self.lateness_s, self._leapt, self._n_due = late_s, False, 0
         elif not self._leapt:
             self.counts["too late" if late_s > 0.0 else "off the clock"] += time_s.size
+            if late_s > 0.0:
+                self.too_late = now_s, late_s
             return None
         elif not self._agrees(now_s - newest_s):
             self.counts["off the clock"] += time_s.size
@@ -174,6 +178,11 @@ class Clocks:
             "time: clock set": self.set
         }
         return {kind: n for kind, n in found.items() if n}
+
+    @property
+    def too_late(self) -> tuple[float, float]:
+        """When a reading came last that was too late to be taken, and by how much; minus infinity and NaN."""
+        return max((one.too_late for one in self._streams.values()), default=(-math.inf, math.nan))
 
     @property
     def lateness_s(self) -> dict[str, float]:
@@ -292,6 +301,9 @@ class ClockWatch:
         self._newest_s: dict[str, float] = {}
         self._n_behind: dict[str, int] = {}
         self.times_set = 0
+
+    too_late = -math.inf, math.nan
+    """As of :attr:`Clocks.too_late`: by their stamps alone samples are never late."""
 
     @property
     def counts(self) -> dict[str, int]:

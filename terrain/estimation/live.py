@@ -71,6 +71,7 @@ N_STEPS = 1024
 QUEUE = 1024
 """Samples of a stream that wait for the wheels; five seconds of a camera."""
 
+_JUST_BEFORE_S = 1e-6
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
 
 Samples = tuple[list[float], Array, Array]
@@ -129,6 +130,8 @@ class Tick(NamedTuple):
 class History:
     """The last ticks with all that was remembered after each, and the last samples of each stream.
 
+    The first is none: what was remembered before any.
+
     Parameters
     ----------
     memories : arrays that are all an estimator remembers
@@ -136,7 +139,8 @@ class History:
 
     def __init__(self, memories: Sequence[Array]) -> None:
         self._memories = memories
-        self._ticks: deque[tuple[Tick, list[Array]]] = deque(maxlen=N_TICKS)
+        before = Tick(-math.inf, None), [memory.copy() for memory in memories]
+        self._ticks: deque[tuple[Tick, list[Array]]] = deque([before], maxlen=N_TICKS)
         self._samples: deque[tuple[float, dict[str, Samples]]] = deque(maxlen=N_STEPS)
 
     def add_samples(self, came: dict[str, Samples], now_s: float) -> None:
@@ -167,7 +171,9 @@ class History:
 
     def reaches(self, time_s: float) -> bool:
         """Say whether it is possible to go back before an instant."""
-        return bool(self._ticks) and time_s - TICK_S > max(self._ticks[0][0].time_s, self.last_s - REWIND_S)
+        if not self._ticks:
+            return False
+        return bool(time_s - TICK_S > max(self._ticks[0][0].time_s, self.last_s - REWIND_S))
 
     def go_back(self, time_s: float) -> list[Tick]:
         """Put the memories back to the last tick before an instant; return the ticks after it."""
@@ -333,6 +339,8 @@ class LiveFilter:
         self._unsettled: deque[LiveEstimate] = deque()
         self._newest_s: dict[str, float] = {}
         self._counted: Counter[str] = Counter()
+        self.too_late = -math.inf, math.nan
+        """Tick at which samples came last that were too late to be taken, and by how much."""
 
     def _connect(self, channels: Mapping[str, tuple[str, ...]], has_gnss: bool) -> None:
         """Find each channel's column, and lay out the queues."""
@@ -466,10 +474,13 @@ class LiveFilter:
 
     def settle(self, *, all_of_them: bool = False) -> list[LiveEstimate]:
         """Return the estimates that have settled since the last call, or all that are there, at a log's end."""
-        last_s = self._history.last_s
-        reached_s = math.inf
-        for name in self._n_columns:  # a stream that stopped is not waited for
-            newest_s = self._newest_s.get(name, -math.inf)
+        if not self._unsettled:
+            return []
+        last_s, first_s, reached_s = self._history.last_s, self._unsettled[0].time_s, math.inf
+        for (
+            name
+        ) in self._n_columns:  # a stream that stopped, or does not begin, is waited for no longer than that
+            newest_s = self._newest_s.setdefault(name, first_s - _JUST_BEFORE_S)
             if newest_s > last_s - REWIND_S:
                 reached_s = min(reached_s, newest_s)
         reached_s = math.inf if all_of_them else max(reached_s, last_s - REWIND_S)
@@ -511,7 +522,10 @@ class LiveFilter:
         """Return the instant to go back to for late samples, infinite where there is none that is new."""
         known = self._history.stamps(name)
         late = [stamp_s for stamp_s in stamps if stamp_s <= last_s and stamp_s not in known]
-        if not late or not self._history.reaches(min(late)):
+        if late and not self._history.reaches(min(late)):
+            self.too_late = last_s, last_s - min(late)
+            return math.inf
+        if not late:
             return math.inf
         self._counted["came late"] += 1
         return min(late)

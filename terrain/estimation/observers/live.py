@@ -65,6 +65,9 @@ class LiveObserver:
         self._unreadable: dict[str, int] = {}
         self.latest: LiveObserverEstimate | None = None
 
+    too_late = -math.inf, math.nan
+    """Samples that come late are left out, and counted, one by one."""
+
     filter: None = None
     """No memory of it is kept over a restart: it starts from its first samples."""
 

@@ -275,3 +275,27 @@ def test_what_is_kept_is_as_old_as_the_last_sample_over_any_number_of_restarts(
     clock["now_s"] = 1016.0  # it sent nothing meanwhile
     third.restore(again.state())
     assert third.restored.terrain == ""
+
+
+def test_samples_that_come_too_late_are_named_within_five_seconds_and_no_longer_than_they_do(
+    samples, swerve_model
+):
+    """The wheels come 0.4 s after the other streams from 6 s to 16 s, in order."""
+    session, texts, waiting = agrimaro(swerve_model), {}, []
+    for sample in samples:
+        now_s, readings = sample.time_s, dict(sample.readings)
+        if "wheels" in readings:
+            waiting.append((now_s + 0.4 * (6.0 <= now_s < 16.0), readings.pop("wheels")))
+        due = [reading for due_s, reading in waiting if due_s <= now_s]
+        waiting = [(due_s, reading) for due_s, reading in waiting if due_s > now_s]
+        for name, reading in (*readings.items(), *(("wheels", reading) for reading in due)):
+            session.put({name: (reading.time_s.tolist(), reading.values.tolist())}, None, NOW_S + now_s)
+        session.put(None, sample.twist.tolist(), NOW_S + now_s)
+        session.step(NOW_S + now_s)
+        texts[now_s] = session.late
+    assert not any(text for time_s, text in texts.items() if time_s < 6.0)
+    named = {time_s: text for time_s, text in texts.items() if text}
+    assert min(named) <= 11.0
+    assert all(text.startswith("no terrain: samples come late by 4") for text in named.values())
+    assert texts[max(texts)] == ""
+    assert session.content()["late"] is None
