@@ -60,7 +60,7 @@ from terrain.estimation.observers.slip_odometry import ROWS as ODOMETRY_ROWS
 from terrain.estimation.observers.tracked import ROWS, tracked_observer
 from terrain.estimation.observers.tracked_settings import TrackedSettings
 from terrain.identify import Fit, Parameter, deal, folds, identify
-from terrain.logs.drive_poses import WindowPoses
+from terrain.logs.drive import WindowPoses
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
 

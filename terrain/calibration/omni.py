@@ -35,7 +35,7 @@ from terrain.measured_slip.delay import estimate_delay
 from terrain.measured_slip.rollers import MIN_RUNS, RollerFindings, distance_bound, roller_findings
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip, outside_source
 from terrain.records import Array, RunLog
-from terrain.robots.omni import OmniRobot
+from terrain.robots import OmniRobot
 
 FRICTION = "motors.friction_nm"
 COM_X, COM_Y = "body.com_x_m", "body.com_y_m"

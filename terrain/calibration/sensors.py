@@ -33,7 +33,7 @@ from terrain.errors import DataError
 from terrain.estimation.feed import MIN_CONFIDENCE_RATIO
 from terrain.identify import Parameter, half_width, identify, std_interval
 from terrain.kinematics.camera import CHANNELS, body_motion
-from terrain.kinematics.wheel_velocity import TWIST, point_velocity
+from terrain.kinematics.wheels import TWIST, point_velocity
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot

@@ -34,7 +34,7 @@ import numpy as np
 from terrain.calibration.finding import Finding, around, undetermined
 from terrain.calibration.sensors import Stretch, at_times, origin_twist
 from terrain.identify import half_width
-from terrain.kinematics.swerve import wheel_velocities
+from terrain.kinematics.wheels import wheel_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 

@@ -50,7 +50,7 @@ from terrain.estimation.observers.sideslip_pose import (
     PoseSettings,
 )
 from terrain.records import Array
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 from terrain.simulation.car import CarCommand, CarSample
 
 REACH_TIME_CONSTANTS = 1.0

@@ -27,8 +27,8 @@ from terrain.control.situations import (
 )
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import DRIVING_MPS, OutputStatus
-from terrain.kinematics.true_slip import true_slip
-from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
+from terrain.kinematics.logged_wheels import true_slip
+from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.simulation.scenario.scenario import Scenario

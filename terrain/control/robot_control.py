@@ -38,7 +38,7 @@ from terrain.control.wheel_controllers import (
 from terrain.entry_point import entry_point
 from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.estimation.live import LiveEstimate
-from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
+from terrain.kinematics.commands import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Command, Reading
 from terrain.robots import SwerveRobot

@@ -27,7 +27,7 @@ from terrain.control.traction import (
     with_motor_driver,
 )
 from terrain.estimation.live import LiveEstimate
-from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
+from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTarget
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS

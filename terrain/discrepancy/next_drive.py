@@ -46,7 +46,7 @@ from terrain.effects import (
     effect_named,
 )
 from terrain.errors import ConfigError
-from terrain.kinematics.wheel_motion import wheel_motion
+from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.planar.model import TRUTH

@@ -10,8 +10,7 @@ import numpy as np
 
 from terrain.angles import unwrapped
 from terrain.errors import OutsideRegionWarning
-from terrain.kinematics import omni
-from terrain.kinematics.swerve import forward
+from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot, Region, Robot
 from terrain.robots.region import Range, outside, widened
@@ -130,22 +129,20 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
     rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels])
     if robot.rate_channels[0].startswith("motor_"):
         rates = rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
-    if robot.on_omni_wheels:
-        rolled, _ = omni.forward(robot.wheel_positions_m, robot.wheel_directions_rad, rates)
-        return np.hypot(rolled[:, 0], rolled[:, 1]), rolled[:, 2], grade
-    speed = rates.mean(axis=1)
+    directions, speed = robot.wheel_directions_rad, rates.mean(axis=1)
     if isinstance(robot, BicycleRobot):
         return speed, _turned(run, robot, wheels.time_s, speed), grade
-    if not robot.steered:
-        return speed, forward(robot.wheel_positions_m, 1.0, rates, np.zeros_like(rates))[0][:, 2], grade
-    steering = run.streams.get("steering")
-    if steering is None:
-        return speed, none, grade
-    columns = [
-        np.interp(wheels.time_s, steering.time_s, unwrapped(steering.channel(f"angle_{wheel}_rad"))) - zero
-        for wheel, zero in zip(robot.wheels, robot.steering_zeros_rad, strict=True)
-    ]
-    return speed, forward(robot.wheel_positions_m, 1.0, rates, np.column_stack(columns))[0][:, 2], grade
+    if robot.steered:
+        steering = run.streams.get("steering")
+        if steering is None:
+            return speed, none, grade
+        columns = [
+            np.interp(wheels.time_s, steering.time_s, unwrapped(steering.channel(name))) - zero
+            for name, zero in zip(robot.steer_channels, robot.steering_zeros_rad, strict=True)
+        ]
+        directions = np.column_stack(columns)
+    twist, _ = no_slip_twist(robot.wheel_positions_m, directions, rates, robot.on_omni_wheels)
+    return np.hypot(twist[:, 0], twist[:, 1]) if robot.on_omni_wheels else speed, twist[:, 2], grade
 
 
 def _turned(run: RunLog, robot: BicycleRobot, time_s: Array, speed_mps: Array) -> Array:

@@ -28,8 +28,7 @@ from terrain.errors import DataError
 from terrain.identify import Parameter, folds, identify
 from terrain.measured_slip.slips import MeasuredSlip
 from terrain.records import Array
-from terrain.robots import Robot
-from terrain.robots.omni import OmniRobot
+from terrain.robots import OmniRobot, Robot
 from terrain.simulation.planar.omni import steady_twist
 
 N_FOLDS = 5

@@ -20,7 +20,7 @@ import numpy as np
 from terrain.effects import NUISANCES, PARAMETER, SENSED_ONLY
 from terrain.errors import ConfigError
 from terrain.extension import warn_outside
-from terrain.kinematics.wheel_motion import wheel_motion
+from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot, load_robot
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log

@@ -42,7 +42,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.resampling import on_clock
 from terrain.estimation.table import MeasurementTable
-from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
+from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack, read_only
 from terrain.robots import Robot
 

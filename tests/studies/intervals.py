@@ -25,7 +25,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.files.documents import read_yaml
 from terrain.identify import Parameter, half_width, identify
-from terrain.kinematics import omni
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.measured_slip.rollers import roller_findings
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import description_file, load_robot
@@ -250,7 +250,7 @@ def _rollers(seed: int) -> Iterator[Interval]:
         for k in range(24):
             angle = 2 * np.pi * k / 24
             ahead = np.array([np.cos(angle), np.sin(angle)])
-            wheels = omni.inverse(*place, 0.1 * np.array([[*ahead, 0.0]]))
+            wheels = 0.1 * np.array([[*ahead, 0.0]]) @ rolling_matrix(*place).T
             twist = steady_twist(wheels, *place, load, rho, 0.06)[0, :2] + rng.normal(0.0, 0.002, 2)
             side = (ahead[0] * twist[1] - ahead[1] * twist[0]) / 0.1
             slip = SimpleNamespace(

@@ -30,7 +30,7 @@ from terrain.effects import OTHER_LOGGER, PlantPart, checked_effects, in_plant
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.extension import apply_homes
 from terrain.kernels import filled, is_finite
-from terrain.kinematics.swerve import wheel_commands
+from terrain.kinematics.commands import wheel_commands
 from terrain.logs.schema import unit_of
 from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot, SwerveRobot, as_drive

@@ -43,8 +43,7 @@ from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kinematics.omni import rolling_matrix
-from terrain.kinematics.wheel_velocity import velocity_matrix
+from terrain.kinematics.wheels import rolling_matrix, velocity_matrix
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
 from terrain.terramechanics.soil import Soil

@@ -38,8 +38,8 @@ from terrain.effects import (
 )
 from terrain.errors import ConfigError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.wheel_motion import WheelMotion, wheel_motion
-from terrain.kinematics.wheel_velocity import point_velocity, wheel_frame_velocities
+from terrain.kinematics.commands import WheelMotion, wheel_motion
+from terrain.kinematics.wheels import point_velocity, wheel_frame_velocities
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import BicycleRobot, Part, Robot, SwerveRobot

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve_limits import scaled
+from terrain.kinematics.commands import scaled
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot, SwerveRobot
 from terrain.simulation.scenario.drawn import course

@@ -19,7 +19,8 @@ from terrain.control.traction import (
     with_motor_driver,
 )
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve import forward, inverse
+from terrain.kinematics.commands import inverse
+from terrain.kinematics.wheels import no_slip_twist
 from terrain.robots import load_robot
 
 ROBOT = load_robot("agrimaro")
@@ -241,7 +242,7 @@ def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
         assert after.driven_mps == report.driven_mps
         share = report.driven_mps / desired
         assert command == pytest.approx(share * wheel, abs=1e-12)
-        got, residual = forward(POSITIONS_M, RADIUS_M, command, steer)
+        got, residual = no_slip_twist(POSITIONS_M, steer, RADIUS_M * np.asarray(command))
         assert got == pytest.approx(share * np.array(twist), abs=1e-9)
         assert residual < 1e-9
         # backward is forward in a mirror

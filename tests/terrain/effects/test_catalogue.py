@@ -35,7 +35,7 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import ConfigError
-from terrain.kinematics.omni import inverse
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.robots import TrackedRobot, load_robot
 from terrain.simulation.planar.model import Ground, make_planar
 from terrain.simulation.planar.noise import load_scatter
@@ -96,7 +96,7 @@ def rich_drive(drive):
         return 3.0 * speed[:, None], steer, grade, roll
     if drive == "omni":
         robot, twist = ROBOTS[drive], np.column_stack([speed, 0.4 * np.cos(0.7 * t), turn])
-        wheels = inverse(robot.wheel_positions_m, robot.wheel_directions_rad, twist)
+        wheels = twist @ rolling_matrix(robot.wheel_positions_m, robot.wheel_directions_rad).T
         return np.ascontiguousarray(wheels), np.zeros((t.size, 3)), grade, roll
     steer = np.column_stack([0.5 * np.sin(0.7 * t), -0.4 * np.sin(0.6 * t), 0.2 * np.sin(0.8 * t)])
     return np.column_stack([speed, 0.9 * speed, 1.1 * speed]), steer, grade, roll

@@ -8,7 +8,7 @@ from scipy.integrate import quad, solve_ivp
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve import wheel_commands
+from terrain.kinematics.commands import wheel_commands
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve import forward, wheel_commands, wheel_velocities
+from terrain.kinematics.commands import wheel_commands
+from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
 from terrain.robots import load_robot
 from terrain.simulation.scenario.drawn import PATCH_M, SLIP_MARGIN
 from terrain.simulation.scenario.drives import CIRCLE_M
@@ -75,7 +76,7 @@ def test_wheels_follow_their_commands_except_during_steering(name):
         np.zeros(3),
     )
     np.testing.assert_array_equal(admitted, drive.twist)  # nothing is left for the limiter to do
-    twist, residual_mps = forward(*geometry, wheel, steer)
+    twist, residual_mps = no_slip_twist(ROBOT.wheel_positions_m, steer, ROBOT.wheel_radius_m * wheel)
     off = np.abs(twist - drive.twist).max(axis=1) > 1e-6
     assert off.mean() < 0.15
     assert residual_mps[~off].max(initial=0.0) < 1e-6

@@ -4,22 +4,23 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import block_diag
 
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve import (
+from terrain.kinematics.commands import (
     FAR_RAD,
     STANDING_MPS,
-    forward,
+    admissible_scale,
+    admissible_yaw_rate,
     inverse,
+    scaled,
     wheel_command_step,
     wheel_commands,
-    wheel_velocities,
+    wheel_motion,
 )
-from terrain.kinematics.swerve_limits import admissible_scale, admissible_yaw_rate, scaled
+from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
 from terrain.robots import load_robot
 
-ROBOT = load_robot("agrimaro")
+ROBOT, HUSKY, ROBOTINO = (load_robot(name) for name in ("agrimaro", "husky", "robotino"))
 WHEELS_M = ROBOT.wheel_positions_m
 RADIUS_M = ROBOT.wheel_radius_m
 SPEED_MAX_RADPS = ROBOT.motors.speed_max_radps
@@ -38,7 +39,7 @@ STEERS = st.tuples(*[st.floats(-100.0, 100.0)] * 3)
 @given(twist=TWISTS, steer=STEERS)
 def test_forward_undoes_inverse_and_no_wheel_turns_more_than_a_quarter(twist, steer):
     wheel, aim = inverse(WHEELS_M, RADIUS_M, twist, steer)
-    back, residual_mps = forward(WHEELS_M, RADIUS_M, wheel, aim)
+    back, residual_mps = no_slip_twist(WHEELS_M, aim, RADIUS_M * wheel)
     np.testing.assert_allclose(back, twist, atol=3 * STANDING_MPS)
     assert residual_mps < 3 * STANDING_MPS
     assert np.abs(aim - steer).max() <= math.pi / 2 + 1e-12
@@ -46,56 +47,6 @@ def test_forward_undoes_inverse_and_no_wheel_turns_more_than_a_quarter(twist, st
     np.testing.assert_array_equal(aim[standing], np.array(steer)[standing])
     wheel_speed = RADIUS_M * wheel[:, None] * np.stack([np.cos(aim), np.sin(aim)], axis=-1)
     np.testing.assert_allclose(wheel_speed, wheel_velocities(WHEELS_M, twist), atol=STANDING_MPS)
-
-
-def test_velocities_are_those_of_points_of_a_body_that_moves():
-    twist, dt_s = np.array([0.7, -0.4, 0.9]), 1e-6
-    turn = twist[2] * dt_s
-    rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-    moved = WHEELS_M @ rotation.T + twist[:2] * dt_s
-    np.testing.assert_allclose(wheel_velocities(WHEELS_M, twist), (moved - WHEELS_M) / dt_s, atol=1e-5)
-
-
-def test_pseudo_inverse_of_the_source_and_least_squares_agree_on_wheels_that_contradict_each_other():
-    rng = np.random.default_rng(3)
-    wheel, steer = rng.normal(0, 5, (20, 3)), rng.normal(0, 3, (20, 3))
-    twist, residual_mps = forward(WHEELS_M, RADIUS_M, wheel, steer)
-    x, y = WHEELS_M.T
-    rows = np.array([row for i in range(3) for row in ([-y[i], 1, 0], [x[i], 0, 1])])  # (2.3): yaw rate first
-    for k in range(20):
-        spread = block_diag(*[[[RADIUS_M * math.cos(d)], [RADIUS_M * math.sin(d)]] for d in steer[k]])
-        assert spread.shape == (6, 3)
-        by_pinv = np.linalg.pinv(rows) @ spread @ wheel[k]
-        by_lstsq, square, *_ = np.linalg.lstsq(rows, spread @ wheel[k])
-        np.testing.assert_allclose(twist[k], by_pinv[[1, 2, 0]], atol=1e-12)
-        np.testing.assert_allclose(twist[k], by_lstsq[[1, 2, 0]], atol=1e-12)
-        assert residual_mps[k] == pytest.approx(math.sqrt(square[0]), rel=1e-9)
-    assert residual_mps.min() > 0.1
-
-
-def test_the_wheel_order_of_equation_2_3_does_not_fit_the_geometry_of_7_2():
-    """The erratum: (2.3) puts wheel 1 at +w/2, 7.2 puts it at -w/2."""
-    of_2_3 = WHEELS_M[[1, 0, 2]]
-    twist = np.array([0.5, 0.0, 0.6])
-    wheel, steer = inverse(WHEELS_M, RADIUS_M, twist, np.zeros(3))
-    right, residual_mps = forward(WHEELS_M, RADIUS_M, wheel, steer)
-    wrong, contradiction_mps = forward(of_2_3, RADIUS_M, wheel, steer)
-    np.testing.assert_allclose(right, twist, atol=1e-12)
-    assert residual_mps < 1e-12
-    assert abs(wrong[2] - twist[2]) > 0.3  # rad/s
-    assert contradiction_mps > 0.1
-    np.testing.assert_allclose(  # without yaw the order is of no account, which is how it stays unseen
-        forward(of_2_3, RADIUS_M, *inverse(WHEELS_M, RADIUS_M, [0.5, 0.2, 0.0], np.zeros(3)))[0],
-        [0.5, 0.2, 0.0],
-        atol=1e-12,
-    )
-
-
-def test_a_missing_sample_is_no_twist_and_spoils_no_other():
-    twist, residual_mps = forward(WHEELS_M, RADIUS_M, [[5, np.nan, 5], [5, 5, 5]], np.zeros(3))
-    assert np.isnan(twist[0]).all()
-    assert np.isnan(residual_mps[0])
-    np.testing.assert_allclose(twist[1], [1, 0, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("turns", [40, -40])
@@ -215,7 +166,7 @@ def test_commands_keep_every_limit_and_drive_waits_for_steering():
     clear = np.abs(error - FAR_RAD) > 1e-9
     np.testing.assert_allclose(speed_mps[clear], (full_mps * factor[:, None])[clear], atol=1e-9)
     settled = error < 1e-9
-    twist, residual_mps = forward(WHEELS_M, RADIUS_M, wheel[settled], steer[settled])
+    twist, residual_mps = no_slip_twist(WHEELS_M, steer[settled], RADIUS_M * wheel[settled])
     np.testing.assert_allclose(twist, admitted[settled], atol=1e-6)
     assert residual_mps.max() < 1e-6
 
@@ -223,20 +174,6 @@ def test_commands_keep_every_limit_and_drive_waits_for_steering():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: wheel_velocities([0.5, 0.0], [1, 0, 0]), r"positions_m has shape \(2,\)"),
-        (lambda: wheel_velocities([[0.5, 0.0]], [1, 0, 0]), r"positions_m has shape \(1, 2\)"),
-        (lambda: wheel_velocities([[0.5, 0.0]] * 3, [1, 0, 0]), "positions_m holds one place only"),
-        (lambda: wheel_velocities([[0, np.inf], [1, 0]], [1, 0, 0]), "positions_m holds inf, finite"),
-        (lambda: wheel_velocities(WHEELS_M, [1, 0]), r"twist has shape \(2,\), \(\.\.\., 3\) is required"),
-        (lambda: wheel_velocities(WHEELS_M, [1, 0, np.nan]), "twist holds nan, finite numbers"),
-        (lambda: wheel_velocities(WHEELS_M, ["left", 0, 0]), "twist cannot be read as an array of numbers"),
-        (lambda: forward(WHEELS_M, 0.0, np.ones(3), np.ones(3)), "radius_m is 0.0, a number above zero"),
-        (lambda: forward(WHEELS_M, RADIUS_M, np.ones(2), np.ones(3)), r"wheel_radps has shape \(2,\)"),
-        (lambda: forward(WHEELS_M, RADIUS_M, [1, np.inf, 1], np.ones(3)), "wheel_radps holds inf"),
-        (
-            lambda: forward(WHEELS_M, RADIUS_M, np.ones((5, 3)), np.ones((4, 3))),
-            r"wheel_radps \(5, 3\) and steer_rad \(4, 3\)",
-        ),
         (lambda: inverse(WHEELS_M, -0.2, [1, 0, 0], np.zeros(3)), "radius_m is -0.2"),
         (lambda: inverse(WHEELS_M, math.nan, [1, 0, 0], np.zeros(3)), "radius_m holds nan"),
         (lambda: inverse(WHEELS_M, RADIUS_M, [1, 0, 0], [0, 0, np.nan]), "steer_now_rad holds nan"),
@@ -259,3 +196,41 @@ def test_invalid_robots_and_motions_are_refused_in_one_sentence(call, message):
     with pytest.raises(ConfigError, match=message) as error:
         call()
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("robot", [ROBOT, HUSKY], ids=lambda robot: robot.name)
+def test_wheels_that_follow_their_commands_drive_the_twist(robot):
+    desired = np.tile([0.5, 0.0, 0.3], (100, 1))
+    motion = wheel_motion(robot, desired, 0.02)
+    np.testing.assert_allclose(motion.wheel_speed_mps, motion.wheel_radps * robot.wheel_radius_m)
+    rates, steer = motion.wheel_radps[-1], motion.steer_rad[-1]
+    twist, _ = no_slip_twist(robot.wheel_positions_m, steer, robot.wheel_radius_m * rates)
+    np.testing.assert_allclose(twist, desired[-1], atol=1e-9)
+
+
+@pytest.mark.parametrize("robot", [ROBOT, HUSKY, ROBOTINO], ids=lambda robot: robot.name)
+def test_no_wheel_turns_faster_than_its_motor_can(robot):
+    motion = wheel_motion(robot, np.tile([50.0, 0.0, 9.0], (50, 1)), 0.02)
+    assert np.abs(motion.wheel_radps).max() <= robot.motors.speed_max_radps * (1 + 1e-12)
+
+
+def test_a_robot_without_motors_is_named():
+    with pytest.raises(ConfigError, match=r"robot agrimaro: .* no section 'motors'"):
+        wheel_motion(ROBOT.without("motors"), np.zeros((2, 3)), 0.02)
+
+
+def test_a_skid_steer_robot_without_motors_has_no_fastest_speed():
+    motion = wheel_motion(HUSKY.without("motors"), np.array([[50.0, 0.0, 9.0]]), 0.02)
+    turn_mps = 9.0 * HUSKY.track_m / 2
+    np.testing.assert_allclose(motion.wheel_speed_mps, [[50.0 - turn_mps, 50.0 + turn_mps]])
+
+
+def test_an_omni_robot_keeps_its_direction_where_a_wheel_is_at_its_limit():
+    desired = np.array([[0.1, 0.05, 0.2], [5.0, 2.5, 10.0]])
+    motion = wheel_motion(ROBOTINO, desired, 0.02)
+    back, _ = no_slip_twist(
+        ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad, motion.wheel_speed_mps, True
+    )
+    np.testing.assert_allclose(back[0], desired[0], atol=1e-12)
+    np.testing.assert_allclose(back[1] / back[1, 0], desired[1] / desired[1, 0], rtol=1e-9)
+    np.testing.assert_allclose(motion.twist, back, atol=1e-12)

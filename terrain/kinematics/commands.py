@@ -1,33 +1,38 @@
-"""Kinematics of a robot whose wheels are all driven and steered: twist to wheels, wheels to twist, limits.
+"""Commands for the wheels that drive desired twists, of every drive, within what motors and steering can do.
 
-With wheel i at ``(x_i, y_i)``, steered by ``d_i`` and turning at ``w_i``, radius r::
+The wheels of a swerve robot of radius r are all driven and steered; with the velocities p_i' of their centres::
 
-    velocity of its centre    p_i' = (v_x - y_i g', v_y + x_i g')                        (2.2)
     rolling without slip      p_i' = r w_i (cos d_i, sin d_i)                            (2.1)
-    all wheels                S(d) w = H V, V = H^+ S(d) w                               (2.3), (2.4)
     wheels for a twist        d_i = atan2(p_iy', p_ix') + k pi, w_i = (-1)^k |p_i'| / r  (2.5)
+    no motor saturates        |p_i'| <= r w_max of every wheel                           (2.6)-(2.10)
 
-A twist is an array ``(..., 3)`` ordered ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` everywhere here; the
-source puts the yaw rate first, and the columns of its H are reordered accordingly.
+The admissible region is convex, but no polyhedron: each wheel bounds it by a cylinder.
 
-Source: Danzi, AgriMaRo thesis, 2.3.  Corrected: one table of wheel positions, ``robot.wheel_positions_m``
-(its 7.2), because (2.3) numbers the wheels of the x axis in the opposite order; rows of H are
-``[-y_i 1 0; x_i 0 1]``; S is block-diagonal, 6 x 3.  Limits: :mod:`terrain.kinematics.swerve_limits`.
-
-Functions check what they are given; :func:`wheel_command_step` alone trusts it.
+Source: Danzi, AgriMaRo thesis, 2.3.  Corrected: (2.6)-(2.9) have ``y' + x_i g'`` and ``x' - y_i g'`` with each
+wheel's own position.  Functions check what they are given; :func:`wheel_command_step` alone trusts it.
 """
 
 from __future__ import annotations
 
 import math
+from functools import singledispatch
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, types
 
 from terrain.errors import ConfigError
-from terrain.kinematics.arguments import above_zero, broadcast, finite_numbers, wheel_positions
-from terrain.kinematics.wheel_velocity import point_velocity, velocity_matrix
+from terrain.kinematics.wheels import (
+    above_zero,
+    broadcast,
+    finite_numbers,
+    point_velocity,
+    wheel_frame_velocities,
+    wheel_positions,
+    wheel_velocities,
+)
 from terrain.records import Array
+from terrain.robots import BicycleRobot, OmniRobot, Robot, SkidSteerRobot, SwerveRobot
 
 STANDING_MPS = 1e-6
 """A wheel slower than this is at rest: below, its direction is rounding, no command."""
@@ -41,59 +46,90 @@ _TABLE = types.Array(types.float64, 2, "A", readonly=True)
 _F8 = types.float64
 
 
-def wheel_velocities(positions_m: Array, twist: Array) -> Array:
-    """Return the velocity (..., wheels, 2) of the wheel centres in the body frame, equation (2.2).
-
-    Raises
-    ------
-    ConfigError
-        if ``positions_m`` is no (wheels, 2), ``twist`` no (..., 3), or either is not finite.
-
-    Examples
-    --------
-    >>> wheel_velocities([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.75]], [1.0, 0.0, 0.2])
-    array([[ 1.  , -0.1 ],
-           [ 1.  ,  0.1 ],
-           [ 1.15,  0.  ]])
-    """
-    return _velocities(wheel_positions(positions_m), finite_numbers("twist", twist, 3))
-
-
-def forward(positions_m: Array, radius_m: float, wheel_radps: Array, steer_rad: Array) -> tuple[Array, Array]:
-    """Return the twist that fits the wheels best, and how far they contradict each other.
+class WheelMotion(NamedTuple):
+    """Commands for the wheels of a robot.
 
     Parameters
     ----------
-    positions_m : (wheels, 2)
-    radius_m : of the wheels
-    wheel_radps, steer_rad : (..., wheels); NaN is a missing sample
+    twist : (n, 3) of the body, shortened where a wheel would saturate
+    wheel_speed_mps : (n, wheels) wheel circumferential speeds
+    wheel_radps : (n, wheels) the same as rates of the wheels
+    steer_rad : (n, wheels) steering angles; 0 without steering
+    """
 
-    Returns
-    -------
-    twist : (..., 3) the least-squares solution (2.4); NaN where a sample is missing
-    residual_mps : (...) norm of ``S w - H V`` over all wheels: 0 when a rigid body rolls without slip
+    twist: Array
+    wheel_speed_mps: Array
+    wheel_radps: Array
+    steer_rad: Array
+
+
+@singledispatch
+def wheel_motion(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
+    """Return the commands with which a robot drives desired twists, its steering straight at the start.
+
+    Parameters
+    ----------
+    robot : a swerve robot with motors and steering; other robots without motors have no fastest speed
+    twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
+    dt_s : time from one twist to the next
 
     Raises
     ------
     ConfigError
-        for shapes that do not fit, infinite values or a radius that is not above zero.
+        if the description of a swerve robot lacks a section.
+
+    Notes
+    -----
+    A swerve robot: :func:`wheel_commands`.  A skid-steer robot of track B: ``v_left = v - w B / 2``,
+    ``v_right = v + w B / 2``, each within what its motor can do.  An omni robot: speeds along its wheels, shortened
+    by what brings the fastest wheel to its limit.  A car-like robot of wheelbase L: ``tan d = L w / v`` in front
+    within its limits, straight at rest, and the twist that it gives.
 
     Examples
     --------
-    >>> twist, residual_mps = forward([[-0.5, 0.0], [0.5, 0.0]], 0.2, [5.0, 5.0], [-0.1, 0.1])
-    >>> twist.round(3), residual_mps.round(3)
-    (array([0.995, 0.   , 0.2  ]), np.float64(0.0))
+    >>> from terrain.robots import load_robot
+    >>> wheel_motion(load_robot("husky"), np.array([[0.5, 0.0, 1.0]]), 0.02).wheel_speed_mps
+    array([[0.2146, 0.7854]])
     """
-    positions = wheel_positions(positions_m)
-    radius = above_zero("radius_m", radius_m)
-    wheel = finite_numbers("wheel_radps", wheel_radps, len(positions), missing=True)
-    steer = finite_numbers("steer_rad", steer_rad, len(positions), missing=True)
-    wheel, steer = broadcast(wheel_radps=wheel, steer_rad=steer)
-    wheel_speed = np.stack([np.cos(steer), np.sin(steer)], axis=-1) * (radius * wheel)[..., None]
-    seen = wheel_speed.reshape(*wheel.shape[:-1], -1)
-    rows = velocity_matrix(positions)
-    twist = seen @ np.linalg.pinv(rows).T
-    return twist, np.linalg.norm(seen - twist @ rows.T, axis=-1)
+    raise ConfigError(f"robot {robot.name}: no kinematics are known for the drive {robot.drive!r}")
+
+
+@wheel_motion.register
+def _(robot: SwerveRobot, twist: Array, dt_s: float) -> WheelMotion:
+    admitted, wheel_radps, steer_rad = wheel_commands(
+        robot.wheel_positions_m,
+        robot.wheel_radius_m,
+        robot.motors.speed_max_radps,
+        robot.steering.rate_max_radps,
+        dt_s,
+        twist,
+        np.zeros(len(robot.wheels)),
+    )
+    return WheelMotion(admitted, wheel_radps * robot.wheel_radius_m, wheel_radps, steer_rad)
+
+
+@wheel_motion.register(SkidSteerRobot)
+@wheel_motion.register(OmniRobot)
+def _(robot: Robot, twist: Array, dt_s: float) -> WheelMotion:
+    speeds, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, robot.wheel_directions_rad)
+    limit = robot.wheel_radius_m * robot.completed.motors.speed_max_radps
+    if robot.sideways:
+        over = np.maximum(np.abs(speeds).max(axis=1, keepdims=True) / limit, 1.0)
+        twist, speeds = twist / over, speeds / over
+    speeds = np.clip(speeds, -limit, limit)
+    return WheelMotion(twist, speeds, speeds / robot.wheel_radius_m, np.zeros_like(speeds))
+
+
+@wheel_motion.register
+def _(robot: BicycleRobot, twist: Array, dt_s: float) -> WheelMotion:
+    speed = np.clip(twist[:, 0], -robot.speed_max_mps, robot.speed_max_mps)
+    curvature = np.divide(twist[:, 2], twist[:, 0], out=np.zeros(len(twist)), where=twist[:, 0] != 0.0)
+    steer = np.arctan(robot.wheelbase_m * curvature)
+    steer = np.clip(steer, -robot.steering_max_rad, robot.steering_max_rad)
+    steers, still = np.column_stack([steer, np.zeros_like(steer)]), np.zeros_like(speed)
+    speeds = np.column_stack([speed / np.cos(steer), speed])
+    driven = np.column_stack([speed, still, speed * np.tan(steer) / robot.wheelbase_m])
+    return WheelMotion(driven, speeds, speeds / robot.wheel_radius_m, steers)
 
 
 def inverse(positions_m: Array, radius_m: float, twist: Array, steer_now_rad: Array) -> tuple[Array, Array]:
@@ -126,7 +162,7 @@ def inverse(positions_m: Array, radius_m: float, twist: Array, steer_now_rad: Ar
     """
     positions = wheel_positions(positions_m)
     radius = above_zero("radius_m", radius_m)
-    velocity = _velocities(positions, finite_numbers("twist", twist, 3))
+    velocity = wheel_velocities(positions, twist)
     now = finite_numbers("steer_now_rad", steer_now_rad, len(positions))
     along, across, now = broadcast(twist=velocity[..., 0], _=velocity[..., 1], steer_now_rad=now)
     wheel, steer = np.empty(now.shape), np.empty(now.shape)
@@ -161,11 +197,6 @@ def wheel_commands(
     -------
     twist_admitted : (n, 3) the twists within the admissible region
     wheel_radps, steer_rad : (n, wheels)
-
-    Raises
-    ------
-    ConfigError
-        for shapes that do not fit, values that are not finite, limits that are not above zero.
 
     Examples
     --------
@@ -291,6 +322,76 @@ def _commands(
     return admitted, speed, steer
 
 
-def _velocities(positions: Array, twist: Array) -> Array:
-    flat = twist @ velocity_matrix(positions).T
-    return np.asarray(flat.reshape(*flat.shape[:-1], len(positions), 2))
+def admissible_scale(positions_m: Array, radius_m: float, twist: Array, speed_max_radps: float) -> Array:
+    """Return the largest k (...), at most 1, with which ``k * twist`` saturates no wheel, (2.10).
+
+    Examples
+    --------
+    >>> admissible_scale([[-0.5, 0.0], [0.5, 0.0]], 0.2, [[4.0, 0.0, 0.0], [1.0, 0.0, 0.0]], 10.0)
+    array([0.5, 1. ])
+    """
+    limit_mps = above_zero("radius_m", radius_m) * above_zero("speed_max_radps", speed_max_radps)
+    velocity = wheel_velocities(positions_m, twist)
+    fastest_mps = np.hypot(velocity[..., 0], velocity[..., 1]).max(axis=-1)
+    return np.asarray(limit_mps / np.maximum(fastest_mps, limit_mps))
+
+
+def scaled(positions_m: Array, radius_m: float, twist: Array, speed_max_radps: float) -> Array:
+    """Return the twist (..., 3) in its own direction, shortened until no wheel saturates.
+
+    The direction is kept, so the centre of rotation and the path are: the robot is slower on the same curve.
+
+    Examples
+    --------
+    >>> scaled([[-0.5, 0.0], [0.5, 0.0]], 0.2, [2.4, 0.0, 3.6], 10.0)
+    array([1.6, 0. , 2.4])
+    """
+    scale = admissible_scale(positions_m, radius_m, twist, speed_max_radps)
+    return np.asarray(np.asarray(twist, dtype=np.float64) * scale[..., None])
+
+
+def admissible_yaw_rate(
+    positions_m: Array, radius_m: float, speed_x_mps: Array, speed_y_mps: Array, speed_max_radps: float
+) -> tuple[Array, Array]:
+    """Return the lowest and the highest yaw rate (...) that saturate no wheel at a given translation.
+
+    The boundary of the admissible region: with v_max = r w_max, (2.6) corrected asks of every wheel
+    ``(x_i^2 + y_i^2) g'^2 + 2 (x_i v_y - y_i v_x) g' + v_x^2 + v_y^2 - v_max^2 <= 0``, an interval of g'.
+    Figure 2.8 and its dimensionless twist (2.11) come of positions in half wheelbases, radius and limit 1.
+
+    Parameters
+    ----------
+    positions_m : (wheels, 2)
+    radius_m : of the wheels
+    speed_x_mps, speed_y_mps : (...) broadcast against each other
+    speed_max_radps : limit of the wheels
+
+    Returns
+    -------
+    low_radps, high_radps : (...); NaN where no yaw rate is admissible
+
+    Examples
+    --------
+    >>> xi = 1.5  # track over half the wheelbase
+    >>> admissible_yaw_rate([[-1, 0], [1, 0], [0, -xi]], 1.0, [0.0, 0.7], 0.0, 1.0)
+    (array([-0.66666667, -0.71414284]), array([0.66666667, 0.2       ]))
+    """
+    positions = wheel_positions(positions_m)
+    limit_mps = above_zero("radius_m", radius_m) * above_zero("speed_max_radps", speed_max_radps)
+    x_mps, y_mps = broadcast(
+        speed_x_mps=finite_numbers("speed_x_mps", speed_x_mps),
+        speed_y_mps=finite_numbers("speed_y_mps", speed_y_mps),
+    )
+    x, y = positions.T
+    square = x * x + y * y
+    across = x * y_mps[..., None] - y * x_mps[..., None]
+    away = x * x_mps[..., None] + y * y_mps[..., None]
+    # across^2 + away^2 = square * speed^2 turns the discriminant into one that cancels nothing
+    inside = square * limit_mps**2 - away**2
+    # a wheel at the origin does not feel the yaw rate: it bounds the translation alone
+    free = np.where(np.hypot(x_mps, y_mps) <= limit_mps, np.inf, np.nan)[..., None]
+    root = np.sqrt(np.where(inside >= 0, inside, np.nan))
+    pivot = np.where(square > 0, square, 1.0)
+    low = np.where(square > 0, (-across - root) / pivot, -free).max(axis=-1)
+    high = np.where(square > 0, (-across + root) / pivot, free).min(axis=-1)
+    return np.where(low <= high, low, np.nan), np.where(low <= high, high, np.nan)
