@@ -13,20 +13,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.bootstrap import bootstrap_counts
 from terrain.discrepancy.clocks import (
     CLOCKED,
     FINE_S,
     MAX_LAG_S,
     MIN_EXCITATION,
     MIN_LAG_S,
-    correlations,
 )
 from terrain.discrepancy.residuals import low_pass_of, prepare_inputs
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.records import Array
+from terrain.signals import Pair, common_delay
 from terrain.simulation.planar.replay import replay
 
 LAGS_S = np.arange(MIN_LAG_S, MAX_LAG_S + 1e-9, FINE_S)
@@ -52,8 +51,6 @@ MIN_RUNS = 3
 MIN_GAIN = 30.0
 """Twice the log-likelihood that a lag has to gain over the median of all lags, to be one: a channel that
 follows the wheels gains hundreds, one that does not follows them nowhere."""
-
-N_BOOTSTRAP = 200
 
 MIN_STD_S = 0.002
 """A tenth of the grid's step: runs that agree to less are limited by it."""
@@ -107,13 +104,10 @@ class Latencies(NamedTuple):
     is_delay: bool
 
 
-class _Pair(NamedTuple):
-    """A channel of a run beside what is expected of it: samples, and a fine grid with values and slopes."""
+class _RunPair(NamedTuple):
+    """A channel of a run beside what is expected of it, and how many of its samples are independent."""
 
-    time_s: Array
-    measured: Array
-    expected: Array
-    slope: Array
+    pair: Pair
     n_independent: float
 
 
@@ -131,19 +125,17 @@ def latencies_of(signals: Sequence[Signals], simulation: Simulation, seed: int =
     seed : of the bootstrap
     """
     pairs = [_pairs(run, simulation) for run in signals]
-    lags, draws = {}, {}
+    lags = {}
     for c, name in enumerate(CLOCKED):
         own = [pair[c] for pair in pairs if c in pair]
         if len(own) < MIN_RUNS:
             continue
-        table = np.array([_gain(pair, pair.expected, LAGS_S) for pair in own])
+        table = np.array([_gain(pair, LAGS_S) for pair in own])
         total = table.sum(axis=0)
         if total.max() - np.median(total) < MIN_GAIN:
             continue
-        counts = bootstrap_counts(len(own), N_BOOTSTRAP, seed)
-        draws[name] = np.array([_peak_s(total) for total in counts @ table])
-        std_s = max(float(draws[name].std()), MIN_STD_S)
-        lags[name] = Latency(name, _peak_s(total), std_s, len(own))
+        found = common_delay(LAGS_S, table, seed=seed)
+        lags[name] = Latency(name, found.delay_s, max(found.std_s, MIN_STD_S), len(own))
     return Latencies(tuple(lags.values()), *_parts(lags), is_delay=_is_delay(pairs, lags))
 
 
@@ -189,7 +181,7 @@ def _is_significant(lag_s: float, std_s: float) -> bool:
     return bool(abs(lag_s) > max(SIGMAS * std_s, GROSS_S))
 
 
-def _pairs(run: Signals, simulation: Simulation) -> dict[int, _Pair]:
+def _pairs(run: Signals, simulation: Simulation) -> dict[int, _RunPair]:
     """Return the channels of a run that are measured and of which something is expected, by place."""
     dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(run, low_pass_of([run]))
     planar = simulation.planar_on(run.terrain)
@@ -205,29 +197,20 @@ def _pairs(run: Signals, simulation: Simulation) -> dict[int, _Pair]:
         if known.sum() >= MIN_KNOWN and np.std(expected[known]) > MIN_EXCITATION:
             fine = np.convolve(np.interp(wide_s, at_s, expected), SMOOTH, mode="valid")
             n = float(known.sum() * dt * INDEPENDENT_HZ)
-            pairs[c] = _Pair(
-                at_s - fine_s[0], np.ascontiguousarray(values), fine, np.gradient(fine, FINE_S), n
-            )
+            time_s = at_s - fine_s[0]
+            slope = np.gradient(fine, FINE_S)
+            pairs[c] = _RunPair(Pair(time_s, np.ascontiguousarray(values), FINE_S, fine, slope, 0.0), n)
     return pairs
 
 
-def _gain(pair: _Pair, expected: Array, lags_s: Array) -> Array:
+def _gain(run: _RunPair, lags_s: Array) -> Array:
     """Return twice the log-likelihood (lags,) that a run gains by following the prediction."""
-    found = np.asarray(correlations(pair.time_s, pair.measured, expected, FINE_S, lags_s, 0.0))
-    return np.asarray(-pair.n_independent * np.log1p(-np.minimum(found**2, 0.9999)))
+    return np.asarray(
+        -run.n_independent * np.log1p(-np.minimum(run.pair.correlations(lags_s, 0.0) ** 2, 0.9999))
+    )
 
 
-def _peak_s(gain: Array) -> float:
-    """Return the lag of the highest point, by a parabola through it and its neighbours."""
-    i = int(np.argmax(gain))
-    if i in (0, gain.size - 1):
-        return float(LAGS_S[i])
-    before, at, after = gain[i - 1 : i + 2]
-    bend = before - 2.0 * at + after
-    return float(LAGS_S[i] + (0.5 * FINE_S * (before - after) / bend if bend < 0 else 0.0))
-
-
-def _is_delay(pairs: Sequence[dict[int, _Pair]], lags: Mapping[str, Latency]) -> bool:
+def _is_delay(pairs: Sequence[dict[int, _RunPair]], lags: Mapping[str, Latency]) -> bool:
     """Return whether wheels that are late are so by a delay, and not by a low-pass of time constant ``T``.
 
     What a body does is ahead of late wheels: ``x(t + T)`` by a delay, ``x + T dx/dt`` by a low-pass.
@@ -236,8 +219,9 @@ def _is_delay(pairs: Sequence[dict[int, _Pair]], lags: Mapping[str, Latency]) ->
     gained = 0.0
     for name in lags:
         delay, low_pass = np.zeros((2, late_s.size))
-        for pair in (pair[CLOCKED.index(name)] for pair in pairs if CLOCKED.index(name) in pair):
-            delay += _gain(pair, pair.expected, -late_s)
-            low_pass += [_gain(pair, pair.expected + late * pair.slope, NO_LAG_S)[0] for late in late_s]
+        for run, n in (each[CLOCKED.index(name)] for each in pairs if CLOCKED.index(name) in each):
+            delay += _gain(_RunPair(run, n), -late_s)
+            ahead = [run._replace(reference=run.reference + late * run.slope) for late in late_s]
+            low_pass += [_gain(_RunPair(each, n), NO_LAG_S)[0] for each in ahead]
         gained += delay.max() - low_pass.max()
     return bool(gained > SHAPE_GAIN)

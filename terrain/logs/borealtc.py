@@ -73,4 +73,5 @@ def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
         if re.fullmatch("[0-9]+", run.words["run"]) and not run.words["terrain"].startswith(".")
     ]
     found.sort(key=lambda run: (run.words["terrain"], run.words["run"]))
-    return [partial(read_run, folder, MAPPING, run, by="BorealTC layout") for run in found]
+    read = partial(read_run, folder, MAPPING, by="BorealTC layout", linked_folders=True)
+    return [partial(read, run) for run in found]

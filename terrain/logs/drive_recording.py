@@ -4,7 +4,7 @@ r"""Reader of whole recordings of DRIVE: the topics of a robot at 20 Hz, with mo
 norlab-ulaval/doughnut_calib, ``raw_dataframe``).  The folder names robot and terrain, as ``husky_wet_grass``;
 a recording is the session of its runs.  A step is one command: what was driven under it is a run
 ``<folder>_<recording>_step_001``; an operator drives before the first one and between them, which makes the
-runs ``..._hand_000`` (:mod:`terrain.logs.drive_recording`).  Terrain is taken to be that of the folder
+runs ``..._hand_000``.  Terrain is taken to be that of the folder
 throughout.
 
 ============  =================================================  ========================================

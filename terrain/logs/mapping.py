@@ -266,6 +266,7 @@ def read_run(
     repair: bool = False,
     read_messages: ReadMessages | None = None,
     by: str = "by a mapping",
+    linked_folders: bool = False,
 ) -> RunLog:
     """Return the run whose files were found.
 
@@ -277,6 +278,7 @@ def read_run(
     repair : drop and count what a strict read refuses
     read_messages : reads streams whose files are bags
     by : what the run states of how it was read
+    linked_folders : whether the folder of a file may be a link that leads elsewhere
 
     Raises
     ------
@@ -290,7 +292,8 @@ def read_run(
     streams: dict[str, Stream] = {}
     files = []
     for name, stream in mapping.streams.items():
-        path = check_log_file(folder / found.places.get(name, stream.file.format(**words)), folder)
+        path = folder / found.places.get(name, stream.file.format(**words))
+        check_log_file(path, path.parent if linked_folders else folder)
         files.append(path.relative_to(folder).as_posix())
         if stream.messages is None:
             streams[name] = _read_stream(path, stream, dropped, repair=repair)

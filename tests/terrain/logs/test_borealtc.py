@@ -11,7 +11,7 @@ def read_run(folder, number, repair=False):
     (read,) = (
         each
         for each in find_runs(folder.parent)
-        if (each.args[2].words["terrain"], each.args[2].words["run"]) == (folder.name, number)
+        if (each.args[-1].words["terrain"], each.args[-1].words["run"]) == (folder.name, number)
     )
     return read(repair=repair)
 
