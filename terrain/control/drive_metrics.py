@@ -31,7 +31,7 @@ from terrain.kinematics.logged_wheels import true_slip
 from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.scenario import Scenario
 
 PEAK_ABOVE_MPS = 0.2
 """Slip is evaluated above this speed: below it is the ratio of two small speeds."""

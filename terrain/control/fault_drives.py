@@ -43,9 +43,8 @@ from terrain.errors import ConfigError
 from terrain.records import Array, Command, RunLog, Sample, read_only
 from terrain.robots import Robot
 from terrain.simulation.conditions import Faults
-from terrain.simulation.faults.catalogue import fault_catalogue
-from terrain.simulation.faults.fault import FaultyBus, Nature, SensorFault
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.faults import FaultyBus, Nature, SensorFault, fault_catalogue
+from terrain.simulation.scenario import Scenario
 
 START, STOP, STEADY = "start", "stop", "steady"
 

@@ -29,7 +29,7 @@ from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.model import planar_ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import Hills, simulate_planar
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss, is_lost, with_raw_fixes
 from terrain.simulation.slip_sweep import learning_run
 from terrain.simulation.tracked import COMMANDS_HZ, Slope, simulate_tracked

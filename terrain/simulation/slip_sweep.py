@@ -17,7 +17,7 @@ from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.scenario import RATE_HZ, Patch, Scenario
+from terrain.simulation.scenario import RATE_HZ, Patch, Scenario
 from terrain.terramechanics.soil import load_soil, scattered
 
 SWEEP_SLIP = 0.75

@@ -32,7 +32,7 @@ from terrain.robots import description_file, load_robot
 from terrain.simulation.bench import six_positions_log
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.omni import steady_twist
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio
 from terrain.slip_learning.forces import RunBins

@@ -59,7 +59,7 @@ from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.scenario import Scenario
 from terrain.simulation.sensors import STEP_S
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import GROUND, ground_record, wheel_ground

@@ -8,7 +8,7 @@ a delay later, one step at the least.
 Examples
 --------
 >>> from terrain.robots import load_robot
->>> from terrain.simulation.scenario.make import make_scenario
+>>> from terrain.simulation.scenario import make_scenario
 >>> from terrain.terramechanics.soil import load_soil
 >>> robot = load_robot("agrimaro")
 >>> drive = make_scenario("straight", robot, ["grass"], 5.0)
@@ -43,7 +43,7 @@ from terrain.simulation.dynamic.plant import (
     start_state,
 )
 from terrain.simulation.dynamic.step import advance, settle
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.scenario import Scenario
 from terrain.simulation.sensors import (
     BODY_ROW,
     STEP_S,

@@ -18,7 +18,7 @@ from terrain.control.fault_drives import (
 )
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.faults.fault import Nature
+from terrain.simulation.faults import Nature
 
 STEP_S, START_S, END_S, N = 0.02, 2.0, 5.0, 400
 TIME_S = STEP_S * np.arange(N)

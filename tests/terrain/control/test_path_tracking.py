@@ -21,7 +21,7 @@ from terrain.records import Command
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil, scattered
 
 ROBOT = load_robot("agrimaro")

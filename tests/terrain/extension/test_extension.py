@@ -30,7 +30,7 @@ from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.model import planar_ground
 from terrain.simulation.planar.run import simulate_planar
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 ROBOT, HUSKY, OMNI = load_robot("agrimaro"), load_robot("husky"), load_robot("robotino")

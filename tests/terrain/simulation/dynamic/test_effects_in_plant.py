@@ -19,7 +19,7 @@ from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.contact import shear_slip
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import load_soil
 

@@ -11,8 +11,7 @@ from terrain.logs.write import write_run
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.dynamic.simulate import COMMAND_CHANNELS, simulate
-from terrain.simulation.scenario.make import make_scenario
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.scenario import Scenario, make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import Scatter, load_soil, soil_names
 

@@ -34,7 +34,7 @@ from terrain.simulation.dynamic.step import (
     advance,
     settle,
 )
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import BODY_ROW, STEP_S, Motion
 from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import equilibrium_slip, friction_limit, wheel_ground

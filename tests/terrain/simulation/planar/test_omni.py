@@ -19,7 +19,7 @@ from terrain.simulation.planar.noise import load_noise
 from terrain.simulation.planar.omni import ROLLING_MPS, SUBSTEPS, currents_of, steady_twist
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.run import simulate_run
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil, soil_from
 
 ROBOT = load_robot("robotino")

@@ -29,7 +29,7 @@ from terrain.simulation.planar.model import Ground, make_planar, planar_ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.replay import replay
 from terrain.simulation.planar.run import Hills, simulate_planar
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")

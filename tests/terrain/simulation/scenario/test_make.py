@@ -8,11 +8,17 @@ from terrain.errors import ConfigError
 from terrain.kinematics.commands import wheel_commands
 from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
 from terrain.robots import load_robot
-from terrain.simulation.scenario.drawn import PATCH_M, SLIP_MARGIN
-from terrain.simulation.scenario.drives import CIRCLE_M
-from terrain.simulation.scenario.legs import ACCEL_MPS2, YAW_ACCEL_RADPS2
-from terrain.simulation.scenario.make import SCENARIOS, make_scenario
-from terrain.simulation.scenario.scenario import Patch, Scenario
+from terrain.simulation.scenario import (
+    ACCEL_MPS2,
+    CIRCLE_M,
+    PATCH_M,
+    SCENARIOS,
+    SLIP_MARGIN,
+    YAW_ACCEL_RADPS2,
+    Patch,
+    Scenario,
+    make_scenario,
+)
 
 ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
 DRAWN = ("survey", "course")
