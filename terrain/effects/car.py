@@ -23,11 +23,7 @@ CAR: tuple[Effect, ...] = (
         "steering_offset_front",
         (
             Parameter(
-                "steering_offset_front_rad",
-                -0.3,
-                0.3,
-                0.005,
-                inverse=Inverse(("steering",), "angle + d0"),
+                "steering_offset_front_rad", -0.3, 0.3, 0.005, inverse=Inverse(("steering",), "angle + d0")
             ),
         ),
         "d = measured angle + d0",

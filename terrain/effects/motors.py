@@ -91,11 +91,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         (
             # zero of a Hall sensor: up to 2 % of a range of 50 to 200 A
             Parameter(
-                "current_offset_a",
-                -4.0,
-                4.0,
-                0.05,
-                inverse=Inverse(("wheels",), "current of each motor - b"),
+                "current_offset_a", -4.0, 4.0, 0.05, inverse=Inverse(("wheels",), "current of each motor - b")
             ),
         ),
         "current of each motor + b: n b in the sum of n motors, nothing in the difference of the sides",

@@ -122,11 +122,7 @@ SENSORS: tuple[Effect, ...] = (
         (
             # measured: 0.16 s (Husky) and 0.3 to 0.5 s (Warthog), poses of a lidar's scans, DRIVE
             Parameter(
-                "camera_latency_s",
-                0.0,
-                1.0,
-                0.005,
-                homes=(Home("camera", "latency_s", Combine.ADDED),),
+                "camera_latency_s", 0.0, 1.0, 0.005, homes=(Home("camera", "latency_s", Combine.ADDED),)
             ),
         ),
         "camera(t) = what it sees at t - T",
@@ -185,15 +181,7 @@ SENSORS: tuple[Effect, ...] = (
     ),
     Effect(
         "clock_offset",
-        (
-            Parameter(
-                "clock_offset_s",
-                -0.5,
-                0.5,
-                0.005,
-                inverse=Inverse(OTHER_LOGGER, "stamp t' - T"),
-            ),
-        ),
+        (Parameter("clock_offset_s", -0.5, 0.5, 0.005, inverse=Inverse(OTHER_LOGGER, "stamp t' - T")),),
         "IMU and camera stamp t' = t + T; wheels, currents and steering t: for T < 0 these are the late ones",
         "two loggers without a common clock",
         WITH_IMU,

@@ -151,15 +151,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
     ),
     Effect(
         "steering_delay",
-        (
-            Parameter(
-                "steering_delay_s",
-                0.0,
-                0.5,
-                0.01,
-                inverse=Inverse(("steering",), "stamp t + T"),
-            ),
-        ),
+        (Parameter("steering_delay_s", 0.0, 0.5, 0.01, inverse=Inverse(("steering",), "stamp t + T")),),
         "d(t) = measured angle at t - T",
         KINEMATICS,
         (SWERVE, BICYCLE),

@@ -148,12 +148,7 @@ def simulate_run(
 
 
 def _tracked_run(
-    robot: TrackedRobot,
-    soil: Soil,
-    twist: Array,
-    seed: np.random.SeedSequence,
-    run_id: str,
-    setup: Setup,
+    robot: TrackedRobot, soil: Soil, twist: Array, seed: np.random.SeedSequence, run_id: str, setup: Setup
 ) -> RunLog:
     """Return a run on an even slope, without undulations; a receiver is always on board."""
     conditions = setup.conditions

@@ -73,12 +73,7 @@ def learning_runs(
 
 
 def learning_run(
-    robot: Robot,
-    terrain: str,
-    seed: int,
-    number: int,
-    drive: Drive | None = None,
-    run_id: str | None = None,
+    robot: Robot, terrain: str, seed: int, number: int, drive: Drive | None = None, run_id: str | None = None
 ) -> RunLog:
     """Return one run.
 

@@ -35,13 +35,7 @@ from terrain.logs.schema import unit_of
 from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot, SwerveRobot, as_drive
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
-from terrain.simulation.dynamic.plant import (
-    TerrainProfile,
-    check_step,
-    draw_profile,
-    make_plant,
-    start_state,
-)
+from terrain.simulation.dynamic.plant import TerrainProfile, check_step, draw_profile, make_plant, start_state
 from terrain.simulation.dynamic.step import advance, settle
 from terrain.simulation.scenario import Scenario
 from terrain.simulation.sensors import (
@@ -189,11 +183,7 @@ def _generators(seed: int | np.random.SeedSequence) -> dict[str, np.random.Gener
 
 
 def _sensors(
-    motion: Motion,
-    robot: Robot,
-    faults: Faults,
-    gnss: Gnss | None,
-    rngs: Mapping[str, np.random.Generator],
+    motion: Motion, robot: Robot, faults: Faults, gnss: Gnss | None, rngs: Mapping[str, np.random.Generator]
 ) -> dict[str, Sensor]:
     """Return the sensors on board, by stream."""
     sensors: dict[str, Sensor] = {

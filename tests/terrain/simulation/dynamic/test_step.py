@@ -179,12 +179,7 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         slip = (deflection + DEFLECTION_DAMPING_S * creep(wheel_speed)) / plant.relaxation_m
         got = np.array(
             [
-                wheel_ground(
-                    grounds[patch[i]],
-                    normal[i],
-                    np.clip(slip[0, i], -1, 1),
-                    slip[1, i],
-                )
+                wheel_ground(grounds[patch[i]], normal[i], np.clip(slip[0, i], -1, 1), slip[1, i])
                 for i in range(3)
             ]
         ).T
