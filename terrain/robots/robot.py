@@ -170,7 +170,7 @@ class Robot(ABC):
     wheelbase_m : distance between front and rear wheel
     mass_kg : total mass without payload
     parts : sections of the description by name
-    effects : parameters of :mod:`terrain.effects.catalogue` that are not 0, by name
+    effects : parameters of :mod:`terrain.effects` that are not 0, by name
     effects_cov : (n, n) covariance of the effects in their order; NaN where unknown
     region : of driving, that the effects were validated in; None where none is stated
     assumed : numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``

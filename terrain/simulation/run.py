@@ -88,7 +88,7 @@ def simulate_run(
     conditions : nominal conditions
     faults : faults of the sensors
     gnss : receiver on board, if any
-    effects : parameters of :mod:`terrain.effects.catalogue` that act
+    effects : parameters of :mod:`terrain.effects` that act
 
     Raises
     ------

@@ -110,7 +110,7 @@ def simulate(
     controller : called once an instant of the scenario; before its first command is in force, the wheels are
         commanded to stand and the steering to stay at 0
     command_delay_s : from that instant to when the command is in force, in whole steps, one at least
-    effects : parameters of :mod:`terrain.effects.catalogue` that act on this robot and its sensors, beside
+    effects : parameters of :mod:`terrain.effects` that act on this robot and its sensors, beside
         those of its description or in place of them; the commands and the log do not contain them
 
     Returns
