@@ -169,7 +169,7 @@ def test_ranks_of_scatter_are_those_of_the_scatter_that_is_published():
     assert sorted(ranks) == list(range(1, len(NUISANCES) + 1))
 
 
-ADDED = '''
+ADDED = r'''
 import importlib.util, json, sys, types
 from pathlib import Path
 
