@@ -48,7 +48,7 @@ from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import KnownTerrain
 from terrain.errors import ConfigError
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
-from terrain.simulation.faults import SensorFault, fault_catalogue, select_faults
+from terrain.simulation.faults import fault_catalogue, select_faults
 
 if TYPE_CHECKING:
     from pipelines.drive.drive import Settings
