@@ -30,22 +30,20 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 from pydantic import Field
 from scipy.optimize import minimize_scalar
-from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.feature_selection import SelectPercentile, VarianceThreshold, f_classif
 from sklearn.impute import SimpleImputer
 from sklearn.pipeline import Pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
-from sklearn.utils.multiclass import check_classification_targets
-from sklearn.utils.validation import check_is_fitted, validate_data
 
 from terrain.classify.folds import block_groups, split_runs
+from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -256,7 +254,7 @@ class Preparation(NamedTuple):
         return np.asarray(np.clip((used - self.mean) / self.scale, -CLIP_STD, CLIP_STD))
 
 
-class GroupedSVC(ClassifierMixin, BaseEstimator):
+class GroupedSVC(GroupedClassifier):
     """RBF SVM with its own scaling, selection, choice of hyper-parameters and calibration.
 
     Parameters
@@ -302,17 +300,11 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         DataError
             if there is one class only, or a class has too few windows to hold some of them out.
         """
-        X, y = validate_data(self, X, y, ensure_all_finite="allow-nan")
-        check_classification_targets(y)
-        self.classes_, counts = np.unique(y, return_counts=True)
-        if len(self.classes_) < 2:
-            raise DataError(
-                f"all windows are {str(self.classes_[0])!r}: a classifier needs at least two classes"
-            )
+        X, y, groups = self._training_rows(X, y, groups)
+        counts = np.unique(y, return_counts=True)[1]
         if counts.min() < 2:
             rare = str(self.classes_[counts.argmin()])
             raise DataError(f"there is one window of class {rare!r}; at least 2 are needed")
-        groups = np.arange(len(y)) if groups is None else np.asarray(groups)
         candidates = [Candidate(*candidate) for candidate in self.candidates]
         step = -(-len(y) // MAX_INNER_ROWS)
         inner_y, gap = y[::step], -(-self.gap // step)
@@ -373,32 +365,18 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
 
         As in all of scikit-learn, two classes have one value (n,), positive for the second.
         """
-        check_is_fitted(self)
         if len(self.classes_) == 2:
             return -self.scale_ * self.margins(X)[:, 0]
         return np.asarray(np.log(np.maximum(self.predict_proba(X), np.finfo(float).tiny)))
 
     def margins(self, X: Array) -> Array:
         """Return the margins of the pairs of classes (n, k (k - 1) / 2), positive for the first of a pair."""
-        check_is_fitted(self)
-        X = validate_data(self, X, reset=False, ensure_all_finite="allow-nan")
-        return _margins(self.svc_, self.preparation_.of(X), self.classes_)
+        rows = self._rows(X)
+        return _margins(self.svc_, self.preparation_.of(rows), self.classes_)
 
     def predict_proba(self, X: Array) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``."""
-        check_is_fitted(self)
         return class_probabilities(self.margins(X), len(self.classes_), self.scale_)
-
-    def predict(self, X: Array) -> Array:
-        """Return the class of the highest probability (n,)."""
-        best = self.predict_proba(X).argmax(axis=1)
-        return np.asarray(self.classes_[best])
-
-    def __sklearn_tags__(self) -> Any:
-        """Declare that NaN is accepted."""
-        tags = super().__sklearn_tags__()
-        tags.input_tags.allow_nan = True
-        return tags
 
 
 def f_score(X: Array, y: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ import numpy as np
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.classify.folds import block_groups, split_runs
 from terrain.classify.metrics import N_BOOTSTRAP
-from terrain.classify.novelty import KNOWN_KEPT, NoveltyScore
+from terrain.classify.novelty import KNOWN_KEPT, learn_novelty
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -113,8 +113,8 @@ def score_fold(
     X: Array, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array, unknown: Array
 ) -> Scored:
     """Return the novelty of held-out and of unknown rows, by a score that is fitted on training rows."""
-    fitted = NoveltyScore(gap=gap, seed=seed).fit(X[train], y[train], group[train])
-    return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.numbers_.threshold)
+    fitted = learn_novelty(X[train], y[train], group[train], gap=gap, seed=seed)
+    return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.threshold)
 
 
 def unknown_figures(
