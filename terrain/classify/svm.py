@@ -41,6 +41,7 @@ from sklearn.impute import SimpleImputer
 from sklearn.pipeline import Pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
+from sklearn.utils.validation import check_is_fitted
 
 from terrain.classify.folds import block_groups, split_runs
 from terrain.classify.grouped import GroupedClassifier
@@ -365,6 +366,7 @@ class GroupedSVC(GroupedClassifier):
 
         As in all of scikit-learn, two classes have one value (n,), positive for the second.
         """
+        check_is_fitted(self)
         if len(self.classes_) == 2:
             return -self.scale_ * self.margins(X)[:, 0]
         return np.asarray(np.log(np.maximum(self.predict_proba(X), np.finfo(float).tiny)))
