@@ -6,7 +6,7 @@ dealing; with runs of unequal length nearly every seed gives the same folds, and
 meaningless.)  A class that has a single run cannot be both held out whole and trained on: its run is
 cut into contiguous blocks, and training windows beside a test block are left out.
 
-Out-of-fold probabilities inside a training part: what a threshold or a calibration may be fitted to.
+Inner folds of a training part give out-of-fold probabilities, which a threshold or a calibration may be fitted to.
 """
 
 from __future__ import annotations

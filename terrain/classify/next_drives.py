@@ -10,9 +10,8 @@ it falls in the proportion in which the curve does.  Weighted by how much of the
 to be, this is the accuracy that the runs would gain.  The law is that of the learning curve (e.g. Cortes et
 al., Learning Curves: Asymptotic Values and Rate of Convergence, 1994).
 
-Accuracy by support: by the true terrain, and by the mark that needs no label.
-
-Each held-out window is judged by a table of the training windows of its own fold.  Figures are ratios of sums
+Accuracy is also given by support, by the true terrain and by the mark that needs no label.  Each held-out window
+is judged by a table of the training windows of its own fold.  Figures are ratios of sums
 over windows, their intervals those of a bootstrap that draws whole runs within their classes.
 """
 

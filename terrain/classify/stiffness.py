@@ -1,4 +1,4 @@
-"""Terrains by stiffness: levels, the cost of confusing soft with hard, and clusters of runs without labels.
+"""Terrains by stiffness: levels, the cost of confusing soft with hard, clusters of runs, and figures by level.
 
 The AgriMaRo thesis (8.1) groups terrains "primarily on the level of stiffness or deformability": compact and
 paved surfaces are the low-difficulty extreme, yielding ones the other.  A wrong class within a level costs
@@ -9,8 +9,6 @@ little, as the slip to aim for is alike; hard taken for soft, or soft for hard, 
 
 with the level l of each class and w = :data:`WITHIN_LEVEL_COST`.  The decision of least expected cost under
 the probabilities p is ``argmin_j sum_i p_i C_ij`` (Duda, Hart and Stork, Pattern Classification, 2.2).
-
-How well held-out windows are classified by stiffness level, and whether clusters of runs are these levels.
 """
 
 from __future__ import annotations

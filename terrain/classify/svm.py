@@ -6,10 +6,8 @@ here the inner folds are made of whole groups wherever a class has more than one
 
 Steps of ``fit``: scale and select on each inner training part, fit every candidate there, keep the
 candidate with the best accuracy on the held-out parts; its held-out margins of pairs of classes give the one
-scale of :mod:`terrain.classify.svm` that makes the true classes most likely; scale, select and fit once
+scale, below, that makes the true classes most likely; scale, select and fit once
 more on everything.
-
-Class probabilities from the margins of pairs of classes.
 
 One support vector machine separates each pair of classes (a, b), a before b, by a margin ``f_ab``, positive
 for a.  With one scale s for all pairs, ``r_ab = 1 / (1 + exp(-s f_ab))`` estimates the probability of a where

@@ -1,10 +1,8 @@
-"""Metrics of a simulated drive, from the truth in its log.
+"""Metrics of a simulated drive by name, from the truth in its log.
 
 Energy is the mechanical work of the wheels' motors, ``max(T w, 0)`` summed over wheels: the motor drivers do
 not recover energy.  Controllers are compared at equal distance, as at equal time the consumption of one that
 travels less far is lower.
-
-Evaluation of a simulated drive: all its metrics by name, and the energy of several at equal distance.
 """
 
 from __future__ import annotations

@@ -1,14 +1,9 @@
-"""Closed-loop drives with a sensor fault, clean, and by plain commands; and what the fault does to them.
-
-A pilot's exceptions do not end a drive: they are counted, and the wheels keep their last command.
-
-Situations in which a sensor fault matters most, and the moment at which it begins in each.
-
-What a sensor fault does to a closed-loop drive: its figures, and the bars that they have to meet.
+"""What a sensor fault does to a closed-loop drive: situations, drives, figures, and the bars that they have to meet.
 
 A drive with a fault is compared with two others in the same situation and by the same seed: the *clean* one,
 by the same controller without the fault, and the *plain* one, by the commands of the kinematics alone, which
-no sensor fault touches.  A fault must not make slip control worse than having none.
+no sensor fault touches.  A fault must not make slip control worse than having none.  A pilot's exceptions do not
+end a drive: they are counted, and the wheels keep their last command.
 """
 
 from __future__ import annotations
