@@ -1,8 +1,9 @@
 """What a table of target slips aims for on each terrain, ready for the control loop.
 
-Braking by controlled slip is aimed for where it stops a robot sooner than locked wheels.  On terrain that shears, thrust rises with slip up to the locked wheel: nothing stops sooner.  On hard terrain
-it falls again beyond a peak.  Slip is controlled in braking where it falls by more than the controller loses
-while slip builds up, and where friction is so small that wheels lock at all.
+Braking by controlled slip is aimed for where it stops a robot sooner than locked wheels.  On terrain that
+shears, thrust rises with slip up to the locked wheel: nothing stops sooner.  On hard terrain it falls again
+beyond a peak.  Slip is controlled in braking where it falls by more than the controller loses while slip
+builds up, and where friction is so small that wheels lock at all.
 """
 
 from __future__ import annotations
