@@ -311,6 +311,6 @@ def _named(rows: Sequence[FaultRow]) -> str:
     """Return the sensors that were named in any row, each with its statuses."""
     named: dict[str, set[str]] = defaultdict(set)
     for row in rows:
-        for sensor, statuses in (row.blamed or {}).items():
+        for sensor, statuses in (row.sensors_named or {}).items():
             named[sensor].update(statuses.split(", "))
     return "; ".join(f"{sensor}: {', '.join(sorted(named[sensor]))}" for sensor in sorted(named))

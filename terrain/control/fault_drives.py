@@ -442,7 +442,7 @@ class FaultRow:
     kind, streams, nature : of the fault
     figures : of the drive
     bars : by name, whether it is met; None where it does not apply
-    blamed : by the name of a sensor, what the controller's ``health`` named it; None without a ``health``
+    sensors_named : by the name of a sensor, what the controller's ``health`` named it; None without a ``health``
     exception : the first one that the controller raised, or empty
     """
 
@@ -452,7 +452,7 @@ class FaultRow:
     nature: str
     figures: FaultFigures
     bars: Mapping[str, bool | None]
-    blamed: Mapping[str, str] | None
+    sensors_named: Mapping[str, str] | None
     exception: str
 
     @property
@@ -590,7 +590,7 @@ def evaluate_case(loop: FaultLoop, case: FaultCase, references: References) -> F
         nature=fault.nature.value,
         figures=figures,
         bars=judge(figures, fault.nature),
-        blamed=named_sensors(pilot.health, acts.tolist(), float(time_s[1] - time_s[0])),
+        sensors_named=named_sensors(pilot.health, acts.tolist(), float(time_s[1] - time_s[0])),
         exception=pilot.exception,
     )
 
