@@ -35,7 +35,7 @@ from terrain.control.situations import (
 )
 from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError
-from terrain.records import Array, Command, RunLog, Sample, read_only
+from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.faults import FaultyBus, Nature, SensorFault, fault_catalogue
@@ -137,8 +137,7 @@ class Limits(NamedTuple):
 LIMITS = Limits()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FaultDrive:
+class FaultDrive(NamedTuple):
     """What is evaluated of a drive, at the instants of its control.
 
     Parameters
@@ -166,15 +165,6 @@ class FaultDrive:
     speed_mps: Array
     stop_s: float = math.inf
     stop_m: float = math.nan
-
-    def __post_init__(self) -> None:
-        for name in ("ok", "moving"):
-            object.__setattr__(self, name, read_only(getattr(self, name), np.bool_))
-        for name in (
-            *("time_s", "slip_ratio", "true_slip_ratio", "body_slip_ratio"),
-            *("commanded_mps", "desired_mps", "speed_mps"),
-        ):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 class FaultFigures(NamedTuple):
