@@ -35,7 +35,8 @@ class GroupedClassifier(ClassifierMixin, BaseEstimator):
 
     def predict(self, X: Array) -> Array:
         """Return the class of the highest probability (n,)."""
-        return np.asarray(self.classes_[self.predict_proba(X).argmax(axis=1)])
+        best = self.predict_proba(X).argmax(axis=1)
+        return np.asarray(self.classes_[best])
 
     def __sklearn_tags__(self) -> Any:
         """Declare that NaN is accepted."""
