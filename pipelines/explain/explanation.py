@@ -14,7 +14,7 @@ from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, T
 from pipelines.report.versions import versions
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
-from terrain.discrepancy.powertrain_answer import PowertrainAnswer
+from terrain.discrepancy.powertrain import PowertrainAnswer
 from terrain.discrepancy.robot_terms import quantity
 from terrain.discrepancy.sentences import (
     channel_label,
