@@ -15,11 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.clocks import Shift, shifts_of
+from terrain.discrepancy.clocks import Latencies, Shift, latencies_of, shifts_of, starting_values
 from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of, values_by_session
 from terrain.discrepancy.evidence import Evidence, move_point, partial_information, recentre
 from terrain.discrepancy.faults import Fault, faults_of, repaired
-from terrain.discrepancy.latencies import Latencies, latencies_of, starting_values
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of, measured_channels, rows_of

@@ -13,10 +13,9 @@ from functools import partial
 
 import numpy as np
 
-from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Shift, offsets_of, shifts_of
+from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Latencies, Shift, offsets_of, shifts_of
 from terrain.discrepancy.evidence import PRIOR_STD, Evidence
 from terrain.discrepancy.faults import LEAST, MOTION, G, H, Response, X, Y, gains_of, responses_of
-from terrain.discrepancy.latencies import Latencies
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.verdict import Clock, Excluded
 from terrain.effects import CHANNELS, CURRENT, INDEX, SPEED_X, SPEED_Y

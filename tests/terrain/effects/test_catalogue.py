@@ -190,7 +190,7 @@ exec(compile(source.replace("    *CAR,\n", "    *CAR,\n" + entry), str(place), "
 
 from dataclasses import replace
 import terrain.effects as effects
-from terrain.discrepancy.sentences import limit_text
+from terrain.discrepancy.statements import limit_text
 from terrain.discrepancy.robot_terms import quantity
 from terrain.discrepancy import residuals, search, evidence
 from terrain.discrepancy.simulation import Simulation
