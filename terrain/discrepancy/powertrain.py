@@ -500,16 +500,16 @@ def powertrain_of(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Powert
     of_two_sides = (DIFFERENCE_GAIN, COMMON_LIMIT, DIFFERENCE_LIMIT)
     candidates = [i for i in range(len(NAMES)) if two_sides or i not in of_two_sides]
     fold_of = np.random.default_rng(seed).permutation(n_runs) % FOLDS
-    kept, vector = _add_parts(traces, candidates, fold_of, seed)
-    kept, vector, error, gains = _drop_parts(traces, kept, vector, fold_of, seed)
-    vector = _fit(traces, kept, vector, np.ones(n_runs), both_sides=True)
-    intervals = _intervals(traces, kept, vector, seed)
+    present, vector = _add_parts(traces, candidates, fold_of, seed)
+    present, vector, error, gains = _drop_parts(traces, present, vector, fold_of, seed)
+    vector = _fit(traces, present, vector, np.ones(n_runs), both_sides=True)
+    intervals = _intervals(traces, present, vector, seed)
     parts = []
     for i in candidates:
-        if i in kept:
+        if i in present:
             room_s = GRID_ROOM_S if i in (DELAY, TIME_CONSTANT) else 0.0
             low, high = max(intervals[i][0] - room_s, 0.0), intervals[i][1] + room_s
-            if i == DELAY and not {TIME_CONSTANT, SLEW} & set(kept):  # the next sample shows all of a step
+            if i == DELAY and not {TIME_CONSTANT, SLEW} & set(present):  # the next sample shows all of a step
                 low, high = max(low - traces.hold_s, 0.0), high + traces.hold_s
             parts.append(Part(NAMES[i], PartStatus.FOUND, float(vector[i]), low, high, gains[i]))
         else:
@@ -622,28 +622,28 @@ def _add_parts(
 ) -> tuple[list[int], Array]:
     """Return the parts that reduce the error of runs left out, added one at a time, and all values."""
     every = np.ones(len(fold_of))
-    kept: list[int] = []
+    present: list[int] = []
     vector, error = ABSENT.copy(), squared_errors(traces, ABSENT)
     while True:
         fits = []
         for i in candidates:
-            if i not in kept:
-                p = _fit(traces, [*kept, i], _started(traces, vector, i), every)
+            if i not in present:
+                p = _fit(traces, [*present, i], _started(traces, vector, i), every)
                 fits.append((float(squared_errors(traces, p).sum()), i, p))
         least = (1.0 - MIN_GAIN_RATIO) * float(squared_errors(traces, vector).sum())
         for fitted, i, p in sorted(fits, key=lambda each: each[0]):
             if fitted >= least:
-                return kept, vector
-            left = _left_out(traces, [*kept, i], p, fold_of)
+                return present, vector
+            left = _left_out(traces, [*present, i], p, fold_of)
             if _low_gain(error, left, seed) > 0.0:
-                kept, vector, error = sorted([*kept, i]), p, left
+                present, vector, error = sorted([*present, i]), p, left
                 break
         else:
-            return kept, vector
+            return present, vector
 
 
 def _drop_parts(
-    traces: Traces, kept: list[int], vector: Array, fold_of: Array, seed: int
+    traces: Traces, present: list[int], vector: Array, fold_of: Array, seed: int
 ) -> tuple[list[int], Array, Array, dict[int, float]]:
     """Return the parts without those that a later one made needless, and what each removes beside the others.
 
@@ -651,18 +651,18 @@ def _drop_parts(
     """
     every = np.ones(len(fold_of))
     while True:
-        error = _left_out(traces, kept, vector, fold_of)
+        error = _left_out(traces, present, vector, fold_of)
         gains, needless = {}, {}
-        for i in kept:
-            rest = [j for j in kept if j != i]
+        for i in present:
+            rest = [j for j in present if j != i]
             without = _fit(traces, rest, _without(vector, i), every)
             left = _left_out(traces, rest, without, fold_of)
             gains[i] = float(1.0 - error.sum() / left.sum())
             if _low_gain(left, error, seed) <= 0.0:
                 needless[i] = rest, without
         if not needless:
-            return kept, vector, error, gains
-        kept, vector = needless[min(needless, key=lambda i: gains[i])]
+            return present, vector, error, gains
+        present, vector = needless[min(needless, key=lambda i: gains[i])]
 
 
 def _started(traces: Traces, vector: Array, i: int) -> Array:
@@ -692,17 +692,17 @@ def _low_gain(before: Array, after: Array, seed: int) -> float:
 
 
 def _intervals(
-    traces: Traces, kept: Sequence[int], vector: Array, seed: int
+    traces: Traces, present: Sequence[int], vector: Array, seed: int
 ) -> dict[int, tuple[float, float]]:
     """Return the interval of each part over bootstrap samples of the runs, by one Gauss-Newton step each."""
-    if not kept:
+    if not present:
         return {}
-    a, g = _normal(traces, kept, vector, both_sides=True)
+    a, g = _normal(traces, present, vector, both_sides=True)
     counts = bootstrap_counts(len(a), DRAWS, seed).astype(float)
-    total = np.tensordot(counts, a, axes=1) + 1e-12 * np.eye(len(kept))
+    total = np.tensordot(counts, a, axes=1) + 1e-12 * np.eye(len(present))
     change = np.linalg.solve(total, (counts @ g)[..., None])[..., 0]
-    draws = np.clip(vector[list(kept)] + change, LOW[list(kept)], HIGH[list(kept)])
-    return {i: percentile_interval(draws[:, k]) for k, i in enumerate(kept)}
+    draws = np.clip(vector[list(present)] + change, LOW[list(present)], HIGH[list(present)])
+    return {i: percentile_interval(draws[:, k]) for k, i in enumerate(present)}
 
 
 def _is_excited(traces: Traces, vector: Array, i: int) -> bool:

@@ -514,8 +514,8 @@ def _slope(pairs: Sequence[tuple[Array, Array]]) -> Slope:
     means = np.array([float(np.median(pair[1] - pair[0])) for pair in pairs])
     level_std = _std_of_mean(means - level, np.array([float(pair[0].size) for pair in pairs]))
     rms = float(np.sqrt(np.mean((y - x) ** 2)))
-    moved = np.abs(y - x - level).sum() < (1.0 - EXPLAINS) * left
-    if abs(level) > max(CLEAR_STDS * level_std, LEVEL_RATIO * rms) and moved:
+    shifted = np.abs(y - x - level).sum() < (1.0 - EXPLAINS) * left
+    if abs(level) > max(CLEAR_STDS * level_std, LEVEL_RATIO * rms) and shifted:
         return Slope(math.nan, math.nan, level, level_std)
     return Slope(math.nan, math.nan)
 

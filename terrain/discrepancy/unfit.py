@@ -371,10 +371,10 @@ def _stalled_rows(run: Response, common: Array, least_s: float) -> tuple[Array, 
         rests |= known & still
         moves |= known & ~still
     stays = asked & rests & ~moves
-    kept = np.zeros(n, dtype=bool)
+    stalled = np.zeros(n, dtype=bool)
     for start, end in stretches(stays):
-        kept[start:end] = (end - start) * run.period_s >= least_s
-    return kept, asked
+        stalled[start:end] = (end - start) * run.period_s >= least_s
+    return stalled, asked
 
 
 def _stall_words(run: Response, common: Array, stay: Array) -> str:
