@@ -97,8 +97,7 @@ def motor_friction(runs: Sequence[RunLog], robot: OmniRobot) -> Finding:
         return undetermined(
             [FRICTION], "no run of motors alone: none without a pose whose motors all turn at several speeds"
         )[0]
-    motors = robot.motors
-    nm_per_a = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+    nm_per_a = robot.motors.nm_per_a
     means = np.array([each.mean(axis=0) for each in by_motor.values()])
     mean_a, slope = means.mean(axis=0)
     half = float(half_width(means[:, 0].std(ddof=1) / math.sqrt(len(means)), len(means) - 1))

@@ -185,7 +185,9 @@ def _point(run: RunLog, slip: MeasuredSlip, robot: Robot) -> tuple[float, float,
     mean_a = float(current[known].mean())
     if not robot.describes("motors"):
         return ratio, mean_a, np.nan
-    motors = robot.motors
-    torque_nm = mean_a * motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
     load_n = robot.mass_kg * GRAVITY_MPS2 / len(robot.wheels)
-    return ratio, mean_a, (torque_nm - motors.friction_nm) / robot.wheel_radius_m / load_n
+    return (
+        ratio,
+        mean_a,
+        (mean_a * robot.motors.nm_per_a - robot.motors.friction_nm) / robot.wheel_radius_m / load_n,
+    )

@@ -57,6 +57,11 @@ class Motors:
     speed_integral_nmpr: NotNegative
     speed_estimate_time_constant_s: NotNegative
 
+    @property
+    def nm_per_a(self) -> float:
+        """Torque at the wheel for an ampere of its motor."""
+        return self.torque_constant_nmpa * self.reduction_ratio * self.efficiency_ratio
+
 
 @dataclass(frozen=True, slots=True)
 class Steering:
