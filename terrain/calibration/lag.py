@@ -78,14 +78,7 @@ class Event(NamedTuple):
 
 
 def starts_and_stops(run: RunLog, robot: Robot, hard: Sequence[str]) -> list[Event]:
-    """Return the straight starts and stops of a run where it is labelled as hard ground.
-
-    Parameters
-    ----------
-    run : with the streams wheels, steering, imu and odometry; none is found without one of them
-    robot : swerve robot with all sections, whose steering zeros are about right
-    hard : terrain labels of hard ground
-    """
+    """Return the straight starts and stops of a run where it is labelled as hard ground."""
     found = []
     for label in run.labels:
         if label.terrain in hard:

@@ -592,11 +592,6 @@ def efficiencies_before(
     """Return the efficiencies (2,) of the left and the right track before a command's last window.
 
     None where there are fewer than two windows, gaps that are too long, or too few fixes.
-
-    Parameters
-    ----------
-    run, windows, robot, delay_s : as :func:`legs_of_windows` takes them
-    mount : (3,) of :class:`FittedOdometry`
     """
     origins = window_origins(run, windows)
     if len(origins) < 2:

@@ -115,13 +115,7 @@ def outside_source(run: RunLog) -> str | None:
 
 
 def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
-    """Return what a run's body travelled, as measured from outside.
-
-    Parameters
-    ----------
-    run : with one of :data:`SOURCES`
-    robot : whose log it is; where its camera sits, if the odometry is one's
-    delay_s : of the outside measurement behind the wheels; it is taken off its stamps
+    """Return what a run's body travelled, as measured from outside, ``delay_s`` before its stamps.
 
     Raises
     ------

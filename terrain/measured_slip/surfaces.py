@@ -68,14 +68,7 @@ class SurfaceSlip:
 
 
 def surface_slip(terrain: str, runs: Sequence[MeasuredSlip], rng: np.random.Generator) -> SurfaceSlip:
-    """Return what runs on one surface measured, of their windows in steady motion.
-
-    Parameters
-    ----------
-    terrain : its name
-    runs : at least one
-    rng : draws runs
-    """
+    """Return what runs on one surface measured, of their windows in steady motion."""
     steady = [run.steady for run in runs]
     slips = [run.body_slip[run.known] for run in runs]
     known = [i for i, slip in enumerate(slips) if slip.size]

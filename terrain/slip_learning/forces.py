@@ -262,12 +262,6 @@ def wheel_forces(
 ) -> WheelForces:
     """Return thrust, load and slip of each wheel of a run.
 
-    Parameters
-    ----------
-    run : log of a swerve robot with motor currents and an IMU
-    robot : its description, all sections
-    track, table, slip : state, measurements and slip by a filter with slip speeds (``vio15``)
-
     Raises
     ------
     ConfigError

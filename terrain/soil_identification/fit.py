@@ -276,13 +276,7 @@ class CohesionRow(NamedTuple):
 def cohesion_profile(
     law: Law, trials: Trials, wheel: Wheel, cohesions_pa: Sequence[float]
 ) -> list[CohesionRow]:
-    """Return how much less friction goes with a cohesion that is given.
-
-    Parameters
-    ----------
-    law, trials, wheel : as :func:`~terrain.soil_identification.fit.fit_law` takes them
-    cohesions_pa : values to hold
-    """
+    """Return how much less friction goes with a cohesion that is given."""
     rows = []
     place = law.free.index("tan_friction")
     for cohesion_pa in cohesions_pa:
