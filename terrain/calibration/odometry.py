@@ -353,7 +353,7 @@ def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> Fitted
         def residual(values: Array, error_m: float = error_m) -> Array:
             return errors_m(values) / error_m
 
-        fit = identify(residual, [*parameters, *MOUNT], number, "soft_l1", starts)
+        fit = identify(residual, [*parameters, *MOUNT], number, True, starts)
         starts, distance_m = [fit.value], np.hypot(*errors_m(fit.value).T)
         error_m = max(float(np.median(distance_m)), LEAST_ERROR_M)
     covariance = np.zeros((N_MODEL, N_MODEL))

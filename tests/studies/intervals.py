@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import truncnorm
 
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
@@ -231,10 +232,14 @@ def _skid_steer(seed: int) -> Iterator[Interval]:
 
 
 def _soil(seed: int) -> Iterator[Interval]:
-    law, hidden = LAWS["wong_reece"], {"tan_friction": 0.65, "shear_modulus_m": 0.016}
-    depth = np.array([mean for mean, _ in SINKAGES[law.sinkage].values()])
-    trials = wheel_trials(law, depth, hidden, seed)
-    found = parameters_of(fit_law(law, trials, WHEEL), trials, 40, seed)
+    """Numbers as likely as the priors take them for, and errors as large as such laws have."""
+    law, rng, hidden = LAWS["wong_reece"], np.random.default_rng(900 + seed), {}
+    for name in law.free:
+        mean, std, low, high = FORCE[name]
+        hidden[name] = truncnorm.rvs((low - mean) / std, (high - mean) / std, mean, std, random_state=rng)
+    depth = [max(rng.normal(mean, std), 1e-4) for mean, std in SINKAGES[law.sinkage].values()]
+    trials = wheel_trials(law, np.array(depth), hidden, seed, noise_ratio=0.1)
+    found = parameters_of(fit_law(law, trials, WHEEL), trials, 30, seed)
     for name, truth in hidden.items():
         yield Interval(name, *found[name].interval, truth)
 
