@@ -6,7 +6,7 @@ A use draws data with numbers that it hides, identifies them, and looks whether 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -318,7 +318,6 @@ class Settings(BaseSettings):
     uses: str = setting(",".join(USES), "Names, separated by commas.")
 
 
-@dataclass(frozen=True)
 class IntervalsResult(Result):
     """Coverage of every number in every use."""
 
