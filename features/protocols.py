@@ -28,7 +28,7 @@ from terrain.classify.slow_fast import (
     slow_fast_split,
 )
 from terrain.errors import DataError
-from terrain.logs.merge import distinct_runs
+from terrain.logs.duplicates import distinct_runs
 from terrain.logs.regimes import driven_at, regime_of
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows

@@ -22,7 +22,7 @@ from features.windows import TIME_TOLERANCE_S, Layout, WindowRule, cut_at, wheel
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.choice import Estimate, estimated_values
 from terrain.estimation.clocks import readable
-from terrain.kinematics.wheel_speed import wheel_speeds_from
+from terrain.kinematics.logged_wheels import wheel_speeds_from
 from terrain.records import Array, Reading, Stream, Windows
 from terrain.robots import Robot
 
@@ -308,7 +308,7 @@ class WindowFeed:
     """Cut windows from the readings of sensors and the estimates of a filter.
 
     The windows are those that :func:`~features.windows.cut_windows` cuts from the log with wheel speeds
-    (:func:`terrain.kinematics.wheel_speed.with_wheel_speeds`) and estimates
+    (:func:`terrain.kinematics.logged_wheels.with_wheel_speeds`) and estimates
     (:func:`terrain.estimation.enriched.enriched`).
 
     Parameters

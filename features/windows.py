@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 
 from terrain.errors import ConfigError, DataError
-from terrain.logs.plausible import refuse_implausible, usable_rows
+from terrain.logs.samples import refuse_implausible, usable_rows
 from terrain.logs.schema import SIGNAL_SETS, signal_set_of
 from terrain.logs.schema import TIME_TOLERANCE_S as TIME_TOLERANCE_S
 from terrain.records import Array, RunLog, Stream, Windows

@@ -42,14 +42,14 @@ from terrain.estimation.summary import summarize
 from terrain.estimation.table import measurement_table
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
-from terrain.kinematics.swerve import forward, wheel_velocities
-from terrain.kinematics.swerve_limits import admissible_scale, admissible_yaw_rate
+from terrain.kinematics.commands import admissible_scale, admissible_yaw_rate
+from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 from terrain.robots import Robot, load_robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
-from terrain.simulation.scenario.legs import STAND_S
+from terrain.simulation.scenario import STAND_S
 from terrain.slip import MIN_SPEED_MPS
 from terrain.terramechanics.soil import load_soil, soil_names
 from terrain.terramechanics.stiffness import response_of
@@ -444,7 +444,7 @@ def _motion_figure(estimate: Estimate) -> Figure:
         table.columns([name.format(wheel) for wheel in robot.wheels])
         for name in ("wheel_{}_radps", "steer_{}_rad")
     )
-    twist = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)[0]
+    twist = no_slip_twist(robot.wheel_positions_m, steer, robot.wheel_radius_m * rates)[0]
     panels = []
     for k, state in enumerate(("speed_x_mps", "speed_y_mps", "yaw_rate_radps")):
         mean, std = track.state(state), track.std(state)

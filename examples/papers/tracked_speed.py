@@ -21,7 +21,7 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.records import Array
-from terrain.robots.tracked import TrackedRobot
+from terrain.robots import TrackedRobot
 from terrain.status import StatusCode
 
 

@@ -10,8 +10,8 @@ arc at 30 deg/s is seen 0.2 % too slow.
 .. math::
     \hat a = (X^T X + \Lambda)^{-1} X^T y,
 
-with the clustered sandwich of :mod:`terrain.identify`: samples of a run are not counted as independent; p values are
-those of t with G - 1 degrees of freedom.  Where the columns, scaled to length 1, have a condition number above
+with the covariance by clusters of :mod:`terrain.identify`: samples of a run are not counted as independent; p values
+are those of t with G - 1 degrees of freedom.  Where the columns, scaled to length 1, have a condition number above
 :data:`ILL_CONDITIONED`, Lambda is that of ridge regression on centred and scaled columns, its size the one that
 predicts runs left out best; with 0 among the choices.
 
@@ -84,7 +84,7 @@ from terrain.estimation.observers.slip_model import (
     model_of,
     next_displacement,
 )
-from terrain.identify import Parameter, cluster_scores, half_width, identify, sandwich, select
+from terrain.identify import Parameter, half_width, identify, jackknife_covariance, leave_out, select
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
 
@@ -322,7 +322,8 @@ def fit_runs(x: Array, y: Array, run: Array, names: tuple[str, ...], *, ridge: b
     inverse = np.linalg.inv(x.T @ x + _penalty(x, size))
     coefficient = inverse @ (x.T @ y)
     residual = y - x @ coefficient
-    covariance = sandwich(cluster_scores(x * residual[:, None], number) @ inverse)
+    normal = x.T @ x + _penalty(x, size)
+    covariance = jackknife_covariance(leave_out(x, x * residual[:, None], number, normal))
     std = np.sqrt(np.diag(covariance))
     means = np.bincount(number, residual) / np.bincount(number)
     constant = bool((x == 1.0).all(axis=0).any())

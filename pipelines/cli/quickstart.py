@@ -93,7 +93,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
     from terrain.classify.folds import hold_out_runs
     from terrain.control.slip_table import load_slip_table
     from terrain.files.atomic import ensure_writable
-    from terrain.logs.merge import distinct_runs
+    from terrain.logs.duplicates import distinct_runs
 
     data, out = settings.data, settings.out
     ensure_writable(out)

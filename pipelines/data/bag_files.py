@@ -29,11 +29,10 @@ from terrain.errors import LogError, TerrainError, one_line
 from terrain.files.documents import first_fault, read_yaml
 from terrain.files.names import shown
 from terrain.files.regular import MEBIBYTE
-from terrain.logs.faults import DAMAGED_BLOCK, EARLY_END, Faults, Topic
-from terrain.logs.log_files import check_log_file, short_name
 from terrain.logs.read import RunHead
 from terrain.logs.run_topics import Messages
-from terrain.logs.topic_mapping import DISTRO, short_type
+from terrain.logs.samples import check_log_file, short_name
+from terrain.logs.topics import DAMAGED_BLOCK, DISTRO, EARLY_END, Faults, Topic, short_type
 
 if TYPE_CHECKING:
     from mcap.records import Chunk

@@ -10,11 +10,7 @@ from pathlib import Path
 from pipelines.data.bag_files import Bag, decoder_of, find_bags, messages_of, open_bag, topics_of
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
-from terrain.logs.borealtc import whole_run_label
-from terrain.logs.faults import Faults, Topic
-from terrain.logs.log_files import checked_names, short_name
-from terrain.logs.parquet_file import MAX_VALUES
-from terrain.logs.recorded_windows import RecordedWindow, window_of_text
+from terrain.logs.labels import RecordedWindow, whole_run_label, window_of_text
 from terrain.logs.run_topics import (
     RUN_TOPIC,
     STRING,
@@ -24,10 +20,17 @@ from terrain.logs.run_topics import (
     run_of,
     string_of,
 )
-from terrain.logs.samples import refuse_apart
-from terrain.logs.topic_mapping import Mapping as TopicMapping
-from terrain.logs.topic_mapping import check_stream, load_mapping, standard_mapping
-from terrain.logs.topic_streams import MappedTopics
+from terrain.logs.samples import checked_names, refuse_apart, short_name
+from terrain.logs.tables import MAX_VALUES
+from terrain.logs.topics import (
+    Faults,
+    MappedTopics,
+    Topic,
+    TopicMapping,
+    check_stream,
+    load_mapping,
+    standard_mapping,
+)
 from terrain.records import RunLog, Stream
 from terrain.robots import Robot, robot_named
 
@@ -39,7 +42,7 @@ def find_runs(place: Path, mapping: str | Path | None, robot: Robot | None) -> l
     ----------
     place : folder of bags, the folder of a bag or a file; one in a folder of its own is labelled with that
         folder's name as its terrain
-    mapping : YAML file (:mod:`terrain.logs.topic_mapping`); by the types of the topics by default
+    mapping : YAML file (:mod:`terrain.logs.topics`); by the types of the topics by default
     robot : of all runs that do not name theirs; that of the mapping by default
     """
     if place.is_file():  # one that the user names may be a link

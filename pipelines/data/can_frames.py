@@ -31,7 +31,7 @@ from terrain.errors import ConfigError, LogError, one_line
 from terrain.files.documents import read_yaml
 from terrain.files.resources import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.logs.borealtc import whole_run_label
+from terrain.logs.labels import whole_run_label
 from terrain.logs.mapping import check_unit
 from terrain.logs.parts import Assembler, Part
 from terrain.logs.samples import checked_stream

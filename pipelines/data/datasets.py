@@ -14,8 +14,8 @@ from terrain.errors import ConfigError, LogError
 
 if TYPE_CHECKING:
     from pipelines.data.runs import Runs
-    from terrain.logs.checks import Check
     from terrain.logs.drive import DriveRobot
+    from terrain.logs.plausibility import Check
     from terrain.records import RunLog
     from terrain.robots import Robot
 
@@ -62,12 +62,11 @@ class RunLoader(NamedTuple):
         run = self.read(repair=self.repair)
         wheels = run.streams.get("wheels")
         if wheels is not None and any(channel.startswith("motor_") for channel in wheels.channels):
-            from terrain.kinematics.wheel_speed import with_wheel_speeds
+            from terrain.kinematics.logged_wheels import with_wheel_speeds
 
             run = with_wheel_speeds(run, robot_named(run.robot, self.robot))
         if self.align:
-            from terrain.logs.align import align
-            from terrain.logs.clock import estimate_clock
+            from terrain.logs.clock import align, estimate_clock
 
             run = align(run, estimate_clock(run, track_m=robot_named(run.robot, self.robot).track_m))
         return run
@@ -96,7 +95,7 @@ def load_runs(folder: str | Path, *, robot: str | Path | None = None, **reading:
         :data:`DRIVE_ROBOT` by default
     layout : one of :data:`~pipelines.data.settings.Layout`; ``auto`` looks, as by default
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
-        their DBC, by default AgriMaRo's; of bags their topics (``terrain.logs.topic_mapping``)
+        their DBC, by default AgriMaRo's; of bags their topics (``terrain.logs.topics``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
 
@@ -181,8 +180,7 @@ def verdict(run: RunLog, robot: Robot | None = None) -> tuple[Check, ...]:
     run : as a reader returns it
     robot : that the user named; where the run names another, that of the package
     """
-    from terrain.logs.plausibility import judge
-    from terrain.logs.turn_checks import Scale
+    from terrain.logs.plausibility import Scale, judge
     from terrain.robots import robot_named
 
     try:
@@ -251,7 +249,7 @@ def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:
     """Return the readers of files by a mapping; a stream may lie in a bag."""
     from pipelines.data import bag_runs
     from terrain.logs import mapping as by_mapping
-    from terrain.logs.topic_mapping import check_stream
+    from terrain.logs.topics import check_stream
 
     read = by_mapping.load_mapping(mapping, check_stream)
     radius_m = bag_runs.wheel_radius_m(read.robot, robot)

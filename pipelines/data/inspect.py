@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from features.breaks import OddStretch
-    from terrain.logs.checks import Check
     from terrain.logs.clock import ClockEstimate
     from terrain.logs.duplicates import SharedStretch
+    from terrain.logs.plausibility import Check
     from terrain.logs.quality import StreamQuality
     from terrain.records import RunLog
     from terrain.robots import Robot
@@ -125,7 +125,7 @@ def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
 
 def report(result: Inspection) -> Report:
     """Return what is odd about the runs first, then rates and gaps of their streams, then their clocks."""
-    from terrain.logs.merge import sentences
+    from terrain.logs.duplicates import sentences
     from terrain.logs.plausibility import doubt_sentences, doubts_of, worst
 
     doubts = list(doubt_sentences(doubts_of({each.run_id: each.plausibility for each in result.runs})))

@@ -48,7 +48,7 @@ from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import KnownTerrain
 from terrain.errors import ConfigError
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
-from terrain.simulation.faults.catalogue import fault_catalogue, select_faults
+from terrain.simulation.faults import fault_catalogue, select_faults
 
 if TYPE_CHECKING:
     from pipelines.drive.drive import Settings
@@ -311,6 +311,6 @@ def _named(rows: Sequence[FaultRow]) -> str:
     """Return the sensors that were named in any row, each with its statuses."""
     named: dict[str, set[str]] = defaultdict(set)
     for row in rows:
-        for sensor, statuses in (row.blamed or {}).items():
+        for sensor, statuses in (row.sensors_named or {}).items():
             named[sensor].update(statuses.split(", "))
     return "; ".join(f"{sensor}: {', '.join(sorted(named[sensor]))}" for sensor in sorted(named))

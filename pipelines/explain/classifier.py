@@ -15,7 +15,7 @@ from pipelines.report.numbers import plural
 from pipelines.report.results import Progress, silent
 from terrain.discrepancy.held_out import Comparison, accuracy_change
 from terrain.errors import TerrainError
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog
 from terrain.robots import Robot

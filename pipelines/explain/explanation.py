@@ -14,25 +14,23 @@ from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, T
 from pipelines.report.versions import versions
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
-from terrain.discrepancy.powertrain_answer import PowertrainAnswer
+from terrain.discrepancy.powertrain import PowertrainAnswer
 from terrain.discrepancy.robot_terms import quantity
-from terrain.discrepancy.sentences import (
+from terrain.discrepancy.statements import (
+    CHANNEL_WORDS,
+    SESSION_COLUMNS,
+    Statement,
     channel_label,
     effect_label,
     gain_text,
     in_words_of,
     limit_text,
     quantity_interval,
+    session_rows,
+    split_ruled_out,
     value_with_interval,
     varying_text,
     verdict_text,
-)
-from terrain.discrepancy.statements import (
-    CHANNEL_WORDS,
-    SESSION_COLUMNS,
-    Statement,
-    session_rows,
-    split_ruled_out,
 )
 from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import effect_named

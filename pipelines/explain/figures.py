@@ -12,8 +12,7 @@ from terrain.discrepancy.constancy import PartValues
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.residuals import binned_means, noise_spectrum, run_means, spectrum
 from terrain.discrepancy.robot_terms import quantity
-from terrain.discrepancy.sentences import channel_label
-from terrain.discrepancy.statements import CHANNEL_WORDS, INPUT_LABELS
+from terrain.discrepancy.statements import CHANNEL_WORDS, INPUT_LABELS, channel_label
 from terrain.effects import CHANNELS
 from terrain.records import Array
 

@@ -34,9 +34,7 @@ from terrain import __version__
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
 from terrain.logs.digest import data_digest, joint_digest
-from terrain.logs.duplicates import PrintFiles, shared_stretches
-from terrain.logs.fingerprints import RunPrint, run_print
-from terrain.logs.merge import sentences
+from terrain.logs.duplicates import PrintFiles, RunPrint, run_print, sentences, shared_stretches
 from terrain.records import Array, RunLog, Stream, Windows
 
 FORMAT_VERSION = 5
@@ -50,7 +48,7 @@ class RunHead(NamedTuple):
     run_id, robot, filter, digest : of the run; the digest is of its content
     streams : name, channels and sample period in s of each
     repaired : what a repairing reader dropped, as counts by kind
-    print_digest : of its samples, see :class:`~terrain.logs.fingerprints.RunPrint`
+    print_digest : of its samples, see :class:`~terrain.logs.duplicates.RunPrint`
     fault : why it was skipped; empty of one that was read
     """
 

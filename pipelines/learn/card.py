@@ -140,8 +140,7 @@ def write_training(folder: Path, name: str, record: TrainingRecord) -> ModelResu
     timed: dict[str, Any] = {"latency_ms": 1e3 * float(np.median(times_s))}
     if (folder / ONNX_FILE).is_file():
         onnx_times_s = time_of_onnx((folder / ONNX_FILE).read_bytes(), window, N_TIMED)
-        if onnx_times_s is not None:
-            timed["onnx_latency_ms"] = 1e3 * float(np.median(onnx_times_s))
+        timed["onnx_latency_ms"] = 1e3 * float(np.median(onnx_times_s))
     record = record.model_copy(update=timed)
     atomic_write(folder / TRAINING_FILE, record.model_dump_json(indent=1) + "\n")
     seal(folder, model.info)

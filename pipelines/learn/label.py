@@ -21,7 +21,7 @@ from terrain.files.names import plain_name
 
 if TYPE_CHECKING:
     from terrain.classify.proposals import LabelSource, Proposal
-    from terrain.logs.recorded_windows import DoubtfulWindow, RunWindows
+    from terrain.logs.labels import DoubtfulWindow, RunWindows
     from terrain.records import Label, RunLog
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
@@ -143,8 +143,7 @@ def run(
     TerrainError
         if a file cannot be written.
     """
-    from terrain.logs.labels import set_label
-    from terrain.logs.recorded_windows import doubtful_windows
+    from terrain.logs.labels import doubtful_windows, set_label
 
     if settings.model is not None:
         return _propose(settings, settings.model)
@@ -231,8 +230,8 @@ def _checked_answers(file: Path, runs: Sequence[RunLog], *, new_class: bool) -> 
     """Return the proposals of a table with their answers; an empty one leaves a proposal to its confidence."""
     from terrain.classify.proposals import Proposal, check_answers
     from terrain.files.documents import first_fault
-    from terrain.logs.borealtc import whole_run_label
-    from terrain.logs.csv_table import text_rows
+    from terrain.logs.labels import whole_run_label
+    from terrain.logs.tables import text_rows
 
     proposal = TypeAdapter(Proposal, config=ConfigDict(allow_inf_nan=False))
     rows = []

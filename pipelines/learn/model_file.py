@@ -1,7 +1,7 @@
 """A trained model as a folder: ``model.skops``, ``network.onnx`` where it has one, and a manifest.
 
 The scikit-learn part is loaded by skops with the fixed list of types below and nothing else, so that a file
-cannot bring code of its own; the network is stored as ONNX, from which its numbers are read.  The manifest,
+cannot bring code of its own; the network is an ONNX graph, of operators that only compute.  The manifest,
 written last, says how windows must be cut and holds the checksums of all files: a damaged folder is
 distinguished from an intact one.  A registered model is a copy of such a folder.
 """
@@ -27,9 +27,8 @@ from features.samples import is_centred
 from features.windows import Layout, WindowRule
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain import __version__
-from terrain.classify.network_numbers import check_network
-from terrain.classify.network_onnx import network_onnx, numbers_of_onnx
-from terrain.classify.novelty import NoveltyNumbers, check_novelty
+from terrain.classify.network_onnx import check_network, with_centred
+from terrain.classify.novelty import Novelty, check_novelty
 from terrain.classify.support import SupportTable, check_support
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
@@ -70,8 +69,8 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "terrain.classify.grouped_network.NetworkChoice",
     "terrain.classify.grouped_network.Trial",
     "terrain.classify.ground_response.GroundResponse",
-    "terrain.classify.network_numbers.SampleColumns",
-    "terrain.classify.novelty.NoveltyNumbers",
+    "terrain.classify.network_input.SampleColumns",
+    "terrain.classify.novelty.Novelty",
     "terrain.classify.own.OwnClassifier",
     "terrain.classify.ground_response.Process",
     "terrain.classify.response.GroupedResponse",
@@ -125,25 +124,24 @@ def write_model(folder: Path, model: TerrainModel) -> None:
         if it has a network and onnx is not installed.
     """
     network = _network(model.recipe)
-    numbers = None if network is None else network.numbers_
+    graph = None if network is None else network.onnx_
     try:
         if network is not None:
-            network.numbers_ = None  # they lie in a file of their own
+            network.onnx_ = b""  # it lies in a file of its own
         content = packed({"recipe": model.recipe, "novelty": model.novelty, "support": model.support})
     finally:
         if network is not None:
-            network.numbers_ = numbers
+            network.onnx_ = graph
     for name in (MANIFEST_FILE, *FILES):  # of a model that lay there
         (folder / name).unlink(missing_ok=True)
     atomic_write(folder / MODEL_FILE, content)
-    if numbers is not None:
+    if network is not None:
         levels = model.recipe[0].matrix.level_sets
         centred = {
             each.stream: [is_centred(each.stream, name, levels) for name in each.channels]
-            for each in numbers.columns
+            for each in network.columns
         }
-        onnx = network_onnx(numbers, model.info.classes, model.info.window_s, centred)
-        atomic_write(folder / ONNX_FILE, onnx)
+        atomic_write(folder / ONNX_FILE, with_centred(graph, centred, model.info.window_s))
     seal(folder, model.info)
 
 
@@ -190,8 +188,8 @@ def read_model(source: str | Path) -> TerrainModel:
         recipe, novelty, support = _unpacked(contents[MODEL_FILE])
         if (network := _network(recipe)) is not None:
             file = folder / ONNX_FILE
-            network.numbers_ = numbers_of_onnx(contents[ONNX_FILE], network.columns)
-            check_network(network.numbers_, len(info.classes))
+            network.onnx_ = with_centred(contents[ONNX_FILE], {}, info.window_s)
+            check_network(network.onnx_, network.columns, len(info.classes))
             file = folder / MODEL_FILE
         if tuple(str(name) for name in recipe.classes_) != info.classes:
             raise DataError("its classes are not those of the manifest")
@@ -204,10 +202,8 @@ def read_model(source: str | Path) -> TerrainModel:
         if novelty is not None:
             check_novelty(novelty, len(info.classes))
             n_features = recipe.matrix.of(window).shape[1]
-            if novelty.settings[1] != n_features:
-                raise DataError(
-                    f"its novelty score is of {novelty.settings[1]:.0f} features; it has {n_features}"
-                )
+            if novelty.n_features != n_features:
+                raise DataError(f"its novelty score is of {novelty.n_features} features; it has {n_features}")
     except ConfigError:
         raise
     except Exception as error:  # skops, numpy and scikit-learn raise whatever a stranger's file leads them to
@@ -341,10 +337,10 @@ def _load_pyfunc(path: str) -> Any:
 def _network(recipe: WindowPipeline) -> Any:
     """Return the fitted network of a recipe; None where it has none."""
     last = recipe[-1]
-    return last if hasattr(last, "numbers_") else getattr(last, "network_", None)
+    return last if hasattr(last, "onnx_") else getattr(last, "network_", None)
 
 
-def _unpacked(content: bytes) -> tuple[WindowPipeline, NoveltyNumbers | None, SupportTable | None]:
+def _unpacked(content: bytes) -> tuple[WindowPipeline, Novelty | None, SupportTable | None]:
     """Return recipe, novelty score and support of a model file; ``DataError`` says why it is none."""
     from skops import io
 
@@ -363,7 +359,7 @@ def _unpacked(content: bytes) -> tuple[WindowPipeline, NoveltyNumbers | None, Su
         raise DataError(f"it holds a {type(recipe).__name__}, not a recipe of this package")
     if not hasattr(recipe[0], "layout_"):
         raise DataError("it holds a recipe that was never fitted")
-    for limit, kind in ((novelty, NoveltyNumbers), (support, SupportTable)):
+    for limit, kind in ((novelty, Novelty), (support, SupportTable)):
         if limit is not None and not isinstance(limit, kind):
             raise DataError(f"it holds a {type(limit).__name__}, {kind.__name__} is read")
     return recipe, novelty, support

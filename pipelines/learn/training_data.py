@@ -18,7 +18,9 @@ from pipelines.learn.model_file import model_info
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
-from terrain.classify.limits import learn_limits
+from terrain.classify.conformal import conformal_threshold, held_out_scores
+from terrain.classify.novelty import learn_novelty
+from terrain.classify.support import learn_support
 from terrain.errors import DataError
 from terrain.logs.digest import data_digest
 from terrain.logs.schema import ESTIMATED
@@ -156,11 +158,20 @@ def with_limits(
     recipe, info : fitted on the windows, and what is known of it
     samples, features, motion : the windows, their features (n, f), and how the robot moved in each, if known
     """
-    moved = None if motion is None else motion[:2]
+    notes, conformal, novelty, support = [], None, None, None
     terrain, run_id = samples.terrain, samples.run_id
-    limits = learn_limits(recipe[-1], features, terrain, run_id, moved, samples.gap, info.seed)
-    info = replace(info, conformal=limits.conformal)
-    return TerrainModel(recipe, info, limits.novelty, limits.support), limits.notes
+    try:
+        novelty = learn_novelty(features, terrain, run_id, gap=samples.gap, seed=info.seed)
+    except DataError as error:
+        notes.append(f"no window is ever called unknown: {error}")
+    try:
+        conformal = conformal_threshold(held_out_scores(recipe[-1], terrain), run_id)
+    except (AttributeError, DataError) as error:
+        notes.append(f"no sets of terrains: {error}")
+    if motion is not None:
+        driven = motion.speed_mps, motion.yaw_rate_radps
+        support = learn_support(*driven, terrain, run_id, np.unique(terrain).tolist())
+    return TerrainModel(recipe, replace(info, conformal=conformal), novelty, support), tuple(notes)
 
 
 def fitted_model(

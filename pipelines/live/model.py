@@ -18,7 +18,7 @@ from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.report.results import described
 from terrain.classify.conformal import conformal_sets
-from terrain.classify.novelty import NoveltyNumbers, novelty_scores
+from terrain.classify.novelty import Novelty
 from terrain.classify.support import SupportTable, support_of
 from terrain.classify.terrain_filter import TerrainFilter
 from terrain.records import Array, Windows
@@ -77,7 +77,7 @@ class TerrainModel(NamedTuple):
 
     recipe: Any
     info: ModelInfo
-    novelty: NoveltyNumbers | None = None
+    novelty: Novelty | None = None
     support: SupportTable | None = None
     over_time: TerrainFilter | None = None
 
@@ -111,7 +111,7 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
     features, recipe = None, model.recipe
     if model.novelty is not None:
         features = recipe.matrix.of(windows)
-        novelty = novelty_scores(model.novelty, features)
+        novelty = model.novelty.score(features)
     from_features = getattr(recipe, "probabilities", None)  # takes features that are there already
     probability = np.asarray(
         recipe.predict_proba(windows) if from_features is None else from_features(windows, features)

@@ -26,8 +26,8 @@ import numpy as np
 from pipelines.data.bag_files import McapWriter
 from pipelines.live.chain import CommandStatus, Step
 from terrain.control.switching import SWITCHING
+from terrain.logs.labels import RecordedWindow
 from terrain.logs.read import RunHead
-from terrain.logs.recorded_windows import RecordedWindow
 from terrain.logs.replay import TWIST
 from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, RunRecorder, check_recordable
 from terrain.logs.samples import BAD_TIME

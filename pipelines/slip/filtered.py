@@ -31,7 +31,7 @@ from terrain.estimation.reference import lagged_slip_at
 from terrain.estimation.stuck import stuck_intervals
 from terrain.estimation.summary import EstimateSummary, summarize
 from terrain.estimation.tuned_noise import TunedNoise, tuned_noise
-from terrain.kinematics.swerve import forward
+from terrain.kinematics.wheels import no_slip_twist
 from terrain.logs.clock import offsets_apart_s
 from terrain.records import GATED, Array, RunLog
 from terrain.robots import Robot, packaged_robot
@@ -203,7 +203,7 @@ def _measured(estimate: Estimate) -> dict[str, dict[str, Array]]:
         }
     rates = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
     steer = table.columns([f"steer_{wheel}_rad" for wheel in robot.wheels])
-    twist = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)[0]
+    twist = no_slip_twist(robot.wheel_positions_m, steer, robot.wheel_radius_m * rates)[0]
     found = {}
     for state, wheels in zip(("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), twist.T, strict=True):
         found[state] = {"encoders, forward kinematics": wheels}

@@ -29,7 +29,7 @@ from terrain.calibration.finding import Finding, undetermined
 from terrain.calibration.sensors import MAX_GAP_S, Stretch, at_times, origin_twist
 from terrain.estimation.resampling import low_pass
 from terrain.identify import half_width
-from terrain.kinematics.swerve import forward
+from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
@@ -78,14 +78,7 @@ class Event(NamedTuple):
 
 
 def starts_and_stops(run: RunLog, robot: Robot, hard: Sequence[str]) -> list[Event]:
-    """Return the straight starts and stops of a run where it is labelled as hard ground.
-
-    Parameters
-    ----------
-    run : with the streams wheels, steering, imu and odometry; none is found without one of them
-    robot : swerve robot with all sections, whose steering zeros are about right
-    hard : terrain labels of hard ground
-    """
+    """Return the straight starts and stops of a run where it is labelled as hard ground."""
     found = []
     for label in run.labels:
         if label.terrain in hard:
@@ -152,8 +145,8 @@ def _within(stretch: Stretch, robot: Robot) -> list[Event]:
     time_s = wheels.time_s
     zeros = (steering.zero_1_rad, steering.zero_2_rad, steering.zero_3_rad)
     steer = at_times(Stream(angles.time_s, np.unwrap(angles.values, axis=0) - zeros, angles.channels), time_s)
-    wheel_speed, _ = forward(
-        robot.wheel_positions_m, robot.wheel_radius_m, wheels.values / motors.reduction_ratio, steer
+    wheel_speed, _ = no_slip_twist(
+        robot.wheel_positions_m, steer, robot.wheel_radius_m * (wheels.values / motors.reduction_ratio)
     )
     imu = Stream(imu.time_s - sensors.imu_latency_s, imu.values, imu.channels)
     found = []

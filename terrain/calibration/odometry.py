@@ -60,7 +60,7 @@ from terrain.estimation.observers.slip_odometry import ROWS as ODOMETRY_ROWS
 from terrain.estimation.observers.tracked import ROWS, tracked_observer
 from terrain.estimation.observers.tracked_settings import TrackedSettings
 from terrain.identify import Fit, Parameter, deal, folds, identify
-from terrain.logs.drive_poses import WindowPoses
+from terrain.logs.drive import WindowPoses
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
 
@@ -353,7 +353,7 @@ def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> Fitted
         def residual(values: Array, error_m: float = error_m) -> Array:
             return errors_m(values) / error_m
 
-        fit = identify(residual, [*parameters, *MOUNT], number, "soft_l1", starts)
+        fit = identify(residual, [*parameters, *MOUNT], number, True, starts)
         starts, distance_m = [fit.value], np.hypot(*errors_m(fit.value).T)
         error_m = max(float(np.median(distance_m)), LEAST_ERROR_M)
     covariance = np.zeros((N_MODEL, N_MODEL))
@@ -592,11 +592,6 @@ def efficiencies_before(
     """Return the efficiencies (2,) of the left and the right track before a command's last window.
 
     None where there are fewer than two windows, gaps that are too long, or too few fixes.
-
-    Parameters
-    ----------
-    run, windows, robot, delay_s : as :func:`legs_of_windows` takes them
-    mount : (3,) of :class:`FittedOdometry`
     """
     origins = window_origins(run, windows)
     if len(origins) < 2:

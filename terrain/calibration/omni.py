@@ -35,7 +35,7 @@ from terrain.measured_slip.delay import estimate_delay
 from terrain.measured_slip.rollers import MIN_RUNS, RollerFindings, distance_bound, roller_findings
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip, outside_source
 from terrain.records import Array, RunLog
-from terrain.robots.omni import OmniRobot
+from terrain.robots import OmniRobot
 
 FRICTION = "motors.friction_nm"
 COM_X, COM_Y = "body.com_x_m", "body.com_y_m"
@@ -97,8 +97,7 @@ def motor_friction(runs: Sequence[RunLog], robot: OmniRobot) -> Finding:
         return undetermined(
             [FRICTION], "no run of motors alone: none without a pose whose motors all turn at several speeds"
         )[0]
-    motors = robot.motors
-    nm_per_a = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+    nm_per_a = robot.motors.nm_per_a
     means = np.array([each.mean(axis=0) for each in by_motor.values()])
     mean_a, slope = means.mean(axis=0)
     half = float(half_width(means[:, 0].std(ddof=1) / math.sqrt(len(means)), len(means) - 1))

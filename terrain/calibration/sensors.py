@@ -33,7 +33,7 @@ from terrain.errors import DataError
 from terrain.estimation.feed import MIN_CONFIDENCE_RATIO
 from terrain.identify import Parameter, half_width, identify, std_interval
 from terrain.kinematics.camera import CHANNELS, body_motion
-from terrain.kinematics.wheel_velocity import TWIST, point_velocity
+from terrain.kinematics.wheels import TWIST, point_velocity
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
@@ -89,12 +89,6 @@ def standing(run: RunLog, robot: Robot, min_s: float = MIN_STANDING_S) -> list[S
 
     The wheels stand, where the log has any; the IMU is there, scatters about its noise, turns by no more
     than a bias can, and is not frozen.  What is returned is short of the motion at either end by a block.
-
-    Parameters
-    ----------
-    run : with the stream ``imu``
-    robot : with all sections
-    min_s : least length
     """
     _, motors, _, _, sensors = robot.equipment
     imu = Stretch(run).of("imu", GYRO + ACCEL)
@@ -130,12 +124,7 @@ def batches(stream: Stream, length_s: float = BATCH_S) -> Iterator[Array]:
 
 
 def gyro_bias(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
-    """Return the biases of the three gyros and how much they differ from one power-on to the next.
-
-    Parameters
-    ----------
-    stretches : standing, of any runs; each run is taken for a power-on
-    robot : with sensors described
+    """Return the biases of the three gyros and how much they differ from one power-on (each run) to the next.
 
     Notes
     -----
@@ -290,13 +279,7 @@ def fit_gravity(means_mps2: Array, variance: Array) -> tuple[Array, Array, Array
 
 
 def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
-    """Return biases and scales of the accelerometer, and how much the biases differ between power-ons.
-
-    Parameters
-    ----------
-    stretches : standing, of at least :data:`MIN_POSITION_S`, of any runs; a run counts that has six positions
-    robot : with sensors described
-    """
+    """Return biases and scales of the accelerometer by runs held in six positions, and how much biases differ."""
     bias_names = [f"sensors.accel_bias_{axis}_mps2" for axis in "xyz"]
     scale_names = [f"sensors.accel_scale_{axis}_ratio" for axis in "xyz"]
     std_name = "sensors.accel_bias_std_mps2"
@@ -351,11 +334,6 @@ NOISE_FLOOR = 1e-5
 
 def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     """Return the standard deviation of the noise of each kind of sensor at rest.
-
-    Parameters
-    ----------
-    stretches : standing, of any runs
-    robot : swerve robot with all sections
 
     Notes
     -----

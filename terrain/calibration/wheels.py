@@ -34,7 +34,7 @@ import numpy as np
 from terrain.calibration.finding import Finding, around, undetermined
 from terrain.calibration.sensors import Stretch, at_times, origin_twist
 from terrain.identify import half_width
-from terrain.kinematics.swerve import wheel_velocities
+from terrain.kinematics.wheels import wheel_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
@@ -81,12 +81,6 @@ class Steady(NamedTuple):
 
 def steady_stretches(run: RunLog, robot: Robot, hard: Sequence[str]) -> list[Steady]:
     """Return the steady stretches of a run where it is labelled as hard ground; none without a camera.
-
-    Parameters
-    ----------
-    run : with the streams wheels, steering and odometry
-    robot : swerve robot with all sections
-    hard : terrain labels of hard ground
 
     Notes
     -----
@@ -227,11 +221,6 @@ a slip stiffness of 10 to 20 loads."""
 def steering_zeros(stretches: Sequence[Steady], robot: Robot) -> list[Finding]:
     """Return the zero of each steering encoder.
 
-    Parameters
-    ----------
-    stretches : steady, of any runs
-    robot : swerve robot with all sections
-
     Notes
     -----
     Least squares with Huber's weights on the equations of this module's head.  The interval is that of
@@ -266,11 +255,6 @@ def steering_zeros(stretches: Sequence[Steady], robot: Robot) -> list[Finding]:
 
 def reduction_ratio(stretches: Sequence[Steady], robot: Robot) -> Finding:
     """Return the reduction ratio from motor rates and the speed over ground, with the described wheel radius.
-
-    Parameters
-    ----------
-    stretches : steady, of any runs
-    robot : swerve robot with all sections
 
     Notes
     -----

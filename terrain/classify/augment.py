@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from terrain.classify.network_numbers import SampleColumns
+from terrain.classify.network_input import SampleColumns
 from terrain.records import Array
 
 GAIN_STD = 0.5

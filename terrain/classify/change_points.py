@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.records import Array
 
@@ -64,36 +63,21 @@ def change_points(values: Array) -> list[Break]:
 
 
 def _partition(z: Array, least: int, penalty: float) -> list[int]:
-    """Return the end of each segment, in order."""
-    origin = _origins(z, least, penalty)
-    ends, end = [], len(z)
-    while end > 0:
-        ends.append(end)
-        end = int(origin[end])
-    return ends[::-1]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _origins(z: Array, least: int, penalty: float) -> Array:
-    """Return, for each end (n + 1,), where the last segment of the best partition up to it begins."""
-    n, c = z.shape
-    sums, squares = np.zeros((n + 1, c)), np.zeros(n + 1)
-    for i in range(n):
-        squares[i + 1] = squares[i]
-        for j in range(c):
-            sums[i + 1, j] = sums[i, j] + z[i, j]
-            squares[i + 1] += z[i, j] * z[i, j]
-    best = np.full(n + 1, np.inf)
-    origin = np.zeros(n + 1, dtype=np.int64)
+    """Return the end of each segment of the best partition, in order."""
+    n = len(z)
+    sums = np.concatenate([np.zeros((1, z.shape[1])), np.cumsum(z, axis=0)])
+    squares = np.concatenate([[0.0], np.cumsum(np.square(z).sum(axis=1))])
+    best, origin = np.full(n + 1, np.inf), np.zeros(n + 1, dtype=int)
     best[0] = -penalty
     for end in range(least, n + 1):
-        for first in range(end - least + 1):
-            if best[first] < np.inf:
-                cost = squares[end] - squares[first]
-                for j in range(c):
-                    total = sums[end, j] - sums[first, j]
-                    cost -= total * total / (end - first)
-                if best[first] + cost + penalty < best[end]:
-                    best[end] = best[first] + cost + penalty
-                    origin[end] = first
-    return origin
+        first = np.arange(end - least + 1)
+        within = (
+            squares[end] - squares[first] - np.square(sums[end] - sums[first]).sum(axis=1) / (end - first)
+        )
+        costs = best[first] + within + penalty
+        origin[end] = costs.argmin()
+        best[end] = costs[origin[end]]
+    ends = [n]
+    while origin[ends[-1]] > 0:
+        ends.append(int(origin[ends[-1]]))
+    return ends[::-1]

@@ -6,7 +6,7 @@ dealing; with runs of unequal length nearly every seed gives the same folds, and
 meaningless.)  A class that has a single run cannot be both held out whole and trained on: its run is
 cut into contiguous blocks, and training windows beside a test block are left out.
 
-Out-of-fold probabilities inside a training part: what a threshold or a calibration may be fitted to.
+Inner folds of a training part give out-of-fold probabilities, which a threshold or a calibration may be fitted to.
 """
 
 from __future__ import annotations
@@ -36,6 +36,14 @@ class Fold(NamedTuple):
     number: int
     train: Array
     test: Array
+
+
+def two_classes(y: Array) -> Array:
+    """Return the classes (k,) of rows (n,); ``DataError`` where there is one only."""
+    classes = np.unique(y)
+    if len(classes) < 2:
+        raise DataError(f"all windows are {str(classes[0])!r}: a classifier needs at least two classes")
+    return classes
 
 
 def single_run_classes(y: Array, groups: Array) -> list[Any]:
@@ -79,8 +87,7 @@ def fold_numbers(y: Array, groups: Array, n_folds: int, rng: np.random.Generator
     DataError
         if there is one class only, or fewer groups than folds.
     """
-    if len(np.unique(y)) < 2:
-        raise DataError(f"all windows are {str(np.unique(y)[0])!r}: a classifier needs at least two classes")
+    two_classes(y)
     names, group_of = np.unique(np.asarray(groups, dtype=str), return_inverse=True)
     if len(names) < n_folds:
         raise DataError(f"{len(names)} runs are fewer than {n_folds} folds")

@@ -1,10 +1,8 @@
 r"""How one ground answers: what responses of the wheels to expect at a regime of motion, and their scatter.
 
 Responses are of a wheel (its current, its slip) or of the whole robot (the slip of its body).  Each quantity
-is a process over the regime (:mod:`terrain.classify.ground_response`); what is left of all of them together
+is a process over the regime of motion; what is left of all of them together
 has one covariance: that of means of runs that were left out, and that of windows within a run.
-
-What wheels answer to how they are driven: Gaussian processes over the regime of motion.
 
 A motor's current on a given ground depends on how its wheel is driven: how fast, and in which direction
 relative to the other wheels.  The *regime* of wheel i among W is what all wheels roll, in order from it,

@@ -3,40 +3,32 @@
 Steps of ``fit``: standardise by all rows; on all inner folds of whole runs choose the augmentation; fit one
 network an inner fold, stopped where its held-out runs are most likely; their held-out probabilities give the
 temperature; fit the members anew on all runs, for the mean number of epochs of these networks: with few runs,
-each one counts.  What is fitted is kept as
-:class:`~terrain.classify.network_numbers.NetworkNumbers`: it predicts without torch.
+each one counts.  What is fitted is kept as a graph (:mod:`terrain.classify.network_onnx`): it predicts without
+torch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from sklearn.base import BaseEstimator, ClassifierMixin
-from sklearn.utils.multiclass import check_classification_targets
-from sklearn.utils.validation import check_is_fitted, validate_data
 
 from terrain.classify.augment import Augmentation, mirrors_of
 from terrain.classify.folds import inner_splits
+from terrain.classify.grouped import GroupedClassifier
 from terrain.classify.network import (
     Task,
     fit_member,
     fit_on_all,
-    network_numbers_of,
     reproducible,
     require_torch,
     task_of,
+    weights_of,
 )
-from terrain.classify.network_numbers import (
-    SampleColumns,
-    log_softmax,
-    mean_log_probabilities,
-    probabilities,
-    softmax,
-    streams_of,
-)
+from terrain.classify.network_input import SampleColumns, log_softmax, softmax, streams_of
+from terrain.classify.network_onnx import log_probabilities, network_onnx, require_onnx
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -60,12 +52,12 @@ class Trial(NamedTuple):
     loss: float
 
 
-class GroupedNetwork(ClassifierMixin, BaseEstimator):
+class GroupedNetwork(GroupedClassifier):
     """Ensemble of small convolutional networks that keeps runs whole.
 
     Parameters
     ----------
-    columns : :class:`~terrain.classify.network_numbers.SampleColumns` of each stream
+    columns : :class:`~terrain.classify.network_input.SampleColumns` of each stream
     n_inner_folds : networks that choose and calibrate, one an inner fold
     n_members : networks that predict, each fitted on all runs
     epochs : at most, of each
@@ -79,7 +71,7 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
     best_ : :class:`NetworkChoice`
     trials_ : :class:`Trial` of each augmentation that was tried
     inner_probability_ : (n, k) of each training row by the member that did not see its run; NaN where all did
-    numbers_ : what it predicts with
+    onnx_ : the graph that it predicts with
     """
 
     def __init__(
@@ -112,19 +104,14 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
         Raises
         ------
         ConfigError
-            if torch is not installed.
+            if torch or onnx is not installed.
         DataError
             if there is one class only, too few windows to hold some of them out, or other columns.
         """
-        X, y = validate_data(self, X, y, ensure_all_finite="allow-nan")
-        check_classification_targets(y)
         require_torch()
-        self.classes_, class_index = np.unique(y, return_inverse=True)
-        if len(self.classes_) < 2:
-            raise DataError(
-                f"all windows are {str(self.classes_[0])!r}: a classifier needs at least two classes"
-            )
-        groups = np.arange(len(y)) if groups is None else np.asarray(groups)
+        require_onnx()
+        X, y, groups = self._training_rows(X, y, groups)
+        class_index = np.searchsorted(self.classes_, y)
         columns = tuple(self.columns)
         if not columns or sum(each.width for each in columns) != X.shape[1]:
             raise DataError(f"the columns of the samples do not describe rows of {X.shape[1]} columns")
@@ -150,7 +137,8 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
         temperature = fit_temperature(log_probability[held_out], class_index[held_out])
         self.inner_probability_ = softmax(log_probability / temperature)
         self.best_ = NetworkChoice(*used, epochs)
-        self.numbers_ = network_numbers_of(task, fill, nets, temperature)
+        members = [weights_of(net) for net in nets]
+        self.onnx_ = network_onnx(columns, task.branches, members, fill, temperature, self.classes_.tolist())
         return self
 
     def _choose(self, task: Task, splits: Sequence[tuple[Array, Array]]) -> Augmentation:
@@ -185,27 +173,12 @@ class GroupedNetwork(ClassifierMixin, BaseEstimator):
 
     def predict_proba(self, X: Array) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``."""
-        check_is_fitted(self)
-        X = validate_data(self, X, reset=False, ensure_all_finite="allow-nan")
-        return probabilities(self.numbers_, X)
+        return np.asarray(np.exp(log_probabilities(self.onnx_, self.columns, self._rows(X))))
 
     def decision_function(self, X: Array) -> Array:
         """Return log probabilities (n, k); of two classes the odds of the second (n,)."""
-        check_is_fitted(self)
-        X = validate_data(self, X, reset=False, ensure_all_finite="allow-nan")
-        found = log_softmax(mean_log_probabilities(self.numbers_, X) / self.numbers_.temperature)
+        found = log_probabilities(self.onnx_, self.columns, self._rows(X))
         return found[:, 1] - found[:, 0] if len(self.classes_) == 2 else found
-
-    def predict(self, X: Array) -> Array:
-        """Return the class of the highest probability (n,)."""
-        best = self.predict_proba(X).argmax(axis=1)
-        return np.asarray(self.classes_[best])
-
-    def __sklearn_tags__(self) -> Any:
-        """Declare that NaN is accepted."""
-        tags = super().__sklearn_tags__()
-        tags.input_tags.allow_nan = True
-        return tags
 
 
 def fit_temperature(log_probability: Array, class_index: Array) -> float:

@@ -1,7 +1,4 @@
-"""Windows that were held out: what a classifier that is fitted on every fold makes of them, and its figures.
-
-How well sets of classes hold the true one, of windows whose runs were held out.
-"""
+"""Windows that were held out: what a classifier that is fitted on every fold makes of them, and its figures."""
 
 from __future__ import annotations
 

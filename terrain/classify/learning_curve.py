@@ -19,13 +19,6 @@ ENOUGH_GAIN = 0.01
 """Enough runs: doubling them would gain less than this accuracy."""
 
 
-class EnoughRuns(NamedTuple):
-    """How many runs of each class are enough; None where that was not reached or cannot be determined."""
-
-    n_runs: int | None
-    statement: str
-
-
 class LearningCurve(NamedTuple):
     """Accuracy against the number of training runs of each class.
 
@@ -45,14 +38,7 @@ class LearningCurve(NamedTuple):
     statement: str
 
 
-class DrawnFolds(NamedTuple):
-    """Folds with fewer training runs, :data:`CURVE_DRAWS` repeats a size; ``runs_per_class`` of each and of all."""
-
-    folds: list[Fold]
-    runs_per_class: Array
-
-
-def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> DrawnFolds:
+def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> tuple[list[Fold], Array]:
     """Draw at most m training runs of each class, for each m of :data:`CURVE_RUNS`; test rows stay the same.
 
     Parameters
@@ -60,6 +46,11 @@ def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> Dra
     y, group : (n,) class and run of each row
     folds : those of one repeat
     seed : of the draws
+
+    Returns
+    -------
+    folds : :data:`CURVE_DRAWS` repeats a size
+    runs_per_class : of each size, and of all runs
     """
     available = [
         np.array([len(set(group[train][y[train] == name])) for name in np.unique(y[train])])
@@ -78,7 +69,7 @@ def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> Dra
                     kept |= np.isin(group[train], chosen) & of_class
                 drawn.append(Fold(CURVE_DRAWS * number + draw, fold, train[kept], test))
     means = [[np.minimum(counts, size).mean() for counts in available] for size in (*sizes, len(y))]
-    return DrawnFolds(drawn, np.mean(means, axis=1))
+    return drawn, np.mean(means, axis=1)
 
 
 def learning_curve(runs_per_class: Array, drawn: Sequence[float], full: float) -> LearningCurve:
@@ -90,11 +81,11 @@ def learning_curve(runs_per_class: Array, drawn: Sequence[float], full: float) -
     return LearningCurve(tuple(runs_per_class.tolist()), tuple(accuracy.tolist()), spread, *enough)
 
 
-def enough_runs(runs_per_class: Array, accuracy: Array) -> EnoughRuns:
-    """Return how many runs of each class would be enough, by the law ``accuracy(m) = a - b m^-c``.
+def enough_runs(runs_per_class: Array, accuracy: Array) -> tuple[int | None, str]:
+    """Return how many runs of each class would be enough by the law ``accuracy(m) = a - b m^-c``, and a sentence.
 
     Enough is the smallest whole m for which doubling gains less than :data:`ENOUGH_GAIN` by that law; it
-    is not sought beyond ten times the largest m that was measured.
+    is not sought beyond ten times the largest m that was measured, and is None beyond, or with too few points.
 
     Parameters
     ----------
@@ -103,11 +94,11 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> EnoughRuns:
     Examples
     --------
     >>> m = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
-    >>> enough_runs(m, 0.9 - 0.3 / m).n_runs
+    >>> enough_runs(m, 0.9 - 0.3 / m)[0]
     16
     """
     if len(accuracy) < MIN_CURVE_POINTS:
-        return EnoughRuns(None, f"{len(accuracy)} sizes are too few to estimate how many runs are enough")
+        return (None, f"{len(accuracy)} sizes are too few to estimate how many runs are enough")
     fit = least_squares(
         lambda p: p[0] - p[1] * runs_per_class ** -p[2] - accuracy,
         x0=[min(accuracy.max() + 0.02, 1.0), 0.3, 0.7],
@@ -120,13 +111,13 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> EnoughRuns:
     slack = float(np.interp(largest, sizes, gain))
     found = sizes[gain < ENOUGH_GAIN]
     if not len(found):
-        return EnoughRuns(
+        return (
             None,
             f"not enough yet: doubling the {largest:.1f} runs per class would still gain {_percent(slack, 1)}",
         )
     enough = int(found[0])
     verdict = "enough" if enough <= largest else "not enough yet"
-    return EnoughRuns(
+    return (
         enough,
         f"{verdict}: {enough} {'run' if enough == 1 else 'runs'} per class would be enough "
         f"(doubling them gains under {_percent(ENOUGH_GAIN, 0)}); "

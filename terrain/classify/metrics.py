@@ -1,7 +1,5 @@
 """Figures of merit of held-out predictions: accuracy, calibration, votes, and an interval over runs.
 
-Whether a classifier's confidence indicates that it is right, with intervals over runs.
-
 Windows of one run are not independent: intervals are those of a bootstrap that draws whole runs, within their
 classes, and computes each figure again from the windows of the runs drawn.
 """

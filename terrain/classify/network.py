@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.classify.augment import Augmentation, augmented, mirrors_of
-from terrain.classify.network_numbers import (
+from terrain.classify.network_input import (
     FLOOR_RATIO,
-    BranchNumbers,
-    NetworkNumbers,
+    Branch,
     SampleColumns,
     power_spectrogram,
     seen,
     standardised,
     streams_of,
 )
+from terrain.classify.network_onnx import MemberWeights
 from terrain.errors import ConfigError
 from terrain.records import Array
 
@@ -53,7 +53,7 @@ class Task(NamedTuple):
     weight: Array
     n_classes: int
     columns: tuple[SampleColumns, ...]
-    branches: list[BranchNumbers]
+    branches: list[Branch]
     means: list[Array]
 
     def rows(self, streams: Sequence[Array]) -> list[Array]:
@@ -94,7 +94,6 @@ def task_of(columns: tuple[SampleColumns, ...], samples: Array, class_index: Arr
     """
     streams = list(streams_of(columns, samples))
     branches = []
-    nothing = np.zeros(0, np.float32)
     for each, values in zip(columns, streams, strict=True):
         floor = np.zeros(len(each.channels), np.float32)
         if each.frame:
@@ -103,9 +102,7 @@ def task_of(columns: tuple[SampleColumns, ...], samples: Array, class_index: Arr
         found = seen(each, values, floor)
         std = found.std(axis=(0, 3))
         std = np.where(std > 1e-6 * np.maximum(1.0, np.abs(found.mean(axis=(0, 3)))), std, 1.0)
-        branches.append(
-            BranchNumbers(floor, found.mean(axis=(0, 3)), std, nothing, nothing, nothing, nothing)
-        )
+        branches.append(Branch(floor, found.mean(axis=(0, 3)), std))
     means = [values.mean(axis=(0, 2)) for values in streams]
     _, run, count = np.unique(groups, return_inverse=True, return_counts=True)
     weight = 1.0 / np.sqrt(count[run])
@@ -232,29 +229,11 @@ def _network(task: Task) -> Any:
     return Network()
 
 
-def network_numbers_of(task: Task, fill: Array, nets: Sequence[Any], temperature: float) -> NetworkNumbers:
-    """Return the numbers of all members; the normalisation of batches goes into the convolutions.
-
-    Parameters
-    ----------
-    task : that they were fitted to
-    fill : (n_columns,) what a missing sample is taken for
-    nets : the members
-    temperature : of their mean log probabilities
-    """
-    branches = []
-    for i, branch in enumerate(task.branches):
-        parts = [(*_folded(net.branches[i], 1), *_folded(net.branches[i], 5)) for net in nets]
-        branches.append(BranchNumbers(*branch[:3], *(np.stack(part) for part in zip(*parts, strict=True))))
-    heads = [[p.detach().numpy().copy() for p in (net.head[1].weight, net.head[1].bias)] for net in nets]
-    return NetworkNumbers(
-        task.columns,
-        fill,
-        tuple(branches),
-        np.stack([head[0] for head in heads]),
-        np.stack([head[1] for head in heads]),
-        temperature,
-    )
+def weights_of(net: Any) -> MemberWeights:
+    """Return the weights of a member; the normalisation of batches goes into the convolutions."""
+    branches = [(*_folded(branch, 1), *_folded(branch, 5)) for branch in net.branches]
+    weight, bias = (p.detach().numpy().copy() for p in (net.head[1].weight, net.head[1].bias))
+    return MemberWeights(branches, weight, bias)
 
 
 def _folded(branch: Any, place: int) -> tuple[Array, Array]:

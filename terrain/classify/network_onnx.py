@@ -1,9 +1,16 @@
-"""A fitted network as an ONNX file, which is the one form it is stored in: windows in, probabilities out.
+"""A fitted network as an ONNX graph: the one form that it has, here, in a model's folder and in other programs.
 
-The graph has one input a stream, ``(windows, channels, samples)`` as they were measured, missing ones NaN,
-and one output, ``(windows, classes)``.  Channels, rates, length and classes are in the file's metadata.  It
-is the computation of :mod:`terrain.classify.network_numbers`, step by step; this package reads the numbers
-back from it, and other programs run it as it is.
+The graph has one input a stream, ``(windows, channels, samples)``, missing ones NaN, and two outputs ``(windows,
+classes)``: probabilities, and their logarithms.  It computes
+
+- what :mod:`terrain.classify.network_input` describes of each stream;
+- two convolutions over time, each with a rectifier; then the mean and the largest value over time; of the
+  samples of a slow stream also the mean and standard deviation of each channel;
+- one linear layer that joins all branches.  Several members, fitted with other runs held out, share the
+  standardisation; the mean of their log probabilities, divided by a temperature, gives the probabilities.
+
+In the file of a model channels lose their mean over the window first, where training windows had lost it, so that
+other programs give what was measured.  Channels, rates, length and classes are in its metadata.
 """
 
 from __future__ import annotations
@@ -11,31 +18,68 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from terrain.classify.network_numbers import (
+from terrain.classify.network_input import (
     CLIP_STD,
-    BranchNumbers,
-    NetworkNumbers,
+    Branch,
     SampleColumns,
     fourier_kernel,
+    log_softmax,
+    streams_of,
 )
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array, Windows
 
 OPSET = 17
 IR_VERSION = 8
-OUTPUT = "probabilities"
+OUTPUT, LOG_OUTPUT = "probabilities", "log_probabilities"
+ROWS_AT_ONCE = 256
+
+OPERATORS = frozenset(
+    (
+        *("Add", "Clip", "Concat", "Conv", "Div", "IsNaN", "Log", "LogSoftmax", "MatMul", "Mul", "ReduceMax"),
+        *(
+            "ReduceMean",
+            "Relu",
+            "Reshape",
+            "Slice",
+            "Softmax",
+            "Sqrt",
+            "Squeeze",
+            "Sub",
+            "Unsqueeze",
+            "Where",
+        ),
+    )
+)
+"""Of the graph; none of them repeats or reads anything, so that a stranger's file cannot either."""
+
+
+class MemberWeights(NamedTuple):
+    """Weights of a member, with h hidden channels.
+
+    Parameters
+    ----------
+    branches : of each stream the weights (h, c f, 3) and (h, h, 3) and biases (h,) of both convolutions, in order
+    head_weight, head_bias : (k, p), (k,) of the layer that joins the branches
+    """
+
+    branches: Sequence[tuple[Array, Array, Array, Array]]
+    head_weight: Array
+    head_bias: Array
 
 
 def require_onnx() -> Any:
     """Return onnx; a :class:`~terrain.errors.ConfigError` where it is not installed."""
     try:
         import onnx
+        import onnxruntime  # noqa: F401
     except ModuleNotFoundError as error:
-        raise ConfigError("a network is stored as ONNX: pip install 'terrain-slip[cnn]'") from error
+        raise ConfigError("a network is an ONNX graph: pip install 'terrain-slip[cnn]'") from error
     return onnx
 
 
@@ -68,76 +112,80 @@ class _Graph:
 
 
 def network_onnx(
-    numbers: NetworkNumbers, classes: Sequence[str], length_s: float, centred: Mapping[str, Sequence[bool]]
+    columns: Sequence[SampleColumns],
+    branches: Sequence[Branch],
+    members: Sequence[MemberWeights],
+    fill: Array,
+    temperature: float,
+    classes: Sequence[str],
 ) -> bytes:
-    """Return the content of an ONNX file.
+    """Return the graph of a fitted network.
 
     Parameters
     ----------
-    numbers : of the fitted network
+    columns, branches : of each stream
+    members : with equal shapes
+    fill : (n_columns,) what a missing sample is taken for
+    temperature : that log probabilities are divided by
     classes : (k,) names in the order of the output
-    length_s : of a window
-    centred : of each stream, which of its channels lose their mean over the window
-
-    Raises
-    ------
-    ConfigError
-        if onnx is not installed.
     """
     onnx, graph = require_onnx(), _Graph()
     helper = onnx.helper
-    n_members, k = numbers.head_bias.shape
     inputs, pooled, place = [], [], 0
-    for columns, branch in zip(numbers.columns, numbers.branches, strict=True):
-        shape = ["windows", len(columns.channels), columns.n_samples]
-        inputs.append(helper.make_tensor_value_info(columns.stream, onnx.TensorProto.FLOAT, shape))
-        fill = numbers.fill[place : place + columns.width].reshape(len(columns.channels), -1)
-        place += columns.width
-        filled = _filled(graph, columns.stream, centred[columns.stream], fill)
-        pooled += _branch(graph, columns, branch, filled)
+    for number, (each, branch) in enumerate(zip(columns, branches, strict=True)):
+        shape = ["windows", len(each.channels), each.n_samples]
+        inputs.append(helper.make_tensor_value_info(each.stream, onnx.TensorProto.FLOAT, shape))
+        missing = fill[place : place + each.width].reshape(len(each.channels), -1)
+        place += each.width
+        weights = [
+            np.stack(part) for part in zip(*(member.branches[number] for member in members), strict=True)
+        ]
+        pooled += _branch(graph, each, branch, weights, _filled(graph, each, missing))
     joined = graph.step("Concat", *pooled, axis=2)
     column = graph.step("Unsqueeze", joined, graph.constant(np.array([3])))
-    product = graph.step("MatMul", graph.constant(numbers.head_weight, "head_weight"), column)
-    flat = graph.step("Squeeze", product, graph.constant(np.array([3])))
-    logits = graph.step("Add", flat, graph.constant(numbers.head_bias, "head_bias"))
-    mean = graph.step("ReduceMean", graph.step("LogSoftmax", logits, axis=2), axes=[1], keepdims=0)
-    tempered = graph.step("Div", mean, graph.constant(np.array(numbers.temperature)))
+    head = graph.constant(np.stack([member.head_weight for member in members]), "head_weight")
+    flat = graph.step("Squeeze", graph.step("MatMul", head, column), graph.constant(np.array([3])))
+    bias = graph.constant(np.stack([member.head_bias for member in members]), "head_bias")
+    each_log = graph.step("LogSoftmax", graph.step("Add", flat, bias), axis=2)
+    mean = graph.step("ReduceMean", each_log, axes=[1], keepdims=0)
+    tempered = graph.step("Div", mean, graph.constant(np.array(temperature), "temperature"))
     graph.step("Softmax", tempered, output=OUTPUT, axis=1)
-    output = helper.make_tensor_value_info(OUTPUT, onnx.TensorProto.FLOAT, ["windows", k])
+    graph.step("LogSoftmax", tempered, output=LOG_OUTPUT, axis=1)
+    outputs = [
+        helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, ["windows", len(classes)])
+        for name in (OUTPUT, LOG_OUTPUT)
+    ]
     model = helper.make_model(
-        helper.make_graph(graph.nodes, "terrain", inputs, [output], graph.constants),
+        helper.make_graph(graph.nodes, "terrain", inputs, outputs, graph.constants),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="terrain-slip",
     )
     streams = {
         each.stream: {"channels": each.channels, "rate_hz": each.rate_hz, "n_samples": each.n_samples}
-        for each in numbers.columns
+        for each in columns
     }
-    metadata = {
-        "classes": json.dumps([str(name) for name in classes]),
-        "streams": json.dumps(streams),
-        "length_s": json.dumps(length_s),
-        "members": json.dumps(n_members),
-        "temperature": repr(float(numbers.temperature)),
-    }
+    metadata = {"classes": json.dumps([str(name) for name in classes]), "streams": json.dumps(streams)}
     helper.set_model_props(model, metadata)
     onnx.checker.check_model(model)
     return bytes(model.SerializeToString())
 
 
-def _filled(graph: _Graph, stream: str, centred: Sequence[bool], fill: Array) -> str:
-    """Subtract the mean over the window of some channels, and fill what is missing."""
-    mask = graph.constant(np.array(centred)[:, None])
+def _filled(graph: _Graph, columns: SampleColumns, fill: Array) -> str:
+    """Subtract the mean over the window of some channels, at first of none, and fill what is missing."""
+    stream = columns.stream
+    mask = graph.constant(np.zeros((len(columns.channels), 1), bool), f"{stream}.centred")
     mean = graph.step("Where", mask, graph.mean(stream, 2), graph.constant(np.array(0.0)))
     values = graph.step("Sub", stream, mean)
     return graph.step("Where", graph.step("IsNaN", values), graph.constant(fill, f"{stream}.fill"), values)
 
 
-def _branch(graph: _Graph, columns: SampleColumns, branch: BranchNumbers, values: str) -> list[str]:
+def _branch(
+    graph: _Graph, columns: SampleColumns, branch: Branch, weights: Sequence[Array], values: str
+) -> list[str]:
     """Return what a branch passes on, each (windows, K, p)."""
     c, frame = len(columns.channels), columns.frame
-    n_members, hidden = branch.bias_1.shape
+    n_members, hidden = weights[1].shape
     half = frame // 2
     if frame:
         values = graph.step("Sub", values, graph.mean(values, 2))
@@ -165,16 +213,13 @@ def _branch(graph: _Graph, columns: SampleColumns, branch: BranchNumbers, values
         (0, branch.mean.size, n_frames if frame else columns.n_samples),
     )
     found = rows
-    for number, weight, bias, groups in (
-        (1, branch.weight_1, branch.bias_1, 1),
-        (2, branch.weight_2, branch.bias_2, n_members),
-    ):
+    for number, groups in ((1, 1), (2, n_members)):
+        weight, bias = weights[2 * number - 2 : 2 * number]
         kernel = graph.constant(
             weight.reshape(n_members * hidden, *weight.shape[2:]), f"{columns.stream}.weight_{number}"
         )
         offset = graph.constant(bias.ravel(), f"{columns.stream}.bias_{number}")
-        found = graph.step("Conv", found, kernel, offset, pads=[1, 1], group=groups)
-        found = graph.step("Relu", found)
+        found = graph.step("Relu", graph.step("Conv", found, kernel, offset, pads=[1, 1], group=groups))
     each = (-1, n_members, hidden)
     pooled = [
         graph.shaped(graph.mean(found, 2), each),
@@ -189,54 +234,101 @@ def _branch(graph: _Graph, columns: SampleColumns, branch: BranchNumbers, values
     return pooled
 
 
-def numbers_of_onnx(content: bytes, columns: Sequence[SampleColumns]) -> NetworkNumbers:
-    """Return the numbers of a network out of the ONNX file that it is stored in.
+def with_centred(content: bytes, centred: Mapping[str, Sequence[bool]], length_s: float) -> bytes:
+    """Return a graph that subtracts the mean over the window of some channels of each stream.
 
     Parameters
     ----------
-    content : as :func:`network_onnx` returns it
-    columns : that the network was fitted to
+    content : of a graph
+    centred : of each stream, which of its channels; of one that is not named, none
+    length_s : of a window, for the metadata
+    """
+    onnx = require_onnx()
+    model = onnx.load_from_string(content)
+    for each in model.graph.initializer:
+        stream, _, kind = each.name.rpartition(".")
+        if kind == "centred":
+            mask = np.zeros(tuple(each.dims), bool)
+            mask[:] = np.array(centred.get(stream, False)).reshape(-1, 1)
+            each.CopyFrom(onnx.numpy_helper.from_array(mask, each.name))
+    metadata = {each.key: each.value for each in model.metadata_props}
+    onnx.helper.set_model_props(model, metadata | {"length_s": json.dumps(length_s)})
+    return bytes(model.SerializeToString())
+
+
+@lru_cache(maxsize=8)
+def _session(content: bytes) -> Any:
+    """Return what runs a graph, on one core."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+
+
+def log_probabilities(content: bytes, columns: Sequence[SampleColumns], samples: Array) -> Array:
+    """Return the logarithms of the calibrated probabilities (n, k), in the order of the classes.
+
+    Parameters
+    ----------
+    content : of the network's graph
+    columns : that it was fitted to
+    samples : (n, n_columns), NaN where a sample is missing
+
+    Raises
+    ------
+    ConfigError
+        if onnxruntime is not installed.
+    DataError
+        if there are not as many columns, or a sample is infinite.
+    """
+    require_onnx()
+    if np.isinf(samples).any():
+        raise DataError("a sample is infinite")
+    streams = {
+        each.stream: np.ascontiguousarray(values, dtype=np.float32)
+        for each, values in zip(columns, streams_of(columns, samples), strict=True)
+    }
+    blocks = [
+        _session(content).run(
+            [LOG_OUTPUT], {name: rows[at : at + ROWS_AT_ONCE] for name, rows in streams.items()}
+        )[0]
+        for at in range(0, max(len(samples), 1), ROWS_AT_ONCE)
+    ]
+    return log_softmax(np.concatenate(blocks).astype(np.float64))
+
+
+def check_network(content: bytes, columns: Sequence[SampleColumns], n_classes: int) -> None:
+    """Refuse what is no graph of a network for these columns and classes.
 
     Raises
     ------
     ConfigError
         if onnx is not installed.
     DataError
-        if it is no such file; shapes are compared by :func:`terrain.classify.network_numbers.check_network`.
+        if it is none, or a number in it is not finite.
     """
     onnx = require_onnx()
+    width = sum(each.width for each in columns)
     try:
         model = onnx.load_from_string(content)
-        found = {each.name: onnx.numpy_helper.to_array(each) for each in model.graph.initializer}
-        described = {each.key: each.value for each in model.metadata_props}
-        n_members = int(described["members"])
-        branches, fill = [], []
-        for each in columns:
-            named = {name: found.get(f"{each.stream}.{name}") for name in ("fill", *BranchNumbers._fields)}
-            if not each.frame:  # of samples, which have no spectrum
-                named["floor"] = np.zeros(len(each.channels), np.float32)
-            part = {name: np.asarray(array) for name, array in named.items()}
-            fill.append(part["fill"].ravel())
-            of_members = [
-                part[name].reshape(n_members, -1, *part[name].shape[1:]) for name in BranchNumbers._fields[3:]
-            ]
-            branches.append(
-                BranchNumbers(part["floor"].ravel(), part["mean"][..., 0], part["std"][..., 0], *of_members)
-            )
-        return NetworkNumbers(
-            tuple(columns),
-            np.concatenate(fill).astype(float),
-            tuple(branches),
-            found["head_weight"],
-            found["head_bias"],
-            float(described["temperature"]),
-        )
-    except Exception as error:  # whatever a damaged file leads protobuf and numpy to
+        if not {node.op_type for node in model.graph.node} <= OPERATORS:
+            raise DataError("the graph has other operators than a network")
+        for each in model.graph.initializer:
+            if len(each.external_data) or not np.isfinite(onnx.numpy_helper.to_array(each)).all():
+                raise DataError(f"the network's {each.name} are not finite numbers")
+        for samples in (np.full((1, width), np.nan), np.random.default_rng(0).standard_normal((2, width))):
+            found = log_probabilities(content, columns, samples)
+            if found.shape != (len(samples), n_classes) or not np.isfinite(found).all():
+                raise DataError(
+                    f"it gives log probabilities of the shape {found.shape}, or none that are finite"
+                )
+    except Exception as error:  # whatever a damaged file leads protobuf and its runtime to
         raise DataError(str(error) or type(error).__name__) from error
 
 
-def time_of_onnx(content: bytes, window: Windows, n: int) -> Array | None:
-    """Return how long (n,) in s one window takes on one core; None where onnxruntime is not installed.
+def time_of_onnx(content: bytes, window: Windows, n: int) -> Array:
+    """Return how long (n,) in s one window takes on one core.
 
     Parameters
     ----------
@@ -244,13 +336,7 @@ def time_of_onnx(content: bytes, window: Windows, n: int) -> Array | None:
     window : a single one, with the channels of the file
     n : repetitions, after a first one
     """
-    try:
-        import onnxruntime
-    except ModuleNotFoundError:
-        return None
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    session = _session(content)
     streams = json.loads(session.get_modelmeta().custom_metadata_map["streams"])
     inputs = {}
     for stream, described in streams.items():
@@ -259,6 +345,6 @@ def time_of_onnx(content: bytes, window: Windows, n: int) -> Array | None:
     times_s = np.empty(n + 1)
     for number in range(n + 1):
         began_s = time.perf_counter()
-        session.run(None, inputs)
+        session.run([OUTPUT], inputs)
         times_s[number] = time.perf_counter() - began_s
     return times_s[1:]

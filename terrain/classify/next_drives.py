@@ -10,9 +10,8 @@ it falls in the proportion in which the curve does.  Weighted by how much of the
 to be, this is the accuracy that the runs would gain.  The law is that of the learning curve (e.g. Cortes et
 al., Learning Curves: Asymptotic Values and Rate of Convergence, 1994).
 
-Accuracy by support: by the true terrain, and by the mark that needs no label.
-
-Each held-out window is judged by a table of the training windows of its own fold.  Figures are ratios of sums
+Accuracy is also given by support, by the true terrain and by the mark that needs no label.  Each held-out window
+is judged by a table of the training windows of its own fold.  Figures are ratios of sums
 over windows, their intervals those of a bootstrap that draws whole runs within their classes.
 """
 
@@ -93,25 +92,9 @@ class PartFigures(NamedTuple):
     errors_ratio_ci: Interval | None
 
 
-class SupportAccuracy(NamedTuple):
-    """Accuracy by support.
-
-    Parameters
-    ----------
-    by_true_terrain : by :class:`~terrain.classify.support.SupportLevel` of the true terrain: needs labels
-    unsupported, supported : by the mark of the prediction, without a label
-    auc : area from the supported probability to correctness; None where all are right
-    """
-
-    by_true_terrain: dict[str, PartFigures]
-    unsupported: PartFigures
-    supported: PartFigures
-    auc: float | None
-
-
 def support_accuracy(
     held_out: HeldOutSupport, run_id: Array, terrain: Array, rng: np.random.Generator
-) -> SupportAccuracy:
+) -> tuple[dict[str, PartFigures], PartFigures, PartFigures, float | None]:
     """Return the accuracy of held-out windows by their support.
 
     Parameters
@@ -120,15 +103,21 @@ def support_accuracy(
     run_id, terrain : (n,) run and true terrain of each window
     rng : source of the bootstrap
 
+    Returns
+    -------
+    by_true_terrain : by :class:`~terrain.classify.support.SupportLevel` of the true terrain: needs labels
+    unsupported, supported : by the mark of the prediction, without a label
+    auc : area from the supported probability to correctness; None where all are right
+
     Examples
     --------
     >>> right, runs = np.array([[True, True, False, True]]), np.array([[5, 5, 0, 2]])
     >>> held_out = HeldOutSupport(right, runs, runs, 0.9 * runs / (1 + runs), runs > 1)
     >>> run, terrain = np.array(list("aabb")), np.array(["ice"] * 4)
-    >>> found = support_accuracy(held_out, run, terrain, np.random.default_rng(0))
-    >>> found.unsupported.windows_ratio, found.unsupported.errors_ratio, found.supported.accuracy
+    >>> levels, without, supported, auc = support_accuracy(held_out, run, terrain, np.random.default_rng(0))
+    >>> without.windows_ratio, without.errors_ratio, supported.accuracy
     (0.25, 1.0, 1.0)
-    >>> found.by_true_terrain["1 to 3 runs"].accuracy, found.auc
+    >>> levels["1 to 3 runs"].accuracy, auc
     (1.0, 1.0)
     """
     class_of, place = runs_of_classes(run_id, terrain)
@@ -144,7 +133,7 @@ def support_accuracy(
         for probability, right in zip(held_out.probability, held_out.correct, strict=True)
     ]
     known = np.isfinite(areas)
-    return SupportAccuracy(
+    return (
         {each.value: part(level == each.value) for each in SupportLevel},
         part(~held_out.supported),
         part(held_out.supported),
@@ -206,25 +195,6 @@ class Growth(NamedTuple):
         return np.asarray(self.floor + self.scale * (1.0 + np.asarray(n_runs, dtype=float)) ** -self.power)
 
 
-class Cells(NamedTuple):
-    """Cells of a terrain in a regime, each (cells,).
-
-    Parameters
-    ----------
-    expected_ratio : of the driving that is expected, what takes place in the cell
-    n_windows : held-out windows in the cell
-    n_errors : how many of them, mean over repeats, were wrong
-    held_out_runs : training runs near them when they were held out, mean
-    all_runs : training runs near them with all runs in training
-    """
-
-    expected_ratio: Array
-    n_windows: Array
-    n_errors: Array
-    held_out_runs: Array
-    all_runs: Array
-
-
 def fit_growth(n_runs: Array, correct: Array) -> Growth | None:
     """Return how errors fall with the number of training runs; None where the data cannot show it.
 
@@ -254,20 +224,37 @@ def fit_growth(n_runs: Array, correct: Array) -> Growth | None:
     return Growth(*(float(value) for value in fit.x))
 
 
-def expected_gain(growth: Growth, cells: Cells, added_runs: int = ADDED_RUNS) -> Array:
-    """Return the accuracy that so many more runs in each cell would gain (cells,).
+def expected_gain(
+    growth: Growth,
+    expected_ratio: Array,
+    n_windows: Array,
+    n_errors: Array,
+    held_out_runs: Array,
+    all_runs: Array,
+    added_runs: int = ADDED_RUNS,
+) -> Array:
+    """Return the accuracy that so many more runs in each cell, a terrain in a regime, would gain (cells,).
+
+    Parameters
+    ----------
+    growth : how errors fall
+    expected_ratio : (cells,) of the driving that is expected, what takes place in the cell
+    n_windows, n_errors : (cells,) held-out windows in it, and how many of them, mean over repeats, were wrong
+    held_out_runs : (cells,) training runs near them when they were held out, mean
+    all_runs : (cells,) training runs near them with all runs in training
+    added_runs : in each cell
 
     Examples
     --------
-    >>> cells = Cells(*np.array([[0.5, 0.5], [100, 100], [80, 20], [0, 3], [0, 3]]))
-    >>> expected_gain(Growth(0.0, 0.8, 1.0), cells, 4).round(3).tolist()
+    >>> cells = np.array([[0.5, 0.5], [100, 100], [80, 20], [0, 3], [0, 3]])
+    >>> expected_gain(Growth(0.0, 0.8, 1.0), *cells, added_runs=4).round(3).tolist()
     [0.32, 0.05]
     """
-    of_curve = growth.error(cells.held_out_runs)
-    error = (cells.n_errors + PRIOR_WINDOWS * of_curve) / (cells.n_windows + PRIOR_WINDOWS)
-    fall = growth.error(cells.all_runs) - growth.error(cells.all_runs + added_runs)
+    of_curve = growth.error(held_out_runs)
+    error = (n_errors + PRIOR_WINDOWS * of_curve) / (n_windows + PRIOR_WINDOWS)
+    fall = growth.error(all_runs) - growth.error(all_runs + added_runs)
     relative = np.divide(fall, of_curve, out=np.zeros_like(fall), where=of_curve > 0)
-    return np.asarray(cells.expected_ratio * error * relative)
+    return np.asarray(expected_ratio * error * relative)
 
 
 class SupportRow(NamedTuple):
@@ -329,7 +316,7 @@ class Coverage(NamedTuple):
     next_drives : best first; empty where the data cannot show what more runs gain
     accuracy_by_support : a row of :class:`~terrain.classify.next_drives.PartFigures` for each
         :class:`~terrain.classify.support.SupportLevel` of the true terrain
-    unsupported, supported, supported_auc : as :class:`~terrain.classify.next_drives.SupportAccuracy`
+    unsupported, supported, supported_auc : as :func:`support_accuracy`
     """
 
     support: tuple[SupportRow, ...]
@@ -378,15 +365,13 @@ def coverage_of(held_out: HeldOut, run_id: Array, motion: Motion, window_s: floa
             cells.append((expected, n, errors, true_runs, all_runs))
     drives: list[NextDrive] = []
     growth = fit_growth(support.true_runs.ravel(), support.correct.ravel())
-    gain = expected_gain(growth, Cells(*np.array(cells, dtype=float).T)) if growth else np.zeros(len(cells))
+    gain = expected_gain(growth, *np.array(cells, dtype=float).T) if growth else np.zeros(len(cells))
     for i in np.argsort(-gain, kind="stable")[:MAX_DRIVES]:
         if gain[i] >= MIN_GAIN:
             of_terrain, of_regime, n, _, right = rows[i]
             lasts_s = max(RUN_WINDOWS * window_s, MIN_RUN_S)
             drive = of_terrain, of_regime, ADDED_RUNS, lasts_s, float(gain[i]), cells[i][-1], n, right
             drives.append(NextDrive(*drive))
-    accuracy = support_accuracy(support, run_id, terrain, np.random.default_rng(seed))
-    by_support = tuple(
-        {"support": level, **part._asdict()} for level, part in accuracy.by_true_terrain.items()
-    )
-    return Coverage(tuple(rows), tuple(drives), by_support, *accuracy[1:])
+    levels, without, supported, auc = support_accuracy(support, run_id, terrain, np.random.default_rng(seed))
+    by_support = tuple({"support": level, **part._asdict()} for level, part in levels.items())
+    return Coverage(tuple(rows), tuple(drives), by_support, without, supported, auc)

@@ -1,11 +1,4 @@
-"""Fitting of the novelty score: whether a window is of a terrain that was never learned.
-
-The terms and their combination are those of :mod:`terrain.classify.novelty`.  Their references are
-windows of known terrains whose runs took no part in fitting: inner folds of whole runs.  The threshold keeps
-a given part of these windows.  Nothing is weighted, so that nothing has to be learned from terrains that are
-left out.  The score needs no classifier, and stands beside any.
-
-A fitted novelty score as plain numbers: how unlike all known terrains a window is, without scikit-learn.
+"""Whether a window is of a terrain that was never learned: how unlike all known ones it is.
 
 Three terms, each larger for a window that is less like the training windows:
 
@@ -19,6 +12,10 @@ Three terms, each larger for a window that is less like the training windows:
 Each term has its rank among the terms of held-out known windows, ``P = (n_above + 1) / (n + 1)``, and the
 score is ``-(log P_1 + log P_2 + log P_3)`` (Fisher 1932, combination of independent tests; the terms depend
 on each other, so that the score is compared with a threshold of held-out windows and not with a chi-square).
+
+The references are windows of known terrains whose runs took no part in fitting: inner folds of whole runs.  The
+threshold keeps a given part of these windows.  Nothing is weighted, so that nothing has to be learned from
+terrains that are left out.  The score needs no classifier, and stands beside any.
 """
 
 from __future__ import annotations
@@ -27,27 +24,37 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
-from sklearn.base import BaseEstimator
-from sklearn.covariance import ledoit_wolf
-from sklearn.svm import SVC
-from sklearn.utils.validation import check_is_fitted
+from scipy.spatial.distance import cdist
 
-from terrain.classify.folds import inner_splits
-from terrain.classify.svm import f_score
+from terrain.classify.folds import inner_splits, two_classes
 from terrain.errors import DataError
 from terrain.records import Array
 
 N_TERMS = 3
 N_NEAR = 10
 """Neighbours are sought in so many leading components: in more, all distances become alike."""
+KNOWN_KEPT = 0.95
+"""Part of the windows of known terrains that is not to be called unknown."""
+N_COMPONENTS = 40
+MAX_PROTOTYPES = 1500
+"""Neighbours are sought among at most so many training windows, thinned evenly: 15 us a window."""
+MAX_REFERENCE = 2000
+CLIP_STD = 5.0
+"""Scaled features are clipped here, as those of the classifier."""
+SELECTED = 0.8
+"""Part of the features that an F test between classes keeps, as the classifier's."""
+N_INNER_FOLDS = 5
+PENALTY, GAMMA = 10.0, 1.0
+"""Of the support vector machine; gamma is relative to 1 / number of features.  The kernel is narrower than
+what classifies best."""
 
 
-class NoveltyNumbers(NamedTuple):
-    """What a fitted novelty score computes with.
+class Novelty(NamedTuple):
+    """A fitted score of novelty.
 
     Parameters
     ----------
+    n_features : before selection
     columns : (m,) places of the features that are used
     fill, mean, scale : (m,) median, mean and standard deviation of each
     components : (q, m) principal directions, divided by the square root of m
@@ -58,10 +65,10 @@ class NoveltyNumbers(NamedTuple):
         ``f = sum_i w_i exp(-gamma / m |x - v_i|^2) + c``, positive for the first class of a pair
     squares : (v,) squared lengths of the vectors
     reference : (n, 3) ascending terms of held-out known windows
-    settings : (4,) clip in standard deviations, number of features before selection, gamma, threshold of the
-        score
+    threshold : of the score, above which a window is unknown
     """
 
+    n_features: int
     columns: Array
     fill: Array
     mean: Array
@@ -77,16 +84,48 @@ class NoveltyNumbers(NamedTuple):
     offsets: Array
     squares: Array
     reference: Array
-    settings: Array
+    threshold: float
 
-    @property
-    def threshold(self) -> float:
-        """Score above which a window is unknown."""
-        return float(self.settings[3])
+    def score(self, features: Array) -> Array:
+        """Return the score (n,) of features (n, f), NaN where not defined; NaN where one is infinite.
+
+        Raises
+        ------
+        DataError
+            if there are not as many features.
+        """
+        return fisher_scores(self.reference, self.terms(features))
+
+    def is_unknown(self, features: Array) -> Array:
+        """Return whether each window (n,) is unlike all known terrains; so is one without a score."""
+        return ~(self.score(features) <= self.threshold)
+
+    def terms(self, features: Array) -> Array:
+        """Return the three terms (n, 3) of each window; arguments and errors as :meth:`score`."""
+        features = np.asarray(features, dtype=float)
+        if features.ndim != 2 or features.shape[1] != self.n_features:
+            raise DataError(f"features have the shape {features.shape}, (n, {self.n_features}) is needed")
+        used = features[:, self.columns]
+        used = np.where(np.isfinite(used), used, self.fill)
+        scaled = np.clip((used - self.mean) / self.scale, -CLIP_STD, CLIP_STD)
+        components = scaled @ self.components.T
+        terms = np.empty((len(features), N_TERMS))
+        terms[:, 0] = -largest_margin(self._pair_margins(scaled), len(self.means))
+        terms[:, 1] = cdist(components @ self.within.T, self.means, "sqeuclidean").min(axis=1)
+        terms[:, 1] -= np.square(components @ self.background.T - self.centre).sum(axis=1)
+        terms[:, 2] = cdist(components[:, : self.prototypes.shape[1]], self.prototypes).min(axis=1)
+        terms[np.isinf(features).any(axis=1)] = np.nan
+        return terms
+
+    def _pair_margins(self, rows: Array) -> Array:
+        products = rows.astype(self.vectors.dtype) @ self.vectors.T
+        squares = np.square(rows).sum(axis=1)[:, np.newaxis] + self.squares - 2.0 * products
+        gamma = GAMMA / len(self.columns)
+        return np.asarray(np.exp(-gamma * np.maximum(squares, 0.0)) @ self.weights + self.offsets)
 
 
-def check_novelty(numbers: NoveltyNumbers, n_classes: int) -> None:
-    """Refuse numbers that do not fit each other.
+def check_novelty(novelty: Novelty, n_classes: int) -> None:
+    """Refuse a score whose numbers do not fit each other.
 
     Raises
     ------
@@ -94,60 +133,21 @@ def check_novelty(numbers: NoveltyNumbers, n_classes: int) -> None:
         if a shape is another, a number is not finite, or a place is none.
     """
     m, q, s, n = (
-        len(numbers.columns),
-        len(numbers.components),
-        len(numbers.prototypes),
-        len(numbers.reference),
+        len(part) for part in (novelty.columns, novelty.components, novelty.prototypes, novelty.reference)
     )
-    near, v, p = min(q, N_NEAR), len(numbers.vectors), n_classes * (n_classes - 1) // 2
+    near, v, p = min(q, N_NEAR), len(novelty.vectors), n_classes * (n_classes - 1) // 2
     shapes = (
-        (m,), (m,), (m,), (m,), (q, m), (q, q), (q, q), (n_classes, q), (q,), (s, near),
-        (v, m), (v, p), (p,), (v,), (n, N_TERMS), (4,)
+        (), (m,), (m,), (m,), (m,), (q, m), (q, q), (q, q), (n_classes, q), (q,), (s, near),
+        (v, m), (v, p), (p,), (v,), (n, N_TERMS), ()
     )  # fmt: skip
-    for name, array, shape in zip(numbers._fields, numbers, shapes, strict=True):
-        kind = "iu" if name == "columns" else "f"
+    for name, array, shape in zip(novelty._fields, map(np.asarray, novelty), shapes, strict=True):
+        kind = "iu" if name in ("columns", "n_features") else "f"
         if array.shape != shape or array.dtype.kind not in kind or not np.isfinite(array).all():
             raise DataError(f"the novelty score's {name} are not {shape} finite numbers")
-    if min(m, q, s, n) == 0 or numbers.columns.min() < 0 or numbers.columns.max() >= numbers.settings[1]:
+    if min(m, q, s, n) == 0 or novelty.columns.min() < 0 or novelty.columns.max() >= novelty.n_features:
         raise DataError("the novelty score's columns are none of its features")
-    if (numbers.scale <= 0.0).any() or (numbers.settings[:3] <= 0.0).any():
+    if (novelty.scale <= 0.0).any():
         raise DataError("the novelty score's scales are not above zero")
-
-
-def novelty_scores(numbers: NoveltyNumbers, features: Array) -> Array:
-    """Return the score (n,) of each window; NaN where a feature is infinite.
-
-    Parameters
-    ----------
-    numbers : of the fitted score
-    features : (n, f), NaN where not defined
-
-    Raises
-    ------
-    DataError
-        if there are not as many features.
-    """
-    return fisher_scores(numbers.reference, novelty_terms(numbers, features))
-
-
-def novelty_terms(numbers: NoveltyNumbers, features: Array) -> Array:
-    """Return the three terms (n, 3) of each window; arguments and errors as :func:`novelty_scores`."""
-    clip, n_features, gamma, _ = numbers.settings.tolist()
-    if features.ndim != 2 or features.shape[1] != n_features:
-        raise DataError(f"features have the shape {features.shape}, (n, {n_features:.0f}) is needed")
-    used = features[:, numbers.columns]
-    used = np.where(np.isfinite(used), used, numbers.fill)
-    scaled = np.clip((used - numbers.mean) / numbers.scale, -clip, clip)
-    components = scaled @ numbers.components.T
-    terms = np.empty((len(features), N_TERMS))
-    margins = pair_margins(numbers, gamma / len(numbers.columns), scaled)
-    terms[:, 0] = -largest_margin(margins, len(numbers.means))
-    terms[:, 1] = _least_squares(components @ numbers.within.T, numbers.means)
-    terms[:, 1] -= np.square(components @ numbers.background.T - numbers.centre).sum(axis=1)
-    near = np.ascontiguousarray(components[:, : numbers.prototypes.shape[1]])
-    terms[:, 2] = np.sqrt(_least_squares(near, numbers.prototypes))
-    terms[np.isinf(features).any(axis=1)] = np.nan
-    return terms
 
 
 def largest_margin(margins: Array, n_classes: int) -> Array:
@@ -184,111 +184,51 @@ def fisher_scores(reference: Array, terms: Array) -> Array:
     return score
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _least_squares(rows: Array, points: Array) -> Array:
-    """Return the squared distance (n,) from each row to the nearest point."""
-    found = np.empty(rows.shape[0])
-    for n in range(rows.shape[0]):
-        least = np.inf
-        for i in range(points.shape[0]):
-            squares = 0.0
-            for j in range(points.shape[1]):
-                difference = rows[n, j] - points[i, j]
-                squares += difference * difference
-            least = min(least, squares)
-        found[n] = least
-    return found
-
-
-def pair_margins(numbers: NoveltyNumbers, gamma: float, rows: Array) -> Array:
-    """Return the margin (n, p) of each pair of classes of each row (n, m)."""
-    products = rows.astype(numbers.vectors.dtype) @ numbers.vectors.T
-    squares = np.square(rows).sum(axis=1)[:, np.newaxis] + numbers.squares - 2.0 * products
-    found: Array = np.exp(-gamma * np.maximum(squares, 0.0)) @ numbers.weights + numbers.offsets
-    return found
-
-
-KNOWN_KEPT = 0.95
-"""Part of the windows of known terrains that is not to be called unknown."""
-N_COMPONENTS = 40
-MAX_PROTOTYPES = 1500
-"""Neighbours are sought among at most so many training windows, thinned evenly: 15 us a window."""
-MAX_REFERENCE = 2000
-CLIP_STD = 5.0
-"""Scaled features are clipped here, as those of the classifier."""
-SELECTED = 0.8
-"""Part of the features that an F test between classes keeps, as the classifier's."""
-N_INNER_FOLDS = 5
-PENALTY, GAMMA = 10.0, 1.0
-"""Of the support vector machine; gamma is relative to 1 / number of features.  The kernel is narrower than
-what classifies best."""
-
-
-class NoveltyScore(BaseEstimator):
-    """How unlike all known terrains a window is.
+def learn_novelty(
+    X: Array,
+    y: Array,
+    groups: Array | None = None,
+    *,
+    n_inner_folds: int = N_INNER_FOLDS,
+    gap: int = 1,
+    seed: int = 0,
+) -> Novelty:
+    """Return the score of novelty that training windows give.
 
     Parameters
     ----------
+    X : (n, f) features, NaN where not defined
+    y : (n,) classes
+    groups : (n,) run of each row; every row is its own run when missing
     n_inner_folds : of whole runs, whose windows are the references
     gap : rows left out beside a block, where the only run of a class is cut
     seed : deals runs into inner folds
 
-    Attributes
-    ----------
-    numbers_ : :class:`~terrain.classify.novelty.NoveltyNumbers`
+    Raises
+    ------
+    DataError
+        if there is one class only, or rows are too few to hold some of them out.
     """
-
-    def __init__(self, n_inner_folds: int = N_INNER_FOLDS, gap: int = 1, seed: int = 0) -> None:
-        self.n_inner_folds = n_inner_folds
-        self.gap = gap
-        self.seed = seed
-
-    def fit(self, X: Array, y: Array, groups: Array | None = None) -> NoveltyScore:
-        """Fit the distances and margins, their references, and the threshold.
-
-        Parameters
-        ----------
-        X : (n, f) features, NaN where not defined
-        y : (n,) classes
-        groups : (n,) run of each row; every row is its own run when missing
-
-        Raises
-        ------
-        DataError
-            if there is one class only, or rows are too few to hold some of them out.
-        """
-        X, y = np.asarray(X, dtype=float), np.asarray(y)
-        groups = np.arange(len(y)) if groups is None else np.asarray(groups)
-        classes = np.unique(y)
-        if len(classes) < 2:
-            raise DataError(f"all windows are {str(classes[0])!r}: a classifier needs at least two classes")
-        terms = np.full((len(y), N_TERMS), np.nan)
-        for train, test in inner_splits(y, groups, self.n_inner_folds, self.seed, self.gap):
-            terms[test] = novelty_terms(_fit(X[train], y[train]), X[test])
-        known = terms[np.isfinite(terms).all(axis=1)]
-        if not len(known):
-            raise DataError("the windows are too few to hold some of them out; add runs")
-        reference = np.sort(known, axis=0)
-        if len(reference) > MAX_REFERENCE:
-            reference = np.quantile(reference, np.linspace(0.0, 1.0, MAX_REFERENCE), axis=0)
-        threshold = float(np.quantile(fisher_scores(reference, known), KNOWN_KEPT))
-        fitted = _fit(X, y)
-        settings = np.append(fitted.settings[:3], threshold)
-        self.numbers_ = fitted._replace(reference=reference, settings=settings)
-        return self
-
-    def score(self, X: Array) -> Array:
-        """Return the score (n,) of features (n, f), higher for windows less like any known terrain."""
-        check_is_fitted(self, "numbers_")
-        return novelty_scores(self.numbers_, np.asarray(X, dtype=float))
-
-    def is_unknown(self, X: Array) -> Array:
-        """Return whether each window (n,) is unlike all known terrains; so is one without a score."""
-        return ~(self.score(X) <= self.numbers_.threshold)
+    X, y = np.asarray(X, dtype=float), np.asarray(y)
+    groups = np.arange(len(y)) if groups is None else np.asarray(groups)
+    two_classes(y)
+    terms = np.full((len(y), N_TERMS), np.nan)
+    for train, test in inner_splits(y, groups, n_inner_folds, seed, gap):
+        terms[test] = _fitted(X[train], y[train]).terms(X[test])
+    known = terms[np.isfinite(terms).all(axis=1)]
+    if not len(known):
+        raise DataError("the windows are too few to hold some of them out; add runs")
+    reference = np.sort(known, axis=0)
+    if len(reference) > MAX_REFERENCE:
+        reference = np.quantile(reference, np.linspace(0.0, 1.0, MAX_REFERENCE), axis=0)
+    threshold = float(np.quantile(fisher_scores(reference, known), KNOWN_KEPT))
+    return _fitted(X, y)._replace(reference=reference, threshold=threshold)
 
 
-def _fit(X: Array, y: Array) -> NoveltyNumbers:
-    """Return the numbers of the terms, without references and threshold."""
+def _fitted(X: Array, y: Array) -> Novelty:
+    """Return the score without references and threshold."""
+    from terrain.classify.svm import f_score
+
     valid = np.isfinite(X)
     some = valid.any(axis=0)
     fill = np.zeros(X.shape[1])
@@ -311,15 +251,17 @@ def _fit(X: Array, y: Array) -> NoveltyNumbers:
     means = np.stack([z[class_of == c].mean(axis=0) for c in range(len(classes))])
     within, background = _whitening(z - means[class_of]), _whitening(z - z.mean(axis=0))
     step = -(-len(z) // MAX_PROTOTYPES)
-    return NoveltyNumbers(
-        columns.astype(np.int64), fill, mean, scale, components, within, background,
+    return Novelty(
+        X.shape[1], columns.astype(np.int64), fill, mean, scale, components, within, background,
         means @ within.T, background @ z.mean(axis=0), np.ascontiguousarray(z[::step, :N_NEAR]),
-        *_pair_machine(scaled, y), np.zeros((0, N_TERMS)), np.array([CLIP_STD, X.shape[1], GAMMA, np.inf]),
+        *_pair_machine(scaled, y), np.zeros((0, N_TERMS)), np.inf,
     )  # fmt: skip
 
 
 def _pair_machine(scaled: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     """Return support vectors, their weights in each pair of classes, offsets, and squared lengths."""
+    from sklearn.svm import SVC
+
     svc = SVC(C=PENALTY, gamma=GAMMA / scaled.shape[1], cache_size=500).fit(scaled, y)
     sign = -1.0 if len(svc.classes_) == 2 else 1.0  # scikit-learn turns the two-class decision around
     bounds = np.concatenate(([0], np.cumsum(svc.n_support_)))
@@ -335,6 +277,8 @@ def _pair_machine(scaled: Array, y: Array) -> tuple[Array, Array, Array, Array]:
 
 def _whitening(residuals: Array) -> Array:
     """Return W (q, q) with ``W'W`` the inverse of the shrunk covariance (Ledoit and Wolf 2004) of rows."""
+    from sklearn.covariance import ledoit_wolf
+
     covariance = ledoit_wolf(residuals, assume_centered=True)[0]
     covariance += 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
     found: Array = np.linalg.inv(np.linalg.cholesky(covariance))

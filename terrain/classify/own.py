@@ -5,17 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from sklearn.base import BaseEstimator, ClassifierMixin, clone
+from sklearn.base import clone
 from sklearn.linear_model import LogisticRegression
 
 from terrain.classify.folds import block_groups, split_runs
+from terrain.classify.grouped import GroupedClassifier
 from terrain.classify.svm import Preparation, fit_preparation
 from terrain.records import Array
 
 N_INNER_FOLDS = 3
 
 
-class OwnClassifier(ClassifierMixin, BaseEstimator):
+class OwnClassifier(GroupedClassifier):
     """A user's own classifier behind imputation and scaling, with probabilities whatever it gives.
 
     Held-out outputs of inner folds of whole runs give the thresholds of sets of classes, and, where the
@@ -90,10 +91,6 @@ class OwnClassifier(ClassifierMixin, BaseEstimator):
     def predict_proba(self, X: Array) -> Array:
         """Return probabilities (n, k) in the order of ``classes_``."""
         return self._probability(self._outputs(self.fitted_, np.asarray(X, dtype=float)))
-
-    def predict(self, X: Array) -> Array:
-        """Return the class of the highest probability (n,)."""
-        return np.asarray(self.classes_[self.predict_proba(X).argmax(axis=1)])
 
     def _fitted(self, X: Array, y: Array) -> tuple[Preparation, Any]:
         preparation = fit_preparation(X, y, 100.0)

@@ -1,8 +1,7 @@
 """Stretches of one ground that a classifier proposes as labels, and which of them are worth a question.
 
-The most likely sequence of grounds under all windows of a run, also those that come later.
-
-For labels, unlike on the robot, the whole run is known: the path of a hidden Markov model (Viterbi 1967)
+For labels, unlike on the robot, the whole run is known: a stretch is one of the most likely sequence of grounds
+under all windows of a run, the path of a hidden Markov model (Viterbi 1967)
 whose states are the classes, with the class shares of training taken out of the probabilities and a mean time
 on one ground as in :mod:`terrain.classify.terrain_filter`.
 """

@@ -21,11 +21,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
-from sklearn.base import BaseEstimator, ClassifierMixin
-from sklearn.utils.multiclass import check_classification_targets
-from sklearn.utils.validation import check_is_fitted, validate_data
 
 from terrain.classify.ground_response import fit_ground, regimes
+from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -50,7 +48,7 @@ class ResponseChoice(NamedTuple):
     temperature: float
 
 
-class GroupedResponse(ClassifierMixin, BaseEstimator):
+class GroupedResponse(GroupedClassifier):
     """Terrain by the responses of wheels, with whole runs left out where it judges itself.
 
     Parameters
@@ -85,16 +83,9 @@ class GroupedResponse(ClassifierMixin, BaseEstimator):
             if there is one class only, the columns are others, or a class has no window in which the robot
             moves and all responses are known.
         """
-        X, y = validate_data(self, X, y, ensure_all_finite="allow-nan")
-        check_classification_targets(y)
-        self.classes_ = np.unique(y)
-        if len(self.classes_) < 2:
-            raise DataError(
-                f"all windows are {str(self.classes_[0])!r}: a classifier needs at least two classes"
-            )
+        X, y, groups = self._training_rows(X, y, groups)
         if not self.columns or sum(self.columns) != X.shape[1]:
             raise DataError(f"the columns of wheels and responses do not describe rows of {X.shape[1]}")
-        groups = np.arange(len(y)) if groups is None else np.asarray(groups)
         n_wheels = self.columns[0]
         norm = np.linalg.norm(X[:, :n_wheels], axis=1)
         self.fastest_mps_ = float(np.nanmax(norm, initial=0.0))
@@ -125,16 +116,11 @@ class GroupedResponse(ClassifierMixin, BaseEstimator):
 
     def predict_proba(self, X: Array) -> Array:
         """Return the probability (n, k) of each class; equal ones where the robot stands."""
-        check_is_fitted(self)
-        X = validate_data(self, X, ensure_all_finite="allow-nan", reset=False)
+        X = self._rows(X)
         regime, moving = self._regimes(X)
         likely = np.zeros((len(X), len(self.classes_)))
         likely[moving] = self._log_likelihood(regime[moving], X[moving, self.columns[0] :])
         return _softmax(self.temperature_ * likely)
-
-    def predict(self, X: Array) -> Array:
-        """Return the most probable class (n,)."""
-        return np.asarray(self.classes_[self.predict_proba(X).argmax(axis=1)])
 
     def _regimes(self, X: Array) -> tuple[Array, Array]:
         speed = X[:, : self.columns[0]]

@@ -8,16 +8,15 @@ draws them towards one half each, the mean of the two, which is where few runs l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
-from sklearn.base import BaseEstimator, ClassifierMixin
-from sklearn.utils.validation import check_is_fitted, validate_data
 
 from terrain.classify.folds import fold_numbers
+from terrain.classify.grouped import GroupedClassifier
 from terrain.classify.grouped_network import GroupedNetwork
-from terrain.classify.network_numbers import SampleColumns, log_softmax
+from terrain.classify.network_input import SampleColumns, log_softmax
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import DataError
 from terrain.records import Array
@@ -48,7 +47,7 @@ class StackChoice(NamedTuple):
     loss_stack: float
 
 
-class GroupedStack(ClassifierMixin, BaseEstimator):
+class GroupedStack(GroupedClassifier):
     """Stack of :class:`GroupedSVC` and :class:`GroupedNetwork` that keeps runs whole.
 
     Parameters
@@ -98,8 +97,7 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
         DataError
             also if the rows hold no features beside the samples.
         """
-        X, y = validate_data(self, X, y, ensure_all_finite="allow-nan")
-        groups = np.arange(len(y)) if groups is None else np.asarray(groups)
+        X, y, groups = self._training_rows(X, y, groups)
         features, samples = self._parts(X)
         of_both = {"n_inner_folds": self.n_inner_folds, "gap": self.gap, "seed": self.seed}
         svm = GroupedSVC(self.candidates, **of_both).fit(features, y, groups)
@@ -110,7 +108,6 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
             trial_epochs=self.trial_epochs,
             **of_both,
         ).fit(samples, y, groups)
-        self.classes_ = svm.classes_
         both = np.stack([svm.inner_probability_, network.inner_probability_])
         rows = np.flatnonzero(np.isfinite(both).all(axis=(0, 2)))
         if not len(rows):
@@ -136,23 +133,10 @@ class GroupedStack(ClassifierMixin, BaseEstimator):
 
     def predict_proba(self, X: Array) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``."""
-        check_is_fitted(self)
-        X = validate_data(self, X, reset=False, ensure_all_finite="allow-nan")
-        features, samples = self._parts(X)
+        features, samples = self._parts(self._rows(X))
         svm = None if self.svm_ is None else self.svm_.predict_proba(features)
         network = None if self.network_ is None else self.network_.predict_proba(samples)
         return joined_of(svm, network, np.array([self.best_.weight_svm, self.best_.weight_cnn]))
-
-    def predict(self, X: Array) -> Array:
-        """Return the class of the highest probability (n,)."""
-        best = self.predict_proba(X).argmax(axis=1)
-        return np.asarray(self.classes_[best])
-
-    def __sklearn_tags__(self) -> Any:
-        """Declare that NaN is accepted."""
-        tags = super().__sklearn_tags__()
-        tags.input_tags.allow_nan = True
-        return tags
 
 
 def fit_weights(probability: Array, class_index: Array) -> Array:

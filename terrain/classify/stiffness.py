@@ -1,4 +1,4 @@
-"""Terrains by stiffness: levels, the cost of confusing soft with hard, and clusters of runs without labels.
+"""Terrains by stiffness: levels, the cost of confusing soft with hard, clusters of runs, and figures by level.
 
 The AgriMaRo thesis (8.1) groups terrains "primarily on the level of stiffness or deformability": compact and
 paved surfaces are the low-difficulty extreme, yielding ones the other.  A wrong class within a level costs
@@ -9,8 +9,6 @@ little, as the slip to aim for is alike; hard taken for soft, or soft for hard, 
 
 with the level l of each class and w = :data:`WITHIN_LEVEL_COST`.  The decision of least expected cost under
 the probabilities p is ``argmin_j sum_i p_i C_ij`` (Duda, Hart and Stork, Pattern Classification, 2.2).
-
-How well held-out windows are classified by stiffness level, and whether clusters of runs are these levels.
 """
 
 from __future__ import annotations
@@ -53,6 +51,9 @@ CLIP_STD = 5.0
 """Scaled values are clipped here, so that one run is not a cluster because of one feature."""
 
 N_BOOTSTRAP = 1000
+
+
+Interval = tuple[float, float]
 
 
 class StiffnessLevel(IntEnum):
@@ -109,22 +110,9 @@ def least_cost_class(probability: Array, cost: Array) -> Array:
     return np.asarray(candidates.argmax(axis=1))
 
 
-class RunClusters(NamedTuple):
-    """Clusters of runs, found without labels.
-
-    Parameters
-    ----------
-    cluster : (n_runs,) number of the cluster of each run, from 0
-    n_clusters : of the smallest Bayesian information criterion
-    bic : (k,) the criterion with 1, 2, ... clusters; the smallest is best
-    """
-
-    cluster: Array
-    n_clusters: int
-    bic: Array
-
-
-def cluster_runs(values: Array, speed_mps: Array, seed: int, n_clusters: int | None = None) -> RunClusters:
+def cluster_runs(
+    values: Array, speed_mps: Array, seed: int, n_clusters: int | None = None
+) -> tuple[Array, Array]:
     """Cluster runs by what they have in common beside their speed.
 
     Each value is scaled over the runs and freed of its linear dependence on the logarithm of the speed, as
@@ -139,6 +127,11 @@ def cluster_runs(values: Array, speed_mps: Array, seed: int, n_clusters: int | N
     seed : of the starts
     n_clusters : fixed number; by the criterion where None
 
+    Returns
+    -------
+    cluster : (n_runs,) number of the cluster of each run, from 0
+    bic : (k,) the criterion with 1, 2, ... clusters; the smallest is best
+
     Raises
     ------
     DataError
@@ -148,7 +141,7 @@ def cluster_runs(values: Array, speed_mps: Array, seed: int, n_clusters: int | N
     --------
     >>> rng = np.random.default_rng(0)
     >>> values = np.repeat([[0.0] * 6, [4.0] * 6], 10, axis=0) + 0.3 * rng.normal(size=(20, 6))
-    >>> cluster_runs(values, np.full(20, 0.5), 0).n_clusters
+    >>> int(cluster_runs(values, np.full(20, 0.5), 0)[1].argmin()) + 1
     2
     """
     from sklearn.decomposition import PCA
@@ -176,7 +169,7 @@ def cluster_runs(values: Array, speed_mps: Array, seed: int, n_clusters: int | N
         found.append((float(mixture.bic(reduced)), np.asarray(mixture.predict(reduced))))
     bic = np.array([each[0] for each in found])
     best = int(bic.argmin())
-    return RunClusters(found[best][1], numbers[best], bic)
+    return found[best][1], bic
 
 
 def _without_speed(scaled: Array, speed_mps: Array) -> Array:
@@ -189,15 +182,10 @@ def _without_speed(scaled: Array, speed_mps: Array) -> Array:
     return rest
 
 
-class Agreement(NamedTuple):
-    """Adjusted Rand index of two groupings of runs, and its 95 % interval over the runs."""
+def agreement(one: Array, other: Array, rng: np.random.Generator) -> tuple[float, Interval]:
+    """Return the adjusted Rand index of two groupings, 1 the same, 0 as by chance, and its 95 % interval over runs.
 
-    adjusted_rand: float
-    interval: tuple[float, float]
-
-
-def agreement(one: Array, other: Array, rng: np.random.Generator) -> Agreement:
-    """Return how far two groupings agree: 1 the same, 0 as by chance (Hubert and Arabie 1985).
+    Source: Hubert and Arabie (1985).
 
     A bootstrap over runs repeats runs, which always agree with themselves, so its index is taken over pairs
     of *different* runs only.
@@ -210,7 +198,7 @@ def agreement(one: Array, other: Array, rng: np.random.Generator) -> Agreement:
     Examples
     --------
     >>> groups = np.repeat(["soft", "hard"], 6)
-    >>> agreement(groups, np.repeat([1, 0], 6), np.random.default_rng(0)).adjusted_rand
+    >>> agreement(groups, np.repeat([1, 0], 6), np.random.default_rng(0))[0]
     1.0
     """
     first, second = (np.unique(each, return_inverse=True)[1] for each in (one, other))
@@ -221,7 +209,7 @@ def agreement(one: Array, other: Array, rng: np.random.Generator) -> Agreement:
         draws[i] = _adjusted_rand(np.bincount(rows, minlength=n).astype(float), *same)
     finite = draws[np.isfinite(draws)]
     interval = percentile_interval(finite) if len(finite) else (np.nan, np.nan)
-    return Agreement(_adjusted_rand(np.ones(n), *same), interval)
+    return _adjusted_rand(np.ones(n), *same), interval
 
 
 def _adjusted_rand(weight: Array, same_one: Array, same_other: Array) -> float:
@@ -248,7 +236,7 @@ class LevelClusters(NamedTuple):
 
     n_clusters: int
     adjusted_rand: float
-    interval: tuple[float, float]
+    interval: Interval
     adjusted_rand_of_classes: float
 
 
@@ -269,13 +257,13 @@ class StiffnessFigures(NamedTuple):
 
     levels: Mapping[str, str]
     accuracy: float
-    accuracy_ci: tuple[float, float]
+    accuracy_ci: Interval
     cost: float
-    cost_ci: tuple[float, float]
+    cost_ci: Interval
     least_cost: float
-    least_cost_ci: tuple[float, float]
+    least_cost_ci: Interval
     gain: float
-    gain_ci: tuple[float, float]
+    gain_ci: Interval
     least_cost_accuracy: float
     soft_hard_ratio: float
     clusters: LevelClusters | None
@@ -335,7 +323,7 @@ def _level_clusters(
         known = np.isfinite(features[run_id == run]).any(axis=0)
         row[known] = np.nanmedian(features[run_id == run][:, known], axis=0)
     try:
-        found = cluster_runs(values, np.array([speed_mps[run] for run in runs]), seed)
+        cluster, bic = cluster_runs(values, np.array([speed_mps[run] for run in runs]), seed)
     except DataError:
         return None
     agreed = []
@@ -344,6 +332,6 @@ def _level_clusters(
         for run in runs:
             names, counts = np.unique(of_window[run_id == run], return_counts=True)
             most.append(str(names[counts.argmax()]))
-        agreed.append(agreement(found.cluster, np.array(most), np.random.default_rng(seed)))
-    by_level, by_class = agreed
-    return LevelClusters(found.n_clusters, by_level.adjusted_rand, by_level.interval, by_class.adjusted_rand)
+        agreed.append(agreement(cluster, np.array(most), np.random.default_rng(seed)))
+    (by_level, interval), (by_class, _) = agreed
+    return LevelClusters(int(bic.argmin()) + 1, by_level, interval, by_class)

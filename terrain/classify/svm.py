@@ -6,10 +6,8 @@ here the inner folds are made of whole groups wherever a class has more than one
 
 Steps of ``fit``: scale and select on each inner training part, fit every candidate there, keep the
 candidate with the best accuracy on the held-out parts; its held-out margins of pairs of classes give the one
-scale of :mod:`terrain.classify.svm` that makes the true classes most likely; scale, select and fit once
+scale, below, that makes the true classes most likely; scale, select and fit once
 more on everything.
-
-Class probabilities from the margins of pairs of classes.
 
 One support vector machine separates each pair of classes (a, b), a before b, by a margin ``f_ab``, positive
 for a.  With one scale s for all pairs, ``r_ab = 1 / (1 + exp(-s f_ab))`` estimates the probability of a where
@@ -30,22 +28,21 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numba import njit
 from pydantic import Field
 from scipy.optimize import minimize_scalar
-from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.feature_selection import SelectPercentile, VarianceThreshold, f_classif
 from sklearn.impute import SimpleImputer
 from sklearn.pipeline import Pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVC
-from sklearn.utils.multiclass import check_classification_targets
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 
 from terrain.classify.folds import block_groups, split_runs
+from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -256,7 +253,7 @@ class Preparation(NamedTuple):
         return np.asarray(np.clip((used - self.mean) / self.scale, -CLIP_STD, CLIP_STD))
 
 
-class GroupedSVC(ClassifierMixin, BaseEstimator):
+class GroupedSVC(GroupedClassifier):
     """RBF SVM with its own scaling, selection, choice of hyper-parameters and calibration.
 
     Parameters
@@ -302,17 +299,11 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
         DataError
             if there is one class only, or a class has too few windows to hold some of them out.
         """
-        X, y = validate_data(self, X, y, ensure_all_finite="allow-nan")
-        check_classification_targets(y)
-        self.classes_, counts = np.unique(y, return_counts=True)
-        if len(self.classes_) < 2:
-            raise DataError(
-                f"all windows are {str(self.classes_[0])!r}: a classifier needs at least two classes"
-            )
+        X, y, groups = self._training_rows(X, y, groups)
+        counts = np.unique(y, return_counts=True)[1]
         if counts.min() < 2:
             rare = str(self.classes_[counts.argmin()])
             raise DataError(f"there is one window of class {rare!r}; at least 2 are needed")
-        groups = np.arange(len(y)) if groups is None else np.asarray(groups)
         candidates = [Candidate(*candidate) for candidate in self.candidates]
         step = -(-len(y) // MAX_INNER_ROWS)
         inner_y, gap = y[::step], -(-self.gap // step)
@@ -380,25 +371,12 @@ class GroupedSVC(ClassifierMixin, BaseEstimator):
 
     def margins(self, X: Array) -> Array:
         """Return the margins of the pairs of classes (n, k (k - 1) / 2), positive for the first of a pair."""
-        check_is_fitted(self)
-        X = validate_data(self, X, reset=False, ensure_all_finite="allow-nan")
-        return _margins(self.svc_, self.preparation_.of(X), self.classes_)
+        rows = self._rows(X)
+        return _margins(self.svc_, self.preparation_.of(rows), self.classes_)
 
     def predict_proba(self, X: Array) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``."""
-        check_is_fitted(self)
         return class_probabilities(self.margins(X), len(self.classes_), self.scale_)
-
-    def predict(self, X: Array) -> Array:
-        """Return the class of the highest probability (n,)."""
-        best = self.predict_proba(X).argmax(axis=1)
-        return np.asarray(self.classes_[best])
-
-    def __sklearn_tags__(self) -> Any:
-        """Declare that NaN is accepted."""
-        tags = super().__sklearn_tags__()
-        tags.input_tags.allow_nan = True
-        return tags
 
 
 def f_score(X: Array, y: Array) -> tuple[Array, Array]:

@@ -29,7 +29,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array
@@ -159,17 +158,16 @@ def filter_step(
     >>> belief.probability.round(2)
     array([0.99, 0.  , 0.01])
     """
-    rows = np.asarray(probability, dtype=np.float64).reshape(1, -1)
-    out = np.empty((1, len(belief.probability)))
-    silent_s = _run(
-        np.ascontiguousarray(belief.probability, dtype=np.float64),
-        float(belief.silent_s),
-        rows,
-        np.array([[dt_s, novelty]], dtype=np.float64),
-        *_numbers(settings),
-        out,
-    )
-    return FilterBelief(out[0], silent_s)
+    stays = math.exp(-settings.renewal_hz * dt_s)
+    now = stays * belief.probability + (1.0 - stays) * settings.grounds
+    silent_s = belief.silent_s + dt_s
+    if not np.isfinite(probability).all():
+        return FilterBelief(now, silent_s)
+    share, power = settings.outlier_ratio, min(silent_s / settings.evidence_s, 1.0)
+    now[:-1] *= ((1.0 - share) * np.asarray(probability) / np.array(settings.prior) + share) ** power
+    if math.isfinite(novelty):
+        now[-1] *= math.exp(power * novelty)
+    return FilterBelief(now / now.sum(), 0.0)
 
 
 def filter_run(
@@ -196,7 +194,7 @@ def filter_run(
     >>> float((reported(belief[24:], 0.5) == 1).argmax() / 4)  # s from the change to where it is reported
     0.75
     """
-    rows = np.ascontiguousarray(probability, dtype=np.float64)
+    rows = np.asarray(probability, dtype=np.float64)
     time_s = np.asarray(time_s, dtype=np.float64)
     if rows.shape != (len(time_s), len(settings.prior)):
         raise DataError(
@@ -209,16 +207,10 @@ def filter_run(
     dt_s = np.diff(time_s, prepend=time_s[:1])
     if not (dt_s >= 0.0).all():
         raise DataError("the windows of a run must be in order of time")
-    begin = initial_belief(settings)
-    out = np.empty((len(rows), len(begin.probability)))
-    _run(
-        begin.probability,
-        begin.silent_s,
-        rows,
-        np.column_stack([dt_s, scores]),
-        *_numbers(settings),
-        out,
-    )
+    belief, out = initial_belief(settings), np.empty((len(rows), len(settings.prior) + 1))
+    for i, (row, step_s, score) in enumerate(zip(rows, dt_s.tolist(), scores.tolist(), strict=True)):
+        belief = filter_step(belief, row, step_s, settings, score)
+        out[i] = belief.probability
     return out
 
 
@@ -286,53 +278,3 @@ class LiveTerrainFilter:
         belief = self._belief.probability
         best = int(reported(belief[None], self.settings.threshold)[0])
         return best, float(belief[best]) if best >= 0 else math.nan
-
-
-def _numbers(settings: TerrainFilter) -> tuple[Array, Array, Array]:
-    """Return prior, shares of grounds, and renewal rate, evidence time and share of outliers."""
-    prior = np.array(settings.prior, dtype=np.float64)
-    rates = np.array([settings.renewal_hz, settings.evidence_s, settings.outlier_ratio])
-    return prior, settings.grounds, rates
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _run(
-    belief: Array,
-    silent_s: float,
-    probability: Array,
-    steps: Array,
-    prior: Array,
-    grounds: Array,
-    rates: Array,
-    out: Array,
-) -> float:
-    """Write the belief after each row; return the time since the last output.
-
-    ``steps`` has time and novelty of each row, ``rates`` those of :func:`_numbers`.
-    """
-    renewal_hz, evidence_s, outlier_ratio = rates[0], rates[1], rates[2]
-    n_classes = prior.size
-    now = belief.copy()
-    for n in range(probability.shape[0]):
-        kept = math.exp(-renewal_hz * steps[n, 0])
-        for c in range(n_classes + 1):
-            now[c] = kept * now[c] + (1.0 - kept) * grounds[c]
-        silent_s += steps[n, 0]
-        finite = True
-        for c in range(n_classes):
-            finite = finite and math.isfinite(probability[n, c])
-        if finite:
-            power = min(silent_s / evidence_s, 1.0)
-            total = 0.0
-            for c in range(n_classes):
-                ratio = (1.0 - outlier_ratio) * probability[n, c] / prior[c] + outlier_ratio
-                now[c] *= ratio**power
-                total += now[c]
-            if math.isfinite(steps[n, 1]):
-                now[n_classes] *= math.exp(power * steps[n, 1])
-            total += now[n_classes]
-            for c in range(n_classes + 1):
-                now[c] /= total
-            silent_s = 0.0
-        out[n] = now
-    return silent_s

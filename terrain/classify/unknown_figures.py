@@ -14,7 +14,7 @@ import numpy as np
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.classify.folds import block_groups, split_runs
 from terrain.classify.metrics import N_BOOTSTRAP
-from terrain.classify.novelty import KNOWN_KEPT, NoveltyScore
+from terrain.classify.novelty import KNOWN_KEPT, learn_novelty
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -68,13 +68,6 @@ class Scored(NamedTuple):
     threshold: float
 
 
-class Compared(NamedTuple):
-    """By run of known and unknown windows: how many pairs the unknown one wins, and how many pairs are."""
-
-    won: Array
-    pairs: Array
-
-
 def left_out_folds(
     terrain: Array, run_id: Array, n_folds: int, gap: int, seed: int
 ) -> list[tuple[Array, Array, Array]]:
@@ -113,8 +106,8 @@ def score_fold(
     X: Array, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array, unknown: Array
 ) -> Scored:
     """Return the novelty of held-out and of unknown rows, by a score that is fitted on training rows."""
-    fitted = NoveltyScore(gap=gap, seed=seed).fit(X[train], y[train], group[train])
-    return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.numbers_.threshold)
+    fitted = learn_novelty(X[train], y[train], group[train], gap=gap, seed=seed)
+    return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.threshold)
 
 
 def unknown_figures(
@@ -139,8 +132,8 @@ def unknown_figures(
     spans = [_compare([_span_means(s, run_of, start_s) for s in p], run_of) for p in of_terrain.values()]
     rows_of = {
         name: LeftOutTerrain(
-            float(window.won.sum() / window.pairs.sum()),
-            float(span.won.sum() / span.pairs.sum()),
+            float(window[0].sum() / window[1].sum()),
+            float(span[0].sum() / span[1].sum()),
             _accepted([(part.unknown_scores, part.threshold) for part in parts]),
             _accepted([(part.known_scores, part.threshold) for part in parts]),
         )
@@ -169,8 +162,11 @@ def _span_means(scored: Scored, run_of: Array, start_s: Array) -> Scored:
     return Scored(known, unknown, known_scores, unknown_scores, scored.threshold)
 
 
-def _compare(parts: Sequence[Scored], run_of: Array) -> Compared:
-    """Compare known and unknown windows that one fold scored; ties count one half, NaN as unknown."""
+def _compare(parts: Sequence[Scored], run_of: Array) -> tuple[Array, Array]:
+    """Return, by run of known and unknown windows, how many pairs the unknown one wins, and how many pairs are.
+
+    Pairs are of one fold; ties count one half, NaN as unknown.
+    """
     n_runs = int(run_of.max()) + 1
     won, pairs = np.zeros((2, n_runs, n_runs))
     for part in parts:
@@ -183,10 +179,10 @@ def _compare(parts: Sequence[Scored], run_of: Array) -> Compared:
             up_to = np.searchsorted(ordered, unknown_scores, "right")
             won[run] += np.bincount(unknown_run, (below + up_to) / 2.0, n_runs)
             pairs[run] += np.bincount(unknown_run, minlength=n_runs) * len(ordered)
-    return Compared(won, pairs)
+    return won, pairs
 
 
-def _interval(compared: Sequence[Compared], weights: Array) -> tuple[float, float]:
+def _interval(compared: Sequence[tuple[Array, Array]], weights: Array) -> tuple[float, float]:
     """Return the interval of the mean area over the terrains that were left out."""
     draws = np.zeros(len(weights))
     for won, pairs in compared:

@@ -1,10 +1,9 @@
 """What a table of target slips aims for on each terrain, ready for the control loop.
 
-Braking by controlled slip: where it stops a robot sooner than locked wheels.
-
-On terrain that shears, thrust rises with slip up to the locked wheel: nothing stops sooner.  On hard terrain
-it falls again beyond a peak.  Slip is controlled in braking where it falls by more than the controller loses
-while slip builds up, and where friction is so small that wheels lock at all.
+Braking by controlled slip is aimed for where it stops a robot sooner than locked wheels.  On terrain that
+shears, thrust rises with slip up to the locked wheel: nothing stops sooner.  On hard terrain it falls again
+beyond a peak.  Slip is controlled in braking where it falls by more than the controller loses while slip
+builds up, and where friction is so small that wheels lock at all.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.slip_table import CurveEntry, SlipTable
+from terrain.control.traction import TractionTarget
 from terrain.records import SlipTarget
 
 SLICK_RATIO = 0.5
@@ -30,15 +30,8 @@ DECELERATION_RATIO = 0.9
 """Planned deceleration over that at the peak; with more, the slip would diverge from the peak."""
 
 
-class Braking(NamedTuple):
-    """Slip of the peak, and the planned deceleration on level terrain."""
-
-    slip_ratio: float
-    mps2: float
-
-
-def braking_by_slip(curve: CurveEntry | None) -> Braking | None:
-    """Return slip and deceleration on terrain with that curve, or None where locked wheels stop as soon.
+def braking_by_slip(curve: CurveEntry | None) -> tuple[float, float] | None:
+    """Return slip of the peak and planned deceleration on level terrain; None where locked wheels stop as soon.
 
     Examples
     --------
@@ -52,9 +45,8 @@ def braking_by_slip(curve: CurveEntry | None) -> Braking | None:
     peak = int(thrust.argmax())
     if peak == len(slip) - 1 or thrust[peak] > SLICK_RATIO or thrust[-1] > LOCKED_RATIO * thrust[peak]:
         return None
-    return Braking(
-        float(slip[peak]), DECELERATION_RATIO * float(thrust[peak] + curve.resistance_ratio) * GRAVITY_MPS2
-    )
+    deceleration_mps2 = DECELERATION_RATIO * float(thrust[peak] + curve.resistance_ratio) * GRAVITY_MPS2
+    return float(slip[peak]), deceleration_mps2
 
 
 MARGIN_MAX_RATIO = 0.06
@@ -64,19 +56,10 @@ table that aims for a peak."""
 
 
 class Aim(NamedTuple):
-    """What a table aims for on a terrain.
+    """What a table aims for on a terrain: its targets by drive state, and those of traction control on the level."""
 
-    Parameters
-    ----------
-    entry : of the table, by drive state
-    slip_ratio, margin_ratio : target in traction, and by how much it is above that of steady motion
-    braking : by controlled slip; None where locked wheels stop as soon or no curve was learned
-    """
-
-    entry: Mapping[str, SlipTarget]
-    slip_ratio: float
-    margin_ratio: float
-    braking: Braking | None
+    slip_targets: Mapping[str, SlipTarget]
+    level: TractionTarget
 
 
 class Aims(dict[str, Aim]):
@@ -99,7 +82,8 @@ class Aims(dict[str, Aim]):
 
 
 def _aim(table: SlipTable, terrain: str) -> Aim:
-    entry = table.lookup(terrain)
-    traction = entry["traction"]
-    margin = min(traction.slip_ratio - entry["steady"].slip_ratio, MARGIN_MAX_RATIO)
-    return Aim(entry, traction.slip_ratio, margin, braking_by_slip(table.curves.get(traction.terrain)))
+    targets = table.lookup(terrain)
+    traction = targets["traction"]
+    margin = min(traction.slip_ratio - targets["steady"].slip_ratio, MARGIN_MAX_RATIO)
+    braking = braking_by_slip(table.curves.get(traction.terrain)) or (0.0, 0.0)
+    return Aim(targets, TractionTarget(traction.slip_ratio, *braking, margin))

@@ -5,10 +5,9 @@ At a tick the observer takes what was measured, the path gives the deviations of
 is that of the extended kinematic model without slip.  The robot stops where it does not know where it is: no
 fix for three seconds, or further from the path than its search reaches; at the end the drive is finished.
 
-Speed and steering ahead of bends, by the grip that the estimated cornering stiffness shows.
-
-An axle under the load N carries |F| = f N.  With the cornering stiffness C_0 that the tyre has at small slip,
-the force that saturates at the grip mu is, as in :mod:`terrain.simulation.car`::
+The preview gives speed and steering ahead of bends, by the grip that the estimated cornering stiffness
+shows.  An axle under the load N carries |F| = f N.  With the cornering stiffness C_0 that the tyre has at small
+slip, the force that saturates at the grip mu is, as in :mod:`terrain.simulation.car`::
 
     f = mu (1 - exp(-q / mu)),   q = C_0 |b| / N
 
@@ -50,7 +49,7 @@ from terrain.estimation.observers.sideslip_pose import (
     PoseSettings,
 )
 from terrain.records import Array
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 from terrain.simulation.car import CarCommand, CarSample
 
 REACH_TIME_CONSTANTS = 1.0

@@ -244,6 +244,7 @@ def thesis_step(
     --------
     Forward in traction with too much slip: case 1A of table 8.1, with a radius of 1 m.
 
+    >>> import numpy as np
     >>> settings = ThesisSettings(1.0, Gains(1.0, 0.0, 0.0, limit=1.0))
     >>> rate, speed, targets = np.array([0.7]), np.array([0.6]), (0.1, -0.15, 0.05)
     >>> (wheel,), _ = thesis_step(settings, [WheelPid()], rate, rate, speed, np.ones(1), 0.6, targets, 0.02)

@@ -1,6 +1,6 @@
 """Drives of several controllers at equal conditions: evaluated, and compared seed by seed.
 
-Means with their 95 % intervals over simulated runs, by Student's distribution, and paired differences.
+Means over drives and paired differences have 95 % intervals by Student's distribution.
 """
 
 from __future__ import annotations

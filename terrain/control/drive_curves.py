@@ -11,7 +11,7 @@ import numpy as np
 from terrain.control.danzi_pid import DriveState
 from terrain.control.drive_metrics import PEAK_ABOVE_MPS, low_passed_slip
 from terrain.control.slip_table import SlipTable
-from terrain.kinematics.true_slip import true_slip
+from terrain.kinematics.logged_wheels import true_slip
 from terrain.records import Array, RunLog
 
 MAX_POINTS = 2500

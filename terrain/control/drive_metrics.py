@@ -1,10 +1,8 @@
-"""Metrics of a simulated drive, from the truth in its log.
+"""Metrics of a simulated drive by name, from the truth in its log.
 
 Energy is the mechanical work of the wheels' motors, ``max(T w, 0)`` summed over wheels: the motor drivers do
 not recover energy.  Controllers are compared at equal distance, as at equal time the consumption of one that
 travels less far is lower.
-
-Evaluation of a simulated drive: all its metrics by name, and the energy of several at equal distance.
 """
 
 from __future__ import annotations
@@ -27,11 +25,11 @@ from terrain.control.situations import (
 )
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import DRIVING_MPS, OutputStatus
-from terrain.kinematics.true_slip import true_slip
-from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
+from terrain.kinematics.logged_wheels import true_slip
+from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.scenario import Scenario
 
 PEAK_ABOVE_MPS = 0.2
 """Slip is evaluated above this speed: below it is the ratio of two small speeds."""

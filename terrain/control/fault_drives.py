@@ -1,14 +1,9 @@
-"""Closed-loop drives with a sensor fault, clean, and by plain commands; and what the fault does to them.
-
-A pilot's exceptions do not end a drive: they are counted, and the wheels keep their last command.
-
-Situations in which a sensor fault matters most, and the moment at which it begins in each.
-
-What a sensor fault does to a closed-loop drive: its figures, and the bars that they have to meet.
+"""What a sensor fault does to a closed-loop drive: situations, drives, figures, and the bars that they have to meet.
 
 A drive with a fault is compared with two others in the same situation and by the same seed: the *clean* one,
 by the same controller without the fault, and the *plain* one, by the commands of the kinematics alone, which
-no sensor fault touches.  A fault must not make slip control worse than having none.
+no sensor fault touches.  A fault must not make slip control worse than having none.  A pilot's exceptions do not
+end a drive: they are counted, and the wheels keep their last command.
 """
 
 from __future__ import annotations
@@ -40,12 +35,11 @@ from terrain.control.situations import (
 )
 from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError
-from terrain.records import Array, Command, RunLog, Sample, read_only
+from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
 from terrain.simulation.conditions import Faults
-from terrain.simulation.faults.catalogue import fault_catalogue
-from terrain.simulation.faults.fault import FaultyBus, Nature, SensorFault
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.faults import FaultyBus, Nature, SensorFault, fault_catalogue
+from terrain.simulation.scenario import Scenario
 
 START, STOP, STEADY = "start", "stop", "steady"
 
@@ -143,8 +137,7 @@ class Limits(NamedTuple):
 LIMITS = Limits()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FaultDrive:
+class FaultDrive(NamedTuple):
     """What is evaluated of a drive, at the instants of its control.
 
     Parameters
@@ -172,15 +165,6 @@ class FaultDrive:
     speed_mps: Array
     stop_s: float = math.inf
     stop_m: float = math.nan
-
-    def __post_init__(self) -> None:
-        for name in ("ok", "moving"):
-            object.__setattr__(self, name, read_only(getattr(self, name), np.bool_))
-        for name in (
-            *("time_s", "slip_ratio", "true_slip_ratio", "body_slip_ratio"),
-            *("commanded_mps", "desired_mps", "speed_mps"),
-        ):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
 
 
 class FaultFigures(NamedTuple):
@@ -448,7 +432,7 @@ class FaultRow:
     kind, streams, nature : of the fault
     figures : of the drive
     bars : by name, whether it is met; None where it does not apply
-    blamed : by the name of a sensor, what the controller's ``health`` named it; None without a ``health``
+    sensors_named : by the name of a sensor, what the controller's ``health`` named it; None without a ``health``
     exception : the first one that the controller raised, or empty
     """
 
@@ -458,7 +442,7 @@ class FaultRow:
     nature: str
     figures: FaultFigures
     bars: Mapping[str, bool | None]
-    blamed: Mapping[str, str] | None
+    sensors_named: Mapping[str, str] | None
     exception: str
 
     @property
@@ -596,7 +580,7 @@ def evaluate_case(loop: FaultLoop, case: FaultCase, references: References) -> F
         nature=fault.nature.value,
         figures=figures,
         bars=judge(figures, fault.nature),
-        blamed=named_sensors(pilot.health, acts.tolist(), float(time_s[1] - time_s[0])),
+        sensors_named=named_sensors(pilot.health, acts.tolist(), float(time_s[1] - time_s[0])),
         exception=pilot.exception,
     )
 

@@ -1,13 +1,9 @@
-"""The table of target slips of the terrains that were learned.
-
-A target slip of one session taken for another session of the same surface: by how much it is off.
-
-The table of target slips that runs at constant speed show: steady slip, measured from outside.
+"""Tables of target slips that runs show: by the slip curves of terrains, or by steady slip measured from outside.
 
 A robot that is driven at a constant speed takes the slip at which thrust balances resistance: the *steady*
 target, with its error over runs.  How much more thrust more slip would give, and where its peak is, such runs
 do not show; the targets of traction and braking stay assumed, traction at least just above the steady slip,
-or no robot would start.
+or no robot would start.  What such a target of one session costs in another session of the same surface is measured.
 """
 
 from __future__ import annotations
@@ -84,7 +80,7 @@ def learned_table(learned: Sequence[LearnedTerrain], robot: Robot, name: str) ->
             targets[entry.terrain] = _estimated(entry.terrain, entry.targets, entry.curve.n_runs)
             curves[entry.terrain] = curve_entry(entry.curve, entry.targets, robot)
         else:
-            targets[entry.terrain] = _assumed(entry, default)
+            targets[entry.terrain] = _assumed(entry.terrain, default, entry.status)
             reasons[entry.terrain] = entry.reason
     reasons.setdefault(FALLBACK, "used for a terrain without an entry")
     targets.setdefault(FALLBACK, _fallback(targets, default))
@@ -100,13 +96,20 @@ def _estimated(terrain: str, targets: Targets, n_runs: int) -> dict[str, SlipTar
     return found
 
 
-def _assumed(entry: LearnedTerrain, default: SlipTable) -> dict[str, SlipTarget]:
-    found = {}
-    for state, assumed in default.lookup(entry.terrain).items():
-        source = f"table {default.name}, {assumed.terrain}: {assumed.source}"
-        numbers = assumed.slip_ratio, math.nan, 0
-        found[state] = SlipTarget(entry.terrain, state, *numbers, entry.status, source)
-    return found
+def _assumed(
+    terrain: str, default: SlipTable, status: TargetStatus = TargetStatus.UNESTIMATED
+) -> dict[str, SlipTarget]:
+    """Return the numbers of the packaged table for a terrain."""
+    return {
+        state: target._replace(
+            terrain=terrain,
+            slip_std=math.nan,
+            n_runs=0,
+            status=status,
+            source=f"table {default.name}, {target.terrain}: {target.source}",
+        )
+        for state, target in default.lookup(terrain).items()
+    }
 
 
 def _fallback(targets: Mapping[str, Mapping[str, SlipTarget]], default: SlipTable) -> dict[str, SlipTarget]:
@@ -313,7 +316,7 @@ def measured_table(surfaces: Sequence[SurfaceSlip], robot: Robot, name: str) -> 
         targets[surface.terrain] = _targets(surface, default)
     reasons.setdefault(FALLBACK, "used for a terrain without an entry")
     if FALLBACK not in targets:
-        targets[FALLBACK] = _copied(FALLBACK, default.targets[default.fallback], default)
+        targets[FALLBACK] = _assumed(FALLBACK, default)
     return SlipTable(name, FALLBACK, targets, robot.name, {}, reasons)
 
 
@@ -325,7 +328,7 @@ def reason_of(surface: SurfaceSlip) -> str:
 
 
 def _targets(surface: SurfaceSlip, default: SlipTable) -> dict[str, SlipTarget]:
-    assumed = _copied(surface.terrain, default.lookup(surface.terrain), default)
+    assumed = _assumed(surface.terrain, default)
     if reason_of(surface) is not NO_PEAK:
         return assumed
     low, high = surface.interval
@@ -344,19 +347,6 @@ def _targets(surface: SurfaceSlip, default: SlipTable) -> dict[str, SlipTarget]:
         source = "assumed: just above the steady slip that was measured"
         traction = traction._replace(slip_ratio=round(least, DIGITS), source=source)
     return {**assumed, "steady": steady, "traction": traction}
-
-
-def _copied(terrain: str, entry: Mapping[str, SlipTarget], default: SlipTable) -> dict[str, SlipTarget]:
-    return {
-        state: target._replace(
-            terrain=terrain,
-            slip_std=math.nan,
-            n_runs=0,
-            status=TargetStatus.UNESTIMATED,
-            source=f"table {default.name}, {target.terrain}: {target.source}",
-        )
-        for state, target in entry.items()
-    }
 
 
 class LearnedSurfaces(NamedTuple):

@@ -19,7 +19,7 @@ from terrain.control.switching import UNKNOWN
 from terrain.errors import DataError
 from terrain.files.documents import first_fault
 from terrain.files.regular import read_regular
-from terrain.logs.recorded_windows import Number
+from terrain.logs.labels import Number
 
 BIASES_FRESH_S = 600.0
 """A bias older than that is estimated anew: with temperature it moves further than its walk says."""

@@ -1,7 +1,4 @@
-"""A car-like robot along a path in simulation: what is driven, and the figures that it is judged by.
-
-How well a car-like robot followed a path, and what its observer knew, by a simulated truth.
-"""
+"""A car-like robot along a path in simulation: what is driven, how well, and what its observer knew."""
 
 from __future__ import annotations
 

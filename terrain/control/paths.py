@@ -22,7 +22,7 @@ from scipy.interpolate import splev, splprep
 from terrain.angles import unwrapped, wrapped
 from terrain.errors import DataError, LogError
 from terrain.records import Array, read_only
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 from terrain.status import StatusCode
 
 GRID_M = 0.05

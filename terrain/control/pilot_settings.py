@@ -142,4 +142,6 @@ def wheel_controller(robot: Robot, settings: PilotSettings) -> WheelController:
         return traction
     if settings.controller == "thesis":
         return ThesisController(robot, settings.gains, settings.traction.stale_max_s)
-    return RampController(settings.ramp_mps2 if settings.controller == "ramp" else math.inf)
+    return RampController(
+        robot.wheel_radius_m, settings.ramp_mps2 if settings.controller == "ramp" else math.inf
+    )

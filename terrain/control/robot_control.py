@@ -31,14 +31,14 @@ from terrain.control.traction import TractionStatus, TractionTarget
 from terrain.control.wheel_controllers import (
     UNOBSERVED,
     WheelObserver,
-    WheelRequest,
     estimate_age,
+    largest_forward,
     step_or_period,
 )
 from terrain.entry_point import entry_point
 from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.estimation.live import LiveEstimate
-from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
+from terrain.kinematics.commands import FAR_RAD, wheel_command_step
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Command, Reading
 from terrain.robots import SwerveRobot
@@ -171,16 +171,14 @@ class RobotControl:
             belief = drive_on(belief, desired_mps, step_s, self._settings.switching)
         observed = self._observer.observe(seen, time_s) if self._estimates else _NOT_ESTIMATED
         sound = health <= _SOUND
-        entry = self._aims[belief.terrain].entry
-        request = WheelRequest(
-            wheel_radps, desired_mps, target, entry, observed if sound else UNOBSERVED, dt_s
+        slip_targets = self._aims[belief.terrain].slip_targets
+        command_radps, done = self._controller.step(
+            wheel_radps, observed if sound else UNOBSERVED, target, slip_targets, dt_s
         )
-        command_radps, done = self._controller.step(request)
         status, slip_ratio = done.status, done.slip_ratio
         if not sound:
             status = status if status == TractionStatus.BAD_TIME else TractionStatus.UNSOUND
-            slips = observed.wheels.slip_ratio
-            slip_ratio = float(np.where(wheel_radps < 0.0, -slips, slips).max())  # NaN where one is
+            slip_ratio = largest_forward(wheel_radps, observed.slip_ratio)
         self._actuation.commanded(command_radps * self._radius_m, self.steer_rad)
         figures = PilotStatus(
             float(status),
@@ -190,7 +188,7 @@ class RobotControl:
             done.aimed_ratio,
             done.balance_ratio,
             slip_ratio,
-            float(observed.wheels.slip_std.max()),
+            float(observed.slip_std.max()),
             observed.stale_s,
             float(done.drive_state),
             done.driven_mps,
@@ -227,11 +225,13 @@ class RobotControl:
     def _target(self, terrain: str, seen: LiveEstimate | None, dt_s: float) -> TractionTarget:
         """Return the slips to aim for; the target moves to that of the terrain at a bounded rate."""
         aim, rate_ratio = self._aims[terrain], self._settings.switching.rate_ratio
-        self.target_ratio = approach(self.target_ratio, aim.slip_ratio, rate_ratio, dt_s)
-        if aim.braking is None:
-            return TractionTarget(self.target_ratio, margin_ratio=aim.margin_ratio)
-        mps2 = max(aim.braking.mps2 + uphill_mps2(seen, *self._tilt_rad), 0.0)
-        return TractionTarget(self.target_ratio, aim.braking.slip_ratio, mps2, aim.margin_ratio)
+        self.target_ratio = approach(self.target_ratio, aim.level.traction_ratio, rate_ratio, dt_s)
+        target = aim.level._replace(traction_ratio=self.target_ratio)
+        if target.braking_mps2 == 0.0:
+            return target
+        return target._replace(
+            braking_mps2=max(target.braking_mps2 + uphill_mps2(seen, *self._tilt_rad), 0.0)
+        )
 
     def _track(
         self, twist: Array, seen: LiveEstimate | None, time_s: float, dt_s: float

@@ -28,7 +28,7 @@ from typing import NamedTuple
 from terrain.control.paths import GRID_M, Place, ReferencePath
 from terrain.errors import ConfigError
 from terrain.records import Array
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 from terrain.status import StatusCode
 
 

@@ -1,4 +1,4 @@
-"""Switching of targets: when a classification is accepted, and how fast a target may change.
+"""The terrain that a controller believes in: its sources, when a classification is accepted, and targets that follow.
 
 A classifier gives one output per window, and some are wrong; a target that followed each output would jump.
 Here a class is accepted when it was classified with sufficient probability, window after window, for a dwell
@@ -6,8 +6,6 @@ time.  Outputs of low probability for as long are accepted as "unknown", for whi
 used.  A class that no output has confirmed for some time of driving becomes unknown, too: a classifier that
 fell silent, or that contradicts itself, says nothing of where the robot has come to since.  The target then
 moves to its new value at a bounded rate.
-
-Sources of the current terrain for the control of a robot: a known one, none, or a classifier elsewhere.
 """
 
 from __future__ import annotations

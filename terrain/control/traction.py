@@ -107,15 +107,17 @@ class TractionTarget(NamedTuple):
     margin_ratio: float = 0.0
 
 
-class WheelMeasurements(NamedTuple):
-    """Estimated state of the wheels, each an array (wheels,) of floats, contiguous.
+class WheelMotion(NamedTuple):
+    """Estimated motion at the wheels; arrays (wheels,), signed along each wheel as it is steered.
 
     Parameters
     ----------
-    speed_mps, accel_mps2 : speed and acceleration over ground along each wheel as it is steered, of the
-        filter
-    slip_ratio, slip_std : slip, signed along the wheel, and its standard deviation
-    torque_nm : of the motors, at the wheels, signed along the wheel; NaN where it is not known
+    speed_mps, accel_mps2 : speed and acceleration over ground, of the filter
+    slip_ratio, slip_std : slip and its standard deviation
+    torque_nm : of the motors, at the wheels; NaN where it is not known
+    wheel_radps : rates
+    chassis_mps : magnitude of the robot's velocity
+    stale_s : time since the speed over ground was measured last; infinite before the first time
     """
 
     speed_mps: Array
@@ -123,6 +125,9 @@ class WheelMeasurements(NamedTuple):
     slip_ratio: Array
     slip_std: Array
     torque_nm: Array
+    wheel_radps: Array
+    chassis_mps: float
+    stale_s: float
 
 
 def check_settings(settings: TractionSettings) -> TractionSettings:
@@ -190,26 +195,26 @@ class TractionStatus(StatusCode):
     UNSOUND = 5
 
 
-class TractionReport(NamedTuple):
-    """What a step decided, and by what.
+class WheelReport(NamedTuple):
+    """What a step of a controller of the wheels decided, and by what; NaN where it does not have the figure.
 
     Parameters
     ----------
     driven_mps : commanded speed of the fastest wheel
-    target_ratio : s* with its floor
+    aimed_ratio : s* with its floor
     balance_ratio : slip of steady motion; NaN until it was measured
     slip_ratio : largest of the wheels, positive in traction; NaN where it is not known
-    drive_state : number of a :class:`terrain.control.danzi_pid.DriveState`, by what is commanded: the
-        measured acceleration would latch into braking
-    status : number of a :class:`TractionStatus`
+    drive_state : by what is commanded, as the measured acceleration would latch into braking; of the thesis'
+        controller that of the first wheel
+    status : whether a correction was made
     """
 
     driven_mps: float
-    target_ratio: float
+    aimed_ratio: float
     balance_ratio: float
     slip_ratio: float
-    drive_state: int
-    status: int
+    drive_state: DriveState
+    status: TractionStatus
 
 
 class TractionState(NamedTuple):
@@ -252,7 +257,7 @@ class _Seen(NamedTuple):
     accel_mps2: float
     largest_slip: float
     mean_slip: float
-    status: int
+    status: TractionStatus
 
 
 _SLOW_S = 0.5  # window of the speed gain: shorter is noise, longer comes late
@@ -275,8 +280,7 @@ def _observe(
     settings: TractionSettings,
     state: TractionState,
     radius_m: float,
-    wheels: WheelMeasurements,
-    stale_s: float,
+    wheels: WheelMotion,
 ) -> _Seen:
     """Return the motion over ground seen from the fastest wheel: the least that a wheel shows."""
     status = TractionStatus.OK
@@ -302,7 +306,7 @@ def _observe(
             q, gain = sign * speed / ratio, sign * accel / ratio
     if math.isinf(q):
         q, gain = 0.0, 0.0
-    if status is TractionStatus.OK and not stale_s <= settings.stale_max_s:
+    if status is TractionStatus.OK and not wheels.stale_s <= settings.stale_max_s:
         status = TractionStatus.STALE
     if status is TractionStatus.OK and not uncertain <= settings.std_max_ratio:
         status = TractionStatus.UNCERTAIN
@@ -338,7 +342,7 @@ def _drive(
     """Return the state with the next d, which was ``was_mps``."""
     desired = driven = state.desired_mps
     held_s = braking_s = 0.0
-    if seen.status != TractionStatus.OK:
+    if seen.status is not TractionStatus.OK:
         driven = min(desired, was_mps + settings.fade_mps2 * dt_s)
     elif drive_state is DriveState.TRACTION:
         ahead = seen.ground_mps + settings.lead_s * min(max(seen.accel_mps2, 0.0), settings.lead_max_mps2)
@@ -413,7 +417,7 @@ def _share_torque(
         mean += torque / len(filtered)
     grip = min(max(2.0 - abs(seen.mean_slip) / _GRIP, 0.0), 1.0)
     command = [rate * state.driven_mps for rate in state.rate_radpm]
-    if seen.status == TractionStatus.OK:
+    if seen.status is TractionStatus.OK:
         for i, sign in enumerate(signs):
             limit = grip * settings.droop_max_ratio * abs(command[i])
             droop = settings.droop_radps_per_nm * (filtered[i] - mean)
@@ -427,10 +431,9 @@ def traction_step(
     target: TractionTarget,
     radius_m: float,
     wheel_radps: Array,
-    wheels: WheelMeasurements,
-    stale_s: float,
+    wheels: WheelMotion,
     dt_s: float,
-) -> tuple[Array, TractionState, TractionReport]:
+) -> tuple[Array, TractionState, WheelReport]:
     """Return the wheels' commands, the next state, and why.
 
     Parameters
@@ -439,8 +442,7 @@ def traction_step(
     target : slips to aim for
     radius_m : nominal radius of the wheels
     wheel_radps : (wheels,) desired
-    wheels : estimates
-    stale_s : time since the speed over ground was measured last
+    wheels : as estimated
     dt_s : since the step before
 
     Returns
@@ -459,7 +461,7 @@ def traction_step(
         state = state._replace(rate_radpm=tuple(rate / desired for rate in rates))
     if not 0.0 < dt_s <= MAX_STEP_S:
         driven = min(desired, was + settings.fade_mps2 * _USUAL_STEP_S)
-        report = TractionReport(
+        report = WheelReport(
             driven,
             target.traction_ratio,
             state.balance_ratio,
@@ -469,15 +471,15 @@ def traction_step(
         )
         command = np.array([rate * driven for rate in state.rate_radpm])
         return command, state._replace(driven_mps=driven), report
-    seen = _observe(settings, state, radius_m, wheels, stale_s)
+    seen = _observe(settings, state, radius_m, wheels)
     margin = max(settings.balance_margin_ratio, target.margin_ratio)
     aimed = _aimed_slip(state, target.traction_ratio, margin)
     drive_state = _commanded_state(state, desired, was, dt_s)
     state = state._replace(desired_mps=desired)
     state = _drive(settings, state, target, aimed, seen, drive_state, was, dt_s)
-    if seen.status == TractionStatus.OK:
+    if seen.status is TractionStatus.OK:
         state = _learn_balance(settings, state, seen, aimed, margin, dt_s)
     command, torques = _share_torque(settings, state, wheels.torque_nm, seen, dt_s)
-    slip = math.nan if seen.status == TractionStatus.NO_SLIP else seen.largest_slip
-    report = TractionReport(state.driven_mps, aimed, state.balance_ratio, slip, drive_state, seen.status)
+    slip = math.nan if seen.status is TractionStatus.NO_SLIP else seen.largest_slip
+    report = WheelReport(state.driven_mps, aimed, state.balance_ratio, slip, drive_state, seen.status)
     return command, state._replace(droop_nm=torques), report

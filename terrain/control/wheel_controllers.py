@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -21,13 +21,14 @@ from terrain.control.traction import (
     TractionState,
     TractionStatus,
     TractionTarget,
-    WheelMeasurements,
+    WheelMotion,
+    WheelReport,
     check_settings,
     traction_step,
     with_motor_driver,
 )
 from terrain.estimation.live import LiveEstimate
-from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
+from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTarget
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS
@@ -41,68 +42,26 @@ def step_or_period(dt_s: float) -> float:
     return dt_s if 0.0 < dt_s <= MAX_STEP_S else PERIOD_S
 
 
-class Observation(NamedTuple):
-    """Estimated motion at the wheels.
-
-    Parameters
-    ----------
-    wheels : along each wheel
-    wheel_radps : (wheels,) rates
-    chassis_mps : magnitude of the robot's velocity
-    stale_s : time since the speed over ground was measured last; infinite before the first time
-    """
-
-    wheels: WheelMeasurements
-    wheel_radps: Array
-    chassis_mps: float
-    stale_s: float
-
-
-class WheelRequest(NamedTuple):
-    """Inputs of one step.
-
-    Parameters
-    ----------
-    wheel_radps, desired_mps : (wheels,) desired rates, and the circumferential speed of the fastest
-    target : slips of the traction controller
-    slip_targets : of the current terrain by drive state, for the thesis' controller
-    observed : estimates
-    dt_s : since the step before; NaN where the clock is not valid
-    """
-
-    wheel_radps: Array
-    desired_mps: float
-    target: TractionTarget
-    slip_targets: Mapping[str, SlipTarget]
-    observed: Observation
-    dt_s: float
-
-
-class WheelReport(NamedTuple):
-    """What a step decided; NaN where a controller does not have the figure.
-
-    Parameters
-    ----------
-    driven_mps : commanded speed of the fastest wheel
-    aimed_ratio, balance_ratio, slip_ratio : target slip with its floor, slip of steady motion, and largest
-        slip of a wheel
-    drive_state : by what is commanded (traction) or of the first wheel (thesis)
-    status : whether a correction was made
-    """
-
-    driven_mps: float
-    aimed_ratio: float
-    balance_ratio: float
-    slip_ratio: float
-    drive_state: int
-    status: int
-
-
 class WheelController(Protocol):
     """Turns desired wheel speeds into commanded ones, step by step."""
 
-    def step(self, request: WheelRequest) -> tuple[Array, WheelReport]:
-        """Return the commanded rates (wheels,) and what was decided."""
+    def step(
+        self,
+        wheel_radps: Array,
+        seen: WheelMotion,
+        target: TractionTarget,
+        slip_targets: Mapping[str, SlipTarget],
+        dt_s: float,
+    ) -> tuple[Array, WheelReport]:
+        """Return the commanded rates (wheels,) and what was decided.
+
+        Parameters
+        ----------
+        wheel_radps : (wheels,) desired
+        seen : as estimated
+        target, slip_targets : slips of the current terrain, of the traction controller and by drive state
+        dt_s : since the step before; NaN where the clock is not valid
+        """
         ...
 
     def reset_terrain(self) -> None:
@@ -127,7 +86,7 @@ class WheelObserver:
         self._positions_m = robot.wheel_positions_m
         self._radius_m, self._steer_states = robot.wheel_radius_m, steer_states
 
-    def observe(self, estimate: LiveEstimate | None, time_s: float) -> Observation:
+    def observe(self, estimate: LiveEstimate | None, time_s: float) -> WheelMotion:
         """Return the motion at the wheels; NaN before the first estimate."""
         if estimate is None:
             return UNOBSERVED
@@ -154,14 +113,19 @@ class WheelObserver:
         chassis_mps = math.hypot(estimate.speed_x_mps, estimate.speed_y_mps)
         rates = estimate.wheel_speed_mps / self._radius_m
         speed_mps, accel_mps2, slip_ratio, slip_std = np.array(columns).T
-        measured = WheelMeasurements(speed_mps, accel_mps2, slip_ratio, slip_std, torque_nm)
-        return Observation(measured, rates, chassis_mps, stale_s)
+        return WheelMotion(
+            speed_mps, accel_mps2, slip_ratio, slip_std, torque_nm, rates, chassis_mps, stale_s
+        )
 
 
-UNOBSERVED = Observation(
-    WheelMeasurements(*np.full((5, 3), math.nan)), np.full(3, math.nan), math.nan, math.inf
-)
+_UNKNOWN = np.full(3, math.nan)
+UNOBSERVED = WheelMotion(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, math.nan, math.inf)
 """Before the first estimate."""
+
+
+def largest_forward(wheel_radps: Array, slip_ratio: Array) -> float:
+    """Return the largest slip of the wheels, positive in traction in the desired direction; NaN where one is."""
+    return float(np.where(wheel_radps < 0.0, -slip_ratio, slip_ratio).max())
 
 
 def estimate_age(estimate: LiveEstimate, time_s: float) -> float:
@@ -174,20 +138,28 @@ class RampController:
 
     Parameters
     ----------
+    radius_m : of the wheels
     ramp_mps2 : largest rise; infinite for none
     """
 
-    def __init__(self, ramp_mps2: float = math.inf) -> None:
-        self._ramp_mps2 = ramp_mps2
+    def __init__(self, radius_m: float, ramp_mps2: float = math.inf) -> None:
+        self._radius_m, self._ramp_mps2 = radius_m, ramp_mps2
         self._wheel, self._driven_mps = np.zeros(3), 0.0
 
-    def step(self, request: WheelRequest) -> tuple[Array, WheelReport]:
+    def step(
+        self,
+        wheel_radps: Array,
+        seen: WheelMotion,
+        target: TractionTarget,
+        slip_targets: Mapping[str, SlipTarget],
+        dt_s: float,
+    ) -> tuple[Array, WheelReport]:
         """Return the commanded rates (wheels,) and what was decided."""
-        wheel, desired_mps = request.wheel_radps, request.desired_mps
-        before_mps = self._driven_mps if float(wheel @ self._wheel) >= 0.0 else 0.0
-        rise_mps = self._ramp_mps2 * step_or_period(request.dt_s)
-        self._wheel, self._driven_mps = wheel, min(desired_mps, before_mps + rise_mps)
-        command = wheel * (self._driven_mps / desired_mps) if desired_mps > 0.0 else wheel
+        desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
+        before_mps = self._driven_mps if float(wheel_radps @ self._wheel) >= 0.0 else 0.0
+        rise_mps = self._ramp_mps2 * step_or_period(dt_s)
+        self._wheel, self._driven_mps = wheel_radps, min(desired_mps, before_mps + rise_mps)
+        command = wheel_radps * (self._driven_mps / desired_mps) if desired_mps > 0.0 else wheel_radps
         unknown = math.nan
         return command, WheelReport(
             self._driven_mps, unknown, unknown, unknown, DriveState.STEADY, TractionStatus.OK
@@ -210,20 +182,19 @@ class TractionController:
         self._settings = with_motor_driver(check_settings(settings), robot)
         self._radius_m, self._state = robot.wheel_radius_m, TractionState()
 
-    def step(self, request: WheelRequest) -> tuple[Array, WheelReport]:
+    def step(
+        self,
+        wheel_radps: Array,
+        seen: WheelMotion,
+        target: TractionTarget,
+        slip_targets: Mapping[str, SlipTarget],
+        dt_s: float,
+    ) -> tuple[Array, WheelReport]:
         """Return the commanded rates (wheels,) and what was decided."""
-        observed = request.observed
         command, self._state, report = traction_step(
-            self._settings,
-            self._state,
-            request.target,
-            self._radius_m,
-            request.wheel_radps,
-            observed.wheels,
-            observed.stale_s,
-            request.dt_s,
+            self._settings, self._state, target, self._radius_m, wheel_radps, seen, dt_s
         )
-        return command, WheelReport(*report)
+        return command, report
 
     def reset_terrain(self) -> None:
         """Drop the balance of steady motion and the floor of the target."""
@@ -244,29 +215,33 @@ class ThesisController:
         self._settings = check_thesis(ThesisSettings(robot.wheel_radius_m, gains))
         self._stale_max_s, self._state = stale_max_s, [WheelPid()] * len(robot.wheels)
 
-    def step(self, request: WheelRequest) -> tuple[Array, WheelReport]:
+    def step(
+        self,
+        wheel_radps: Array,
+        seen: WheelMotion,
+        target: TractionTarget,
+        slip_targets: Mapping[str, SlipTarget],
+        dt_s: float,
+    ) -> tuple[Array, WheelReport]:
         """Return the commanded rates (wheels,) and what was decided."""
-        wheel, observed, dt_s = request.wheel_radps, request.observed, request.dt_s
-        stale = observed.stale_s > self._stale_max_s
         wheels, self._state = thesis_step(
             self._settings,
             self._state,
-            wheel,
-            observed.wheel_radps,
-            UNOBSERVED.wheels.speed_mps if stale else observed.wheels.speed_mps,
-            observed.wheels.accel_mps2,
-            observed.chassis_mps,
-            [request.slip_targets[state].slip_ratio for state in DRIVE_STATES],
+            wheel_radps,
+            seen.wheel_radps,
+            UNOBSERVED.speed_mps if seen.stale_s > self._stale_max_s else seen.speed_mps,
+            seen.accel_mps2,
+            seen.chassis_mps,
+            [slip_targets[state].slip_ratio for state in DRIVE_STATES],
             dt_s,
         )
         desired = np.array([one.desired_ratio for one in wheels])
         status = TractionStatus.OK if np.isfinite(desired).all() else TractionStatus.NO_SLIP
         if not 0.0 < dt_s <= MAX_STEP_S:
             status = TractionStatus.BAD_TIME
-        command = wheel + np.array([one.correction_radps for one in wheels])
+        command = wheel_radps + np.array([one.correction_radps for one in wheels])
         driven_mps = float(np.abs(command).max()) * self._settings.wheel_radius_m
-        slip = observed.wheels.slip_ratio
-        aimed, largest = (float(np.where(wheel < 0.0, -s, s).max()) for s in (desired, slip))
+        aimed, largest = (largest_forward(wheel_radps, slips) for slips in (desired, seen.slip_ratio))
         return command, WheelReport(driven_mps, aimed, math.nan, largest, wheels[0].drive_state, status)
 
     def reset_terrain(self) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from terrain.angles import wrapped
 from terrain.entry_point import entry_point
-from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
+from terrain.kinematics.commands import FAR_RAD, wheel_command_step
 from terrain.records import Array, Command, Reading
 from terrain.robots import SwerveRobot
 from terrain.status import StatusCode

@@ -8,18 +8,21 @@ wrong.  The rate between the two clocks is common to all runs.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.interpolate import CubicSpline
 
 from terrain.discrepancy.evidence import Evidence
-from terrain.discrepancy.residuals import Rows
+from terrain.discrepancy.residuals import Rows, low_pass_of, prepare_inputs
+from terrain.discrepancy.signals import Signals
+from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Array
+from terrain.signals import MIN_ROWS, DelayFit, Pair, common_delay, has_rival, refine_delay
+from terrain.simulation.planar.replay import replay
 
 MIN_LAG_S, MAX_LAG_S = -1.0, 2.0
 """Loggers of a run are started together, the wheels' first.  The other sign is that of wheels that are late:
@@ -55,8 +58,8 @@ MIN_EXCITATION = 0.02
 MIN_CORRELATION = 0.7
 """Least correlation at the best shift."""
 
-RIVAL_MARGIN, RIVAL_FLOOR = 0.15, 0.02
-"""A peak elsewhere is no rival if it leaves so much more of the variance, relative and absolute."""
+RIVAL_FLOOR = 0.02
+"""A peak elsewhere is no rival if it leaves so much more of the variance, beside the relative margin."""
 
 SAME_PEAK_S = 0.5
 """Two shifts closer than this are of one peak."""
@@ -64,19 +67,11 @@ SAME_PEAK_S = 0.5
 MAX_STD_S = 0.1
 """Largest standard deviation of a clock that is used."""
 
-MEMORY_S = 2.0
-"""Assumed correlation time of the residual."""
-
-MAX_STEPS, CONVERGED_S = 12, 0.003
-"""Of least squares."""
-
 EVENT_S, EVENT_RATIO = 3.0, 0.7
 """A clock is not used if that ratio of its information comes from so short a time: from one event."""
 
 FURTHEST = 1.5
 """A rate is refused that is so many times out of the bounds."""
-
-MIN_ROWS = 30
 
 
 class Shift(NamedTuple):
@@ -95,25 +90,8 @@ class Shift(NamedTuple):
     lost: Array
 
 
-class _Pair(NamedTuple):
-    """A channel of a run beside what is expected of it: rows, and a fine grid with values and slopes."""
-
-    time_s: Array
-    measured: Array
-    expected: Array
-    slope: Array
-
-
-_Pairs = dict[tuple[int, int], _Pair]
+_Pairs = dict[tuple[int, int], Pair]
 """By run and place in CLOCKED."""
-
-
-class _Fit(NamedTuple):
-    """Lag at the middle of a run and rate, with their covariance (2, 2)."""
-
-    lag_s: float
-    rate: float
-    cov: Array
 
 
 def shifts_of(info: Evidence) -> Shift:
@@ -135,7 +113,7 @@ def shifts_of(info: Evidence) -> Shift:
         rate = _shared_rate(fits)
     lag_s, std_s = np.full((2, n, len(CLOCKED)), np.nan)
     for at, free in fits.items():
-        fit: _Fit | None = free
+        fit: DelayFit | None = free
         if abs(free.rate - rate) * 0.5 * pairs[at].time_s[-1] > LAG_STEP_S:
             fit = _refine_lag(pairs[at], float(LAGS_S[np.argmax(tables[at])]), rate, rate_stays=True)
         if fit is not None:
@@ -174,7 +152,7 @@ def offsets_of(shift: Shift) -> tuple[Array, Array]:
     return offset_s, std_s
 
 
-def _pairs(run: Rows) -> dict[int, _Pair]:
+def _pairs(run: Rows) -> dict[int, Pair]:
     """Return the channels that are measured and of which something is expected, by their place in CLOCKED."""
     compared = {}
     for c, name in enumerate(CLOCKED):
@@ -189,7 +167,7 @@ def _pairs(run: Rows) -> dict[int, _Pair]:
     values, slopes = np.asarray(curve(fine_s)).T.copy(), np.asarray(curve(fine_s, 1)).T.copy()
     time_s = run.time_s - run.time_s[0]
     return {
-        c: _Pair(time_s, np.ascontiguousarray(measured), values[k], slopes[k])
+        c: Pair(time_s, np.ascontiguousarray(measured), FINE_S, values[k], slopes[k], 0.5 * time_s[-1])
         for k, (c, (measured, _)) in enumerate(compared.items())
     }
 
@@ -199,7 +177,7 @@ def _search_rates(pairs: _Pairs, rates: Sequence[float]) -> tuple[float, dict[tu
     rate, least = 0.0, np.inf
     best: dict[tuple[int, int], Array] = {}
     for tried in rates:
-        found = {at: _correlations(pair, LAGS_S, tried) for at, pair in pairs.items()}
+        found = {at: pair.correlations(LAGS_S, tried) for at, pair in pairs.items()}
         peaks = np.array([min(max(column.max(), 0.0), 0.9999) for column in found.values()])
         loss = float(np.log1p(-(peaks**2)).sum())  # minus a log-likelihood, gains and constants free
         if loss < least:
@@ -211,19 +189,19 @@ def _search_rates(pairs: _Pairs, rates: Sequence[float]) -> tuple[float, dict[tu
 
 def _fit_lags(
     pairs: _Pairs, tables: dict[tuple[int, int], Array], rate: float
-) -> dict[tuple[int, int], _Fit]:
+) -> dict[tuple[int, int], DelayFit]:
     """Return the fits from the best lags, of the channels that have one best."""
     fits = {}
     for at, column in tables.items():
         best = int(np.argmax(column))
-        if column[best] > MIN_CORRELATION and not _has_rival(column, best):
+        if column[best] > MIN_CORRELATION and not has_rival(LAGS_S, column, best, SAME_PEAK_S, RIVAL_FLOOR):
             fit = _refine_lag(pairs[at], float(LAGS_S[best]), rate)
             if fit is not None:
                 fits[at] = fit
     return fits
 
 
-def _shared_rate(fits: dict[tuple[int, int], _Fit]) -> float:
+def _shared_rate(fits: dict[tuple[int, int], DelayFit]) -> float:
     """Return the median of the rates, weighted by their information."""
     if not fits:
         return 0.0
@@ -232,112 +210,227 @@ def _shared_rate(fits: dict[tuple[int, int], _Fit]) -> float:
     return rates[int(np.searchsorted(total, 0.5 * total[-1]))][0]
 
 
-def _correlations(pair: _Pair, lags_s: Array, rate: float) -> Array:
-    return np.asarray(correlations(pair.time_s, pair.measured, pair.expected, FINE_S, lags_s, rate))
-
-
-@njit(cache=True)
-def correlations(
-    time_s: Array, measured: Array, expected: Array, step_s: float, lags_s: Array, rate: float
-) -> Array:
-    """Return the correlation (lags,) of a signal with one on a fine grid, shifted; 0 where few samples meet.
-
-    The signal at ``t`` is compared with the prediction at ``t - lag - rate (t - middle)``.
-    """
-    out = np.zeros(lags_s.size)
-    known = np.isfinite(measured)
-    n, middle_s = known.sum(), 0.5 * time_s[-1]
-    for a in range(lags_s.size):
-        met = 0
-        x, y, xx, yy, xy = 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(time_s.size):
-            at = (time_s[k] - lags_s[a] - rate * (time_s[k] - middle_s)) / step_s
-            if not known[k] or at < 0.0 or at >= expected.size - 1:
-                continue
-            i = int(at)
-            value = expected[i] + (at - i) * (expected[i + 1] - expected[i])
-            met += 1
-            x += value
-            y += measured[k]
-            xx += value * value
-            yy += measured[k] * measured[k]
-            xy += value * measured[k]
-        if met < 10 or 2 * met < n:
-            continue
-        power = (xx - x * x / met) * (yy - y * y / met)
-        if power > 1e-20:
-            out[a] = (xy - x * y / met) / math.sqrt(power)
-    return out
-
-
-def _fits_further(pair: _Pair, best: float) -> bool:
+def _fits_further(pair: Pair, best: float) -> bool:
     """Whether a channel that fits at no shift within the search fits well at one beyond it."""
     if pair.time_s[-1] < 2 * FAR_LAG_S:
         return False
     lags_s = np.arange(-FAR_LAG_S, FAR_LAG_S + 1e-9, LAG_STEP_S)
-    beyond = float(_correlations(pair, lags_s, 0.0).max())
+    beyond = float(pair.correlations(lags_s, 0.0).max())
     return beyond > MIN_CORRELATION and beyond > best + 0.15
 
 
-def _has_rival(column: Array, best: int) -> bool:
-    """Whether a peak elsewhere explains nearly as much."""
-    left = 1.0 - np.clip(column, 0.0, 1.0) ** 2
-    rises = np.diff(column) >= 0
-    top = np.append(True, rises) & np.append(~rises, True)
-    elsewhere = top & (np.abs(LAGS_S - LAGS_S[best]) > SAME_PEAK_S)
-    return bool((left[elsewhere] < (1 + RIVAL_MARGIN) * left[best] + RIVAL_FLOOR).any())
+def _refine_lag(pair: Pair, lag_s: float, rate: float, rate_stays: bool = False) -> DelayFit | None:
+    """Return lag and rate, or the lag alone, by least squares from a start, or None if they diverge."""
+    return refine_delay(
+        pair,
+        lag_s,
+        rate,
+        near_s=SAME_PEAK_S,
+        rate_max=FURTHEST * max(RATES),
+        rate_stays=rate_stays,
+        event=(EVENT_S, EVENT_RATIO),
+    )
 
 
-def _refine_lag(pair: _Pair, lag_s: float, rate: float, rate_stays: bool = False) -> _Fit | None:
-    """Return lag and rate, or the lag alone, by least squares from a start, or None if they diverge.
+# -- Lag of each sensor behind the wheels, from all runs together, and its parts: a clock, and latencies ---
+# A short run measures no clock: it holds one change of the command, of which a camera may see a half.  A lag
+# that is common to all runs is measured by all of them: the likelihood of each run, its gain and constant free,
+# is a function of the lag, and their sum has one peak.  Signs are free too, since a turned sign is found later.
 
-    Gain and constant are fitted beside them.  The covariance is ``(J'J)^-1 J'R J (J'J)^-1`` with the
-    autocovariance ``R`` of what is left, tapered.
+FINE_LAGS_S = np.arange(MIN_LAG_S, MAX_LAG_S + 1e-9, FINE_S)
+
+EDGE_S = MAX_LAG_S + 10 * FINE_S
+"""Before and after a run its first and last prediction are held: commands are."""
+
+SMOOTH = np.hanning(27)[1:-1] / np.hanning(27).sum()
+"""Window of half a second over the prediction: encoders that are read a few times a second are held, and the
+likelihood of a lag has kinks where edges meet samples."""
+
+NO_LAG_S = np.zeros(1)
+
+MIN_KNOWN = 10
+"""Samples of a channel in a run, below which gain and constant leave nothing to compare."""
+
+INDEPENDENT_HZ = 5.0
+"""Samples a second that count as independent: what a robot does changes within 2 Hz."""
+
+MIN_RUNS = 3
+"""Least number of runs for a standard deviation."""
+
+MIN_GAIN = 30.0
+"""Twice the log-likelihood that a lag has to gain over the median of all lags, to be one: a channel that
+follows the wheels gains hundreds, one that does not follows them nowhere."""
+
+MIN_STD_S = 0.002
+"""A tenth of the grid's step: runs that agree to less are limited by it."""
+
+SIGMAS, GROSS_S = 3.0, 0.1
+"""A search starts from a lag beyond so many standard deviations, and beyond the second: what is less, a
+search that is linear about no lag finds by itself and names by its shape, and slip that follows the traction
+looks like 0.08 s."""
+
+SHAPE_GAIN = 10.0
+"""Twice the log-likelihood by which a delay has to fit better than a low-pass of the encoders."""
+
+
+class Latency(NamedTuple):
+    """How far a channel is behind what the wheels predict, common to all runs.
+
+    Parameters
+    ----------
+    channel : of :data:`~terrain.discrepancy.clocks.CLOCKED`
+    lag_s, std_s : over what the simulation has of it already, and its standard deviation by bootstrap over
+        runs; negative where the wheels are late
+    n_runs : that measure it
     """
-    start_s, centred_s = lag_s, pair.time_s - 0.5 * pair.time_s[-1]
-    fine_s = FINE_S * np.arange(pair.expected.size)
-    for _ in range(MAX_STEPS):
-        at_s = pair.time_s - lag_s - rate * centred_s
-        use = np.isfinite(pair.measured) & (at_s > 0.0) & (at_s < fine_s[-1])
-        if use.sum() < MIN_ROWS:
-            return None
-        value, seen = np.interp(at_s[use], fine_s, pair.expected), pair.measured[use]
-        level = value - value.mean()
-        gain = float(level @ seen) / max(float(level @ level), 1e-12)
-        late = -gain * np.interp(at_s[use], fine_s, pair.slope)
-        j = np.array([late, late * centred_s[use], value, np.ones(value.size)])
-        if rate_stays:
-            j[1] = centred_s[use]  # a drift, in its place
-        size = np.sqrt((j * j).sum(axis=1))
-        if not gain > 0 or not size.min() > 1e-9:
-            return None
-        j /= size[:, None]
-        gram = j @ j.T
-        if not np.linalg.det(gram) > 1e-9:
-            return None
-        off = seen - gain * value
-        step = np.linalg.solve(gram, j @ off)
-        left = off - step @ j
-        by_s, faster = float(step[0] / size[0]), 0.0 if rate_stays else float(step[1] / size[1])
-        lag_s, rate = lag_s + by_s, rate + faster
-        if abs(by_s) + abs(faster) * centred_s[-1] < CONVERGED_S:
-            break
-    else:
-        return None
-    if abs(lag_s - start_s) > SAME_PEAK_S or abs(rate) > FURTHEST * max(RATES):
-        return None
-    power = late * late
-    rows = math.ceil(EVENT_S / float(pair.time_s[1] - pair.time_s[0]))
-    if np.convolve(power, np.ones(min(rows, power.size))).max() > EVENT_RATIO * power.sum():
-        return None
-    scores = j * left
-    spread = scores @ scores.T
-    lags = math.ceil(MEMORY_S / float(pair.time_s[1] - pair.time_s[0]))
-    for lag in range(1, lags):
-        lagged = (1.0 - lag / lags) * scores[:, lag:] @ scores[:, :-lag].T
-        spread += lagged + lagged.T
-    inverse = np.linalg.inv(gram)[:2]
-    cov = inverse @ spread @ inverse.T / np.outer(size[:2], size[:2])
-    if rate_stays:
-        cov[0, 1] = cov[1, 0] = 0.0
-    return _Fit(lag_s, rate, cov) if cov[0, 0] > 0 and cov[1, 1] > 0 else None
+
+    channel: str
+    lag_s: float
+    std_s: float
+    n_runs: int
+
+
+class Latencies(NamedTuple):
+    """Lags of all channels, and their parts.
+
+    Parameters
+    ----------
+    channels : those of which a lag is measured
+    clock_s, clock_std_s : of the earlier of IMU and camera behind the wheels; NaN if neither is measured
+    imu_s, imu_std_s : of the IMU behind that; NaN where it is not measured, or where a delay of the
+        yaw motion looks the same
+    camera_s, camera_std_s : of the camera behind that; NaN where it is not measured
+    is_delay : whether the wheels are late by a delay, and not by a low-pass of their encoders
+    """
+
+    channels: tuple[Latency, ...]
+    clock_s: float
+    clock_std_s: float
+    imu_s: float
+    imu_std_s: float
+    camera_s: float
+    camera_std_s: float
+    is_delay: bool
+
+
+class _RunPair(NamedTuple):
+    """A channel of a run beside what is expected of it, and how many of its samples are independent."""
+
+    pair: Pair
+    n_independent: float
+
+
+def latencies_of(signals: Sequence[Signals], simulation: Simulation, seed: int = 0) -> Latencies:
+    """Return the lag of each channel behind the wheels, common to all runs.
+
+    The gyro measures the IMU; heading rate and speed measure the camera, which is the earlier of the two: a
+    body may move late, and no channel can be early.  A gyro that is late behind the speed alone may be that
+    of a body that turns late; only a heading distinguishes the two.
+
+    Parameters
+    ----------
+    signals : of all runs
+    simulation : its prediction may be wrong in size and in sign
+    seed : of the bootstrap
+    """
+    pairs = [_run_pairs(run, simulation) for run in signals]
+    lags = {}
+    for c, name in enumerate(CLOCKED):
+        own = [pair[c] for pair in pairs if c in pair]
+        if len(own) < MIN_RUNS:
+            continue
+        table = np.array([_gain(pair, FINE_LAGS_S) for pair in own])
+        total = table.sum(axis=0)
+        if total.max() - np.median(total) < MIN_GAIN:
+            continue
+        found = common_delay(FINE_LAGS_S, table, seed=seed)
+        lags[name] = Latency(name, found.delay_s, max(found.std_s, MIN_STD_S), len(own))
+    return Latencies(tuple(lags.values()), *_parts(lags), is_delay=_is_delay(pairs, lags))
+
+
+def _parts(lags: Mapping[str, Latency]) -> tuple[float, float, float, float, float, float]:
+    """Return clock, latency of the IMU and latency of the camera, each with its standard deviation."""
+    gyro, heading = lags.get(GYRO), lags.get(HEADING)
+    camera = min((lags[name] for name in (HEADING, SPEED_X) if name in lags), key=_lag_s, default=None)
+    if gyro is None or camera is None:
+        only = gyro or camera
+        clock = (math.nan, math.nan) if only is None else (only.lag_s, only.std_s)
+        return (*clock, math.nan, math.nan, math.nan, math.nan)
+    std_s = math.hypot(gyro.std_s, camera.std_s)
+    if gyro.lag_s <= camera.lag_s:
+        return gyro.lag_s, gyro.std_s, 0.0, std_s, camera.lag_s - gyro.lag_s, std_s
+    imu = (math.nan, math.nan)
+    if heading is not None:
+        imu = max(gyro.lag_s - heading.lag_s, 0.0), math.hypot(gyro.std_s, heading.std_s)
+    return camera.lag_s, camera.std_s, *imu, 0.0, std_s
+
+
+def _lag_s(latency: Latency) -> float:
+    return latency.lag_s
+
+
+def starting_values(latencies: Latencies) -> dict[str, float]:
+    """Return parameters by which a search may start, of what is significant; none where nothing is late.
+
+    Keys are ``clock_offset_s``, which is negative where the wheels are late, ``camera_latency_s`` and
+    ``imu_latency_s``.  A clock is left out where a low-pass of the encoders explains late wheels as well.
+    """
+    values = {}
+    clock_s = latencies.clock_s
+    if _is_significant(clock_s, latencies.clock_std_s) and (clock_s > 0 or latencies.is_delay):
+        values["clock_offset_s"] = clock_s
+    if _is_significant(latencies.camera_s, latencies.camera_std_s):
+        values["camera_latency_s"] = latencies.camera_s
+    if _is_significant(latencies.imu_s, latencies.imu_std_s):
+        values["imu_latency_s"] = latencies.imu_s
+    return values
+
+
+def _is_significant(lag_s: float, std_s: float) -> bool:
+    return bool(abs(lag_s) > max(SIGMAS * std_s, GROSS_S))
+
+
+def _run_pairs(run: Signals, simulation: Simulation) -> dict[int, _RunPair]:
+    """Return the channels of a run that are measured and of which something is expected, by place."""
+    dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(run, low_pass_of([run]))
+    planar = simulation.planar_on(run.terrain)
+    predicted = np.asarray(replay(planar, simulation.vector, dt, wheel_speed, steer, grade, roll))
+    at_s = dt * np.arange(len(predicted))
+    half_s = FINE_S * (SMOOTH.size // 2)
+    wide_s = np.arange(-EDGE_S - half_s, at_s[-1] + EDGE_S + half_s, FINE_S)
+    fine_s = wide_s[SMOOTH.size // 2 : -(SMOOTH.size // 2)]
+    pairs = {}
+    for c, name in enumerate(CLOCKED):
+        values, expected = (each[:, CHANNELS.index(name)] for each in (measured, predicted))
+        known = np.isfinite(values)
+        if known.sum() >= MIN_KNOWN and np.std(expected[known]) > MIN_EXCITATION:
+            fine = np.convolve(np.interp(wide_s, at_s, expected), SMOOTH, mode="valid")
+            n = float(known.sum() * dt * INDEPENDENT_HZ)
+            time_s = at_s - fine_s[0]
+            slope = np.gradient(fine, FINE_S)
+            pairs[c] = _RunPair(Pair(time_s, np.ascontiguousarray(values), FINE_S, fine, slope, 0.0), n)
+    return pairs
+
+
+def _gain(run: _RunPair, lags_s: Array) -> Array:
+    """Return twice the log-likelihood (lags,) that a run gains by following the prediction."""
+    return np.asarray(
+        -run.n_independent * np.log1p(-np.minimum(run.pair.correlations(lags_s, 0.0) ** 2, 0.9999))
+    )
+
+
+def _is_delay(pairs: Sequence[dict[int, _RunPair]], lags: Mapping[str, Latency]) -> bool:
+    """Return whether wheels that are late are so by a delay, and not by a low-pass of time constant ``T``.
+
+    What a body does is ahead of late wheels: ``x(t + T)`` by a delay, ``x + T dx/dt`` by a low-pass.
+    """
+    late_s = np.arange(0.0, -MIN_LAG_S, FINE_S)
+    gained = 0.0
+    for name in lags:
+        delay, low_pass = np.zeros((2, late_s.size))
+        for run, n in (each[CLOCKED.index(name)] for each in pairs if CLOCKED.index(name) in each):
+            delay += _gain(_RunPair(run, n), -late_s)
+            ahead = [run._replace(reference=run.reference + late * run.slope) for late in late_s]
+            low_pass += [_gain(_RunPair(each, n), NO_LAG_S)[0] for each in ahead]
+        gained += delay.max() - low_pass.max()
+    return bool(gained > SHAPE_GAIN)

@@ -15,11 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.clocks import Shift, shifts_of
+from terrain.discrepancy.clocks import Latencies, Shift, latencies_of, shifts_of, starting_values
 from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of, values_by_session
 from terrain.discrepancy.evidence import Evidence, move_point, partial_information, recentre
 from terrain.discrepancy.faults import Fault, faults_of, repaired
-from terrain.discrepancy.latencies import Latencies, latencies_of, starting_values
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of, measured_channels, rows_of
@@ -114,7 +113,7 @@ def diagnose_signals(
     )
     parameters = names_of(named)
     at = [found.names.index(name) for name in parameters]
-    grown = np.array([found.tried[effect.name].inflation for effect in named for _ in effect.parameters])
+    inflation = np.array([found.tried[effect.name].inflation for effect in named for _ in effect.parameters])
     verdict = _verdict(sets, causes, varying, unexplained)
     if verdict is None:
         verdict = Verdict.NOT_EXCITED if len(missed) > BLIND_RATIO * len(limits) else Verdict.NONE
@@ -124,7 +123,7 @@ def diagnose_signals(
         verdict=verdict,
         causes=causes,
         parameters=parameters,
-        cov=found.cov[np.ix_(at, at)] * np.sqrt(np.outer(grown, grown)),
+        cov=found.cov[np.ix_(at, at)] * np.sqrt(np.outer(inflation, inflation)),
         ambiguous_sets=tuple(sets),
         ambiguous_values=rival_values(found, sets),
         unexplained=unexplained,
@@ -348,13 +347,13 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
     seeds, aligned, shift = _aligned(problem, latencies)
     excluded = unfit_runs(runs, aligned, shift)
     if excluded:
-        gone = {run.run_id for run in excluded}
-        kept = tuple(run for run in runs if run.run_id not in gone)
-        if len(kept) < MIN_RUNS:
+        unfit = {run.run_id for run in excluded}
+        fit = tuple(run for run in runs if run.run_id not in unfit)
+        if len(fit) < MIN_RUNS:
             reasons = "; ".join(f"{run.run_id}: {run.reason}" for run in excluded[:3])
-            raise DataError(f"runs: only {len(kept)} of {len(signals)} are fit to be compared ({reasons})")
-        problem = problem._replace(signals=kept)
-        seeds, aligned, shift = _aligned(problem, latencies_of(kept, simulation))
+            raise DataError(f"runs: only {len(fit)} of {len(signals)} are fit to be compared ({reasons})")
+        problem = problem._replace(signals=fit)
+        seeds, aligned, shift = _aligned(problem, latencies_of(fit, simulation))
     if not any(np.nanmax(np.abs(run.wheel_speed_mps), initial=0.0) > REST_MPS for run in problem.signals):
         n = len(problem.signals)
         raise DataError(f"runs: in all {n} the wheels are at rest; runs that drive are required")

@@ -33,7 +33,7 @@ from terrain.discrepancy.terrain_match import TerrainMatch, simulation_for
 from terrain.discrepancy.verdict import INTERVAL_T, Diagnosis
 from terrain.effects import Effect
 from terrain.errors import ConfigError, DataError
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 

@@ -411,8 +411,8 @@ def correlation(a: Array, one: Sequence[int], other: Sequence[int]) -> float:
         values, vectors = np.linalg.eigh(a[np.ix_(at, at)])
         if not values[-1] > 1e-12:
             return 1.0
-        kept = values > 1e-9 * values[-1]
-        roots.append(vectors[:, kept] / np.sqrt(values[kept]))
+        shown = values > 1e-9 * values[-1]
+        roots.append(vectors[:, shown] / np.sqrt(values[shown]))
     between = roots[0].T @ a[np.ix_(one, other)] @ roots[1]
     return min(float(np.linalg.norm(between, 2)), 1.0)
 

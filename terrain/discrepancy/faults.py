@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.discrepancy.clocks import CLOCKED, Shift
-from terrain.discrepancy.latencies import INDEPENDENT_HZ, Latencies, latencies_of
+from terrain.discrepancy.clocks import CLOCKED, INDEPENDENT_HZ, Latencies, Shift, latencies_of
 from terrain.discrepancy.residuals import INPUTS, LowPass, Rows, rows_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation

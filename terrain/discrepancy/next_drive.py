@@ -46,13 +46,12 @@ from terrain.effects import (
     effect_named,
 )
 from terrain.errors import ConfigError
-from terrain.kinematics.wheel_motion import wheel_motion
+from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.planar.model import TRUTH
 from terrain.simulation.planar.motion import move
-from terrain.simulation.scenario.make import SCENARIOS, make_scenario
-from terrain.simulation.scenario.scenario import RATE_HZ
+from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
 
 DEFAULT_SOIL, HARD_SOIL, NEXT_RUNS = "grass", "tiles", 8
 """Of the command that simulates the next drive: a soil, one for robots that get stuck on it, and as many runs

@@ -328,15 +328,15 @@ def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None 
     info = start
     if seeds:
         there = move_point(base, tuple(seeds), np.array(list(seeds.values())))
-        first, info = _grow(problem, problem.at(there), there, [])
+        first, info = _add_causes(problem, problem.at(there), there, [])
         seeded = [each for each in problem.library if set(names_of([each])) & set(seeds)]
         causes = [*seeded, *(cause for cause in first if cause not in seeded)]
         causes, info = _refit_significant(problem, recentre(info, base), base, causes)
-    causes, info = _grow(problem, info, base, causes)
+    causes, info = _add_causes(problem, info, base, causes)
     return _found(problem, info, causes)
 
 
-def _grow(
+def _add_causes(
     problem: Problem, info: Evidence, base: Array, causes: list[Effect]
 ) -> tuple[list[Effect], Evidence]:
     """Add effects, refit, drop and swap, until none is significant that is not there."""
@@ -371,8 +371,8 @@ def refit(problem: Problem, start: Evidence, found: Found, causes: Sequence[Effe
 
     Those that are no longer significant are dropped.
     """
-    kept, info = _refit_significant(problem, found.info, start.vector, list(causes))
-    return _found(problem, info, kept)
+    significant, info = _refit_significant(problem, found.info, start.vector, list(causes))
+    return _found(problem, info, significant)
 
 
 def _found(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> Found:

@@ -100,5 +100,5 @@ class Simulation:
 
     def with_effects(self, values: Mapping[str, float]) -> Simulation:
         """Return the same with effects added to those that are built in already."""
-        grown = {name: self.effects.get(name, 0.0) + value for name, value in values.items()}
-        return replace(self, effects={**self.effects, **grown})
+        added = {name: self.effects.get(name, 0.0) + value for name, value in values.items()}
+        return replace(self, effects={**self.effects, **added})

@@ -13,10 +13,9 @@ from functools import partial
 
 import numpy as np
 
-from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Shift, offsets_of, shifts_of
+from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Latencies, Shift, offsets_of, shifts_of
 from terrain.discrepancy.evidence import PRIOR_STD, Evidence
 from terrain.discrepancy.faults import LEAST, MOTION, G, H, Response, X, Y, gains_of, responses_of
-from terrain.discrepancy.latencies import Latencies
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.verdict import Clock, Excluded
 from terrain.effects import CHANNELS, CURRENT, INDEX, SPEED_X, SPEED_Y
@@ -372,10 +371,10 @@ def _stalled_rows(run: Response, common: Array, least_s: float) -> tuple[Array, 
         rests |= known & still
         moves |= known & ~still
     stays = asked & rests & ~moves
-    kept = np.zeros(n, dtype=bool)
+    stalled = np.zeros(n, dtype=bool)
     for start, end in stretches(stays):
-        kept[start:end] = (end - start) * run.period_s >= least_s
-    return kept, asked
+        stalled[start:end] = (end - start) * run.period_s >= least_s
+    return stalled, asked
 
 
 def _stall_words(run: Response, common: Array, stay: Array) -> str:

@@ -171,7 +171,7 @@ def _tried(found: Found, effect: Effect, scatter: Sequence[float] = ()) -> _Trie
     free = np.arange(len(least)) >= len(least) - len(own)
     start = least.copy()
     start[free] = scatter or [each.scatter for each in _at_common_fit(found, effect)]
-    varies = [*info.nuisances[_kept(info, own)], *info.places(own)]
+    varies = [*info.nuisances[_is_beside(info, own)], *info.places(own)]
     gram, shared = info.grams.sum(axis=1), info.places(names)
     fit = fit_mixed(gram, shared, varies, least, start, free)
     alike = fit_mixed(gram, shared, varies, least, least, np.zeros_like(free))
@@ -193,7 +193,7 @@ def _refitted(problem: Problem, found: Found, tried: _Tried) -> _Tried:
     return tried
 
 
-def _kept(info: Evidence, own: Sequence[str]) -> Array:
+def _is_beside(info: Evidence, own: Sequence[str]) -> Array:
     """Return which of the nuisances are of no effect of their own."""
     return ~np.isin(info.nuisances, info.places(own))
 
@@ -201,7 +201,7 @@ def _kept(info: Evidence, own: Sequence[str]) -> Array:
 def _least_std(found: Found, own: Sequence[str]) -> Array:
     """Return the standard deviations assumed of nuisances, and those of an effect, last."""
     info = found.info
-    names = [info.parameters[i] for i in info.nuisances[_kept(info, own)]]
+    names = [info.parameters[i] for i in info.nuisances[_is_beside(info, own)]]
     return np.array([_assumed(found, name) or LEAST_RATIO * PRIOR_STD[name] for name in (*names, *own)])
 
 
@@ -221,11 +221,11 @@ def _values_by_run(
     own : parameters that ``fit`` has deviations of beside the nuisances, last
     """
     info = found.info
-    varies = np.array([*info.nuisances[_kept(info, own)], *info.places(own)], dtype=int)
+    varies = np.array([*info.nuisances[_is_beside(info, own)], *info.places(own)], dtype=int)
     beside = varies != info.places([name])[0]
-    kept, q = varies[beside], int(beside.sum())
+    random, q = varies[beside], int(beside.sum())
     columns = np.zeros((len(info.parameters) + 1, q + 2))  # what varies, the parameter, and the residual
-    columns[kept, np.arange(q)] = 1.0
+    columns[random, np.arange(q)] = 1.0
     columns[info.places([name])[0], q] = 1.0
     columns[info.places(names), -1] = -fit.shared
     columns[-1, -1] = 1.0
@@ -366,9 +366,9 @@ def fit_mixed(
     (True, True)
     """
     last = gram.shape[1] - 1
-    kept, m = [*shared, last], len(shared)
-    inside, cross = gram[:, own][:, :, own], gram[:, own][:, :, kept]
-    outside = gram[:, kept][:, :, kept].sum(axis=0)
+    outer, m = [*shared, last], len(shared)
+    inside, cross = gram[:, own][:, :, own], gram[:, own][:, :, outer]
+    outside = gram[:, outer][:, :, outer].sum(axis=0)
     std = np.maximum(start_std, least_std)
     values, loss = np.zeros(m), 0.0
     for step in range(EM_STEPS + 1):

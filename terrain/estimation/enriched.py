@@ -8,7 +8,7 @@ import numpy as np
 
 from terrain.estimation.estimate import Estimate
 from terrain.estimation.stuck import Motion
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import RunLog, Stream
 

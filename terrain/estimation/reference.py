@@ -12,7 +12,7 @@ from scipy.integrate import cumulative_trapezoid
 
 from terrain.errors import DataError
 from terrain.estimation.resampling import low_pass
-from terrain.kinematics.true_slip import true_slip, wheel_and_ground_speed
+from terrain.kinematics.logged_wheels import true_slip, wheel_and_ground_speed
 from terrain.records import Array, RunLog, StateTrack, Stream
 from terrain.robots import Robot
 from terrain.slip import slip_ratio

@@ -29,8 +29,7 @@ from terrain.estimation.feed import (
     STREAMS,
     TICK_S,
 )
-from terrain.kinematics.swerve import forward
-from terrain.kinematics.wheel_velocity import point_velocity
+from terrain.kinematics.wheels import no_slip_twist, point_velocity
 from terrain.logs.samples import longest_rise
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
@@ -351,7 +350,7 @@ def gnss_heading(table: MeasurementTable, robot: Robot) -> float:
 def _speed_over_ground(table: MeasurementTable, robot: Robot) -> Array:
     """Return the speed (n,) of the origin in body axes, forward + 1j left: the camera's, or the wheels'."""
     rates, steer = table.columns(list(robot.wheel_rows)), table.columns(list(robot.steer_rows))
-    twist, _ = forward(robot.wheel_positions_m, robot.wheel_radius_m, rates, steer)
+    twist, _ = no_slip_twist(robot.wheel_positions_m, steer, robot.wheel_radius_m * rates)
     speed = twist[:, 0] + 1j * twist[:, 1]
     if not robot.describes("camera"):
         return np.asarray(speed)

@@ -14,7 +14,7 @@ from terrain.errors import DataError
 from terrain.estimation.feed import UNMEASURED_AFTER_S
 from terrain.estimation.filter import Filter
 from terrain.estimation.table import MeasurementTable
-from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
+from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTrack, StateTrack
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS

@@ -108,13 +108,7 @@ def parse_json(content: bytes | str) -> Any:
 
 
 def parse_document(content: bytes | str, model: type[Document]) -> Document:
-    """Return what a pydantic model makes of a JSON text.
-
-    Raises
-    ------
-    ValueError
-        as :func:`parse_json`, or in one sentence where the model does not accept it, which names the place.
-    """
+    """Return what a pydantic model makes of a JSON text."""
     from pydantic import ValidationError
 
     parse_json(content)

@@ -37,13 +37,7 @@ def read_regular(path: Path, place: str, kind: type[TerrainError], most_bytes: i
 
 
 def check_regular(path: Path, place: str, kind: type[TerrainError]) -> None:
-    """Refuse what is no regular file: reading a pipe or a device need not end.
-
-    Raises
-    ------
-    TerrainError
-        of the kind, if it is missing, cannot be opened or is no regular file.
-    """
+    """Refuse what is no regular file: reading a pipe or a device need not end."""
     try:
         mode = path.stat().st_mode
     except OSError as error:

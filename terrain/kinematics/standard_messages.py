@@ -17,7 +17,7 @@ from terrain.logs.geodesy import local_metres
 from terrain.logs.mapping import POSITION_CHANNELS
 from terrain.logs.replay import TWIST
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
-from terrain.logs.topic_streams import Converted, MessageKind
+from terrain.logs.topics import Converted, MessageKind
 from terrain.records import Array, Stream
 
 UNKNOWN = -1.0

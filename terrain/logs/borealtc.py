@@ -14,6 +14,7 @@ file                     columns                  becomes stream and channels
 \                        ``curL curR``            ``current_left_a current_right_a``
 =======================  =======================  ===================================================
 
+A class is the word ``terrain`` and N the word ``run`` of a mapping of files (:mod:`terrain.logs.mapping`).
 The run is called ``<CLASS>_<N>`` with the digits of the file name, the robot is ``husky``, and one label
 covers the whole run.
 """
@@ -21,44 +22,43 @@ covers the whole run.
 from __future__ import annotations
 
 import re
-from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
+from terrain.logs.mapping import Mapping, found_files, read_run
+from terrain.records import RunLog
 
-from terrain.files.names import normal_name, shown
-from terrain.logs.csv_table import data_row, read_columns
-from terrain.logs.log_files import check_log_file, checked_names, short_name
-from terrain.logs.samples import checked_stream, refuse_apart
-from terrain.records import Label, RunLog, Stream
-
-TABLES: dict[str, tuple[str, dict[str, str]]] = {
-    "imu": (
-        "imu",
-        {
-            "gyro_x_radps": "wx",
-            "gyro_y_radps": "wy",
-            "gyro_z_radps": "wz",
-            "accel_x_mps2": "ax",
-            "accel_y_mps2": "ay",
-            "accel_z_mps2": "az",
-        },
-    ),
-    "pro": (
-        "wheels",
-        {
-            "speed_left_mps": "velL",
-            "speed_right_mps": "velR",
-            "current_left_a": "curL",
-            "current_right_a": "curR",
-        },
-    ),
+COLUMNS: dict[str, dict[str, tuple[str, str]]] = {
+    "imu": {
+        **{f"gyro_{axis}_radps": (f"w{axis}", "rad/s") for axis in "xyz"},
+        **{f"accel_{axis}_mps2": (f"a{axis}", "m/s^2") for axis in "xyz"},
+    },
+    "wheels": {
+        **{f"speed_{side}_mps": (f"vel{side[0].upper()}", "m/s") for side in ("left", "right")},
+        **{f"current_{side}_a": (f"cur{side[0].upper()}", "A") for side in ("left", "right")},
+    },
 }
-"""Prefix of a file: the stream it becomes, and the column of each channel."""
+"""Column and unit of each channel of a stream."""
 
-_FILE_NAME = re.compile(r"(imu|pro)_([0-9]+)\.csv")
+MAPPING = Mapping.model_validate(
+    {
+        "robot": "husky",
+        "run_id": "{terrain}_{run}",
+        "terrain": "{terrain}",
+        "streams": {
+            name: {
+                "file": f"{{terrain}}/{prefix}_{{run}}.csv",
+                "time": {"column": "time", "unit": "s"},
+                "channels": {
+                    channel: {"column": column, "unit": unit}
+                    for channel, (column, unit) in COLUMNS[name].items()
+                },
+            }
+            for name, prefix in (("imu", "imu"), ("wheels", "pro"))
+        },
+    }
+)
 
 
 def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
@@ -67,65 +67,11 @@ def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
     The list is empty when the folder does not have the layout.  A run of which one file is missing has
     a reader too: it raises :class:`LogError` with the name of that file.
     """
-    found = set()
-    for path in folder.glob("*/*.csv"):
-        match = _FILE_NAME.fullmatch(path.name)
-        if match and not path.parent.name.startswith("."):
-            found.add((path.parent, match[2]))
-    return [partial(read_run, class_folder, number) for class_folder, number in sorted(found)]
-
-
-def read_run(class_folder: Path, number: str, *, repair: bool = False) -> RunLog:
-    """Return run ``number`` of the terrain that ``class_folder`` is named after.
-
-    Parameters
-    ----------
-    class_folder : folder of ``imu_<number>.csv`` and ``pro_<number>.csv``
-    number : digits as in the file names
-    repair : drop and count what a strict read refuses
-
-    Raises
-    ------
-    LogError
-        if a file is missing, empty or broken, or the two do not overlap in time.
-    """
-    dropped: Counter[str] = Counter()
-    streams = {}
-    for prefix, (stream, columns) in TABLES.items():
-        path = check_log_file(class_folder / f"{prefix}_{number}.csv", class_folder)
-        table = read_columns(path, ["time", *columns.values()], repair=repair, dropped=dropped)
-        streams[stream] = checked_stream(
-            short_name(path),
-            table[:, 0],
-            table[:, 1:],
-            list(columns),
-            row_of=partial(data_row, path),
-            columns=list(columns.values()),
-            repairs=dropped if repair else None,
-        )
-    terrain = normal_name(class_folder.name)
-    run_id = f"{terrain}_{number}"
-    refuse_apart(run_id, streams)
-    run = RunLog(
-        run_id,
-        "husky",
-        streams,
-        (whole_run_label(streams, terrain),),
-        source=f"{class_folder.name}/imu_{number}.csv and pro_{number}.csv, BorealTC layout",
-        dropped=dropped,
-    )
-    return checked_names(f"run {shown(run_id)}", run)
-
-
-def whole_run_label(streams: Mapping[str, Stream], terrain: str) -> Label:
-    """Return the label that covers every sample of a run, the last one with its sampling period.
-
-    Examples
-    --------
-    >>> whole_run_label({"imu": Stream([0.0, 0.5, 1.0], [[0.0]] * 3, ("gyro_z_radps",))}, "SNOW")
-    Label(start_s=0.0, end_s=1.5, terrain='SNOW')
-    """
-    last = max(streams.values(), key=lambda stream: float(stream.time_s[-1]))
-    period_s = float(np.median(np.diff(last.time_s)))
-    start_s = min(float(stream.time_s[0]) for stream in streams.values())
-    return Label(start_s, float(last.time_s[-1]) + period_s, terrain)
+    found = [
+        run
+        for run in found_files(folder, MAPPING)
+        if re.fullmatch("[0-9]+", run.words["run"]) and not run.words["terrain"].startswith(".")
+    ]
+    found.sort(key=lambda run: (run.words["terrain"], run.words["run"]))
+    read = partial(read_run, folder, MAPPING, by="BorealTC layout", linked_folders=True)
+    return [partial(read, run) for run in found]

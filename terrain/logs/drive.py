@@ -17,7 +17,7 @@ stream        channels                                    from
 ``imu``       ``gyro_z_radps``                            ``imu_yaw``, a rate and no angle
 \             ``accel_x_mps2 accel_y_mps2 accel_z_mps2``  ``-imu_ax -imu_ay imu_az``, specific force
 ``lidar``     ``speed_x_mps speed_y_mps yaw_rate_radps``  ``icp_x icp_y icp_yaw``, see
-                                                          :func:`~terrain.logs.lidar_twist.body_twists`
+                                                          :func:`~terrain.logs.held.body_twists`
 ``commands``  ``wheel_left_radps wheel_right_radps``      ``cmd_left cmd_right`` as published
 ============  ==========================================  ===============================================
 
@@ -38,7 +38,7 @@ Husky's log, then of six sessions of a Warthog and one of a Marmotte:
   counted.
 - ``icp_yaw`` is a difference of two wrapped angles, and the position of a window is turned by the mean of
   the first five of them, not by the first: ``icp_x`` points along the mean heading of the first 0.25 s.  The
-  Marmotte's, of another repository, are in the frame of the first: :mod:`terrain.logs.window_frame` finds it.
+  Marmotte's, of another repository, are in the frame of the first: :mod:`terrain.logs.held` finds it.
   Where the heading wraps within these (11 windows) that mean is no direction that the robot ever had.
 - *Late*: the Husky's lidar lags the gyro by 0.16 s; after that their yaw rates agree to 0.03 rad/s rms.  Its
   wheel speeds lag the gyro by 0.26 s while speeds change.  The Warthog's lidar lags by 0.4 to 0.7 s, its
@@ -67,14 +67,21 @@ import numpy as np
 
 from terrain.errors import LogError
 from terrain.files.names import normal_name
-from terrain.logs.csv_table import data_row, read_columns
-from terrain.logs.held import undo_hold, usual_hold
+from terrain.logs.held import CHANNELS as TWIST_CHANNELS
+from terrain.logs.held import (
+    N_FRAME,
+    body_twists,
+    dated,
+    frame_coefficient,
+    is_first_pose,
+    new_poses,
+    undo_hold,
+    usual_hold,
+    usual_wait,
+)
 from terrain.logs.imu_axes import ImuAxes, find_axes
-from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
-from terrain.logs.lidar_twist import N_FRAME, body_twists
-from terrain.logs.log_files import check_log_file, checked_names, short_name
-from terrain.logs.samples import checked_stream
-from terrain.logs.window_frame import frame_coefficient, is_first_pose
+from terrain.logs.samples import check_log_file, checked_names, checked_stream, short_name
+from terrain.logs.tables import data_row, read_columns
 from terrain.records import Array, Label, RunLog
 
 FILE_NAME = "samples.csv.gz"
@@ -196,11 +203,6 @@ def commands_of(path: Path, named: bool, robot: DriveRobot) -> list[tuple[DriveW
     path : folder of the session
     named : whether the name of its folder is that of the session, even without a number
     robot : that drove it
-
-    Raises
-    ------
-    LogError
-        as :func:`find_runs` does.
     """
     name = normal_name(path.resolve().name)
     numbered = _SESSION_NAME.fullmatch(name)
@@ -335,11 +337,6 @@ def refuse_other_robot(name: str, wheel_radps: Array, robot: DriveRobot) -> None
     name : of the file, for the message
     wheel_radps : (..., 2)
     robot : that is taken for the one that drove
-
-    Raises
-    ------
-    LogError
-        if they do.
     """
     fastest = float(np.nanmax(np.abs(wheel_radps), initial=0.0))
     if fastest > MAX_OVERSPEED * robot.wheel_rate_max_radps:
@@ -381,3 +378,52 @@ def _checked_keys(path: Path, keys: Array) -> Array:
             found = ", ".join(f"{v:.15g}" for v in np.unique(value[i]))
             raise LogError(f"{name}: {_KEYS[key]} in {windows[i]} is {found}; it must be {accepted}")
     return keys
+
+
+class WindowPoses(NamedTuple):
+    """Poses of a window of a command, in the frame of the first of them.
+
+    Parameters
+    ----------
+    time_s : (m,) on the clock of the run
+    pose : (m, 3) x, y and yaw of the lidar's point
+    """
+
+    time_s: Array
+    pose: Array
+
+
+def read_window_poses(folder: Path, robot: DriveRobot) -> dict[str, tuple[WindowPoses, ...]]:
+    """Return the lidar poses of each run's windows, as far as their time is known.
+
+    A window without two such poses is left out.
+
+    Parameters
+    ----------
+    folder, robot : as :func:`terrain.logs.drive.find_runs` takes them
+    """
+    found: dict[str, tuple[WindowPoses, ...]] = {}
+    for path in find_sessions(folder):
+        for windows, start, end in commands_of(path, path != folder, robot):
+            run_id, _ = named_run(windows, start, end)
+            kept, time_s = on_one_clock(windows, start, end)
+            begins_s = time_s[np.cumsum(kept.sum(axis=1)) - 1] - windows.time_s[-1]
+            scan = usual_wait(new_poses(windows.pose))
+            poses = (_window_poses(windows, start + i, begins_s[i], scan) for i in range(end - start))
+            found[run_id] = tuple(window for window in poses if len(window.time_s) > 1)
+    return found
+
+
+def _window_poses(windows: DriveWindows, which: int, begins_s: float, scan: int) -> WindowPoses:
+    """Return the poses of one window whose time is known, in the frame of the first."""
+    published = windows.pose[which]
+    arrival = np.flatnonzero(new_poses(published[None])[0])
+    at, usable = dated(arrival, len(published), scan)
+    pose = published[arrival[usable]].copy()
+    pose[:, 2] = np.unwrap(pose[:, 2])
+    if not len(pose):
+        return WindowPoses(np.empty(0), pose)
+    heading = pose[0, 2] - windows.frame_yaw[which]
+    offset = (pose[:, 0] - pose[0, 0] + 1j * (pose[:, 1] - pose[0, 1])) * np.exp(-1j * heading)
+    moved = np.column_stack([offset.real, offset.imag, pose[:, 2] - pose[0, 2]])
+    return WindowPoses(begins_s + windows.time_s[at[usable]], moved)

@@ -4,7 +4,7 @@ r"""Reader of whole recordings of DRIVE: the topics of a robot at 20 Hz, with mo
 norlab-ulaval/doughnut_calib, ``raw_dataframe``).  The folder names robot and terrain, as ``husky_wet_grass``;
 a recording is the session of its runs.  A step is one command: what was driven under it is a run
 ``<folder>_<recording>_step_001``; an operator drives before the first one and between them, which makes the
-runs ``..._hand_000`` (:mod:`terrain.logs.recording_stretches`).  Terrain is taken to be that of the folder
+runs ``..._hand_000``.  Terrain is taken to be that of the folder
 throughout.
 
 ============  =================================================  ========================================
@@ -13,7 +13,7 @@ stream        channels                                           from
 ``wheels``    ``speed_left_mps speed_right_mps``                 ``meas_*_vel`` times the nominal radius
 \             ``current_left_a ...`` ``voltage_left_v ...``      ``*_wheel_current``, ``*_wheel_voltage``
 ``imu``       ``gyro_x_radps ...`` ``accel_x_mps2 ...``          ``imu_x ...``, ``imu_acceleration_x ...``
-``lidar``     ``speed_x_mps speed_y_mps yaw_rate_radps``         poses, see :mod:`~terrain.logs.lidar_twist`
+``lidar``     ``speed_x_mps speed_y_mps yaw_rate_radps``         poses, see :mod:`~terrain.logs.held`
 ``pose``      ``position_x_m position_y_m yaw_rad``              ``icp_pos_*``, ``icp_quat_*``
 ``commands``  ``speed_x_mps yaw_rate_radps``                     ``cmd_vel_x``, ``cmd_vel_omega``
 ============  =================================================  ========================================
@@ -39,33 +39,142 @@ Warthog and one of a Husky show:
 - *Missing*: a column that holds nothing but 0 was not recorded (the Husky's imu), and the imu is 0 before its
   first message.  Both are left out.
 - *Lost*: on the wet grass poses jump by up to 12 m.  Where they scatter too much for a speed they are NaN.
+
+A recording is cut into runs: one a command, and what an operator drove between them.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.errors import LogError
 from terrain.files.names import normal_name
-from terrain.logs.csv_table import data_row, read_columns, read_words
-from terrain.logs.current_signs import MIN_MOVING_RADPS, POWER_SIGN, current_sign, with_sign_of_torque
 from terrain.logs.drive import FILE_NAME as SAMPLES_FILE
 from terrain.logs.drive import DriveRobot, refuse_other_robot
-from terrain.logs.held import undo_hold, usual_hold
-from terrain.logs.imu_axes import find_axes
-from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
-from terrain.logs.lidar_twist import MAX_STD, dated, new_poses, twists_and_std, usual_wait
-from terrain.logs.log_files import check_log_file, checked_names, short_name
-from terrain.logs.recording_stretches import Cut, cut_recording
-from terrain.logs.samples import BAD_TIME, checked_stream, longest_rise
+from terrain.logs.held import CHANNELS as TWIST_CHANNELS
+from terrain.logs.held import MAX_STD, dated, new_poses, twists_and_std, undo_hold, usual_hold, usual_wait
+from terrain.logs.imu_axes import MIN_MOVING_RADPS, POWER_SIGN, current_sign, find_axes, with_sign_of_torque
+from terrain.logs.samples import (
+    BAD_TIME,
+    check_log_file,
+    checked_names,
+    checked_stream,
+    longest_rise,
+    short_name,
+)
 from terrain.logs.schema import POSE_CHANNELS
+from terrain.logs.tables import data_row, read_columns, read_words
 from terrain.records import Array, Label, RunLog
+
+MIN_RUN_S = 2.0
+"""Shorter stretches hold no window and no steady speed."""
+
+STANDING_S = 2.0
+"""So long without motion ends what an operator drove."""
+
+MARGIN_S = 0.5
+"""What is kept of the standing before and after it: starts and stops are whole."""
+
+
+class Cut(NamedTuple):
+    """Rows ``first`` to ``end`` (not included) of a recording that make one run.
+
+    Parameters
+    ----------
+    name : ``step_003``, or ``hand_000`` of what an operator drove
+    first, end : rows
+    commanded : whether the logged command drove it
+    """
+
+    name: str
+    first: int
+    end: int
+    commanded: bool
+
+
+class Cuts(NamedTuple):
+    """Runs of a recording, and how many commands were left out because nothing moved."""
+
+    runs: tuple[Cut, ...]
+    n_still: int
+
+
+def cut_recording(step: Array, commanded: Array, moving: Array, breaks: Array, period_s: float) -> Cuts:
+    """Return the runs of a recording.
+
+    A run is what follows without a break in one step under the logged command (``step_003``; where an
+    operator intervened, so that it was begun anew, ``step_003_2``), or what was driven otherwise, between two
+    times of standing (``hand_000``, ``hand_001``).
+
+    Parameters
+    ----------
+    step : (n,) number of the command
+    commanded : (n,) whether the logged command drives
+    moving : (n,) whether a wheel turns
+    breaks : (n,) whether samples are lost before a row
+    period_s : from row to row
+
+    Examples
+    --------
+    >>> step = np.repeat([0, 1, 2], 60)
+    >>> moving = np.repeat([False, True, True, False], 45)
+    >>> cut_recording(step, step > 0, moving, np.zeros(180, bool), 0.05).runs[:2]
+    (Cut(name='step_001', first=60, end=120, commanded=True),
+     Cut(name='step_002', first=120, end=180, commanded=True))
+    """
+    n_min = round(MIN_RUN_S / period_s)
+    runs: list[Cut] = []
+    seen: dict[int, int] = {}
+    n_still = 0
+    for first, end in _stretches(np.column_stack([step, commanded]), breaks):
+        if not commanded[first] or end - first < n_min:
+            continue
+        if not moving[first:end].any():
+            n_still += 1
+            continue
+        number = int(step[first])
+        seen[number] = seen.get(number, 0) + 1
+        again = f"_{seen[number]}" if seen[number] > 1 else ""
+        runs.append(Cut(f"step_{number:03d}{again}", first, end, True))
+    n_hand = 0
+    for first, end in _stretches(np.asarray(commanded)[:, None], breaks):
+        if commanded[first]:
+            continue
+        for start, stop in _driven(moving[first:end], period_s):
+            if stop - start >= n_min:
+                runs.append(Cut(f"hand_{n_hand:03d}", first + start, first + stop, False))
+                n_hand += 1
+    return Cuts(tuple(sorted(runs, key=lambda cut: cut.first)), n_still)
+
+
+def _stretches(keys: Array, breaks: Array) -> Sequence[tuple[int, int]]:
+    """Return first row and end of each stretch of equal keys (n, k) without a break."""
+    if not len(keys):
+        return []
+    starts = np.flatnonzero(np.r_[True, (keys[1:] != keys[:-1]).any(axis=1) | breaks[1:].astype(bool)])
+    return list(zip(starts.tolist(), [*starts[1:].tolist(), len(keys)], strict=True))
+
+
+def _driven(moving: Array, period_s: float) -> list[tuple[int, int]]:
+    """Return what lies between two times of standing, with a margin on both sides."""
+    rows = np.flatnonzero(moving)
+    if not rows.size:
+        return []
+    apart = np.flatnonzero(np.diff(rows) * period_s > STANDING_S)
+    margin = round(MARGIN_S / period_s)
+    firsts, lasts = rows[np.r_[0, apart + 1]], rows[np.r_[apart, rows.size - 1]]
+    return [
+        (max(int(first) - margin, 0), min(int(last) + 1 + margin, len(moving)))
+        for first, last in zip(firsts, lasts, strict=True)
+    ]
+
 
 SUFFIX = ".csv.gz"
 
@@ -151,11 +260,6 @@ def find_runs(folder: Path, robot_of: Callable[[str], DriveRobot]) -> list[Calla
 
 def named_by_folder(path: Path) -> tuple[str, str]:
     """Return robot and terrain of a recording by the name of its folder.
-
-    Raises
-    ------
-    LogError
-        if the name is not ``<robot>_<terrain>``.
 
     Examples
     --------

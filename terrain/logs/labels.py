@@ -1,18 +1,27 @@
-"""Labels of runs: intervals as the terrains change, those that are set, and those of run folders."""
+"""Labels of runs: intervals as the terrains change, those that are set, and those of run folders.
+
+Beside them lie the windows that were recorded with a run: what the model gave for each, in ``windows.json`` or in a
+bag.  Class names can be any text, so they are no channels of a stream; readers of run folders pass the file over.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
-from terrain.files.documents import read_json
-from terrain.logs.borealtc import whole_run_label
+from terrain.files.documents import first_fault, read_json
+from terrain.files.regular import MEBIBYTE, read_regular
 from terrain.logs.read import read_run, read_run_head, run_folders
+from terrain.logs.samples import short_name
 from terrain.logs.schema import TIME_TOLERANCE_S
 from terrain.records import Label, Stream
 
@@ -27,6 +36,20 @@ class ChangedLabels(NamedTuple):
     start_s: float
     end_s: float
     labels: tuple[Label, ...]
+
+
+def whole_run_label(streams: Mapping[str, Stream], terrain: str) -> Label:
+    """Return the label that covers every sample of a run, the last one with its sampling period.
+
+    Examples
+    --------
+    >>> whole_run_label({"imu": Stream([0.0, 0.5, 1.0], [[0.0]] * 3, ("gyro_z_radps",))}, "SNOW")
+    Label(start_s=0.0, end_s=1.5, terrain='SNOW')
+    """
+    last = max(streams.values(), key=lambda stream: float(stream.time_s[-1]))
+    period_s = float(np.median(np.diff(last.time_s)))
+    start_s = min(float(stream.time_s[0]) for stream in streams.values())
+    return Label(start_s, float(last.time_s[-1]) + period_s, terrain)
 
 
 def label_intervals(
@@ -163,3 +186,129 @@ def folder_of(run_id: str, folders: Sequence[Path], data: Path) -> Path:
     if not found:
         raise ConfigError(f"{data}: there is no run {run_id!r}")
     return found[0]
+
+
+WINDOWS_FILE = "windows.json"
+
+MAX_BYTES = 64 * MEBIBYTE
+"""Windows each second of a week with ten classes."""
+
+Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number that is null in JSON where it is not finite."""
+
+
+class RecordedWindow(BaseModel):
+    """A window of a recorded run.
+
+    Parameters
+    ----------
+    start_s, end_s : on the clock of the run
+    terrain, probability : class of the largest probability; empty and NaN where the model refused the window
+    probabilities : of each class; NaN where it was refused
+    doubtful : the probability is below that from which an output counts, or no terrain is named
+    refused : why; empty where there is an output
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    start_s: float
+    end_s: float
+    terrain: str
+    probability: Number
+    probabilities: dict[str, Number]
+    doubtful: bool
+    refused: str = ""
+
+
+class _File(BaseModel):
+    """Content of ``windows.json``."""
+
+    version: Literal[1]
+    windows: list[RecordedWindow]
+
+
+def windows_text(windows: Iterable[RecordedWindow]) -> str:
+    """Return the content of ``windows.json``; a number that is not finite is null."""
+    return _File(version=1, windows=list(windows)).model_dump_json(indent=1) + "\n"
+
+
+def read_windows(run_folder: Path) -> list[RecordedWindow] | None:
+    """Return the windows that were recorded with a run; None where none were."""
+    path = run_folder / WINDOWS_FILE
+    if not path.exists():
+        return None
+    place = short_name(path)
+    try:
+        return _File.model_validate_json(read_regular(path, place, LogError, MAX_BYTES)).windows
+    except ValidationError as error:
+        raise LogError(f"{place}: is damaged ({first_fault(error)})") from error
+
+
+def window_of_text(place: str, text: str) -> RecordedWindow:
+    """Return a window of its entry as JSON, as a bag has it."""
+    try:
+        return RecordedWindow.model_validate_json(text)
+    except ValidationError as error:
+        raise LogError(f"{place}: a recorded window is damaged ({first_fault(error)})") from error
+
+
+class DoubtfulWindow(NamedTuple):
+    """A window whose output does not count.
+
+    Parameters
+    ----------
+    run_id, start_s, end_s : which one
+    terrain, probability : output of the model; empty and NaN where it refused the window
+    refused : why it did
+    label : of the run, where one covers the whole window
+    """
+
+    run_id: str
+    start_s: float
+    end_s: float
+    terrain: str
+    probability: float
+    refused: str
+    label: str | None
+
+
+class RunWindows(NamedTuple):
+    """Windows of a run: how many there are, are doubtful, and of those lack a label; None: none recorded."""
+
+    run_id: str
+    n_windows: int | None
+    n_doubtful: int
+    n_without_label: int
+
+
+def doubtful_windows(
+    data: Path, run_id: str | None = None
+) -> tuple[tuple[RunWindows, ...], tuple[DoubtfulWindow, ...]]:
+    """Return the windows whose outputs do not count, of all runs or of one, and how many each run has."""
+    folders = labelled_folders(data)
+    if run_id is not None:
+        folders = [folder_of(run_id, folders, data)]
+    runs: list[RunWindows] = []
+    found: list[DoubtfulWindow] = []
+    for folder in folders:
+        head, windows = read_run_head(folder), read_windows(folder)
+        labels = head.checked_labels(short_name(folder / "run.json"))
+        if windows is None:
+            runs.append(RunWindows(head.run_id, None, 0, 0))
+            continue
+        rows = [
+            DoubtfulWindow(
+                head.run_id,
+                window.start_s,
+                window.end_s,
+                window.terrain,
+                window.probability,
+                window.refused,
+                label_over(labels, window.start_s, window.end_s),
+            )
+            for window in windows
+            if window.doubtful
+        ]
+        runs.append(RunWindows(head.run_id, len(windows), len(rows), sum(row.label is None for row in rows)))
+        found += rows
+    return tuple(runs), tuple(found)

@@ -59,13 +59,11 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from terrain.errors import ConfigError, LogError
 from terrain.files.documents import first_fault, read_yaml
 from terrain.files.names import check_name, has_control_characters, normal_name, shown
-from terrain.logs.borealtc import whole_run_label
-from terrain.logs.csv_table import TextLayout
 from terrain.logs.geodesy import local_metres
-from terrain.logs.log_files import check_log_file, checked_names, short_name
-from terrain.logs.samples import checked_stream, refuse_apart
+from terrain.logs.labels import whole_run_label
+from terrain.logs.samples import check_log_file, checked_names, checked_stream, refuse_apart, short_name
 from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, canonical_unit, unit_of
-from terrain.logs.tables import read_table, table_row
+from terrain.logs.tables import TextLayout, read_table, table_row
 from terrain.records import Array, RunLog, Stream
 
 MAX_HEADER_ROWS = 1000
@@ -232,6 +230,15 @@ def find_runs(
     LogError
         if no file fits.
     """
+    found = found_files(folder, mapping)
+    if not found:
+        patterns = ", ".join(stream.file for stream in mapping.streams.values())
+        raise LogError(f"{folder}: no file there fits the mapping ({patterns})")
+    return [partial(read_run, folder, mapping, run, read_messages=read_messages) for run in found]
+
+
+def found_files(folder: Path, mapping: Mapping) -> list[Found]:
+    """Return the files of each run that a mapping finds under a folder; none where no file fits."""
     found: dict[str, Found] = {}
     for name, stream in mapping.streams.items():
         pattern = _pattern(normal_name(stream.file))
@@ -240,13 +247,7 @@ def find_runs(
             if match := pattern.fullmatch(normal_name(place)):
                 words = match.groupdict()
                 found.setdefault(repr(sorted(words.items())), Found(words, {})).places[name] = place
-    if not found:
-        patterns = ", ".join(stream.file for stream in mapping.streams.values())
-        raise LogError(f"{folder}: no file there fits the mapping ({patterns})")
-    return [
-        partial(read_run, folder, mapping, run, read_messages=read_messages)
-        for _, run in sorted(found.items())
-    ]
+    return [run for _, run in sorted(found.items())]
 
 
 def _glob_of(file: str) -> str:
@@ -264,6 +265,8 @@ def read_run(
     *,
     repair: bool = False,
     read_messages: ReadMessages | None = None,
+    by: str = "by a mapping",
+    linked_folders: bool = False,
 ) -> RunLog:
     """Return the run whose files were found.
 
@@ -274,6 +277,8 @@ def read_run(
     found : its words and files; a stream whose file was not found is missing there
     repair : drop and count what a strict read refuses
     read_messages : reads streams whose files are bags
+    by : what the run states of how it was read
+    linked_folders : whether the folder of a file may be a link that leads elsewhere
 
     Raises
     ------
@@ -287,7 +292,8 @@ def read_run(
     streams: dict[str, Stream] = {}
     files = []
     for name, stream in mapping.streams.items():
-        path = check_log_file(folder / found.places.get(name, stream.file.format(**words)), folder)
+        path = folder / found.places.get(name, stream.file.format(**words))
+        check_log_file(path, path.parent if linked_folders else folder)
         files.append(path.relative_to(folder).as_posix())
         if stream.messages is None:
             streams[name] = _read_stream(path, stream, dropped, repair=repair)
@@ -305,7 +311,7 @@ def read_run(
             mapping.robot,
             streams,
             (whole_run_label(streams, terrain),) if terrain else (),
-            source=f"{' and '.join(dict.fromkeys(files))}, by a mapping",
+            source=f"{' and '.join(dict.fromkeys(files))}, {by}",
             dropped=dropped,
         ),
     )

@@ -49,10 +49,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from terrain.errors import LogError
 from terrain.files.documents import first_fault, read_json
 from terrain.files.names import name_fault, shown
-from terrain.logs.log_files import check_log_file, checked_names, short_name
-from terrain.logs.parquet_file import read_parquet
-from terrain.logs.samples import checked_stream, refuse_apart
+from terrain.logs.samples import check_log_file, checked_names, checked_stream, refuse_apart, short_name
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
+from terrain.logs.tables import read_parquet
 from terrain.records import Label, RunLog, Stream
 
 MAX_STREAMS = 64

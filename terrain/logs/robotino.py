@@ -51,10 +51,9 @@ import numpy as np
 from terrain.errors import LogError
 from terrain.files.documents import read_json
 from terrain.files.names import normal_name, shown
-from terrain.logs.csv_table import TextLayout, data_row, header_of, read_columns
-from terrain.logs.log_files import check_log_file, checked_names, short_name
-from terrain.logs.samples import checked_stream
+from terrain.logs.samples import check_log_file, checked_names, checked_stream, short_name
 from terrain.logs.schema import POSE_CHANNELS
+from terrain.logs.tables import TextLayout, data_row, header_of, read_columns
 from terrain.records import Array, Label, RunLog, Stream
 
 ROBOT = "robotino"
@@ -271,7 +270,7 @@ def _commands(log: _Log, table: dict[str, Array]) -> Stream:
 
 
 def _to_motors() -> Array:
-    """Return the matrix (3, 3) from a twist to motor speeds (:mod:`terrain.kinematics.omni`)."""
+    """Return the matrix (3, 3) from a twist to motor speeds (:func:`terrain.kinematics.wheels.rolling_matrix`)."""
     direction = np.radians([150.0, 270.0, 390.0])
     rows = np.stack([np.cos(direction), np.sin(direction), np.full(3, WHEEL_DISTANCE_M)], axis=-1)
     return np.asarray(rows * (GEAR / WHEEL_RADIUS_M))

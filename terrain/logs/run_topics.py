@@ -22,11 +22,11 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
 from terrain.errors import DataError, LogError
 from terrain.files.documents import first_fault, parse_json
 from terrain.files.names import plain_name, shown
-from terrain.logs.faults import DAMAGED_MESSAGE, Faults, Topic
 from terrain.logs.labels import label_changes
 from terrain.logs.read import MAX_STREAMS, MAY_BE_UNKNOWN, LabelEntry, RunHead
 from terrain.logs.samples import DEAD_CHANNEL, checked_stream
 from terrain.logs.schema import unit_of
+from terrain.logs.topics import DAMAGED_MESSAGE, Faults, Topic
 from terrain.records import Array, Label, RunLog, Stream
 
 PREFIX = "/terrain/"
@@ -164,11 +164,6 @@ def string_message(text: str) -> bytes:
 def string_of(place: str, message: bytes) -> str:
     r"""Return the text of a message of ``std_msgs/String``.
 
-    Raises
-    ------
-    LogError
-        if it is damaged.
-
     Examples
     --------
     >>> string_of("a.mcap", string_message("a"))
@@ -268,11 +263,6 @@ def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iter
     ----------
     run : with any streams
     windows : time of the end and description of each window that was recorded with it
-
-    Raises
-    ------
-    DataError
-        as :func:`origin_of`.
     """
     origin_s = origin_of(run)
     start_s = min(float(stream.time_s[0]) for stream in run.streams.values())

@@ -1,6 +1,7 @@
-"""From arrays to a :class:`~terrain.records.Stream`: the one place where a log is judged.
+"""From arrays to a :class:`~terrain.records.Stream`, and from files to arrays: the one place where a log is judged.
 
-Every reader hands its arrays to :func:`checked_stream`.  A strict read refuses times that are not finite,
+Files of a log and the names in it do not lead elsewhere, whoever wrote it.  Every reader hands its arrays to
+:func:`checked_stream`.  A strict read refuses times that are not finite,
 go back or repeat, channels with nothing finite in them and streams of fewer than two samples.  A
 repairing read drops the rows at fault, keeps a dead channel as NaN (all runs of a data set must have the
 same channels), and counts what it did.  NaN among finite values is no fault: it stays NaN, infinite values
@@ -13,12 +14,114 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from terrain.errors import LogError
-from terrain.logs.plausible import MAX_MAGNITUDE
-from terrain.records import Array, Stream
+from terrain.errors import DataError, LogError
+from terrain.files.names import check_name, has_control_characters, shown
+from terrain.files.regular import check_inside, check_regular
+from terrain.records import Array, RunLog, Stream
+
+MAX_MAGNITUDE = 1e12
+"""No quantity of a vehicle is larger in its SI unit (a position on Earth in m has 8 digits, a time since 1970
+in s has 10); the fourth power of what is much larger, which features need, is no finite number."""
+
+BEYOND = f"beyond {MAX_MAGNITUDE:g} in its SI unit no quantity is plausible: --repair leaves such values out"
+"""What a message states of a value that is larger, wherever it is found."""
+
+
+def usable_rows(samples: Array, *, unknown_is_a_value: bool = False) -> Array:
+    """Return which rows (n,) of samples (n, c) hold plausible values only.
+
+    Parameters
+    ----------
+    samples : SI units
+    unknown_is_a_value : NaN is plausible, as unobservable slip is
+
+    Examples
+    --------
+    >>> usable_rows(np.array([[1.0, -2.0], [1.0, np.nan], [np.inf, 0.0], [1e200, 0.0]])).tolist()
+    [True, False, False, False]
+    """
+    usable = np.abs(samples) <= MAX_MAGNITUDE  # NaN is not
+    if unknown_is_a_value:
+        usable |= np.isnan(samples)
+    return np.asarray(usable.all(axis=1))
+
+
+def refuse_implausible(run: RunLog, channels: Mapping[str, Sequence[str]]) -> None:
+    """Refuse a finite value that no quantity can have, in the channels of some streams of a run."""
+    for name, of_stream in channels.items():
+        stream = run.streams[name]
+        for channel in of_stream:
+            values = stream.channel(channel)
+            beyond = np.flatnonzero((np.abs(values) > MAX_MAGNITUDE) & np.isfinite(values))
+            if len(beyond):
+                raise DataError(
+                    f"run {run.run_id}, stream {name!r}: channel {channel!r} is {values[beyond[0]]:.6g} at "
+                    f"{stream.time_s[beyond[0]]:.2f} s; {BEYOND}"
+                )
+
+
+def short_name(path: Path) -> str:
+    """Return folder and name of a file, as messages call it: ``ASPHALT/imu_03.csv``."""
+    return "/".join(path.parts[-2:])
+
+
+def check_log_file(path: Path, folder: Path) -> Path:
+    """Return a regular file that lies in a folder, links resolved; the folder itself may be a link.
+
+    Raises
+    ------
+    LogError
+        if the file is missing or a link that leads out of the folder, or is no regular file.
+    """
+    place = short_name(path)
+    if not path.is_symlink() and not path.exists():
+        raise LogError(f"{place}: is missing")
+    check_inside(path, folder, place, LogError)
+    check_regular(path, place, LogError)
+    return path
+
+
+def checked_names(place: str, run: RunLog) -> RunLog:
+    """Return a run whose names are plain ones: it says nothing of where a file lies.
+
+    Parameters
+    ----------
+    place : file, as messages name it
+    run : run log; a session that is empty is unknown
+
+    Raises
+    ------
+    LogError
+        if a run, robot, session, terrain, stream or channel has no plain name, or what was dropped a name
+        with control characters.
+
+    Examples
+    --------
+    >>> checked_names("run.json", RunLog("SNOW_01", "robots/husky.yaml", {}))
+    Traceback (most recent call last):
+    terrain.errors.LogError: run.json: robot 'robots/husky.yaml' is no plain name: it holds a path separator
+    """
+    check_name(f"{place}: run_id", run.run_id, LogError)
+    check_name(f"{place}: robot", run.robot, LogError)
+    if run.session:
+        check_name(f"{place}: session", run.session, LogError)
+    if run.filter:
+        check_name(f"{place}: filter", run.filter, LogError)
+    for terrain in run.terrains:
+        check_name(f"{place}: terrain", terrain, LogError)
+    for name, stream in run.streams.items():
+        check_name(f"{place}: stream", name, LogError)
+        for channel in stream.channels:
+            check_name(f"{place}: channel", channel, LogError)
+    for kind in run.dropped:
+        if has_control_characters(kind):
+            raise LogError(f"{place}: key {shown(kind)} of 'dropped' holds a control character")
+    return run
+
 
 BAD_TIME = "rows with a bad time"
 BAD_CELL = "cells that are no number"

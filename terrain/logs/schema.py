@@ -35,47 +35,23 @@ UNIT_SYMBOLS: dict[str, str] = {
 }
 """Unit word at the end of a channel name, and how it is printed; ``code`` is the number of a status."""
 
+_SCALES: dict[str, dict[str, float]] = {
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3},
+    "mps": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3, "km/h": 1.0 / 3.6, "mph": 0.44704},
+    "mps2": {"m/s^2": 1.0, "mm/s^2": 1e-3, "g": GRAVITY_MPS2, "mg": 1e-3 * GRAVITY_MPS2},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295},
+    "radps": {"rad/s": 1.0, "deg/s": 0.017453292519943295, "rpm": 0.10471975511965977},
+    "a": {"A": 1.0, "mA": 1e-3},
+    "v": {"V": 1.0, "mV": 1e-3, "kV": 1e3},
+    "nm": {"Nm": 1.0, "mNm": 1e-3, "kNm": 1e3},
+    "n": {"N": 1.0, "kN": 1e3},
+    "ratio": {"1": 1.0, "%": 1e-2},
+    "k": {"K": 1.0, "degC": 1.0, "degF": 5.0 / 9.0},
+    "kg": {"kg": 1.0, "t": 1e3},
+}
 UNIT_SCALES: dict[str, tuple[str, float]] = {
-    "s": ("s", 1.0),
-    "ms": ("s", 1e-3),
-    "us": ("s", 1e-6),
-    "ns": ("s", 1e-9),
-    "m": ("m", 1.0),
-    "cm": ("m", 1e-2),
-    "mm": ("m", 1e-3),
-    "km": ("m", 1e3),
-    "m/s": ("mps", 1.0),
-    "cm/s": ("mps", 1e-2),
-    "mm/s": ("mps", 1e-3),
-    "km/h": ("mps", 1.0 / 3.6),
-    "mph": ("mps", 0.44704),
-    "m/s^2": ("mps2", 1.0),
-    "mm/s^2": ("mps2", 1e-3),
-    "g": ("mps2", GRAVITY_MPS2),
-    "mg": ("mps2", 1e-3 * GRAVITY_MPS2),
-    "rad": ("rad", 1.0),
-    "mrad": ("rad", 1e-3),
-    "deg": ("rad", 0.017453292519943295),
-    "rad/s": ("radps", 1.0),
-    "deg/s": ("radps", 0.017453292519943295),
-    "rpm": ("radps", 0.10471975511965977),
-    "A": ("a", 1.0),
-    "mA": ("a", 1e-3),
-    "V": ("v", 1.0),
-    "mV": ("v", 1e-3),
-    "kV": ("v", 1e3),
-    "Nm": ("nm", 1.0),
-    "mNm": ("nm", 1e-3),
-    "kNm": ("nm", 1e3),
-    "N": ("n", 1.0),
-    "kN": ("n", 1e3),
-    "1": ("ratio", 1.0),
-    "%": ("ratio", 1e-2),
-    "K": ("k", 1.0),
-    "degC": ("k", 1.0),
-    "degF": ("k", 5.0 / 9.0),
-    "kg": ("kg", 1.0),
-    "t": ("kg", 1e3),
+    unit: (word, factor) for word, units in _SCALES.items() for unit, factor in units.items()
 }
 """Unit accepted in a mapping file: the SI unit word it becomes, and the factor.
 
@@ -84,39 +60,24 @@ UNIT_SCALES: dict[str, tuple[str, float]] = {
 UNIT_OFFSETS: dict[str, float] = {"degC": 273.15, "degF": 273.15 - 32.0 * 5.0 / 9.0}
 """What is added after the factor, where the zero of a unit is not that of the SI unit."""
 
-UNIT_ALIASES: dict[str, str] = {
-    "sec": "s",
-    "seconds": "s",
-    "msec": "ms",
-    "\u00b5s": "us",
-    "\u03bcs": "us",
-    "m/s2": "m/s^2",
-    "m/s\u00b2": "m/s^2",
-    "m s^-2": "m/s^2",
-    "mm/s2": "mm/s^2",
-    "mm/s\u00b2": "mm/s^2",
-    "kmh": "km/h",
-    "kph": "km/h",
-    "km/hr": "km/h",
-    "m s^-1": "m/s",
-    "m/sec": "m/s",
-    "\u00b0": "deg",
-    "degree": "deg",
-    "degrees": "deg",
-    "\u00b0/s": "deg/s",
-    "deg/sec": "deg/s",
-    "rad/sec": "rad/s",
-    "1/min": "rpm",
-    "r/min": "rpm",
-    "U/min": "rpm",
-    "RPM": "rpm",
-    "N m": "Nm",
-    "N*m": "Nm",
-    "N\u00b7m": "Nm",
-    "\u00b0C": "degC",
-    "\u00b0F": "degF",
-    "percent": "%",
+_SPELLINGS: dict[str, tuple[str, ...]] = {
+    "s": ("sec", "seconds"),
+    "ms": ("msec",),
+    "us": ("\u00b5s", "\u03bcs"),
+    "m/s^2": ("m/s2", "m/s\u00b2", "m s^-2"),
+    "mm/s^2": ("mm/s2", "mm/s\u00b2"),
+    "km/h": ("kmh", "kph", "km/hr"),
+    "m/s": ("m s^-1", "m/sec"),
+    "deg": ("\u00b0", "degree", "degrees"),
+    "deg/s": ("\u00b0/s", "deg/sec"),
+    "rad/s": ("rad/sec",),
+    "rpm": ("1/min", "r/min", "U/min", "RPM"),
+    "Nm": ("N m", "N*m", "N\u00b7m"),
+    "degC": ("\u00b0C",),
+    "degF": ("\u00b0F",),
+    "%": ("percent",),
 }
+UNIT_ALIASES: dict[str, str] = {other: unit for unit, others in _SPELLINGS.items() for other in others}
 """Other spellings of units, as labs and instruments write them."""
 
 
@@ -195,12 +156,7 @@ _SET_OF_STREAM: dict[str, str] = {"estimator": "estimator", "slip": "slip"}
 
 
 def unit_of(channel: str) -> str:
-    """Return the SI unit word of a channel name.
-
-    Raises
-    ------
-    LogError
-        if the name does not end in a known unit.
+    """Return the SI unit word of a channel name; a name that ends in none is refused.
 
     Examples
     --------

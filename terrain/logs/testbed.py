@@ -51,9 +51,8 @@ import numpy as np
 
 from terrain.errors import LogError
 from terrain.files.names import shown
-from terrain.logs.csv_table import number_in, text_rows
-from terrain.logs.log_files import check_log_file, checked_names, short_name
-from terrain.logs.samples import checked_stream
+from terrain.logs.samples import check_log_file, checked_names, checked_stream, short_name
+from terrain.logs.tables import number_in, text_rows
 from terrain.records import Label, RunLog
 
 WHEELS = ("smooth", "grouser")

@@ -10,8 +10,8 @@ from types import MappingProxyType
 from terrain.errors import LogError
 from terrain.files.atomic import atomic_folder
 from terrain.files.names import plain_name, shown
-from terrain.logs.log_files import checked_names
 from terrain.logs.read import RunFile, RunHead, StreamFile
+from terrain.logs.samples import checked_names
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
 from terrain.records import RunLog, Stream
 
@@ -20,11 +20,6 @@ LABELS_FILE = "labels.csv"
 
 def run_folder(run_id: str, folder: str | Path) -> Path:
     """Return where a run lies within a data-set folder.
-
-    Raises
-    ------
-    LogError
-        if the id cannot be the name of a folder.
 
     Examples
     --------

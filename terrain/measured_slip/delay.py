@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import DataError
+from terrain.kinematics.wheels import no_slip_twist
 from terrain.measured_slip.slips import (
     Travelled,
-    rolled_twists,
     travelled,
     wheel_directions,
     wheel_speeds,
@@ -132,7 +132,7 @@ def _misfits(run: RunLog, robot: Robot, lags_s: Array, n_parts: int) -> list[Arr
     one = np.zeros(int(known.sum()), dtype=np.int64)
     u, _ = window_rates(time_s[known], sums[known], one, start_s, end_s, 3, 0.4)
     directions = wheel_directions(run, robot, start_s, end_s)
-    rolled = rolled_twists(u, robot.wheel_positions_m, directions, robot.on_omni_wheels)
+    rolled, _ = no_slip_twist(robot.wheel_positions_m, directions, u, robot.on_omni_wheels)
     size_m = float(np.linalg.norm(robot.wheel_positions_m, axis=1).max())
     scale = np.array([1.0, 1.0, size_m])
     seen = np.array(

@@ -43,12 +43,7 @@ class SlipStep(NamedTuple):
 
 
 def slip_step(run: RunLog, robot: Robot, delay_s: float = 0.0) -> SlipStep | None:
-    """Return when the slip of a run changes; None where it does not, as measured from outside.
-
-    Parameters
-    ----------
-    run, robot, delay_s : as :func:`~terrain.measured_slip.slips.measured_slip` takes them
-    """
+    """Return when the slip of a run changes; None where it does not, as measured from outside."""
     return step_of(measured_slip(run, robot, window_s=WINDOW_S, stride_s=STRIDE_S, delay_s=delay_s), robot)
 
 

@@ -28,8 +28,7 @@ from terrain.errors import DataError
 from terrain.identify import Parameter, folds, identify
 from terrain.measured_slip.slips import MeasuredSlip
 from terrain.records import Array
-from terrain.robots import Robot
-from terrain.robots.omni import OmniRobot
+from terrain.robots import OmniRobot, Robot
 from terrain.simulation.planar.omni import steady_twist
 
 N_FOLDS = 5
@@ -166,14 +165,7 @@ def roller_findings(
 
 
 def surface_of_windows(slip: MeasuredSlip, found: RollerFindings, robot: Robot) -> list[str]:
-    """Return the surface whose rollers explain each window of a run best; empty where it is not steady.
-
-    Parameters
-    ----------
-    slip : of the run, which may cross from one surface to another
-    found : of runs on one surface each, of the robot with the same load
-    robot : whose runs they are
-    """
+    """Return the surface whose rollers explain each window of a run best; empty where it is not steady."""
     names = list(found.roller_ratio)
     rows = np.flatnonzero(slip.steady & np.isfinite(slip.body_slip) & np.isfinite(slip.body_side))
     windows = _Cases(
@@ -296,14 +288,7 @@ class DistanceBound(NamedTuple):
 def distance_bound(
     runs: Sequence[MeasuredSlip], robot: OmniRobot, rng: np.random.Generator
 ) -> DistanceBound | None:
-    """Return the bound that runs on one surface give; None where their turns do not follow the wheels.
-
-    Parameters
-    ----------
-    runs : measured, on a surface where wheels slip little
-    robot : with the distance as described
-    rng : draws runs
-    """
+    """Return the bound that runs on one surface give; None where their turns do not follow the wheels."""
     turns = []
     for run in runs:
         known = np.isfinite(run.twist[:, 2]) & np.isfinite(run.rolled_twist[:, 2])

@@ -47,7 +47,7 @@ from numba import njit
 from terrain.errors import ConfigError, DataError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
-from terrain.kinematics.wheel_velocity import TWIST, point_velocity, wheel_frame_velocities
+from terrain.kinematics.wheels import TWIST, no_slip_twist, point_velocity, wheel_frame_velocities
 from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, RunLog, SlipTrack, Stream, read_only
 from terrain.robots import Robot
@@ -115,13 +115,7 @@ def outside_source(run: RunLog) -> str | None:
 
 
 def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
-    """Return what a run's body travelled, as measured from outside.
-
-    Parameters
-    ----------
-    run : with one of :data:`SOURCES`
-    robot : whose log it is; where its camera sits, if the odometry is one's
-    delay_s : of the outside measurement behind the wheels; it is taken off its stamps
+    """Return what a run's body travelled, as measured from outside, ``delay_s`` before its stamps.
 
     Raises
     ------
@@ -423,7 +417,7 @@ def measured_slip(
     along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, direction)
     along_std = _along_std(twist_std, robot.wheel_positions_m, direction)
     slip, slip_std = _slip(u, u_std, along, along_std, min_speed_mps)
-    rolled_twist = rolled_twists(u, robot.wheel_positions_m, direction, robot.on_omni_wheels)
+    rolled_twist, _ = no_slip_twist(robot.wheel_positions_m, direction, u, robot.on_omni_wheels)
     body_slip, body_std, side = _body(rolled_twist, u_std, twist, twist_std, min_speed_mps)
     return MeasuredSlip(
         run_id=run.run_id,
@@ -514,35 +508,6 @@ def wheel_directions(run: RunLog, robot: Robot, start_s: Array, end_s: Array) ->
         if inside.any():
             means[i] = np.angle(np.nanmean(np.exp(1j * angles[inside]), axis=0))
     return means
-
-
-def rolled_twists(
-    wheel_speed_mps: Array, positions_m: Array, direction_rad: Array, rolls_across: bool
-) -> Array:
-    """Return the twist (k, 3) that fits wheels which do not slip, by least squares.
-
-    Parameters
-    ----------
-    wheel_speed_mps : (k, wheels)
-    positions_m : (wheels, 2)
-    direction_rad : (k, wheels)
-    rolls_across : whether wheels roll across their direction too, as omni wheels; others do not move there
-
-    Examples
-    --------
-    >>> rolled_twists(np.array([[0.9, 1.1]]), np.array([[0, 0.5], [0, -0.5]]), np.zeros((1, 2)), False)
-    array([[1. , 0. , 0.2]])
-    """
-    x_m, y_m = positions_m.T
-    cos, sin = np.cos(direction_rad), np.sin(direction_rad)
-    rows = np.stack([cos, sin, x_m * sin - y_m * cos], axis=-1)
-    goal = wheel_speed_mps[..., None]
-    if not rolls_across:
-        rows = np.concatenate([rows, np.stack([-sin, cos, x_m * cos + y_m * sin], axis=-1)], axis=1)
-        goal = np.concatenate([goal, np.zeros_like(goal)], axis=1)
-    unknown = ~(np.isfinite(rows).all(axis=(1, 2)) & np.isfinite(goal).all(axis=(1, 2)))
-    found = np.linalg.pinv(np.where(unknown[:, None, None], 0.0, rows)) @ np.nan_to_num(goal)
-    return np.where(unknown[:, None], np.nan, found[..., 0] + 0.0)
 
 
 def spinning_wheels(found: MeasuredSlip, spin_ratio: float = 0.9, others_ratio: float = 0.5) -> Sequence[str]:

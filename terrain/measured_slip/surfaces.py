@@ -68,14 +68,7 @@ class SurfaceSlip:
 
 
 def surface_slip(terrain: str, runs: Sequence[MeasuredSlip], rng: np.random.Generator) -> SurfaceSlip:
-    """Return what runs on one surface measured, of their windows in steady motion.
-
-    Parameters
-    ----------
-    terrain : its name
-    runs : at least one
-    rng : draws runs
-    """
+    """Return what runs on one surface measured, of their windows in steady motion."""
     steady = [run.steady for run in runs]
     slips = [run.body_slip[run.known] for run in runs]
     known = [i for i, slip in enumerate(slips) if slip.size]
@@ -185,7 +178,9 @@ def _point(run: RunLog, slip: MeasuredSlip, robot: Robot) -> tuple[float, float,
     mean_a = float(current[known].mean())
     if not robot.describes("motors"):
         return ratio, mean_a, np.nan
-    motors = robot.motors
-    torque_nm = mean_a * motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
     load_n = robot.mass_kg * GRAVITY_MPS2 / len(robot.wheels)
-    return ratio, mean_a, (torque_nm - motors.friction_nm) / robot.wheel_radius_m / load_n
+    return (
+        ratio,
+        mean_a,
+        (mean_a * robot.motors.nm_per_a - robot.motors.friction_nm) / robot.wheel_radius_m / load_n,
+    )

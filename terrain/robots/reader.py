@@ -19,7 +19,8 @@ use of it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -31,19 +32,32 @@ from terrain.files.descriptions import check_keys, number
 from terrain.files.documents import read_yaml
 from terrain.files.names import check_name, shown
 from terrain.files.resources import data_folder
-from terrain.robots.bicycle import BicycleRobot
-from terrain.robots.omni import OmniRobot
-from terrain.robots.parts import IDENTIFIED, KIND_OF_SECTION
 from terrain.robots.region import read_region
-from terrain.robots.robot import Robot
-from terrain.robots.skid_steer import SkidSteerRobot
-from terrain.robots.swerve import SwerveRobot
-from terrain.robots.tracked import TrackedRobot
+from terrain.robots.robot import (
+    KIND_OF_SECTION,
+    BicycleRobot,
+    OmniRobot,
+    Robot,
+    SkidSteerRobot,
+    SwerveRobot,
+    TrackedRobot,
+)
 
 KIND_OF_DRIVE: dict[str, type[Robot]] = {
     kind.drive: kind for kind in (SkidSteerRobot, TrackedRobot, SwerveRobot, OmniRobot, BicycleRobot)
 }
 """The type of each drive."""
+
+IDENTIFIED: Mapping[str, float | None] = {
+    "rolling_radius_m": None,
+    "effective_track_m": None,
+    "lidar_delay_s": -math.inf,
+    "wheels_delay_s": -math.inf,
+    "wheel_distance_m": None,
+}
+"""Numbers of the section ``identified``, which logs of one robot showed and no nominal figure is: the least
+value of each, None for above zero (:mod:`terrain.calibration.skid_steer`,
+:mod:`terrain.calibration.omni`)."""
 
 
 def load_robot(name_or_path: str | Path) -> Robot:
@@ -76,25 +90,13 @@ def _packaged(name: str) -> Robot:
 
 
 def read_description(name_or_path: str | Path) -> tuple[str, Any]:
-    """Return the file name and the YAML content of a robot's description, unchecked.
-
-    Raises
-    ------
-    ConfigError
-        if there is no such robot, or the file is no YAML.
-    """
+    """Return the file name and the YAML content of a robot's description, unchecked."""
     path = description_file(name_or_path)
     return path.name, read_yaml(path)
 
 
 def description_file(name_or_path: str | Path) -> Path:
-    """Return the file of a robot's description: the path itself, or that of a robot of the package.
-
-    Raises
-    ------
-    ConfigError
-        if there is no robot of that name.
-    """
+    """Return the file of a robot's description: the path itself, or that of a robot of the package."""
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml"):
         return path
@@ -120,11 +122,6 @@ def robot_names() -> tuple[str, ...]:
 def packaged_robot(name: str) -> Robot:
     """Return a robot of the package by the name that a log gives: a name, never the path of a file.
 
-    Raises
-    ------
-    ConfigError
-        if the package has no robot of the name.
-
     Examples
     --------
     >>> packaged_robot("husky").drive
@@ -143,24 +140,12 @@ def packaged_robot(name: str) -> Robot:
 
 
 def robot_named(name: str, given: Robot | None) -> Robot:
-    """Return the robot that a log names: the one that is given, where it bears the name, else the package's.
-
-    Raises
-    ------
-    ConfigError
-        if the package has no robot of the name.
-    """
+    """Return the robot that a log names: the one that is given, where it bears the name, else the package's."""
     return given if given is not None and given.name == name else packaged_robot(name)
 
 
 def robot_from(file: str, described: Any) -> Robot:
-    """Return the robot of a description's content; ``file`` is what messages call it.
-
-    Raises
-    ------
-    ConfigError
-        as :func:`load_robot` does.
-    """
+    """Return the robot of a description's content; ``file`` is what messages call it."""
     drive = described.get("drive") if isinstance(described, dict) else None
     kind = KIND_OF_DRIVE.get(drive, SkidSteerRobot) if isinstance(drive, str) else SkidSteerRobot
     optional = (*KIND_OF_SECTION, "identified", "filters", "effects")

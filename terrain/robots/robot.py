@@ -1,20 +1,160 @@
-"""What all robots share: geometry, mass, the sections of their description, and their effects."""
+"""Robots: the sections of their descriptions, what all drives share, and what each kind of drive is."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Annotated, Any, ClassVar, NamedTuple, Self, TypeAlias, TypeVar
 
 import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.records import Array, read_only
-from terrain.robots.parts import KIND_OF_SECTION, Body, Camera, Equipment, Motors, Part, Sensors, Steering
 from terrain.robots.region import Region
+
+Signed = Annotated[float, -math.inf]
+"""A number of a description that may have any value; a plain ``float`` has to be above zero."""
+
+NotNegative = Annotated[float, 0.0]
+"""A number that may be zero."""
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """Masses, tyres, and how far the track can be adjusted."""
+
+    footprint_min_m: float
+    footprint_max_m: float
+    tyre_width_m: float
+    yaw_inertia_kgm2: float
+    com_x_m: Signed
+    com_y_m: Signed
+    com_height_m: NotNegative
+    wheel_inertia_kgm2: float
+    contact_length_m: float
+    relaxation_length_m: float
+    tyre_stiffness_npm: float
+    tyre_damping_nspm: float
+
+
+@dataclass(frozen=True, slots=True)
+class Motors:
+    """Motors behind a reduction, and the speed loop of the motor drivers; torques and gains at the wheel."""
+
+    reduction_ratio: float
+    torque_constant_nmpa: float
+    efficiency_ratio: float
+    torque_max_nm: float
+    supply_v: float
+    speed_max_radps: float
+    torque_time_constant_s: NotNegative
+    friction_nm: NotNegative
+    speed_gain_nmspr: float
+    speed_integral_nmpr: NotNegative
+    speed_estimate_time_constant_s: NotNegative
+
+    @property
+    def nm_per_a(self) -> float:
+        """Torque at the wheel for an ampere of its motor."""
+        return self.torque_constant_nmpa * self.reduction_ratio * self.efficiency_ratio
+
+
+@dataclass(frozen=True, slots=True)
+class Steering:
+    """Steering of each wheel: its limits, its dead band, and the zero of its encoder."""
+
+    rate_max_radps: float
+    accel_max_radps2: float
+    dead_band_rad: NotNegative
+    torque_max_nm: float
+    zero_1_rad: Signed
+    zero_2_rad: Signed
+    zero_3_rad: Signed
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """Tracking camera: where it is mounted on the body, and the errors of its pose stream."""
+
+    lever_x_m: Signed
+    lever_y_m: Signed
+    lever_z_m: Signed
+    rate_hz: float
+    latency_s: NotNegative
+    time_constant_s: NotNegative
+    speed_std_mps: float
+    yaw_rate_std_radps: float
+    yaw_std_rad: float
+    position_std_m: float
+    dropout_rate_hz: NotNegative
+    dropout_length_s: float
+    jump_rate_hz: NotNegative
+    jump_std_m: NotNegative
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """Rates, noise, bias and delay of all sensors but the camera.
+
+    ``*_std`` are standard deviations of a sample while the robot stands still; ``*_bias_std`` of a bias from
+    one power-on to the next; ``*_walk`` the random walk of a bias (per root second).
+    """
+
+    wheels_rate_hz: float
+    hall_steps_ratio: float
+    encoder_time_constant_s: NotNegative
+    motor_std_radps: float
+    current_std_a: float
+    steering_rate_hz: float
+    steering_steps_ratio: float
+    steering_std_rad: float
+    imu_rate_hz: float
+    imu_latency_s: NotNegative
+    gyro_std_radps: float
+    gyro_bias_x_radps: Signed
+    gyro_bias_y_radps: Signed
+    gyro_bias_z_radps: Signed
+    gyro_bias_std_radps: NotNegative
+    gyro_walk_radps: NotNegative
+    accel_std_mps2: float
+    accel_bias_x_mps2: Signed
+    accel_bias_y_mps2: Signed
+    accel_bias_z_mps2: Signed
+    accel_bias_std_mps2: NotNegative
+    accel_scale_x_ratio: float
+    accel_scale_y_ratio: float
+    accel_scale_z_ratio: float
+    tilt_std_rad: float
+    yaw_std_rad: float
+
+
+Part: TypeAlias = Body | Motors | Steering | Camera | Sensors
+"""Any section of a description."""
+
+
+class Equipment(NamedTuple):
+    """Every section of a description."""
+
+    body: Body
+    motors: Motors
+    steering: Steering
+    camera: Camera
+    sensors: Sensors
+
+
+KIND_OF_SECTION: Mapping[str, type[Part]] = {
+    "body": Body,
+    "motors": Motors,
+    "steering": Steering,
+    "camera": Camera,
+    "sensors": Sensors,
+}
+"""What each section of a description is read into, by its key in the file."""
+
 
 P = TypeVar("P", bound=Part)
 
@@ -35,7 +175,7 @@ class Robot(ABC):
     wheelbase_m : distance between front and rear wheel
     mass_kg : total mass without payload
     parts : sections of the description by name
-    effects : parameters of :mod:`terrain.effects.catalogue` that are not 0, by name
+    effects : parameters of :mod:`terrain.effects` that are not 0, by name
     effects_cov : (n, n) covariance of the effects in their order; NaN where unknown
     region : of driving, that the effects were validated in; None where none is stated
     assumed : numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
@@ -64,16 +204,25 @@ class Robot(ABC):
     """The kind of drive, as descriptions name it."""
     wheels: ClassVar[tuple[str, ...]]
     """The wheels' names, as channels have them."""
-    sections: ClassVar[tuple[str, ...]]
+    logged_wheels: ClassVar[tuple[str, ...]]
+    """Names of the wheels whose rates are logged, in the order of :attr:`rate_channels`."""
+    steered_wheels: ClassVar[tuple[str, ...]] = ()
+    """Names of the wheels that are steered, the first ones of :attr:`wheels`."""
+    by_motor: ClassVar[bool] = False
+    """Whether logs have the rates of motors, and tables those of wheels; else circumferential speeds."""
+    sections: ClassVar[tuple[str, ...]] = ("body", "motors", "camera", "sensors")
     """Sections that a complete description has."""
     n_tyres: ClassVar[int]
     """Tyres that carry the weight."""
-    steered: ClassVar[bool]
-    """Whether wheels are steered: there is a stream of angles."""
-    sideways: ClassVar[bool]
+    sideways: ClassVar[bool] = False
     """Whether it can drive sideways."""
-    skids: ClassVar[bool]
+    skids: ClassVar[bool] = False
     """Whether it turns by skidding, so that the turning moment takes a current of its own."""
+
+    @property
+    def steered(self) -> bool:
+        """Whether wheels are steered: there is a stream of angles."""
+        return bool(self.steered_wheels)
 
     @property
     def on_omni_wheels(self) -> bool:
@@ -101,8 +250,9 @@ class Robot(ABC):
     @classmethod
     def described(cls, name: str, numbers: Mapping[str, float], **also: Any) -> Self:
         """Return the robot of a description's :attr:`numbers`; ``also`` are other parameters."""
-        radius_m, track_m, wheelbase_m, mass_kg = (numbers[key] for key in cls.numbers)
-        return cls(name, radius_m, track_m, wheelbase_m, mass_kg, **also)
+        own = {written: field for field, written in cls.spelled.items()}
+        also |= {own.get(key, key): value for key, value in numbers.items()}
+        return cls(name=name, **also)
 
     @property
     @abstractmethod
@@ -115,24 +265,21 @@ class Robot(ABC):
         return np.zeros(len(self.wheels))
 
     @property
-    @abstractmethod
     def rate_channels(self) -> tuple[str, ...]:
-        """Channels of the stream ``wheels`` that tell how fast each wheel turns."""
+        """Channels of the stream ``wheels``: rates of motors, ahead of the reduction, or wheel speeds."""
+        pattern = "motor_{}_radps" if self.by_motor else "speed_{}_mps"
+        return tuple(pattern.format(wheel) for wheel in self.logged_wheels)
 
     @property
-    @abstractmethod
     def wheel_rows(self) -> tuple[str, ...]:
         """Row of each wheel's rate or speed in a table of measurements."""
+        unit = "radps" if self.by_motor else "mps"
+        return tuple(f"wheel_{wheel}_{unit}" for wheel in self.logged_wheels)
 
     @property
-    @abstractmethod
     def steer_rows(self) -> tuple[str, ...]:
         """Row of each wheel's steering angle in a table of measurements; none without steering."""
-
-    @property
-    def logged_wheels(self) -> tuple[str, ...]:
-        """Names of the wheels whose rates are logged, in the order of :attr:`rate_channels`."""
-        return tuple(channel.partition("_")[2].rpartition("_")[0] for channel in self.rate_channels)
+        return tuple(f"steer_{wheel}_rad" for wheel in self.steered_wheels)
 
     @property
     def steer_channels(self) -> tuple[str, ...]:
@@ -144,25 +291,27 @@ class Robot(ABC):
         >>> load_robot("adap2e").steer_channels, load_robot("husky").steer_channels
         (('angle_front_rad',), ())
         """
-        return tuple(row.replace("steer_", "angle_") for row in self.steer_rows)
+        return tuple(f"angle_{wheel}_rad" for wheel in self.steered_wheels)
 
     @property
-    @abstractmethod
     def steering_zeros_rad(self) -> Array:
         """Reading (wheels,) of each steering encoder where the wheel points ahead; 0 without steering."""
+        return np.zeros(len(self.wheels))
 
     @property
-    @abstractmethod
     def steering_rate_max_radps(self) -> float:
         """Fastest steering rate; 0 without steering."""
+        return 0.0
 
-    @abstractmethod
     def logged_rates(self, wheel_speed_mps: Array) -> Array:
         """Return what :attr:`rate_channels` log of wheel circumferential speeds (..., wheels)."""
+        if self.by_motor:
+            return np.asarray(wheel_speed_mps / self.wheel_radius_m * self.motors.reduction_ratio)
+        return np.asarray(wheel_speed_mps)[..., len(self.wheels) - len(self.logged_wheels) :]
 
-    @abstractmethod
     def wheel_speeds_mps(self, rows: Array) -> Array:
         """Return wheel circumferential speeds for values (..., wheels) of :attr:`wheel_rows`."""
+        return np.asarray(rows * self.wheel_radius_m if self.by_motor else rows)
 
     @property
     def body(self) -> Body:
@@ -214,11 +363,6 @@ class Robot(ABC):
 
     def require(self, *sections: str) -> None:
         """Make sure that the description has the sections named.
-
-        Raises
-        ------
-        ConfigError
-            if one is missing.
 
         Examples
         --------
@@ -281,11 +425,6 @@ class Robot(ABC):
     def with_track(self, track_m: float) -> Self:
         """Return the robot with its adjustable track set.
 
-        Raises
-        ------
-        ConfigError
-            if the track is beyond its adjustment.
-
         Examples
         --------
         >>> from terrain.robots import load_robot
@@ -297,13 +436,7 @@ class Robot(ABC):
         return changed
 
     def check_geometry(self, place: str) -> None:
-        """Refuse dimensions that no body can have; ``place`` is what messages call the robot.
-
-        Raises
-        ------
-        ConfigError
-            if track or wheelbase are not above zero, or the track is beyond what the footprint allows.
-        """
+        """Refuse dimensions that no body can have; ``place`` is what messages call the robot."""
         if self.wheelbase_m <= 0 or self.track_m <= 0:
             raise ConfigError(f"{place}: track_m and wheelbase_m must be above zero")
         if not self.describes("body"):
@@ -328,13 +461,7 @@ class Robot(ABC):
 
 
 def check_centre_of_mass(place: str, positions_m: Array, body: Body) -> None:
-    """Refuse a centre of mass that lifts one of three wheels.
-
-    Raises
-    ------
-    ConfigError
-        if it is outside the triangle of the wheels (3, 2).
-    """
+    """Refuse a centre of mass that lifts one of three wheels."""
     moments = np.vstack([np.ones(3), positions_m.T])
     shares = np.linalg.solve(moments, [1.0, body.com_x_m, body.com_y_m])
     if shares.min() <= 0:
@@ -354,6 +481,307 @@ def _neutral(kind: type[P], **values: float) -> P:
     return kind(**(default | values))
 
 
+@dataclass(frozen=True)
+class SkidSteerRobot(Robot):
+    """Four wheels that are driven by sides and not steered; each side counts as one wheel.
+
+    The wheels of a side turn together, and a difference of the sides turns the robot.
+    """
+
+    drive: ClassVar[str] = "skid_steer"
+    wheels: ClassVar[tuple[str, ...]] = ("left", "right")
+    logged_wheels: ClassVar[tuple[str, ...]] = wheels
+    n_tyres: ClassVar[int] = 4
+    skids: ClassVar[bool] = True
+
+    @cached_property
+    def wheel_positions_m(self) -> Array:
+        """Middle (2, 2) of each side in the body frame."""
+        return read_only([[0.0, self.track_m / 2], [0.0, -self.track_m / 2]])
+
+
+@dataclass(frozen=True)
+class TrackedRobot(SkidSteerRobot):
+    """Two tracks; ``wheel_radius_m`` is that of the sprocket, ``wheelbase_m`` the length on the ground.
+
+    Logs are those of a skid-steer robot, and so is all that needs no more than the speeds of the two sides.
+
+    Parameters
+    ----------
+    track_width_m : of one track
+    com_height_m : of the centre of mass above the ground
+    """
+
+    track_width_m: float = 0.15
+    com_height_m: float = 0.15
+
+    numbers: ClassVar[tuple[str, ...]] = (
+        *("sprocket_radius_m", "track_m", "contact_length_m", "track_width_m", "com_height_m", "mass_kg"),
+    )
+    spelled: ClassVar[Mapping[str, str]] = MappingProxyType(
+        {"wheel_radius_m": "sprocket_radius_m", "wheelbase_m": "contact_length_m"}
+    )
+    drive: ClassVar[str] = "tracked"
+    n_tyres: ClassVar[int] = 2
+
+    @property
+    def half_track_m(self) -> float:
+        """Half the distance between the middles of the tracks, d of Tazzari et al. and Yamauchi et al.
+
+        Examples
+        --------
+        >>> from terrain.robots import load_robot
+        >>> load_robot("patako").half_track_m
+        0.1965
+        """
+        return self.track_m / 2.0
+
+    @property
+    def contact_length_m(self) -> float:
+        """Length of a track on the ground."""
+        return self.wheelbase_m
+
+    def check_geometry(self, place: str) -> None:
+        """Refuse dimensions that no body can have."""
+        super().check_geometry(place)
+        if self.track_width_m <= 0 or self.com_height_m <= 0:
+            raise ConfigError(f"{place}: track_width_m and com_height_m must be above zero")
+        if self.track_width_m >= self.track_m:
+            raise ConfigError(
+                f"{place}: track_width_m is {self.track_width_m:g}, less than track_m "
+                f"({self.track_m:g} m) is required: the tracks would overlap"
+            )
+
+
+@dataclass(frozen=True)
+class SwerveRobot(Robot):
+    """Three wheels that are driven and steered each.
+
+    Two of them are on the body's x axis, the third to the right of it (Danzi, AgriMaRo thesis, 7.2).
+    """
+
+    drive: ClassVar[str] = "swerve"
+    wheels: ClassVar[tuple[str, ...]] = ("1", "2", "3")
+    logged_wheels: ClassVar[tuple[str, ...]] = wheels
+    steered_wheels: ClassVar[tuple[str, ...]] = wheels
+    by_motor: ClassVar[bool] = True
+    sections: ClassVar[tuple[str, ...]] = ("body", "motors", "steering", "camera", "sensors")
+    n_tyres: ClassVar[int] = 3
+    sideways: ClassVar[bool] = True
+
+    @cached_property
+    def wheel_positions_m(self) -> Array:
+        """Position (3, 2) of each wheel in the body frame.
+
+        Examples
+        --------
+        >>> from terrain.robots import load_robot
+        >>> load_robot("agrimaro").wheel_positions_m
+        array([[-0.5075,  0.    ],
+               [ 0.5075,  0.    ],
+               [ 0.    , -0.756 ]])
+        """
+        half_m = self.wheelbase_m / 2
+        return read_only([[-half_m, 0.0], [half_m, 0.0], [0.0, -self.track_m]])
+
+    @property
+    def steering(self) -> Steering:
+        """Limits and zeros of the steering."""
+        return self._part(Steering)
+
+    @property
+    def steering_zeros_rad(self) -> Array:
+        """Reading (3,) of each steering encoder where the wheel points ahead."""
+        return np.array([self.steering.zero_1_rad, self.steering.zero_2_rad, self.steering.zero_3_rad])
+
+    @property
+    def steering_rate_max_radps(self) -> float:
+        """Fastest steering rate."""
+        return self.steering.rate_max_radps
+
+    def check_geometry(self, place: str) -> None:
+        """Refuse dimensions that no body can have, and a load that lifts a wheel."""
+        super().check_geometry(place)
+        if self.describes("body"):
+            check_centre_of_mass(place, self.wheel_positions_m, self.body)
+
+
+@dataclass(frozen=True)
+class OmniRobot(Robot):
+    """Three omni wheels on a circle about the body's origin, 120 degrees apart, that all turn it to the left.
+
+    A wheel's motor rate is positive where the wheel drives the robot counter-clockwise.  ``track_m`` and
+    ``wheelbase_m`` are the sides of the rectangle around the wheels where the first is at 60 degrees:
+    ``sqrt(3) d`` and ``1.5 d`` of the distance d.
+
+    Parameters
+    ----------
+    first_wheel_rad : place of the first wheel on the circle, from the x axis
+    """
+
+    first_wheel_rad: float = math.pi / 3
+
+    numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "wheel_distance_m", "first_wheel_rad", "mass_kg")
+    drive: ClassVar[str] = "omni"
+    wheels: ClassVar[tuple[str, ...]] = ("1", "2", "3")
+    logged_wheels: ClassVar[tuple[str, ...]] = wheels
+    by_motor: ClassVar[bool] = True
+    n_tyres: ClassVar[int] = 3
+    sideways: ClassVar[bool] = True
+
+    @classmethod
+    def described(cls, name: str, numbers: Mapping[str, float], **also: Any) -> Self:
+        """Return the robot of a description's numbers; ``also`` are other parameters."""
+        distance_m = numbers["wheel_distance_m"]
+        return cls(
+            name,
+            numbers["wheel_radius_m"],
+            math.sqrt(3.0) * distance_m,
+            1.5 * distance_m,
+            numbers["mass_kg"],
+            first_wheel_rad=numbers["first_wheel_rad"],
+            **also,
+        )
+
+    @property
+    def wheel_distance_m(self) -> float:
+        """Distance of each wheel from the body's origin.
+
+        Examples
+        --------
+        >>> from terrain.robots import load_robot
+        >>> round(load_robot("robotino").wheel_distance_m, 6)
+        0.125
+        """
+        return self.track_m / math.sqrt(3.0)
+
+    @cached_property
+    def _places_rad(self) -> Array:
+        return self.first_wheel_rad + 2.0 * np.pi / 3.0 * np.arange(3)
+
+    @cached_property
+    def wheel_positions_m(self) -> Array:
+        """Position (3, 2) of each wheel in the body frame."""
+        angle = self._places_rad
+        return read_only(self.wheel_distance_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+
+    @cached_property
+    def wheel_directions_rad(self) -> Array:
+        """Direction (3,) that each wheel drives along: counter-clockwise about the origin.
+
+        Examples
+        --------
+        >>> from terrain.robots import load_robot
+        >>> np.degrees(load_robot("robotino").wheel_directions_rad).round(6).tolist()
+        [150.0, 270.0, 390.0]
+        """
+        return read_only(self._places_rad + np.pi / 2)
+
+    def check_geometry(self, place: str) -> None:
+        """Refuse dimensions that no body can have, and a load that lifts a wheel."""
+        if self.wheel_distance_m <= 0:
+            raise ConfigError(f"{place}: wheel_distance_m must be above zero")
+        if not self.describes("body"):
+            return
+        if 2.0 * self.wheel_distance_m > self.body.footprint_max_m:
+            raise ConfigError(
+                f"{place}: wheel_distance_m is {self.wheel_distance_m:g}; the footprint allows up to "
+                f"{self.body.footprint_max_m / 2.0:g} m"
+            )
+        check_centre_of_mass(place, self.wheel_positions_m, self.body)
+
+
+@dataclass(frozen=True)
+class BicycleRobot(Robot):
+    """A car-like robot; its body's origin is the middle of the rear axle, as in Deremetz et al.
+
+    Logs have one speed, that of the rear axle, and one steering angle, that of the bicycle's front wheel.
+
+    Parameters
+    ----------
+    com_ahead_m : distance of the centre of mass ahead of the rear axle, L_R
+    com_height_m : of the centre of mass above the ground
+    yaw_inertia_kgm2 : about the centre of mass, I_z
+    steering_max_rad : largest steering angle
+    steering_time_constant_s : of the first-order lag of the steering
+    steering_rate_radps : fastest steering rate
+    speed_max_mps : fastest speed
+    front_cornering_npr, rear_cornering_npr : cornering stiffness of each axle, N/rad
+    """
+
+    com_ahead_m: float = 0.6
+    com_height_m: float = 0.4
+    yaw_inertia_kgm2: float = 200.0
+    steering_max_rad: float = 0.35
+    steering_time_constant_s: float = 0.1
+    steering_rate_radps: float = 1.0
+    speed_max_mps: float = 8.0
+    front_cornering_npr: float = 15000.0
+    rear_cornering_npr: float = 15000.0
+
+    numbers: ClassVar[tuple[str, ...]] = (
+        *Robot.numbers,
+        *("com_ahead_m", "com_height_m", "yaw_inertia_kgm2", "steering_max_rad"),
+        *("steering_time_constant_s", "steering_rate_radps", "speed_max_mps"),
+        *("front_cornering_npr", "rear_cornering_npr"),
+    )
+    drive: ClassVar[str] = "bicycle"
+    wheels: ClassVar[tuple[str, ...]] = ("front", "rear")
+    logged_wheels: ClassVar[tuple[str, ...]] = ("rear",)
+    steered_wheels: ClassVar[tuple[str, ...]] = ("front",)
+    sections: ClassVar[tuple[str, ...]] = ("sensors",)
+    n_tyres: ClassVar[int] = 4
+
+    @property
+    def com_behind_front_m(self) -> float:
+        """Distance of the centre of mass behind the front axle, L_F.
+
+        Examples
+        --------
+        >>> from terrain.robots import load_robot
+        >>> load_robot("adap2e").com_behind_front_m
+        0.6
+        """
+        return self.wheelbase_m - self.com_ahead_m
+
+    @property
+    def understeer_s2pm(self) -> float:
+        """Understeer K by its tyres: at speed v it turns as one with the wheelbase ``L + K v^2``.
+
+        Examples
+        --------
+        >>> from terrain.robots import load_robot
+        >>> load_robot("adap2e").understeer_s2pm
+        0.0
+        """
+        ahead = self.com_ahead_m / self.front_cornering_npr
+        behind = self.com_behind_front_m / self.rear_cornering_npr
+        return self.mass_kg * (ahead - behind) / self.wheelbase_m
+
+    @cached_property
+    def wheel_positions_m(self) -> Array:
+        """Position (2, 2) of the front and the rear wheel; the rear axle is the body's origin."""
+        return read_only([[self.wheelbase_m, 0.0], [0.0, 0.0]])
+
+    @property
+    def steering_rate_max_radps(self) -> float:
+        """Fastest steering rate."""
+        return self.steering_rate_radps
+
+    def check_geometry(self, place: str) -> None:
+        """Refuse dimensions that no body can have."""
+        super().check_geometry(place)
+        if not 0.0 < self.com_ahead_m < self.wheelbase_m:
+            raise ConfigError(
+                f"{place}: com_ahead_m is {self.com_ahead_m:g}, between 0 and wheelbase_m "
+                f"({self.wheelbase_m:g} m) is required"
+            )
+        if not 0.0 < self.steering_max_rad < np.pi / 2:
+            raise ConfigError(
+                f"{place}: steering_max_rad is {self.steering_max_rad:g}, below pi/2 is required"
+            )
+
+
 _R = TypeVar("_R", bound=Robot)
 
 
@@ -365,11 +793,6 @@ def as_drive(kind: type[_R], robot: Robot, refusal: str) -> _R:
     kind : of robot that is required
     robot : any
     refusal : the message for other robots, with ``{name}`` and ``{drive}`` in it
-
-    Raises
-    ------
-    ConfigError
-        if it has another drive.
 
     Examples
     --------

@@ -32,11 +32,7 @@ POSITIONS = (
 
 
 def six_positions_log(
-    robot: Robot,
-    seed: int | np.random.SeedSequence,
-    *,
-    hold_s: float = 5.0,
-    run_id: str = "bench",
+    robot: Robot, seed: int | np.random.SeedSequence, *, hold_s: float = 5.0, run_id: str = "bench"
 ) -> RunLog:
     """Return the log of an IMU alone, held still in six positions and turned by hand between them.
 

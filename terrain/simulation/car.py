@@ -37,7 +37,7 @@ from terrain.errors import ConfigError
 from terrain.kernels import filled, numbers, record
 from terrain.logs.schema import GNSS_CHANNELS
 from terrain.records import Array, RunLog, Stream
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 from terrain.simulation.sensors import BODY_TRUTH, white_imu
 from terrain.slip import slip_angle
 

@@ -20,7 +20,7 @@ import numpy as np
 from terrain.effects import NUISANCES, PARAMETER, SENSED_ONLY
 from terrain.errors import ConfigError
 from terrain.extension import warn_outside
-from terrain.kinematics.wheel_motion import wheel_motion
+from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot, load_robot
 from terrain.simulation.bench import POSITIONS, TURN_S, six_positions_log
@@ -29,7 +29,7 @@ from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.model import planar_ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import Hills, simulate_planar
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss, is_lost, with_raw_fixes
 from terrain.simulation.slip_sweep import learning_run
 from terrain.simulation.tracked import COMMANDS_HZ, Slope, simulate_tracked
@@ -88,7 +88,7 @@ def simulate_run(
     conditions : nominal conditions
     faults : faults of the sensors
     gnss : receiver on board, if any
-    effects : parameters of :mod:`terrain.effects.catalogue` that act
+    effects : parameters of :mod:`terrain.effects` that act
 
     Raises
     ------
@@ -148,12 +148,7 @@ def simulate_run(
 
 
 def _tracked_run(
-    robot: TrackedRobot,
-    soil: Soil,
-    twist: Array,
-    seed: np.random.SeedSequence,
-    run_id: str,
-    setup: Setup,
+    robot: TrackedRobot, soil: Soil, twist: Array, seed: np.random.SeedSequence, run_id: str, setup: Setup
 ) -> RunLog:
     """Return a run on an even slope, without undulations; a receiver is always on board."""
     conditions = setup.conditions

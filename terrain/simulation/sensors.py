@@ -27,7 +27,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.kernels import numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera, turned
-from terrain.kinematics.wheel_velocity import point_velocity
+from terrain.kinematics.wheels import point_velocity
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Reading, RunLog, Stream
 from terrain.robots import Robot, Sensors

@@ -17,7 +17,7 @@ from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.scenario import RATE_HZ, Patch, Scenario
+from terrain.simulation.scenario import RATE_HZ, Patch, Scenario
 from terrain.terramechanics.soil import load_soil, scattered
 
 SWEEP_SLIP = 0.75
@@ -73,12 +73,7 @@ def learning_runs(
 
 
 def learning_run(
-    robot: Robot,
-    terrain: str,
-    seed: int,
-    number: int,
-    drive: Drive | None = None,
-    run_id: str | None = None,
+    robot: Robot, terrain: str, seed: int, number: int, drive: Drive | None = None, run_id: str | None = None
 ) -> RunLog:
     """Return one run.
 

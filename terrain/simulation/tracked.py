@@ -288,13 +288,7 @@ def rut_depth(tracks: Any, load_n: float) -> float:
 
 @njit(cache=True)
 def track_forces(
-    tracks: Any,
-    belt_mps: Array,
-    twist: Array,
-    grade_rad: float,
-    roll_rad: float,
-    heap_m2: float,
-    out: Array,
+    tracks: Any, belt_mps: Array, twist: Array, grade_rad: float, roll_rad: float, heap_m2: float, out: Array
 ) -> None:
     """Write the force along x, that along y and the moment (3,) of the ground and of gravity on the body.
 

@@ -127,23 +127,6 @@ the data end before the peak."""
 _MIN_VARIANCE = 1e-9
 
 
-class Fit(NamedTuple):
-    """A law with its parameters, the factor of each run, and the mean squared normalized residual."""
-
-    law: str
-    parameters: tuple[float, ...]
-    run_factors: tuple[float, ...]
-    misfit: float
-
-
-class _RunTerms(NamedTuple):
-    """Factor less 1 and offset of slip of each run (runs,), and the residual of each bin (k,)."""
-
-    factor: Array
-    offset: Array
-    residual: Array
-
-
 class _Pooled:
     """All bins of all runs, one after the other."""
 
@@ -165,8 +148,8 @@ class _Pooled:
         by_slip = self.curve(law, theta)[1] * self.slip_std
         return np.asarray(np.maximum(self.std**2 + by_slip**2, _MIN_VARIANCE))
 
-    def run_terms(self, law: str, theta: Array, variance: Array) -> _RunTerms:
-        """Return the most likely factor and offset of each run.
+    def residuals(self, theta: Array, law: str, variance: Array) -> Array:
+        """Return normalized residuals of bins and of the runs' priors, at the most likely terms of each run.
 
         ``mu = (1 + g) f + b f'`` is linear in both, with a prior on each: the solution is in closed form.
         """
@@ -179,13 +162,8 @@ class _Pooled:
         gg, gb, bb = sums[0] + RUN_STD_RATIO**-2, sums[1], sums[2] + SLIP_OFFSET_STD**-2
         det = gg * bb - gb**2
         factor, offset = (bb * sums[3] - gb * sums[4]) / det, (gg * sums[4] - gb * sums[3]) / det
-        return _RunTerms(factor, offset, residual - factor[self.run] * f - offset[self.run] * slope)
-
-    def residuals(self, theta: Array, law: str, variance: Array) -> Array:
-        """Return normalized residuals of bins and of the runs' priors."""
-        terms = self.run_terms(law, theta, variance)
-        normalized = terms.residual / np.sqrt(variance)
-        return np.concatenate([normalized, terms.factor / RUN_STD_RATIO, terms.offset / SLIP_OFFSET_STD])
+        left = (residual - factor[self.run] * f - offset[self.run] * slope) / np.sqrt(variance)
+        return np.concatenate([left, factor / RUN_STD_RATIO, offset / SLIP_OFFSET_STD])
 
     def cost(self, law: str, theta: Array) -> float:
         """Return twice the negative log likelihood of the bins and of the priors, but for a constant."""
@@ -207,8 +185,8 @@ class _Pooled:
         return -0.5 * float(mahalanobis + log_det + len(f) * math.log(2 * math.pi))
 
 
-def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None = None) -> Fit:
-    """Return a law fitted to runs, each with a factor and an offset of its own.
+def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None = None) -> tuple[float, ...]:
+    """Return the parameters of a law fitted to runs, each with a factor and an offset of its own.
 
     Parameters
     ----------
@@ -224,11 +202,7 @@ def fit_curve(law: str, runs: Sequence[RunBins], start: Sequence[float] | None =
     pooled = _Pooled(runs)
     guesses = _starts(law, pooled) if start is None else [np.asarray(start)]
     found = [_search(pooled, law, guess, renew=start is None) for guess in guesses]
-    theta = min(found, key=lambda theta: pooled.cost(law, theta))
-    variance = pooled.variance(law, theta)
-    terms = pooled.run_terms(law, theta, variance)
-    misfit = float(np.mean(terms.residual**2 / variance))
-    return Fit(law, tuple(theta.tolist()), tuple((1.0 + terms.factor).tolist()), misfit)
+    return tuple(min(found, key=lambda theta: pooled.cost(law, theta)).tolist())
 
 
 def _parameters(law: str, near: Array) -> list[Parameter]:
@@ -276,7 +250,7 @@ def select_law(runs: Sequence[RunBins]) -> tuple[str, tuple[float, ...], dict[st
     more than a standard error, since it nearly contains the other.  :data:`NO_CURVE` is a model that does not
     depend on the slip: the mean of the others' bins.
     """
-    of_all = {law: fit_curve(law, runs).parameters for law in LAW_PARAMETERS}
+    of_all = {law: fit_curve(law, runs) for law in LAW_PARAMETERS}
 
     def score(law: str, train: Array, test: Array) -> Array:
         others, left_out = [runs[i] for i in train], _Pooled([runs[i] for i in test])
@@ -285,7 +259,7 @@ def select_law(runs: Sequence[RunBins]) -> tuple[str, tuple[float, ...], dict[st
             f = np.full(len(left_out.slip), float(traction.mean()))
             variance = left_out.std**2 + float(np.var(traction)) + _MIN_VARIANCE
             return np.array([left_out.log_likelihood(f, np.zeros_like(f), variance)])
-        theta = fit_curve(law, others, of_all[law]).parameters
+        theta = fit_curve(law, others, of_all[law])
         f, slope = left_out.curve(law, theta)
         return np.array([left_out.log_likelihood(f, slope, left_out.variance(law, theta))])
 
@@ -583,9 +557,9 @@ def learn_curve(
 
 def _refitted(model: _Model, runs: Sequence[RunBins], resistances: Resistances, drawn: Array) -> _Model:
     """Return the model fitted to the runs of one bootstrap draw."""
-    fit = fit_curve(model.law, [runs[i] for i in drawn], model.parameters)
+    parameters = fit_curve(model.law, [runs[i] for i in drawn], model.parameters)
     rho, _ = weighted_resistance(Resistances(resistances.ratio[drawn], resistances.std[drawn]))
-    return _Model(model.law, fit.parameters, model.resistance_ratio if math.isnan(rho) else rho)
+    return _Model(model.law, parameters, model.resistance_ratio if math.isnan(rho) else rho)
 
 
 def _std_over_runs(draws: Sequence[float], n_runs: int) -> float:

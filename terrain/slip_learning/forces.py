@@ -31,8 +31,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -42,8 +40,8 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.resampling import on_clock
 from terrain.estimation.table import MeasurementTable
-from terrain.kinematics.wheel_velocity import TWIST, wheel_frame_velocities
-from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack, read_only
+from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
+from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack
 from terrain.robots import Robot
 
 MIN_SPEED_MPS = 0.2
@@ -96,22 +94,7 @@ class Contacts(NamedTuple):
         return np.asarray(rolling * np.where(oblique, np.hypot(1.0, side), 1.0))
 
 
-class Travel(NamedTuple):
-    """Speed (n,) of the body, its direction of travel (n, 2) in the body frame, and its yaw rate (n,)."""
-
-    speed_mps: Array
-    direction: Array
-    yaw_rate_radps: Array
-
-    @property
-    def moving(self) -> Array:
-        """Whether (n,) the speed is above :data:`MIN_SPEED_MPS`; the direction is zero elsewhere."""
-        return np.asarray(self.speed_mps > MIN_SPEED_MPS)
-
-
-def wheel_contacts(
-    robot: Robot, track: StateTrack, table: MeasurementTable, relaxation_length_m: float
-) -> Contacts:
+def wheel_contacts(robot: Robot, track: StateTrack, table: MeasurementTable) -> Contacts:
     """Return the motion of each wheel by a state track and the wheel rates measured beside it."""
     steer = np.column_stack([track.state(f"steer_{wheel}_rad") for wheel in robot.wheels])
     rate = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
@@ -121,22 +104,10 @@ def wheel_contacts(
     slip_speed = wheel_speed - forward
     reference = np.maximum(np.abs(wheel_speed), np.abs(forward))
     slips = [
-        contact_slip(track.time_s, slip_speed[:, i], reference[:, i], relaxation_length_m)
+        contact_slip(track.time_s, slip_speed[:, i], reference[:, i], robot.body.relaxation_length_m)
         for i in range(len(robot.wheels))
     ]
     return Contacts(steer, rate, wheel_speed, forward, left, reference, np.column_stack(slips))
-
-
-def travel_of(track: StateTrack) -> Travel:
-    """Return the motion of the body."""
-    speed = np.hypot(track.state("speed_x_mps"), track.state("speed_y_mps"))
-    direction = np.divide(
-        np.column_stack([track.state("speed_x_mps"), track.state("speed_y_mps")]),
-        speed[:, None],
-        out=np.zeros((speed.size, 2)),
-        where=(speed > MIN_SPEED_MPS)[:, None],
-    )
-    return Travel(speed, direction, track.state("yaw_rate_radps"))
 
 
 @njit(cache=True)
@@ -145,12 +116,7 @@ def contact_slip(
 ) -> Array:
     """Return the slip (n,) of a contact that follows the slip velocity over its relaxation length.
 
-    Parameters
-    ----------
-    time_s : (n,) strictly increasing
-    slip_speed_mps : (n,) w r - v
-    reference_speed_mps : (n,) the larger magnitude of wheel circumferential speed and speed over ground
-    relaxation_m : above 0
+    ``slip_speed_mps`` (n,) is w r - v, ``reference_speed_mps`` (n,) the larger magnitude of w r and v.
 
     Examples
     --------
@@ -202,8 +168,7 @@ RATE_SMOOTHING_S = 0.06
 """Centred mean under the wheel's acceleration: Hall steps and noise of three samples."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class WheelForces:
+class WheelForces(NamedTuple):
     """Thrust, load and slip of each wheel over a run; positive in traction, forward or in reverse.
 
     Parameters
@@ -237,14 +202,6 @@ class WheelForces:
     conditions: Mapping[str, Array]
     balance_valid: Array
 
-    def __post_init__(self) -> None:
-        for name in ("time_s", "slip_ratio", "slip_std", "thrust_n", "load_npkg", "reference_speed_mps"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-        for name in ("total_thrust_n", "speed_mps", "grade_mps2", "normal_mps2"):
-            object.__setattr__(self, name, read_only(getattr(self, name)))
-        object.__setattr__(self, "balance_valid", read_only(self.balance_valid, np.bool_))
-        object.__setattr__(self, "conditions", MappingProxyType(dict(self.conditions)))
-
     @property
     def valid(self) -> Array:
         """Whether (n, wheels) every one of :attr:`conditions` holds."""
@@ -258,27 +215,6 @@ class WheelForces:
                 begin = start_s + (LABEL_EDGE_S if start_s > self.time_s[0] else 0.0)
                 inside |= (self.time_s >= begin) & (self.time_s < end_s)
         return inside
-
-
-class _Forces(NamedTuple):
-    """Torque and thrust of each wheel, and its load over the robot's mass, (n, wheels) each."""
-
-    torque_nm: Array
-    thrust_n: Array
-    load_npkg: Array
-
-
-def wheel_torque(
-    current_a: Array, torque_constant_nmpa: float, reduction_ratio: float, efficiency_ratio: float
-) -> Array:
-    """Return the torque at the wheel in Nm for the current of its motor; any shape.
-
-    Examples
-    --------
-    >>> wheel_torque(np.array([10.0, -10.0]), 0.25, 10.0, 0.85)
-    array([ 21.25, -21.25])
-    """
-    return np.asarray(current_a) * (torque_constant_nmpa * reduction_ratio * efficiency_ratio)
 
 
 def ground_thrust(
@@ -326,12 +262,6 @@ def wheel_forces(
 ) -> WheelForces:
     """Return thrust, load and slip of each wheel of a run.
 
-    Parameters
-    ----------
-    run : log of a swerve robot with motor currents and an IMU
-    robot : its description, all sections
-    track, table, slip : state, measurements and slip by a filter with slip speeds (``vio15``)
-
     Raises
     ------
     ConfigError
@@ -340,43 +270,65 @@ def wheel_forces(
         if the log has no motor currents or no IMU with roll and pitch, or the track no slip speeds.
     """
     robot.require(*robot.sections)
-    sensors = robot.sensors
     _check_channels(run, robot)
     if "slip_speed_1_mps" not in track.states:
         raise DataError(f"run {run.run_id}: the track has no slip speeds: estimate it with vio15")
-    up = _up(run, track.time_s, sensors.imu_latency_s, sensors.encoder_time_constant_s)
-    accel = [track.state("accel_x_mps2"), track.state("accel_y_mps2"), np.zeros(track.time_s.size)]
+    clock, sensors = track.time_s, robot.sensors
+    up = _up(run, clock, sensors.imu_latency_s, sensors.encoder_time_constant_s)
+    accel = [track.state("accel_x_mps2"), track.state("accel_y_mps2"), np.zeros(clock.size)]
     force = GRAVITY_MPS2 * up + np.column_stack(accel)
-    contacts = wheel_contacts(robot, track, table, robot.body.relaxation_length_m)
-    travel = travel_of(track)
-    forces = _forces(run, robot, track.time_s, contacts.rate_radps, force)
+    contacts = wheel_contacts(robot, track, table)
+    velocity = np.column_stack([track.state("speed_x_mps"), track.state("speed_y_mps")])
+    speed = np.hypot(*velocity.T)
+    moving = speed > MIN_SPEED_MPS
+    along = np.divide(velocity, speed[:, None], out=np.zeros_like(velocity), where=moving[:, None])
+    torque = _wheel_torque(run, robot, clock)
+    wheel_accel = _smooth(np.gradient(contacts.rate_radps, clock, axis=0), clock)
+    resistance = robot.motors.friction_nm, robot.body.wheel_inertia_kgm2, robot.wheel_radius_m
+    thrust = ground_thrust(torque, contacts.rate_radps, wheel_accel, *resistance)
+    load = wheel_loads(robot, force)
     fresh = ~slip.stale & np.isfinite(track.reference_age_s)
-    conditions = _conditions(robot, track.time_s, slip, contacts, forces, fresh)
+    with np.errstate(invalid="ignore"):
+        thrust_change = np.abs(_smooth(np.gradient(thrust, clock, axis=0), clock))
+        thrust_rate = thrust_change / np.maximum(robot.mass_kg * load, 1.0)
+    standing = wheel_loads(robot, np.array([[0.0, 0.0, GRAVITY_MPS2]]))
+    conditions = {
+        "slip known": np.isfinite(slip.slip_ratio) & (slip.slip_std < MAX_SLIP_STD),
+        "speed fresh": np.repeat(fresh[:, None], 3, axis=1),
+        "moving": np.abs(contacts.forward_mps) > MIN_SPEED_MPS,
+        "rolling straight": contacts.oblique | (contacts.side_ratio < SMALL_SLIP),
+        "slip followed": np.abs(np.gradient(contacts.slip_ratio, clock, axis=0)) < MAX_SLIP_RATE_PS,
+        "thrust followed": thrust_rate < MAX_THRUST_RATE_PS,
+        "loaded": load > MIN_LOAD_RATIO * standing,
+        "torque free": np.abs(torque) < MAX_TORQUE_RATIO * robot.motors.torque_max_nm,
+        "current known": np.isfinite(thrust),
+        "attitude known": np.repeat(np.asarray(np.isfinite(load).all(axis=1))[:, None], 3, axis=1),
+    }
+    straight = np.abs(contacts.left_mps) < math.tan(MAX_SLIP_ANGLE_RAD) * np.abs(contacts.forward_mps)
+    balanced = moving & fresh & (np.abs(track.state("yaw_rate_radps")) < MAX_YAW_RATE_RADPS)
+    known = straight & conditions["current known"] & conditions["attitude known"]
+    noise_a = sensors.current_std_a * math.sqrt(_noise_gain(clock, sensors.encoder_time_constant_s))
+    cos_along = np.cos(contacts.steer_rad) * along[:, :1] + np.sin(contacts.steer_rad) * along[:, 1:]
     factor = contacts.vector_factor
-    cos_travel = (
-        np.cos(contacts.steer_rad) * travel.direction[:, :1]
-        + np.sin(contacts.steer_rad) * travel.direction[:, 1:]
-    )
     return WheelForces(
-        time_s=track.time_s,
+        time_s=clock,
         slip_ratio=np.where(conditions["slip known"], contacts.slip_ratio * factor, np.nan),
         slip_std=slip.slip_std,
-        thrust_n=forces.thrust_n * factor,
-        load_npkg=forces.load_npkg,
+        thrust_n=thrust * factor,
+        load_npkg=load,
         reference_speed_mps=contacts.reference_speed_mps,
-        total_thrust_n=(forces.thrust_n * cos_travel).sum(axis=1),
-        speed_mps=travel.speed_mps,
-        grade_mps2=GRAVITY_MPS2 * (up[:, :2] * travel.direction).sum(axis=1),
+        total_thrust_n=(thrust * cos_along).sum(axis=1),
+        speed_mps=speed,
+        grade_mps2=GRAVITY_MPS2 * (up[:, :2] * along).sum(axis=1),
         normal_mps2=force[:, 2],
-        thrust_std_n=_thrust_std_n(robot, track.time_s),
+        thrust_std_n=noise_a * robot.motors.nm_per_a / robot.wheel_radius_m,
         conditions=conditions,
-        balance_valid=_balance_valid(travel, contacts) & fresh & _all_known(conditions),
+        balance_valid=balanced & known.all(axis=1),
     )
 
 
 def _check_channels(run: RunLog, robot: Robot) -> None:
-    wheels = [f"current_{wheel}_a" for wheel in robot.wheels]
-    wheels += [f"motor_{wheel}_radps" for wheel in robot.wheels]
+    wheels = [name.format(wheel) for name in ("current_{}_a", "motor_{}_radps") for wheel in robot.wheels]
     for stream, channels in (("wheels", wheels), ("imu", ["roll_rad", "pitch_rad"])):
         present = run.streams[stream].channels if stream in run.streams else ()
         missing = [channel for channel in channels if channel not in present]
@@ -393,69 +345,12 @@ def _up(run: RunLog, clock: Array, imu_latency_s: float, time_constant_s: float)
     return np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
 
 
-def _forces(run: RunLog, robot: Robot, clock: Array, rate_radps: Array, force_mps2: Array) -> _Forces:
-    """Return torque, thrust and load of each wheel by its current, its rate and the body's specific force."""
-    motors, wheels = robot.motors, run.streams["wheels"]
-    measured = {name: wheels.channel(name) for name in (f"current_{wheel}_a" for wheel in robot.wheels)}
-    filtered = on_clock(clock, wheels.time_s, measured, robot.sensors.encoder_time_constant_s)
-    torque = wheel_torque(
-        np.column_stack(list(filtered.values())),
-        motors.torque_constant_nmpa,
-        motors.reduction_ratio,
-        motors.efficiency_ratio,
-    )
-    accel = _smooth(np.gradient(rate_radps, clock, axis=0), clock)
-    inertia_kgm2 = robot.body.wheel_inertia_kgm2
-    thrust = ground_thrust(torque, rate_radps, accel, motors.friction_nm, inertia_kgm2, robot.wheel_radius_m)
-    return _Forces(torque, thrust, wheel_loads(robot, force_mps2))
-
-
-def _conditions(
-    robot: Robot, clock: Array, slip: SlipTrack, contacts: Contacts, forces: _Forces, fresh: Array
-) -> dict[str, Array]:
-    """Return by name whether (n, wheels) a sample meets each condition of its use."""
-    with np.errstate(invalid="ignore"):
-        thrust_rate = np.abs(_smooth(np.gradient(forces.thrust_n, clock, axis=0), clock)) / np.maximum(
-            robot.mass_kg * forces.load_npkg, 1.0
-        )
-    standing = wheel_loads(robot, np.array([[0.0, 0.0, GRAVITY_MPS2]]))
-    attitude = np.asarray(np.isfinite(forces.load_npkg).all(axis=1))
-    slip_rate = np.abs(np.gradient(contacts.slip_ratio, clock, axis=0))
-    torque_limit_nm = MAX_TORQUE_RATIO * robot.motors.torque_max_nm
-    return {
-        "slip known": np.isfinite(slip.slip_ratio) & (slip.slip_std < MAX_SLIP_STD),
-        "speed fresh": np.repeat(fresh[:, None], 3, axis=1),
-        "moving": np.abs(contacts.forward_mps) > MIN_SPEED_MPS,
-        "rolling straight": contacts.oblique | (contacts.side_ratio < SMALL_SLIP),
-        "slip followed": slip_rate < MAX_SLIP_RATE_PS,
-        "thrust followed": thrust_rate < MAX_THRUST_RATE_PS,
-        "loaded": forces.load_npkg > MIN_LOAD_RATIO * standing,
-        "torque free": np.abs(forces.torque_nm) < torque_limit_nm,
-        "current known": np.isfinite(forces.thrust_n),
-        "attitude known": np.repeat(attitude[:, None], 3, axis=1),
-    }
-
-
-def _balance_valid(travel: Travel, contacts: Contacts) -> Array:
-    """Return whether (n,) the robot drives straight enough for a balance without side forces."""
-    straight = np.abs(contacts.left_mps) < math.tan(MAX_SLIP_ANGLE_RAD) * np.abs(contacts.forward_mps)
-    turns_little = np.abs(travel.yaw_rate_radps) < MAX_YAW_RATE_RADPS
-    return np.asarray(travel.moving & turns_little & straight.all(axis=1))
-
-
-def _all_known(conditions: Mapping[str, Array]) -> Array:
-    known = conditions["current known"] & conditions["attitude known"]
-    return np.asarray(known.all(axis=1))
-
-
-def _thrust_std_n(robot: Robot, clock: Array) -> float:
-    """Return the standard deviation of a thrust by the noise of the current behind the low-pass filter."""
-    motors, sensors = robot.motors, robot.sensors
-    noise_a = sensors.current_std_a * math.sqrt(_noise_gain(clock, sensors.encoder_time_constant_s))
-    per_ampere_nm = wheel_torque(
-        np.ones(1), motors.torque_constant_nmpa, motors.reduction_ratio, motors.efficiency_ratio
-    )
-    return float(noise_a * per_ampere_nm[0] / robot.wheel_radius_m)
+def _wheel_torque(run: RunLog, robot: Robot, clock: Array) -> Array:
+    """Return the torque (n, wheels) at each wheel by its current."""
+    wheels = run.streams["wheels"]
+    current_a = {name: wheels.channel(name) for name in (f"current_{wheel}_a" for wheel in robot.wheels)}
+    filtered = on_clock(clock, wheels.time_s, current_a, robot.sensors.encoder_time_constant_s)
+    return np.column_stack(list(filtered.values())) * robot.motors.nm_per_a
 
 
 def _smooth(values: Array, time_s: Array) -> Array:
@@ -525,16 +420,6 @@ class Balance(NamedTuple):
     resistance_std: float
 
 
-class _Means(NamedTuple):
-    """Means (k,) over :data:`BALANCE_S`, and where (k - 1,) one follows another without a gap."""
-
-    thrust_n: Array
-    accel_mps2: Array
-    force_mps2: Array
-    normal_mps2: Array
-    consecutive: Array
-
-
 def body_balance(forces: WheelForces, robot: Robot, where: Array) -> Balance:
     """Return mass and resistance of a run; the resistance is NaN where there are too few means.
 
@@ -551,16 +436,6 @@ def body_balance(forces: WheelForces, robot: Robot, where: Array) -> Balance:
     parts = valid_intervals(forces.time_s, forces.balance_valid & where, BALANCE_S)
     if len(parts) < MIN_MEANS:
         return Balance(robot.mass_kg, robot.mass_kg * MASS_STD_RATIO, math.nan, math.nan)
-    means = _means(forces, parts)
-    mass_kg, mass_std_kg = _mass(means, robot.mass_kg)
-    ratio = (means.thrust_n / mass_kg - means.force_mps2) / means.normal_mps2
-    rho = float(np.median(ratio))
-    scatter = 1.4826 * float(np.median(np.abs(ratio - rho))) * math.sqrt(CORRELATED_MEANS / len(ratio))
-    by_mass = mass_std_kg / mass_kg * abs(float(np.median(means.thrust_n / mass_kg / means.normal_mps2)))
-    return Balance(mass_kg, mass_std_kg, rho, math.hypot(math.hypot(scatter, by_mass), TILT_STD_RAD))
-
-
-def _means(forces: WheelForces, parts: list[slice]) -> _Means:
     thrust_n, grade, normal = (
         np.array([values[part].mean() for part in parts])
         for values in (forces.total_thrust_n, forces.grade_mps2, forces.normal_mps2)
@@ -569,10 +444,16 @@ def _means(forces: WheelForces, parts: list[slice]) -> _Means:
     gained_mps = np.array([forces.speed_mps[b] - forces.speed_mps[a] for a, b in ends])
     accel = gained_mps / np.array([forces.time_s[b] - forces.time_s[a] for a, b in ends])
     consecutive = np.diff([part.start for part in parts]) == parts[0].stop - parts[0].start
-    return _Means(thrust_n, accel, grade + accel, normal, consecutive)
+    changes = (np.diff(values)[consecutive] for values in (thrust_n, grade + accel, accel))
+    mass_kg, mass_std_kg = _mass(robot.mass_kg, *changes)
+    ratio = (thrust_n / mass_kg - (grade + accel)) / normal
+    rho = float(np.median(ratio))
+    scatter = 1.4826 * float(np.median(np.abs(ratio - rho))) * math.sqrt(CORRELATED_MEANS / len(ratio))
+    by_mass = mass_std_kg / mass_kg * abs(float(np.median(thrust_n / mass_kg / normal)))
+    return Balance(mass_kg, mass_std_kg, rho, math.hypot(math.hypot(scatter, by_mass), TILT_STD_RAD))
 
 
-def _mass(means: _Means, prior_kg: float) -> tuple[float, float]:
+def _mass(prior_kg: float, d_thrust: Array, d_force: Array, d_accel: Array) -> tuple[float, float]:
     """Return the mass and its standard deviation: its prior, combined with an estimate by changes.
 
     The mass is estimated by what changes from one mean to the next, with the changes of the acceleration a
@@ -580,9 +461,6 @@ def _mass(means: _Means, prior_kg: float) -> tuple[float, float]:
     while the attitude has the error of the body's tilt on rough terrain, which would bias m to low values.
     """
     prior_std_kg = prior_kg * MASS_STD_RATIO
-    d_thrust, d_force, d_accel = (
-        np.diff(values)[means.consecutive] for values in (means.thrust_n, means.force_mps2, means.accel_mps2)
-    )
     covariation = float(d_accel @ d_force)
     found_kg = float(d_accel @ d_thrust) / covariation if covariation > 0.0 else math.nan
     # a robot that hardly changes its speed may come out at any mass, with a small error from few changes

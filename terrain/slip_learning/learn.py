@@ -120,15 +120,7 @@ def terrain_runs(run: RunLog, robot: Robot) -> list[TerrainRun]:
 def learn_terrain(
     terrain: str, runs: Sequence[TerrainRun], seed: int, n_bootstrap: int = N_BOOTSTRAP
 ) -> LearnedTerrain:
-    """Return what runs show of one terrain; a curve is fitted only where they suffice for one.
-
-    Parameters
-    ----------
-    terrain : its name
-    runs : on it
-    seed : of the bootstrap
-    n_bootstrap : how many draws of runs
-    """
+    """Return what runs show of one terrain; a curve is fitted only where they suffice for one."""
     with_bins = [run for run in runs if len(run.bins.slip_ratio)]
     bins = [run.bins for run in with_bins]
     resistances = Resistances(

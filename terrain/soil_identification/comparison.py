@@ -161,11 +161,6 @@ def polynomial_predictions(training: Trials, tested: Trials) -> dict[str, Predic
     """Return forces over the load and sinkage by ridge regression on a polynomial of slip and angle.
 
     The strength of the ridge is chosen by leave-one-out on the training part.
-
-    Parameters
-    ----------
-    training : means of settings
-    tested : trials
     """
     from sklearn.linear_model import RidgeCV
     from sklearn.pipeline import make_pipeline

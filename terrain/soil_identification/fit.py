@@ -218,7 +218,8 @@ class SoilParameter(NamedTuple):
     ----------
     name : ends in its unit, or in ``ratio`` or ``exponent``
     value : of the fit to all trials
-    interval : 95 % over bootstrap samples of the settings of slip and angle, and the fit's own value
+    interval : 95 %: what holds both the bootstrap over settings of slip and angle, which knows nothing of what the
+        prior pulls, and what the fit with its prior leaves open
     prior_std : standard deviation that the prior holds it with
     informed_ratio : standard deviation with the trials over that without them
     identified : whether the trials narrow it to less than half, away from its bounds
@@ -254,14 +255,18 @@ def parameters_of(
         again = fit_law(fit.law, weighed, fit.wheel, start=fit)
         draws.append(np.concatenate([again.sinkage.value, again.force.value]))
         on_draw()
-    fits = [*zip(fit.sinkage.parameters, fit.sinkage.value.tolist(), fit.sinkage.std.tolist(), strict=True)]
-    fits += zip(fit.force.parameters, fit.force.value.tolist(), fit.force.std.tolist(), strict=True)
-    identified = np.concatenate([fit.sinkage.identified, fit.force.identified]).tolist()
-    found = {}
-    for k, (p, value, std) in enumerate(fits):
-        low, high = percentile_interval(np.array(draws)[:, k]) if draws else (np.nan, np.nan)
-        interval = min(low, value), max(high, value)
-        found[p.name] = SoilParameter(p.name, value, interval, p.prior_std, std / p.prior_std, identified[k])
+    drawn = np.array(draws).T if draws else None
+    found: dict[str, SoilParameter] = {}
+    for own in (fit.sinkage, fit.force):
+        columns = (own.value, own.std, *own.interval, own.identified)
+        for p, value, std, low, high, identified in zip(
+            own.parameters, *(c.tolist() for c in columns), strict=True
+        ):
+            if drawn is not None:
+                least, most = percentile_interval(drawn[len(found)])
+                low, high = min(low, least), max(high, most)
+            interval = max(low, p.low), min(high, p.high)
+            found[p.name] = SoilParameter(p.name, value, interval, p.prior_std, std / p.prior_std, identified)
     return found
 
 
@@ -276,13 +281,7 @@ class CohesionRow(NamedTuple):
 def cohesion_profile(
     law: Law, trials: Trials, wheel: Wheel, cohesions_pa: Sequence[float]
 ) -> list[CohesionRow]:
-    """Return how much less friction goes with a cohesion that is given.
-
-    Parameters
-    ----------
-    law, trials, wheel : as :func:`~terrain.soil_identification.fit.fit_law` takes them
-    cohesions_pa : values to hold
-    """
+    """Return how much less friction goes with a cohesion that is given."""
     rows = []
     place = law.free.index("tan_friction")
     for cohesion_pa in cohesions_pa:

@@ -63,10 +63,6 @@ def plain_prediction(soil: Soil, trials: Trials, wheel: Wheel) -> Prediction:
     """Return what the simulator's law predicts; its apparent modulus is NaN.
 
     Lateral slip is over the larger of both speeds along the wheel, as in the simulator.
-
-    Parameters
-    ----------
-    soil, trials, wheel : of the prediction
     """
     ground = ground_record(soil, wheel.tip_radius_m, wheel.width_m, 0.0)[0]
     out = np.full((len(trials), 4), np.nan)
@@ -152,16 +148,7 @@ DIGITS = 4
 
 
 def soil_yaml(name: str, wheel: str, dataset: str, fit: PlainFit, friction: SoilParameter, law: str) -> str:
-    """Return the text of a soil file.
-
-    Parameters
-    ----------
-    name : of the soil
-    wheel, dataset : of the trials
-    fit : of the simulator's law
-    friction : tangent of the friction angle, of the law of stresses ``law``
-    law : its name
-    """
+    """Return the text of a soil file."""
     described: dict[str, Any] = {"name": name, "law": "janosi"}
     described["rolling_resistance_ratio"] = _entry(
         0.0, "ratio", "assumed: a rigid wheel has no loss of its own"

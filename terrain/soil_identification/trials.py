@@ -173,12 +173,7 @@ def calibration_rows(trials: Trials) -> Array:
 
 
 def side_coupling(trials: Trials) -> Coupling:
-    """Return the coupling that the trials of a locked wheel along its axle show.
-
-    Parameters
-    ----------
-    trials : single ones
-    """
+    """Return the coupling that the trials of a locked wheel along its axle show."""
     own = trials.chosen(calibration_rows(trials))
     if len(own) < MIN_TRIALS:
         return Coupling(np.nan, np.nan, len(own))
@@ -190,11 +185,6 @@ def without_coupling(trials: Trials, coupling: Coupling) -> Trials:
     """Return trials with their traction corrected, less those that the coupling was found from.
 
     Without a coupling they are returned as they are.
-
-    Parameters
-    ----------
-    trials : single ones, of the same testbed
-    coupling : of the testbed
     """
     if np.isnan(coupling.ratio):
         return trials

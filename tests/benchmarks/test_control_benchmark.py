@@ -13,7 +13,7 @@ from pipelines.live.pilot import LivePilot
 from terrain.control.danzi_pid import ThesisSettings, WheelPid, thesis_step
 from terrain.control.pid import Gains
 from terrain.control.pilot_settings import PilotSettings
-from terrain.control.traction import SETTINGS, TractionState, TractionTarget, WheelMeasurements, traction_step
+from terrain.control.traction import SETTINGS, TractionState, TractionTarget, WheelMotion, traction_step
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
@@ -41,8 +41,8 @@ def rows():
 def with_traction(desired, rate, ground, accel, slip, torque):
     state, std, aim = TractionState(), np.full(3, 0.005), TractionTarget(0.1)
     for u, v, a, s, t in zip(desired, ground, accel, slip, torque, strict=True):
-        wheels = WheelMeasurements(v, a, s, std, t)
-        command, state, _ = traction_step(SETTINGS, state, aim, 0.2, u, wheels, 0.0, DT_S)
+        wheels = WheelMotion(v, a, s, std, t, u, 0.0, 0.0)
+        command, state, _ = traction_step(SETTINGS, state, aim, 0.2, u, wheels, DT_S)
     return command
 
 

@@ -21,7 +21,7 @@ from features.stream import WindowStream
 from features.windows import WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import load_runs
 from pipelines.live.model import assess
-from terrain.classify.novelty import NoveltyScore
+from terrain.classify.novelty import learn_novelty
 from terrain.classify.support import learn_support
 from terrain.records import RunLog, Stream
 
@@ -151,5 +151,5 @@ def champion(windows):
     moved = motion.speed_mps, motion.yaw_rate_radps
     support = learn_support(*moved, terrain, windows.run_id.astype(str), np.unique(terrain).tolist())
     return SimpleNamespace(
-        recipe=recipe, novelty=NoveltyScore().fit(features, terrain, windows.run_id).numbers_, support=support
+        recipe=recipe, novelty=learn_novelty(features, terrain, windows.run_id), support=support
     )

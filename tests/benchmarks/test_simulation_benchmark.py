@@ -4,7 +4,7 @@ import pytest
 
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 TIMES_REAL_TIME = 100.0

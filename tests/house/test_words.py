@@ -54,7 +54,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "tests/terrain/effects/test_catalogue.py": ("steering_play=0.01",),
     "tests/pipelines/classify/test_train_predict.py": ('"taught_runs"',),
     "tests/pipelines/drive/test_drive.py": ("told:clay",),
-    "terrain/effects/wheels.py": ('"steering_play"', '"steering_play_rad"'),
+    "terrain/effects.py": ('"steering_play"', '"steering_play_rad"'),
     "pipelines/reporting/json_file.py": ('"ours"', '"taught_runs"', '"felt_ratio"'),
     "README.md": ("told:NAME",),
     "CHANGELOG.md": ("told:NAME", "`steering_play`", "`ours`", "`taught_runs`", "`felt_ratio`"),

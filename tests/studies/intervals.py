@@ -6,11 +6,12 @@ A use draws data with numbers that it hides, identifies them, and looks whether 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import truncnorm
 
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
@@ -25,14 +26,14 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.files.documents import read_yaml
 from terrain.identify import Parameter, half_width, identify
-from terrain.kinematics import omni
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.measured_slip.rollers import roller_findings
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import description_file, load_robot
 from terrain.simulation.bench import six_positions_log
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.omni import steady_twist
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio
 from terrain.slip_learning.forces import RunBins
@@ -231,10 +232,14 @@ def _skid_steer(seed: int) -> Iterator[Interval]:
 
 
 def _soil(seed: int) -> Iterator[Interval]:
-    law, hidden = LAWS["wong_reece"], {"tan_friction": 0.65, "shear_modulus_m": 0.016}
-    depth = np.array([mean for mean, _ in SINKAGES[law.sinkage].values()])
-    trials = wheel_trials(law, depth, hidden, seed)
-    found = parameters_of(fit_law(law, trials, WHEEL), trials, 40, seed)
+    """Numbers as likely as the priors take them for, and errors as large as such laws have."""
+    law, rng, hidden = LAWS["wong_reece"], np.random.default_rng(900 + seed), {}
+    for name in law.free:
+        mean, std, low, high = FORCE[name]
+        hidden[name] = truncnorm.rvs((low - mean) / std, (high - mean) / std, mean, std, random_state=rng)
+    depth = [max(rng.normal(mean, std), 1e-4) for mean, std in SINKAGES[law.sinkage].values()]
+    trials = wheel_trials(law, np.array(depth), hidden, seed, noise_ratio=0.1)
+    found = parameters_of(fit_law(law, trials, WHEEL), trials, 30, seed)
     for name, truth in hidden.items():
         yield Interval(name, *found[name].interval, truth)
 
@@ -250,7 +255,7 @@ def _rollers(seed: int) -> Iterator[Interval]:
         for k in range(24):
             angle = 2 * np.pi * k / 24
             ahead = np.array([np.cos(angle), np.sin(angle)])
-            wheels = omni.inverse(*place, 0.1 * np.array([[*ahead, 0.0]]))
+            wheels = 0.1 * np.array([[*ahead, 0.0]]) @ rolling_matrix(*place).T
             twist = steady_twist(wheels, *place, load, rho, 0.06)[0, :2] + rng.normal(0.0, 0.002, 2)
             side = (ahead[0] * twist[1] - ahead[1] * twist[0]) / 0.1
             slip = SimpleNamespace(
@@ -313,7 +318,6 @@ class Settings(BaseSettings):
     uses: str = setting(",".join(USES), "Names, separated by commas.")
 
 
-@dataclass(frozen=True)
 class IntervalsResult(Result):
     """Coverage of every number in every use."""
 

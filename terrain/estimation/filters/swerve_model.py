@@ -11,7 +11,7 @@ import math
 from numba import njit
 
 from terrain.estimation.filter import OBSERVE, PROPAGATE
-from terrain.kinematics.wheel_velocity import in_wheel_frame, point_velocity
+from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array
 
 LARGEST_SLIP_RATIO = 0.95

@@ -13,7 +13,7 @@ from terrain.estimation.observers.family import Observer, ObserverStatus, Observ
 from terrain.estimation.observers.rows import feed_of, rows_of
 from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel
 from terrain.extension import correct
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot

@@ -69,7 +69,7 @@ from terrain.estimation.observers.sideslip_pose import (
     take_inputs,
 )
 from terrain.records import Array
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 
 RATE, SIDE, C_F, C_R, SEEN_AT = range(SHARED_SIZE, SHARED_SIZE + 5)
 """Places of the state in the memory, and of the time of the last yaw rate or force, plus one."""

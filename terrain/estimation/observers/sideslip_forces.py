@@ -19,7 +19,7 @@ from numba import njit
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.observers.sideslip_pose import AHEAD, N_SHARED
 from terrain.records import Array
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 
 MASS, INERTIA, BEHIND, C_LOW, C_HIGH_F, C_HIGH_R, EXCITED, PRINTED = range(N_SHARED, N_SHARED + 8)
 """Places of the dynamics in parameters; ``PRINTED`` is 1 with line 2 as it is printed."""

@@ -42,7 +42,7 @@ from terrain.estimation.observers.sideslip_pose import (
     yaw_rate_of,
 )
 from terrain.records import Array
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 
 SLIP_WALK = N_SHARED
 COV = SHARED_SIZE

@@ -89,7 +89,7 @@ from terrain.estimation.observers.sideslip_pose import (
     yaw_rate_of,
 )
 from terrain.records import Array
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 
 RATE, SIDE, C_F, C_R, RATE_AGE = range(SHARED_SIZE, SHARED_SIZE + 5)
 """Places of yaw rate, lateral velocity and cornering stiffness in the memory, and of the gyro's age."""

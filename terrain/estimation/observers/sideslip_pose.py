@@ -42,7 +42,7 @@ from terrain.angles import wrapped
 from terrain.errors import ConfigError
 from terrain.estimation.observers.family import ObserverStatus
 from terrain.records import Array
-from terrain.robots.bicycle import BicycleRobot
+from terrain.robots import BicycleRobot
 
 SIDESLIP_ROWS: tuple[str, ...] = (
     *("speed_rear_mps", "steer_front_rad", "position_x_m", "position_y_m", "yaw_rad"),

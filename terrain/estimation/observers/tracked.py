@@ -46,7 +46,7 @@ from terrain.estimation.observers.family import Observer, ObserverOutput, Observ
 from terrain.estimation.observers.tracked_interval import inverse_3, normalised_gain, observe_interval
 from terrain.estimation.observers.tracked_settings import TrackedSettings, tracked_params
 from terrain.records import Array
-from terrain.robots.tracked import TrackedRobot
+from terrain.robots import TrackedRobot
 
 ROWS = ("speed_left_mps", "speed_right_mps", "position_x_m", "position_y_m", "yaw_rad", "yaw_rate_radps")
 STATES = (

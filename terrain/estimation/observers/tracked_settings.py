@@ -9,7 +9,7 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.records import Array
-from terrain.robots.tracked import TrackedRobot
+from terrain.robots import TrackedRobot
 
 (
     HALF_TRACK,

@@ -1,6 +1,6 @@
 """A swerve robot on its terrain: the records of its dynamic simulation, and how stiff its contacts may be.
 
-Effects of the robot (:mod:`terrain.effects.catalogue`) act where a real robot would have them:
+Effects of the robot (:mod:`terrain.effects`) act where a real robot would have them:
 
 - **wheel_radius, one_sided_radius**: true radii of the wheels, of which the commands know nothing;
 - **steering_delay, steering_backlash, steering_offset_i**: between the encoder, which the steering motor
@@ -59,7 +59,7 @@ from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.scenario import Scenario
 from terrain.simulation.sensors import STEP_S
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import GROUND, ground_record, wheel_ground

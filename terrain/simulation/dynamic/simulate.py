@@ -8,7 +8,7 @@ a delay later, one step at the least.
 Examples
 --------
 >>> from terrain.robots import load_robot
->>> from terrain.simulation.scenario.make import make_scenario
+>>> from terrain.simulation.scenario import make_scenario
 >>> from terrain.terramechanics.soil import load_soil
 >>> robot = load_robot("agrimaro")
 >>> drive = make_scenario("straight", robot, ["grass"], 5.0)
@@ -30,20 +30,14 @@ from terrain.effects import OTHER_LOGGER, PlantPart, checked_effects, in_plant
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.extension import apply_homes
 from terrain.kernels import filled, is_finite
-from terrain.kinematics.swerve import wheel_commands
+from terrain.kinematics.commands import wheel_commands
 from terrain.logs.schema import unit_of
 from terrain.records import Array, Command, Label, RunLog, Sample, Stream
 from terrain.robots import Robot, SwerveRobot, as_drive
 from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults
-from terrain.simulation.dynamic.plant import (
-    TerrainProfile,
-    check_step,
-    draw_profile,
-    make_plant,
-    start_state,
-)
+from terrain.simulation.dynamic.plant import TerrainProfile, check_step, draw_profile, make_plant, start_state
 from terrain.simulation.dynamic.step import advance, settle
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.scenario import Scenario
 from terrain.simulation.sensors import (
     BODY_ROW,
     STEP_S,
@@ -116,7 +110,7 @@ def simulate(
     controller : called once an instant of the scenario; before its first command is in force, the wheels are
         commanded to stand and the steering to stay at 0
     command_delay_s : from that instant to when the command is in force, in whole steps, one at least
-    effects : parameters of :mod:`terrain.effects.catalogue` that act on this robot and its sensors, beside
+    effects : parameters of :mod:`terrain.effects` that act on this robot and its sensors, beside
         those of its description or in place of them; the commands and the log do not contain them
 
     Returns
@@ -189,11 +183,7 @@ def _generators(seed: int | np.random.SeedSequence) -> dict[str, np.random.Gener
 
 
 def _sensors(
-    motion: Motion,
-    robot: Robot,
-    faults: Faults,
-    gnss: Gnss | None,
-    rngs: Mapping[str, np.random.Generator],
+    motion: Motion, robot: Robot, faults: Faults, gnss: Gnss | None, rngs: Mapping[str, np.random.Generator]
 ) -> dict[str, Sensor]:
     """Return the sensors on board, by stream."""
     sensors: dict[str, Sensor] = {

@@ -36,7 +36,7 @@ import numpy as np
 from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.kinematics.wheel_velocity import point_velocity
+from terrain.kinematics.wheels import point_velocity
 from terrain.records import Array
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.dynamic.plant import FIELD_STEP_M, TerrainProfile

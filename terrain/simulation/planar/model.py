@@ -1,7 +1,7 @@
 """The planar simulation: from wheels, steering and tilt to motion, currents and what sensors show of them.
 
 One body for all wheeled robots, fed either with what a simulated drive does to the wheels or with what a log
-records of them; whatever is wrong about it is a parameter of :mod:`terrain.effects.catalogue`, 0 where
+records of them; whatever is wrong about it is a parameter of :mod:`terrain.effects`, 0 where
 absent.
 
 - **kinematics** without slip: of a swerve robot the least-squares twist of its wheels' velocities, of a
@@ -43,8 +43,7 @@ from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kinematics.omni import rolling_matrix
-from terrain.kinematics.wheel_velocity import velocity_matrix
+from terrain.kinematics.wheels import rolling_matrix, velocity_matrix
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
 from terrain.terramechanics.soil import Soil

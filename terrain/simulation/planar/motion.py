@@ -227,12 +227,7 @@ def slip_along(
 
 @njit(cache=True)
 def move_skid(
-    planar: Planar,
-    p: Any,
-    dt: float,
-    wheel_speed_mps: Array,
-    grade_rad: Array,
-    disturbance: Array,
+    planar: Planar, p: Any, dt: float, wheel_speed_mps: Array, grade_rad: Array, disturbance: Array
 ) -> Array:
     """Return motion, traction and currents; arguments are those of :func:`move`."""
     n = wheel_speed_mps.shape[0]

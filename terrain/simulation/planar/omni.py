@@ -52,7 +52,7 @@ from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import EFFECTS
-from terrain.kinematics.omni import rolling_matrix
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array
 from terrain.simulation.contact import softness
 from terrain.simulation.planar.model import AMPS, FORCE, N_TRUTH, SLIP, VX, VY, Planar, W, slopes
@@ -282,9 +282,9 @@ def steady_twist(
     --------
     A wheel that rolls across entirely, and carries most of the weight, brakes the more:
 
-    >>> from terrain.kinematics.omni import inverse, wheels_on_circle
-    >>> place = wheels_on_circle(0.125, np.radians([60.0, 180.0, 300.0]))
-    >>> ahead, left = (inverse(*place, np.array(v)) for v in ([0.1, 0, 0], [0, 0.1, 0]))
+    >>> from terrain.robots import load_robot
+    >>> place = load_robot("robotino").wheel_positions_m, np.radians([150.0, 270.0, 390.0])
+    >>> ahead, left, _ = 0.1 * rolling_matrix(*place).T
     >>> load = np.array([0.25, 0.5, 0.25])
     >>> steady_twist(np.array([ahead, left]), *place, load, 0.8)[:, :2].diagonal().round(4)
     array([0.0429, 0.0652])

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 
 from terrain.effects import EFFECTS
-from terrain.kinematics.wheel_velocity import point_velocity
+from terrain.kinematics.wheels import point_velocity
 from terrain.records import Array
 from terrain.simulation.planar.model import AMPS, AX, TURNING_AMPS, VX, VY, Planar, W, delayed, slopes
 from terrain.simulation.planar.motion import move

@@ -38,8 +38,8 @@ from terrain.effects import (
 )
 from terrain.errors import ConfigError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.wheel_motion import WheelMotion, wheel_motion
-from terrain.kinematics.wheel_velocity import point_velocity, wheel_frame_velocities
+from terrain.kinematics.commands import WheelMotion, wheel_motion
+from terrain.kinematics.wheels import point_velocity, wheel_frame_velocities
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import BicycleRobot, Part, Robot, SwerveRobot
@@ -150,7 +150,7 @@ def simulate_planar(
     twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` at 50 Hz, from rest
     seed : of everything that is drawn; the same gives the same bytes, and a sequence is left as it is
     ground : a firm one by default
-    effects : parameters of :mod:`terrain.effects.catalogue`, beside or in place of the description's own
+    effects : parameters of :mod:`terrain.effects`, beside or in place of the description's own
     scatter : of this run's own parameters; by default they do not
     hills, noise : level and without noise by default; then encoders do not quantise
     outside : amplitudes of :data:`OUTSIDE`

@@ -11,8 +11,8 @@ from pipelines.data.datasets import load_runs
 from pipelines.learn.label import SOURCES_FILE, Settings
 from pipelines.learn.label import run as label
 from terrain.errors import ConfigError, DataError, LogError
+from terrain.logs.labels import WINDOWS_FILE, RecordedWindow, windows_text
 from terrain.logs.read import read_run
-from terrain.logs.recorded_windows import WINDOWS_FILE, RecordedWindow, windows_text
 from terrain.logs.write import write_run
 
 WINDOWS = [

@@ -20,7 +20,7 @@ from pipelines.live.classifying import (
 )
 from pipelines.live.observer import Observer
 from terrain.estimation.live import LiveFilter
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import Reading, Stream

@@ -12,8 +12,8 @@ from pipelines.slip.learn_slip import learn_slip_table
 from terrain.control.learned_table import FEW_RUNS, NO_PEAK
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.kinematics import omni
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream, TargetStatus
 from terrain.robots import load_robot
@@ -29,7 +29,7 @@ def omni_run(rng, run_id, terrain, direction, slip, current_a, session="", noise
     """Return a run at 0.1 m/s in one direction, by its slip and currents, seen by a camera above."""
     time_s = np.arange(0.0, LENGTH_S, 0.031)
     twist = 0.1 * np.array([np.cos(direction), np.sin(direction), 0.0])
-    wheels = omni.inverse(ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad, twist)
+    wheels = twist @ rolling_matrix(ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad).T
     flat = np.zeros((time_s.size, 3))
     travelled = np.cumsum(0.1 * (1 - np.asarray(slip)) * np.ones(time_s.size)) * 0.031
     pose = np.outer(travelled, 10 * twist) + rng.normal(0.0, 0.0005, flat.shape)

@@ -29,8 +29,8 @@ from terrain.effects import (
     effect_named,
     library_of,
 )
-from terrain.kinematics.wheel_speed import with_wheel_speeds
-from terrain.logs.lidar_twist import CHANNELS as TWIST_CHANNELS
+from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.logs.held import CHANNELS as TWIST_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.simulation.planar.noise import Scatter, load_noise, load_scatter

@@ -81,6 +81,10 @@ CLOCK_STATED_S = 0.04
 """Largest error of the delay between two loggers that is stated: two samples of the wheels' logger."""
 
 
+OF_STAGE = ("variant", "accepted", "clipped", "late_s", "stalled", "present", "fault")
+"""What a trial takes from its stage as it is."""
+
+
 class Varying(NamedTuple):
     """An effect that differs from run to run, as it was answered.
 
@@ -187,19 +191,12 @@ def run_trial(case: Case) -> Trial:
     drawn, noise = np.random.SeedSequence(key).spawn(2)
     stage = stage_of(case, robot, np.random.default_rng(drawn), noise)
     answer: Diagnosis | None = None
-    refusal = ""
-    start_s = time.perf_counter()
+    refusal, start_s = "", time.perf_counter()
     try:
         answer = diagnose(stage.runs, stage.simulation or simulation_of(robot), stage.hidden.library)
     except DataError as error:
         refusal = str(error)
-    return _trial(case, robot, stage, answer, refusal, time.perf_counter() - start_s)
-
-
-def _trial(
-    case: Case, robot: Robot, stage: Stage, answer: Diagnosis | None, refusal: str, seconds: float
-) -> Trial:
-    hidden = stage.hidden
+    hidden, seconds = stage.hidden, time.perf_counter() - start_s
     return Trial(
         row=case.row,
         number=case.number,
@@ -211,14 +208,8 @@ def _trial(
         over_limit=hidden.over_limit,
         classes=_classes(stage, robot, case.row),
         seconds=seconds,
-        variant=stage.variant,
-        accepted=stage.accepted,
-        clipped=stage.clipped,
-        late_s=stage.late_s,
-        stalled=stage.stalled,
-        present=stage.present,
-        fault=stage.fault,
         refusal=refusal,
+        **{name: getattr(stage, name) for name in OF_STAGE},
         **_answered(answer),
     )
 

@@ -26,7 +26,7 @@ from terrain.calibration.odometry import (
     without_tilt,
 )
 from terrain.errors import DataError
-from terrain.logs.drive_poses import WindowPoses
+from terrain.logs.drive import WindowPoses
 from terrain.robots import load_robot
 from terrain.simulation.tracked import QUIET, PrescribedSlip
 

@@ -8,7 +8,7 @@ from pipelines.report.results import silent
 from pipelines.slip import calibrate
 from terrain.calibration.omni import COM_X, COM_Y, DISTANCE, FRICTION, RADIUS, identify_omni, motor_friction
 from terrain.errors import DataError
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot

@@ -16,18 +16,17 @@ from sklearn.utils.estimator_checks import (
 
 from terrain.classify import grouped_network
 from terrain.classify.augment import Augmentation, augmented, mirror_of, mirrors_of
-from terrain.classify.grouped_network import GroupedNetwork, fit_temperature
-from terrain.classify.network import fit_member, fit_on_all, network_numbers_of, reproducible, task_of
-from terrain.classify.network_numbers import (
+from terrain.classify.grouped_network import GroupedNetwork, fill_of, fit_temperature
+from terrain.classify.network import fit_member, fit_on_all, reproducible, task_of, weights_of
+from terrain.classify.network_input import (
     SampleColumns,
-    check_network,
     fourier_kernel,
     log_softmax,
-    mean_log_probabilities,
     power_spectrogram,
     softmax,
     streams_of,
 )
+from terrain.classify.network_onnx import check_network, log_probabilities, network_onnx
 from terrain.errors import ConfigError, DataError
 
 COLUMNS = (
@@ -50,6 +49,17 @@ def draw_windows(n_runs=4, n_windows=10, seed=0, strength=1.0):
     imu[:, 1] += strength * wave
     wheels = rng.standard_normal((len(run), 2, 10))
     return np.concatenate([imu.reshape(len(run), -1), wheels.reshape(len(run), -1)], axis=1), terrain, run
+
+
+def graph_of(task, nets):
+    return network_onnx(
+        COLUMNS,
+        task.branches,
+        [weights_of(net) for net in nets],
+        np.zeros(WIDTH),
+        1.0,
+        list("abc")[: task.n_classes],
+    )
 
 
 def quick(**changed):
@@ -84,7 +94,7 @@ def test_labels_dealt_to_runs_at_random_are_not_learned():
     assert model.predict_proba(test).max(axis=1).mean() < 0.6  # and the temperature shows it
 
 
-def test_the_numbers_compute_what_torch_computes():
+def test_the_graph_computes_what_torch_computes():
     X, y, run = draw_windows()
     index = np.unique(y, return_inverse=True)[1]
     task = task_of(COLUMNS, X.astype(np.float32), index, run)
@@ -94,9 +104,9 @@ def test_the_numbers_compute_what_torch_computes():
         rows = [torch.from_numpy(rows) for rows in task.rows(task.streams)]
         with torch.no_grad():
             desired = np.mean([torch.log_softmax(m.net(rows), 1).numpy() for m in members], axis=0)
-    numbers = network_numbers_of(task, np.zeros(WIDTH), [member.net for member in members], 1.0)
-    check_network(numbers, 3)
-    np.testing.assert_allclose(mean_log_probabilities(numbers, X), desired, atol=2e-5)
+    graph = graph_of(task, [member.net for member in members])
+    check_network(graph, COLUMNS, 3)
+    np.testing.assert_allclose(log_probabilities(graph, COLUMNS, X), log_softmax(desired), atol=2e-5)
     np.testing.assert_allclose(
         log_softmax(members[0].held_out), members[0].held_out, atol=1e-6, err_msg="log probabilities"
     )
@@ -137,7 +147,7 @@ def test_missing_samples_are_taken_for_the_mean_of_their_channel(fitted):
     damaged = X.copy()
     damaged[:, 100:] = np.nan
     filled = X.copy()
-    filled[:, 100:] = fitted.numbers_.fill[100:]
+    filled[:, 100:] = fill_of(COLUMNS, draw_windows()[0])[100:]
     assert np.array_equal(fitted.predict_proba(damaged), fitted.predict_proba(filled))
     X_train, y, run = draw_windows()
     X_train[:, 100:] = np.nan  # never measured
@@ -177,23 +187,9 @@ def test_without_torch_training_is_refused_and_classifying_is_not(fitted, monkey
 
 def test_infinite_samples_and_other_widths_are_refused(fitted):
     with pytest.raises(DataError, match="infinite"):
-        mean_log_probabilities(fitted.numbers_, np.full((1, WIDTH), np.inf))
+        log_probabilities(fitted.onnx_, COLUMNS, np.full((1, WIDTH), np.inf))
     with pytest.raises(DataError, match="is needed"):
-        mean_log_probabilities(fitted.numbers_, np.zeros((1, WIDTH - 1)))
-
-
-@pytest.mark.parametrize(
-    ("name", "array"),
-    [
-        ("fill", np.zeros(3)),
-        ("head_bias", np.full((2, 3), np.nan)),
-        ("temperature", 0.0),
-        ("temperature", np.nan),
-    ],
-)
-def test_numbers_that_do_not_fit_each_other_are_refused(fitted, name, array):
-    with pytest.raises(DataError):
-        check_network(fitted.numbers_._replace(**{name: array}), 3)
+        log_probabilities(fitted.onnx_, COLUMNS, np.zeros((1, WIDTH - 1)))
 
 
 def test_the_spectrogram_is_that_of_scipy():
@@ -222,9 +218,8 @@ def test_many_short_runs_outweigh_one_long_run():
     task = task_of(COLUMNS, X, index, run)
     with reproducible():
         nets = [fit_on_all(task, Augmentation(shift=True), 6, seed) for seed in range(2)]
-    numbers = network_numbers_of(task, np.zeros(WIDTH), nets, 1.0)
     other = rng.standard_normal((200, WIDTH))
-    assert softmax(mean_log_probabilities(numbers, other))[:, 1].mean() > 0.55
+    assert np.exp(log_probabilities(graph_of(task, nets), COLUMNS, other))[:, 1].mean() > 0.55
 
 
 def test_all_inner_folds_choose_the_augmentation(monkeypatch):

@@ -1,11 +1,109 @@
-"""Next drives: the law of growth is found again, and the gain has the signs that it must have."""
+"""Training coverage of held-out windows: a run never covers itself, and what was never driven is asked for first."""
+
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrain.classify.next_drives import Cells, Growth, expected_gain, fit_growth
+from terrain.classify.folds import Fold
+from terrain.classify.held_out import FoldResult, HeldOut
+from terrain.classify.next_drives import (
+    Growth,
+    HeldOutSupport,
+    coverage_of,
+    expected_gain,
+    fit_growth,
+    held_out_support,
+    support_accuracy,
+)
+from terrain.classify.regimes import Motion
+from terrain.classify.support import SupportLevel
+
+RUNS = [(name, speed) for speed in (0.2, 0.6) for name in ("ice", "mud") for _ in range(5)]
+
+
+class Evaluated(NamedTuple):
+    held_out: HeldOut
+    run_id: np.ndarray
+    motion: Motion
+
+    def coverage(self):
+        return coverage_of(*self, 2.0, 0)
+
+    def runs_near(self):
+        return held_out_support(*self).true_runs[0]
+
+
+def evaluated(runs, folds=3, seed=0):
+    """Return 20 held-out windows a run ``(class, speed)``: right mostly where another run drove the class so fast."""
+    rng, number = np.random.default_rng(seed), np.repeat(np.arange(len(runs)), 20)
+    terrain, n = np.array([runs[i][0] for i in number]), len(number)
+    speed = np.array([runs[i][1] for i in number]) + rng.normal(0, 0.005, n)
+    fold, run_id = number % folds, number.astype(str)
+
+    def of(probability):
+        results = []
+        for k in range(folds):
+            test = np.flatnonzero(fold == k)
+            results.append(FoldResult(Fold(0, k, np.flatnonzero(fold != k), test), probability[test], {}))
+        return Evaluated(HeldOut.of_folds(results, terrain), run_id, Motion(speed, np.zeros(n), np.zeros(n)))
+
+    classes = np.unique(terrain)
+    seen = of(np.full((n, len(classes)), 0.5)).runs_near() > 0
+    right = rng.random(n) < np.where(seen, 0.9, 0.1)
+    answer = np.where(right, np.searchsorted(classes, terrain), (np.searchsorted(classes, terrain) + 1) % 2)
+    return of(np.where(np.arange(len(classes)) == answer[:, None], 0.9, 0.1))
+
+
+def test_coverage_is_counted_among_other_runs_of_the_fold_only():
+    one = evaluated([*RUNS, ("ice", 1.5)])
+    near, own = one.runs_near(), one.run_id == str(len(RUNS))
+    assert (near[own] == 0).all()  # a run never supports itself
+    assert (near[~own] > 0).all()
+    terrain = one.held_out.truth
+    for _, _, train, test in (result.fold for result in one.held_out.results):
+        for row in test:
+            beside = np.abs(one.motion.speed_mps[train] - one.motion.speed_mps[row]) < 0.1
+            assert near[row] == len(np.unique(one.run_id[train][beside & (terrain[train] == terrain[row])]))
+
+
+def test_the_terrain_that_was_driven_once_at_a_speed_is_asked_for_first():
+    one = evaluated([*RUNS, ("ice", 1.5), ("mud", 1.5), ("mud", 1.5), ("mud", 1.5)])
+    found = one.coverage()
+    first = found.next_drives[0]
+    assert (first.terrain, first.windows, first.support_runs) == ("ice", 20, 1.0)
+    assert first.regime.startswith("straight at ")
+    assert "1.5" in first.regime
+    assert first.request == f"ice, {first.regime}, at least 2 runs of 20 s"
+    gains = [drive.gain for drive in found.next_drives]
+    assert gains == sorted(gains, reverse=True)
+    assert [row["support"] for row in found.accuracy_by_support] == [level.value for level in SupportLevel]
+    never = found.accuracy_by_support[0]
+    assert never["accuracy"] < 0.3
+    assert never["windows_ratio"] == pytest.approx(20 / len(one.run_id))
+
+
+def test_rows_count_every_window_once_and_name_what_was_never_driven():
+    one = evaluated([*RUNS, ("ice", 1.5)])
+    rows = one.coverage().support
+    assert sum(row.windows for row in rows) == len(one.run_id)
+    missing = [row.as_json() for row in rows if row.windows == 0]
+    assert [(row["class"], row["n_runs"], row["accuracy"]) for row in missing] == [("mud", 0, None)]
+
+
+def test_windows_that_were_not_held_out_are_left_out():
+    one = evaluated(RUNS)
+    held_out = HeldOut.of_folds(one.held_out.results[:1], one.held_out.truth)
+    rows = one._replace(held_out=held_out).coverage().support
+    assert sum(row.windows for row in rows) == len(one.held_out.results[0].fold.test)
+
+
+def test_a_class_of_one_fold_only_has_no_coverage_there():
+    one = evaluated([*RUNS, ("snow", 0.2)])
+    alone = one.held_out.truth == "snow"
+    assert (one.runs_near()[alone] == 0).all()
 
 
 @pytest.mark.parametrize("law", [Growth(0.05, 0.7, 1.0), Growth(0.0, 0.9, 0.5)])
@@ -22,7 +120,7 @@ def test_two_numbers_of_runs_show_no_law():
 
 
 def cells(ratio=0.2, n_windows=50.0, n_errors=20.0, held_out=2.0, runs=2.5):
-    return Cells(*(np.array([value]) for value in (ratio, n_windows, n_errors, held_out, runs)))
+    return [np.array([value]) for value in (ratio, n_windows, n_errors, held_out, runs)]
 
 
 LAWS = st.builds(Growth, st.floats(0, 0.3), st.floats(0.05, 0.7), st.floats(0.1, 2))
@@ -30,14 +128,64 @@ LAWS = st.builds(Growth, st.floats(0, 0.3), st.floats(0.05, 0.7), st.floats(0.1,
 
 @given(LAWS, st.floats(0, 20), st.integers(1, 6))
 def test_a_gain_is_never_negative_nor_more_than_the_errors_of_its_cell(law, runs, added):
-    gain = expected_gain(law, cells(runs=runs, held_out=runs), added)[0]
+    gain = expected_gain(law, *cells(runs=runs, held_out=runs), added)[0]
     assert 0 <= gain <= 0.2
-    assert gain <= expected_gain(law, cells(runs=runs, held_out=runs), added + 1)[0]
+    assert gain <= expected_gain(law, *cells(runs=runs, held_out=runs), added + 1)[0]
 
 
 @given(LAWS)
 def test_errors_and_expected_driving_raise_a_gain_and_support_lowers_it(law):
-    gain = expected_gain(law, cells())[0]
-    assert expected_gain(law, cells(n_errors=40.0))[0] > gain
-    assert expected_gain(law, cells(ratio=0.4))[0] == pytest.approx(2 * gain)
-    assert expected_gain(law, cells(runs=9.0))[0] < gain
+    gain = expected_gain(law, *cells())[0]
+    assert expected_gain(law, *cells(n_errors=40.0))[0] > gain
+    assert expected_gain(law, *cells(ratio=0.4))[0] == pytest.approx(2 * gain)
+    assert expected_gain(law, *cells(runs=9.0))[0] < gain
+
+
+def drawn(seed, n=80, repeats=3):
+    rng = np.random.default_rng(seed)
+    runs = rng.integers(0, 8, (2, repeats, n))
+    probability = rng.random((repeats, n))
+    right = rng.random((repeats, n)) < 0.3 + 0.6 * runs[0] / 8
+    place = np.sort(rng.integers(0, 10, n))
+    return (
+        HeldOutSupport(right, runs[0], runs[1], probability, probability > 0.5),
+        place.astype(str),
+        np.where(place < 5, "ice", "mud"),
+    )
+
+
+@given(st.integers(0, 1000))
+def test_levels_and_marks_divide_windows_and_errors(seed):
+    held_out, run_id, terrain = drawn(seed)
+    levels, *marks, _ = support_accuracy(held_out, run_id, terrain, np.random.default_rng(0))
+    for parts in (list(levels.values()), marks):
+        assert sum(part.windows_ratio for part in parts) == pytest.approx(1)
+        assert sum(part.errors_ratio for part in parts) == pytest.approx(1)
+        mean = sum(part.windows_ratio * (part.accuracy or 0) for part in parts)
+        assert mean == pytest.approx(held_out.correct.mean())
+        for part in parts:
+            low, high = part.windows_ratio_ci
+            assert low <= high
+
+
+def test_the_interval_covers_the_accuracy_that_runs_are_drawn_from():
+    held_out, run_id, terrain = drawn(7, n=4000)
+    found = support_accuracy(held_out, run_id, terrain, np.random.default_rng(0))[2]
+    low, high = found.accuracy_ci
+    assert low < found.accuracy < high
+    assert high - low < 0.1
+
+
+def test_a_part_without_windows_has_no_accuracy_and_no_errors_have_no_ratio():
+    ones = np.ones((1, 6), dtype=int)
+    held_out = HeldOutSupport(ones > 0, 9 * ones, 9 * ones, 0.9 * ones, ones > 0)
+    run_id, terrain = np.array(list("aabbcc")), np.full(6, "ice")
+    _, without, supported, auc = support_accuracy(held_out, run_id, terrain, np.random.default_rng(0))
+    assert without == (0.0, (0.0, 0.0), None, None, None, None)
+    assert supported.accuracy == 1.0
+    assert auc is None
+
+
+def test_the_same_source_gives_the_same_intervals():
+    results = [support_accuracy(*drawn(3), np.random.default_rng(1)) for _ in range(2)]
+    assert results[0] == results[1]

@@ -5,12 +5,12 @@ import pytest
 
 from terrain.classify.folds import inner_probabilities, inner_splits
 from terrain.classify.novelty import (
+    CLIP_STD,
+    GAMMA,
     KNOWN_KEPT,
-    NoveltyScore,
     check_novelty,
     largest_margin,
-    novelty_scores,
-    novelty_terms,
+    learn_novelty,
 )
 from terrain.classify.svm import GroupedSVC
 from terrain.errors import DataError
@@ -30,7 +30,7 @@ def draw(centres, n_runs=6, n_windows=15, seed=0, run_std=0.3, n_features=30):
 
 @pytest.fixture(scope="module")
 def fitted():
-    return NoveltyScore(seed=1).fit(*draw((0, 1, 2)))
+    return learn_novelty(*draw((0, 1, 2)), seed=1)
 
 
 def test_a_terrain_that_was_hidden_is_found_and_held_out_runs_of_known_ones_are_kept(fitted):
@@ -47,25 +47,25 @@ def test_the_score_of_a_window_does_not_depend_on_the_others_nor_on_the_order_of
     scores = fitted.score(X)
     np.testing.assert_allclose(fitted.score(X[::-1]), scores[::-1], rtol=1e-9)
     np.testing.assert_allclose(fitted.score(X[7:8]), scores[7:8], rtol=1e-9)
-    again = NoveltyScore(seed=1).fit(X, y, runs)
-    assert all(np.array_equal(a, b) for a, b in zip(again.numbers_, fitted.numbers_, strict=True))
+    again = learn_novelty(X, y, runs, seed=1)
+    assert all(np.array_equal(a, b) for a, b in zip(again, fitted, strict=True))
 
 
 def test_terms_agree_with_their_equations(fitted):
     X, _, _ = draw((0, 3), seed=4)
-    n = fitted.numbers_
-    x = np.clip((X[:, n.columns] - n.mean) / n.scale, -n.settings[0], n.settings[0])
+    n = fitted
+    x = np.clip((X[:, n.columns] - n.mean) / n.scale, -CLIP_STD, CLIP_STD)
     z = x @ n.components.T
     to_class = [np.square(z @ n.within.T - m).sum(axis=1) for m in n.means]
     relative = np.min(to_class, axis=0) - np.square(z @ n.background.T - n.centre).sum(axis=1)
     near = np.linalg.norm(z[:, np.newaxis, : n.prototypes.shape[1]] - n.prototypes, axis=2).min(axis=1)
     squares = np.square(x[:, np.newaxis] - n.vectors).sum(axis=2)
-    margins = np.exp(-n.settings[2] * squares / len(n.columns)) @ n.weights + n.offsets
+    margins = np.exp(-GAMMA * squares / len(n.columns)) @ n.weights + n.offsets
     wins = np.full((len(X), 3, 3), np.inf)
     for pair, (a, b) in enumerate(combinations(range(3), 2)):
         wins[:, a, b], wins[:, b, a] = margins[:, pair], -margins[:, pair]
     expected = np.stack([-wins.min(axis=2).max(axis=1), relative, near], axis=1)
-    np.testing.assert_allclose(novelty_terms(n, X), expected, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(n.terms(X), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_pair_margins_are_those_of_scikit_learn():
@@ -73,14 +73,12 @@ def test_pair_margins_are_those_of_scikit_learn():
 
     for classes in ((0, 1), (0, 1, 2)):
         X, y, runs = draw(classes)
-        n = NoveltyScore().fit(X, y, runs).numbers_
-        x = np.clip((X[:, n.columns] - n.mean) / n.scale, -n.settings[0], n.settings[0])
+        n = learn_novelty(X, y, runs)
+        x = np.clip((X[:, n.columns] - n.mean) / n.scale, -CLIP_STD, CLIP_STD)
         svc = SVC(C=10.0, gamma=1.0 / x.shape[1], decision_function_shape="ovo").fit(x, y)
         margins = svc.decision_function(x)
         margins = -margins[:, np.newaxis] if margins.ndim == 1 else margins
-        np.testing.assert_allclose(
-            -novelty_terms(n, X)[:, 0], largest_margin(margins, len(classes)), atol=1e-5
-        )
+        np.testing.assert_allclose(-n.terms(X)[:, 0], largest_margin(margins, len(classes)), atol=1e-5)
 
 
 def test_broken_and_missing_features(fitted):
@@ -97,20 +95,20 @@ def test_broken_and_missing_features(fitted):
 def test_few_data():
     X, y, runs = draw((0, 1))
     alone = np.where(y == "terrain 1", "one run", runs)
-    assert np.isfinite(NoveltyScore().fit(X, y, alone).score(X)).all()
+    assert np.isfinite(learn_novelty(X, y, alone).score(X)).all()
     X[:, 3], X[:, 4] = np.nan, 7.0
-    assert np.isfinite(NoveltyScore().fit(X, y, runs).score(X)).all()
+    assert np.isfinite(learn_novelty(X, y, runs).score(X)).all()
     with pytest.raises(DataError, match="at least two classes"):
-        NoveltyScore().fit(X, np.full(len(y), "ice"), runs)
+        learn_novelty(X, np.full(len(y), "ice"), runs)
     with pytest.raises(DataError, match="no feature varies"):
-        NoveltyScore().fit(np.ones_like(X), y, runs)
+        learn_novelty(np.ones_like(X), y, runs)
     with pytest.raises(DataError, match="too few"):
-        NoveltyScore().fit(X[[0, -1]], y[[0, -1]], runs[[0, -1]])
+        learn_novelty(X[[0, -1]], y[[0, -1]], runs[[0, -1]])
 
 
-@pytest.mark.parametrize("name", ["columns", "within", "reference", "settings", "vectors"])
+@pytest.mark.parametrize("name", ["columns", "within", "reference", "vectors"])
 def test_numbers_that_do_not_fit_are_refused(fitted, name):
-    numbers = fitted.numbers_
+    numbers = fitted
     check_novelty(numbers, 3)
     wrong = getattr(numbers, name).copy()
     wrong[-1] = -1 if name == "columns" else np.nan
@@ -118,7 +116,7 @@ def test_numbers_that_do_not_fit_are_refused(fitted, name):
         check_novelty(numbers._replace(**{name: wrong}), 3)
     with pytest.raises(DataError):
         check_novelty(numbers, 4)
-    assert len(novelty_scores(numbers, np.zeros((0, 30)))) == 0
+    assert len(numbers.score(np.zeros((0, 30)))) == 0
 
 
 def test_inner_probabilities_are_of_other_runs():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 
-from terrain.classify.network_numbers import SampleColumns
+from terrain.classify.network_input import SampleColumns
 from terrain.classify.stack import GroupedStack, chosen_of, fit_weights, joined, joined_of
 from terrain.errors import DataError
 

@@ -36,9 +36,9 @@ def test_area_by_runs_is_that_of_all_pairs():
     known, new = np.round(rng.normal(size=40), 1), np.round(rng.normal(0.7, 1, 30), 1)
     run_of = np.concatenate([np.repeat(np.arange(4), 10), np.repeat(np.arange(4, 7), 10)])
     part = Scored(np.arange(40), np.arange(40, 70), known, new, 0.0)
-    compared = unknown_figures._compare([part], run_of)
+    won, pairs = unknown_figures._compare([part], run_of)
     expected = roc_auc_score(np.repeat([0, 1], [40, 30]), np.concatenate([known, new]))
-    assert compared.won.sum() / compared.pairs.sum() == pytest.approx(expected)
+    assert won.sum() / pairs.sum() == pytest.approx(expected)
     weights = np.ones((50, 7)) + np.random.default_rng(1).multinomial(7, np.full(7, 1 / 7), 50)
-    low, high = unknown_figures._interval([compared], weights)
+    low, high = unknown_figures._interval([(won, pairs)], weights)
     assert low < expected < high

@@ -16,12 +16,12 @@ from terrain.control.path_tracking import (
 )
 from terrain.errors import ConfigError
 from terrain.estimation.live import LiveFilter
-from terrain.kinematics.swerve import FAR_RAD, wheel_command_step
+from terrain.kinematics.commands import FAR_RAD, wheel_command_step
 from terrain.records import Command
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil, scattered
 
 ROBOT = load_robot("agrimaro")

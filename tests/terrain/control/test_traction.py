@@ -13,13 +13,14 @@ from terrain.control.traction import (
     TractionState,
     TractionStatus,
     TractionTarget,
-    WheelMeasurements,
+    WheelMotion,
     check_settings,
     traction_step,
     with_motor_driver,
 )
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve import forward, inverse
+from terrain.kinematics.commands import inverse
+from terrain.kinematics.wheels import no_slip_twist
 from terrain.robots import load_robot
 
 ROBOT = load_robot("agrimaro")
@@ -48,8 +49,8 @@ def steps(
 ):
     """One step, each row given whole or as one number for all wheels; (command, next state, report)."""
     rows = [np.array(np.broadcast_to(row, 3), float) for row in (wheel, ground_mps, accel, slip, std, torque)]
-    target, wheels = TractionTarget(*map(float, aim)), WheelMeasurements(*rows[1:])
-    return traction_step(using, state, target, RADIUS_M, rows[0], wheels, stale_s, dt_s)
+    target, wheels = TractionTarget(*map(float, aim)), WheelMotion(*rows[1:], rows[0], NAN, stale_s)
+    return traction_step(using, state, target, RADIUS_M, rows[0], wheels, dt_s)
 
 
 def plain(using, m, aim, radius, wheel, ground, accel, slips, stds, stale, torque, dt):
@@ -187,12 +188,12 @@ def test_any_drive_with_faults_equals_the_reference_implementation(seed):
             stale_s = rng.choice([NAN, INF, 3.01, 2.9])
         if rng.random() < 0.05:
             dt_s = rng.choice(BAD_TIMES)
-        wheels = WheelMeasurements(*rows)
-        command, state, report = traction_step(using, state, aim, RADIUS_M, wheel, wheels, stale_s, dt_s)
+        wheels = WheelMotion(*rows, wheel, NAN, stale_s)
+        command, state, report = traction_step(using, state, aim, RADIUS_M, wheel, wheels, dt_s)
         given = (*rows[:4], stale_s, rows[4], dt_s)
         expected, driven, target, status = plain(using, memory, aim, RADIUS_M, wheel, *given)
         assert command == pytest.approx(expected, abs=1e-12), k
-        decided = [report.driven_mps, report.target_ratio, report.status]
+        decided = [report.driven_mps, report.aimed_ratio, report.status]
         assert decided == pytest.approx([driven, target, status], abs=1e-12), k
         assert numbers_of(state) == pytest.approx(in_order(memory), nan_ok=True, abs=1e-12), k
         assert np.isfinite(command).all()
@@ -241,7 +242,7 @@ def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
         assert after.driven_mps == report.driven_mps
         share = report.driven_mps / desired
         assert command == pytest.approx(share * wheel, abs=1e-12)
-        got, residual = forward(POSITIONS_M, RADIUS_M, command, steer)
+        got, residual = no_slip_twist(POSITIONS_M, steer, RADIUS_M * np.asarray(command))
         assert got == pytest.approx(share * np.array(twist), abs=1e-9)
         assert residual < 1e-9
         # backward is forward in a mirror
@@ -324,9 +325,9 @@ def test_balance_is_measured_in_steady_motion_and_sets_the_floor_of_the_target()
     assert np.isnan(seen[:80]).all()
     assert seen[-1] == pytest.approx(0.15, abs=1e-3)
     assert state.floor_ratio == pytest.approx(0.15 + SETTINGS.balance_margin_ratio, abs=1e-3)
-    assert steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=(0.05,))[2].target_ratio == state.floor_ratio
+    assert steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=(0.05,))[2].aimed_ratio == state.floor_ratio
     aim = TractionTarget(0.9, margin_ratio=0.05)
-    working = steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=aim)[2].target_ratio
+    working = steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=aim)[2].aimed_ratio
     assert working == pytest.approx(0.2, abs=1e-3)  # no more than the balance and what the work takes
     other = state.on_other_terrain()
     assert (math.isnan(other.balance_ratio), other.floor_ratio) == (True, 0.0)

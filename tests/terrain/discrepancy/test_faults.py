@@ -12,6 +12,7 @@ from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
 from pipelines.data.datasets import load_runs
+from terrain.discrepancy.clocks import latencies_of
 from terrain.discrepancy.faults import (
     AMPS,
     KEYS,
@@ -30,7 +31,6 @@ from terrain.discrepancy.faults import (
     reading_of,
     repaired,
 )
-from terrain.discrepancy.latencies import latencies_of
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.effects import CHANNELS

@@ -10,7 +10,7 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 
 from pipelines.data.datasets import load_runs
-from terrain.discrepancy.latencies import latencies_of, starting_values
+from terrain.discrepancy.clocks import latencies_of, starting_values
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import GYRO, HEADING, SPEED_X

@@ -16,7 +16,7 @@ from terrain.records import RunLog
 from terrain.robots import load_robot
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import Hills, simulate_planar
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 
 SCATTER = load_scatter()._asdict()
 HUSKY = Simulation(load_robot("husky"), scatter=SCATTER)

@@ -10,7 +10,7 @@ from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, CURRENT, HEADING, SPEED_X, SPEED_Y, showing
 from terrain.errors import DataError
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs import robotino
 from terrain.records import Stream
 from terrain.robots import load_robot

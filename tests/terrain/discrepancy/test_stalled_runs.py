@@ -8,8 +8,8 @@ import pytest
 from studies.blind_trials.trial import simulation_of
 
 from pipelines.data.datasets import load_runs
+from terrain.discrepancy.clocks import latencies_of
 from terrain.discrepancy.faults import Response, responses_of
-from terrain.discrepancy.latencies import latencies_of
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.unfit import common_gains, odd_runs, stalled_runs

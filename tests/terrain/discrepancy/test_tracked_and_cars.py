@@ -7,10 +7,10 @@ from studies.blind_trials.hidden import Row, cases_of, hidden_runs
 from studies.blind_trials.limits import limits_of
 from studies.blind_trials.trial import run_trial, simulation_of
 
-from terrain.discrepancy.command_response import traces_of
 from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.faults import candidate_changes
 from terrain.discrepancy.next_drive import next_command
+from terrain.discrepancy.powertrain import traces_of
 from terrain.discrepancy.robot_terms import in_robot_terms, value_in_robot_terms
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.verdict import Value

@@ -21,7 +21,7 @@ from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.run import Hills, simulate_planar
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 ODD = 2

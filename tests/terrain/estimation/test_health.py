@@ -15,8 +15,7 @@ from terrain.estimation.live import LiveFilter
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
-from terrain.simulation.faults.catalogue import fault_catalogue
-from terrain.simulation.faults.fault import FaultyBus
+from terrain.simulation.faults import FaultyBus, fault_catalogue
 from terrain.simulation.run import simulate_run
 
 ROBOT = load_robot("agrimaro")

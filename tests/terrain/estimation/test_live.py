@@ -17,7 +17,7 @@ from terrain.estimation.live import CHANNELS, QUEUE, LiveFilter
 from terrain.estimation.table import measurement_table
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot

@@ -6,7 +6,7 @@ import pytest
 from terrain.errors import DataError
 from terrain.estimation.reference import lagged_slip, true_states
 from terrain.estimation.resampling import low_pass
-from terrain.kinematics.true_slip import wheel_and_ground_speed
+from terrain.kinematics.logged_wheels import wheel_and_ground_speed
 from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

@@ -11,7 +11,7 @@ from terrain.estimation.estimate import estimate_run
 from terrain.estimation.summary import summarize
 from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import load_soil
 

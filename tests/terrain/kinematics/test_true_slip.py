@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from terrain.kinematics.true_slip import true_slip, wheel_and_ground_speed
+from terrain.kinematics.logged_wheels import true_slip, wheel_and_ground_speed
 from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

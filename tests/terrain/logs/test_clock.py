@@ -4,8 +4,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
-from terrain.logs.align import align
-from terrain.logs.clock import MAX_OFFSET_S, estimate_clock
+from terrain.logs.clock import MAX_OFFSET_S, align, estimate_clock
 from terrain.records import RunLog, Stream
 
 TRACK_M = 0.5708

@@ -10,9 +10,8 @@ from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.digest import data_digest
 from terrain.logs.drive import FILE_NAME, STREAMS, DriveRobot, find_runs
-from terrain.logs.held import between_updates
+from terrain.logs.held import between_updates, body_twists
 from terrain.logs.imu_axes import GYRO_TURNED
-from terrain.logs.lidar_twist import body_twists
 from terrain.robots import load_robot
 
 RADIUS_M = 0.165

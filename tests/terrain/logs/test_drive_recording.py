@@ -11,10 +11,9 @@ from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
-from terrain.logs.current_signs import NO_SIGN, POWER_SIGN, current_sign
 from terrain.logs.digest import data_digest
 from terrain.logs.drive_recording import LOST, NOT_RECORDED, STILL
-from terrain.logs.imu_axes import GYRO_IN_DEGREES, GYRO_TURNED, TURNED
+from terrain.logs.imu_axes import GYRO_IN_DEGREES, GYRO_TURNED, NO_SIGN, POWER_SIGN, TURNED, current_sign
 from terrain.logs.samples import BAD_CELL, BAD_TIME
 from terrain.robots import load_robot
 

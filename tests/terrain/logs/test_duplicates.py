@@ -7,9 +7,7 @@ import pytest
 
 from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
-from terrain.logs.duplicates import PrintFiles, groups_of, shared_stretches
-from terrain.logs.fingerprints import run_print
-from terrain.logs.merge import merge_runs
+from terrain.logs.duplicates import PrintFiles, groups_of, merge_runs, run_print, shared_stretches
 from terrain.records import Label, RunLog, Stream
 
 

@@ -198,7 +198,7 @@ TEXTS = {
 def test_headers_delimiters_and_decimals_of_instruments_are_read(tmp_path, save, monkeypatch, text, slow):
     """By pyarrow, and cell by cell."""
     if slow:
-        monkeypatch.setattr("terrain.logs.csv_table._fast", lambda *_: None)
+        monkeypatch.setattr("terrain.logs.tables._fast", lambda *_: None)
     content, keys = TEXTS[text]
     (tmp_path / "data.csv").write_text(content)
     (run,) = load_runs(tmp_path, mapping=save(one_stream(SPEED, **keys)))

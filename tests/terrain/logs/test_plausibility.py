@@ -11,9 +11,7 @@ from pipelines.data.datasets import load_runs, verdict
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
 from terrain.errors import LogError
-from terrain.logs.checks import Level
-from terrain.logs.plausibility import doubt_sentences, doubts_of, judge, worst
-from terrain.logs.turn_checks import Scale
+from terrain.logs.plausibility import Level, Scale, doubt_sentences, doubts_of, judge, worst
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot

@@ -9,7 +9,7 @@ from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from terrain.errors import LogError
-from terrain.kinematics import omni
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.logs import robotino
 from terrain.logs.digest import data_digest
 from terrain.logs.robotino import HELD, NO_SIGN, SCALED
@@ -28,7 +28,9 @@ def columns_of(twist=(0.08, 0.06, 0.0), slip=0.2, heading=0.3, n=120, scale=1.01
     """Return what the logger writes of a robot that slips alike in all directions, as it turns and drives."""
     rng = np.random.default_rng(3)
     time_s = np.cumsum(rng.uniform(0.029, 0.033, n))
-    motor = 16.0 / 0.04 * omni.inverse(ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad, np.array(twist))
+    motor = (
+        16.0 / 0.04 * np.array(twist) @ rolling_matrix(ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad).T
+    )
     yaw = heading + (1 - slip) * twist[2] * time_s
     step = np.exp(1j * yaw) * complex(twist[0], twist[1]) * (1 - slip)
     place = np.concatenate([[0], np.cumsum((step[1:] + step[:-1]) / 2 * np.diff(time_s))]) + 1.5 - 0.7j
@@ -75,7 +77,7 @@ def test_a_run_comes_back_in_the_frames_of_the_project(root):
     assert (run.run_id, run.robot, run.terrains, run.session) == ("moss_07", "robotino", ("moss",), "")
     wheels, pose = run.streams["wheels"], run.streams["pose"]
     speeds = np.column_stack([wheels.channel(f"speed_{i}_mps") for i in (1, 2, 3)])
-    expected = omni.inverse(ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad, np.array(twist))
+    expected = np.array(twist) @ rolling_matrix(ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad).T
     # The hold of the counts, 19 ms, against the 3.7 s of the run.
     np.testing.assert_allclose(speeds.mean(axis=0), expected, atol=0.005 * np.hypot(*twist[:2]))
     span_s = pose.time_s[-1] - pose.time_s[0]
@@ -104,7 +106,9 @@ def test_the_scale_of_a_rate_is_that_of_its_counts_whatever_the_direction(root):
     for number, twist in enumerate([(0.1, 0.0, 0.0), (-0.05, 0.0866, 0.0), (0.0, 0.0, 0.6)]):
         write_log(root / f"one_surface/moss/exp{number:02d}.csv.gz", columns_of(twist, scale=1.05))
     for run, twist in zip(load_runs(root), [(0.1, 0, 0), (-0.05, 0.0866, 0), (0, 0, 0.6)], strict=True):
-        expected = omni.inverse(ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad, np.array(twist, float))
+        expected = (
+            np.array(twist, float) @ rolling_matrix(ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad).T
+        )
         speeds = run.streams["wheels"].values[:, -3:].mean(axis=0)
         np.testing.assert_allclose(speeds, expected, atol=0.006 * np.abs(expected).max())
 

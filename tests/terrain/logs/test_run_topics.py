@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from terrain.errors import DataError, LogError
 from terrain.logs.digest import data_digest
-from terrain.logs.faults import Faults, Topic
 from terrain.logs.read import read_run
 from terrain.logs.run_topics import RUN_TOPIC, read_document, run_messages, run_of, string_of
+from terrain.logs.topics import Faults, Topic
 from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
 

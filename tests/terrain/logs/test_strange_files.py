@@ -14,7 +14,7 @@ from pipelines.data.datasets import load_runs
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, LogError, TerrainError
 from terrain.files.resources import data_folder
-from terrain.logs import csv_table, parquet_file
+from terrain.logs import tables
 from terrain.logs.mapping import load_mapping
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
@@ -193,10 +193,10 @@ def test_a_parquet_file_is_judged_before_it_is_read(folder, monkeypatch):
     parquet.write_table(whole.set_column(gyro, "gyro_z_radps", nested), file)
     assert "column 'gyro_z_radps' holds list<" in refusal(read_run, folder)
     parquet.write_table(whole, file)
-    monkeypatch.setattr(parquet_file, "MAX_VALUES", 100)
+    monkeypatch.setattr(tables, "MAX_VALUES", 100)
     assert "has 200 rows of 7 columns, at most 100 values are read" in refusal(read_run, folder)
     monkeypatch.undo()
-    monkeypatch.setattr(parquet_file, "MAX_FOOTER_BYTES", 100)
+    monkeypatch.setattr(tables, "MAX_FOOTER_BYTES", 100)
     assert "imu.parquet: describes itself in" in refusal(read_run, folder)
 
 
@@ -205,10 +205,10 @@ def test_a_packed_csv_file_that_grows_too_large_is_refused(tmp_path, monkeypatch
 
     path = tmp_path / "samples.csv.gz"
     path.write_bytes(gzip.compress(b"a\n" + b"0\n" * 2_000_000))
-    assert len(csv_table.read_columns(path, ["a"])) == 2_000_000
-    monkeypatch.setattr(csv_table, "MAX_UNPACKED_BYTES", 2**20)
+    assert len(tables.read_columns(path, ["a"])) == 2_000_000
+    monkeypatch.setattr(tables, "MAX_UNPACKED_BYTES", 2**20)
     with pytest.raises(LogError, match="unpacks to more than 1 MiB"):
-        csv_table.read_columns(path, ["a"])
+        tables.read_columns(path, ["a"])
 
 
 def fuzzed(whole, rng):

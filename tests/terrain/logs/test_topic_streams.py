@@ -9,9 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
-from terrain.logs.faults import Faults, Topic
-from terrain.logs.topic_mapping import load_mapping
-from terrain.logs.topic_streams import MappedTopics
+from terrain.logs.topics import Faults, MappedTopics, Topic, load_mapping
 
 START_NS = 1_700_000_000_123_456_789
 TYPES = {

@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-from terrain.logs.drive import DriveRobot, find_runs
-from terrain.logs.drive_poses import read_window_poses
-from terrain.logs.lidar_twist import N_FRAME
-from terrain.logs.window_frame import frame_coefficient, is_first_pose
+from terrain.logs.drive import DriveRobot, find_runs, read_window_poses
+from terrain.logs.held import N_FRAME, frame_coefficient, is_first_pose
 
 PERIOD_S = 0.05
 

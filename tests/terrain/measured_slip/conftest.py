@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from terrain.kinematics import omni
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 
@@ -42,7 +42,7 @@ def make_omni_run(robotino):
         seen_s = np.maximum(time_s - delay_s, 0.0)
         pose = np.column_stack([np.interp(seen_s, fine, part) for part in (place.real, place.imag, yaw)])
         pose += rng.normal(0.0, 1.0, pose.shape) * [noise_m, noise_m, 8 * noise_m]
-        wheels = omni.inverse(robotino.wheel_positions_m, robotino.wheel_directions_rad, np.array(twist))
+        wheels = np.array(twist) @ rolling_matrix(robotino.wheel_positions_m, robotino.wheel_directions_rad).T
         rates = np.interp(time_s, fine, going)[:, None] * robotino.logged_rates(wheels)
         rates += rng.normal(0.0, 0.5 if noise_m else 0.0, rates.shape)
         currents = current_a + 0.02 * rng.normal(size=rates.shape)

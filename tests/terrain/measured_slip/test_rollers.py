@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import DataError
-from terrain.kinematics import omni
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.measured_slip.rollers import distance_bound, roller_findings, surface_of_windows
 from terrain.measured_slip.slips import measured_slip
 from terrain.simulation.planar.omni import steady_twist
@@ -24,7 +24,7 @@ def slips_of(make_omni_run, robot, rng, surface, group, n=24):
     for i in range(n):
         direction = 2 * np.pi * i / n
         desired = 0.1 * (1 + i % 3) * np.array([[np.cos(direction), np.sin(direction), 0.0]])
-        wheels = omni.inverse(*place_of(robot), desired)
+        wheels = desired @ rolling_matrix(*place_of(robot)).T
         twist = steady_twist(wheels, *place_of(robot), LOADS[group], RATIO[surface], KAPPA)[0]
         twist[:2] += rng.normal(0.0, 0.003, 2) * np.linalg.norm(desired)
         run = make_omni_run(rng, twist=tuple(twist), slip=0.0, start_s=-1.0, length_s=6.0)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
+from terrain.kinematics.wheels import no_slip_twist
 from terrain.measured_slip.delay import DelayStatus, estimate_delay
 from terrain.measured_slip.ground_changes import slip_step
 from terrain.measured_slip.slips import (
     measured_slip,
     outside_source,
-    rolled_twists,
     spinning_wheels,
     travelled,
     window_rates,
@@ -179,7 +179,7 @@ def test_wheels_that_do_not_roll_across_determine_a_swerve_twist():
     twist = np.array([[0.5, 0.2, 0.3]])
     ahead = twist[:, :1] - twist[:, 2:] * positions[:, 1]
     left = twist[:, 1:2] + twist[:, 2:] * positions[:, 0]
-    found = rolled_twists(np.hypot(ahead, left), positions, np.arctan2(left, ahead), False)
+    found = no_slip_twist(positions, np.arctan2(left, ahead), np.hypot(ahead, left))[0]
     np.testing.assert_allclose(found, twist, atol=1e-12)
 
 

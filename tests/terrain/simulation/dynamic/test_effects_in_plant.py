@@ -14,12 +14,12 @@ from terrain.errors import ConfigError
 from terrain.estimation.resampling import low_pass
 from terrain.extension import corrected, corrected_log
 from terrain.kinematics.camera import body_motion
-from terrain.kinematics.swerve import forward
+from terrain.kinematics.wheels import no_slip_twist
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.contact import shear_slip
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import load_soil
 
@@ -80,7 +80,7 @@ def twist_error(component):
         late = angles.time_s > 6.0
         steer = np.column_stack([angles.channel(f"angle_{i}_rad")[late] for i in (1, 2, 3)]) - zeros
         rate = rates.mean(axis=0) / robot.motors.reduction_ratio
-        twist, _ = forward(robot.wheel_positions_m, robot.wheel_radius_m, rate, steer.mean(axis=0))
+        twist, _ = no_slip_twist(robot.wheel_positions_m, steer.mean(axis=0), robot.wheel_radius_m * rate)
         imu, late = steady(run, "imu")
         turn = imu.channel("gyro_z_radps")[late].mean()
         camera, late = steady(run, "odometry")
@@ -94,7 +94,9 @@ def twist_error(component):
 def asked(radii=(1.0, 1.0, 1.0), steer=(0.0, 0.0, 0.0), component=2):
     """Change of the twist of wheels that are commanded straight ahead at 1 m/s."""
     rate = np.array(radii) / ROBOT.wheel_radius_m
-    return float(forward(ROBOT.wheel_positions_m, ROBOT.wheel_radius_m, rate, np.array(steer))[0][component])
+    return float(
+        no_slip_twist(ROBOT.wheel_positions_m, np.array(steer), ROBOT.wheel_radius_m * rate)[0][component]
+    )
 
 
 def encoder_error(run, robot):

@@ -16,7 +16,7 @@ from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.dynamic.plant import make_plant, start_state, uniform_profile
 from terrain.simulation.dynamic.simulate import COMMAND_CHANNELS, Drive, simulate
 from terrain.simulation.dynamic.step import advance, settle
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import BODY_ROW, Gnss
 from terrain.terramechanics.soil import load_soil, soil_names
 

@@ -11,8 +11,7 @@ from terrain.logs.write import write_run
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.dynamic.simulate import COMMAND_CHANNELS, simulate
-from terrain.simulation.scenario.make import make_scenario
-from terrain.simulation.scenario.scenario import Scenario
+from terrain.simulation.scenario import Scenario, make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import Scatter, load_soil, soil_names
 
@@ -305,10 +304,7 @@ def test_a_course_is_labelled_ground_by_ground():
         ({"robot": dataclasses.replace(ROBOT, mass_kg=1e9)}, "its motion cannot be integrated"),
         ({"robot": with_part("body", yaw_inertia_kgm2=1e-9)}, "its motion cannot be integrated"),
         ({"robot": with_part("body", tyre_stiffness_npm=1e12)}, "its motion cannot be integrated"),
-        (
-            {"robot": with_part("sensors", imu_rate_hz=1e9)},
-            "sensors: imu_rate_hz is 1e[+]09, at most 1000",
-        ),
+        ({"robot": with_part("sensors", imu_rate_hz=1e9)}, "sensors: imu_rate_hz is 1e[+]09, at most 1000"),
         ({"robot": with_part("motors", speed_max_radps=1e6)}, "km of terrain are simulated at most"),
     ],
 )

@@ -8,7 +8,7 @@ from scipy.integrate import quad, solve_ivp
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve import wheel_commands
+from terrain.kinematics.commands import wheel_commands
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
@@ -34,7 +34,7 @@ from terrain.simulation.dynamic.step import (
     advance,
     settle,
 )
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import BODY_ROW, STEP_S, Motion
 from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import equilibrium_slip, friction_limit, wheel_ground
@@ -179,12 +179,7 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         slip = (deflection + DEFLECTION_DAMPING_S * creep(wheel_speed)) / plant.relaxation_m
         got = np.array(
             [
-                wheel_ground(
-                    grounds[patch[i]],
-                    normal[i],
-                    np.clip(slip[0, i], -1, 1),
-                    slip[1, i],
-                )
+                wheel_ground(grounds[patch[i]], normal[i], np.clip(slip[0, i], -1, 1), slip[1, i])
                 for i in range(3)
             ]
         ).T

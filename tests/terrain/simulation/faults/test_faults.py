@@ -13,17 +13,19 @@ from terrain.kinematics.camera import body_motion, to_camera
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Command, Reading, Sample, Stream
 from terrain.robots import load_robot
-from terrain.simulation.faults.catalogue import (
+from terrain.simulation.faults import (
+    EVERY,
     JITTER_S,
     NOISE_FACTOR,
     OTHER_WIDTH,
     SPIKE,
+    STREAMS,
+    FaultyBus,
+    Nature,
     fault_catalogue,
     noise_std,
     select_faults,
 )
-from terrain.simulation.faults.changes import EVERY
-from terrain.simulation.faults.fault import STREAMS, FaultyBus, Nature
 from terrain.simulation.run import simulate_run
 
 ROBOT = load_robot("agrimaro")

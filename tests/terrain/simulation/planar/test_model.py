@@ -20,7 +20,7 @@ from terrain.effects import (
     library_of,
     vector_of,
 )
-from terrain.kinematics.swerve import inverse
+from terrain.kinematics.commands import inverse
 from terrain.robots import load_robot
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.planar.model import TRUTH, Ground, delayed, lagged, make_planar

@@ -7,8 +7,8 @@ from scipy.integrate import solve_ivp
 from terrain.effects import vector_of
 from terrain.errors import ConfigError
 from terrain.extension import apply_homes
-from terrain.kinematics import omni
-from terrain.kinematics.wheel_speed import with_wheel_speeds
+from terrain.kinematics.logged_wheels import with_wheel_speeds
+from terrain.kinematics.wheels import rolling_matrix
 from terrain.measured_slip.rollers import roller_findings
 from terrain.measured_slip.slips import measured_slip
 from terrain.robots import load_robot
@@ -19,7 +19,7 @@ from terrain.simulation.planar.noise import load_noise
 from terrain.simulation.planar.omni import ROLLING_MPS, SUBSTEPS, currents_of, steady_twist
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.run import simulate_run
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil, soil_from
 
 ROBOT = load_robot("robotino")
@@ -49,7 +49,7 @@ def moved(robot, ground, wheels, p=NONE, grade=0.0, dt=DT):
 
 
 def wheels_for(twist, n=300):
-    return np.tile(omni.inverse(*PLACE, np.array(twist)), (n, 1))
+    return np.tile(np.array(twist) @ rolling_matrix(*PLACE).T, (n, 1))
 
 
 def heading_to(direction_rad, speed_mps=0.2):
@@ -103,7 +103,7 @@ def test_with_equal_loads_a_third_of_a_turn_changes_nothing():
 
 def starting(n=60):
     ramp = np.minimum(np.arange(n) / 20.0, 1.0)[:, None]
-    return ramp * omni.inverse(*PLACE, np.array([0.15, 0.1, 0.6]))
+    return ramp * np.array([0.15, 0.1, 0.6]) @ rolling_matrix(*PLACE).T
 
 
 def law(planar, u, twist, stiff, rolling):

@@ -22,14 +22,14 @@ from terrain.errors import ConfigError
 from terrain.estimation.resampling import low_pass
 from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
 from terrain.kinematics.camera import body_motion
-from terrain.kinematics.true_slip import wheel_and_ground_speed
+from terrain.kinematics.logged_wheels import wheel_and_ground_speed
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground, make_planar, planar_ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.replay import replay
 from terrain.simulation.planar.run import Hills, simulate_planar
-from terrain.simulation.scenario.make import make_scenario
+from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")

@@ -5,13 +5,20 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.kinematics.swerve import forward, wheel_commands, wheel_velocities
+from terrain.kinematics.commands import wheel_commands
+from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
 from terrain.robots import load_robot
-from terrain.simulation.scenario.drawn import PATCH_M, SLIP_MARGIN
-from terrain.simulation.scenario.drives import CIRCLE_M
-from terrain.simulation.scenario.legs import ACCEL_MPS2, YAW_ACCEL_RADPS2
-from terrain.simulation.scenario.make import SCENARIOS, make_scenario
-from terrain.simulation.scenario.scenario import Patch, Scenario
+from terrain.simulation.scenario import (
+    ACCEL_MPS2,
+    CIRCLE_M,
+    PATCH_M,
+    SCENARIOS,
+    SLIP_MARGIN,
+    YAW_ACCEL_RADPS2,
+    Patch,
+    Scenario,
+    make_scenario,
+)
 
 ROBOT, HUSKY = load_robot("agrimaro"), load_robot("husky")
 DRAWN = ("survey", "course")
@@ -75,7 +82,7 @@ def test_wheels_follow_their_commands_except_during_steering(name):
         np.zeros(3),
     )
     np.testing.assert_array_equal(admitted, drive.twist)  # nothing is left for the limiter to do
-    twist, residual_mps = forward(*geometry, wheel, steer)
+    twist, residual_mps = no_slip_twist(ROBOT.wheel_positions_m, steer, ROBOT.wheel_radius_m * wheel)
     off = np.abs(twist - drive.twist).max(axis=1) > 1e-6
     assert off.mean() < 0.15
     assert residual_mps[~off].max(initial=0.0) < 1e-6

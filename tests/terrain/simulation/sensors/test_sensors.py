@@ -141,9 +141,7 @@ def random_motion(n=700):
 @pytest.mark.parametrize("cuts", [range(1, 700), range(1, 700, 20), [1, 2, 3, 250, 251, 699]])
 def test_a_motion_in_blocks_gives_the_bytes_of_the_motion_in_one(cuts):
     odd = with_changes("sensors", imu_rate_hz=128.0, imu_latency_s=0.0, wheels_rate_hz=30.0).with_parts(
-        camera=dataclasses.replace(
-            ROBOT.camera, dropout_rate_hz=3.0, dropout_length_s=0.02, jump_rate_hz=4.0
-        ),
+        camera=dataclasses.replace(ROBOT.camera, dropout_rate_hz=3.0, dropout_length_s=0.02, jump_rate_hz=4.0)
     )
     faults = Faults(camera_lost_s=((0.1, 0.2),), gnss_lost_s=((0.3, 0.4),))
     whole, parts = Motion(random_motion()), Motion(random_motion(), 0)

@@ -1,0 +1,1196 @@
+"""Effects: named groups of parameters of the simulation that are 0 where the effect is absent.
+
+An entry holds all about an effect: bounds, formula, source, robots, channels, where a description has it, how
+it is taken off samples, and how it is shown.
+
+Signals of the formulas are those of :mod:`terrain.simulation.planar.model`: ``u`` the speed that the wheels
+would roll without slip, ``v`` the speed over ground, ``d`` a steering angle, ``w`` the yaw rate, ``F`` the
+traction, ``W = m g`` the nominal weight, ``f = F / W``, ``th`` the grade (uphill positive), ``ph`` the roll
+(left side up positive), ``B`` the track, ``dv`` right minus left wheel speed and
+``q = |dv| / (|dv| + 2 |u|)`` how tight a turn is.
+
+To add an effect, write its entry into the library, and its formula into the kernels of
+:mod:`terrain.simulation.planar`.  Everything else reads the entry.
+
+The section ``effects`` of a robot's description has those found by ``terrain explain``.  Each parameter is a
+number with unit, source and interval like any other; the covariance has a row a parameter, and may be left
+out where it is unknown::
+
+    effects:
+      schema: 1
+      wheel_radius_ratio: {value: 0.031, unit: ratio, source: "terrain explain", interval: [0.028, 0.034]}
+      camera_yaw_rad: {value: -0.012, unit: rad, source: "terrain explain", interval: [-0.013, -0.011]}
+      covariance:
+        wheel_radius_ratio: {wheel_radius_ratio: 2.3e-06, camera_yaw_rad: 1.0e-08}
+        camera_yaw_rad: {wheel_radius_ratio: 1.0e-08, camera_yaw_rad: 2.6e-07}
+
+A parameter that is not there is 0, and its effect absent.  Former names of parameters are read as the present
+ones.
+
+Examples
+--------
+>>> found = effect_named("gyro_scale")
+>>> found.formula, found.parameters[0].inverse.formula
+('gyro = (1 + k) w', '(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)')
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from terrain.errors import ConfigError
+from terrain.files.descriptions import check_keys, number
+from terrain.kernels import record
+from terrain.records import Array, read_only
+
+GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING = (
+    "yaw_rate_radps",
+    "speed_x_mps",
+    "speed_y_mps",
+    "accel_x_mps2",
+    "current_a",
+    "turning_current_a",
+    "heading_rate_radps",
+)
+CHANNELS: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING)
+"""Channels that are compared: gyro, speed over ground of the camera's point, accelerometer, sum of the motor
+currents, right minus left current, and the rate of a heading that no gyro measured (lidar, two antennas)."""
+
+MOTION: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y)
+"""Channels of the planar motion."""
+
+SKID, TRACKED, SWERVE, OMNI, BICYCLE = "skid_steer", "tracked", "swerve", "omni", "bicycle"
+SKIDDING = (SKID, TRACKED)
+"""Drives that turn by a difference of their sides."""
+
+BOTH = (*SKIDDING, SWERVE)
+"""Drives of wheels that do not roll across, but for cars."""
+
+WITH_IMU = (*BOTH, BICYCLE)
+"""Drives whose logs have an IMU."""
+
+EVERY = (*WITH_IMU, OMNI)
+
+
+class Combine(Enum):
+    """How a parameter ``e`` changes a number ``x`` of a robot's description."""
+
+    ADDED = "x + e"
+    SUBTRACTED = "x - e"
+    TIMES = "x (1 + e)"
+    OVER = "x / (1 + e)"
+
+    def apply(self, number: float, value: float) -> float:
+        """Return the changed number.
+
+        Examples
+        --------
+        >>> Combine.OVER.apply(0.3, 1.0), Combine.SUBTRACTED.apply(0.0, 0.1)
+        (0.15, -0.1)
+        """
+        if self is Combine.ADDED:
+            return number + value
+        if self is Combine.SUBTRACTED:
+            return number - value
+        return number * (1.0 + value) if self is Combine.TIMES else number / (1.0 + value)
+
+
+class Home(NamedTuple):
+    """A number of the description that a parameter changes.
+
+    Parameters
+    ----------
+    section : of the description; empty for a number of the robot itself
+    field : in the section
+    combine : how the two are combined
+    scaled_by : field of the same section that the parameter is multiplied by first; empty for none
+    optional : whether the parameter also has its other homes where the description lacks this section
+    """
+
+    section: str
+    field: str
+    combine: Combine
+    scaled_by: str = ""
+    optional: bool = False
+
+
+class Inverse(NamedTuple):
+    """How a parameter is taken off the samples of a log, by :class:`terrain.extension.Correction`.
+
+    Parameters
+    ----------
+    streams : whose samples or stamps change
+    formula : corrected from measured, in the signals of this module
+    without_home : samples change only where the description lacks the section of the parameter's home
+    """
+
+    streams: tuple[str, ...]
+    formula: str
+    without_home: bool = False
+
+
+class Parameter(NamedTuple):
+    """A number of the simulation that is 0 where its effect is absent.
+
+    Parameters
+    ----------
+    name : ends in its unit
+    low, high : bounds of the search
+    step : a small change that is still visible, over which sensitivities are taken
+    homes : where the description has it; all of them change together
+    inverse : how it is taken off samples, if it can be
+    one_sided : sensitivities are taken towards the positive side only: a backlash is not negative.  All
+        others are taken to both sides: a delay to one side alone is half a step off, and noise of the wheels
+        looks like it
+    scatter_rank : place in the order in which values that scatter from run to run are drawn, from 1; 0 for a
+        parameter that does not scatter
+    as_percent : pages write it as a percentage
+    is_error : it states the error of something that is there, so that pages write "off by"
+    deprecated : former names, accepted in files and on the command line
+    """
+
+    name: str
+    low: float
+    high: float
+    step: float
+    homes: tuple[Home, ...] = ()
+    inverse: Inverse | None = None
+    one_sided: bool = False
+    scatter_rank: int = 0
+    as_percent: bool = False
+    is_error: bool = False
+    deprecated: tuple[str, ...] = ()
+
+    @property
+    def unit(self) -> str:
+        """Last word of the name."""
+        return self.name.rpartition("_")[2]
+
+    @property
+    def label(self) -> str:
+        """Words of the name without its unit, as pages write it."""
+        return self.name.rpartition("_")[0].replace("_", " ")
+
+
+class PlantPart(Enum):
+    """Which part of the dynamic simulation an effect acts in."""
+
+    DESCRIPTION = "the number of its home"
+    BODY = "masses and wheel radii of the plant"
+    LINKAGE = "between the steering encoders and the wheels"
+    CONTACT = "between wheel and ground"
+    SENSORS = "samples and stamps"
+
+
+class Wording(Enum):
+    """What a sentence makes of the values of an effect."""
+
+    NUMBER = "the number of its home, or the values themselves"
+    TRACK = "an effective track in m"
+    MEASURED_POINT = "where the measured point is"
+    LATE = "who is late, in s"
+    CAMERA_YAW = "an angle of the camera in degrees"
+    FAST_TURNS = "by how much the track acts narrower in a fast turn"
+    LOSS_IN_TURNS = "the speed that a turn takes"
+    SIDE_SLIP = "the speed to the outside of a turn"
+    GYRO_SCALE = "by how much the gyro reads too much"
+    CENTRE_OF_MASS = "where the centre of mass is"
+    WHEEL_DISTANCE = "a distance of the wheels in m"
+    SIDES = "by how much the wheels of a side are larger"
+    UNDERSTEER = "by how much less it turns at a speed"
+
+
+class Effect(NamedTuple):
+    """An error that the simulation may have.
+
+    Parameters
+    ----------
+    name : as ``--effect`` and results have it
+    parameters : its numbers
+    formula : in the signals of this module
+    source : of the formula
+    drives : kinds of robots that it applies to
+    channels : of :data:`CHANNELS`, where it is visible: a tenth as clearly over the noise as in the clearest
+    needs : the driving that excites it
+    sensed_only : it changes what sensors measure, and not the motion of the body
+    plant : the part of the dynamic simulation that it acts in; None where that simulates none of its robots
+    aliases : other names of the same effect, which no log distinguishes from it
+    twins : names of effects that look the same, and the channel that a log needs to distinguish them
+    deprecated : former names, accepted on the command line
+    wording : what sentences make of its values
+    late : who is late by a positive and by a negative value, of an effect that is worded so
+    modifies : name of the effect without which it does nothing; empty for an effect that acts by itself
+    beside : drive, and name of the effect that has to be known before runs of it can show this one
+    """
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    formula: str
+    source: str
+    drives: tuple[str, ...]
+    channels: tuple[str, ...]
+    needs: str
+    sensed_only: bool = False
+    plant: PlantPart | None = None
+    aliases: tuple[str, ...] = ()
+    twins: tuple[tuple[str, str], ...] = ()
+    deprecated: tuple[str, ...] = ()
+    wording: Wording = Wording.NUMBER
+    late: tuple[str, str] = ("", "")
+    modifies: str = ""
+    beside: tuple[tuple[str, str], ...] = ()
+
+
+def effect(
+    name: str,
+    parameter: Parameter,
+    *entry: Any,
+    homes: tuple[Home, ...] = (),
+    inverse: Inverse | None = None,
+    **others: Any,
+) -> Effect:
+    """Return an effect of one parameter.
+
+    Parameters
+    ----------
+    name : of the effect
+    parameter : called by its unit alone: its name is that of the effect, and the unit
+    homes, inverse : of the parameter
+    entry, others : fields of :class:`Effect` from the formula on
+    """
+    named = parameter._replace(name=f"{name}_{parameter.name}", homes=homes, inverse=inverse)
+    return Effect(name, (named,), *entry, **others)
+
+
+KINEMATICS = "kinematics of a planar robot"
+
+
+def _steering_offset(wheel: int) -> Effect:
+    name = f"steering_offset_{wheel}"
+    return effect(
+        name,
+        Parameter("rad", -0.3, 0.3, 0.005),
+        f"d_{wheel} = measured angle + d0",
+        KINEMATICS,
+        (SWERVE,),
+        (*MOTION, HEADING) if wheel < 3 else MOTION,  # wheel 3 is beside the middle, and hardly turns it
+        "several speeds and standstill",
+        homes=(Home("steering", f"zero_{wheel}_rad", Combine.SUBTRACTED),),
+        plant=PlantPart.LINKAGE,
+    )
+
+
+def _wheel_scale(wheel: int) -> Effect:
+    """Return the scale of one encoder.
+
+    All three together span wheel_radius and one_sided_radius, so that of the five three logs
+    determine three; one alone looks like neither.
+    """
+    name = f"wheel_scale_{wheel}"
+    return effect(
+        name,
+        # an encoder that loses counts, or a tyre of another wear: a fifth is more than either
+        Parameter("ratio", -0.2, 0.2, 0.01, as_percent=True, is_error=True),
+        f"wheel speed {wheel} = (1 + e) x measured",
+        KINEMATICS,
+        (SWERVE,),
+        (*MOTION, HEADING),
+        "straight drives in several directions",
+        inverse=Inverse(("wheels",), f"rate and speed of wheel {wheel} x (1 + e)"),
+        plant=PlantPart.SENSORS,
+    )
+
+
+WHEELS_AND_STEERING: tuple[Effect, ...] = (
+    effect(
+        "wheel_radius",
+        Parameter("ratio", -0.3, 0.3, 0.01, scatter_rank=5, as_percent=True, is_error=True),
+        "wheel speed = (1 + e) r x wheel rate, torque = (1 + e) r F",
+        KINEMATICS,
+        EVERY,
+        (*MOTION, CURRENT, HEADING),
+        "any speed; slopes and accelerations to part it from slip",
+        homes=(Home("", "wheel_radius_m", Combine.TIMES),),
+        inverse=Inverse(("wheels",), "wheel speed in m/s x (1 + e), where a log has it"),
+        plant=PlantPart.BODY,
+        aliases=("encoder_scale",),
+    ),
+    effect(
+        "one_sided_radius",
+        # pressure and wear of tyres differ by a few percent from side to side
+        Parameter("ratio", -0.1, 0.1, 0.008, scatter_rank=6, as_percent=True, is_error=True),
+        "wheel speeds of the right side x (1 + e/2), of the left x (1 - e/2)",
+        KINEMATICS,
+        BOTH,
+        (*MOTION, HEADING),
+        "fast and straight",
+        inverse=Inverse(
+            ("wheels", "truth"), "rates and speeds of the right side x (1 + e/2), left x (1 - e/2)"
+        ),
+        plant=PlantPart.BODY,
+        wording=Wording.SIDES,
+    ),
+    *(_wheel_scale(wheel) for wheel in (1, 2, 3)),
+    *(_steering_offset(wheel) for wheel in (1, 2, 3)),
+    effect(
+        "steering_backlash",
+        Parameter("rad", 0.0, 0.2, 0.003, one_sided=True, deprecated=("steering_play_rad",)),
+        "d follows the measured angle through a play of half width b",
+        "play operator; Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989",
+        (SWERVE, BICYCLE),
+        (*MOTION, HEADING),
+        "reversals of the steering",
+        inverse=Inverse(("steering",), "angles pass through a play of half width b"),
+        plant=PlantPart.LINKAGE,
+        deprecated=("steering_play",),
+    ),
+    effect(
+        "steering_delay",
+        Parameter("s", 0.0, 0.5, 0.01),
+        "d(t) = measured angle at t - T",
+        KINEMATICS,
+        (SWERVE, BICYCLE),
+        (*MOTION, HEADING),
+        "steps of the steering",
+        inverse=Inverse(("steering",), "stamp t + T"),
+        plant=PlantPart.LINKAGE,
+    ),
+    effect(
+        "yaw_delay",
+        Parameter("s", 0.0, 0.5, 0.01),
+        "w(t) = what the wheels ask for at t - T",
+        "pure delay",
+        SKIDDING,
+        (GYRO, SPEED_Y, HEADING),
+        "steps of the yaw rate",
+        inverse=Inverse(("wheels",), "right minus left wheel speed of t - T; of whole runs only"),
+        wording=Wording.LATE,
+        late=("the robot turning", "the robot turning"),
+    ),
+)
+
+OTHER_LOGGER = ("imu", "odometry", "gnss", "lidar")
+"""Streams that are not stamped by the logger of the wheels."""
+
+SENSORS: tuple[Effect, ...] = (
+    effect(
+        "gyro_bias",
+        # 3 deg/s, the zero error of MEMS gyros as data sheets have it (Bosch BMI055: 1 deg/s)
+        Parameter("radps", -0.05, 0.05, 0.001, scatter_rank=1),
+        "gyro = w + b",
+        "IEEE Std 952",
+        WITH_IMU,
+        (GYRO,),
+        "standstill; several runs, since every power-on has a bias of its own",
+        homes=(Home("sensors", "gyro_bias_z_radps", Combine.ADDED),),
+        inverse=Inverse(("imu",), "gyro - b where the description has no home; fused yaw - b t"),
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+    ),
+    effect(
+        "gyro_scale",
+        # data sheets of MEMS gyros have 1 to 4 %; a part that is off by more than 15 % is broken
+        Parameter("ratio", -0.15, 0.15, 0.01, as_percent=True, is_error=True),
+        "gyro = (1 + k) w",
+        "IEEE Std 952",
+        WITH_IMU,
+        (GYRO,),
+        "turns, and an absolute heading on a skid-steer robot",
+        inverse=Inverse(("imu",), "(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)"),
+        sensed_only=True,
+        plant=PlantPart.SENSORS,
+        twins=(("effective_track", HEADING),),
+        wording=Wording.GYRO_SCALE,
+    ),
+    effect(
+        "accel_bias",
+        Parameter("mps2", -2.0, 2.0, 0.02, scatter_rank=2),
+        "accelerometer = a_x + g sin th + b",
+        "IEEE Std 1293",
+        WITH_IMU,
+        (ACCEL,),
+        "several runs, since every power-on has a bias of its own",
+        homes=(Home("sensors", "accel_bias_x_mps2", Combine.ADDED, scaled_by="accel_scale_x_ratio"),),
+        inverse=Inverse(("imu",), "accelerometer - b", without_home=True),
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+        aliases=("accelerometer_mounting_pitch",),
+    ),
+    effect(
+        "imu_latency",
+        # as much of it and of camera_latency is a clock_offset: logs determine two of the three
+        Parameter("s", 0.0, 0.5, 0.005),
+        "gyro, accelerometer and tilt(t) = what they measure at t - T",
+        "pure delay; the samples of one IMU arrive together",
+        WITH_IMU,
+        (GYRO, ACCEL),
+        "steps of the yaw rate, and a camera that is not late",
+        homes=(Home("sensors", "imu_latency_s", Combine.ADDED),),
+        inverse=Inverse(("imu",), "stamp t - T", without_home=True),
+        plant=PlantPart.DESCRIPTION,
+        wording=Wording.LATE,
+        late=("the IMU", "the IMU"),
+    ),
+    effect(
+        "camera_latency",
+        # measured: 0.16 s (Husky) and 0.3 to 0.5 s (Warthog), poses of a lidar's scans, DRIVE
+        Parameter("s", 0.0, 1.0, 0.005),
+        "camera(t) = what it sees at t - T",
+        "pure delay",
+        EVERY,
+        (SPEED_X, SPEED_Y, HEADING),
+        "accelerations at two frequencies",
+        homes=(Home("camera", "latency_s", Combine.ADDED),),
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+        wording=Wording.LATE,
+        late=("the camera or lidar", "the camera or lidar"),
+    ),
+    effect(
+        "camera_yaw",
+        Parameter("rad", -0.3, 0.3, 0.005),
+        "camera = R(-a) (v_x, v_y): mounted turned to the left by -a, v_y grows by a v",
+        KINEMATICS,
+        EVERY,
+        (SPEED_X, SPEED_Y),
+        "straight, on more than one side slope",
+        inverse=Inverse(("odometry", "lidar", "pose"), "R(a) of what the camera measured; yaw of a pose + a"),
+        sensed_only=True,
+        plant=PlantPart.SENSORS,
+        wording=Wording.CAMERA_YAW,
+    ),
+    Effect(
+        "lever_arm",
+        tuple(
+            Parameter(
+                f"lever_{axis}_m",
+                -1.0,
+                1.0,
+                0.02,
+                homes=(Home("camera", f"lever_{axis}_m", Combine.ADDED),),
+                is_error=True,
+            )
+            for axis in ("x", "y")
+        ),
+        "v_x - l_y w, v_y + l_x w at the camera",
+        KINEMATICS,
+        EVERY,
+        (SPEED_X, SPEED_Y),
+        "turns to both sides",
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+        wording=Wording.MEASURED_POINT,
+    ),
+    effect(
+        "clock_offset",
+        Parameter("s", -0.5, 0.5, 0.005),
+        "IMU and camera stamp t' = t + T; wheels, currents and steering t: for T < 0 these are the late ones",
+        "two loggers without a common clock",
+        WITH_IMU,
+        (*MOTION, HEADING),
+        "switching manoeuvres",
+        inverse=Inverse(OTHER_LOGGER, "stamp t' - T"),
+        plant=PlantPart.SENSORS,
+        wording=Wording.LATE,
+        late=("the other sensors logged", "the wheels logged"),
+    ),
+    effect(
+        "clock_rate",
+        Parameter("ratio", -0.02, 0.02, 0.0005, as_percent=True, is_error=True),
+        "IMU and camera stamp t' = (1 + r) t",
+        "two loggers without a common clock",
+        WITH_IMU,
+        (*MOTION, HEADING),
+        "switching manoeuvres from the start of a run to its end",
+        inverse=Inverse(OTHER_LOGGER, "stamp t' / (1 + r), from the first stamp of the wheels"),
+        plant=PlantPart.SENSORS,
+    ),
+    effect(
+        "encoder_lag",
+        Parameter("s", 0.0, 0.5, 0.005),
+        "T d(measured)/dt + measured = wheel rate",
+        "first-order low-pass",
+        WITH_IMU,
+        (*MOTION, CURRENT, TURNING_CURRENT, HEADING),
+        "accelerations",
+        homes=(Home("sensors", "encoder_time_constant_s", Combine.ADDED),),
+        plant=PlantPart.DESCRIPTION,
+    ),
+)
+"""They change what a log holds of a motion; most of them nothing else."""
+
+SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
+    effect(
+        "effective_track",
+        Parameter("ratio", -0.5, 4.0, 0.02, scatter_rank=9, as_percent=True, is_error=True),
+        "w = dv / (B (1 + e))",
+        "Mandow et al., Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007",
+        SKIDDING,
+        (GYRO, SPEED_Y, HEADING),
+        "turns in place and in arcs, and an absolute heading",
+        homes=(Home("", "track_m", Combine.TIMES),),
+        twins=(("gyro_scale", HEADING),),
+        wording=Wording.TRACK,
+    ),
+    effect(
+        "turning_slip",
+        Parameter("ratio", -0.5, 0.9, 0.02),
+        "dv loses D = k q dv, shared as u_r = D a/(a+b), u_l = -D b/(a+b), a = |v_r|^(1-n), b = |v_l|^(1-n), "
+        "n = 0.5",
+        "Endo et al., IROS 2007, as in Yamauchi et al., (27) written without its singular points; the size "
+        "of D is this project's",
+        SKIDDING,
+        (*MOTION, HEADING),
+        "arcs of several radii and turns in place",
+    ),
+    effect(
+        "turning_slip_power",
+        # n from 0, in proportion to the speeds, to 1, alike; Endo et al. fitted one to each ground
+        Parameter("ratio", -0.5, 0.5, 0.02),
+        "n = 0.5 + e in turning_slip",
+        "Endo et al., IROS 2007, as in Yamauchi et al., (27)",
+        (TRACKED,),
+        (SPEED_X, ACCEL, CURRENT),
+        "arcs of several radii with much turning slip",
+        modifies="turning_slip",
+    ),
+    effect(
+        "track_narrowing",
+        # measured: 0.03 to 0.045 s^2/m^2 (Warthog on asphalt and gravel, up to 3.5 m/s and 2.8 rad/s); it
+        # goes with 1/mu^2, and would be 2 at mu = 0.1
+        Parameter("s2pm2", 0.0, 2.0, 0.02),
+        "w grows by x/(1 + x), x = c (u w)^2 / (1 + (w / w0)^2), w0 = 1 rad/s, u and w without it",
+        "lateral acceleration moves the centre of rotation ahead by s0, about c' u (turn_side_slip), and the "
+        "moment that resists turning falls with (2 s0 / L)^2: Wong, Theory of Ground Vehicles, skid-steering "
+        "at high speeds; that it builds up with w, and the bounded form, are this project's",
+        SKIDDING,
+        (GYRO, SPEED_Y, HEADING),
+        "fast arcs, and turns in place",
+        wording=Wording.FAST_TURNS,
+    ),
+    effect(
+        "turn_drag",
+        # measured: 0.02 to 0.1 s^2 (Warthog on asphalt and sand), 0.6 to 0.9 s^2 (Husky)
+        Parameter("s2", -0.1, 3.0, 0.005),
+        "u / (1 + c w^2) in place of u, about u (1 - c w^2), and that itself for c < 0; w as simulated, with "
+        "the effective track",
+        "second-order loss of speed in turns, as in the logs of Baril et al., DRIVE, ICRA 2024; the bounded "
+        "form is this project's",
+        SKIDDING,
+        (SPEED_X,),
+        "arcs of several yaw rates",
+        wording=Wording.LOSS_IN_TURNS,
+    ),
+    effect(
+        "force_slip",
+        Parameter("ratio", -0.3, 3.0, 0.02, scatter_rank=8),
+        "v = u - |u| c f",
+        "linear part of any thrust curve; Wong, Theory of Ground Vehicles",
+        EVERY,
+        (SPEED_X, SPEED_Y),
+        "slopes and accelerations",
+        plant=PlantPart.CONTACT,
+    ),
+    effect(
+        "shear_slip",
+        Parameter("ratio", 0.0, 3.0, 0.02),
+        "f = f_max (1 - K/(s l) (1 - exp(-s l/K))), with K/l = c f_max / 2 so that c is its slip per force "
+        "at the start",
+        "Janosi and Hanamoto 1961, as integrated along the contact (Yamauchi et al., (17), corrected)",
+        WITH_IMU,
+        (SPEED_X, SPEED_Y),
+        "tractions over half of f_max, of both small and large size",
+        plant=PlantPart.CONTACT,
+    ),
+    effect(
+        "slip_resistance",
+        Parameter("ratio", 0.0, 5.0, 0.05),
+        "resistance grows by b |s| W",
+        "Lyasko, Slip sinkage effect in soil-vehicle mechanics, J. Terramechanics 2010: linear in slip",
+        BOTH,
+        (CURRENT, SPEED_X),
+        "a range of slip",
+        plant=PlantPart.CONTACT,
+    ),
+    effect(
+        "rolling_resistance",
+        # without currents it shows by the slip that it takes, as a smaller wheel radius does
+        Parameter("ratio", -0.05, 0.5, 0.005, scatter_rank=7),
+        "resistance grows by c W",
+        "Wong, Theory of Ground Vehicles",
+        BOTH,
+        (CURRENT, SPEED_X),
+        "several speeds, forward and backward",
+        plant=PlantPart.CONTACT,
+    ),
+    effect(
+        "viscous_drag",
+        Parameter("nspm", 0.0, 500.0, 3.0),
+        "resistance grows by c v",
+        "viscous friction of bearings and gears",
+        BOTH,
+        (CURRENT, SPEED_X),
+        "three speeds",
+        plant=PlantPart.CONTACT,
+    ),
+)
+
+SIDEWAYS: tuple[Effect, ...] = (
+    effect(
+        "turn_side_slip",
+        # measured: 0.11 to 0.19 s (Husky; Warthog on asphalt, gravel and sand), DRIVE, as turn_drag
+        Parameter("s", -0.5, 0.5, 0.005),
+        "v_y = -c v_x w: to the outside of a turn",
+        "m (dv_y/dt + w v_x) = -K v_y with c = m/K; the centre of rotation lies c v_x ahead: Mandow et al., "
+        "Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007",
+        SKIDDING,
+        (SPEED_Y,),
+        "arcs of several speeds, to both sides",
+        wording=Wording.SIDE_SLIP,
+    ),
+    effect(
+        "side_slip_build_up",
+        # with the friction of turn_side_slip its time constant would be c, 0.2 s at the most where measured
+        Parameter("s", 0.0, 1.0, 0.01, one_sided=True),
+        "T dv_y/dt + v_y = -c v_x w",
+        "first-order lag of the lateral motion: the inertia in m (dv_y/dt + w v_x) = -K v_y",
+        SKIDDING,
+        (SPEED_Y,),
+        "steps of the yaw rate while driving",
+        modifies="turn_side_slip",
+    ),
+    effect(
+        "scrub",
+        Parameter("ratio", -0.2, 1.0, 0.005),
+        "resistance to rolling and to turning grow by k q W",
+        "scrub of skidding wheels; the form in q as EKF practice has it",
+        SKIDDING,
+        (CURRENT, TURNING_CURRENT, SPEED_X),
+        "turns",
+    ),
+    effect(
+        "side_hill_slip",
+        Parameter("ratio", 0.0, 5.0, 0.05),
+        "v_y = -c ph |v|",
+        "Yamauchi et al., (2), with the sign that gravity sets",
+        WITH_IMU,
+        (SPEED_Y,),
+        "both signs of roll",
+        plant=PlantPart.CONTACT,
+    ),
+)
+
+LOAD_AND_MOTORS: tuple[Effect, ...] = (
+    effect(
+        "payload",
+        Parameter("ratio", -0.5, 1.5, 0.02, as_percent=True),
+        "mass m (1 + p)",
+        "Newton",
+        (*BOTH, OMNI),  # of a car, whose currents are not logged, it looks like its tyres
+        (CURRENT, SPEED_X),
+        "accelerations and slopes",
+        homes=(
+            Home("", "mass_kg", Combine.TIMES),
+            Home("body", "yaw_inertia_kgm2", Combine.TIMES, optional=True),
+        ),
+        plant=PlantPart.BODY,
+        twins=(("motor_constant", SPEED_X),),
+        beside=((OMNI, "roller_friction"),),
+    ),
+    effect(
+        "motor_constant",
+        Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True, is_error=True),
+        "current (1 + q)",
+        "DC motor: current is torque over its constant",
+        BOTH,
+        (CURRENT, TURNING_CURRENT),
+        "accelerations and slopes",
+        homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
+        inverse=Inverse(("wheels",), "current / (1 + q)", without_home=True),
+        sensed_only=True,
+        plant=PlantPart.DESCRIPTION,
+        twins=(("payload", SPEED_X),),
+    ),
+    effect(
+        "motor_drift",
+        Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True),
+        "current (1 + q t / 60 s) from the start of a run",
+        "remanence of a magnet that warms; linear over a run",
+        BOTH,
+        (CURRENT, TURNING_CURRENT),
+        "long runs",
+        inverse=Inverse(("wheels",), "current / (1 + q t / 60 s), from the first stamp of the wheels"),
+        sensed_only=True,
+        plant=PlantPart.SENSORS,
+    ),
+    effect(
+        "current_offset",
+        # zero of a Hall sensor: up to 2 % of a range of 50 to 200 A
+        Parameter("a", -4.0, 4.0, 0.05),
+        "current of each motor + b: n b in the sum of n motors, nothing in the difference of the sides",
+        "zero error of a current sensor",
+        BOTH,
+        (CURRENT,),
+        "standstill, and driving forward and backward",
+        inverse=Inverse(("wheels",), "current of each motor - b"),
+        sensed_only=True,
+        plant=PlantPart.SENSORS,
+    ),
+)
+
+LAW = "this project's; docs/measured_slip.md has how it holds on measured runs"
+
+OMNI_WHEELS: tuple[Effect, ...] = (
+    effect(
+        "roller_friction",
+        Parameter("ratio", 0.0, 1.5, 0.01),
+        "across each wheel G = -r n W v_across / U, beside F = C n W (u - v_along) / U along it",
+        LAW,
+        (OMNI,),
+        (SPEED_X, SPEED_Y, HEADING, GYRO, CURRENT),
+        "straight drives in several directions",
+    ),
+    Effect(
+        "load_shift",
+        # measured: 16 mm ahead by weights (Robotino)
+        tuple(
+            Parameter(
+                f"load_shift_{axis}_m",
+                -0.05,
+                0.05,
+                0.001,
+                homes=(Home("body", f"com_{axis}_m", Combine.ADDED),),
+            )
+            for axis in ("x", "y")
+        ),
+        "n_i = (1 + 2 c . p_i / d^2) / 3 of wheels at p_i, d from the middle, with the centre of mass c",
+        "balance of moments",
+        (OMNI,),
+        (SPEED_X, SPEED_Y, HEADING, GYRO),
+        "straight drives in several directions over ground on which the rollers resist",
+        wording=Wording.CENTRE_OF_MASS,
+    ),
+    effect(
+        "wheel_distance",
+        # a tape measures it to a few per cent; measured turns: 0.120 to 0.128 m of 0.125 m (Robotino)
+        Parameter("ratio", -0.1, 0.1, 0.005, as_percent=True, is_error=True),
+        "w = mean wheel speed / (d (1 + e))",
+        KINEMATICS,
+        (OMNI,),
+        (HEADING, GYRO),
+        "turns",
+        homes=(Home("", "track_m", Combine.TIMES), Home("", "wheelbase_m", Combine.TIMES)),
+        wording=Wording.WHEEL_DISTANCE,
+    ),
+    effect(
+        "camera_scale",
+        Parameter("ratio", -0.3, 0.3, 0.01, as_percent=True, is_error=True),
+        "positions, and speeds over ground, (1 + s) x what they are",
+        "a camera above measures in pixels",
+        (OMNI,),
+        (SPEED_X, SPEED_Y),
+        "straight drives, and turns to part it from the radius of the wheels",
+        inverse=Inverse(("pose",), "positions / (1 + s)"),
+        sensed_only=True,
+    ),
+)
+"""What makes omni robots slip, and what looks like it."""
+
+SINGLE_TRACK = "linear single-track model: Rajamani, Vehicle Dynamics and Control"
+
+CAR: tuple[Effect, ...] = (
+    effect(
+        "steering_offset_front",
+        Parameter("rad", -0.3, 0.3, 0.005),
+        "d = measured angle + d0",
+        KINEMATICS,
+        (BICYCLE,),
+        (GYRO, HEADING),
+        "several speeds and standstill",
+        inverse=Inverse(("steering",), "angle + d0"),
+    ),
+    effect(
+        "understeer",
+        # cars have 0.001 to 0.006 s^2/m (1 to 5 deg per g over 9.8 m/s^2); soft tyres on soil more.  Below
+        # the lower bound the front axle of a light robot would be stiffer than rigid
+        Parameter("s2pm", -0.01, 0.1, 0.001),
+        "w = v tan d / (L + K v |v|): the front axle yields by K L / (m a) rad/N more, a the distance of the "
+        "centre of mass from the rear axle",
+        "understeer gradient, Gillespie, Fundamentals of Vehicle Dynamics: tyres and compliance of the "
+        "steering alike",
+        (BICYCLE,),
+        (GYRO, HEADING),
+        "arcs of several speeds, to both sides",
+        wording=Wording.UNDERSTEER,
+    ),
+    effect(
+        "cornering_stiffness",
+        # load, pressure and ground: a third on loose soil of what it is on firm ground (Wong, Theory of
+        # Ground Vehicles)
+        Parameter("ratio", -0.7, 2.0, 0.02, as_percent=True, is_error=True),
+        "stiffness of both axles x (1 + e); so does a load of 1 / (1 + e) - 1, with nothing else to show it",
+        SINGLE_TRACK,
+        (BICYCLE,),
+        (SPEED_Y, GYRO),
+        "fast arcs to both sides, side slopes and steps of the steering",
+        homes=(Home("", "front_cornering_npr", Combine.TIMES), Home("", "rear_cornering_npr", Combine.TIMES)),
+    ),
+)
+"""What makes a car-like robot turn otherwise than its wheels point."""
+
+LIBRARY: tuple[Effect, ...] = (
+    *WHEELS_AND_STEERING,
+    *SENSORS,
+    *SLIP_AND_RESISTANCE,
+    *LOAD_AND_MOTORS,
+    *SIDEWAYS,
+    *OMNI_WHEELS,
+    *CAR,
+)
+"""Every known effect.  The order is no ranking, but results list effects in it."""
+
+TILT_OFFSETS: tuple[Parameter, ...] = (
+    Parameter("pitch_offset_rad", -math.inf, math.inf, 0.005, scatter_rank=3),
+    Parameter("roll_offset_rad", -math.inf, math.inf, 0.005, scatter_rank=4),
+)
+"""Errors of the measured tilt.  They belong to no effect, and are only ever estimated run by run."""
+
+PARAMETER: dict[str, Parameter] = {p.name: p for effect in LIBRARY for p in effect.parameters}
+"""Parameters of the library by name."""
+
+BOUNDS: dict[str, tuple[float, float]] = {name: (p.low, p.high) for name, p in PARAMETER.items()}
+"""Physical limits of each parameter of the library."""
+
+STEPS: dict[str, float] = {p.name: p.step for p in (*PARAMETER.values(), *TILT_OFFSETS)}
+"""Change of a parameter over which its sensitivity is taken."""
+
+NUISANCES: tuple[str, ...] = tuple(
+    p.name
+    for p in sorted((*PARAMETER.values(), *TILT_OFFSETS), key=lambda p: p.scatter_rank)
+    if p.scatter_rank
+)
+"""Parameters that scatter from run to run, in the order in which they are drawn."""
+
+SENSED_ONLY: tuple[str, ...] = tuple(
+    p.name for effect in LIBRARY if effect.sensed_only for p in effect.parameters
+)
+"""Parameters that change what sensors measure, and not the motion of the body."""
+
+ONE_SIDED: tuple[str, ...] = tuple(name for name, p in PARAMETER.items() if p.one_sided)
+"""Parameters whose sensitivity is taken towards the positive side only."""
+
+DEPRECATED: dict[str, str] = {old: p.name for p in PARAMETER.values() for old in p.deprecated}
+"""Former names of parameters, and the present ones."""
+
+
+def effect_named(name: str) -> Effect:
+    """Return the effect of a name, an alias or a former name.
+
+    Raises
+    ------
+    ConfigError
+        for an unknown name.
+
+    Examples
+    --------
+    >>> effect_named("encoder_scale").name, effect_named("lever_arm").parameters[1].name
+    ('wheel_radius', 'lever_y_m')
+    """
+    for effect in LIBRARY:
+        if name in (effect.name, *effect.aliases, *effect.deprecated):
+            return effect
+    raise ConfigError(f"effect {name!r} is unknown: use one of {', '.join(e.name for e in LIBRARY)}")
+
+
+def library_of(drive: str) -> tuple[Effect, ...]:
+    """Return the effects that apply to robots of a drive."""
+    return tuple(effect for effect in LIBRARY if drive in effect.drives)
+
+
+def chosen_effects(drive: str, names: Collection[str]) -> tuple[Effect, ...]:
+    """Return effects by their names, in the order of the catalogue.
+
+    Raises
+    ------
+    ConfigError
+        if one is unknown, or does not apply to robots of a drive.
+    """
+    chosen = [effect_named(name) for name in names]
+    for effect in chosen:
+        if drive not in effect.drives:
+            raise ConfigError(f"effect {effect.name} does not apply to a robot with the drive {drive!r}")
+    return tuple(effect for effect in LIBRARY if effect in chosen)
+
+
+def showing(drive: str, known: Collection[str] = ()) -> tuple[Effect, ...]:
+    """Return those effects of a drive that runs may show, with the parameters that are known already.
+
+    Examples
+    --------
+    >>> {e.name for e in library_of("omni")} - {e.name for e in showing("omni")}
+    {'payload'}
+    >>> showing("omni", ["roller_friction_ratio"]) == library_of("omni")
+    True
+    """
+
+    def shows(effect: Effect) -> bool:
+        others = [effect_named(name) for of, name in effect.beside if of == drive]
+        return all(any(p.name in known for p in other.parameters) for other in others)
+
+    return tuple(effect for effect in library_of(drive) if shows(effect))
+
+
+def parameters_of(drive: str) -> dict[str, Parameter]:
+    """Return the parameters, by name, of all effects that apply to robots of a drive.
+
+    Examples
+    --------
+    >>> parameters_of("skid_steer")["effective_track_ratio"].high
+    4.0
+    """
+    return {parameter.name: parameter for effect in library_of(drive) for parameter in effect.parameters}
+
+
+def nuisances_of(drive: str) -> tuple[str, ...]:
+    """Return the parameters that scatter from run to run on robots of a drive, in the order of drawing.
+
+    Examples
+    --------
+    >>> set(NUISANCES) - set(nuisances_of("swerve"))
+    {'effective_track_ratio'}
+    """
+    own = {*parameters_of(drive), *(p.name for p in TILT_OFFSETS)}
+    return tuple(name for name in NUISANCES if name in own)
+
+
+def in_plant(*parts: PlantPart) -> tuple[str, ...]:
+    """Return the parameters that act in some parts of the dynamic simulation.
+
+    Examples
+    --------
+    >>> in_plant(PlantPart.BODY)
+    ('wheel_radius_ratio', 'one_sided_radius_ratio', 'payload_ratio')
+    """
+    return tuple(p.name for effect in LIBRARY if effect.plant in parts for p in effect.parameters)
+
+
+def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:
+    """Return the parameters that all ``NAME=VALUE`` set together; several values are separated by commas.
+
+    Raises
+    ------
+    ConfigError
+        for an unknown name, an effect that does not apply to the robot or is given twice, a value that is no
+        number, too few or too many of them, or one out of bounds.
+
+    Examples
+    --------
+    >>> read_effects_of(["wheel_radius=0.03", "lever_arm=0.1,-0.05"], "skid_steer")
+    {'wheel_radius_ratio': 0.03, 'lever_x_m': 0.1, 'lever_y_m': -0.05}
+    """
+    acting: dict[str, float] = {}
+    for text in texts:
+        name, _, given = text.partition("=")
+        effect = effect_named(name.strip())
+        if drive not in effect.drives:
+            raise ConfigError(f"effect {effect.name} does not apply to a robot with the drive {drive!r}")
+        try:
+            values = [float(part) for part in given.split(",")]
+        except ValueError:
+            values = []
+        required = ",".join(p.name for p in effect.parameters)
+        if len(values) != len(effect.parameters):
+            raise ConfigError(f"--effect is {text!r}; {effect.name}=VALUE with {required} is required")
+        for parameter, value in zip(effect.parameters, values, strict=True):
+            if not parameter.low <= value <= parameter.high:
+                raise ConfigError(
+                    f"effect {effect.name}: {parameter.name} is {value:g}, "
+                    f"{parameter.low:g} to {parameter.high:g} is accepted"
+                )
+            if parameter.name in acting:
+                raise ConfigError(f"effect {name!r} is given twice")
+            acting[parameter.name] = value
+    return acting
+
+
+PARAMETERS: tuple[str, ...] = (*PARAMETER, *(p.name for p in TILT_OFFSETS))
+"""Order of the numbers in the vector."""
+
+INDEX: dict[str, int] = {name: i for i, name in enumerate(PARAMETERS)}
+"""Place of each parameter in the vector."""
+
+EFFECTS = record(dict.fromkeys(PARAMETERS, float))
+"""The vector as a record: ``vector.view(EFFECTS)[0]`` has the parameters by name."""
+
+
+def vector_of(values: Mapping[str, float]) -> Array:
+    """Return the numbers (len(PARAMETERS),) of a simulation, 0 where none is given.
+
+    Raises
+    ------
+    ConfigError
+        for an unknown parameter, or a value that is not finite.
+    """
+    vector = np.zeros(len(PARAMETERS))
+    for name, value in values.items():
+        if name not in INDEX or not math.isfinite(value):
+            raise ConfigError(
+                f"effects: {name} is {value!r}; a finite number of a known parameter is required"
+            )
+        vector[INDEX[name]] = value
+    return vector
+
+
+SCHEMA = 1
+"""Version of the section that is read and written."""
+
+NOT_EFFECTS = ("schema", "covariance", "region")
+"""Keys of the section that name no parameter; the region is read by :mod:`terrain.robots.region`."""
+
+ROUNDING = 1e-5
+"""A covariance is written with seven digits: correlations may miss symmetry and sign by as much."""
+
+
+def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict[str, float]:
+    """Return the values of effects by parameter, checked.
+
+    Parameters
+    ----------
+    place : what messages call it
+    values : by parameter
+    drive : of the robot
+
+    Raises
+    ------
+    ConfigError
+        for a parameter that is unknown or of an effect that does not apply to the robot, or a value that is
+        no finite number within its bounds.
+    """
+    known = parameters_of(drive)
+    for name, value in values.items():
+        if name not in known:
+            if name in PARAMETER:
+                raise ConfigError(f"{place}: {name} does not apply to a robot with the drive {drive!r}")
+            raise ConfigError(f"{place}: {name} is no parameter of an effect (known: {', '.join(known)})")
+        low, high = known[name].low, known[name].high
+        plain = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+        if not (plain and math.isfinite(value) and low <= value <= high):
+            raise ConfigError(f"{place}: {name} is {value!r}, a number from {low:g} to {high:g} is required")
+    return {name: float(value) for name, value in values.items()}
+
+
+def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, float], Array]:
+    """Return the values of a section by parameter, and their covariance (n, n) in the same order.
+
+    Parameters
+    ----------
+    place : file and section, as messages name them
+    described : what the file holds
+    drive : of the robot
+
+    Returns
+    -------
+    values : as :func:`checked_effects` does
+    covariance : NaN where the section has none
+
+    Raises
+    ------
+    ConfigError
+        if the schema is newer than this version, a parameter is not accepted, or the covariance is no
+        covariance of the parameters that are given.
+
+    Examples
+    --------
+    >>> entry = {"value": 0.1, "unit": "rad", "source": "by hand"}
+    >>> read_effects("mine.yaml: effects", {"schema": 1, "camera_yaw_rad": entry}, "swerve")
+    ({'camera_yaw_rad': 0.1}, array([[nan]]))
+    """
+    if not isinstance(described, dict) or "schema" not in described:
+        raise ConfigError(f"{place} is {described!r}, a mapping with schema and parameters is required")
+    schema = described["schema"]
+    if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
+        raise ConfigError(f"{place}: schema is {schema!r}, {SCHEMA} is required")
+    if schema > SCHEMA:
+        raise ConfigError(
+            f"{place}: schema {schema} is newer than this version of terrain, which reads {SCHEMA}"
+        )
+    entries = _renamed(place, {k: v for k, v in described.items() if k not in NOT_EFFECTS})
+    known = parameters_of(drive)
+    checked_effects(place, dict.fromkeys((name for name in entries if name not in known), 0.0), drive)
+    values = {
+        name: number(f"{place}: {name}", entry, known[name].unit, -math.inf)
+        for name, entry in entries.items()
+    }
+    values = checked_effects(place, values, drive)
+    if "covariance" not in described:
+        return values, np.full((len(values), len(values)), np.nan)
+    return values, _covariance(f"{place}: covariance", described["covariance"], list(values))
+
+
+def _renamed(place: str, entries: dict[Any, Any]) -> dict[str, Any]:
+    """Return entries by the present names of their parameters."""
+    renamed: dict[str, Any] = {}
+    for given, entry in entries.items():
+        name = DEPRECATED.get(str(given), str(given))
+        if name in renamed:
+            raise ConfigError(f"{place}: {name} is given twice, once by its former name")
+        renamed[name] = entry
+    return renamed
+
+
+def _covariance(place: str, described: Any, names: list[str]) -> Array:
+    if isinstance(described, dict):
+        described = _renamed(place, described)
+    check_keys(place, described, names)
+    for name in names:
+        if isinstance(described[name], dict):
+            described[name] = _renamed(f"{place}: {name}", described[name])
+        check_keys(f"{place}: {name}", described[name], names)
+    rows = [[described[row][column] for column in names] for row in names]
+    for row, entries in zip(names, rows, strict=True):
+        for column, entry in zip(names, entries, strict=True):
+            if isinstance(entry, bool) or not isinstance(entry, int | float) or not math.isfinite(entry):
+                raise ConfigError(f"{place}: {row}, {column} is {entry!r}, a finite number is required")
+    return checked_covariance(place, np.array(rows, dtype=float).reshape(len(names), len(names)))
+
+
+def checked_covariance(place: str, covariance: Array) -> Array:
+    """Return a covariance (n, n), read-only and symmetric to the last bit.
+
+    Raises
+    ------
+    ConfigError
+        if it is no square of finite numbers, is not symmetric, or gives some combination a negative variance.
+
+    Examples
+    --------
+    >>> checked_covariance("covariance", np.array([[1.0, 2.0], [2.0, 1.0]]))
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: covariance is not positive semi-definite: its correlations have eigenvalue -1
+    """
+    if (
+        covariance.ndim != 2
+        or covariance.shape[0] != covariance.shape[1]
+        or not np.isfinite(covariance).all()
+    ):
+        raise ConfigError(f"{place} has the shape {covariance.shape}; a square of finite numbers is required")
+    variance = covariance.diagonal()
+    if (variance < 0).any():
+        raise ConfigError(f"{place} is not positive semi-definite: it has the variance {variance.min():g}")
+    std = np.sqrt(variance)
+    scale = np.where(std > 0, std, 1.0)
+    correlation = covariance / scale[:, None] / scale
+    skew = float(np.abs(correlation - correlation.T).max(initial=0.0))
+    if skew > ROUNDING:
+        raise ConfigError(f"{place} is not symmetric: two of its correlations differ by {skew:.3g}")
+    least = float(np.linalg.eigvalsh((correlation + correlation.T) / 2).min(initial=0.0))
+    if least < -ROUNDING:
+        raise ConfigError(
+            f"{place} is not positive semi-definite: its correlations have eigenvalue {least:.3g}"
+        )
+    return read_only((covariance + covariance.T) / 2)

@@ -1,0 +1,745 @@
+"""Extended robots: a description with effects, and what filters make of it.
+
+The catalogue (:mod:`terrain.effects`) states of each effect where it goes.  It has a home in the description,
+as a wheel's radius has, or an inverse on samples, as a gyro's scale has, or neither, as those of the ground
+and of turning, which filters do not model.  Whoever reads a run and its robot corrects both, once::
+
+    run, robot = correct(run, robot)
+
+and filters take what is corrected.  A live chain gives its estimator the robot and the
+:class:`Correction` of :func:`correct_live`.  Where a description lacks the section of a home, samples are
+corrected instead if the effect has an inverse.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import yaml
+
+from terrain.angles import unwrapped, wrapped
+from terrain.effects import (
+    OTHER_LOGGER,
+    PARAMETER,
+    SCHEMA,
+    Home,
+    Parameter,
+    checked_covariance,
+    checked_effects,
+    parameters_of,
+)
+from terrain.errors import ConfigError, OutsideRegionWarning
+from terrain.files.atomic import atomic_write
+from terrain.files.documents import parse_yaml, read_yaml
+from terrain.kinematics.camera import turned
+from terrain.kinematics.wheels import no_slip_twist
+from terrain.records import Array, RunLog, Stream
+from terrain.robots import BicycleRobot, Region, Robot, description_file, robot_from
+from terrain.robots.region import Range, outside, widened
+
+AnyRobot = TypeVar("AnyRobot", bound=Robot)
+"""What is corrected keeps its drive."""
+
+
+def apply_homes(robot: AnyRobot, names: Collection[str] = tuple(PARAMETER)) -> AnyRobot:
+    """Return a robot with those of its effects that have a home in its description applied there.
+
+    Parameters
+    ----------
+    robot : any; without effects it is returned as it is
+    names : parameters that are applied, as far as the robot has them and the section of their home
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> extended = replace(load_robot("agrimaro"), effects={"payload_ratio": 0.1, "camera_yaw_rad": 0.02})
+    >>> robot = apply_homes(extended)
+    >>> round(robot.mass_kg, 3), dict(robot.effects)
+    (99.0, {'camera_yaw_rad': 0.02})
+    """
+    applied = []
+    for name, value in robot.effects.items():
+        homes = PARAMETER[name].homes
+        if name in names and homes and all(home.optional or _has_section(robot, home) for home in homes):
+            for home in homes:
+                robot = _apply(robot, home, value)
+            applied.append(name)
+    return _without(robot, applied)
+
+
+def corrected(robot: AnyRobot) -> AnyRobot:
+    """Return the robot that filters take, together with a log that is :func:`corrected_log`.
+
+    Effects with a home in the description are applied there; of the others those are left that have no
+    inverse on samples.  A robot without effects is returned as it is, and so is one that was corrected.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> robot = corrected(replace(load_robot("agrimaro"), effects={"wheel_radius_ratio": 0.05}))
+    >>> round(robot.wheel_radius_m, 3), dict(robot.effects)
+    (0.21, {})
+    """
+    return _without(apply_homes(robot), [name for name in robot.effects if PARAMETER[name].inverse])
+
+
+def check_corrected(robot: Robot) -> None:
+    """Refuse a robot with effects that :func:`corrected` would apply or that samples would be corrected for.
+
+    Raises
+    ------
+    ConfigError
+        if there are any: a filter would take them for motion.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> check_corrected(replace(load_robot("agrimaro"), effects={"camera_yaw_rad": 0.02}))
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: robot agrimaro: camera_yaw_rad is not corrected, neither in it nor in its log
+    """
+    left = set(robot.effects) - set(corrected(robot).effects)
+    if left:
+        raise ConfigError(
+            f"robot {robot.name}: {', '.join(sorted(left))} is not corrected, neither in it nor in its log"
+        )
+
+
+def _has_section(robot: Robot, home: Home) -> bool:
+    return not home.section or robot.describes(home.section)
+
+
+def _apply(robot: AnyRobot, home: Home, value: float) -> AnyRobot:
+    """Return a robot with one number of its description changed; the same robot if it lacks the section."""
+    if not _has_section(robot, home):
+        return robot
+    part: Any = robot.parts[home.section] if home.section else robot
+    if home.scaled_by:
+        value *= getattr(part, home.scaled_by)
+    part = replace(part, **{home.field: home.combine.apply(getattr(part, home.field), value)})
+    changed: AnyRobot = robot.with_parts(**{home.section: part}) if home.section else part
+    return changed
+
+
+def _without(robot: AnyRobot, names: Collection[str]) -> AnyRobot:
+    kept = [i for i, name in enumerate(robot.effects) if name not in names]
+    if len(kept) == len(robot.effects):
+        return robot
+    effects = list(robot.effects.items())
+    return replace(
+        robot, effects=dict(effects[i] for i in kept), effects_cov=robot.effects_cov[np.ix_(kept, kept)]
+    )
+
+
+OUTSIDE_S = 1.0
+"""Time outside after which a live drive is: shorter ones, as of a bump, are in the percentiles' tails."""
+
+MAX_STEP_S = 0.1
+"""Longest time that a live sample stands for: after a gap nothing is known of what was driven."""
+
+PERCENTILES = (1.0, 99.0)
+"""Edges of a range: single samples, as of a start or a wheel that spun, are not what was validated."""
+
+
+def region_of(runs: Sequence[RunLog], robot: Robot) -> Region:
+    """Return the ranges of wheel speed, yaw rate by the wheels and slope of runs, and their terrains.
+
+    Parameters
+    ----------
+    runs : of the robot, as measured
+    robot : for its geometry; effects are not applied, so that a run can be judged before it is corrected
+
+    Examples
+    --------
+    >>> from terrain.records import Stream
+    >>> from terrain.robots import load_robot
+    >>> wheels = Stream([0.0, 0.1], [[0.5, 0.9], [0.5, 0.9]], ("speed_left_mps", "speed_right_mps"))
+    >>> region = region_of([RunLog("a", "husky", {"wheels": wheels})], load_robot("husky"))
+    >>> region.wheel_speed_mps, region.grade_rad
+    ((0.7, 0.7), None)
+    """
+    driven = [_driven(run, robot) for run in runs]
+    speed, turn, grade = (np.concatenate([each[i] for each in driven] or [np.empty(0)]) for i in range(3))
+    terrains = sorted({name for run in runs for name in run.terrains})
+    return Region(_range(speed), _range(turn), _range(grade), tuple(terrains))
+
+
+def warn_outside(run: RunLog, robot: Robot) -> None:
+    """Warn, in one sentence, where a run leaves the region that the robot's effects were validated in.
+
+    Parameters
+    ----------
+    run : as measured, or simulated
+    robot : nothing is compared where its description has no region
+
+    Warns
+    -----
+    OutsideRegionWarning
+        with the ranges of the run and those validated.
+    """
+    if robot.region is None:
+        return
+    beyond = outside(robot.region, region_of([run], robot))
+    if beyond:
+        warn_of(f"run {run.run_id}", robot, beyond)
+
+
+def warn_of(drive: str, robot: Robot, beyond: str) -> None:
+    """Warn that a drive leaves the region, ``beyond`` as :func:`terrain.robots.region.outside` returns it."""
+    warnings.warn(
+        f"{drive} leaves the region that the effects of robot {robot.name} were validated in: {beyond}",
+        OutsideRegionWarning,
+        stacklevel=4,
+    )
+
+
+class RegionMonitor:
+    """Warns, once, when a robot that is driven live has been outside its region for :data:`OUTSIDE_S`.
+
+    Parameters
+    ----------
+    robot : whose region it is; without one nothing is compared
+
+    Attributes
+    ----------
+    compares : whether samples are compared: there is a region, and nothing was warned of yet
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot, self._outside_s, self._last_s = robot, 0.0, math.inf
+        region = robot.region
+        ranges = {} if region is None else region._asdict()
+        self._limits = tuple(
+            widened(name, ranges[name]) if ranges.get(name) is not None else (-math.inf, math.inf)
+            for name in ("wheel_speed_mps", "yaw_rate_radps")
+        )
+        self.compares = region is not None
+
+    def step(self, time_s: float, wheel_speed_mps: float, yaw_rate_radps: float) -> None:
+        """Take in a sample: mean wheel speed and yaw rate; NaN is inside."""
+        if not self.compares:
+            return
+        (slow, fast), (right, left) = self._limits
+        step_s = min(max(time_s - self._last_s, 0.0), MAX_STEP_S)
+        self._last_s = time_s
+        beyond = wheel_speed_mps < slow or wheel_speed_mps > fast
+        if not (beyond or yaw_rate_radps < right or yaw_rate_radps > left):
+            return
+        self._outside_s += step_s
+        if self._outside_s >= OUTSIDE_S and self._robot.region is not None:
+            self.compares = False
+            now = Region((wheel_speed_mps,) * 2, (yaw_rate_radps,) * 2, None, ())
+            warn_of(f"the drive at {time_s:.1f} s", self._robot, outside(self._robot.region, now))
+
+
+def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
+    """Return mean wheel speed (n,), yaw rate by the wheels (n,) and slope (m,); empty where not measured.
+
+    Of omni wheels, which drive in three directions, the speed is what they would roll in any.
+    """
+    none = np.empty(0)
+    wheels, imu = run.streams.get("wheels"), run.streams.get("imu")
+    grade = -imu.channel("pitch_rad") if imu is not None and "pitch_rad" in imu.channels else none
+    if wheels is None or not set(robot.rate_channels) <= set(wheels.channels):
+        return none, none, grade
+    rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels])
+    if robot.rate_channels[0].startswith("motor_"):
+        rates = rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
+    directions, speed = robot.wheel_directions_rad, rates.mean(axis=1)
+    if isinstance(robot, BicycleRobot):
+        return speed, _turned(run, robot, wheels.time_s, speed), grade
+    if robot.steered:
+        steering = run.streams.get("steering")
+        if steering is None:
+            return speed, none, grade
+        columns = [
+            np.interp(wheels.time_s, steering.time_s, unwrapped(steering.channel(name))) - zero
+            for name, zero in zip(robot.steer_channels, robot.steering_zeros_rad, strict=True)
+        ]
+        directions = np.column_stack(columns)
+    twist, _ = no_slip_twist(robot.wheel_positions_m, directions, rates, robot.on_omni_wheels)
+    return np.hypot(twist[:, 0], twist[:, 1]) if robot.on_omni_wheels else speed, twist[:, 2], grade
+
+
+def _turned(run: RunLog, robot: BicycleRobot, time_s: Array, speed_mps: Array) -> Array:
+    """Return the yaw rate (n,) of a car-like robot without slip; empty without its steering."""
+    steering = run.streams.get("steering")
+    if steering is None or not set(robot.steer_channels) <= set(steering.channels):
+        return np.empty(0)
+    angle = np.interp(time_s, steering.time_s, steering.channel(robot.steer_channels[0]))
+    return np.asarray(speed_mps * np.tan(angle) / robot.wheelbase_m)
+
+
+def _range(values: Array) -> Range | None:
+    known = values[np.isfinite(values)]
+    if not known.size:
+        return None
+    low, high = np.percentile(known, PERCENTILES)
+    return float(low), float(high)
+
+
+def correct(run: RunLog, robot: AnyRobot) -> tuple[RunLog, AnyRobot]:
+    """Return a log and its robot without the effects that can be taken off them, as filters take both.
+
+    A robot without effects, or one that was corrected, is returned as it is, and so is its log.
+
+    Warns
+    -----
+    OutsideRegionWarning
+        if the run leaves the region that the robot's effects were validated in.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> robot = replace(load_robot("husky"), effects={"wheel_radius_ratio": 0.1})
+    >>> wheels = Stream([0.0, 0.1], [[1.0], [1.0]], ("speed_left_mps",))
+    >>> run, robot = correct(RunLog("a", "husky", {"wheels": wheels}), robot)
+    >>> run.streams["wheels"].values[:, 0], dict(robot.effects)
+    (array([1.1, 1.1]), {})
+    """
+    warn_outside(run, robot)
+    return corrected_log(run, robot), corrected(robot)
+
+
+def correct_live(robot: AnyRobot) -> tuple[AnyRobot, Correction | None]:
+    """Return a robot as live filters take it, and what corrects the samples that come; None without effects.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> correct_live(load_robot("husky"))[1] is None
+    True
+    """
+    return corrected(robot), Correction(robot) if robot.effects else None
+
+
+def corrected_log(run: RunLog, robot: Robot) -> RunLog:
+    """Return a log as the robot would have written it without the effects that have an inverse on samples.
+
+    Parameters
+    ----------
+    run : a log of the robot, as measured
+    robot : with its effects; without any the log is returned as it is
+
+    Notes
+    -----
+    Commands, estimates and labels are left alone; of a simulated truth the wheels' rates become those of
+    wheels of one radius.
+    """
+    if not robot.effects:
+        return run
+    wheels = run.streams.get("wheels")
+    correction = Correction(robot, float(wheels.time_s[0]) if wheels is not None and len(wheels) else 0.0)
+    streams = {
+        name: Stream(*correction(name, stream.channels, stream.time_s, stream.values), stream.channels)
+        for name, stream in run.streams.items()
+    }
+    delay_s = robot.effects.get("yaw_delay_s", 0.0)
+    if delay_s and "wheels" in streams:
+        streams["wheels"] = _delay_turning(streams["wheels"], delay_s)
+    return replace(run, streams=streams)
+
+
+def _delay_turning(wheels: Stream, delay_s: float) -> Stream:
+    """Delay the difference of the sides' wheel speeds, and leave their mean."""
+    names = [f"speed_{side}_mps" for side in ("left", "right")]
+    if not set(names) <= set(wheels.channels):
+        return wheels
+    left, right = (wheels.channel(name) for name in names)
+    half = 0.5 * (right - left)
+    known = np.isfinite(half)
+    if not known.any():
+        return wheels
+    change = np.interp(wheels.time_s - delay_s, wheels.time_s[known], half[known]) - half
+    values = np.array(wheels.values)
+    values[:, wheels.channels.index(names[0])] -= change
+    values[:, wheels.channels.index(names[1])] += change
+    return Stream(wheels.time_s, values, wheels.channels)
+
+
+class Correction:
+    """Takes a robot's effects off samples, a run in one block or block by block.
+
+    The integral of the gyro as it is, bias and scale included, is assumed to be the fused yaw.
+
+    Parameters
+    ----------
+    robot : with its effects
+    start_s : first stamp of the wheels, from which drifts count; the first stamp that comes by default
+    """
+
+    def __init__(self, robot: Robot, start_s: float = math.nan) -> None:
+        self._start_s = start_s
+        self._p = dict.fromkeys(PARAMETER, 0.0) | dict(robot.effects)
+        applied = apply_homes(robot)
+        homeless = applied.effects
+        self._gyro_bias = applied.completed.sensors.gyro_bias_z_radps
+        self._gyro_offset = homeless.get("gyro_bias_radps", 0.0)
+        self._accel_offset = homeless.get("accel_bias_mps2", 0.0)
+        self._imu_late_s = homeless.get("imu_latency_s", 0.0)
+        self._current = 1.0 + homeless.get("motor_constant_ratio", 0.0)
+        half = 0.5 * self._p["one_sided_radius_ratio"]
+        self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
+        self._scale = {wheel: 1.0 + self._p.get(f"wheel_scale_{wheel}_ratio", 0.0) for wheel in robot.wheels}
+        self._has_backlash = self._p["steering_backlash_rad"] > 0.0
+        self._steered, n = robot.steer_channels, len(robot.steer_channels)
+        self._follower, self._angle, self._yaw = np.full(n, np.nan), np.full(n, np.nan), (np.nan, np.nan)
+        self._inverses: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
+            "wheels": self._wheels,
+            "steering": self._steering,
+            "imu": self._imu,
+            "odometry": self._camera,
+            "lidar": self._camera,
+            "pose": self._pose,
+            "truth": self._true_wheels,
+        }
+
+    def __call__(
+        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array
+    ) -> tuple[Array, Array]:
+        """Return stamps (k,) and values (k, c) of the samples that follow on those given before.
+
+        Parameters
+        ----------
+        name, channels : of the stream
+        time_s, values : (k,), (k, c) as measured
+        """
+        if math.isnan(self._start_s):
+            finite = time_s[np.isfinite(time_s)]
+            if not finite.size:
+                return time_s, values
+            self._start_s = float(finite[0])
+        if name in self._inverses:
+            values = np.array(values, dtype=float)
+            with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
+                self._inverses[name](channels, np.asarray(time_s), values)
+        return self._stamps(name, time_s), values
+
+    def _stamps(self, name: str, time_s: Array) -> Array:
+        p = self._p
+        if name == "imu" and self._imu_late_s:
+            time_s = time_s - self._imu_late_s
+        if name in OTHER_LOGGER and (p["clock_offset_s"] or p["clock_rate_ratio"]):
+            since_s = (time_s - self._start_s - p["clock_offset_s"]) / (1.0 + p["clock_rate_ratio"])
+            return np.asarray(self._start_s + since_s)
+        if name == "steering" and p["steering_delay_s"]:
+            return np.asarray(time_s + p["steering_delay_s"])
+        return time_s
+
+    def _wheels(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        warm = 1.0 + self._p["motor_drift_ratio"] * (time_s - self._start_s) / 60.0
+        wheel_speed = 1.0 + self._p["wheel_radius_ratio"]
+        for i, channel in enumerate(channels):
+            quantity, _, rest = channel.partition("_")
+            wheel = rest.rpartition("_")[0]
+            if quantity == "current":
+                values[:, i] -= self._p["current_offset_a"]
+                values[:, i] /= self._current * warm
+            elif wheel in self._side and quantity in ("motor", "speed"):
+                metres = wheel_speed if quantity == "speed" else 1.0
+                values[:, i] *= self._side[wheel] * self._scale[wheel] * metres
+
+    def _true_wheels(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        for i, channel in enumerate(channels):
+            quantity, _, rest = channel.partition("_")
+            wheel = rest.rpartition("_")[0]
+            if quantity == "wheel" and wheel in self._side:
+                values[:, i] *= self._side[wheel]
+
+    def _steering(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        if self._p["steering_offset_front_rad"] and "angle_front_rad" in channels:
+            values[:, channels.index("angle_front_rad")] += self._p["steering_offset_front_rad"]
+        if not self._has_backlash:
+            return
+        half = self._p["steering_backlash_rad"]
+        for wheel, name in enumerate(self._steered):
+            if name not in channels:
+                continue
+            column = channels.index(name)
+            angles = unwrapped(np.concatenate([[self._angle[wheel]], values[:, column]]))[1:]
+            follower = self._follower[wheel]
+            known = np.isfinite(angles)
+            for k in np.flatnonzero(known).tolist():
+                angle = float(angles[k])
+                follower = angle if math.isnan(follower) else min(max(follower, angle - half), angle + half)
+                self._angle[wheel] = angle
+                values[k, column] = follower
+            self._follower[wheel] = follower
+            values[known, column] = wrapped(values[known, column])
+
+    def _imu(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        scale = 1.0 + self._p["gyro_scale_ratio"]
+        if "gyro_z_radps" in channels:
+            gyro = values[:, channels.index("gyro_z_radps")]
+            gyro -= self._gyro_offset
+            if scale != 1.0:
+                gyro -= self._gyro_bias
+                gyro /= scale
+                gyro += self._gyro_bias
+        if "accel_x_mps2" in channels:
+            values[:, channels.index("accel_x_mps2")] -= self._accel_offset
+        bias = self._p["gyro_bias_radps"]
+        if "yaw_rad" in channels and (scale != 1.0 or bias):
+            column = channels.index("yaw_rad")
+            first_rad, last_rad = self._yaw
+            yaw = unwrapped(np.concatenate([[last_rad], values[:, column]]))[1:]
+            known = np.isfinite(yaw)
+            if known.any():
+                first_rad = float(yaw[known][0]) if math.isnan(first_rad) else first_rad
+                self._yaw = first_rad, float(yaw[known][-1])
+            turned_rad = yaw[known] - first_rad - bias * (time_s[known] - self._start_s)
+            values[known, column] = wrapped(first_rad + turned_rad / scale)
+
+    def _camera(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        if self._p["camera_yaw_rad"]:
+            turned(values, channels, -self._p["camera_yaw_rad"])
+
+    def _pose(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
+        scale, angle = 1.0 + self._p["camera_scale_ratio"], self._p["camera_yaw_rad"]
+        for i, channel in enumerate(channels):
+            if channel.startswith("position_") and scale != 1.0:
+                values[:, i] /= scale
+            elif channel == "yaw_rad" and angle:
+                values[:, i] += angle
+
+
+class Origin(StrEnum):
+    """Where a number of a description comes from."""
+
+    SOURCED = "sourced"
+    ASSUMED = "assumed"
+    LEFT_OUT = "left out"
+
+
+class Basis(NamedTuple):
+    """A number of a robot's description that a parameter of an effect changes.
+
+    Parameters
+    ----------
+    section, field : of the description; the section is empty for a number of the robot itself
+    described : the number as it stands; the neutral one of :attr:`terrain.robots.Robot.completed` where the
+        description lacks the section
+    extended : the number with the parameter's value
+    origin : where the described number comes from
+    written : what the description calls it: of tracks ``sprocket_radius_m`` is the ``wheel_radius_m``
+    """
+
+    section: str
+    field: str
+    described: float
+    extended: float
+    origin: Origin
+    written: str
+
+    @property
+    def name(self) -> str:
+        """Name of the number, as :attr:`terrain.robots.Robot.assumed` has it."""
+        return f"{self.section}.{self.written}" if self.section else self.written
+
+
+def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, ...]:
+    """Return the described numbers that a parameter of an effect changes; none where it has no home.
+
+    A lever arm of -0.23 m is relative to the lever arm described: where that one is assumed, so is half of
+    the answer, and only their sum was measured.
+
+    Parameters
+    ----------
+    robot : whose description it is; its own effects are not applied
+    parameter : of :data:`terrain.effects.PARAMETER`
+    value : that was found of it
+
+    Raises
+    ------
+    KeyError
+        if there is no such parameter.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> (basis,) = basis_of(load_robot("husky"), "lever_x_m", -0.23)
+    >>> basis.name, basis.described, round(basis.extended, 2), basis.origin.value
+    ('camera.lever_x_m', 0.35, 0.12, 'assumed')
+    >>> basis_of(load_robot("husky"), "yaw_delay_s")
+    ()
+    """
+    before = replace(robot.completed, effects={}, effects_cov=np.empty((0, 0)))
+    after = apply_homes(replace(before, effects={parameter: value}, effects_cov=np.full((1, 1), np.nan)))
+    found = []
+    for home in PARAMETER[parameter].homes:
+        if home.section and home.section not in before.parts:
+            continue
+        written = home.field if home.section else robot.spelled.get(home.field, home.field)
+        name = f"{home.section}.{written}" if home.section else written
+        origin = Origin.ASSUMED if name in robot.assumed else Origin.SOURCED
+        if home.section and not robot.describes(home.section):
+            origin = Origin.LEFT_OUT
+        described, extended = (_number(each, home.section, home.field) for each in (before, after))
+        found.append(Basis(home.section, home.field, described, extended, origin, written))
+    return tuple(found)
+
+
+def _number(robot: Robot, section: str, field: str) -> float:
+    part: Any = robot.parts[section] if section else robot
+    return float(getattr(part, field))
+
+
+DIGITS = 7
+"""Significant digits that a file has of each number."""
+
+
+def extended_yaml(
+    robot_name: str | Path,
+    values: Mapping[str, float],
+    covariance: Array,
+    intervals: Mapping[str, tuple[float, float]],
+    source: str,
+    region: Region | None = None,
+) -> str:
+    """Return the description of a robot with a section ``effects``, as YAML.
+
+    Everything else is kept, comments included; an earlier section ``effects`` is replaced.
+
+    Parameters
+    ----------
+    robot_name : name of a robot or path of its YAML file
+    values : by parameter
+    covariance : (n, n) of the values in their order
+    intervals : 95 % of each value, by parameter
+    source : of the numbers, in words
+    region : of driving, that they were validated in
+
+    Raises
+    ------
+    ConfigError
+        if the robot, a value, the covariance or an interval is not accepted.
+
+    Examples
+    --------
+    >>> value, interval = {"gyro_scale_ratio": 0.02}, {"gyro_scale_ratio": (0.016, 0.024)}
+    >>> text = extended_yaml("husky", value, np.array([[4e-6]]), interval, "me")
+    >>> print("".join(text.partition("effects:")[1:]), end="")
+    effects:
+      schema: 1
+      gyro_scale_ratio: {value: 0.02, unit: ratio, source: me, interval: [0.016, 0.024]}
+      covariance:
+        gyro_scale_ratio: {gyro_scale_ratio: 4.0e-06}
+    """
+    path = description_file(robot_name)
+    described = read_yaml(path)
+    robot = robot_from(path.name, described)
+    values = checked_effects("effects", values, robot.drive)
+    names = list(values)
+    cov = checked_covariance("effects: covariance", np.asarray(covariance, dtype=float))
+    if cov.shape != (len(names), len(names)):
+        raise ConfigError(
+            f"effects: covariance has the shape {cov.shape}, {(len(names), len(names))} is required"
+        )
+    lines = _section_lines(values, parameters_of(robot.drive), cov, intervals, source)
+    lines += [] if region is None else _region_lines(region)
+    text = _without_effects(path.read_text(encoding="utf-8-sig")) + "\n".join(lines) + "\n"
+    try:
+        content = parse_yaml(text)
+    except ValueError:
+        content = None
+    others = {name: entry for name, entry in described.items() if name != "effects"}
+    if not isinstance(content, dict) or {n: e for n, e in content.items() if n != "effects"} != others:
+        raise ConfigError(f"{path}: cannot be extended as it is written: one section a line is required")
+    robot_from(path.name, content)
+    return text
+
+
+def write_extended(
+    out: str | Path,
+    robot_name: str | Path,
+    values: Mapping[str, float],
+    covariance: Array,
+    intervals: Mapping[str, tuple[float, float]],
+    source: str,
+    region: Region | None = None,
+) -> Robot:
+    """Write the description of :func:`extended_yaml` to a file, and return the robot.
+
+    Raises
+    ------
+    ConfigError
+        as :func:`extended_yaml` does, or if the file is no YAML by its name, or is there already.
+    """
+    out = Path(out)
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError(f"{out}: a robot's description is a .yaml file")
+    if out.exists():
+        raise ConfigError(f"{out}: is there already, and is left as it is; choose another name")
+    text = extended_yaml(robot_name, values, covariance, intervals, source, region)
+    atomic_write(out, text)
+    return robot_from(out.name, parse_yaml(text))
+
+
+def _section_lines(
+    values: Mapping[str, float],
+    known: Mapping[str, Parameter],
+    cov: Array,
+    intervals: Mapping[str, tuple[float, float]],
+    source: str,
+) -> list[str]:
+    """Return the lines of the section ``effects``."""
+    names = list(values)
+    section: dict[str, Any] = {"schema": SCHEMA}
+    for name in names:
+        low, high = (float(edge) for edge in intervals.get(name, (math.nan, math.nan)))
+        if not low <= values[name] <= high < math.inf:
+            raise ConfigError(
+                f"effects: {name} is {values[name]:g}, its interval {low:g} to {high:g} must hold it"
+            )
+        section[name] = {
+            "value": _rounded(values[name]),
+            "unit": known[name].unit,
+            "source": source,
+            "interval": [_rounded(low), _rounded(high)],
+        }
+    rows = {
+        row: {column: _rounded(cov[i, j]) for j, column in enumerate(names)} for i, row in enumerate(names)
+    }
+    lines = ["effects:", *(f"  {name}: {_flow(entry)}" for name, entry in section.items())]
+    lines += ["  covariance:" if rows else "  covariance: {}"]
+    return lines + [f"    {name}: {_flow(row)}" for name, row in rows.items()]
+
+
+def _region_lines(region: Region) -> list[str]:
+    """Return the lines of the region; a range that was not measured has none."""
+    ranges = {name: value for name, value in region._asdict().items() if value is not None}
+    ranges["terrains"] = list(region.terrains)
+    entries = {
+        name: value if name == "terrains" else [_rounded(edge) for edge in value]
+        for name, value in ranges.items()
+    }
+    return ["  region:", *(f"    {name}: {_flow(entry)}" for name, entry in entries.items())]
+
+
+def _without_effects(text: str) -> str:
+    """Return the text of a description without its section ``effects``."""
+    kept, inside = [], False
+    for line in text.splitlines():
+        if inside and line.strip() and not line.startswith((" ", "#")):
+            inside = False
+        if line.startswith("effects:"):
+            inside = True
+        if not inside:
+            kept.append(line)
+    return "\n".join(kept).rstrip() + "\n"
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def _flow(entry: Any) -> str:
+    text = yaml.safe_dump(entry, default_flow_style=True, sort_keys=False, allow_unicode=True, width=math.inf)
+    return str(text).removesuffix("...\n").strip()

@@ -1,0 +1,120 @@
+"""Wheels of logs: their circumferential speeds by the rates of their motors, and the true slip of simulated ones."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
+from terrain.records import Array, RunLog, Stream
+from terrain.robots import Robot
+from terrain.slip import traction_slip
+
+
+def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
+    """Return a run whose stream ``wheels`` has wheel speeds (``speed_1_mps``) beside its motor rates.
+
+    Wheel speeds that are there already are made anew; a run without motor rates comes back as it is.
+
+    Parameters
+    ----------
+    run : log
+    robot : gives reduction ratio and nominal wheel radius
+
+    Raises
+    ------
+    ConfigError
+        if the run has motor rates and the robot's description no motors.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> rates = Stream(np.arange(2.0), np.full((2, 3), 50.0), [f"motor_{i}_radps" for i in (1, 2, 3)])
+    >>> run = with_wheel_speeds(RunLog("a", "agrimaro", {"wheels": rates}), load_robot("agrimaro"))
+    >>> run.streams["wheels"].channel("speed_1_mps")
+    array([1., 1.])
+    """
+    wheels = run.streams.get("wheels")
+    found = None if wheels is None else wheel_speeds_from(wheels.channels, robot)
+    if wheels is None or found is None:
+        return run
+    channels, compute = found
+    return replace(
+        run, streams=dict(run.streams) | {"wheels": Stream(wheels.time_s, compute(wheels.values), channels)}
+    )
+
+
+def wheel_speeds_from(
+    channels: Sequence[str], robot: Robot
+) -> tuple[tuple[str, ...], Callable[[Array], Array]] | None:
+    """Return the channels of wheels with their speeds, and what computes these values (n, c) of those measured.
+
+    Parameters
+    ----------
+    channels : that are measured
+    robot : gives reduction ratio and nominal wheel radius
+
+    Returns
+    -------
+    None where there are no motor rates.  Speeds that are measured are left out, and come from the rates.
+    """
+    motors = [f"motor_{wheel}_radps" for wheel in robot.wheels]
+    if not motors or not set(motors) <= set(channels):
+        return None
+    speeds = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
+    at = [channels.index(motor) for motor in motors]
+    kept = [i for i, channel in enumerate(channels) if channel not in speeds]
+    ratio, radius_m = robot.motors.reduction_ratio, robot.wheel_radius_m
+
+    def with_speeds(values: Array) -> Array:
+        return np.hstack([values[:, kept], values[:, at] / ratio * radius_m])
+
+    return (*(channels[i] for i in kept), *speeds), with_speeds
+
+
+def speed_columns(channels: Sequence[str], robot: Robot | None) -> tuple[list[int], float]:
+    """Return the columns of wheels that tell how fast they turn, and what makes them speeds in m/s."""
+    columns = [i for i, name in enumerate(channels) if name.startswith("speed_")]
+    if columns or robot is None or not robot.describes("motors"):
+        return columns, 1.0
+    motors = [i for i, name in enumerate(channels) if name.startswith("motor_")]
+    return motors, robot.wheel_radius_m / robot.motors.reduction_ratio
+
+
+def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
+    """Return the true wheel speed and speed over ground along each wheel, both (n, wheels) in m/s.
+
+    Parameters
+    ----------
+    truth : stream as ``terrain.simulation`` writes it
+    robot : gives the nominal radius and the positions of the wheels
+    """
+    steer = _wheel_columns(truth, robot, "steer_{}_rad")
+    twist = np.column_stack([truth.channel(name) for name in TWIST])
+    along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
+    return _wheel_columns(truth, robot, "wheel_{}_radps") * robot.wheel_radius_m, along
+
+
+def true_slip(truth: Stream, wheels: Sequence[str]) -> Array:
+    """Return the slip ratio (n, wheels) that a simulation recorded, positive in traction.
+
+    The recorded one is signed along the wheel's own x axis; here its sign is that of traction in both
+    directions (:func:`terrain.slip.traction_slip`).  It is that of the wheels' true radii, up to 2 where a
+    wheel turns against the motion, and NaN where wheel and robot are at rest.
+
+    Parameters
+    ----------
+    truth : stream as ``terrain.simulation`` writes it; a slip that is never defined has no channel
+    wheels : their names
+    """
+    recorded = np.full((len(truth), len(wheels)), np.nan)
+    for i, wheel in enumerate(wheels):
+        if f"slip_{wheel}_ratio" in truth.channels:
+            recorded[:, i] = truth.channel(f"slip_{wheel}_ratio")
+    return traction_slip(recorded, np.column_stack([truth.channel(f"wheel_{w}_radps") for w in wheels]))
+
+
+def _wheel_columns(truth: Stream, robot: Robot, pattern: str) -> Array:
+    return np.column_stack([truth.channel(pattern.format(wheel)) for wheel in robot.wheels])

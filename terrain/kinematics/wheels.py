@@ -1,0 +1,233 @@
+"""Kinematics of wheels, of every drive: the velocity of each for a twist, and the twist for all of them.
+
+With the body's velocity ``(v_x, v_y)`` at its origin, its yaw rate g', and wheel i at ``(x_i, y_i)`` that drives
+along ``d_i``, all in body axes, the angle of its steering or that of an omni wheel's mounting::
+
+    velocity of its centre    p_i' = (v_x - y_i g', v_y + x_i g')                        (2.2)
+    along the wheel           p_ix' cos d_i + p_iy' sin d_i
+    across it, to the left    p_iy' cos d_i - p_ix' sin d_i
+
+Where a wheel rolls without slip, the first is its circumferential speed u_i, which for all of them is ``u = J V``;
+the second is 0, but of an omni wheel, whose rollers turn with it.  The twist of wheels that contradict each other is
+that of least squares, which for wheels that do not roll across is ``V = H^+ S(d) u`` (2.3, 2.4).
+
+A twist is an array ``(..., 3)`` ordered ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` everywhere here.
+
+Sources: Danzi, AgriMaRo thesis, 2.3 and (7.3)-(7.5).  Corrected: it puts the yaw rate first, and the columns of its
+H are reordered accordingly; one table of wheel positions, ``robot.wheel_positions_m`` (its 7.2), because (2.3)
+numbers the wheels of the x axis in the opposite order; rows of H are ``[-y_i 1 0; x_i 0 1]``; S is block-diagonal,
+6 x 3.  Omni wheels: Siegwart, Nourbakhsh, Scaramuzza, Introduction to Autonomous Mobile Robots, 3.2.3: the Swedish
+wheel with rollers at a right angle.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba.extending import register_jitable
+
+from terrain.errors import ConfigError
+from terrain.records import Array
+
+TWIST = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+"""Columns of a twist, as channels and states have them."""
+
+MAX_CONDITION = 1e6
+"""Of the matrix from twist to wheel speeds, lengths over the size of the robot: beyond, directions agree."""
+
+
+def finite_numbers(name: str, given: Any, size: int | None = None, missing: bool = False) -> Array:
+    """Return ``given`` as an array of finite floats with ``size`` columns; NaN too where samples may miss."""
+    try:
+        array = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} cannot be read as an array of numbers") from None
+    if size is not None and array.shape[-1:] != (size,):
+        raise ConfigError(f"{name} has shape {array.shape}, (..., {size}) is required")
+    bad = np.isinf(array) if missing else ~np.isfinite(array)
+    if bad.any():
+        raise ConfigError(f"{name} holds {array[bad].flat[0]}, finite numbers are required")
+    return array
+
+
+def wheel_positions(given: Any) -> Array:
+    """Return positions (wheels, 2) of two wheels or more that are not all in one place, or refuse them."""
+    positions = finite_numbers("positions_m", given, 2)
+    if positions.ndim != 2 or len(positions) < 2:
+        raise ConfigError(f"positions_m has shape {positions.shape}, (wheels, 2) with two wheels is required")
+    if (positions == positions[0]).all():
+        raise ConfigError("positions_m holds one place only: wheels in one place do not tell the yaw rate")
+    return positions
+
+
+def above_zero(name: str, given: Any) -> float:
+    """Return ``given`` as a number above zero, or refuse it."""
+    value = finite_numbers(name, given)
+    if value.ndim or not value > 0:
+        raise ConfigError(f"{name} is {given!r}, a number above zero is required")
+    return float(value)
+
+
+def broadcast(**arrays: Array) -> list[Array]:
+    """Return arrays of one shape, or refuse them; messages leave out the name ``_``."""
+    try:
+        return list(np.broadcast_arrays(*arrays.values()))
+    except ValueError:
+        names = " and ".join(f"{name} {array.shape}" for name, array in arrays.items() if name != "_")
+        raise ConfigError(f"shapes do not fit together: {names}") from None
+
+
+def point_velocity(
+    speed_x_mps: float | Array,
+    speed_y_mps: float | Array,
+    yaw_rate_radps: float | Array,
+    x_m: float | Array,
+    y_m: float | Array,
+) -> tuple[Any, Any]:
+    """Return the velocity, forward and left, of a point of the body; arguments are broadcast.
+
+    Examples
+    --------
+    >>> point_velocity(1.0, 0.0, 0.2, 0.0, -0.75)
+    (1.15, 0.0)
+    """
+    return speed_x_mps - yaw_rate_radps * y_m, speed_y_mps + yaw_rate_radps * x_m
+
+
+def in_wheel_frame(
+    forward_mps: float | Array, left_mps: float | Array, cos_steer: float | Array, sin_steer: float | Array
+) -> tuple[Any, Any]:
+    """Return the components of a velocity along a wheel and across it, to its left.
+
+    Examples
+    --------
+    >>> in_wheel_frame(1.0, 0.5, 0.0, 1.0)  # a wheel that points to the left
+    (0.5, -1.0)
+    """
+    along_mps = forward_mps * cos_steer + left_mps * sin_steer
+    return along_mps, left_mps * cos_steer - forward_mps * sin_steer
+
+
+for function in (point_velocity, in_wheel_frame):
+    register_jitable(function)
+
+
+def wheel_frame_velocities(twist: Array, positions_m: Array, direction_rad: Array) -> tuple[Array, Array]:
+    """Return the velocities (n, wheels) of the wheel centres along each wheel and across it.
+
+    Parameters
+    ----------
+    twist : (n, 3) of the body
+    positions_m : (wheels, 2)
+    direction_rad : (n, wheels) or (wheels,)
+
+    Examples
+    --------
+    >>> wheel_frame_velocities(np.array([[1.0, 0.0, 0.2]]), np.array([[0.5, 0.0]]), np.array([[0.0]]))
+    (array([[1.]]), array([[0.1]]))
+    """
+    forward, left = point_velocity(twist[:, 0:1], twist[:, 1:2], twist[:, 2:3], *positions_m.T)
+    return in_wheel_frame(forward, left, np.cos(direction_rad), np.sin(direction_rad))
+
+
+def velocity_matrix(positions_m: Array) -> Array:
+    """Return H (2 wheels, 3) of (2.3): the wheel centres' velocities are H times the twist.
+
+    Examples
+    --------
+    >>> velocity_matrix(np.array([[0.5, 0.2]]))
+    array([[ 1. ,  0. , -0.2],
+           [ 0. ,  1. ,  0.5]])
+    """
+    x_m, y_m = positions_m.T
+    one, none = np.ones_like(x_m), np.zeros_like(x_m)
+    return np.stack([np.stack([one, none, -y_m], -1), np.stack([none, one, x_m], -1)], 1).reshape(-1, 3)
+
+
+def wheel_velocities(positions_m: Array, twist: Array) -> Array:
+    """Return the velocity (..., wheels, 2) of the wheel centres in the body frame, equation (2.2).
+
+    Raises
+    ------
+    ConfigError
+        if ``positions_m`` is no (wheels, 2), ``twist`` no (..., 3), or either is not finite.
+
+    Examples
+    --------
+    >>> wheel_velocities([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.75]], [1.0, 0.0, 0.2])
+    array([[ 1.  , -0.1 ],
+           [ 1.  ,  0.1 ],
+           [ 1.15,  0.  ]])
+    """
+    positions = wheel_positions(positions_m)
+    flat = finite_numbers("twist", twist, 3) @ velocity_matrix(positions).T
+    return np.asarray(flat.reshape(*flat.shape[:-1], len(positions), 2))
+
+
+def rolling_matrix(positions_m: Array, direction_rad: Array) -> Array:
+    """Return J (..., wheels, 3): circumferential speeds of wheels that roll without slip are J times the twist.
+
+    Raises
+    ------
+    ConfigError
+        for shapes that do not fit, and values that are not finite.
+
+    Examples
+    --------
+    >>> rolling_matrix([[0.1, 0.0], [0.0, 0.1], [-0.1, 0.0]], np.radians([90.0, 180.0, 270.0])).round(2) + 0.0
+    array([[ 0. ,  1. ,  0.1],
+           [-1. ,  0. ,  0.1],
+           [ 0. , -1. ,  0.1]])
+    """
+    positions = wheel_positions(positions_m)
+    direction = finite_numbers("direction_rad", direction_rad, len(positions))
+    (x_m, y_m), cos, sin = positions.T, np.cos(direction), np.sin(direction)
+    return np.stack([cos, sin, x_m * sin - y_m * cos], axis=-1)
+
+
+def no_slip_twist(
+    positions_m: Array, direction_rad: Array, wheel_speed_mps: Array, rolls_across: bool = False
+) -> tuple[Array, Array]:
+    """Return the twist that fits wheels which do not slip best, and how far they contradict each other.
+
+    Parameters
+    ----------
+    positions_m : (wheels, 2)
+    direction_rad : (..., wheels) that each drives along
+    wheel_speed_mps : (..., wheels) circumferential; NaN, here or there, is a missing sample
+    rolls_across : whether wheels roll across their direction too, as omni wheels; others do not move there
+
+    Returns
+    -------
+    twist : (..., 3) least squares; NaN where a sample is missing
+    residual_mps : (...) norm over the wheels of what no twist explains: of three omni wheels always 0
+
+    Raises
+    ------
+    ConfigError
+        for shapes that do not fit, infinite values, and if the wheels do not determine the twist.
+
+    Examples
+    --------
+    >>> twist, residual_mps = no_slip_twist([[-0.5, 0.0], [0.5, 0.0]], [-0.1, 0.1], [1.0, 1.0])
+    >>> twist.round(3), residual_mps.round(3)
+    (array([0.995, 0.   , 0.2  ]), np.float64(0.0))
+    """
+    positions = wheel_positions(positions_m)
+    direction = finite_numbers("direction_rad", direction_rad, len(positions), missing=True)
+    speed = finite_numbers("wheel_speed_mps", wheel_speed_mps, len(positions), missing=True)
+    if not rolls_across:
+        direction, speed = broadcast(direction_rad=direction, wheel_speed_mps=speed)
+        velocity = np.stack([np.cos(direction), np.sin(direction)], axis=-1) * speed[..., None]
+        seen, rows = velocity.reshape(*speed.shape[:-1], -1), velocity_matrix(positions)
+        twist = seen @ np.linalg.pinv(rows).T
+        return twist, np.linalg.norm(seen - twist @ rows.T, axis=-1)
+    rows = rolling_matrix(positions, direction)
+    size_m = np.linalg.norm(positions, axis=1).max()
+    if len(positions) < 3 or not (np.linalg.cond(rows / [1.0, 1.0, size_m]) < MAX_CONDITION).all():
+        raise ConfigError(
+            "the wheels do not determine the twist: their drive directions allow a motion of none"
+        )
+    twist = (np.linalg.pinv(rows) @ speed[..., None])[..., 0]
+    return twist, np.linalg.norm(speed - (rows @ twist[..., None])[..., 0], axis=-1)

@@ -1,0 +1,739 @@
+"""Messages of topics as streams: what a small YAML mapping describes, or what the types of a bag's topics tell.
+
+::
+
+    robot: husky                      # may be left out where --robot is given
+    time: header                      # stamps of the headers, log times where there are none; log: log times
+    labels: /terrain                  # std_msgs/String with the names of terrains as they change
+    streams:
+      imu: {topic: /imu/data, kind: imu}
+      odometry: {topic: /zed/odom, kind: odometry}
+      commands: {topic: /cmd_vel, kind: twist}
+      wheels:
+        topic: /joint_states
+        kind: joints
+        channels:
+          speed_left_mps: {joint: front_left_wheel, field: velocity}
+      battery:
+        topic: /status
+        channels:
+          voltage_v: {field: "cells[0].volts", unit: V, scale: 2, offset: 0.1}
+
+A number becomes ``(scale * number + offset)`` in the unit given, and then SI.  A channel may name a topic of
+its own.  Samples of several topics are joined by ``join``: ``equal`` takes the instants that all topics have,
+by their stamps; ``previous`` the instants of the stream's topic, with the last value of the others by then.
+Messages are an object of ROS or Protobuf, or JSON, whatever decoded them.
+
+What is wrong with a log is refused at once, or counted where it is repaired (:class:`Faults`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field, FiniteFloat, ValidationError
+
+from terrain.errors import ConfigError, LogError
+from terrain.files.documents import first_fault, read_yaml
+from terrain.files.names import check_name, listed, plain_name, shown
+from terrain.files.resources import data_folder
+from terrain.logs.labels import label_intervals
+from terrain.logs.mapping import Strict, Unit, Word, check_unit
+from terrain.logs.samples import checked_stream, longest_rise
+from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, unit_of
+from terrain.logs.tables import MAX_VALUES
+from terrain.records import Array, Label, Stream
+
+EARLY_END = "files that end early"
+DAMAGED_BLOCK = "damaged blocks of messages"
+DAMAGED_MESSAGE = "damaged messages"
+
+
+class Topic(NamedTuple):
+    """A topic: its type, how its messages are encoded, and the definition that the file holds of it.
+
+    ``definition`` is text; of Protobuf it is its bytes, a character each.
+    """
+
+    name: str
+    kind: str
+    encoding: str
+    schema_encoding: str
+    definition: str
+
+
+class Faults:
+    """Faults of one log.
+
+    Parameters
+    ----------
+    repairs : counts by kind; None refuses
+
+    Attributes
+    ----------
+    first : what a strict read would refuse first; empty without a fault
+    """
+
+    def __init__(self, repairs: Counter[str] | None) -> None:
+        self.repairs, self.first = repairs, ""
+
+    def found(self, place: str, kind: str, text: str, n: int = 1) -> None:
+        """Raise :class:`LogError`, or count."""
+        self.first = self.first or f"{place}: {text}; read it with --repair to leave that out"
+        if self.repairs is None:
+            raise LogError(self.first)
+        self.repairs[kind] += n
+
+
+STAMPS = (
+    ("header.stamp.sec", "header.stamp.nanosec"),
+    ("header.stamp.secs", "header.stamp.nsecs"),
+    ("timestamp.seconds", "timestamp.nanos"),
+    ("timestamp.sec", "timestamp.nsec"),
+)
+"""Where messages of ROS, and those of Foxglove in Protobuf and JSON, have the time of a measurement."""
+
+Number = Callable[[Any], float]
+
+
+def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -> Number:
+    """Return what takes a number from each message of a topic; NaN where one lacks it.
+
+    Parameters
+    ----------
+    topic, kind : name and type, as messages name them
+    message : the first one, which shows what fields there are
+    path : as ``twist.linear.x`` or ``data[2]``; of a joint the array that has its number
+    joint : name that stands for an index: its place in the field ``name``
+
+    Raises
+    ------
+    ConfigError
+        if there is no such field, or it holds no number.
+
+    Examples
+    --------
+    >>> speed = number_at("/speeds", "a_msgs/Speeds", {"speeds": [1.5, 2.5]}, "speeds[1]")
+    >>> speed({"speeds": [3, 4]}), speed({"speeds": []})
+    (4.0, nan)
+    """
+    place = f"topic {topic}: field {shown(path)}"
+    if joint:
+        if not {path, "name"} <= set(_fields(message)) or not _is_array(_field(message, path)):
+            raise ConfigError(f"{place} is no array of joints")
+        return lambda message: _of_joint(message, path, joint)
+    steps: list[str | int] = []
+    value, owner = message, kind
+    for name, index in re.findall(r"(\w+)(?:\[(\d+)\])?", path):
+        fields = _fields(value)
+        if name not in fields:
+            lacks = f"has no {name!r} (it has {listed(fields)})" if fields else "has no fields of its own"
+            raise ConfigError(f"{place}: {owner} {lacks}")
+        value, owner = _field(value, name), repr(name)
+        if _is_array(value) != bool(index):
+            fault = f"give an index, as {name}[0]" if not index else f"leave the index out, as {name}"
+            raise ConfigError(f"{place}: {name!r} is {'an' if not index else 'no'} array: {fault}")
+        steps += [name, int(index)] if index else [name]
+        if index:
+            if int(index) >= len(value):  # another message may have more elements
+                return lambda message: _following(message, steps)
+            value = value[int(index)]
+    if value is not None and not isinstance(value, int | float | np.number | np.bool_):
+        fields = _fields(value)
+        inner = f" (it has {listed(fields)})" if fields else ""
+        raise ConfigError(f"{place} is of type {type(value).__name__}, a number is required{inner}")
+    if isinstance(message, dict) or not all(isinstance(step, str) for step in steps):
+        return lambda message: _following(message, steps)
+    return attrgetter(path)
+
+
+def stamp_at(topic: str, kind: str, message: Any) -> tuple[Number, Number] | None:
+    """Return what takes whole seconds and nanoseconds of a measurement from each message; None: it has none."""
+    for pair in STAMPS:
+        try:
+            seconds, rest = (number_at(topic, kind, message, path) for path in pair)
+        except ConfigError:
+            continue
+        return seconds, rest
+    return None
+
+
+def _following(message: Any, steps: list[str | int]) -> float:
+    for step in steps:
+        if isinstance(step, str):
+            message = _field(message, step)
+        else:
+            message = message[step] if step < len(message) else None
+        if message is None:
+            return np.nan
+    return float(message)
+
+
+def _of_joint(message: Any, path: str, joint: str) -> float:
+    names, values = list(_field(message, "name")), _field(message, path)
+    place = names.index(joint) if joint in names else len(values)
+    return float(values[place]) if place < len(values) else np.nan
+
+
+def _fields(message: Any) -> list[str]:
+    """Return the names of the fields of a message; empty of what is none."""
+    if isinstance(message, dict):
+        return [str(name) for name in message]
+    if hasattr(message, "DESCRIPTOR"):
+        return [field.name for field in message.DESCRIPTOR.fields]
+    return [name for name in getattr(message, "__dataclass_fields__", {}) if not name.startswith("__")]
+
+
+def _field(message: Any, name: str) -> Any:
+    return message.get(name) if isinstance(message, dict) else getattr(message, name)
+
+
+def _is_array(value: Any) -> bool:
+    return hasattr(value, "__getitem__") and not isinstance(value, str | bytes | dict) and np.ndim(value) > 0
+
+
+Kind = Literal["fields", "gnss", "imu", "joints", "odometry", "pose", "twist"]
+
+TYPES: Mapping[str, tuple[str, ...]] = {
+    "gnss": ("sensor_msgs/NavSatFix",),
+    "imu": ("sensor_msgs/Imu",),
+    "joints": ("sensor_msgs/JointState",),
+    "odometry": ("nav_msgs/Odometry",),
+    "pose": ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"),
+    "twist": ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"),
+}
+"""Types of the messages of each kind."""
+
+STANDARD_STREAMS: Mapping[str, str] = {"imu": "imu", "odometry": "odometry", "commands": "twist"}
+"""Stream of each kind that needs no mapping, where one topic alone is of its types."""
+
+LABELS_TYPE = "std_msgs/String"
+
+DISTRO = "ROS2_HUMBLE"
+"""Release whose definitions are written, and taken for a bag that holds none and does not name its own."""
+
+_JOINT_UNITS: Mapping[str, str] = {"velocity": "rad/s", "position": "rad", "effort": "Nm"}
+_PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
+
+
+class WheelRadius(Strict):
+    """Radius by which rates of wheels become speeds."""
+
+    value: Annotated[FiniteFloat, Field(gt=0.0)]
+    unit: Literal["m", "mm"]
+    source: Word
+
+
+class Channel(Strict):
+    """Where a channel is: ``(scale * number + offset)`` is in ``unit``; ``source`` is that of those."""
+
+    field: Word
+    joint: str = ""
+    topic: str = ""
+    unit: Unit = ""
+    scale: FiniteFloat = 1.0
+    offset: FiniteFloat = 0.0
+    source: str = ""
+
+
+class StreamMapping(Strict):
+    """Where a stream is."""
+
+    topic: Word
+    kind: Kind = "fields"
+    channels: Annotated[dict[str, Channel], Field(default_factory=dict)]
+    time: Literal["header", "log", ""] = ""
+    join: Literal["equal", "previous"] = "equal"
+    wheel_radius: WheelRadius | None = None
+
+
+class TopicMapping(Strict):
+    """How topics become streams."""
+
+    streams: Annotated[dict[Word, StreamMapping], Field(min_length=1)]
+    robot: str = ""
+    time: Literal["header", "log"] = "header"
+    terrain: str = ""
+    labels: str = ""
+
+
+def short_type(name: str) -> str:
+    """Return the name of a type without its middle part.
+
+    Examples
+    --------
+    >>> short_type("sensor_msgs/msg/Imu")
+    'sensor_msgs/Imu'
+    """
+    parts = name.split("/")
+    return f"{parts[0]}/{parts[-1]}" if len(parts) == 3 else name
+
+
+def load_mapping(path: str | Path) -> TopicMapping:
+    """Return the mapping that a YAML file describes.
+
+    Parameters
+    ----------
+    path : of the file, or the name of a packaged one
+
+    Raises
+    ------
+    ConfigError
+        if the file cannot be read, a key is unknown or missing, or a unit is unknown or does not suit its
+        channel.
+
+    Examples
+    --------
+    >>> load_mapping("husky_topics").streams["wheels"].topic
+    '/joint_states'
+    """
+    path = Path(path)
+    packaged = data_folder("bags") / f"{path}.yaml"
+    if not path.exists() and plain_name(str(path)) and packaged.is_file():
+        path = packaged
+    described = read_yaml(path)
+    try:
+        mapping = TopicMapping.model_validate(described)
+    except ValidationError as error:
+        raise ConfigError(f"{path.name}: {first_fault(error)}") from error
+    for key in ("robot", "terrain"):
+        if getattr(mapping, key):
+            check_name(f"{path.name}: {key}", getattr(mapping, key), ConfigError)
+    if mapping.terrain and mapping.labels:
+        raise ConfigError(f"{path.name}: has both 'terrain' and 'labels', one of them is accepted")
+    for name, stream in mapping.streams.items():
+        check_name(f"{path.name}: stream", name, ConfigError)
+        _check_stream(f"{path.name}: stream {name}", stream)
+    return mapping
+
+
+def check_stream(place: str, described: Mapping[str, object]) -> StreamMapping:
+    """Return a stream of messages that is described in a mapping of files.
+
+    Parameters
+    ----------
+    place : of the stream, as messages name it
+    described : its keys
+    """
+    try:
+        stream = StreamMapping.model_validate(dict(described))
+    except ValidationError as error:
+        raise ConfigError(f"{place}: {first_fault(error)}") from error
+    _check_stream(place, stream)
+    return stream
+
+
+def _check_stream(place: str, stream: StreamMapping) -> None:
+    has_channels = stream.kind in ("fields", "joints")
+    if has_channels != bool(stream.channels):
+        fault = (
+            "has no channels"
+            if has_channels
+            else f"is of kind {stream.kind!r}, which has channels of its own"
+        )
+        raise ConfigError(f"{place}: {fault}")
+    if stream.wheel_radius is not None and stream.kind != "joints":
+        raise ConfigError(f"{place}: 'wheel_radius' is for kind 'joints'")
+    for name, channel in stream.channels.items():
+        try:
+            desired = unit_of(name)
+        except LogError as error:
+            raise ConfigError(f"{place}: {error}") from error
+        at = f"{place}: channel {name}"
+        if stream.kind == "joints":
+            _check_joint(at, channel, desired)
+            continue
+        if channel.joint:
+            raise ConfigError(f"{at}: 'joint' is for kind 'joints'")
+        if not _PATH.fullmatch(channel.field):
+            raise ConfigError(
+                f"{at}: field {channel.field!r} is no path, as 'twist.linear.x' or 'data[2]' is one"
+            )
+        if desired != "code":
+            check_unit(at, channel.unit, desired)
+
+
+def _check_joint(place: str, channel: Channel, desired: str) -> None:
+    if channel.field not in _JOINT_UNITS:
+        raise ConfigError(f"{place}: field {channel.field!r} is none of {', '.join(_JOINT_UNITS)}")
+    if not channel.joint:
+        raise ConfigError(f"{place}: key 'joint' is missing")
+    if channel.topic:
+        raise ConfigError(f"{place}: 'topic' is for streams without a kind")
+    unit = channel.unit or _JOINT_UNITS[channel.field]
+    if not by_radius(channel, desired):
+        check_unit(place, unit, desired)
+
+
+def joint_unit(channel: Channel) -> str:
+    """Return the unit of a joint's number: as stated, else that of ROS."""
+    return channel.unit or _JOINT_UNITS[channel.field]
+
+
+def by_radius(channel: Channel, desired: str) -> bool:
+    """Return whether a channel is a speed whose joint turns: its rate is multiplied by the wheel's radius."""
+    return (
+        desired == "mps" and channel.field == "velocity" and joint_unit(channel) in ("rad/s", "deg/s", "rpm")
+    )
+
+
+def standard_mapping(place: str, topics: list[Topic]) -> TopicMapping:
+    """Return the mapping of a bag by the types of its topics.
+
+    Parameters
+    ----------
+    place : as messages name it
+    topics : of the bag
+
+    Raises
+    ------
+    ConfigError
+        if none has a type of :data:`STANDARD_STREAMS`, or several have one.
+
+    Examples
+    --------
+    >>> standard_mapping("a.mcap", [Topic("/imu", "sensor_msgs/msg/Imu", "cdr", "", "")]).streams["imu"].topic
+    '/imu'
+    """
+    streams = {}
+    for stream, kind in STANDARD_STREAMS.items():
+        fitting = [topic.name for topic in topics if short_type(topic.kind) in TYPES[kind]]
+        if len(fitting) > 1:
+            raise ConfigError(
+                f"{place}: the topics {listed(fitting)} are all of type {' or '.join(TYPES[kind])}: "
+                f"choose one with --mapping"
+            )
+        if fitting:
+            streams[stream] = StreamMapping.model_validate({"topic": fitting[0], "kind": kind})
+    if not streams:
+        raise ConfigError(f"{place}: needs a mapping (--mapping): it has {described(topics)}")
+    return TopicMapping(streams=streams)
+
+
+def described(topics: list[Topic]) -> str:
+    """Return topics with their types, as messages list them."""
+    return listed([f"{topic.name} ({topic.kind})" for topic in sorted(topics)]) if topics else "no topic"
+
+
+MAX_LABELS = 1_000_000
+"""Messages with terrains; ten a second are 28 hours."""
+
+LATEST_NS = 2**62
+"""Latest stamp that a message may have."""
+
+UNMATCHED = "messages without one of equal stamp on the other topics"
+
+Converted = tuple[tuple[str, ...], Array]
+"""Channels, and their values (n, c)."""
+
+
+class MessageKind(NamedTuple):
+    """A type of message that becomes channels of its own.
+
+    Parameters
+    ----------
+    paths : of its numbers
+    channels : from those (n, k) to channels
+    numbers : from a stream to those (n, k), None where the stream lacks channels; None where none is written
+    fixed : what else is written, by path
+    """
+
+    paths: tuple[str, ...]
+    channels: Callable[[Array], Converted]
+    numbers: Callable[[Stream], Array | None] | None = None
+    fixed: Mapping[str, Any] = MappingProxyType({})
+
+
+class MappedTopics:
+    """The topics of a mapping: takes their messages, each once, and gives the streams that they become.
+
+    Parameters
+    ----------
+    place : of the messages, as errors name it
+    mapping : of the topics
+    topics : that there are, by name
+    kinds : by type of message, those that become channels of their own
+    decoder : returns what makes an object of each message of a topic
+    wheel_radius_m : of the robot; None where unknown
+    faults : gets what is damaged
+
+    Raises
+    ------
+    LogError
+        if there is no such topic, or one of another type.
+    ConfigError
+        if speeds of wheels need a radius that is unknown.
+    """
+
+    def __init__(
+        self,
+        place: str,
+        mapping: TopicMapping,
+        topics: Mapping[str, Topic],
+        kinds: Mapping[str, MessageKind],
+        decoder: Callable[[Topic], Callable[[bytes], Any]],
+        wheel_radius_m: float | None,
+        faults: Faults,
+    ) -> None:
+        self._place, self._mapping, self._topics, self._kinds = place, mapping, topics, kinds
+        self._wheel_radius_m, self._faults = wheel_radius_m, faults
+        self._check()
+        self._of_topic: dict[str, _TopicNumbers] = {}
+        for stream in mapping.streams.values():
+            for topic, paths in self._paths(stream).items():
+                numbers = self._of_topic.get(topic)
+                if numbers is None:
+                    numbers = _TopicNumbers(place, topics[topic], decoder(topics[topic]), faults)
+                    self._of_topic[topic] = numbers
+                for path in paths:
+                    numbers.paths.setdefault(path, len(numbers.paths))
+        if mapping.labels:
+            labels = topics[mapping.labels]
+            self._of_topic.setdefault(labels.name, _TopicNumbers(place, labels, decoder(labels), faults))
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Topics whose messages are taken."""
+        return frozenset(self._of_topic)
+
+    def take(self, topic: str, log_ns: int, content: bytes) -> None:
+        """Take a message of one of :attr:`names`, with its log time in ns."""
+        self._of_topic[topic].take(log_ns, content)
+
+    def streams(self, start_ns: int | None = None) -> tuple[int, dict[str, Stream]]:
+        """Return the stamp in ns at which the time of the streams begins, and the streams.
+
+        Parameters
+        ----------
+        start_ns : that stamp; the first one by default, when repairing of those in order
+
+        Raises
+        ------
+        LogError
+            if a topic has no message, topics of a stream have no stamp in common, stamps go back or repeat,
+            a channel has nothing finite, or there are fewer than two samples.
+        """
+        raw = {name: self._raw(name, stream) for name, stream in self._mapping.streams.items()}
+        repairs = self._faults.repairs
+        begin_ns = (
+            start_of([stamp_ns for stamp_ns, _ in raw.values()], repairs) if start_ns is None else start_ns
+        )
+        streams = {}
+        for name, (stamp_ns, (channels, values)) in raw.items():
+            at = f"{self._place}: stream {name}"
+            if stamp_ns.size > 1 and not np.any(stamp_ns):
+                raise LogError(f"{at}: all headers are stamped 0; take the log times (time: log)")
+            time_s = (stamp_ns - begin_ns) / 1e9
+            streams[name] = checked_stream(
+                at, time_s, values, channels, row_of=lambda sample: sample + 1, repairs=repairs
+            )
+        return begin_ns, streams
+
+    def labels(self, start_ns: int, streams: Mapping[str, Stream]) -> tuple[Label, ...]:
+        """Return the terrain intervals of the topic of labels."""
+        texts = self._of_topic[self._mapping.labels].texts
+        return label_intervals(sorted(texts, key=lambda each: each[0]), start_ns, streams)
+
+    def _check(self) -> None:
+        """Refuse topics that are not there or of another type, and speeds without a radius."""
+        topics, there = self._topics, described([*self._topics.values()])
+        for name, stream in self._mapping.streams.items():
+            at = f"{self._place}: stream {name}"
+            for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
+                if topic and topic not in topics:
+                    raise LogError(f"{at}: there is no topic {shown(topic)} (there are {there})")
+            kind = topics[stream.topic].kind
+            if stream.kind != "fields" and short_type(kind) not in TYPES[stream.kind]:
+                raise LogError(
+                    f"{at}: topic {stream.topic} is of type {kind}, "
+                    f"kind {stream.kind!r} is {' or '.join(TYPES[stream.kind])} (there are {there})"
+                )
+            for channel, entry in stream.channels.items():
+                turns = stream.kind == "joints" and by_radius(entry, unit_of(channel))
+                if turns and stream.wheel_radius is None and self._wheel_radius_m is None:
+                    raise ConfigError(
+                        f"{at}: channel {channel} is the speed of a joint that turns: "
+                        f"'wheel_radius' is missing, and the robot has no description"
+                    )
+        labels = self._mapping.labels
+        if labels and labels not in topics:
+            raise LogError(f"{self._place}: labels: there is no topic {shown(labels)} (there are {there})")
+        if labels and short_type(topics[labels].kind) != LABELS_TYPE:
+            raise LogError(
+                f"{self._place}: labels: topic {labels} is of type {topics[labels].kind}, "
+                f"{LABELS_TYPE} is required"
+            )
+
+    def _paths(self, stream: StreamMapping) -> dict[str, list[tuple[str, str]]]:
+        """Return path and joint of each number of a stream, by topic."""
+        if stream.channels:
+            return {
+                topic: [(channel.field, channel.joint) for channel in channels.values()]
+                for topic, channels in _channels_by_topic(stream).items()
+            }
+        kind = self._kinds[short_type(self._topics[stream.topic].kind)]
+        return {stream.topic: [(path, "") for path in kind.paths]}
+
+    def _raw(self, name: str, stream: StreamMapping) -> tuple[Array, Converted]:
+        """Return the stamps (n,) in ns and the channels of a stream."""
+        by_header = (stream.time or self._mapping.time) == "header"
+        found = []
+        for topic, paths in self._paths(stream).items():
+            stamps, values = self._of_topic[topic].numbers(paths, by_header=by_header)
+            if not stamps.size:
+                what = " with any of the joints" if stream.kind == "joints" else ""
+                raise LogError(f"{self._place}: topic {shown(topic)} has no message{what}")
+            found.append((stamps, values))
+        stamp_ns, values = found[0] if len(found) == 1 else self._joined(name, stream, found)
+        if stream.channels:
+            return stamp_ns, (tuple(stream.channels), _in_si(stream, values, self._wheel_radius_m))
+        channels, values = self._kinds[short_type(self._topics[stream.topic].kind)].channels(values)
+        if not channels:
+            raise LogError(f"{self._place}: topic {shown(stream.topic)} states that it measures nothing")
+        return stamp_ns, (channels, values)
+
+    def _joined(
+        self, name: str, stream: StreamMapping, found: list[tuple[Array, Array]]
+    ) -> tuple[Array, Array]:
+        """Return the samples of several topics at stamps that all of them have, or at those of the first."""
+        orders = [np.argsort(stamps, kind="stable") for stamps, _ in found]
+        stamps = [each[order] for (each, _), order in zip(found, orders, strict=True)]
+        values = [each[order] for (_, each), order in zip(found, orders, strict=True)]
+        if stream.join == "previous":
+            others = [_previous(stamps[0], *other) for other in zip(stamps[1:], values[1:], strict=True)]
+            return stamps[0], np.concatenate([values[0], *others], axis=1)
+        common = stamps[0]
+        for each in stamps[1:]:
+            common = np.intersect1d(common, each)
+        n_lost = sum(each.size for each in stamps) - common.size * len(stamps)
+        if n_lost:
+            topics = " and ".join(shown(topic) for topic in _channels_by_topic(stream))
+            text = f"{name}: {n_lost} messages of {topics} lack one of equal stamp (join: previous)"
+            self._faults.found(self._place, UNMATCHED, text, n_lost)
+        if not common.size:
+            raise LogError(
+                f"{self._place}: stream {name}: no two stamps of its topics agree (join: previous)"
+            )
+        rows = [value[np.searchsorted(each, common)] for each, value in zip(stamps, values, strict=True)]
+        return common, np.concatenate(rows, axis=1)
+
+
+class _TopicNumbers:
+    """Collects the numbers of the messages of a topic, or their texts where no path is asked for.
+
+    ``paths`` has for each number its path and, where its array has a number a joint, the joint's name; an
+    entry of ``rows`` has them in that order.
+    """
+
+    def __init__(self, place: str, topic: Topic, decode: Callable[[bytes], Any], faults: Faults) -> None:
+        self.topic, self.paths = topic, dict[tuple[str, str], int]()
+        self.log_ns, self.stamp_ns = list[int](), list[int]()
+        self.rows, self.texts = list[list[float]](), list[tuple[int, str]]()
+        self._place, self._decode, self._faults = place, decode, faults
+        self._numbers: list[Number] | None = None
+        self._stamp: tuple[Number, Number] | None = None
+
+    def take(self, log_ns: int, content: bytes) -> None:
+        try:
+            message = self._decode(content)
+        except Exception as error:  # whatever a library makes of damaged bytes
+            self._damaged(error)
+            return
+        if not self.paths:
+            self.texts.append((log_ns, str(message.data)))
+            self._bounded(len(self.texts), MAX_LABELS, "messages")
+            return
+        if self._numbers is None:
+            about = (self.topic.name, short_type(self.topic.kind), message)
+            self._numbers = [number_at(*about, *path) for path in self.paths]
+            self._stamp = stamp_at(*about)
+        try:
+            row = [float(number(message)) for number in self._numbers]
+            seconds, rest = (0, log_ns) if self._stamp is None else (get(message) for get in self._stamp)
+            stamp_ns = int(seconds) * 10**9 + int(rest)
+            if abs(stamp_ns) > LATEST_NS:
+                raise ValueError("a stamp is beyond what clocks show")
+        except (ValueError, TypeError, AttributeError, OverflowError) as error:
+            self._damaged(error)
+            return
+        self.rows.append(row)
+        self.stamp_ns.append(stamp_ns)
+        self.log_ns.append(log_ns)
+        self._bounded(len(self.rows) * len(self.paths), MAX_VALUES, "values")
+
+    def _bounded(self, n: int, most: int, what: str) -> None:
+        if n > most:
+            raise LogError(f"{self._place}: topic {shown(self.topic.name)} has more than {most} {what}")
+
+    def _damaged(self, error: Exception) -> None:
+        text = f"topic {shown(self.topic.name)} has a message that is not as defined ({str(error)[:120]})"
+        self._faults.found(self._place, DAMAGED_MESSAGE, text)
+
+    def numbers(self, paths: Sequence[tuple[str, str]], *, by_header: bool) -> tuple[Array, Array]:
+        """Return stamps (n,) in ns, and numbers (n, k) of some paths, in the order of log times."""
+        order = np.argsort(np.array(self.log_ns, dtype=np.int64), kind="stable")
+        stamp_ns = np.array(self.stamp_ns if by_header else self.log_ns, dtype=np.int64)
+        values = np.array(self.rows, dtype=np.float64).reshape(len(order), len(self.paths))
+        values = values[order][:, [self.paths[path] for path in paths]]
+        kept: Array = np.ones(len(order), dtype=bool)
+        if any(joint for _, joint in paths):  # a robot may send its joints in several messages
+            kept = np.asarray(np.isfinite(values).any(axis=1))
+        return stamp_ns[order][kept], values[kept]
+
+
+def _channels_by_topic(stream: StreamMapping) -> dict[str, dict[str, Channel]]:
+    """Return the channels of a stream by their topic, those of the stream's own first."""
+    found: dict[str, dict[str, Channel]] = {stream.topic: {}}
+    for name, channel in stream.channels.items():
+        found.setdefault(channel.topic or stream.topic, {})[name] = channel
+    return {topic: channels for topic, channels in found.items() if channels}
+
+
+def _in_si(stream: StreamMapping, values: Array, wheel_radius_m: float | None) -> Array:
+    """Return the channels (n, c) of numbers (n, c) that are in the order of their topics."""
+    if stream.wheel_radius is not None:
+        wheel_radius_m = stream.wheel_radius.value * UNIT_SCALES[stream.wheel_radius.unit][1]
+    names = [name for channels in _channels_by_topic(stream).values() for name in channels]
+    columns = []
+    for name, channel in stream.channels.items():
+        desired = unit_of(name)
+        unit = joint_unit(channel) if stream.kind == "joints" else channel.unit
+        factor = 1.0 if desired == "code" else UNIT_SCALES[unit][1]
+        if stream.kind == "joints" and by_radius(channel, desired):
+            factor *= wheel_radius_m or np.nan
+        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged later
+            scaled = (values[:, names.index(name)] * channel.scale + channel.offset) * factor
+            columns.append(scaled + UNIT_OFFSETS.get(unit, 0.0))
+    return np.column_stack(columns)
+
+
+def _previous(at_ns: Array, stamp_ns: Array, values: Array) -> Array:
+    """Return the last values (m, k) by each of some instants; NaN before the first.
+
+    Examples
+    --------
+    >>> _previous(np.array([1, 5]), np.array([3, 4]), np.array([[1.0], [2.0]])).tolist()
+    [[nan], [2.0]]
+    """
+    last = np.searchsorted(stamp_ns, at_ns, side="right") - 1
+    return np.where((last >= 0)[:, None], values[np.maximum(last, 0)], np.nan)
+
+
+def start_of(stamps: list[Array], repairs: Counter[str] | None) -> int:
+    """Return the stamp in ns at which a run begins: the first one; when repairing, of those in order.
+
+    Examples
+    --------
+    >>> start_of([np.array([50, 40, 60])], None), start_of([np.array([0, 40, 50, 60])], Counter())
+    (40, 0)
+    """
+    if repairs is None:
+        return min(int(each.min()) for each in stamps)
+    return min(int(each[longest_rise(each)[0]]) for each in stamps)

@@ -1,0 +1,323 @@
+"""Signals in time: one low-pass, one resampling, and by how much one signal is behind another.
+
+*A pair.*  A sampled signal y follows a reference x, known on a fine even grid, late by a lag, on a clock of another
+rate, with a gain and a constant that are free because they may be wrong::
+
+    y(t) = gain x(t - lag - rate (t - middle)) + constant + noise
+
+:func:`correlations` over a bounded grid of lags and rates finds the peaks (a free search locks on to mirror images of
+manoeuvres), a second peak that explains nearly as much makes the answer ambiguous (:func:`nearly_as_good`), and
+:func:`refine_delay` finds lag and rate by least squares.
+
+*Many runs.*  A lag that is common to them is measured by all: each gives a curve over the lags, a likelihood say, and
+their sum has one peak (:func:`common_delay`).
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from terrain.bootstrap import bootstrap_counts
+from terrain.records import Array
+
+RIVAL_MARGIN = 0.15
+"""A peak elsewhere is no rival if it leaves so much more of the variance, relative; absolute is an argument."""
+
+MEMORY_S = 2.0
+"""Assumed correlation time of what a fit leaves."""
+
+MAX_STEPS, CONVERGED_S = 12, 0.003
+"""Of least squares."""
+
+MIN_ROWS = 30
+"""Samples of a pair, below which nothing is fitted."""
+
+MIN_SUPPORT = 30
+"""Finite samples, below which a signal is not laid out on a grid."""
+
+EDGE_SIGMAS = 3.0
+"""So close to an end or a gap, in widths of the low-pass, it has too little to average: not used."""
+
+MAX_GAP_SIGMAS = 3.0
+"""Across a longer gap, in widths of the low-pass, nothing is interpolated."""
+
+N_DRAWS = 200
+
+
+class DelayStatus(StrEnum):
+    """Whether a delay was found, and why not.
+
+    ``offset only``: a delay whose change over time, by the rate of a clock, is not to be seen; ``not excited``: the
+    signals hardly vary, or not alike; ``ambiguous``: another delay, or a mirrored gain, fits about as well; ``at
+    bound``: the best fit lies on the edge of the search; ``undetermined``: too few runs show it, or too differently.
+    """
+
+    ESTIMATED = "estimated"
+    OFFSET_ONLY = "offset only"
+    NOT_EXCITED = "not excited"
+    AMBIGUOUS = "ambiguous"
+    AT_BOUND = "at bound"
+    UNDETERMINED = "undetermined"
+
+
+class Delay(NamedTuple):
+    """How late a signal is, its standard deviation, and what the delay grows by a second, if that was sought."""
+
+    delay_s: float
+    std_s: float
+    rate: float
+    status: DelayStatus
+
+
+class Pair(NamedTuple):
+    """A sampled signal beside its reference.
+
+    Parameters
+    ----------
+    time_s : (n,) of the samples, from the first point of the grid
+    measured : (n,) NaN where a sample is missing
+    step_s : of the grid
+    reference, slope : (m,) on the grid, and its derivative; NaN where nothing supports it
+    middle_s : time about which a rate stretches
+    """
+
+    time_s: Array
+    measured: Array
+    step_s: float
+    reference: Array
+    slope: Array
+    middle_s: float
+
+    def correlations(self, lags_s: Array, rate: float) -> Array:
+        """Return the correlation (lags,) at each lag; 0 where fewer than half of the samples have a reference."""
+        return np.asarray(
+            correlations(self.time_s, self.measured, self.reference, self.step_s, self.middle_s, lags_s, rate)
+        )
+
+
+class DelayFit(NamedTuple):
+    """Lag at the middle of a pair and rate, their covariance (2, 2), gain and correlation."""
+
+    lag_s: float
+    rate: float
+    cov: Array
+    gain: float
+    correlation: float
+
+
+def low_pass(values: Array, step_s: float, time_constant_s: float, at_first: bool = False) -> Array:
+    """Return values (n, ...) at even steps behind a first-order low-pass, which starts at 0 or at the first value.
+
+    Examples
+    --------
+    >>> low_pass(np.ones(3), 0.1, 0.1).round(3).tolist()
+    [0.632, 0.865, 0.95]
+    """
+    from scipy.signal import lfilter  # half a second of import
+
+    keep = math.exp(-step_s / time_constant_s) if time_constant_s > 0.0 else 0.0
+    start = keep * values[:1] if at_first else np.zeros_like(values[:1])
+    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values, axis=0, zi=start)[0])
+
+
+def at_times(time_s: Array, values: Array, at_s: Array, max_gap_s: float) -> Array:
+    """Return samples (n, c) at other times (m,), on straight lines; NaN outside, and within longer gaps."""
+    after = np.searchsorted(time_s, at_s)
+    inside = (after > 0) & (after < len(time_s))
+    inside[inside] = time_s[after[inside]] - time_s[after[inside] - 1] <= max_gap_s
+    found = np.full((len(at_s), values.shape[1]), np.nan)
+    for i, column in enumerate(values.T):
+        found[inside, i] = np.interp(at_s[inside], time_s, column)
+    return found
+
+
+def smooth_on_grid(time_s: Array, values: Array, sigma_s: float, n_steps: int) -> tuple[Array, Array]:
+    """Return an even grid (m,) of ``n_steps`` a sigma, and samples (n,) behind a Gaussian low-pass on it.
+
+    NaN near an end or a gap, where samples do not support it.
+    """
+    from scipy.ndimage import binary_erosion, gaussian_filter1d
+
+    finite = np.isfinite(values)
+    step_s = sigma_s / n_steps
+    grid_s = np.arange(time_s[0], time_s[-1] + 1e-6 * step_s, step_s)
+    if finite.sum() < MIN_SUPPORT:
+        return grid_s, np.full(grid_s.size, np.nan)
+    time_s, values = time_s[finite], values[finite]
+    after = np.clip(np.searchsorted(time_s, grid_s), 1, time_s.size - 1)
+    near = time_s[after] - time_s[after - 1] <= MAX_GAP_SIGMAS * sigma_s
+    inside = (grid_s >= time_s[0] - step_s) & (grid_s <= time_s[-1] + step_s)
+    supported = binary_erosion(near & inside, iterations=int(EDGE_SIGMAS * n_steps))
+    smooth = gaussian_filter1d(np.interp(grid_s, time_s, values), n_steps, mode="nearest")
+    return grid_s, np.where(supported, smooth, np.nan)
+
+
+@njit(cache=True)
+def correlations(
+    time_s: Array,
+    measured: Array,
+    reference: Array,
+    step_s: float,
+    middle_s: float,
+    lags_s: Array,
+    rate: float,
+) -> Array:
+    """Return the correlation (lags,) of a signal with a reference on a fine grid; 0 where few samples meet."""
+    out = np.zeros(lags_s.size)
+    known = np.isfinite(measured)
+    n = known.sum()
+    for a in range(lags_s.size):
+        met = 0
+        x, y, xx, yy, xy = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(time_s.size):
+            at = (time_s[k] - lags_s[a] - rate * (time_s[k] - middle_s)) / step_s
+            if not known[k] or at < 0.0 or at >= reference.size - 1:
+                continue
+            i = int(at)
+            value = reference[i] + (at - i) * (reference[i + 1] - reference[i])
+            if math.isnan(value):
+                continue
+            met += 1
+            x += value
+            y += measured[k]
+            xx += value * value
+            yy += measured[k] * measured[k]
+            xy += value * measured[k]
+        if met < 10 or 2 * met < n:
+            continue
+        power = (xx - x * x / met) * (yy - y * y / met)
+        if power > 1e-20:
+            out[a] = (xy - x * y / met) / math.sqrt(power)
+    return out
+
+
+def nearly_as_good(rival: Array | float, best: float, floor: float) -> Array:
+    """Return whether correlations leave no more than the best one does, but for a margin, of the variance."""
+    left, rival_left = 1.0 - np.clip(best, 0.0, 1.0) ** 2, 1.0 - np.clip(rival, 0.0, 1.0) ** 2
+    return np.asarray(rival_left < (1 + RIVAL_MARGIN) * left + floor)
+
+
+def has_rival(lags_s: Array, column: Array, best: int, same_peak_s: float, floor: float) -> bool:
+    """Return whether a peak elsewhere of correlations (lags,) explains nearly as much as the best one."""
+    rises = np.diff(column) >= 0
+    top = np.append(True, rises) & np.append(~rises, True)
+    elsewhere = top & (np.abs(lags_s - lags_s[best]) > same_peak_s)
+    return bool(nearly_as_good(column[elsewhere], float(column[best]), floor).any())
+
+
+def refine_delay(
+    pair: Pair,
+    lag_s: float,
+    rate: float,
+    *,
+    near_s: float,
+    rate_max: float,
+    rate_stays: bool = False,
+    event: tuple[float, float] | None = None,
+) -> DelayFit | None:
+    """Return lag and rate, or the lag alone, by least squares from a start, or None if they diverge.
+
+    Gain and constant are fitted beside them.  The covariance is ``(J'J)^-1 J'R J (J'J)^-1`` with the
+    autocovariance ``R`` of what is left, tapered over :data:`MEMORY_S`.
+
+    Parameters
+    ----------
+    pair : signal and reference
+    lag_s, rate : start
+    near_s, rate_max : how far the lag may go from there, and how large the rate may be
+    rate_stays : keep the rate, and fit a drift in its place
+    event : a time and a ratio: no delay is found if so much of its information comes from so short a time
+    """
+    start_s, centred_s = lag_s, pair.time_s - pair.middle_s
+    fine_s = pair.step_s * np.arange(pair.reference.size)
+    for _ in range(MAX_STEPS):
+        at_s = pair.time_s - lag_s - rate * centred_s
+        value, slope = np.interp(at_s, fine_s, pair.reference), np.interp(at_s, fine_s, pair.slope)
+        use = np.isfinite(pair.measured + value + slope) & (at_s > 0.0) & (at_s < fine_s[-1])
+        if use.sum() < MIN_ROWS:
+            return None
+        value, seen = value[use], pair.measured[use]
+        level = value - value.mean()
+        gain = float(level @ seen) / max(float(level @ level), 1e-12)
+        late = -gain * slope[use]
+        j = np.array([late, late * centred_s[use], value, np.ones(value.size)])
+        if rate_stays:
+            j[1] = centred_s[use]  # a drift, in its place
+        size = np.sqrt((j * j).sum(axis=1))
+        if not gain > 0 or not size.min() > 1e-9:
+            return None
+        j /= size[:, None]
+        gram = j @ j.T
+        if not np.linalg.det(gram) > 1e-9:
+            return None
+        off = seen - gain * value
+        step = np.linalg.solve(gram, j @ off)
+        left = off - step @ j
+        by_s, faster = float(step[0] / size[0]), 0.0 if rate_stays else float(step[1] / size[1])
+        lag_s, rate = lag_s + by_s, rate + faster
+        if abs(by_s) + abs(faster) * centred_s[-1] < CONVERGED_S:
+            break
+    else:
+        return None
+    if abs(lag_s - start_s) > near_s or abs(rate) > rate_max:
+        return None
+    period_s = float(pair.time_s[1] - pair.time_s[0])
+    power = late * late
+    if event is not None:
+        rows = math.ceil(event[0] / period_s)
+        if np.convolve(power, np.ones(min(rows, power.size))).max() > event[1] * power.sum():
+            return None
+    scores = j * left
+    spread = scores @ scores.T
+    lags = math.ceil(MEMORY_S / period_s)
+    for lag in range(1, lags):
+        lagged = (1.0 - lag / lags) * scores[:, lag:] @ scores[:, :-lag].T
+        spread += lagged + lagged.T
+    inverse = np.linalg.inv(gram)[:2]
+    cov = inverse @ spread @ inverse.T / np.outer(size[:2], size[:2])
+    if rate_stays:
+        cov[0, 1] = cov[1, 0] = 0.0
+    if not (cov[0, 0] > 0 and cov[1, 1] > 0):
+        return None
+    return DelayFit(lag_s, rate, cov, gain, float(np.corrcoef(value, seen)[0, 1]))
+
+
+def peak(lags_s: Array, curve: Array) -> float:
+    """Return the lag of the highest point of a curve at even lags, by a parabola through it and its neighbours.
+
+    Examples
+    --------
+    >>> lags_s = np.arange(5.0)
+    >>> peak(lags_s, -((lags_s - 2.2) ** 2))
+    2.2
+    """
+    i = int(np.argmax(curve))
+    if i in (0, curve.size - 1):
+        return float(lags_s[i])
+    before, at, after = curve[i - 1 : i + 2]
+    bend = before - 2.0 * at + after
+    step_s = float(lags_s[1] - lags_s[0])
+    return float(lags_s[i] + (0.5 * step_s * (before - after) / bend if bend < 0.0 else 0.0))
+
+
+def common_delay(lags_s: Array, curves: Array, max_std_s: float = math.inf, seed: int = 0) -> Delay:
+    """Return the lag that is common to runs, and its standard deviation by bootstrap over them.
+
+    Parameters
+    ----------
+    lags_s : (lags,) even
+    curves : (runs, lags) of each run, high where it fits, as a likelihood
+    max_std_s : a delay that is less certain is undetermined, and so is one at an end of the lags
+    seed : of the bootstrap
+    """
+    counts = bootstrap_counts(len(curves), N_DRAWS, seed)
+    delay_s = peak(lags_s, curves.sum(axis=0))
+    std_s = float(np.std([peak(lags_s, total) for total in counts @ curves]))
+    inside = lags_s[1] < delay_s < lags_s[-2]
+    found = inside and std_s <= max_std_s
+    return Delay(delay_s, std_s, math.nan, DelayStatus.ESTIMATED if found else DelayStatus.UNDETERMINED)

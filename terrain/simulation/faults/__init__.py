@@ -1,1 +1,0 @@
-"""Faults of sensors in a closed loop: a catalogue, and the bus that applies one."""

@@ -1,1 +1,0 @@
-"""What is driven on which terrain: twists over time, patches by distance travelled."""
