@@ -1,9 +1,9 @@
 """One time for all that arrives: the caller's, without its steps, and each stream's stamps on it.
 
 Stamps that agree with the time, up to a quarter of a second late, are left as they are. How stamps follow
-each other distinguishes a clock that was set from samples that are late: its stamps leap back, or ahead of
-the time that has passed. After a leap of a stream the difference to the time is taken anew, once three
-readings agree on it; until then they are left out. What is later without a leap is late, however long, and
+each other distinguishes a clock that was set from samples that are late: its stamps jump back, or ahead of
+the time that has passed. After a jump of a stream the difference to the time is taken anew, once three
+readings agree on it; until then they are left out. What is later without a jump is late, however long, and
 left out.
 """
 
@@ -30,8 +30,8 @@ LONGEST_STEP_S = 0.5
 AHEAD_S = 0.1
 """A stamp that is further ahead of the time is wrong."""
 
-LEAP_S, AGREED_S, N_AGREED = 0.25, 0.05, 3
-"""Stamps that advance by so much more than the time have leapt; readings whose difference to the time is the
+JUMP_S, AGREED_S, N_AGREED = 0.25, 0.05, 3
+"""Stamps that advance by so much more than the time have jumped; readings whose difference to the time is the
 same within this, and how many of them are believed."""
 
 REMEMBERED = 64
@@ -102,7 +102,7 @@ class _StreamClock:
         self.too_late = -math.inf, math.nan
         self.offset_s, self.lateness_s = 0.0, 0.0
         self._stamp_s = self._now_s = math.nan
-        self._due_s, self._n_due, self._leapt = math.nan, 0, True  # a first stamp may be of any time
+        self._due_s, self._n_due, self._jumped = math.nan, 0, True  # a first stamp may be of any time
         self.counts = {"off the clock": 0, "too late": 0, "clock set": 0}
 
     def take(self, now_s: float, reading: Reading) -> Reading | None:
@@ -118,13 +118,13 @@ class _StreamClock:
             return None
         newest_s = stamps[0] if len(stamps) == 1 else max(stamps)
         advanced_s = newest_s - self._stamp_s  # since the reading before
-        if advanced_s < -REWIND_S or advanced_s > now_s - self._now_s + LEAP_S:
-            self._leapt, self._n_due = True, 0
+        if advanced_s < -REWIND_S or advanced_s > now_s - self._now_s + JUMP_S:
+            self._jumped, self._n_due = True, 0
         self._stamp_s, self._now_s = newest_s, now_s
         late_s = now_s - (newest_s - self.offset_s)
         if -AHEAD_S <= late_s <= REWIND_S:
-            self.lateness_s, self._leapt, self._n_due = late_s, False, 0
-        elif not self._leapt:
+            self.lateness_s, self._jumped, self._n_due = late_s, False, 0
+        elif not self._jumped:
             self.counts["too late" if late_s > 0.0 else "off the clock"] += time_s.size
             if late_s > 0.0:
                 self.too_late = now_s, late_s
@@ -145,7 +145,7 @@ class _StreamClock:
         if self._n_due < N_AGREED:
             return False
         self.offset_s = -self._due_s + min(max(self.lateness_s, 0.0), REWIND_S)
-        self._leapt, self._n_due = False, 0
+        self._jumped, self._n_due = False, 0
         self.counts["clock set"] += 1
         return True
 
@@ -225,7 +225,7 @@ class Clocks:
             self._offset_s = given_s - (self._now_s + PERIOD_S)
             self.set += 1
             for clock in self._streams.values():
-                clock._leapt = True
+                clock._jumped = True
         self._given_s = given_s
         self._now_s = given_s - self._offset_s
         return self._now_s

@@ -361,7 +361,7 @@ FEED = record(
         **dict.fromkeys(("gyro_angle_rad", "gyro_time_s"), float),
         **dict.fromkeys(("standing_s", "gyro_low_radps", "gyro_high_radps", "gyro_sum_radps"), float),
         "n_gyro": int,
-        **dict.fromkeys(("frozen", "low_confidence", "no_rotation", "jumps"), (int, len(STREAMS))),
+        **dict.fromkeys(("frozen", "low_confidence", "no_rotation", "jump"), (int, len(STREAMS))),
         **dict.fromkeys(("wheels_not_finite", "wheels_beyond"), int),
     }
 )
@@ -715,7 +715,7 @@ def take_sample(
         jumped = _take_odometry(sample, instant_s, came_s, settings, feed, moving)
     else:
         _take_gnss(sample, instant_s, came_s, settings, feed)
-    feed.jumps[stream] += jumped
+    feed.jump[stream] += jumped
 
 
 @_kernel

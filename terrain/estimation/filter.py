@@ -12,7 +12,7 @@ answer as all at once, in O(m d^2) and without inverting a matrix.  A robot, a s
 
 What arrives is not trusted.  Missing values (NaN) are skipped; so are infinite ones, and counted.  What
 disagrees with the prediction beyond the gate of its sensor is left out, and believed once after a while, so
-that a filter that went wrong finds back.  A leap of the clock is believed when the next stamp follows it, and
+that a filter that went wrong finds back.  A jump of the clock is believed when the next stamp follows it, and
 is not integrated over.  Nothing that comes in makes what comes out infinite or NaN.
 
 Loops are written out and divisions unchecked: at these sizes the assignment of a slice costs as much as a
@@ -336,7 +336,7 @@ STATE = record(
 )
 """All that a filter carries from one sample to the next: a copy is a snapshot.
 
-Stamp of the last sample, that of a leap that is not believed yet, time since the speed over ground was
+Stamp of the last sample, that of a jump that is not believed yet, time since the speed over ground was
 measured; what became of the sensors of the last sample, for how long each was rejected (-1 for
 one that was not), and counts of what was left out."""
 
@@ -355,7 +355,7 @@ _WORK = record(
 )
 """Room to compute in."""
 
-_SKIP, _START, _STEP, _LEAP = range(4)  # what the clock says of a row
+_SKIP, _START, _STEP, _JUMP = range(4)  # what the clock says of a row
 _UNSOUND = -1  # a use that is never reported
 
 _kernel = njit(cache=True, error_model="numpy")
@@ -365,14 +365,14 @@ _kernel = njit(cache=True, error_model="numpy")
 def _follows(time_s: float, last_s: float, pending_s: float, max_gap_s: float) -> int:
     """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken.
 
-    A leap is believed where the stamp follows one that leapt before.
+    A jump is believed where the stamp follows one that jumped before.
     """
     if not math.isfinite(time_s):
         return 0
     step_s = time_s - last_s
     if abs(step_s) > max_gap_s:
-        since_leap_s = time_s - pending_s
-        believed = since_leap_s > 0.0 and since_leap_s <= max_gap_s
+        since_jump_s = time_s - pending_s
+        believed = since_jump_s > 0.0 and since_jump_s <= max_gap_s
         return (1 if step_s > 0.0 else -1) if believed else 0
     return 0 if step_s <= 0.0 else 1
 
@@ -381,15 +381,15 @@ def _follows(time_s: float, last_s: float, pending_s: float, max_gap_s: float) -
 def _read_stamp(model: Any, state: Any, time_s: float) -> tuple[int, float]:
     """Say what the clock does, and move it."""
     dt = time_s - state.time_s
-    leaps = abs(dt) > model.max_gap_s  # not the first, whose dt is NaN
+    jumps = abs(dt) > model.max_gap_s  # not the first, whose dt is NaN
     if _follows(time_s, state.time_s, state.pending_time_s, model.max_gap_s) == 0:
-        if leaps and np.isfinite(time_s):
+        if jumps and np.isfinite(time_s):
             state.jumps += 1
             state.pending_time_s = time_s
         else:
             state.not_advanced += 1
         return _SKIP, dt
-    kind = _LEAP if leaps else (_START if np.isnan(dt) else _STEP)
+    kind = _JUMP if jumps else (_START if np.isnan(dt) else _STEP)
     state.time_s, state.pending_time_s = time_s, np.nan
     return kind, dt
 
@@ -701,7 +701,7 @@ def _take(
             walk = samples.walk[n if samples.walk.shape[0] > 1 else 0]
             inputs = samples.inputs[n if samples.inputs.shape[0] > 1 else 0]
             _step(model, state, work, dt, walk, inputs, params, propagate)
-        elif kind == _LEAP:
+        elif kind == _JUMP:
             _predict_over_gap(model, state, work, dt, params, propagate)
         if columns.taken[n]:
             variance = samples.variance[n if samples.variance.shape[0] > 1 else 0]
@@ -787,7 +787,7 @@ class Filter:
         walk: Array | None = None,
         inputs: Array | None = None,
     ) -> bool:
-        """Take in one sample; return False where its stamp did not advance, or leapt.
+        """Take in one sample; return False where its stamp did not advance, or jumped.
 
         Parameters
         ----------
@@ -980,7 +980,7 @@ def run_filter(
 
     Notes
     -----
-    After a leap, means are kept and all covariances but those of the positions go back to the initial one, or
+    After a jump, means are kept and all covariances but those of the positions go back to the initial one, or
     stay where they were when wider; positions are as uncertain as the speeds that this allows make them over
     the gap.  The means are kept because a logger pauses more often than a drive ends, and because what a gap
     does not change, as a gyro's bias, is best known from before; the covariance makes either harmless.

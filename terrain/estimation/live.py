@@ -390,9 +390,8 @@ class LiveFilter:
         for stream, name in enumerate(STREAMS):
             if name in self._queues:
                 counts |= {f"{name}: {kind}": n for kind, n in self._queues[name].counts.items()}
-                for kind in ("frozen", "low_confidence", "no_rotation", "jumps"):
-                    word = "leap" if kind == "jumps" else kind.replace("_", " ")
-                    counts[f"{name}: {word}"] = int(self._feed[kind][0, stream])
+                for kind in ("frozen", "low_confidence", "no_rotation", "jump"):
+                    counts[f"{name}: {kind.replace('_', ' ')}"] = int(self._feed[kind][0, stream])
         return {kind: n for kind, n in (counts | self.filter.dropped).items() if n}
 
     def at(self, now_s: float) -> LiveEstimate | None:

@@ -183,7 +183,7 @@ def measurement_table(
     feed.run_feed(clock, np.array(wheels.values), *samples, settings, memory, rows)
     counts = {"wheels: beyond the motors": int(memory["wheels_beyond"][0])}
     for number, name in enumerate(STREAMS):
-        counts[f"{name}: leap"] = int(memory["jumps"][0, number])
+        counts[f"{name}: jump"] = int(memory["jump"][0, number])
         counts[f"{name}: no rotation"] = int(memory["no_rotation"][0, number])
     dropped += Counter(counts)  # a Counter, so that zeros fall out
     z = feed.measurements(rows)

@@ -134,7 +134,7 @@ def test_a_stamp_a_little_ahead_is_taken():
 
 
 @pytest.mark.parametrize(("late_s", "taken"), [(0.9 * REWIND_S, True), (1.1 * REWIND_S, False), (2.0, False)])
-def test_what_comes_later_and_later_without_a_leap_is_late_and_no_clock_that_was_set(late_s, taken):
+def test_what_comes_later_and_later_without_a_jump_is_late_and_no_clock_that_was_set(late_s, taken):
     robot = Robot()
     robot.run(5)
     for late in np.linspace(0.0, late_s, 150):

@@ -234,7 +234,7 @@ def test_sample_by_sample_equals_batch_bit_for_bit():
 
 
 @pytest.mark.parametrize("stamp_s", [np.inf, -np.inf, np.nan])
-def test_a_stamp_that_is_no_number_is_no_leap_of_the_clock(stamp_s):
+def test_a_stamp_that_is_no_number_is_no_jump_of_the_clock(stamp_s):
     session = Filter(CARRIAGE, CARRIAGE_NOISE)
     for time_s in (0.0, stamp_s, 0.02):
         session.step(time_s, np.zeros(2))

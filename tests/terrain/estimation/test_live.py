@@ -219,7 +219,7 @@ def test_faults_cost_live_what_they_cost_the_batch(stream, fault):
 
 
 def test_an_outlier_disturbs_the_live_estimate_only_briefly():
-    """An IMU repeats an outlier for 60 ms: the batch counts it as a leap, live as frozen."""
+    """An IMU repeats an outlier for 60 ms: the batch counts it as a jump, live as frozen."""
     run = edited(log(), "imu", put(50.0, n=6))
     _, estimates = live(run)
     _, _, slip = batch(run)
@@ -451,7 +451,7 @@ def stamped(rate_hz, stamps):
     "n", [1, 4, 10, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3, 5, 6, 7, 8, 9))]
 )
 def test_a_jump_of_any_length_costs_live_what_it_costs_the_batch(n, stamps):
-    """Four samples that leapt are a step of five periods: the low-pass goes on over it, live and in batch."""
+    """Four samples that jumped are a step of five periods: the low-pass goes on over it, live and in batch."""
     run = edited(edited(log(), "odometry", stamped(200.0, stamps)), "odometry", jump(n))
     assert_equal(run)
 

@@ -72,26 +72,26 @@ ODD = ROBOT.with_parts(
 )
 
 
-def plain_leaps(time_s, value, least, per_second, fate=PASSING):
+def plain_jumps(time_s, value, least, per_second, fate=PASSING):
     """Mark samples that are further from the last one kept than a robot gets, for at most BELIEVED_S."""
     if fate != PASSING:
         return plain_sums(time_s, value, least, per_second, fate) != 0.0
-    leaps = np.zeros(value.size, dtype=bool)
+    jumps = np.zeros(value.size, dtype=bool)
     last, last_s, since_s = np.nan, np.nan, np.nan
     for k in np.flatnonzero(np.isfinite(value)):
         if abs(value[k] - last) > least + per_second * (time_s[k] - last_s):
             since_s = time_s[k] if np.isnan(since_s) else since_s
             if time_s[k] - since_s < BELIEVED_S:
-                leaps[k] = True
+                jumps[k] = True
                 continue
         last, last_s, since_s = value[k], time_s[k], np.nan
-    return leaps
+    return jumps
 
 
 def plain_sums(time_s, value, least, per_second, fate, period_s=None):
-    """Sum the leaps of a row whose leaps last: from sample to sample; zero again within half of the least.
+    """Sum the jumps of a row whose jumps last: from sample to sample; zero again within half of the least.
 
-    A leap from the first sample after a gap is that one's fault.
+    A jump from the first sample after a gap is that one's fault.
     """
     known = np.flatnonzero(np.isfinite(value))
     gap_s = GAP_PERIODS * (np.median(np.diff(time_s)) if period_s is None else period_s)
@@ -278,7 +278,7 @@ def plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal):
 
 
 def plain_table(run, robot, causal, initial_yaw_rad):
-    """Return rows (n, 29), variances (n, 4) and counts of leaps of a swerve robot's run."""
+    """Return rows (n, 29), variances (n, 4) and counts of jumps of a swerve robot's run."""
     dropped, lag_s = Counter(), robot.sensors.encoder_time_constant_s
     wheels = clean_stream(run, "wheels", [f"motor_{i}_radps" for i in (1, 2, 3)], dropped)
     clock, rates = wheels.time_s, wheels.values / robot.motors.reduction_ratio
@@ -286,7 +286,7 @@ def plain_table(run, robot, causal, initial_yaw_rad):
     rows = ROWS_OF_DRIVE["swerve"]
     rates = plain_wheels(clock, wheels.values, rates, robot)
     once, twice, moving = plain_moving(clock, rates * robot.wheel_radius_m)
-    table, leaps = dict(zip(rows, rates.T, strict=False)), {}
+    table, jumps = dict(zip(rows, rates.T, strict=False)), {}
     imu_s, accel_z = np.zeros(0), np.zeros(0)
     camera_lag_s = max(lag_s - robot.camera.time_constant_s, 0.0)
     gnss_variance = dict.fromkeys(GNSS_ROWS, np.full(clock.size, np.nan))
@@ -321,12 +321,12 @@ def plain_table(run, robot, causal, initial_yaw_rad):
             signals["camera_yaw_rad"] = np.where(np.isnan(yaw), np.nan, yaw - sums)
         none = (np.inf, np.inf)
         found = {
-            row: plain_leaps(
+            row: plain_jumps(
                 time_s, v, *(none if row == "camera_yaw_rad" else JUMPS.get(signal_of(row), none))
             )
             for row, v in signals.items()
         }
-        leaps[name] = int(np.any(list(found.values()), axis=0).sum())
+        jumps[name] = int(np.any(list(found.values()), axis=0).sum())
         for row, signal in signals.items():
             signal = np.where(found[row], np.nan, signal)
             table[row] = plain_on_clock(clock, time_s, came_s, signal, tau_s)
@@ -339,7 +339,7 @@ def plain_table(run, robot, causal, initial_yaw_rad):
     table |= derived
     wheel_speed_mps = np.column_stack([table[row] for row in rows[:3]]) * robot.wheel_radius_m
     plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal)
-    return np.column_stack(list(table.values())), np.column_stack(list(gnss_variance.values())), leaps
+    return np.column_stack(list(table.values())), np.column_stack(list(gnss_variance.values())), jumps
 
 
 def plain_wheels(clock, motor_radps, rates, robot):
@@ -378,17 +378,17 @@ def plain_lives(name, stream, moving):
 
 
 def plain_vertical(imu, time_s, robot, signals):
-    """Return the vertical acceleration without gravity; where the attitude leapt, nothing by it is known."""
+    """Return the vertical acceleration without gravity; where the attitude jumped, nothing by it is known."""
     sensors, roll, pitch = robot.sensors, imu.channel("roll_rad"), imu.channel("pitch_rad")
-    leapt = np.zeros(len(roll), dtype=bool)
+    jumped = np.zeros(len(roll), dtype=bool)
     for angle in (roll, pitch):
         sums = plain_sums(time_s, angle, 0.05, 3.0, LATCHED, 0.02)
-        leapt |= np.isfinite(angle) & (sums != 0.0)
+        jumped |= np.isfinite(angle) & (sums != 0.0)
     for row in ("accel_x_mps2", "accel_y_mps2"):
-        signals[row] = np.where(leapt, np.nan, signals[row])
+        signals[row] = np.where(jumped, np.nan, signals[row])
     force = (imu.channel("accel_z_mps2") - sensors.accel_bias_z_mps2) / sensors.accel_scale_z_ratio
     level = GRAVITY_MPS2 * np.cos(roll) * np.cos(pitch)
-    return np.where(leapt, np.nan, force - level)
+    return np.where(jumped, np.nan, force - level)
 
 
 def with_faults(run, rng):
@@ -419,8 +419,8 @@ def drive(kind):
 def test_the_chain_gives_the_numbers_of_its_plain_form(kind, causal, robot):
     run = drive(kind)
     table = measurement_table(run, robot, causal=causal, initial_yaw_rad=0.7)
-    z, gnss_variance, leaps = plain_table(run, robot, causal, 0.7)
+    z, gnss_variance, jumps = plain_table(run, robot, causal, 0.7)
     np.testing.assert_allclose(table.z, z, rtol=0, atol=1e-10)
     np.testing.assert_allclose(table.gnss_variance, gnss_variance, rtol=1e-12)
-    assert {name: table.dropped.get(f"{name}: leap", 0) for name in leaps} == leaps
-    assert (sum(leaps.values()) > 0) == (kind == "faults")
+    assert {name: table.dropped.get(f"{name}: jump", 0) for name in jumps} == jumps
+    assert (sum(jumps.values()) > 0) == (kind == "faults")

@@ -154,7 +154,7 @@ def test_nothing_that_arrives_raises_or_makes_an_estimate_infinite(arrivals):
             assert np.isfinite(estimate.std).all()
             assert estimate.motion in Motion
     estimate_s = time_s + 0.02
-    for _ in range(2):  # a leap is believed when the next stamp follows it
+    for _ in range(2):  # a jump is believed when the next stamp follows it
         estimator.step({"wheels": Reading(np.array([estimate_s]), WHEELS[None])})
         estimate_s += 0.02
     assert np.isfinite(estimator.latest.mean).all()

@@ -414,25 +414,25 @@ def test_a_sensor_that_repeats_itself_is_frozen(stream):
     assert not any(kind.endswith("frozen") for kind in dropped)  # wheels may stand still
 
 
-def test_a_leap_is_taken_out_before_the_low_pass_smears_it():
+def test_a_jump_is_taken_out_before_the_low_pass_smears_it():
     plain = measurement_table(RUN, bare())
     relocalised = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 2.02), 3.0, "velocity_z_mps"))
     table = measurement_table(relocalised, bare())
-    assert table.dropped == {"odometry: leap": 4}
+    assert table.dropped == {"odometry: jump": 4}
     np.testing.assert_allclose(table.z, plain.z, atol=0.03)
 
     jumped = change(RUN, "odometry", set_rows(lambda t: t >= 2.0, 3.0, "velocity_z_mps"))
     table = measurement_table(jumped, bare())
     late = table.time_s > 2.05
-    assert table.dropped["odometry: leap"] == 10  # then the channel is frozen
-    assert np.isnan(rows_of(table, "camera_speed_x_mps")[late]).all()  # a speed over ground cannot leap
+    assert table.dropped["odometry: jump"] == 10  # then the channel is frozen
+    assert np.isnan(rows_of(table, "camera_speed_x_mps")[late]).all()  # a speed over ground cannot jump
     assert np.isfinite(rows_of(table, "camera_yaw_rate_radps", "camera_yaw_rad")[late]).all()
     back = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 3.0), 3.0, "velocity_z_mps"))
     table = measurement_table(back, bare())
     assert np.isfinite(rows_of(table, "camera_speed_x_mps")[table.time_s > 3.05]).all()
 
 
-def test_a_leap_of_the_camera_s_heading_is_taken_off():
+def test_a_jump_of_the_camera_s_heading_is_taken_off():
     def turned(time_s, values, channels):
         late, q = time_s >= 3.0, [channels.index(f"quaternion_{a}_ratio") for a in "xyzw"]
         # the camera's y axis points down: a turn to the left about it is negative
