@@ -26,12 +26,13 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import minimize_scalar
 
 from terrain.calibration.finding import Finding, undetermined
-from terrain.calibration.sensors import MAX_GAP_S, Stretch, at_times, origin_twist
+from terrain.calibration.sensors import MAX_GAP_S, Stretch, origin_twist
 from terrain.estimation.resampling import low_pass
 from terrain.identify import half_width
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
+from terrain.signals import at_times
 
 REFERENCE_LAG_S = 1 / (2 * math.pi * 62.5)
 """Of the accelerometer itself: 62.5 Hz of bandwidth in the fusion modes (Bosch, BNO055 data sheet)."""
@@ -144,7 +145,7 @@ def _within(stretch: Stretch, robot: Robot) -> list[Event]:
         return []
     time_s = wheels.time_s
     zeros = (steering.zero_1_rad, steering.zero_2_rad, steering.zero_3_rad)
-    steer = at_times(Stream(angles.time_s, np.unwrap(angles.values, axis=0) - zeros, angles.channels), time_s)
+    steer = at_times(angles.time_s, np.unwrap(angles.values, axis=0) - zeros, time_s, MAX_GAP_S)
     wheel_speed, _ = no_slip_twist(
         robot.wheel_positions_m, steer, robot.wheel_radius_m * (wheels.values / motors.reduction_ratio)
     )
@@ -159,7 +160,7 @@ def _within(stretch: Stretch, robot: Robot) -> list[Event]:
             continue
         along = change / np.linalg.norm(change)
         grid_s = np.arange(start_s, end_s, GRID_S)
-        accel = at_times(imu, grid_s) @ along
+        accel = at_times(imu.time_s, imu.values, grid_s, MAX_GAP_S) @ along
         viewed = (seen.time_s >= grid_s[0]) & (seen.time_s <= grid_s[-1])
         covered = (time_s >= grid_s[0]) & (time_s <= grid_s[-1])
         gaps = np.diff(seen.time_s[viewed], prepend=grid_s[0], append=grid_s[-1])

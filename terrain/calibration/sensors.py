@@ -196,17 +196,6 @@ def origin_twist(stretch: Stretch, robot: Robot) -> Stream | None:
     return Stream(seen.time_s, np.column_stack([*origin, turn_radps]), TWIST)
 
 
-def at_times(stream: Stream, time_s: Array) -> Array:
-    """Return a stream's values (n, channels) at other times; NaN outside it and within its long gaps."""
-    after = np.searchsorted(stream.time_s, time_s)
-    inside = (after > 0) & (after < len(stream))
-    inside[inside] = stream.time_s[after[inside]] - stream.time_s[after[inside] - 1] <= MAX_GAP_S
-    values = np.full((len(time_s), len(stream.channels)), np.nan)
-    for i, column in enumerate(stream.values.T):
-        values[inside, i] = np.interp(time_s[inside], stream.time_s, column)
-    return values
-
-
 MIN_POSITION_S = 2.0
 """Of a position: "a couple of seconds" (thesis 3.3.3)."""
 

@@ -32,11 +32,12 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.calibration.finding import Finding, around, undetermined
-from terrain.calibration.sensors import Stretch, at_times, origin_twist
+from terrain.calibration.sensors import MAX_GAP_S, Stretch, origin_twist
 from terrain.identify import half_width
 from terrain.kinematics.wheels import wheel_velocities
-from terrain.records import Array, RunLog, Stream
+from terrain.records import Array, RunLog
 from terrain.robots import Robot
+from terrain.signals import at_times
 
 STEADY_S = 0.5
 """Steady driving: the means over this time before and after an instant differ by no more than the two
@@ -125,9 +126,8 @@ def _within(stretch: Stretch, robot: Robot) -> list[Steady]:
     if wheels is None or steering is None or seen is None:
         return []
     time_s = wheels.time_s
-    twist = at_times(seen, time_s)
-    unwrapped = Stream(steering.time_s, np.unwrap(steering.values, axis=0), steering.channels)
-    angle = at_times(unwrapped, time_s)
+    twist = at_times(seen.time_s, seen.values, time_s, MAX_GAP_S)
+    angle = at_times(steering.time_s, np.unwrap(steering.values, axis=0), time_s, MAX_GAP_S)
     motor, current = wheels.values[:, :3], wheels.values[:, 3:]
     wheel_speed = motor / robot.equipment.motors.reduction_ratio * robot.wheel_radius_m
     known = np.isfinite(twist).all(axis=1) & np.isfinite(angle).all(axis=1)

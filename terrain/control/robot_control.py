@@ -35,7 +35,6 @@ from terrain.control.wheel_controllers import (
     largest_forward,
     step_or_period,
 )
-from terrain.entry_point import entry_point
 from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.estimation.live import LiveEstimate
 from terrain.kinematics.commands import FAR_RAD, wheel_command_step
@@ -52,7 +51,6 @@ _NAMED_FIRST = (0, 1, 2, 3, 4, 6, 7, 5)
 # as plain numbers, which compare in a tenth of the time
 _SOUND, _DISAGREES, _LOST = int(SOUND), int(Health.DISAGREES), int(Health.LOST)
 _GYRO, _SEEN, _SEEN_YAW = (SENSORS.index(name) for name in ("gyro", "camera_speed", "camera_yaw"))
-_wheel_command_step = entry_point(wheel_command_step)
 _NOT_ESTIMATED = UNOBSERVED._replace(stale_s=math.nan)
 _NOT_TRACKED = TrackReport(math.nan, math.nan, 0.0, TrackStatus.NO_POSE)
 
@@ -163,7 +161,7 @@ class RobotControl:
         sensor, health = self._judge(seen)
         target = self._target(belief.terrain, seen, step_s)
         twist, tracked = self._track(desired, seen, time_s, dt_s)
-        admitted, wheel_radps, self.steer_rad = _wheel_command_step(
+        admitted, wheel_radps, self.steer_rad = wheel_command_step(
             self._positions_m, *self._limits, step_s, FAR_RAD, twist, self.steer_rad
         )
         desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m

@@ -14,7 +14,6 @@ from enum import auto
 import numpy as np
 
 from terrain.angles import wrapped
-from terrain.entry_point import entry_point
 from terrain.kinematics.commands import FAR_RAD, wheel_command_step
 from terrain.records import Array, Command, Reading
 from terrain.robots import SwerveRobot
@@ -22,8 +21,6 @@ from terrain.status import StatusCode
 
 AHEAD_S = 0.1
 """A sample whose stamp is further ahead of the time is not built on."""
-
-_wheel_command_step = entry_point(wheel_command_step)
 
 
 class BridgeState(StatusCode):
@@ -63,9 +60,7 @@ class LowLevelKinematics:
         """Return the rates (3,) for a twist, and move the steering to within a step."""
         limits = (*self._limits, dt_s, FAR_RAD)
         wheel_radps: Array
-        _, wheel_radps, self.steer_rad = _wheel_command_step(
-            self._positions_m, *limits, twist, self.steer_rad
-        )
+        _, wheel_radps, self.steer_rad = wheel_command_step(self._positions_m, *limits, twist, self.steer_rad)
         return wheel_radps
 
 

@@ -19,7 +19,7 @@ from terrain.calibration.skid_steer import (
 from terrain.errors import ConfigError, DataError
 from terrain.logs.write import write_run
 from terrain.records import Stream
-from terrain.robots import load_robot
+from terrain.robots import description_file, load_robot
 
 HIDDEN = [(0.287, 1.8, 0.3, 0.05), (0.31, 1.5, 0.45, 0.12), (0.3, 2.1, 0.1, 0.0)]
 
@@ -103,19 +103,13 @@ def test_runs_without_a_lidar_are_one_sentence(tmp_path):
 
 
 def test_a_section_with_a_wrong_key_or_unit_is_one_sentence(tmp_path):
-    text, file = _warthog_text(), tmp_path / "mine.yaml"
+    text, file = description_file("warthog").read_text(), tmp_path / "mine.yaml"
     file.write_text(text.replace("effective_track_m:", "effective_width_m:"))
     with pytest.raises(ConfigError, match="identified: key 'effective_width_m' is unknown"):
         load_robot(file)
     file.write_text(text.replace("0.41, unit: s", "0.41, unit: ms"))
     with pytest.raises(ConfigError, match="lidar_delay_s has the unit 'ms', 's' is required"):
         load_robot(file)
-
-
-def _warthog_text():
-    from terrain.files.resources import data_folder
-
-    return (data_folder("robots") / "warthog.yaml").read_text()
 
 
 def overlap(finding, name, robot):

@@ -1,5 +1,6 @@
 """The search on runs in which it is known what is there."""
 
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -9,12 +10,27 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
-from terrain.discrepancy.evidence import Nearby, move_point
+from terrain.discrepancy import search as search_module
+from terrain.discrepancy.evidence import Nearby, Statistics, move_point
 from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.search import RISE, Problem, names_of, search, steps_of, with_rivals
+from terrain.discrepancy.search import (
+    RISE,
+    RIVAL_LOSS,
+    RIVAL_RISE,
+    Problem,
+    Refit,
+    _found,
+    names_of,
+    pooled,
+    relinearize,
+    rivals_of,
+    search,
+    steps_of,
+    with_rivals,
+)
 from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import signals_of
-from terrain.effects import BOUNDS, INDEX, LIBRARY, effect_named
+from terrain.effects import BOUNDS, INDEX, LIBRARY, effect_named, vector_of
 from terrain.robots import load_robot
 
 HUSKY = load_robot("husky")
@@ -213,3 +229,99 @@ def test_a_track_of_half_is_found_though_straight_lines_take_it_for_less_than_no
     found = searched(asked)
     assert [cause.name for cause in found.causes] == ["effective_track"]
     assert found.change[0] == pytest.approx(-0.45, abs=0.02)
+
+
+# -- Values that one simulation has for all runs: the least square over all of them ------------------------
+
+SIMULATION = simulation_of(HUSKY)
+TRACK = "effective_track_ratio"
+
+
+def fitted(values):
+    """Return a problem of runs with a track each, and the fit of one track to them."""
+    (track,) = library = (effect_named("effective_track"),)
+    logs = []
+    for i, value in enumerate(values):
+        drives = rich_drives(np.random.default_rng(i), 1, 30.0)
+        (run,) = hidden_runs(HUSKY, drives, np.random.SeedSequence(i), {TRACK: value})
+        logs.append(replace(run, run_id=f"run_{i}"))
+    signals = tuple(signals_of(run, HUSKY) for run in logs)
+    problem = Problem(signals, SIMULATION, low_pass_of(signals), library)
+    start = problem.at(SIMULATION.vector)
+    return problem, _found(problem, relinearize(problem, start, start.vector, [track]), [track])
+
+
+@pytest.fixture(scope="module")
+def scattered():
+    return fitted([0.3, 1.2, 0.4, 1.3, 0.5, 1.0])
+
+
+def test_it_leaves_the_least_square_where_runs_differ(scattered):
+    problem, found = scattered
+    one = pooled(problem, found)
+    assert found.names == (TRACK,)
+    statistics = Statistics(found.info.noise, SIMULATION.scatter)
+
+    def square(value):
+        info = problem.at(vector_of({TRACK: value}), (TRACK,), statistics)
+        return sum(float((white**2).sum()) for white in info.white_residual)
+
+    best = float(one.change[0])
+    assert square(best) < min(square(0.93 * best), square(1.07 * best))
+    assert square(best) <= square(float(found.change[0]))
+    # six runs determine a mean to 0.41 of their scatter, 0.4, at the best
+    assert 0.08 < float(np.sqrt(one.cov[0, 0])) < 0.4
+
+
+def test_runs_that_are_alike_keep_their_value():
+    problem, found = fitted([0.5] * 4)
+    assert pooled(problem, found) is found
+
+
+# -- Which effects fit as well in the place of a cause, by the losses and squares of their fits ------------
+
+CAUSE, OTHER = effect_named("payload"), effect_named("motor_constant")
+SQUARE = 1000.0
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Evidence of which only the point is read."""
+
+    vector: tuple = (0.0,)
+    model_std: tuple = (0.0,)
+
+
+@pytest.fixture
+def fitted_rivals(monkeypatch):
+    """Return a function that sets loss and square of the other effect's fit, and returns the rivals."""
+
+    def found(behind, square, inflation=1.0):
+        def fit(problem, judge, base, names):
+            own = names == (CAUSE.parameters[0].name,)
+            return Refit(0.0 if own else behind, SQUARE if own else square, np.array([0.1]), np.array([0.01]))
+
+        monkeypatch.setattr(search_module, "fit_again", fit)
+        monkeypatch.setattr(search_module, "_near", lambda *_: [OTHER])
+        monkeypatch.setattr(search_module, "wald_test", lambda *_: SimpleNamespace(inflation=inflation))
+        monkeypatch.setattr(search_module, "_allowed", lambda *_: RIVAL_LOSS)
+        found = rivals_of(None, Judge(), Judge(), [CAUSE])
+        return [each.effect.name for each in found[CAUSE.name]]
+
+    return found
+
+
+def test_an_effect_that_is_little_behind_is_a_rival(fitted_rivals):
+    assert fitted_rivals(RIVAL_LOSS - 1.0, SQUARE) == [OTHER.name]
+    assert fitted_rivals(RIVAL_LOSS + 1.0, SQUARE) == []
+
+
+def test_an_effect_that_leaves_a_larger_square_is_no_rival(fitted_rivals):
+    most = (1.0 + RIVAL_RISE) * SQUARE + RIVAL_LOSS
+    assert fitted_rivals(-50.0, most - 1.0) == [OTHER.name]
+    assert fitted_rivals(-50.0, most + 1.0) == []
+
+
+def test_losses_count_less_where_runs_disagree_on_the_cause(fitted_rivals):
+    assert fitted_rivals(3.0 * RIVAL_LOSS, SQUARE) == []
+    assert fitted_rivals(3.0 * RIVAL_LOSS, SQUARE, inflation=4.0) == [OTHER.name]

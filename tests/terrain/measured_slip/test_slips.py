@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
-from terrain.kinematics.wheels import no_slip_twist
 from terrain.measured_slip.delay import DelayStatus, estimate_delay
 from terrain.measured_slip.ground_changes import slip_step
 from terrain.measured_slip.slips import (
@@ -172,15 +171,6 @@ def test_a_step_of_slip_is_dated(make_omni_run, robotino, before, after):
         assert found.time_s == pytest.approx(6.0, abs=0.3)
         assert (found.before, found.after) == pytest.approx((before, after), abs=0.03)
         assert found.crossing_s == pytest.approx(0.25 / (0.1 * (1 - (before + after) / 2)), rel=0.4)
-
-
-def test_wheels_that_do_not_roll_across_determine_a_swerve_twist():
-    positions = load_robot("agrimaro").wheel_positions_m
-    twist = np.array([[0.5, 0.2, 0.3]])
-    ahead = twist[:, :1] - twist[:, 2:] * positions[:, 1]
-    left = twist[:, 1:2] + twist[:, 2:] * positions[:, 0]
-    found = no_slip_twist(positions, np.arctan2(left, ahead), np.hypot(ahead, left))[0]
-    np.testing.assert_allclose(found, twist, atol=1e-12)
 
 
 def test_a_surface_counts_runs_and_states_how_its_median_carries_over(make_omni_run, robotino):

@@ -9,7 +9,6 @@ from terrain.errors import ConfigError
 from terrain.extension import apply_homes
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.kinematics.wheels import rolling_matrix
-from terrain.measured_slip.rollers import roller_findings
 from terrain.measured_slip.slips import measured_slip
 from terrain.robots import load_robot
 from terrain.simulation.contact import softness
@@ -240,25 +239,6 @@ def test_measured_slip_of_a_simulated_run_is_its_truth(direction_rad):
             if np.isfinite(found.slip_ratio[k, i]) and abs(found.wheel_speed_mps[k, i]) > 0.1:
                 slip = np.nanmean(truth.channel(f"slip_{wheel}_ratio")[inside])
                 assert found.slip_ratio[k, i] == pytest.approx(slip, abs=5 * found.slip_std[k, i] + 0.01)
-
-
-def test_hidden_rollers_load_and_radius_of_simulated_runs_come_back_within_their_intervals():
-    hidden = {"cork": 0.1, "carpet": 0.6}
-    slips, groups = [], []
-    for j, (name, ratio) in enumerate(hidden.items()):
-        ground = CARPET._replace(roller_ratio=ratio / SOFT)
-        for i in range(18):
-            run = driven(2 * np.pi * i / 18, 100 * j + i, ground, 0.2, 4.0, {"wheel_radius_ratio": -0.05})
-            slips.append(measured_slip(run, ROBOT))
-            groups.append(name)
-    found = roller_findings(slips, groups, ROBOT, list(hidden))
-    for name, ratio in hidden.items():
-        low, high = found.roller_interval[name]
-        assert low - 0.01 < ratio < high + 0.01
-    load = make_planar(ROBOT, CARPET).wheel_load_ratio
-    for share, (low, high) in zip(load, found.load_interval, strict=True):
-        assert low - 0.005 < share < high + 0.005
-    assert found.scale_error == pytest.approx(0.05, abs=0.005)
 
 
 @pytest.mark.parametrize(
