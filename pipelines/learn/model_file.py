@@ -124,7 +124,7 @@ def write_model(folder: Path, model: TerrainModel) -> None:
         if it has a network and onnx is not installed.
     """
     network = _network(model.recipe)
-    graph = None if network is None else network.onnx_
+    graph = b"" if network is None else network.onnx_
     try:
         if network is not None:
             network.onnx_ = b""  # it lies in a file of its own
