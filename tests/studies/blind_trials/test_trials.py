@@ -233,20 +233,6 @@ def test_half_of_the_runs_have_the_effect_and_the_others_have_none():
     assert abs(bias) > 0.008
 
 
-@pytest.mark.slow
-def test_trials_of_the_dynamic_simulation_take_every_setting_in_turn():
-    settings = [setting_of(number) for number in range(60)]
-    assert {s.scenario for s in settings} == {"complex", "starts", "survey"}
-    assert sum(s.hides for s in settings) == 30
-    assert all(settings.count(s) == 5 for s in settings)
-    quiet, hides = stage(Row.DYNAMIC, 2, 8), stage(Row.DYNAMIC, 3, 8)
-    assert quiet.hidden.causes == ()
-    assert hides.hidden.causes == ("wheel_radius",)
-    assert quiet.variant == hides.variant == "starts"
-    assert len(quiet.runs) == 6  # as the command, which holds two of eight out
-    assert not {case.robot for case in cases_of(Row.DYNAMIC, 3, 0, 8)} - {"agrimaro"}
-
-
 def test_a_larger_wheel_carries_the_dynamic_robot_further():
     setting = setting_of(2)
     travelled = []

@@ -86,14 +86,7 @@ OF_STAGE = ("variant", "accepted", "clipped", "late_s", "stalled", "present", "f
 
 
 class Varying(NamedTuple):
-    """An effect that differs from run to run, as it was answered.
-
-    Parameters
-    ----------
-    name : of the effect
-    groups : value and run ids of each group
-    rivals : effects that explain the differences as well
-    """
+    """An effect that differs from run to run as it was answered: value and run ids of each group, and its rivals."""
 
     name: str
     groups: tuple[tuple[float, tuple[str, ...]], ...]

@@ -300,12 +300,8 @@ def test_one_run_alone_and_a_run_without_rows_are_no_special_case():
     (run,) = on_one_clock(sound()[:1])
     simulation, low_pass = simulation_of(load_robot("husky")), low_pass_of([run])
     (rows,) = (rows_of(run, simulation.planar_on(""), simulation.vector, (), low_pass),)
-    none = rows._replace(
-        time_s=rows.time_s[:0],
-        measured=rows.measured[:0],
-        predicted=rows.predicted[:0],
-        inputs=rows.inputs[:0],
-    )
+    no_rows = {name: getattr(rows, name)[:0] for name in ("time_s", "measured", "predicted", "inputs")}
+    none = rows._replace(**no_rows)
     assert faults_of([run], [none], simulation, low_pass) == ()
 
 

@@ -1,6 +1,7 @@
 """Sentences of channels: the factor between measured and simulated comes back, all that is found is there."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -73,25 +74,11 @@ def a_run(seed, factor=1.0, level=0.0, std=0.02, channel=YAW, terrain="grass", a
 
 
 def a_diagnosis(**more):
-    empty = {
-        "robot": "husky",
-        "verdict": Verdict.NONE,
-        "causes": (),
-        "parameters": (),
-        "cov": np.empty((0, 0)),
-        "ambiguous_sets": (),
-        "ambiguous_values": {},
-        "unexplained": (),
-        "limits": (),
-        "not_excited": (),
-        "ruled_out": (),
-        "excluded_runs": (),
-        "clocks": (),
-        "next_drive": None,
-        "residual_before": {},
-        "residual_after": {},
-        "n_runs": 8,
-    }
+    none = ("causes", "parameters", "ambiguous_sets", "unexplained", "limits", "not_excited", "ruled_out")
+    empty = dict.fromkeys((*none, "excluded_runs", "clocks"), ())
+    empty |= {name: {} for name in ("ambiguous_values", "residual_before", "residual_after")}
+    empty |= {"robot": "husky", "verdict": Verdict.NONE, "next_drive": None, "n_runs": 8}
+    empty["cov"] = np.empty((0, 0))
     return Diagnosis(**(empty | more))
 
 
@@ -207,7 +194,7 @@ def test_only_the_sum_of_a_described_lever_and_the_one_found_counts():
     camera = HUSKY.camera
 
     def place(described_m, found_m):
-        robot = HUSKY.with_parts(camera=type(camera)(**{**_fields(camera), "lever_x_m": described_m}))
+        robot = HUSKY.with_parts(camera=replace(camera, lever_x_m=described_m))
         values = (
             Value("lever_x_m", found_m, "m", found_m - 0.01, found_m + 0.01),
             Value("lever_y_m", 0.001, "m", -0.01, 0.012),
@@ -216,10 +203,6 @@ def test_only_the_sum_of_a_described_lever_and_the_one_found_counts():
 
     assert place(0.35, -0.23) == place(0.10, 0.02) == "the measured point 0.12 m ahead of the centre"
     assert place(-0.35, 0.0) == "the measured point 0.35 m behind the centre"
-
-
-def _fields(part):
-    return {name: getattr(part, name) for name in type(part).__dataclass_fields__}
 
 
 def test_an_assumed_number_stands_beside_the_value_that_rests_on_it():
