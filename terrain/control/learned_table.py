@@ -22,7 +22,7 @@ from terrain.measured_slip.slips import MeasuredSlip
 from terrain.measured_slip.surfaces import OperatingPoints, SurfaceSlip, operating_points, surface_slip
 from terrain.records import Array, RunLog, SlipTarget, TargetStatus
 from terrain.robots import Robot
-from terrain.simulation.slip_sweep import learning_runs
+from terrain.simulation.run import learning_runs
 from terrain.slip_learning.curve import (
     LAW_PARAMETERS,
     MIN_ABOVE_BALANCE_SLIP,

@@ -30,9 +30,9 @@ from terrain.kinematics.wheels import rolling_matrix
 from terrain.measured_slip.rollers import roller_findings
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import description_file, load_robot
-from terrain.simulation.bench import six_positions_log
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.omni import steady_twist
+from terrain.simulation.run import six_positions_log
 from terrain.simulation.scenario import make_scenario
 from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio

@@ -1,6 +1,6 @@
 """Coverage of the interval of a learned slip peak and error of the peak, over many simulated terrains.
 
-A case is one terrain with the runs of :data:`terrain.simulation.slip_sweep.LEARNING_DRIVES`.  The truth is
+A case is one terrain with the runs of :data:`terrain.simulation.run.LEARNING_DRIVES`.  The truth is
 the peak of the described soil's own net traction under a third of the robot's weight, by the same definition
 over the slips that the case observes.
 """
@@ -23,7 +23,7 @@ from pipelines.report.tree import Column, Report, Table
 from terrain.constants import GRAVITY_MPS2
 from terrain.records import TargetStatus
 from terrain.robots import Robot, load_robot
-from terrain.simulation.slip_sweep import LEARNING_DRIVES, Drive, learning_runs
+from terrain.simulation.run import LEARNING_DRIVES, Drive, learning_runs
 from terrain.slip_learning.curve import N_BOOTSTRAP, Peak, PeakStatus, net_peak
 from terrain.slip_learning.learn import learn_terrain, terrain_runs
 from terrain.terramechanics.soil import load_soil, soil_names

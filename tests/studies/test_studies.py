@@ -19,7 +19,7 @@ from studies.__main__ import STUDIES, main
 from studies.blind_trials.hidden import Row
 from terrain.errors import ConfigError, DataError
 from terrain.robots import load_robot
-from terrain.simulation.slip_sweep import Drive
+from terrain.simulation.run import Drive
 
 ROOT = Path(__file__).parents[2]
 ROBOT = load_robot("agrimaro")

@@ -11,7 +11,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.estimation.table import measurement_table
 from terrain.logs.write import write_run
 from terrain.robots import description_file, load_robot
-from terrain.simulation.bench import six_positions_log
+from terrain.simulation.run import six_positions_log
 
 SOURCE = description_file("agrimaro").read_text(encoding="utf-8")
 

@@ -15,7 +15,7 @@ from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.logs.write import write_run
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.slip_sweep import Drive, learning_runs
+from terrain.simulation.run import Drive, learning_runs
 
 ROBOT = load_robot("agrimaro")
 DRIVES = (

@@ -22,7 +22,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.feed import ROWS_OF_DRIVE
 from terrain.records import RunLog, Stream
-from terrain.simulation.bench import six_positions_log
+from terrain.simulation.run import six_positions_log
 
 
 def with_imu(run, change):

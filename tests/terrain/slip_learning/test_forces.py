@@ -9,8 +9,7 @@ from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.run import simulate_run
-from terrain.simulation.slip_sweep import Drive, SlipSweep, scenario_of
+from terrain.simulation.run import Drive, SlipSweep, scenario_of, simulate_run
 from terrain.slip_learning.forces import (
     body_balance,
     contact_slip,
