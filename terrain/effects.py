@@ -85,8 +85,8 @@ class Combine(Enum):
     TIMES = "x (1 + e)"
     OVER = "x / (1 + e)"
 
-    def apply(self, number: float, value: float) -> float:
-        """Return the changed number.
+    def apply(self, number: Any, value: float) -> Any:
+        """Return the changed number, or numbers.
 
         Examples
         --------
@@ -119,6 +119,10 @@ class Home(NamedTuple):
     optional: bool = False
 
 
+STAMPS = ("stamp",)
+"""In place of channels: the stamps of the samples."""
+
+
 class Inverse(NamedTuple):
     """How a parameter is taken off the samples of a log, by :class:`terrain.extension.Correction`.
 
@@ -126,11 +130,17 @@ class Inverse(NamedTuple):
     ----------
     streams : whose samples or stamps change
     formula : corrected from measured, in the signals of this module
+    columns : beginnings of the channels that change, or :data:`STAMPS`; empty for what takes more than one
+        number a sample, which :class:`terrain.extension.Correction` has by the parameter's name
+    combine : how the corrected number follows from the measured one; of all that act on one number, offsets
+        come off before factors
     without_home : samples change only where the description lacks the section of the parameter's home
     """
 
     streams: tuple[str, ...]
     formula: str
+    columns: tuple[str, ...] = ()
+    combine: Combine = Combine.ADDED
     without_home: bool = False
 
 
@@ -301,7 +311,12 @@ def _wheel_scale(wheel: int) -> Effect:
         (SWERVE,),
         (*MOTION, HEADING),
         "straight drives in several directions",
-        inverse=Inverse(("wheels",), f"rate and speed of wheel {wheel} x (1 + e)"),
+        inverse=Inverse(
+            ("wheels",),
+            f"rate and speed of wheel {wheel} x (1 + e)",
+            (f"motor_{wheel}_", f"speed_{wheel}_"),
+            Combine.TIMES,
+        ),
         plant=PlantPart.SENSORS,
     )
 
@@ -316,7 +331,9 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         (*MOTION, CURRENT, HEADING),
         "any speed; slopes and accelerations to part it from slip",
         homes=(Home("", "wheel_radius_m", Combine.TIMES),),
-        inverse=Inverse(("wheels",), "wheel speed in m/s x (1 + e), where a log has it"),
+        inverse=Inverse(
+            ("wheels",), "wheel speed in m/s x (1 + e), where a log has it", ("speed_",), Combine.TIMES
+        ),
         plant=PlantPart.BODY,
         aliases=("encoder_scale",),
     ),
@@ -357,7 +374,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         (SWERVE, BICYCLE),
         (*MOTION, HEADING),
         "steps of the steering",
-        inverse=Inverse(("steering",), "stamp t + T"),
+        inverse=Inverse(("steering",), "stamp t + T", STAMPS, Combine.ADDED),
         plant=PlantPart.LINKAGE,
     ),
     effect(
@@ -416,7 +433,7 @@ SENSORS: tuple[Effect, ...] = (
         (ACCEL,),
         "several runs, since every power-on has a bias of its own",
         homes=(Home("sensors", "accel_bias_x_mps2", Combine.ADDED, scaled_by="accel_scale_x_ratio"),),
-        inverse=Inverse(("imu",), "accelerometer - b", without_home=True),
+        inverse=Inverse(("imu",), "accelerometer - b", ("accel_x_",), Combine.SUBTRACTED, without_home=True),
         sensed_only=True,
         plant=PlantPart.DESCRIPTION,
         aliases=("accelerometer_mounting_pitch",),
@@ -431,7 +448,7 @@ SENSORS: tuple[Effect, ...] = (
         (GYRO, ACCEL),
         "steps of the yaw rate, and a camera that is not late",
         homes=(Home("sensors", "imu_latency_s", Combine.ADDED),),
-        inverse=Inverse(("imu",), "stamp t - T", without_home=True),
+        inverse=Inverse(("imu",), "stamp t - T", STAMPS, Combine.SUBTRACTED, without_home=True),
         plant=PlantPart.DESCRIPTION,
         wording=Wording.LATE,
         late=("the IMU", "the IMU"),
@@ -494,7 +511,7 @@ SENSORS: tuple[Effect, ...] = (
         WITH_IMU,
         (*MOTION, HEADING),
         "switching manoeuvres",
-        inverse=Inverse(OTHER_LOGGER, "stamp t' - T"),
+        inverse=Inverse(OTHER_LOGGER, "stamp t' - T", STAMPS, Combine.SUBTRACTED),
         plant=PlantPart.SENSORS,
         wording=Wording.LATE,
         late=("the other sensors logged", "the wheels logged"),
@@ -507,7 +524,9 @@ SENSORS: tuple[Effect, ...] = (
         WITH_IMU,
         (*MOTION, HEADING),
         "switching manoeuvres from the start of a run to its end",
-        inverse=Inverse(OTHER_LOGGER, "stamp t' / (1 + r), from the first stamp of the wheels"),
+        inverse=Inverse(
+            OTHER_LOGGER, "stamp t' / (1 + r), from the first stamp of the wheels", STAMPS, Combine.OVER
+        ),
         plant=PlantPart.SENSORS,
     ),
     effect(
@@ -711,7 +730,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         (CURRENT, TURNING_CURRENT),
         "accelerations and slopes",
         homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
-        inverse=Inverse(("wheels",), "current / (1 + q)", without_home=True),
+        inverse=Inverse(("wheels",), "current / (1 + q)", ("current_",), Combine.OVER, without_home=True),
         sensed_only=True,
         plant=PlantPart.DESCRIPTION,
         twins=(("payload", SPEED_X),),
@@ -724,7 +743,11 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         BOTH,
         (CURRENT, TURNING_CURRENT),
         "long runs",
-        inverse=Inverse(("wheels",), "current / (1 + q t / 60 s), from the first stamp of the wheels"),
+        inverse=Inverse(
+            ("wheels",),
+            "current / (1 + q t / 60 s), from the first stamp of the wheels",
+            combine=Combine.OVER,
+        ),
         sensed_only=True,
         plant=PlantPart.SENSORS,
     ),
@@ -737,7 +760,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         BOTH,
         (CURRENT,),
         "standstill, and driving forward and backward",
-        inverse=Inverse(("wheels",), "current of each motor - b"),
+        inverse=Inverse(("wheels",), "current of each motor - b", ("current_",), Combine.SUBTRACTED),
         sensed_only=True,
         plant=PlantPart.SENSORS,
     ),
@@ -795,7 +818,7 @@ OMNI_WHEELS: tuple[Effect, ...] = (
         (OMNI,),
         (SPEED_X, SPEED_Y),
         "straight drives, and turns to part it from the radius of the wheels",
-        inverse=Inverse(("pose",), "positions / (1 + s)"),
+        inverse=Inverse(("pose",), "positions / (1 + s)", ("position_",), Combine.OVER),
         sensed_only=True,
     ),
 )
@@ -812,7 +835,7 @@ CAR: tuple[Effect, ...] = (
         (BICYCLE,),
         (GYRO, HEADING),
         "several speeds and standstill",
-        inverse=Inverse(("steering",), "angle + d0"),
+        inverse=Inverse(("steering",), "angle + d0", ("angle_front_",), Combine.ADDED),
     ),
     effect(
         "understeer",

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -26,9 +26,10 @@ import yaml
 
 from terrain.angles import unwrapped, wrapped
 from terrain.effects import (
-    OTHER_LOGGER,
     PARAMETER,
     SCHEMA,
+    STAMPS,
+    Combine,
     Home,
     Parameter,
     checked_covariance,
@@ -376,30 +377,23 @@ class Correction:
     """
 
     def __init__(self, robot: Robot, start_s: float = math.nan) -> None:
-        self._start_s = start_s
-        self._p = dict.fromkeys(PARAMETER, 0.0) | dict(robot.effects)
+        self._start_s, self._wheels, self._steered = start_s, robot.wheels, robot.steer_channels
         applied = apply_homes(robot)
-        homeless = applied.effects
         self._gyro_bias = applied.completed.sensors.gyro_bias_z_radps
-        self._gyro_offset = homeless.get("gyro_bias_radps", 0.0)
-        self._accel_offset = homeless.get("accel_bias_mps2", 0.0)
-        self._imu_late_s = homeless.get("imu_latency_s", 0.0)
-        self._current = 1.0 + homeless.get("motor_constant_ratio", 0.0)
-        half = 0.5 * self._p["one_sided_radius_ratio"]
-        self._side = {wheel: 1.0 + half if wheel in ("3", "right") else 1.0 - half for wheel in robot.wheels}
-        self._scale = {wheel: 1.0 + self._p.get(f"wheel_scale_{wheel}_ratio", 0.0) for wheel in robot.wheels}
-        self._has_backlash = self._p["steering_backlash_rad"] > 0.0
-        self._steered, n = robot.steer_channels, len(robot.steer_channels)
+        self._gyro_offset = applied.effects.get("gyro_bias_radps", 0.0)
+        self._yaw_bias = robot.effects.get("gyro_bias_radps", 0.0)
+        self._yaw_scale = 1.0 + robot.effects.get("gyro_scale_ratio", 0.0)
+        acting = [
+            (name, float(robot.effects[name]), parameter.inverse)
+            for name, parameter in PARAMETER.items()
+            if robot.effects.get(name)
+            and parameter.inverse
+            and (name in applied.effects or not parameter.inverse.without_home)
+        ]
+        # what was added last comes off first: offsets, then factors
+        self._acting = sorted(acting, key=lambda each: each[2].combine in (Combine.TIMES, Combine.OVER))
+        n = len(self._steered)
         self._follower, self._angle, self._yaw = np.full(n, np.nan), np.full(n, np.nan), (np.nan, np.nan)
-        self._inverses: Mapping[str, Callable[[tuple[str, ...], Array, Array], None]] = {
-            "wheels": self._wheels,
-            "steering": self._steering,
-            "imu": self._imu,
-            "odometry": self._camera,
-            "lidar": self._camera,
-            "pose": self._pose,
-            "truth": self._true_wheels,
-        }
 
     def __call__(
         self, name: str, channels: tuple[str, ...], time_s: Array, values: Array
@@ -416,53 +410,49 @@ class Correction:
             if not finite.size:
                 return time_s, values
             self._start_s = float(finite[0])
-        if name in self._inverses:
-            values = np.array(values, dtype=float)
-            with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
-                self._inverses[name](channels, np.asarray(time_s), values)
-        return self._stamps(name, time_s), values
-
-    def _stamps(self, name: str, time_s: Array) -> Array:
-        p = self._p
-        if name == "imu" and self._imu_late_s:
-            time_s = time_s - self._imu_late_s
-        if name in OTHER_LOGGER and (p["clock_offset_s"] or p["clock_rate_ratio"]):
-            since_s = (time_s - self._start_s - p["clock_offset_s"]) / (1.0 + p["clock_rate_ratio"])
-            return np.asarray(self._start_s + since_s)
-        if name == "steering" and p["steering_delay_s"]:
-            return np.asarray(time_s + p["steering_delay_s"])
-        return time_s
-
-    def _wheels(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
-        warm = 1.0 + self._p["motor_drift_ratio"] * (time_s - self._start_s) / 60.0
-        wheel_speed = 1.0 + self._p["wheel_radius_ratio"]
-        for i, channel in enumerate(channels):
-            quantity, _, rest = channel.partition("_")
-            wheel = rest.rpartition("_")[0]
-            if quantity == "current":
-                values[:, i] -= self._p["current_offset_a"]
-                values[:, i] /= self._current * warm
-            elif wheel in self._side and quantity in ("motor", "speed"):
-                metres = wheel_speed if quantity == "speed" else 1.0
-                values[:, i] *= self._side[wheel] * self._scale[wheel] * metres
-
-    def _true_wheels(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
-        for i, channel in enumerate(channels):
-            quantity, _, rest = channel.partition("_")
-            wheel = rest.rpartition("_")[0]
-            if quantity == "wheel" and wheel in self._side:
-                values[:, i] *= self._side[wheel]
-
-    def _steering(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
-        if self._p["steering_offset_front_rad"] and "angle_front_rad" in channels:
-            values[:, channels.index("angle_front_rad")] += self._p["steering_offset_front_rad"]
-        if not self._has_backlash:
-            return
-        half = self._p["steering_backlash_rad"]
-        for wheel, name in enumerate(self._steered):
-            if name not in channels:
+        stamps, copied, done = np.asarray(time_s), False, set()
+        for parameter, value, inverse in self._acting:
+            if name not in inverse.streams:
                 continue
-            column = channels.index(name)
+            if inverse.columns == STAMPS:
+                stamps = np.asarray(self._start_s + inverse.combine.apply(stamps - self._start_s, value))
+                continue
+            if not copied:
+                values, copied = np.array(values, dtype=float), True
+            with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
+                for i, channel in enumerate(channels):
+                    if inverse.columns and channel.startswith(inverse.columns):
+                        values[:, i] = inverse.combine.apply(values[:, i], value)
+                undo = getattr(self, f"_{parameter}", None)
+                if undo is not None and undo not in done:
+                    undo(name, channels, np.asarray(time_s), values, value)
+                    done.add(undo)
+        return stamps, values
+
+    def _one_sided_radius_ratio(
+        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, value: float
+    ) -> None:
+        for i, channel in enumerate(channels):
+            quantity, _, rest = channel.partition("_")
+            wheel = rest.rpartition("_")[0]
+            if quantity in ("motor", "speed", "wheel") and wheel in self._wheels:
+                values[:, i] *= 1.0 + (0.5 if wheel in ("3", "right") else -0.5) * value
+
+    def _motor_drift_ratio(
+        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, value: float
+    ) -> None:
+        warm = 1.0 + value * (time_s - self._start_s) / 60.0
+        values[:, [i for i, channel in enumerate(channels) if channel.startswith("current_")]] /= warm[
+            :, None
+        ]
+
+    def _steering_backlash_rad(
+        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, half: float
+    ) -> None:
+        for wheel, channel in enumerate(self._steered):
+            if channel not in channels:
+                continue
+            column = channels.index(channel)
             angles = unwrapped(np.concatenate([[self._angle[wheel]], values[:, column]]))[1:]
             follower = self._follower[wheel]
             known = np.isfinite(angles)
@@ -474,8 +464,11 @@ class Correction:
             self._follower[wheel] = follower
             values[known, column] = wrapped(values[known, column])
 
-    def _imu(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
-        scale = 1.0 + self._p["gyro_scale_ratio"]
+    def _gyro_bias_radps(
+        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, value: float
+    ) -> None:
+        """Take bias and scale off the gyro, and off the fused yaw, which sums both."""
+        bias, scale = self._yaw_bias, self._yaw_scale
         if "gyro_z_radps" in channels:
             gyro = values[:, channels.index("gyro_z_radps")]
             gyro -= self._gyro_offset
@@ -483,10 +476,7 @@ class Correction:
                 gyro -= self._gyro_bias
                 gyro /= scale
                 gyro += self._gyro_bias
-        if "accel_x_mps2" in channels:
-            values[:, channels.index("accel_x_mps2")] -= self._accel_offset
-        bias = self._p["gyro_bias_radps"]
-        if "yaw_rad" in channels and (scale != 1.0 or bias):
+        if "yaw_rad" in channels:
             column = channels.index("yaw_rad")
             first_rad, last_rad = self._yaw
             yaw = unwrapped(np.concatenate([[last_rad], values[:, column]]))[1:]
@@ -497,17 +487,15 @@ class Correction:
             turned_rad = yaw[known] - first_rad - bias * (time_s[known] - self._start_s)
             values[known, column] = wrapped(first_rad + turned_rad / scale)
 
-    def _camera(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
-        if self._p["camera_yaw_rad"]:
-            turned(values, channels, -self._p["camera_yaw_rad"])
+    _gyro_scale_ratio = _gyro_bias_radps
 
-    def _pose(self, channels: tuple[str, ...], time_s: Array, values: Array) -> None:
-        scale, angle = 1.0 + self._p["camera_scale_ratio"], self._p["camera_yaw_rad"]
-        for i, channel in enumerate(channels):
-            if channel.startswith("position_") and scale != 1.0:
-                values[:, i] /= scale
-            elif channel == "yaw_rad" and angle:
-                values[:, i] += angle
+    def _camera_yaw_rad(
+        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, value: float
+    ) -> None:
+        if name != "pose":
+            turned(values, channels, -value)
+        elif "yaw_rad" in channels:
+            values[:, channels.index("yaw_rad")] += value
 
 
 class Origin(StrEnum):
