@@ -176,17 +176,6 @@ def test_the_same_seed_gives_the_same_bytes_and_a_cause_leaves_other_sensors_alo
 
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_a_finer_step_changes_little(robot):
-    coarse, fine = (
-        simulate_planar(robot, drive(robot), 2, hills=HILLS, effects={"force_slip_ratio": 0.3}, step_s=step_s)
-        for step_s in (0.01, 0.0025)
-    )
-    a, b = logged(coarse, robot), logged(fine, robot)
-    for c, channel in enumerate(CHANNELS[:-1]):
-        assert np.std(a[:, c] - b[:, c]) <= 0.02 * np.std(b[:, c]) + 1e-9, channel
-
-
-@pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
 def test_commands_are_followed_and_truth_adds_up(robot):
     twist = steady(0.6, 20.0, 0.25)
     run = simulate_planar(robot, twist, 0, ground=Ground(slip_ratio=0.0))
