@@ -328,16 +328,6 @@ def test_steering_is_seen_in_whole_steps_with_its_zero_and_wrapped():
     assert np.abs(error.mean(axis=0)).max() < 4.5 * 0.0011 / math.sqrt(1000)
 
 
-def test_the_third_encoder_does_not_see_its_leg_swing():
-    leg = np.linspace(-0.03, 0.03, 1000)
-    swung = np.column_stack([np.full(1000, 0.2), np.full(1000, -0.1), 0.3 + leg])
-    readings = [
-        steering_stream(motion_of(1.0, steer_rad=steer, leg_rad=swing), ROBOT, rng(1)).values
-        for steer, swing in ((swung, leg), (np.array([[0.2, -0.1, 0.3]]), 0.0))
-    ]
-    np.testing.assert_allclose(readings[0], readings[1], rtol=0, atol=1e-12)
-
-
 def test_current_times_its_constants_is_the_torque():
     robot = with_changes("sensors", current_std_a=0.0)
     torque = np.column_stack([np.linspace(-60, 60, 1000), np.full(1000, 6.0), np.zeros(1000)])
