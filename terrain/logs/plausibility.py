@@ -27,10 +27,11 @@ import numpy as np
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError, LogError
 from terrain.logs.clock import MIN_SAMPLES as MIN_YAW_RATES
-from terrain.logs.clock import YawRatePair, gyro_at, imu_time_s, low_passed_pair
+from terrain.logs.clock import yaw_rate_pair
 from terrain.logs.samples import BEYOND, MAX_MAGNITUDE
 from terrain.logs.schema import NO_FEATURES, signal_set_of, unit_of
 from terrain.records import Array, RunLog, Stream
+from terrain.signals import Pair
 
 
 class Level(StrEnum):
@@ -211,12 +212,14 @@ def check_turns(run: RunLog, scale: Scale) -> Check:
 
     track_m = scale.track_m if math.isfinite(scale.track_m) else 1.0
     try:
-        pair = low_passed_pair(run, track_m)
+        found = yaw_rate_pair(run, track_m)
     except DataError:
         return check(Level.UNKNOWN, math.nan, "yaw rate: no gyro about z, or no left and right wheel speed")
-    if pair is None:
+    if found is None:
         return check(Level.UNKNOWN, math.nan, "yaw rate: too few samples of gyro and wheels together")
-    fits = [fit for shift in np.linspace(-MAX_SHIFT_S, MAX_SHIFT_S, N_SHIFTS) for fit in _fit(pair, shift)]
+    fits = [
+        fit for shift in np.linspace(-MAX_SHIFT_S, MAX_SHIFT_S, N_SHIFTS) for fit in _fit(found[0], shift)
+    ]
     if not fits:
         return check(Level.UNKNOWN, math.nan, "yaw rate: gyro and wheels hardly overlap")
     best = max(fits, key=lambda fit: abs(fit.likeness))
@@ -253,12 +256,13 @@ class _Fit(NamedTuple):
     turn_radps: float
 
 
-def _fit(pair: YawRatePair, shift_s: float) -> list[_Fit]:
+def _fit(pair: Pair, shift_s: float) -> list[_Fit]:
     """Return the fit at a shift; none where less than half of the run overlaps."""
-    gyro, there = gyro_at(pair, imu_time_s(pair, 0.0, shift_s, 0.0), pair.gyro_radps)
+    gyro = pair.at(pair.time_s + shift_s)
+    there = np.isfinite(gyro)
     if there.sum() < max(MIN_YAW_RATES, 0.5 * there.size):
         return []
-    gyro, wheels = gyro[there], pair.wheels_radps[there]
+    gyro, wheels = gyro[there], pair.measured[there]
     sizes = float(gyro @ gyro), float(wheels @ wheels)
     if min(sizes) == 0.0:
         return []
