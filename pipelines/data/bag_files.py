@@ -27,8 +27,7 @@ from pydantic import BaseModel, ValidationError
 from terrain import errors
 from terrain.errors import LogError, TerrainError, one_line
 from terrain.files.documents import first_fault, read_yaml
-from terrain.files.names import shown
-from terrain.files.regular import MEBIBYTE
+from terrain.files.names import MEBIBYTE, shown
 from terrain.logs.read import RunHead
 from terrain.logs.run_topics import Messages
 from terrain.logs.samples import check_log_file, short_name

@@ -18,7 +18,7 @@ from pydantic.dataclasses import dataclass
 from terrain.control.switching import UNKNOWN
 from terrain.errors import DataError
 from terrain.files.documents import first_fault
-from terrain.files.regular import read_regular
+from terrain.files.names import read_regular
 from terrain.logs.labels import Number
 
 BIASES_FRESH_S = 600.0

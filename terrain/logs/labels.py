@@ -19,7 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import first_fault, read_json
-from terrain.files.regular import MEBIBYTE, read_regular
+from terrain.files.names import MEBIBYTE, read_regular
 from terrain.logs.read import read_run, read_run_head, run_folders
 from terrain.logs.samples import short_name
 from terrain.logs.schema import TIME_TOLERANCE_S

@@ -42,8 +42,7 @@ from pydantic import Field, FiniteFloat, ValidationError
 
 from terrain.errors import ConfigError, LogError
 from terrain.files.documents import first_fault, read_yaml
-from terrain.files.names import check_name, listed, plain_name, shown
-from terrain.files.resources import data_folder
+from terrain.files.names import check_name, data_folder, listed, plain_name, shown
 from terrain.logs.labels import label_intervals
 from terrain.logs.mapping import Strict, Unit, Word, check_unit
 from terrain.logs.samples import checked_stream, longest_rise
