@@ -103,19 +103,8 @@ class ClockEstimate(NamedTuple):
     reference_s: float
 
 
-class _Peak(NamedTuple):
-    """A point of the grid."""
-
-    lag_s: float
-    rate: float
-
-
-class _Search(NamedTuple):
-    """What the grid found: the best peak, its best rival, and the best of the mirror image."""
-
-    best: _Peak
-    rival: _Peak | None
-    mirror: _Peak | None
+Peak = tuple[float, float]
+"""Lag and rate of a point of the grid."""
 
 
 def yaw_rate_pair(run: RunLog, track_m: float) -> tuple[Pair, float, float] | None:
@@ -189,7 +178,7 @@ def estimate_clock(
     centre_s = float(np.average(pair.time_s, weights=turning))
     pair, lever_s = pair._replace(middle_s=centre_s), centre_s + start_s - reference_s
 
-    def refined(seen: Pair, at: _Peak, rate_bound: float) -> DelayFit | None:
+    def refined(seen: Pair, at: Peak, rate_bound: float) -> DelayFit | None:
         return refine_delay(
             seen,
             *at,
@@ -204,24 +193,22 @@ def estimate_clock(
     # Where all rates within the bounds move the turns by less than the low-pass smears them, none is tried.
     spread_s = float(np.sqrt(np.average((pair.time_s - centre_s) ** 2, weights=turning)))
     for rate_bound in (max_rate, 0.0) if max_rate * spread_s > sigma_s else (0.0,):
-        search = _search(pair, sigma_s, lever_s, max_offset_s, rate_bound)
-        fit = None if search is None else refined(pair, search.best, rate_bound)
-        if search is None or fit is None:
-            if rate_bound:
-                continue
-            return _no_estimate(DelayStatus.NOT_EXCITED, reference_s)
+        best, rival_at, mirror_at = _search(pair, sigma_s, lever_s, max_offset_s, rate_bound)
+        fit = None if best is None else refined(pair, best, rate_bound)
+        if fit is None:
+            continue
         rate_std = float(np.sqrt(fit.cov[1, 1]))
         if rate_std <= RATE_KNOWN:
             break
-    assert search is not None
-    assert fit is not None
+    if fit is None:
+        return _no_estimate(DelayStatus.NOT_EXCITED, reference_s)
     if fit.correlation < MIN_CORRELATION or fit.gain < MIN_GAIN_SIGMAS * fit.gain_std:
         return _no_estimate(DelayStatus.NOT_EXCITED, reference_s, fit.correlation)
     offset_s = -fit.lag_s + fit.rate * lever_s
     if abs(offset_s) > 0.98 * max_offset_s or abs(fit.rate) > 0.98 * max_rate:
         return _no_estimate(DelayStatus.AT_BOUND, reference_s, fit.correlation)
     mirrored = pair._replace(measured=-pair.measured)
-    for peak, seen in ((search.rival, pair), (search.mirror, mirrored)):
+    for peak, seen in ((rival_at, pair), (mirror_at, mirrored)):
         rival = None if peak is None else refined(seen, peak, rate_bound)
         if rival is None:
             continue
@@ -294,8 +281,8 @@ def _no_estimate(status: DelayStatus, reference_s: float, correlation: float = n
 
 def _search(
     pair: Pair, sigma_s: float, lever_s: float, max_offset_s: float, max_rate: float
-) -> _Search | None:
-    """Return the best correlations on a grid of lag and rate, None where nothing correlates."""
+) -> tuple[Peak | None, Peak | None, Peak | None]:
+    """Return the best peak on a grid of lag and rate, its best rival, and the best of the mirror image, if any."""
     every = -(-pair.time_s.size // MAX_SEARCH_SAMPLES)
     pair = pair._replace(time_s=pair.time_s[::every].copy(), measured=pair.measured[::every].copy())
     reach_s = float(np.max(np.abs(pair.time_s - pair.middle_s)))
@@ -308,18 +295,17 @@ def _search(
     found[np.abs(lags_s[:, None] - rates * lever_s) > max_offset_s * (1.0 + 1e-9)] = 0.0
     row, column = (int(i) for i in np.unravel_index(np.argmax(found), found.shape))
     if found[row, column] <= 0.0:
-        return None
+        return None, None, None
     # A ridge askew to the grid has several points above their neighbours: they are one peak as long as no
     # sample is shifted by more than the low-pass smears it.
     apart_s = np.abs(lags_s[:, None] - lags_s[row]) + np.abs(rates - rates[column]) * reach_s
     tops = (found == maximum_filter(found, size=3)) & (apart_s > SAME_PEAK_SIGMAS * sigma_s)
 
-    def peak(heights: Array) -> _Peak | None:
+    def peak(heights: Array) -> Peak | None:
         at, along = np.unravel_index(np.argmax(heights), heights.shape)
-        return _Peak(float(lags_s[at]), float(rates[along])) if heights[at, along] > 0.0 else None
+        return (float(lags_s[at]), float(rates[along])) if heights[at, along] > 0.0 else None
 
-    best = _Peak(float(lags_s[row]), float(rates[column]))
-    return _Search(best, peak(np.where(tops, found, -1.0)), peak(-found))
+    return peak(found), peak(np.where(tops, found, -1.0)), peak(-found)
 
 
 def _apart_s(pair: Pair, one: DelayFit, other: DelayFit) -> float:

@@ -180,7 +180,6 @@ FEATURE_UNITS: dict[str, str] = {
 }
 """Unit of each quantity that features are made of by name."""
 
-IMU = ("gyro", "accel")
 
 OTHER_QUANTITIES: tuple[str, ...] = (
     *("motor", "angle", "roll", "pitch", "yaw", "voltage", "position", "velocity", "quaternion", "rate"),
@@ -251,12 +250,12 @@ def _odd(stream: str, channel: str) -> Check | None:
     expected = FEATURE_UNITS[quantity]
     if unit != expected:
         return _check(
-            Level.IMPLAUSIBLE if quantity in IMU else Level.DOUBTFUL,
+            Level.IMPLAUSIBLE if quantity in IMU_QUANTITIES else Level.DOUBTFUL,
             channel,
             f"{place}: {quantity} is in {unit!r}, {expected!r} is expected (a name ends in its unit)",
         )
     axis = rest.rpartition("_")[0]
-    if quantity in IMU and axis not in AXES:
+    if quantity in IMU_QUANTITIES and axis not in AXES:
         return _check(
             Level.DOUBTFUL, channel, f"{place}: {axis!r} is no axis, one of {', '.join(AXES)} is expected"
         )
