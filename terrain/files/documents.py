@@ -206,6 +206,29 @@ def _is_deep(found: Any) -> bool:
     return True
 
 
+def accepted(
+    model: type[Document], content: Any, place: str, kind: type[TerrainError], fault: str = ""
+) -> Document:
+    """Return what a pydantic model makes of a mapping or of a JSON text; refused in one sentence.
+
+    Parameters
+    ----------
+    model, content : the latter a text where it is JSON
+    place : as messages name it
+    kind : of error that is raised
+    fault : what a document is that the model does not accept; what it does not accept follows
+    """
+    from pydantic import ValidationError
+
+    try:
+        if isinstance(content, str | bytes):
+            return model.model_validate_json(content)
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = first_fault(error)
+        raise kind(f"{place}: {fault} ({first})" if fault else f"{place}: {first}") from error
+
+
 def read_yaml(path: Path, text: str | None = None) -> Any:
     """Return what a YAML file holds, or a text in place of it, unchecked; no file can run code.
 

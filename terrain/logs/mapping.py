@@ -54,10 +54,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 
 from terrain.errors import ConfigError, LogError, library
-from terrain.files.documents import first_fault, read_yaml
+from terrain.files.documents import accepted, read_yaml
 from terrain.files.names import check_name, has_control_characters, normal_name, shown
 from terrain.logs.labels import whole_run_label
 from terrain.logs.samples import check_log_file, checked_names, checked_stream, refuse_apart, short_name
@@ -221,11 +221,7 @@ def load_mapping(
         channel, or the file patterns do not agree on the words in braces.
     """
     path = Path(path)
-    described = read_yaml(path)
-    try:
-        mapping = Mapping.model_validate(described)
-    except ValidationError as error:
-        raise ConfigError(f"{path.name}: {first_fault(error)}") from error
+    mapping = accepted(Mapping, read_yaml(path), path.name, ConfigError)
     check_name(f"{path.name}: robot", mapping.robot, ConfigError)
     for name, stream in mapping.streams.items():
         if stream.messages is not None:
