@@ -420,13 +420,6 @@ def test_between_updates_keeps_every_measurement_and_holds_what_was_measured_aga
     assert np.isnan(between_updates(np.full(8, np.nan), time_s[:8], 4)).all()
 
 
-def test_import_writes_what_was_read(tmp_path):
-    folder = write(tmp_path / "log", table())
-    found = convert(ConvertSettings(data=folder, out=tmp_path / "raw", layout="drive"))
-    assert (found.n_runs, found.labels) == (3, {})
-    assert data_digest(load_runs(tmp_path / "raw")) == found.digest == data_digest(load_runs(folder))
-
-
 WARTHOG = ("asphalt_1", "asphalt_2", "asphalt_3", "gravel_1", "sand_1", "sand_2")
 
 
