@@ -44,7 +44,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.files.descriptions import check_keys, number
+from terrain.files.documents import check_keys, number
 from terrain.kernels import record
 from terrain.records import Array, read_only
 

@@ -16,13 +16,14 @@ their sum has one peak (:func:`common_delay`).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from terrain.bootstrap import bootstrap_counts
+from terrain.bootstrap import bootstrap_rows
 from terrain.records import Array
 
 RIVAL_MARGIN = 0.15
@@ -66,12 +67,17 @@ class DelayStatus(StrEnum):
 
 
 class Delay(NamedTuple):
-    """How late a signal is, its standard deviation, and what the delay grows by a second, if that was sought."""
+    """How late a signal is, its standard deviation, and the number of runs that it is from."""
 
     delay_s: float
     std_s: float
-    rate: float
+    n_runs: int
     status: DelayStatus
+
+    @property
+    def applied_s(self) -> float:
+        """The delay where it was found, else 0."""
+        return self.delay_s if self.status is DelayStatus.ESTIMATED else 0.0
 
 
 class Pair(NamedTuple):
@@ -93,6 +99,11 @@ class Pair(NamedTuple):
     slope: Array
     middle_s: float
 
+    def at(self, time_s: Array) -> Array:
+        """Return the reference at some times; NaN outside."""
+        grid_s = self.step_s * np.arange(self.reference.size)
+        return np.interp(time_s, grid_s, self.reference, left=np.nan, right=np.nan)
+
     def correlations(self, lags_s: Array, rate: float) -> Array:
         """Return the correlation (lags,) at each lag; 0 where fewer than half of the samples have a reference."""
         return np.asarray(
@@ -101,12 +112,13 @@ class Pair(NamedTuple):
 
 
 class DelayFit(NamedTuple):
-    """Lag at the middle of a pair and rate, their covariance (2, 2), gain and correlation."""
+    """Lag at the middle of a pair and rate, their covariance (2, 2), gain with its deviation, and correlation."""
 
     lag_s: float
     rate: float
     cov: Array
     gain: float
+    gain_std: float
     correlation: float
 
 
@@ -218,12 +230,15 @@ def refine_delay(
     near_s: float,
     rate_max: float,
     rate_stays: bool = False,
+    at_bounds: bool = False,
+    memory_s: float | None = MEMORY_S,
+    min_rows: int = MIN_ROWS,
     event: tuple[float, float] | None = None,
 ) -> DelayFit | None:
     """Return lag and rate, or the lag alone, by least squares from a start, or None if they diverge.
 
     Gain and constant are fitted beside them.  The covariance is ``(J'J)^-1 J'R J (J'J)^-1`` with the
-    autocovariance ``R`` of what is left, tapered over :data:`MEMORY_S`.
+    autocovariance ``R`` of what is left.
 
     Parameters
     ----------
@@ -231,6 +246,10 @@ def refine_delay(
     lag_s, rate : start
     near_s, rate_max : how far the lag may go from there, and how large the rate may be
     rate_stays : keep the rate, and fit a drift in its place
+    at_bounds : steps end at these bounds, and the last one is a fit; by default what leaves them or does not come
+        to rest is none
+    memory_s : over which what is left is correlated, each regressor by itself; None: as it is found to be
+    min_rows : samples that have a reference, at least
     event : a time and a ratio: no delay is found if so much of its information comes from so short a time
     """
     start_s, centred_s = lag_s, pair.time_s - pair.middle_s
@@ -239,7 +258,7 @@ def refine_delay(
         at_s = pair.time_s - lag_s - rate * centred_s
         value, slope = np.interp(at_s, fine_s, pair.reference), np.interp(at_s, fine_s, pair.slope)
         use = np.isfinite(pair.measured + value + slope) & (at_s > 0.0) & (at_s < fine_s[-1])
-        if use.sum() < MIN_ROWS:
+        if use.sum() < min_rows:
             return None
         value, seen = value[use], pair.measured[use]
         level = value - value.mean()
@@ -259,12 +278,16 @@ def refine_delay(
         step = np.linalg.solve(gram, j @ off)
         left = off - step @ j
         by_s, faster = float(step[0] / size[0]), 0.0 if rate_stays else float(step[1] / size[1])
+        if at_bounds:
+            by_s = min(max(by_s, start_s - near_s - lag_s), start_s + near_s - lag_s)
+            faster = min(max(faster, -rate_max - rate), rate_max - rate)
         lag_s, rate = lag_s + by_s, rate + faster
         if abs(by_s) + abs(faster) * centred_s[-1] < CONVERGED_S:
             break
     else:
-        return None
-    if abs(lag_s - start_s) > near_s or abs(rate) > rate_max:
+        if not at_bounds:
+            return None
+    if not at_bounds and (abs(lag_s - start_s) > near_s or abs(rate) > rate_max):
         return None
     period_s = float(pair.time_s[1] - pair.time_s[0])
     power = late * late
@@ -272,19 +295,43 @@ def refine_delay(
         rows = math.ceil(event[0] / period_s)
         if np.convolve(power, np.ones(min(rows, power.size))).max() > event[1] * power.sum():
             return None
-    scores = j * left
-    spread = scores @ scores.T
-    lags = math.ceil(MEMORY_S / period_s)
-    for lag in range(1, lags):
-        lagged = (1.0 - lag / lags) * scores[:, lag:] @ scores[:, :-lag].T
-        spread += lagged + lagged.T
-    inverse = np.linalg.inv(gram)[:2]
-    cov = inverse @ spread @ inverse.T / np.outer(size[:2], size[:2])
+    inverse = np.linalg.inv(gram)
+    every = inverse @ _spread(j, left, None if memory_s is None else math.ceil(memory_s / period_s)) @ inverse
+    cov = every[:2, :2] / np.outer(size[:2], size[:2])
     if rate_stays:
         cov[0, 1] = cov[1, 0] = 0.0
     if not (cov[0, 0] > 0 and cov[1, 1] > 0):
         return None
-    return DelayFit(lag_s, rate, cov, gain, float(np.corrcoef(value, seen)[0, 1]))
+    gain_std = math.sqrt(max(float(every[2, 2]), 0.0)) / float(size[2])
+    return DelayFit(lag_s, rate, cov, gain, gain_std, float(np.corrcoef(value, seen)[0, 1]))
+
+
+def _spread(j: Array, left: Array, lags: int | None) -> Array:
+    """Return the covariance (k, k) of what residuals add to the normal equations of regressors (k, n).
+
+    The autocovariance of each regressor's own products, tapered over some lags; without a number of them, that of
+    the residuals by itself, cut off where it first falls to nothing, for few samples.
+    """
+    if lags is not None:
+        scores = j * left
+        spread = scores @ scores.T
+        for lag in range(1, lags):
+            lagged = (1.0 - lag / lags) * scores[:, lag:] @ scores[:, :-lag].T
+            spread += lagged + lagged.T
+        return np.asarray(spread)
+    shared = [float(left @ left)]
+    for lag in range(1, left.size // 4):
+        product = float(left[lag:] @ left[:-lag])
+        if product <= 0.0:
+            break
+        shared.append(product)
+    n_each = 2.0 * sum(shared) / max(shared[0], 1e-300) - 1.0  # samples that say no more than one would
+    n_free = max(left.size - n_each * len(j), 1.0)
+    spread = j @ j.T * shared[0] / n_free
+    for lag, product in enumerate(shared[1:], start=1):
+        lagged = j[:, lag:] @ j[:, :-lag].T * product / n_free
+        spread += lagged + lagged.T
+    return np.asarray(spread)
 
 
 def peak(lags_s: Array, curve: Array) -> float:
@@ -305,19 +352,21 @@ def peak(lags_s: Array, curve: Array) -> float:
     return float(lags_s[i] + (0.5 * step_s * (before - after) / bend if bend < 0.0 else 0.0))
 
 
-def common_delay(lags_s: Array, curves: Array, max_std_s: float = math.inf, seed: int = 0) -> Delay:
+def common_delay(lags_s: Array, curves: Sequence[Array], max_std_s: float = math.inf, seed: int = 0) -> Delay:
     """Return the lag that is common to runs, and its standard deviation by bootstrap over them.
 
     Parameters
     ----------
     lags_s : (lags,) even
-    curves : (runs, lags) of each run, high where it fits, as a likelihood
+    curves : (lags,) of each run, high where it fits, as a likelihood; none is undetermined
     max_std_s : a delay that is less certain is undetermined, and so is one at an end of the lags
     seed : of the bootstrap
     """
-    counts = bootstrap_counts(len(curves), N_DRAWS, seed)
-    delay_s = peak(lags_s, curves.sum(axis=0))
-    std_s = float(np.std([peak(lags_s, total) for total in counts @ curves]))
-    inside = lags_s[1] < delay_s < lags_s[-2]
-    found = inside and std_s <= max_std_s
-    return Delay(delay_s, std_s, math.nan, DelayStatus.ESTIMATED if found else DelayStatus.UNDETERMINED)
+    if not len(curves):
+        return Delay(math.nan, math.nan, 0, DelayStatus.UNDETERMINED)
+    table = np.asarray(curves)
+    draws = bootstrap_rows(len(table), N_DRAWS, np.random.default_rng(seed))
+    delay_s = peak(lags_s, table.sum(axis=0))
+    std_s = float(np.std([peak(lags_s, table[draw].sum(axis=0)) for draw in draws]))
+    found = lags_s[1] < delay_s < lags_s[-2] and std_s <= max_std_s
+    return Delay(delay_s, std_s, len(table), DelayStatus.ESTIMATED if found else DelayStatus.UNDETERMINED)

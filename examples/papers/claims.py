@@ -25,7 +25,7 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.files.documents import read_yaml
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 
 if TYPE_CHECKING:
     from pipelines.report.figure import Figure

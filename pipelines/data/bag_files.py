@@ -22,13 +22,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 from urllib.parse import quote
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from terrain import errors
 from terrain.errors import LogError, TerrainError, one_line
-from terrain.files.documents import first_fault, read_yaml
-from terrain.files.names import shown
-from terrain.files.regular import MEBIBYTE
+from terrain.files.documents import accepted, read_yaml
+from terrain.files.names import MEBIBYTE, shown
 from terrain.logs.read import RunHead
 from terrain.logs.run_topics import Messages
 from terrain.logs.samples import check_log_file, short_name
@@ -133,10 +132,8 @@ def open_bag(path: Path) -> Bag:
     if path.is_file():
         return Bag(path, (check_log_file(path, path.parent),))
     place = short_name(path / METADATA)
-    try:
-        found = _Metadata.model_validate(read_yaml(check_log_file(path / METADATA, path)))
-    except ValidationError as error:
-        raise LogError(f"{place}: does not list the files of the bag ({first_fault(error)})") from error
+    content = read_yaml(check_log_file(path / METADATA, path))
+    found = accepted(_Metadata, content, place, LogError, "does not list the files of the bag")
     head = found.rosbag2_bagfile_information
     if head.compression_mode:
         raise LogError(

@@ -29,7 +29,7 @@ import numpy as np
 from terrain import errors
 from terrain.errors import ConfigError, LogError, one_line
 from terrain.files.documents import read_yaml
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.labels import whole_run_label
 from terrain.logs.mapping import check_unit

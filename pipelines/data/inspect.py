@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from features.breaks import OddStretch
     from terrain.logs.clock import ClockEstimate
     from terrain.logs.duplicates import SharedStretch
-    from terrain.logs.plausibility import Check
-    from terrain.logs.quality import StreamQuality
+    from terrain.logs.plausibility import Check, StreamQuality
     from terrain.records import RunLog
     from terrain.robots import Robot
 
@@ -109,7 +108,7 @@ def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
     from features.breaks import odd_stretches
     from terrain.errors import ConfigError, DataError
     from terrain.logs.clock import estimate_clock
-    from terrain.logs.quality import stream_quality
+    from terrain.logs.plausibility import stream_quality
     from terrain.robots import robot_named
 
     try:

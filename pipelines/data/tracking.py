@@ -24,8 +24,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from terrain.errors import ModelError, TerrainError
-from terrain.files.atomic import ensure_writable
-from terrain.files.lock import file_lock
+from terrain.files.atomic import ensure_writable, file_lock
 
 FOLDER = "mlruns"
 EXPERIMENT = "terrain"

@@ -33,8 +33,7 @@ from terrain.classify.support import SupportTable, check_support
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_document, parse_json
-from terrain.files.names import MAX_NAME, printable, shown
-from terrain.files.regular import MEBIBYTE, check_inside, read_regular
+from terrain.files.names import MAX_NAME, MEBIBYTE, check_inside, printable, read_regular, shown
 from terrain.records import Array, Windows
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from pipelines.learn.settings import FEATURE_RECIPE, WITHOUT_SVM, LearnSettings
 from terrain.classify.svm import Candidate
 from terrain.errors import ConfigError
 from terrain.files.documents import MAX_JSON_BYTES, parse_document
-from terrain.files.names import printable
-from terrain.files.regular import read_regular
+from terrain.files.names import printable, read_regular
 
 
 def recipe_of(settings: LearnSettings, text: str = FEATURE_RECIPE) -> WindowPipeline:

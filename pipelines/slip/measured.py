@@ -17,13 +17,14 @@ from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
 from terrain.measured_slip import measure
-from terrain.measured_slip.delay import Delay
+from terrain.measured_slip.delay import delay_sentence
 from terrain.measured_slip.predict import PredictionFigures, predictions
 from terrain.measured_slip.rollers import DistanceBound, RollerFindings
 from terrain.measured_slip.slips import measured_slip
 from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, SwerveRobot, as_drive
+from terrain.signals import Delay
 
 if TYPE_CHECKING:
     from pipelines.slip.estimate import EstimateOptions
@@ -142,7 +143,7 @@ def report(result: MeasuredSlipResult) -> Report:
     title = f"median slip over {result.window_s:g} s, by surface"
     parts: list[Part] = [Table(SURFACES, result.surfaces, title)]
     parts += [
-        Text(f"Session {session}: {delay.sentence}" if session else sentence(delay.sentence))
+        Text(f"Session {session}: {delay_sentence(delay)}" if session else sentence(delay_sentence(delay)))
         for session, delay in result.delays.items()
     ]
     if result.predictions:

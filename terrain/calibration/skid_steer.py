@@ -31,6 +31,7 @@ from scipy.stats import trim_mean
 from terrain.calibration.finding import Finding, around, undetermined
 from terrain.identify import half_width, jackknife
 from terrain.records import Array, RunLog
+from terrain.signals import peak
 
 SLIP_RATIO = (0.0, 0.02)
 """Of tyres that drive straight on over hard ground: a rolling resistance of 0.02 to 0.04 of the load over a
@@ -287,11 +288,6 @@ def _best_lag(of_runs: Sequence[Array]) -> tuple[float, int]:
     if not turning:
         return math.nan, 0
     products, one, other = np.sum(turning, axis=0).T
-    likeness = products / np.sqrt(one * other)
-    best = int(np.argmax(likeness))
-    if not 0 < best < 2 * n:
-        return math.nan, 0
-    before, peak, after = likeness[best - 1 : best + 2]
-    bend = before - 2 * peak + after
-    part = 0.5 * (before - after) / bend if bend < 0.0 else 0.0
-    return float((best - n + part) * GRID_S), len(turning)
+    lags_s = GRID_S * np.arange(-n, n + 1)
+    best_s = peak(lags_s, products / np.sqrt(one * other))
+    return (best_s if abs(best_s) < lags_s[-1] else math.nan), len(turning)

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from terrain.control.situations import (
     BRAKE,
@@ -29,6 +28,7 @@ from terrain.kinematics.logged_wheels import true_slip
 from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
+from terrain.signals import low_pass
 from terrain.simulation.scenario import Scenario
 
 PEAK_ABOVE_MPS = 0.2
@@ -152,8 +152,7 @@ def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
 
 def low_passed_slip(slip_ratio: Array, step_s: float) -> Array:
     """Return slip (n, wheels) behind the low-pass of its estimate; NaN counts as 0."""
-    keep = math.exp(-step_s / SMOOTH_S)
-    return np.asarray(lfilter([1.0 - keep], [1.0, -keep], np.nan_to_num(slip_ratio), axis=0))
+    return low_pass(np.nan_to_num(slip_ratio), step_s, SMOOTH_S)
 
 
 def slip_peak(history: DriveHistory, within: Array | None = None) -> float:

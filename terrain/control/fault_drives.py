@@ -15,7 +15,6 @@ from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from scipy.signal import lfilter
 
 from terrain.control.drive_metrics import (
     PEAK_ABOVE_MPS,
@@ -37,6 +36,7 @@ from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError
 from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
+from terrain.signals import low_pass
 from terrain.simulation.conditions import Faults
 from terrain.simulation.faults import FaultyBus, Nature, SensorFault, fault_catalogue
 from terrain.simulation.scenario import Scenario
@@ -233,7 +233,7 @@ def fault_drive(
     step_s = float(history.time_s[1] - history.time_s[0])
     tau_s = robot.equipment.sensors.encoder_time_constant_s
     wheel, ground = (
-        _low_passed(each, step_s, tau_s) for each in (history.wheel_speed_mps, history.ground_mps)
+        low_pass(each, step_s, tau_s, at_first=True) for each in (history.wheel_speed_mps, history.ground_mps)
     )
     fastest = np.maximum(np.abs(wheel), np.abs(ground))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -258,12 +258,6 @@ def fault_drive(
         stop_s=stop_s,
         stop_m=stopping_distance(history, stop_s) if math.isfinite(stop_s) else math.nan,
     )
-
-
-def _low_passed(values: Array, step_s: float, tau_s: float) -> Array:
-    keep = math.exp(-step_s / tau_s) if tau_s > 0.0 else 0.0
-    filtered, _ = lfilter([1.0 - keep], [1.0, -keep], values, axis=0, zi=keep * values[:1])
-    return np.asarray(filtered)
 
 
 def fault_figures(

@@ -12,13 +12,13 @@ import math
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, TypeAdapter
 from pydantic.dataclasses import dataclass
 
 from terrain.control.switching import UNKNOWN
 from terrain.errors import DataError
-from terrain.files.documents import first_fault
-from terrain.files.regular import read_regular
+from terrain.files.documents import accepted
+from terrain.files.names import read_regular
 from terrain.logs.labels import Number
 
 BIASES_FRESH_S = 600.0
@@ -117,10 +117,7 @@ def from_text(text: str | bytes, place: str = "saved state") -> LiveState:
     Traceback (most recent call last):
     terrain.errors.DataError: saved state: is damaged (key 'sha256' is missing)
     """
-    try:
-        document = _Document.model_validate_json(text)
-    except ValidationError as error:
-        raise DataError(f"{place}: is damaged ({first_fault(error)})") from error
+    document = accepted(_Document, text, place, DataError, "is damaged")
     if _sha256(document.state) != document.sha256:
         raise DataError(f"{place}: is damaged (its checksum is another)")
     return document.state

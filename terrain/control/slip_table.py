@@ -19,9 +19,8 @@ import yaml
 
 from terrain.errors import ConfigError
 from terrain.files.atomic import atomic_write
-from terrain.files.descriptions import check_keys
-from terrain.files.documents import read_yaml
-from terrain.files.resources import data_folder
+from terrain.files.documents import check_keys, read_yaml
+from terrain.files.names import data_folder
 from terrain.records import Array, SlipTarget, TargetStatus
 from terrain.slip_learning.curve import LAW_BOUNDS, LAW_PARAMETERS, PeakStatus, traction_ratio
 

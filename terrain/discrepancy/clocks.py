@@ -343,7 +343,7 @@ def latencies_of(signals: Sequence[Signals], simulation: Simulation, seed: int =
         total = table.sum(axis=0)
         if total.max() - np.median(total) < MIN_GAIN:
             continue
-        found = common_delay(FINE_LAGS_S, table, seed=seed)
+        found = common_delay(FINE_LAGS_S, list(table), seed=seed)
         lags[name] = Latency(name, found.delay_s, max(found.std_s, MIN_STD_S), len(own))
     return Latencies(tuple(lags.values()), *_parts(lags), is_delay=_is_delay(pairs, lags))
 

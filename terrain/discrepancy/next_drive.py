@@ -17,7 +17,6 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from terrain.discrepancy.evidence import (
     Evidence,
@@ -49,6 +48,7 @@ from terrain.errors import ConfigError
 from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
+from terrain.signals import low_pass
 from terrain.simulation.planar.model import TRUTH
 from terrain.simulation.planar.motion import move
 from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
@@ -287,10 +287,9 @@ def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
     except ConfigError:
         return None
     motion = wheel_motion(robot, scenario.twist[: round(LONGEST_S * RATE_HZ)], 1.0 / RATE_HZ)
-    keep = math.exp(-1.0 / (RATE_HZ * FOLLOW_S))
     every = round(RATE_HZ / CLOCK_HZ)
     wheel_speed_mps, steer_rad = (
-        np.ascontiguousarray(lfilter([1 - keep], [1, -keep], x, axis=0)[::every])  # as all callers of kernels
+        np.ascontiguousarray(low_pass(x, 1.0 / RATE_HZ, FOLLOW_S)[::every])  # as all callers of kernels
         for x in (motion.wheel_speed_mps, motion.steer_rad)
     )
     return wheel_speed_mps, steer_rad

@@ -3,6 +3,8 @@
 All JSON and YAML files are read here.  What a file may hold is bounded so that no file takes the memory or
 the stack of the process, and so that what comes back can be shown, compared and converted: whole numbers
 have 64 bits at most, numbers of JSON are finite, and texts can be written as UTF-8.
+
+Descriptions have every number with its unit and its source, and no unknown key.
 """
 
 from __future__ import annotations
@@ -15,8 +17,52 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import yaml
 
 from terrain.errors import ConfigError, TerrainError
-from terrain.files.names import shown
-from terrain.files.regular import MEBIBYTE, read_regular
+from terrain.files.names import MEBIBYTE, read_regular, shown
+
+
+def number(place: str, entry: Any, unit: str, low: float | None = None) -> float:
+    """Return the number of an entry ``{value, unit, source}``, with ``interval`` where it was calibrated.
+
+    Parameters
+    ----------
+    place : file and key, as messages name them
+    entry : what the file holds
+    unit : the one accepted
+    low : least value; None where it must be above zero
+
+    Raises
+    ------
+    ConfigError
+        if a key is unknown or missing, the unit another, no source there, or the number out of range.
+    """
+    check_keys(place, entry, ["value", "unit", "source"], optional=("interval",))
+    if entry["unit"] != unit:
+        raise ConfigError(f"{place} has the unit {shown(entry['unit'])}, {unit!r} is required")
+    if not isinstance(entry["source"], str) or not entry["source"].strip():
+        raise ConfigError(f"{place} has no source: say where the number is from, or 'assumed'")
+    value = entry["value"]
+    within = not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
+    if low is None and not (within and value > 0):
+        raise ConfigError(f"{place} is {shown(value)}, a number above zero is required")
+    if low is not None and not (within and value >= low):
+        raise ConfigError(
+            f"{place} is {shown(value)}, a number{' from zero up' if low == 0 else ''} is required"
+        )
+    return float(value)
+
+
+def check_keys(place: str, entry: Any, desired: list[str], optional: tuple[str, ...] = ()) -> None:
+    """Refuse a mapping that lacks a desired key or has one that is not accepted; ``ConfigError``."""
+    if not isinstance(entry, dict):
+        raise ConfigError(f"{place} is {shown(entry)}, a mapping with {', '.join(desired)} is required")
+    accepted = [*desired, *optional]
+    unknown = [str(key) for key in entry if key not in accepted]
+    missing = [key for key in desired if key not in entry]
+    if unknown:
+        raise ConfigError(f"{place}: key {shown(unknown[0])} is unknown (accepted: {', '.join(accepted)})")
+    if missing:
+        raise ConfigError(f"{place}: key {missing[0]!r} is missing")
+
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -158,6 +204,29 @@ def _is_deep(found: Any) -> bool:
         if not level:
             return False
     return True
+
+
+def accepted(
+    model: type[Document], content: Any, place: str, kind: type[TerrainError], fault: str = ""
+) -> Document:
+    """Return what a pydantic model makes of a mapping or of a JSON text; refused in one sentence.
+
+    Parameters
+    ----------
+    model, content : the latter a text where it is JSON
+    place : as messages name it
+    kind : of error that is raised
+    fault : what a document is that the model does not accept; what it does not accept follows
+    """
+    from pydantic import ValidationError
+
+    try:
+        if isinstance(content, str | bytes):
+            return model.model_validate_json(content)
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = first_fault(error)
+        raise kind(f"{place}: {fault} ({first})" if fault else f"{place}: {first}") from error
 
 
 def read_yaml(path: Path, text: str | None = None) -> Any:

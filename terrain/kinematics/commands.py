@@ -165,9 +165,10 @@ def inverse(positions_m: Array, radius_m: float, twist: Array, steer_now_rad: Ar
     velocity = wheel_velocities(positions, twist)
     now = finite_numbers("steer_now_rad", steer_now_rad, len(positions))
     along, across, now = broadcast(twist=velocity[..., 0], _=velocity[..., 1], steer_now_rad=now)
-    wheel, steer = np.empty(now.shape), np.empty(now.shape)
-    _aim_all(along.ravel(), across.ravel(), radius, now.ravel(), wheel.reshape(-1), steer.reshape(-1))
-    return wheel, steer
+    speed, heading = np.hypot(along, across), np.arctan2(across, along)
+    k = np.rint((heading - now) / np.pi)
+    standing, sign = speed < STANDING_MPS, np.where(k % 2 == 0, 1.0, -1.0)
+    return np.where(standing, 0.0, sign * speed / radius), np.where(standing, now, heading - k * np.pi)
 
 
 def wheel_commands(
@@ -235,14 +236,6 @@ def _aim(along_mps: float, across_mps: float, radius_m: float, now_rad: float) -
     k = np.rint((heading_rad - now_rad) / math.pi)
     sign = 1.0 if k % 2 == 0 else -1.0
     return sign * speed_mps / radius_m, heading_rad - k * math.pi
-
-
-@njit(types.void(_ROW, _ROW, _F8, _ROW, _F8[:], _F8[:]), cache=True)
-def _aim_all(
-    along_mps: Array, across_mps: Array, radius_m: float, now_rad: Array, wheel_radps: Array, steer_rad: Array
-) -> None:
-    for i in range(now_rad.size):
-        wheel_radps[i], steer_rad[i] = _aim(along_mps[i], across_mps[i], radius_m, now_rad[i])
 
 
 @njit(types.UniTuple(_F8[::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _ROW, _ROW), cache=True)

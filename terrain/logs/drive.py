@@ -311,7 +311,7 @@ def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> 
     pose = np.stack([columns[name] for name in _POSE], axis=-1)
     own_frame = is_first_pose(*frame_coefficient(pose, values["wheels"], period_s))
     frame_yaw = pose[:, 0, 2] if own_frame else pose[:, :N_FRAME, 2].mean(axis=1)
-    values["lidar"] = body_twists(pose, period_s, frame_yaw=frame_yaw)
+    values["lidar"], _ = body_twists(pose, period_s, frame_yaw=frame_yaw)
     step, steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
     time_s = np.arange(k) * period_s
     name, repairs = short_name(path), axes.repairs()

@@ -59,7 +59,7 @@ from terrain.files.names import normal_name
 from terrain.logs.drive import FILE_NAME as SAMPLES_FILE
 from terrain.logs.drive import DriveRobot, refuse_other_robot
 from terrain.logs.held import CHANNELS as TWIST_CHANNELS
-from terrain.logs.held import MAX_STD, dated, new_poses, twists_and_std, undo_hold, usual_hold, usual_wait
+from terrain.logs.held import MAX_STD, body_twists, dated, new_poses, undo_hold, usual_hold, usual_wait
 from terrain.logs.imu_axes import MIN_MOVING_RADPS, POWER_SIGN, current_sign, find_axes, with_sign_of_torque
 from terrain.logs.samples import (
     BAD_TIME,
@@ -99,15 +99,10 @@ class Cut(NamedTuple):
     commanded: bool
 
 
-class Cuts(NamedTuple):
-    """Runs of a recording, and how many commands were left out because nothing moved."""
-
-    runs: tuple[Cut, ...]
-    n_still: int
-
-
-def cut_recording(step: Array, commanded: Array, moving: Array, breaks: Array, period_s: float) -> Cuts:
-    """Return the runs of a recording.
+def cut_recording(
+    step: Array, commanded: Array, moving: Array, breaks: Array, period_s: float
+) -> tuple[tuple[Cut, ...], int]:
+    """Return the runs of a recording, and how many commands were left out because nothing moved.
 
     A run is what follows without a break in one step under the logged command (``step_003``; where an
     operator intervened, so that it was begun anew, ``step_003_2``), or what was driven otherwise, between two
@@ -125,7 +120,7 @@ def cut_recording(step: Array, commanded: Array, moving: Array, breaks: Array, p
     --------
     >>> step = np.repeat([0, 1, 2], 60)
     >>> moving = np.repeat([False, True, True, False], 45)
-    >>> cut_recording(step, step > 0, moving, np.zeros(180, bool), 0.05).runs[:2]
+    >>> cut_recording(step, step > 0, moving, np.zeros(180, bool), 0.05)[0][:2]
     (Cut(name='step_001', first=60, end=120, commanded=True),
      Cut(name='step_002', first=120, end=180, commanded=True))
     """
@@ -151,7 +146,7 @@ def cut_recording(step: Array, commanded: Array, moving: Array, breaks: Array, p
             if stop - start >= n_min:
                 runs.append(Cut(f"hand_{n_hand:03d}", first + start, first + stop, False))
                 n_hand += 1
-    return Cuts(tuple(sorted(runs, key=lambda cut: cut.first)), n_still)
+    return tuple(sorted(runs, key=lambda cut: cut.first)), n_still
 
 
 def _stretches(keys: Array, breaks: Array) -> Sequence[tuple[int, int]]:
@@ -453,7 +448,7 @@ def _lidar(logged: Array, time_s: Array, period_s: float) -> tuple[Array, Array,
     place = np.round((time_s - time_s[0]) / period_s).astype(np.intp)  # on an even grid, gaps and all
     last = np.searchsorted(place, np.arange(place[-1] + 1), side="right") - 1
     even = pose[last][None]
-    twists, stds = twists_and_std(even, period_s, frame_yaw=np.zeros(1))
+    twists, stds = body_twists(even, period_s, frame_yaw=np.zeros(1))
     twist, std = twists[0], stds[0]
     lost = (std > MAX_STD).any(axis=1)
     twist[~(std <= MAX_STD).all(axis=1)] = np.nan

@@ -107,8 +107,8 @@ def body_twists(
     period_s: float,
     *,
     frame_yaw: Array | None = None,
-) -> Array:
-    r"""Return speeds forward and to the left and yaw rate from poses that are held between two scans.
+) -> tuple[Array, Array]:
+    r"""Return speeds forward and to the left and yaw rate from poses that are held between two scans, and deviations.
 
     A pose is of the time at which its registration began, when the one before came out: one that took longer
     than the usual wait (the median of all) is that much older, and is dated so.  (On sand, where a Warthog's
@@ -136,7 +136,9 @@ def body_twists(
 
     Returns
     -------
-    (n, k, 3) of the point that the pose is of, with the channels :data:`CHANNELS`
+    twist : (n, k, 3) of the point that the pose is of, with the channels :data:`CHANNELS`
+    std : (n, k, 3) its standard deviations by the scatter of the poses about the parabola; NaN where fewer than
+        :data:`MIN_JUDGED_SCANS` poses show one
 
     Examples
     --------
@@ -144,17 +146,8 @@ def body_twists(
 
     >>> pose = np.zeros((1, 40, 3))
     >>> pose[0, :, 0] = 0.5 * 0.1 * (np.arange(40) // 2)
-    >>> body_twists(pose, 0.05)[0, 20].round(6).tolist()
+    >>> body_twists(pose, 0.05)[0][0, 20].round(6).tolist()
     [0.5, 0.0, 0.0]
-    """
-    return twists_and_std(pose, period_s, frame_yaw=frame_yaw)[0]
-
-
-def twists_and_std(pose: Array, period_s: float, *, frame_yaw: Array | None = None) -> tuple[Array, Array]:
-    """Return twists as :func:`body_twists` does, and their standard deviations (n, k, 3).
-
-    The latter come from the scatter of the poses about the parabola; NaN where fewer than
-    :data:`MIN_JUDGED_SCANS` poses show one.
     """
     n, k, _ = pose.shape
     new = new_poses(pose)

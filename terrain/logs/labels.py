@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
-from terrain.files.documents import first_fault, read_json
-from terrain.files.regular import MEBIBYTE, read_regular
+from terrain.files.documents import accepted, read_json
+from terrain.files.names import MEBIBYTE, read_regular
 from terrain.logs.read import read_run, read_run_head, run_folders
 from terrain.logs.samples import short_name
 from terrain.logs.schema import TIME_TOLERANCE_S
@@ -238,18 +238,13 @@ def read_windows(run_folder: Path) -> list[RecordedWindow] | None:
     if not path.exists():
         return None
     place = short_name(path)
-    try:
-        return _File.model_validate_json(read_regular(path, place, LogError, MAX_BYTES)).windows
-    except ValidationError as error:
-        raise LogError(f"{place}: is damaged ({first_fault(error)})") from error
+    text = read_regular(path, place, LogError, MAX_BYTES)
+    return accepted(_File, text, place, LogError, "is damaged").windows
 
 
 def window_of_text(place: str, text: str) -> RecordedWindow:
     """Return a window of its entry as JSON, as a bag has it."""
-    try:
-        return RecordedWindow.model_validate_json(text)
-    except ValidationError as error:
-        raise LogError(f"{place}: a recorded window is damaged ({first_fault(error)})") from error
+    return accepted(RecordedWindow, text, place, LogError, "a recorded window is damaged")
 
 
 class DoubtfulWindow(NamedTuple):

@@ -10,6 +10,8 @@ times as large, a sign that is turned makes it negative.
 
 Thresholds were chosen so that no measured run of four robots is implausible (BorealTC, Vulpi, DRIVE), and
 that the usual mistakes are: a factor of 9.81, 57.3, 3.6, 1000, a turned sign or axis.
+
+:func:`stream_quality` states what shape a stream is in: rate, gaps, jitter, stuck channels, missing values.
 """
 
 from __future__ import annotations
@@ -27,10 +29,118 @@ import numpy as np
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError, LogError
 from terrain.logs.clock import MIN_SAMPLES as MIN_YAW_RATES
-from terrain.logs.clock import YawRatePair, gyro_at, imu_time_s, low_passed_pair
+from terrain.logs.clock import yaw_rate_pair
 from terrain.logs.samples import BEYOND, MAX_MAGNITUDE
 from terrain.logs.schema import NO_FEATURES, signal_set_of, unit_of
 from terrain.records import Array, RunLog, Stream
+from terrain.signals import Pair
+
+GAP_PERIODS = 1.5
+"""An interval of this many median periods has lost at least one sample."""
+
+STUCK_IMU_SAMPLES = 20
+"""A gyro or accelerometer shows its noise in the last digit even at rest: on 69 published Husky runs it never
+holds a value for more than 2 samples, so 20 (0.2 s at 100 Hz) are a fault."""
+
+STUCK_SIBLING_CHANGES = 20
+"""A wheel speed may hold one value for a whole run of steady driving, and a current rest at its floor.  They
+are stuck when the same quantity at another wheel changes so often meanwhile; on the published runs
+it changes at most 7 times."""
+
+IMU_QUANTITIES = ("gyro", "accel")
+
+
+class StreamQuality(NamedTuple):
+    """Sampling of a stream and the quality of its channels.
+
+    A gap is an interval of more than ``GAP_PERIODS`` median periods.  ``longest_gap_s`` is 0 and
+    ``longest_gap_at_s`` NaN where there is none.  ``jitter_s`` is the standard deviation of the other
+    intervals.  ``stuck`` names channels; missing samples and the longest stretch of one value are by channel.
+    """
+
+    n: int
+    rate_hz: float
+    duration_s: float
+    n_gaps: int
+    longest_gap_s: float
+    longest_gap_at_s: float
+    jitter_s: float
+    stuck: tuple[str, ...]
+    n_nonfinite: dict[str, int]
+    longest_constant_s: dict[str, float]
+
+
+def stream_quality(stream: Stream) -> StreamQuality:
+    """Return the quality of a stream of at least two samples.
+
+    A gyro or accelerometer channel is stuck when it holds one value for ``STUCK_IMU_SAMPLES``.  A speed is
+    stuck when it holds one value over ``STUCK_SIBLING_CHANGES`` changes of a sibling: the same quantity, in
+    the same unit, at another wheel.  Currents rest at their floor while the other side works, so that they
+    are stuck only if they never leave one value.  Other channels are not judged.
+
+    Examples
+    --------
+    >>> time_s = np.delete(np.arange(0.0, 1.0, 0.01), [50, 51])
+    >>> quality = stream_quality(Stream(time_s, np.sin(time_s)[:, None], ("gyro_z_radps",)))
+    >>> quality.n_gaps, round(quality.longest_gap_s, 3), round(quality.longest_gap_at_s, 3), quality.stuck
+    (1, 0.03, 0.49, ())
+    """
+    intervals_s = np.diff(stream.time_s)
+    gap = intervals_s > GAP_PERIODS * np.median(intervals_s)
+    longest = int(np.argmax(intervals_s))
+    constant = {name: constant_stretches(stream.channel(name)) for name in stream.channels}
+    return StreamQuality(
+        n=len(stream),
+        rate_hz=stream.rate_hz,
+        duration_s=stream.duration_s,
+        n_gaps=int(gap.sum()),
+        longest_gap_s=float(intervals_s[longest]) if gap.any() else 0.0,
+        longest_gap_at_s=float(stream.time_s[longest]) if gap.any() else float("nan"),
+        jitter_s=float(np.std(intervals_s[~gap])),
+        stuck=tuple(name for name, (first, last) in constant.items() if _is_stuck(stream, name, first, last)),
+        n_nonfinite={name: int(np.sum(~np.isfinite(stream.channel(name)))) for name in stream.channels},
+        longest_constant_s={
+            name: float(np.max(stream.time_s[last] - stream.time_s[first], initial=0.0))
+            for name, (first, last) in constant.items()
+        },
+    )
+
+
+def constant_stretches(values: Array) -> tuple[Array, Array]:
+    """Return first and last index (m,) of the stretches of one finite value that cover ``values`` (n,).
+
+    Examples
+    --------
+    >>> first, last = constant_stretches(np.array([1.0, 1.0, np.nan, 2.0, 2.0, 2.0]))
+    >>> first.tolist(), last.tolist()
+    ([0, 3], [1, 5])
+    """
+    first = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
+    last = np.r_[first[1:] - 1, values.size - 1]
+    finite = np.isfinite(values[first])
+    return first[finite], last[finite]
+
+
+def _is_stuck(stream: Stream, name: str, first: Array, last: Array) -> bool:
+    quantity = name.partition("_")[0]
+    if not first.size:
+        return False
+    if quantity in IMU_QUANTITIES:
+        return bool(np.max(last - first) + 1 >= STUCK_IMU_SAMPLES)
+    if quantity not in ("speed", "current"):
+        return False
+    if quantity == "current" and np.unique(stream.channel(name)[first]).size > 1:
+        return False
+    for sibling in stream.channels:
+        if sibling != name and _kind(sibling) == _kind(name):
+            n_changes = np.r_[0, np.cumsum(np.diff(stream.channel(sibling)) != 0.0)]
+            if np.max(n_changes[last] - n_changes[first]) >= STUCK_SIBLING_CHANGES:
+                return True
+    return False
+
+
+def _kind(channel: str) -> tuple[str, str]:
+    return channel.partition("_")[0], channel.rpartition("_")[2]
 
 
 class Level(StrEnum):
@@ -70,7 +180,6 @@ FEATURE_UNITS: dict[str, str] = {
 }
 """Unit of each quantity that features are made of by name."""
 
-IMU = ("gyro", "accel")
 
 OTHER_QUANTITIES: tuple[str, ...] = (
     *("motor", "angle", "roll", "pitch", "yaw", "voltage", "position", "velocity", "quaternion", "rate"),
@@ -141,12 +250,12 @@ def _odd(stream: str, channel: str) -> Check | None:
     expected = FEATURE_UNITS[quantity]
     if unit != expected:
         return _check(
-            Level.IMPLAUSIBLE if quantity in IMU else Level.DOUBTFUL,
+            Level.IMPLAUSIBLE if quantity in IMU_QUANTITIES else Level.DOUBTFUL,
             channel,
             f"{place}: {quantity} is in {unit!r}, {expected!r} is expected (a name ends in its unit)",
         )
     axis = rest.rpartition("_")[0]
-    if quantity in IMU and axis not in AXES:
+    if quantity in IMU_QUANTITIES and axis not in AXES:
         return _check(
             Level.DOUBTFUL, channel, f"{place}: {axis!r} is no axis, one of {', '.join(AXES)} is expected"
         )
@@ -211,12 +320,14 @@ def check_turns(run: RunLog, scale: Scale) -> Check:
 
     track_m = scale.track_m if math.isfinite(scale.track_m) else 1.0
     try:
-        pair = low_passed_pair(run, track_m)
+        found = yaw_rate_pair(run, track_m)
     except DataError:
         return check(Level.UNKNOWN, math.nan, "yaw rate: no gyro about z, or no left and right wheel speed")
-    if pair is None:
+    if found is None:
         return check(Level.UNKNOWN, math.nan, "yaw rate: too few samples of gyro and wheels together")
-    fits = [fit for shift in np.linspace(-MAX_SHIFT_S, MAX_SHIFT_S, N_SHIFTS) for fit in _fit(pair, shift)]
+    fits = [
+        fit for shift in np.linspace(-MAX_SHIFT_S, MAX_SHIFT_S, N_SHIFTS) for fit in _fit(found[0], shift)
+    ]
     if not fits:
         return check(Level.UNKNOWN, math.nan, "yaw rate: gyro and wheels hardly overlap")
     best = max(fits, key=lambda fit: abs(fit.likeness))
@@ -253,12 +364,13 @@ class _Fit(NamedTuple):
     turn_radps: float
 
 
-def _fit(pair: YawRatePair, shift_s: float) -> list[_Fit]:
+def _fit(pair: Pair, shift_s: float) -> list[_Fit]:
     """Return the fit at a shift; none where less than half of the run overlaps."""
-    gyro, there = gyro_at(pair, imu_time_s(pair, 0.0, shift_s, 0.0), pair.gyro_radps)
+    gyro = pair.at(pair.time_s + shift_s)
+    there = np.isfinite(gyro)
     if there.sum() < max(MIN_YAW_RATES, 0.5 * there.size):
         return []
-    gyro, wheels = gyro[there], pair.wheels_radps[there]
+    gyro, wheels = gyro[there], pair.measured[there]
     sizes = float(gyro @ gyro), float(wheels @ wheels)
     if min(sizes) == 0.0:
         return []

@@ -44,10 +44,10 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from terrain.errors import LogError
-from terrain.files.documents import first_fault, read_json
+from terrain.files.documents import accepted, read_json
 from terrain.files.names import name_fault, shown
 from terrain.logs.samples import check_log_file, checked_names, checked_stream, refuse_apart, short_name
 from terrain.logs.schema import SCHEMA_VERSION, unit_of
@@ -169,17 +169,14 @@ def read_run_head(folder: str | Path) -> RunFile:
     path = Path(folder) / "run.json"
     place = short_name(path)
     described = read_json(check_log_file(path, path.parent), place, LogError)
-    try:
-        if (
-            isinstance(described, dict)
-            and (version := described.get("schema_version", SCHEMA_VERSION)) != SCHEMA_VERSION
-        ):
-            raise LogError(
-                f"{place}: schema version {shown(version)} is unknown, this package reads {SCHEMA_VERSION}"
-            )
-        return RunFile.model_validate(described)
-    except ValidationError as error:
-        raise LogError(f"{place}: {first_fault(error)}") from error
+    version = (
+        described.get("schema_version", SCHEMA_VERSION) if isinstance(described, dict) else SCHEMA_VERSION
+    )
+    if version != SCHEMA_VERSION:
+        raise LogError(
+            f"{place}: schema version {shown(version)} is unknown, this package reads {SCHEMA_VERSION}"
+        )
+    return accepted(RunFile, described, place, LogError)
 
 
 def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:

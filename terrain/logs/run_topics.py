@@ -17,10 +17,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple, Protocol
 
 import numpy as np
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field
 
 from terrain.errors import DataError, LogError
-from terrain.files.documents import first_fault, parse_json
+from terrain.files.documents import accepted, parse_json
 from terrain.files.names import plain_name, shown
 from terrain.logs.labels import label_changes
 from terrain.logs.read import MAX_STREAMS, MAY_BE_UNKNOWN, LabelEntry, RunHead
@@ -399,11 +399,10 @@ def read_document(place: str, text: str, topics: Mapping[str, Topic]) -> RunDocu
     """
     place = f"{place}: {RUN_TOPIC}"
     try:
-        document = RunDocument.model_validate(parse_json(text))
-    except ValidationError as error:
-        raise LogError(f"{place}: is damaged ({first_fault(error)})") from error
+        content = parse_json(text)
     except ValueError as error:
         raise LogError(f"{place}: is damaged ({error})") from error
+    document = accepted(RunDocument, content, place, LogError, "is damaged")
     for name, each in document.streams.items():
         there = topics.get(each.topic)
         if there is None or there.kind != each.kind:

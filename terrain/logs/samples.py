@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from terrain.errors import DataError, LogError
-from terrain.files.names import check_name, has_control_characters, shown
-from terrain.files.regular import check_inside, check_regular
+from terrain.files.names import check_inside, check_name, check_regular, has_control_characters, shown
 from terrain.records import Array, RunLog, Stream
 
 MAX_MAGNITUDE = 1e12

@@ -28,8 +28,7 @@ from typing import Any, BinaryIO, NamedTuple, TextIO
 import numpy as np
 
 from terrain.errors import LogError, library
-from terrain.files.names import listed, normal_name, printable, shown
-from terrain.files.regular import MEBIBYTE, check_regular
+from terrain.files.names import MEBIBYTE, check_regular, listed, normal_name, printable, shown
 from terrain.logs.samples import BAD_CELL, SHORT_ROW, short_name
 from terrain.records import Array
 

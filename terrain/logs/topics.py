@@ -38,12 +38,11 @@ from types import MappingProxyType
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field, FiniteFloat, ValidationError
+from pydantic import Field, FiniteFloat
 
 from terrain.errors import ConfigError, LogError
-from terrain.files.documents import first_fault, read_yaml
-from terrain.files.names import check_name, listed, plain_name, shown
-from terrain.files.resources import data_folder
+from terrain.files.documents import accepted, read_yaml
+from terrain.files.names import check_name, data_folder, listed, plain_name, shown
 from terrain.logs.labels import label_intervals
 from terrain.logs.mapping import Strict, Unit, Word, check_unit
 from terrain.logs.samples import checked_stream, longest_rise
@@ -298,11 +297,7 @@ def load_mapping(path: str | Path) -> TopicMapping:
     packaged = data_folder("bags") / f"{path}.yaml"
     if not path.exists() and plain_name(str(path)) and packaged.is_file():
         path = packaged
-    described = read_yaml(path)
-    try:
-        mapping = TopicMapping.model_validate(described)
-    except ValidationError as error:
-        raise ConfigError(f"{path.name}: {first_fault(error)}") from error
+    mapping = accepted(TopicMapping, read_yaml(path), path.name, ConfigError)
     for key in ("robot", "terrain"):
         if getattr(mapping, key):
             check_name(f"{path.name}: {key}", getattr(mapping, key), ConfigError)
@@ -322,10 +317,7 @@ def check_stream(place: str, described: Mapping[str, object]) -> StreamMapping:
     place : of the stream, as messages name it
     described : its keys
     """
-    try:
-        stream = StreamMapping.model_validate(dict(described))
-    except ValidationError as error:
-        raise ConfigError(f"{place}: {first_fault(error)}") from error
+    stream = accepted(StreamMapping, dict(described), place, ConfigError)
     _check_stream(place, stream)
     return stream
 

@@ -6,14 +6,12 @@ with a gain a run and a component that slip makes free,
 .. math:: \min_\tau \sum_{runs} \sum_c \min_g \sum_t \left(V_c(t + \tau) - g\,V_{w,c}(t)\right)^2 .
 
 A robot that drives steadily shows no delay at all; starts, stops and turns do.  The interval is that of draws
-of runs with replacement (of thirds of a single run).
+of runs with replacement (of thirds of a single run), :func:`terrain.signals.common_delay`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
-from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +26,7 @@ from terrain.measured_slip.slips import (
 )
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
+from terrain.signals import Delay, DelayStatus, common_delay
 
 SEARCH_S = (-0.4, 1.2)
 """Bounds of the search: a lidar that matches scans comes out up to 0.7 s late; beyond a second it is no delay
@@ -47,38 +46,15 @@ MIN_KNOWN = 0.3
 MAX_STD_S = 0.1
 """A delay that is less certain is not applied."""
 
-N_DRAWS = 200
 
-
-class DelayStatus(StrEnum):
-    """Whether a delay was found."""
-
-    ESTIMATED = "estimated"
-    UNDETERMINED = "undetermined"
-
-
-class Delay(NamedTuple):
-    """Delay of the outside measurement behind the wheels, its standard deviation, and what it is from."""
-
-    delay_s: float
-    std_s: float
-    n_runs: int
-    status: DelayStatus
-
-    @property
-    def applied_s(self) -> float:
-        """The delay where it was found, else 0."""
-        return self.delay_s if self.status is DelayStatus.ESTIMATED else 0.0
-
-    @property
-    def sentence(self) -> str:
-        """By how much the outside measurement is late, in words."""
-        if self.status is DelayStatus.UNDETERMINED:
-            return "the delay of the outside measurement was not found, and none is taken off."
-        return (
-            f"the outside measurement is {self.delay_s:+.3f} s behind the wheels "
-            f"(± {1.96 * self.std_s:.3f}), which is taken off."
-        )
+def delay_sentence(delay: Delay) -> str:
+    """Return by how much the outside measurement is late, in words."""
+    if delay.status is not DelayStatus.ESTIMATED:
+        return "the delay of the outside measurement was not found, and none is taken off."
+    return (
+        f"the outside measurement is {delay.delay_s:+.3f} s behind the wheels "
+        f"(± {1.96 * delay.std_s:.3f}), which is taken off."
+    )
 
 
 def estimate_delay(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Delay:
@@ -97,16 +73,7 @@ def estimate_delay(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Delay
             curves += _misfits(run, robot, lags_s, 3 if len(runs) == 1 else 1)
         except DataError:
             continue
-    if not curves:
-        return Delay(float("nan"), float("nan"), 0, DelayStatus.UNDETERMINED)
-    table = np.array(curves)
-    rng = np.random.default_rng(seed)
-    draws = rng.integers(len(table), size=(N_DRAWS, len(table)))
-    found = _lowest(lags_s, table.sum(axis=0))
-    std_s = float(np.std([_lowest(lags_s, table[draw].sum(axis=0)) for draw in draws]))
-    inside = lags_s[0] + STEP_S < found < lags_s[-1] - STEP_S
-    status = DelayStatus.ESTIMATED if inside and std_s <= MAX_STD_S else DelayStatus.UNDETERMINED
-    return Delay(found, std_s, len(table), status)
+    return common_delay(lags_s, [-curve for curve in curves], MAX_STD_S, seed)
 
 
 def _misfits(run: RunLog, robot: Robot, lags_s: Array, n_parts: int) -> list[Array]:
@@ -179,13 +146,3 @@ def _standing_before(path: Travelled) -> Travelled:
         path.n_jumps,
         path.n_gaps,
     )
-
-
-def _lowest(lags_s: Array, misfit: Array) -> float:
-    """Return where a curve is lowest, by the parabola through the three lowest neighbours."""
-    i = int(np.argmin(misfit))
-    if i in (0, len(lags_s) - 1):
-        return float(lags_s[i])
-    before, at, after = misfit[i - 1 : i + 2]
-    bend = before - 2.0 * at + after
-    return float(lags_s[i] + (STEP_S * 0.5 * (before - after) / bend if bend > 0.0 else 0.0))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.measured_slip.delay import Delay, DelayStatus, estimate_delay
+from terrain.measured_slip.delay import estimate_delay
 from terrain.measured_slip.rollers import (
     DistanceBound,
     RollerFindings,
@@ -20,6 +20,7 @@ from terrain.measured_slip.rollers import (
 from terrain.measured_slip.slips import MeasuredSlip, measured_slip
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, as_drive, robot_named
+from terrain.signals import Delay, DelayStatus
 
 WINDOWS_S = (2.0, 0.5)
 """Windows of steady motion; short ones where the outside measurement does not cover longer ones, as a lidar's

@@ -28,10 +28,8 @@ from typing import Any, get_type_hints
 
 from terrain.effects import read_effects
 from terrain.errors import ConfigError
-from terrain.files.descriptions import check_keys, number
-from terrain.files.documents import read_yaml
-from terrain.files.names import check_name, shown
-from terrain.files.resources import data_folder
+from terrain.files.documents import check_keys, number, read_yaml
+from terrain.files.names import check_name, data_folder, shown
 from terrain.robots.region import read_region
 from terrain.robots.robot import (
     KIND_OF_SECTION,

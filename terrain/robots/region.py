@@ -18,7 +18,7 @@ import math
 from typing import Any, NamedTuple
 
 from terrain.errors import ConfigError
-from terrain.files.descriptions import check_keys
+from terrain.files.documents import check_keys
 
 MARGIN = 0.1
 """Part of a range's width that a run may go beyond it: its ends are percentiles, which runs of the same kind

@@ -9,7 +9,7 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.files.documents import read_yaml
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.records import Array
 
 _ANY = (-math.inf, math.inf, "a finite number")

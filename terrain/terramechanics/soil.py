@@ -27,9 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.files.descriptions import check_keys, number
-from terrain.files.documents import read_yaml
-from terrain.files.resources import data_folder
+from terrain.files.documents import check_keys, number, read_yaml
+from terrain.files.names import data_folder
 
 LAWS: dict[str, tuple[str, ...]] = {
     "janosi": ("cohesion_pa", "friction_angle_rad", "shear_modulus_m"),

@@ -21,10 +21,8 @@ import numpy as np
 
 from terrain.classify.stiffness import StiffnessLevel
 from terrain.errors import ConfigError
-from terrain.files.descriptions import check_keys
-from terrain.files.documents import read_yaml
-from terrain.files.names import shown
-from terrain.files.resources import data_folder
+from terrain.files.documents import check_keys, read_yaml
+from terrain.files.names import data_folder, shown
 from terrain.terramechanics.soil import Soil, extra_soil_names, load_soil, soil_names
 from terrain.terramechanics.traction import ground_record, net_pull, wheel_ground
 

@@ -25,8 +25,7 @@ import yaml
 from terrain.errors import ConfigError
 from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel, model_of
 from terrain.files.atomic import atomic_write
-from terrain.files.descriptions import check_keys
-from terrain.files.documents import read_yaml
+from terrain.files.documents import check_keys, read_yaml
 from terrain.files.names import shown
 from terrain.records import Array
 

@@ -13,9 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from terrain.files.descriptions import number
-from terrain.files.documents import read_yaml
-from terrain.files.resources import data_folder
+from terrain.files.documents import number, read_yaml
+from terrain.files.names import data_folder
 from terrain.records import Array
 from terrain.robots import Robot
 

@@ -12,7 +12,7 @@ import pytest
 from pipelines.cli.table import COMMANDS
 from pipelines.learn.model_file import MODEL_FILE
 from pipelines.report.numbers import format_value
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 

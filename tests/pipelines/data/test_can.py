@@ -28,7 +28,7 @@ from pipelines.data.can_frames import (
 )
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.replay import TWIST
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS

@@ -6,7 +6,7 @@ from pathlib import Path
 import cantools
 
 from pipelines.data.run_writers import messages_of_run
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.logs.topics import TYPES, load_mapping, short_type
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"

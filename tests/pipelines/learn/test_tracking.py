@@ -21,7 +21,7 @@ from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.tracking import METRICS, log_training
 from pipelines.learn.training_data import data_of_runs
 from terrain.errors import ModelError, TerrainError
-from terrain.files.lock import file_lock
+from terrain.files.atomic import file_lock
 from terrain.logs.digest import data_digest
 
 

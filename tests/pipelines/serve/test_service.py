@@ -15,7 +15,7 @@ from pipelines.data.datasets import load_runs
 from pipelines.live.observer import Observer
 from pipelines.serve.client import ServiceError, TerrainClient
 from terrain.control.slip_table import load_slip_table
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.logs.replay import replay
 
 from .strangers import CHANNELS, ask, hello, messages, running, until

@@ -9,7 +9,7 @@ import pytest
 from pipelines.serve.serve import Settings, run
 from pipelines.serve.service import Service
 from terrain.errors import ConfigError, TerrainError
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 
 from .strangers import ask, hello, running
 

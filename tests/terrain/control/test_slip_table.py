@@ -15,7 +15,7 @@ from terrain.control.slip_table import (
     write_slip_table,
 )
 from terrain.errors import ConfigError, TerrainError
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.records import SlipTarget
 from terrain.slip_learning.curve import LAW_BOUNDS, LAW_PARAMETERS
 

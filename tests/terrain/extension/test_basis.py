@@ -7,7 +7,7 @@ import yaml
 
 from terrain.effects import PARAMETER, parameters_of
 from terrain.extension import Origin, apply_homes, basis_of
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.robots import load_robot, robot_from
 
 NAMES = ("agrimaro", "husky", "warthog", "marmotte")

@@ -10,7 +10,7 @@ import yaml
 
 from terrain.errors import ConfigError
 from terrain.extension import extended_yaml, write_extended
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.robots import load_robot, robot_from
 
 ROBOT = load_robot("agrimaro")

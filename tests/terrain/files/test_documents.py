@@ -4,8 +4,7 @@ import pytest
 
 from terrain.errors import ConfigError, LogError, TerrainError
 from terrain.files.documents import MAX_DEPTH, MAX_NODES, parse_json, parse_yaml, read_json, read_yaml
-from terrain.files.names import MAX_NAME, check_name, listed, name_fault, shown
-from terrain.files.regular import check_inside, read_regular
+from terrain.files.names import MAX_NAME, check_inside, check_name, listed, name_fault, read_regular, shown
 
 DEEP = 100_000
 

@@ -6,13 +6,12 @@ import time
 import pytest
 
 from terrain.errors import TerrainError
-from terrain.files.atomic import ensure_writable
-from terrain.files.lock import file_lock
+from terrain.files.atomic import ensure_writable, file_lock
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from terrain.files.lock import file_lock
+from terrain.files.atomic import file_lock
 with file_lock(Path(sys.argv[1]), 5.0, "tests"):
     print("held", flush=True)
     time.sleep(60)

@@ -83,13 +83,6 @@ def test_numbers_arrays_and_compiled_code_agree():
             np.testing.assert_allclose(one, (along[k, i], across[k, i]), rtol=0, atol=1e-14)
 
 
-def test_a_wheel_frame_turns_the_velocity_and_keeps_its_size():
-    velocity = wheel_velocities(WHEELS_M, TWIST)
-    along, across = wheel_frame_velocities(TWIST, WHEELS_M, STEER)
-    turned = (along + 1j * across) * np.exp(1j * STEER)
-    np.testing.assert_allclose(turned, velocity[..., 0] + 1j * velocity[..., 1], atol=1e-12)
-
-
 @given(st.floats(0.05, 2.0), st.floats(-np.pi, np.pi), st.floats(0.1, 2.0))
 def test_a_robot_that_is_turned_drives_equally_well_in_its_own_axes(distance_m, turned_rad, speed_mps):
     """Three equal wheels drive equally well in all directions: J'J does not depend on how they are turned."""

@@ -54,7 +54,7 @@ def published_pose(speed_x, speed_y, yaw_rate, yaw_0, hold=2, noise=0.0, rng=Non
 )
 def test_a_circle_gives_its_twist_back_wherever_the_heading_wraps(twist, yaw_0):
     """Exactly: an arc driven steadily is a straight line in its own axes."""
-    found = body_twists(published_pose(*twist, yaw_0)[None], PERIOD_S)[0]
+    found = body_twists(published_pose(*twist, yaw_0)[None], PERIOD_S)[0][0]
     seen = np.isfinite(found).all(axis=1)
     assert seen[8:-8].all()
     assert not seen[[0, 1, -2, -1]].any()
@@ -65,7 +65,7 @@ def test_the_noise_of_a_twist_is_that_of_the_pose_times_its_gain():
     rng = np.random.default_rng(4)
     noise = 0.005
     windows = [published_pose(0.5, 0.0, 0.3, yaw, noise=noise, rng=rng) for yaw in rng.uniform(-3, 3, 300)]
-    found = body_twists(np.array(windows), PERIOD_S)
+    found, _ = body_twists(np.array(windows), PERIOD_S)
     middle = found[:, 14:26].reshape(-1, 3)
     assert np.abs(middle.mean(axis=0) - (0.5, 0.0, 0.3)).max() < 0.002
     # six or seven poses 0.1 s apart: 1 / sqrt(sum t^2) is 1.9 to 2.4; the mean of the first five headings,
@@ -86,7 +86,7 @@ def test_poses_out_of_a_queue_are_not_taken_at_their_time():
         held[24 + late] = pose[scan]
     held[29:] = pose[29:]
     held[29] = pose[24]
-    found = body_twists(held[None], PERIOD_S)[0]
+    found = body_twists(held[None], PERIOD_S)[0][0]
     seen = np.isfinite(found).all(axis=1)
     np.testing.assert_allclose(found[seen], np.broadcast_to((0.5, 0.0, 0.6), (seen.sum(), 3)), atol=0.01)
     assert not seen[14:26].any()
@@ -110,7 +110,7 @@ def test_a_pose_that_took_longer_is_dated_when_its_registration_began():
                 held[done:next_done] = fine[max(begun, 0)]
         held[: starts[1]] = fine[0]
         windows.append(held)
-    found = body_twists(np.array(windows), PERIOD_S)
+    found, _ = body_twists(np.array(windows), PERIOD_S)
     seen = np.isfinite(found).all(axis=2)
     assert seen.mean() > 0.3
     # of the first pose of a window nothing is known, and heading is that of the first five as held
@@ -131,8 +131,8 @@ def test_a_pose_that_never_changes_or_is_missing_gives_no_speed_and_not_zero():
     still = np.zeros((1, N, 3))
     missing = published_pose(0.5, 0.0, 0.2, 0.0)[None].copy()
     missing[0, 10:] = np.nan
-    assert np.isnan(body_twists(still, PERIOD_S)).all()
-    assert np.isnan(body_twists(missing, PERIOD_S)[0, 12:]).all()
+    assert np.isnan(body_twists(still, PERIOD_S)[0]).all()
+    assert np.isnan(body_twists(missing, PERIOD_S)[0][0, 12:]).all()
 
 
 def table(steps=3, windows=3, seed=0, twist=(0.5, 0.0, 0.4)):
@@ -418,13 +418,6 @@ def test_between_updates_keeps_every_measurement_and_holds_what_was_measured_aga
     assert (found[16:21] == measured[4]).all()
     assert np.ptp(found[20:24]) > 0.0
     assert np.isnan(between_updates(np.full(8, np.nan), time_s[:8], 4)).all()
-
-
-def test_import_writes_what_was_read(tmp_path):
-    folder = write(tmp_path / "log", table())
-    found = convert(ConvertSettings(data=folder, out=tmp_path / "raw", layout="drive"))
-    assert (found.n_runs, found.labels) == (3, {})
-    assert data_digest(load_runs(tmp_path / "raw")) == found.digest == data_digest(load_runs(folder))
 
 
 WARTHOG = ("asphalt_1", "asphalt_2", "asphalt_3", "gravel_1", "sand_1", "sand_2")

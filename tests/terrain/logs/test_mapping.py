@@ -39,12 +39,6 @@ def save(tmp_path):
     return write
 
 
-def test_a_mapping_reads_the_borealtc_layout_as_its_own_reader_does(borealtc_dir, save):
-    mapped = load_runs(borealtc_dir, mapping=save(like_borealtc()))
-    assert [run.run_id for run in mapped] == ["ICE_01", "SNOW_01", "SNOW_02"]
-    assert data_digest(mapped) == data_digest(load_runs(borealtc_dir))
-
-
 def test_units_scale_and_offset_become_si(tmp_path, save):
     (tmp_path / "drive.csv").write_text("stamp;yaw;v\n1000;90;36\n1500;-90;72\n2000;;0\n")
     mapping = {

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
-from terrain.logs.quality import stream_quality
+from terrain.logs.plausibility import stream_quality
 from terrain.records import Stream
 
 

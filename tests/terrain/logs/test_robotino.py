@@ -5,13 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipelines.data.convert import Settings as ConvertSettings
-from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from terrain.errors import LogError
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.logs import robotino
-from terrain.logs.digest import data_digest
 from terrain.logs.robotino import HELD, NO_SIGN, SCALED
 from terrain.robots import load_robot
 
@@ -132,15 +129,6 @@ def test_a_folder_of_the_data_set_is_read_alone(root):
     write_log(root / "one_surface/moss/exp01.csv.gz", columns_of())
     write_log(root / "one_surface/cork/exp01.csv.gz", columns_of())
     assert [run.run_id for run in load_runs(root / "one_surface" / "moss")] == ["moss_01"]
-
-
-def test_import_and_read_again_give_one_digest(root, tmp_path):
-    written(root)
-    out = tmp_path / "runs"
-    result = convert(ConvertSettings(data=root, out=out))
-    again = load_runs(out)
-    assert data_digest(again) == data_digest(load_runs(root)) == result.digest
-    assert again[0].dropped == load_runs(root)[0].dropped
 
 
 def _cell(column, row, value):

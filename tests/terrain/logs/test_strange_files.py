@@ -13,7 +13,7 @@ from pyarrow import parquet
 from pipelines.data.datasets import load_runs
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, LogError, TerrainError
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.logs import tables
 from terrain.logs.mapping import load_mapping
 from terrain.logs.read import read_run

@@ -12,7 +12,7 @@ from scipy.io import savemat
 
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
-from terrain.logs.geodesy import local_metres
+from terrain.logs.mapping import local_metres
 
 TIME = {"column": "t", "unit": "s"}
 T = 0.1 * np.arange(6)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
-from terrain.measured_slip.delay import DelayStatus, estimate_delay
+from terrain.measured_slip.delay import estimate_delay
 from terrain.measured_slip.ground_changes import slip_step
 from terrain.measured_slip.slips import (
     measured_slip,
@@ -16,6 +16,7 @@ from terrain.measured_slip.slips import (
 from terrain.measured_slip.surfaces import surface_slip
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
+from terrain.signals import DelayStatus
 from terrain.simulation.planar.run import simulate_planar
 
 HUSKY = load_robot("husky")

@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from terrain.errors import ConfigError
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.robots import load_robot
 
 

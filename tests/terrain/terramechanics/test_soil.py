@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from terrain.errors import ConfigError
-from terrain.files.resources import data_folder
+from terrain.files.names import data_folder
 from terrain.terramechanics.soil import LAWS, RANGES, SINKAGE, Soil, load_soil, scattered, soil_names
 
 
