@@ -24,7 +24,7 @@ Source: the form of the step follows the textbook of Sarkka, Bayesian Filtering 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -778,6 +778,7 @@ class Filter:
         sizes = (m, m, d, len(model.inputs))
         self._sample = _Samples(np.empty(1), *(np.zeros((1, size)) for size in sizes))
         self._nothing = self._columns(1, keep=False)
+        self._compiled: Callable[..., None] | None = None
 
     def step(
         self,
@@ -802,7 +803,12 @@ class Filter:
         sample.variance[0] = self.noise.measurement_variance if variance is None else variance
         sample.walk[0] = 0.0 if walk is None else walk
         sample.inputs[0] = 0.0 if inputs is None else inputs
-        _take(*self._kernel, sample, self._nothing)
+        if self._compiled is None:
+            _take(*self._kernel, sample, self._nothing)
+            (compiled,) = _take.overloads.values()  # its types are found once: that takes longer than a step
+            self._compiled = compiled.entry_point
+        else:
+            self._compiled(*self._kernel, sample, self._nothing)
         return bool(self._nothing.taken[0])
 
     def run(self, time_s: Array, z: Array, inputs: Array | None = None, *, keep: bool = True) -> _Columns:

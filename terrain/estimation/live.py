@@ -43,7 +43,7 @@ from terrain.estimation.filter import (
 )
 from terrain.estimation.filters.skid import make_skid_filter, skid_noise, within_bounds
 from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise, schedule
+from terrain.estimation.filters.swerve_noise import Schedule, default_noise
 from terrain.estimation.health import HealthMonitor
 from terrain.estimation.stuck import STUCK_AFTER_S, Motion, motion_at, motion_memory
 from terrain.estimation.table import OFF_CLOCK_S, latencies_s
@@ -138,8 +138,8 @@ class History:
     """
 
     def __init__(self, memories: Sequence[Array]) -> None:
-        self._memories = memories
-        before = Tick(-math.inf, None), [memory.copy() for memory in memories]
+        self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
+        before = Tick(-math.inf, None), [memory.copy() for memory in self._memories]
         self._ticks: deque[tuple[Tick, list[Array]]] = deque([before], maxlen=N_TICKS)
         self._samples: deque[tuple[float, dict[str, Samples]]] = deque(maxlen=N_STEPS)
 
@@ -210,18 +210,19 @@ class _Queue:
     """
 
     def __init__(self, columns: Array) -> None:
-        self._columns, self._is_there = columns, columns >= 0
+        self._columns, self._is_lacking = columns, columns < 0
         self._waiting: list[tuple[float, bool, Array]] = []
         self.counts: Counter[str] = Counter()
 
     def push(self, time_s: Array, values: Array, last_s: float) -> None:
         """Queue samples; ``last_s`` is the stamp of the last that was taken out."""
-        samples = np.where(self._is_there, values[:, self._columns], np.nan)
+        samples = values[:, self._columns]
+        samples[:, self._is_lacking] = np.nan
         finite = np.isfinite(samples)
-        complete: list[bool] = np.all(finite | ~self._is_there, axis=1).tolist()
         samples[~finite] = np.nan
-        waiting = self._waiting
-        for stamp_s, whole, sample in zip(time_s.tolist(), complete, samples, strict=True):
+        finite[:, self._is_lacking] = True
+        waiting, stamps, complete = self._waiting, time_s.tolist(), np.all(finite, axis=1).tolist()
+        for stamp_s, whole, sample in zip(stamps, complete, samples, strict=True):
             before_s = waiting[-1][0] if waiting else last_s
             if not (math.isfinite(stamp_s) and stamp_s > before_s):
                 self.counts["stamp does not increase"] += 1
@@ -233,7 +234,8 @@ class _Queue:
                 self.counts["waited too long"] += QUEUE // 2
                 del waiting[: QUEUE // 2]
             waiting.append((stamp_s, whole, sample))
-            self.counts["not finite"] += not whole
+            if not whole:
+                self.counts["not finite"] += 1
 
     def take(self, time_s: float) -> list[tuple[float, bool, Array]]:
         """Take out what came by a tick; what is stamped far ahead of it goes."""
@@ -313,7 +315,8 @@ class LiveFilter:
             robot.require("motors", "steering", "sensors")
             usual = default_noise(filter_name, robot, has_gnss)
         _check_numbers(initial_yaw_rad or 0.0, gnss_latency_s, rate_hz or {})
-        self._is_scheduled = noise is None and bool(self.model.inputs)
+        is_scheduled = noise is None and bool(self.model.inputs)
+        self._schedule = Schedule(self.model, ROWS) if is_scheduled else None
         self._robot, self._channels, self._correction = robot, channels, correction
         self.filter = Filter(self.model, usual if noise is None else noise, settings)
         self._connect(channels, has_gnss)
@@ -601,17 +604,12 @@ class LiveFilter:
         """Take the row into the filter, with the noise and the inputs of this tick."""
         z = self._numbers[:, self._row_places][0]
         variance, walk, inputs = self.filter.noise.measurement_variance, None, None
-        if self._is_scheduled:
-            variances, walks, all_inputs = schedule(self.model, variance, self._columns)
-            variance, inputs = variances[0], all_inputs[0]
-            walk = None if walks is None else walks[0]
+        if self._schedule is not None:
+            (variance,), (walk,), (inputs,) = self._schedule(self._numbers, variance)
         if self._gnss_places:
             variance = np.array(variance)
             variance[self._gnss_places] = self._row["gnss_variance"][0]
         self.filter.step(time_s, z, variance, walk, inputs)
-
-    def _columns(self, names: Sequence[str]) -> Array:
-        return self._numbers[:, [ROWS.index(name) for name in names]]
 
     def _estimate(self, time_s: float, wheels: Array, rates: Array) -> LiveEstimate:
         """Return what is known after a tick."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +16,6 @@ from terrain.estimation.filters.swerve_model import WHEELS
 from terrain.estimation.table import MeasurementTable
 from terrain.records import Array
 from terrain.robots import Robot
-
-Columns = Callable[[Sequence[str]], Array]
-"""From names of rows to their measurements (n, k)."""
 
 # of how far a state walks within a second,
 _WALK_STD = {
@@ -83,76 +80,64 @@ def _described_std(robot: Robot) -> dict[str, float]:
 _SHAKEN_S, _CHANGED_RATIO, _UNSEEN_RATIO, _SHAKEN_TURN_S = 0.09, 0.4, 1.0 / 3.0, 0.02
 
 
-def slip_walk(model: FilterModel, columns: Columns) -> Array | None:
-    """Return the variances (n, d) a second by which states of vio15 walk beside their process noise.
+_SHAKEN_ACCEL_RATIO = 0.5  # scatter of an accelerometer by vibration, as a part of the vertical one
+UNKNOWN_MPS2 = 1.4
+"""Vibration where it is not known: that of rough ground."""
+
+
+class Schedule:
+    """What changes from tick to tick of a filter with slip speeds: noise and inputs by the derived rows.
 
     The slip of a wheel changes with the ground under it, which shows as vibration a_z, and with its thrust,
     which shows as a change of the wheel's speed w.  The latter is written so that a start from rest leaves a
-    slip ratio of 0 +- 0.4, fast or slow::
+    slip ratio of 0 +- 0.4, fast or slow: slip speeds walk by, in a second::
 
         q = (0.09 s a_z)^2 + 0.4^2 |d(w^2)/dt|
 
     Rough ground, and wheels that change their speed while they are still being steered, turn the robot, too:
     the yaw rate walks by the mean of ``(0.02 s a_z)^2 + 0.4^2 |d(w^2)/dt|`` over the squared distance of a
-    wheel from the origin.
+    wheel from the origin.  What vibration does to slip goes back and forth: it leads nowhere over seconds
+    without a camera, and there 0.03 s stands for 0.09 s.
 
-    What vibration does to slip goes back and forth: it leads nowhere over seconds without a camera, and there
-    0.03 s stands for 0.09 s.
-
-    None for a filter without slip speeds.
+    An accelerometer has ``R = R_quiet + (0.5 a_z)^2``; as on rough ground where the vibration is unknown.
 
     Parameters
     ----------
-    model : a filter
-    columns : measurements (n, k) by name, as of :meth:`~terrain.estimation.table.MeasurementTable.columns`
+    model : filter with inputs
+    rows : names of the measurements, in the order of the columns that it is called with
     """
-    slips = [state for state in model.states if kind_of(state) == "slip_speed_mps"]
-    if not slips:
-        return None
-    shaken, *changed = np.nan_to_num(columns((DERIVED_ROWS[0], *DERIVED_ROWS[4:7]))).T
-    walk = np.zeros((len(shaken), len(model.states)))
-    unseen = ~(columns(("camera_age_s",))[:, 0] <= UNSEEN_AFTER_S)
-    shaken_s = _SHAKEN_S * (1.0 - (1.0 - _UNSEEN_RATIO) * unseen)
-    for state, change in zip(slips, changed, strict=True):
-        walk[:, model.states.index(state)] = (shaken_s * shaken) ** 2 + 2.0 * _CHANGED_RATIO**2 * change
-    square_arms_m2 = float((model.params[WHEELS] ** 2).sum())
-    turned = 3.0 * (_SHAKEN_TURN_S * shaken) ** 2 + 2.0 * _CHANGED_RATIO**2 * sum(changed)
-    walk[:, model.states.index("yaw_rate_radps")] = turned / square_arms_m2
-    return walk
 
+    def __init__(self, model: FilterModel, rows: Sequence[str]) -> None:
+        self._derived = [rows.index(row) for row in (DERIVED_ROWS[0], *DERIVED_ROWS[4:7], *model.inputs)]
+        self._camera_age = rows.index("camera_age_s")
+        self._accels = [k for k, row in enumerate(model.rows) if kind_of(row) == "accel_mps2"]
+        self._slips = [k for k, state in enumerate(model.states) if kind_of(state) == "slip_speed_mps"]
+        self._turn, self._shape = model.states.index("yaw_rate_radps"), (len(model.rows), len(model.states))
+        self._square_arms_m2 = float((model.params[WHEELS] ** 2).sum())
 
-# Scatter of an accelerometer by vibration, as a part of the vertical one
-_SHAKEN_ACCEL_RATIO = 0.5
-UNKNOWN_MPS2 = 1.4
-"""Vibration where it is not known: that of rough ground."""
+    def __call__(self, z: Array, measurement_variance: Array) -> tuple[Array, Array, Array]:
+        """Return variances (n, m), walks (n, d) and inputs (n, k) for measurements (n, rows).
 
-
-def accel_variance(model: FilterModel, measurement_variance: Array, columns: Columns) -> Array:
-    """Return measurement variances (n, m) with those of the accelerometer by vibration.
-
-    ``R = R_quiet + (0.5 a_z)^2`` with the vertical vibration a_z; as on rough ground where that is unknown.
-    """
-    shaken = columns(DERIVED_ROWS[:1])[:, 0]
-    variance = np.array(np.broadcast_to(measurement_variance, (len(shaken), len(model.rows))))
-    for row in (row for row in model.rows if kind_of(row) == "accel_mps2"):
-        known = np.where(np.isnan(shaken), UNKNOWN_MPS2, shaken)
-        variance[:, model.rows.index(row)] += (_SHAKEN_ACCEL_RATIO * known) ** 2
-    return variance
-
-
-def schedule(
-    model: FilterModel, measurement_variance: Array, columns: Columns
-) -> tuple[Array, Array | None, Array]:
-    """Return what changes from tick to tick: variances (n, m), walks (n, d) and inputs (n, k) of the process.
-
-    Parameters
-    ----------
-    model : a filter with inputs
-    measurement_variance : (m,) or (n, m), physical
-    columns : as of :func:`slip_walk`
-    """
-    variance = accel_variance(model, measurement_variance, columns)
-    return variance, slip_walk(model, columns), np.nan_to_num(columns(model.inputs))
+        Parameters
+        ----------
+        z : measurements; derived rows that are NaN count as nothing
+        measurement_variance : (m,) or (n, m), physical
+        """
+        derived = z[:, self._derived]
+        unknown = np.isnan(derived)
+        vibration = np.where(unknown[:, 0], UNKNOWN_MPS2, derived[:, 0])
+        derived[unknown] = 0.0
+        shaken, changed = derived[:, 0], derived[:, 1:4]
+        variance, walk = np.empty((len(z), self._shape[0])), np.zeros((len(z), self._shape[1]))
+        variance[:] = measurement_variance
+        variance[:, self._accels] += ((_SHAKEN_ACCEL_RATIO * vibration) ** 2)[:, None]
+        unseen = ~(z[:, self._camera_age] <= UNSEEN_AFTER_S)
+        shaken_s = _SHAKEN_S * (1.0 - (1.0 - _UNSEEN_RATIO) * unseen)
+        walk[:, self._slips] = ((shaken_s * shaken) ** 2)[:, None] + 2.0 * _CHANGED_RATIO**2 * changed
+        changes = changed[:, 0] + changed[:, 1] + changed[:, 2]
+        turned = 3.0 * (_SHAKEN_TURN_S * shaken) ** 2 + 2.0 * _CHANGED_RATIO**2 * changes
+        walk[:, self._turn] = turned / self._square_arms_m2
+        return variance, walk, derived[:, 4:]
 
 
 def scheduled(model: FilterModel, noise: Noise, table: MeasurementTable) -> tuple[Noise, Array | None]:
@@ -166,7 +151,7 @@ def scheduled(model: FilterModel, noise: Noise, table: MeasurementTable) -> tupl
     """
     if not model.inputs:
         return noise, None
-    variance, walk, inputs = schedule(model, noise.measurement_variance, table.columns)
+    variance, walk, inputs = Schedule(model, table.rows)(table.z, noise.measurement_variance)
     return replace(noise, measurement_variance=variance, walk_variance=walk), inputs
 
 

@@ -9,7 +9,7 @@ import pytest
 from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S
 from terrain.estimation.filter import GATE_PROBABILITY, HELD_S, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise, schedule, scheduled
+from terrain.estimation.filters.swerve_noise import Schedule, default_noise, scheduled
 from terrain.estimation.live import LiveFilter
 from terrain.estimation.table import measurement_table
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
@@ -43,8 +43,7 @@ def schedule_of(model, noise):
     rows = parts()[2].rows
 
     def of_row(z):
-        columns = lambda names: np.array([[z[rows.index(name)] for name in names]])  # noqa: E731
-        return [part[0] for part in schedule(model, noise.measurement_variance, columns)]
+        return [part[0] for part in Schedule(model, rows)(np.array(z)[None], noise.measurement_variance)]
 
     return of_row
 
