@@ -94,7 +94,7 @@ def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained
     assert len(rows) > 5
     observer = Observer(model, robot=HUSKY, channels=channels_of(runs[5]))
     assert_same(observed(observer, runs[5]), rows)
-    assert observer.estimate.speed_mps > 0.1
+    assert observer.estimate.speed_x_mps > 0.1
 
 
 def test_slip_by_an_observer_of_tracked_robots_is_a_feature_in_the_log_and_live(trained):

@@ -20,8 +20,8 @@ ROBOT = load_robot("agrimaro")
 def standing():
     """The estimate of a robot that stands, and the states of its filter."""
     estimator = LiveFilter(ROBOT)
-    (seen,) = estimator.step({"wheels": Reading(np.array([0.0]), np.zeros((1, 6)))})
-    return seen, estimator.states
+    estimator.step({"wheels": Reading(np.array([0.0]), np.zeros((1, 6)))})
+    return estimator.latest, estimator.states
 
 
 @pytest.mark.parametrize("speed_mps", [0.5, -0.5])

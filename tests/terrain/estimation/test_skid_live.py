@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.feed import ROWS
@@ -25,10 +26,10 @@ def log(scenario="survey", seed=31, soil="grass", duration_s=30.0):
     return simulate_run(HUSKY, soil, scenario, seed, duration_s=duration_s)
 
 
-def live(run, rate_hz=50.0, **options):
+def live(run, replay_hz=50.0, **options):
     channels = {name: run.streams[name].channels for name in ("wheels", "imu") if name in run.streams}
     estimator = LiveFilter(HUSKY, "skid", channels, **options)
-    estimates = [e for sample in replay(run, rate_hz) for e in estimator.step(sample.readings)]
+    estimates = [e for sample in replay(run, replay_hz) for e in estimator.step(sample.readings)]
     return estimator, estimates + estimator.settle(all_of_them=True)
 
 
@@ -98,10 +99,9 @@ def test_how_samples_are_bundled_does_not_matter(rate_hz):
 
 
 def test_live_equals_batch_on_measured_snow(datasets_dir):
-    from terrain.logs.borealtc import read_run
-
-    for number in ("03", "05", "14"):
-        run = read_run(datasets_dir / "borealtc" / "SNOW", number)
+    for run in load_runs(datasets_dir / "borealtc"):
+        if run.run_id not in ("SNOW_03", "SNOW_05", "SNOW_14"):
+            continue
         assert_equal(run, rate_hz={"wheels": 6.5, "imu": 100.0})
 
 

@@ -433,9 +433,10 @@ def test_at_rest_on_the_level_nothing_at_all_happens():
     assert np.isnan(motion.wheel("slip_ratio")).all()
     assert np.isnan(motion.wheel("slip_angle_rad")).all()
     plant = plant_of(load_soil("grass"))
-    state = start_state(plant, np.zeros(3))
-    settle(plant, state)
-    np.testing.assert_array_equal(state, start_state(plant, np.zeros(3)))
+    state = start_state(np.zeros(3))
+    settle(*plant, state)
+    state["n_steps"] = 0
+    assert state.tobytes() == start_state(np.zeros(3)).tobytes()
 
 
 @pytest.mark.parametrize("name", ["tiles", "grass", "snow", "dry_sand"])
