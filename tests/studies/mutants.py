@@ -1,8 +1,9 @@
 """Faults on purpose: whether the tests notice them.
 
-``mutants.yaml`` holds one fault an entry: its name, what it breaks, the file, the text that is there and the
-text in its place, and the tests that have to fail with it.  Each is put into a copy of the working tree, the
-tests are run there, and the tree is as it was.
+``mutants.yaml`` holds one fault an entry: its name, what it is, the file, the text that is there and the text in
+its place, and the tests that have to fail with it; ``mutants_terrain.yaml`` holds those of the mechanisms of
+``terrain``.  Each is put into a copy of the working tree, and the tests are run there.  Kernels that call what
+was changed are compiled anew, as :mod:`terrain.kernel_caches` finds them; the copy keeps the others.
 """
 
 from __future__ import annotations
@@ -26,7 +27,9 @@ from terrain.errors import ConfigError
 EXAMPLE = "python tests/studies mutants --only nan-as-zero"
 REPOSITORY = Path(__file__).resolve().parents[2]
 FILE = Path(__file__).with_suffix(".yaml")
-TIMEOUT_S = 300
+TERRAIN_FILE = FILE.with_name("mutants_terrain.yaml")
+NOT_COPIED = (".git", ".venv", ".*_cache", ".hypothesis", "mlruns")
+TIMEOUT_S = 600
 
 
 class Mutant(NamedTuple):
@@ -35,18 +38,20 @@ class Mutant(NamedTuple):
     Parameters
     ----------
     name : of the fault
-    breaks : what it breaks, in a sentence
+    what : the fault in a sentence, by which it is put in again where its text has moved
     file : that it is in, from the repository
     old, new : the text that occurs once in the file, and what replaces it
     tests : files or nodes of tests
+    kind : numerical (a sign, a factor, an index) or logical (a missing check, a status); empty where not stated
     """
 
     name: str
-    breaks: str
+    what: str
     file: str
     old: str
     new: str
     tests: tuple[str, ...]
+    kind: str = ""
 
 
 class Settings(BaseSettings):
@@ -58,10 +63,11 @@ class Settings(BaseSettings):
 
 
 class Outcome(NamedTuple):
-    """A mutant, whether a test failed with it, and the last line of the tests."""
+    """A mutant, whether a test failed with it; and which and why, or the last line of the tests."""
 
     name: str
-    breaks: str
+    what: str
+    kind: str
     caught: bool
     tests: str
 
@@ -92,18 +98,18 @@ def mutated(text: str, mutant: Mutant) -> str:
 
 
 def is_caught(mutant: Mutant, tree: Path) -> tuple[bool, str]:
-    """Return whether a test fails with a mutant in a tree, and the last line of the tests."""
+    """Return whether a test fails with a mutant in a tree; and which and why, or the last line of the tests."""
     file = tree / mutant.file
     text, times = file.read_text(encoding="utf-8"), file.stat()
     file.write_text(mutated(text, mutant), encoding="utf-8")
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header", "-rN"]
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "--no-header", "-rfE"]
     command += ["-m", "slow or not slow", "--tb=no", "--doctest-modules", *mutant.tests]
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+    settings = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1") | {"COLUMNS": "240"}
     try:
         done = subprocess.run(
             command,
             cwd=tree,
-            env=os.environ | threads | {"PYTHONPATH": str(tree)},
+            env=os.environ | settings | {"PYTHONPATH": str(tree)},
             capture_output=True,
             text=True,
             timeout=TIMEOUT_S,
@@ -114,7 +120,8 @@ def is_caught(mutant: Mutant, tree: Path) -> tuple[bool, str]:
     lines = (done.stdout.strip() or done.stderr.strip()).splitlines()
     if done.returncode not in (0, 1):
         raise ValueError(f"{mutant.name}: the tests did not run: {lines[-1] if lines else done.returncode}")
-    return done.returncode == 1, lines[-1] if lines else ""
+    failed = (line for line in lines if line.startswith(("FAILED ", "ERROR ")))
+    return done.returncode == 1, next(failed, lines[-1] if lines else "")
 
 
 def run(settings: Settings, progress: Progress = silent) -> Mutants:
@@ -130,31 +137,30 @@ def run(settings: Settings, progress: Progress = silent) -> Mutants:
     if unknown:
         raise ConfigError(f"--only: there is no mutant {unknown[0]!r}")
     chosen = [each for each in mutants if not settings.only or each.name in settings.only]
-    found = {}
-    with tempfile.TemporaryDirectory() as place:
-        tree = Path(place) / "tree"
-        shutil.copytree(settings.tree, tree, ignore=shutil.ignore_patterns(".git", ".venv", "mlruns"))
-        for mutant in chosen:
-            progress("mutants", len(found), len(chosen))
-            try:
-                found[mutant.name] = is_caught(mutant, tree)
-            except (ValueError, OSError, subprocess.TimeoutExpired) as error:
-                found[mutant.name] = (False, str(error))
+    found: list[Outcome] = []
+    for mutant in chosen:
         progress("mutants", len(found), len(chosen))
-    by_name = {each.name: each.breaks for each in chosen}
-    return Mutants(tuple(Outcome(name, by_name[name], *outcome) for name, outcome in found.items()))
+        with tempfile.TemporaryDirectory() as place:  # a tree each: kernels compiled with one are of no other
+            tree = Path(place) / "tree"
+            shutil.copytree(settings.tree, tree, ignore=shutil.ignore_patterns(*NOT_COPIED))
+            try:
+                caught, tests = is_caught(mutant, tree)
+            except (ValueError, OSError, subprocess.TimeoutExpired) as error:
+                caught, tests = False, str(error)
+        found.append(Outcome(mutant.name, mutant.what, mutant.kind, caught, tests))
+    progress("mutants", len(found), len(chosen))
+    return Mutants(tuple(found))
 
 
 def report(result: Mutants) -> Report:
     """Return which mutants were caught, the others first."""
     n = sum(each.caught for each in result.mutants)
     rows = [
-        (each.name, "caught" if each.caught else "survived", each.breaks, each.tests)
-        for each in result.mutants
+        (each.name, "caught" if each.caught else "survived", each.what, each.tests) for each in result.mutants
     ]
     rows.sort(key=lambda row: row[1] == "caught")
     return Report(
         "Mutants",
         f"{n} of {len(rows)} mutants are caught.",
-        parts=(Table(("mutant", "", Column("breaks", long=True), Column("tests", long=True)), tuple(rows)),),
+        parts=(Table(("mutant", "", Column("fault", long=True), Column("tests", long=True)), tuple(rows)),),
     )

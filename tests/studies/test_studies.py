@@ -84,7 +84,11 @@ def test_a_table_stands_between_its_marks():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mutant", mutants.read_mutants(), ids=lambda mutant: mutant.name)
+@pytest.mark.parametrize(
+    "mutant",
+    [*mutants.read_mutants(), *mutants.read_mutants(mutants.TERRAIN_FILE)],
+    ids=lambda mutant: mutant.name,
+)
 def test_every_mutant_has_one_place_and_its_tests(mutant):
     text = (ROOT / mutant.file).read_text(encoding="utf-8")
     assert mutants.mutated(text, mutant) != text
