@@ -162,7 +162,7 @@ def estimate_clock(
     >>> speeds = np.column_stack([1 - yaw_rate / 3, 1 + yaw_rate / 3])
     >>> wheels = Stream(time_s[::5], speeds[::5], ("speed_left_mps", "speed_right_mps"))
     >>> found = estimate_clock(RunLog("SNOW_01", "husky", {"imu": gyro, "wheels": wheels}), track_m=0.57)
-    >>> found.status, round(found.offset_s, 2), abs(found.rate) < 1e-3
+    >>> found.status.value, round(found.offset_s, 2), abs(found.rate) < 1e-3
     ('estimated', 0.3, True)
     """
     found = yaw_rate_pair(run, track_m)
