@@ -361,7 +361,9 @@ FEED = record(
         **dict.fromkeys(("gyro_angle_rad", "gyro_time_s"), float),
         **dict.fromkeys(("standing_s", "gyro_low_radps", "gyro_high_radps", "gyro_sum_radps"), float),
         "n_gyro": int,
-        **dict.fromkeys(("frozen", "low_confidence", "no_rotation", "jump"), (int, len(STREAMS))),
+        **dict.fromkeys(
+            ("not_finite", "frozen", "low_confidence", "no_rotation", "jump"), (int, len(STREAMS))
+        ),
         **dict.fromkeys(("wheels_not_finite", "wheels_beyond"), int),
     }
 )
@@ -913,6 +915,7 @@ def take_live(stream: int, sample: Array, complete: bool, came_s: float, setting
     """Take a sample as it came, without a look ahead: unless it repeats the one before, or is not confident."""
     settings, feed = settings[0], feed[0]
     feed.last_s[stream] = came_s
+    feed.not_finite[stream] += not complete
     first, last = (0, 6) if stream == IMU else (3, 13)
     noisy = stream in (IMU, ODOMETRY) and complete
     if noisy and _repeats_all(sample, first, last, feed.before[stream - IMU]):

@@ -234,8 +234,6 @@ class _Queue:
                 self.counts["waited too long"] += QUEUE // 2
                 del waiting[: QUEUE // 2]
             waiting.append((stamp_s, whole, sample))
-            if not whole:
-                self.counts["not finite"] += 1
 
     def take(self, time_s: float) -> list[tuple[float, bool, Array]]:
         """Take out what came by a tick; what is stamped far ahead of it goes."""
@@ -327,8 +325,9 @@ class LiveFilter:
         self._feed, self._row = rows.new_feed(), np.zeros(1, rows.ROW)
         self._numbers = rows.measurements(self._row)
         self._monitor = None if skids else HealthMonitor(robot, self.model)
-        self._slip, self._motion = SlipOfInstant(robot, self.model.states), motion_memory()
-        memories = [self.filter.state, self._feed, self._motion]
+        self._slip = SlipOfInstant(robot, self.model.states)
+        self._motion, self._stuck_since_s = motion_memory(), np.full(1, np.nan)
+        memories = [self.filter.state, self._feed, self._motion, self._stuck_since_s]
         self._history = History(memories if self._monitor is None else [*memories, self._monitor.memory])
         self._region = RegionMonitor(robot)
         self._row_places = [ROWS.index(row) for row in self.model.rows]
@@ -337,9 +336,10 @@ class LiveFilter:
             self.model.states.index(name) if name in self.model.states else -1
             for name in (("speed_mps", "", "yaw_rate_radps", "", "") if skids else _MOTION)
         ]
-        self._skids, self._stuck_since_s = skids, math.nan
+        self._skids = skids
         self.latest: LiveEstimate | None = None
         self._unsettled: deque[LiveEstimate] = deque()
+        self._settled_s = -math.inf
         self._newest_s: dict[str, float] = {}
         self._counted: Counter[str] = Counter()
         self.too_late = -math.inf, math.nan
@@ -393,7 +393,7 @@ class LiveFilter:
         for stream, name in enumerate(STREAMS):
             if name in self._queues:
                 counts |= {f"{name}: {kind}": n for kind, n in self._queues[name].counts.items()}
-                for kind in ("frozen", "low_confidence", "no_rotation", "jump"):
+                for kind in ("not_finite", "frozen", "low_confidence", "no_rotation", "jump"):
                     counts[f"{name}: {kind.replace('_', ' ')}"] = int(self._feed[kind][0, stream])
         return {kind: n for kind, n in (counts | self.filter.dropped).items() if n}
 
@@ -454,10 +454,9 @@ class LiveFilter:
                 late_s = min(late_s, self._late("wheels", stamps, last_s))
         if came:
             history.add_samples(came, last_s)
-            self._newest_s |= {
-                name: max(stamps[-1], self._newest_s.get(name, -math.inf))
-                for name, (stamps, _, _) in came.items()
-            }
+            for name, (stamps, _, _) in came.items():
+                if stamps[-1] <= last_s + OFF_CLOCK_S or last_s == -math.inf:  # else its clock jumped
+                    self._newest_s[name] = max(stamps[-1], self._newest_s.get(name, -math.inf))
         if late_s < math.inf:
             ticks = self._go_back(late_s, ticks)
         if now_s is not None and history.last_s > -math.inf:
@@ -470,7 +469,7 @@ class LiveFilter:
             estimate = self._tick(tick, settled)
             if estimate is not None:
                 self.latest = estimate
-                if tick.wheels is not None:
+                if tick.wheels is not None and tick.time_s > self._settled_s:
                     self._unsettled.append(estimate)
         return settled + self.settle()
 
@@ -489,6 +488,7 @@ class LiveFilter:
         settled = []
         while self._unsettled and self._unsettled[0].time_s <= reached_s + TICK_S:
             settled.append(self._unsettled.popleft())
+            self._settled_s = settled[-1].time_s
         return settled
 
     def _queue_up(self, readings: Mapping[str, Reading], came: dict[str, Samples], last_s: float) -> float:
@@ -578,6 +578,7 @@ class LiveFilter:
             settled += self._unsettled
             self._unsettled.clear()
             self._newest_s.clear()
+            self._settled_s = -math.inf
             rows.forget_times(self._feed)
             for queue in self._queues.values():
                 queue.clear()
@@ -649,7 +650,7 @@ class LiveFilter:
             wheel_speed_mps,
             np.empty(0, np.int8) if self._monitor is None else self._monitor.health.copy(),
             motion,
-            self._stuck_since_s,
+            float(self._stuck_since_s[0]),
         )
 
     def _motion_at(self, time_s: float, mean: Array, std: Array) -> Motion:
@@ -661,9 +662,9 @@ class LiveFilter:
             time_s, left_mps, right_mps, has_gyro, mean[turn], std[bias], self._robot.track_m, self._motion
         )
         if status != Motion.STUCK:
-            self._stuck_since_s = math.nan
-        elif math.isnan(self._stuck_since_s):
-            self._stuck_since_s = time_s - STUCK_AFTER_S
+            self._stuck_since_s[0] = math.nan
+        elif math.isnan(self._stuck_since_s[0]):
+            self._stuck_since_s[0] = time_s - STUCK_AFTER_S
         return Motion(status)
 
 

@@ -1,5 +1,6 @@
 """Samples that come late: the numbers of samples in order, to the last bit, up to the rewind's reach."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,7 +10,7 @@ from hypothesis import strategies as st
 
 from terrain.estimation.live import N_STEPS, REWIND_S, LiveFilter
 from terrain.logs.replay import replay
-from terrain.records import Reading
+from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
@@ -26,8 +27,13 @@ MOST_STEPS = 11
 
 @cache
 def samples():
+    """A drive; of the IMU a sample that may come late is not finite."""
     run = simulate_run(ROBOT, "grass", "straight", 5, duration_s=6.0, faults=Faults(by_chance=False))
-    return list(replay(run))
+    imu = run.streams["imu"]
+    values = np.array(imu.values)
+    values[np.searchsorted(imu.time_s, (FIRST + 5) * PERIOD_S), 3] = np.nan
+    streams = {**run.streams, "imu": Stream(imu.time_s, values, imu.channels)}
+    return list(replay(replace(run, streams=streams)))
 
 
 def bare(sample):
@@ -80,6 +86,12 @@ def assert_same(estimator, expected):
     for one, other in zip(estimator.latest, expected.latest, strict=True):
         np.testing.assert_array_equal(one, other)
     assert estimator.health == expected.health
+    of_lateness = {"came late", "ticks without wheels"}
+    counts, expected_counts = (
+        {kind: n for kind, n in one.dropped.items() if kind not in of_lateness}
+        for one in (estimator, expected)
+    )
+    assert counts == expected_counts
     for one, other in zip(estimator._history._memories, expected._history._memories, strict=True):
         assert one.tobytes() == other.tobytes()
 
@@ -172,3 +184,22 @@ def test_without_wheels_ticks_go_on_by_the_callers_time_and_uncertainty_grows():
     assert estimator.dropped["ticks without wheels"] == len(set(times_s[gone]))
     assert stds[-1] > 2.0 * stds[~gone][-1]
     assert np.isnan(estimator.latest.motor_radps).all()
+
+
+def test_a_stamp_far_ahead_does_not_end_the_wait_for_its_stream():
+    """The IMU's stamps are an hour ahead once; later, its samples come three steps after the wheels'."""
+    estimator, settled = LiveFilter(ROBOT), []
+    for k, (_, readings) in enumerate(delayed({"imu": [3] * N_MIXED})):
+        if k == FIRST - 10:
+            readings = dict(readings, imu=Reading(readings["imu"].time_s + 3600.0, readings["imu"].values))
+        settled += estimator.step(readings)
+    expected, in_time = LiveFilter(ROBOT), []
+    for k, (_, readings) in enumerate(in_order()):
+        if k == FIRST - 10:
+            readings = {name: reading for name, reading in readings.items() if name != "imu"}
+        in_time += expected.step(readings)
+    means = {estimate.time_s: estimate.mean for estimate in in_time}
+    assert len(settled) > FIRST + N_MIXED - 5
+    assert (np.diff([estimate.time_s for estimate in settled]) > 0.0).all()
+    for estimate in settled[: FIRST + N_MIXED - 5]:  # after that the last late ones come out of order
+        np.testing.assert_array_equal(estimate.mean, means[estimate.time_s])

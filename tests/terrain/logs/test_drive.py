@@ -529,3 +529,10 @@ def test_wheels_run_faster_than_the_ground_in_straight_driving(husky_runs):
     assert 0.92 < np.median(ratios) < 1.0
     gained, integrated = np.transpose(accelerations)
     assert np.corrcoef(gained, integrated)[0, 1] > 0.6  # negative with the axes as published
+
+
+def test_import_writes_what_was_read(tmp_path):
+    folder = write(tmp_path / "log", table())
+    found = convert(ConvertSettings(data=folder, out=tmp_path / "raw", layout="drive"))
+    assert (found.n_runs, found.labels) == (3, {})
+    assert data_digest(load_runs(tmp_path / "raw")) == found.digest == data_digest(load_runs(folder))

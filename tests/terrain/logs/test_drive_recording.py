@@ -7,8 +7,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
+from terrain.logs.digest import data_digest
 from terrain.logs.drive_recording import LOST, NOT_RECORDED, STILL
 from terrain.logs.imu_axes import GYRO_IN_DEGREES, GYRO_TURNED, NO_SIGN, POWER_SIGN, TURNED, current_sign
 from terrain.logs.samples import BAD_CELL, BAD_TIME
@@ -345,3 +348,9 @@ def test_of_measured_recordings_lidar_wheels_and_gyro_agree(measured_runs, folde
     else:
         assert not any("imu" in run.streams for run in runs)
         assert NO_SIGN in {kind for run in runs for kind in run.dropped}
+
+
+def test_import_writes_what_was_read(save, tmp_path):
+    data, out = save(recording()), tmp_path / "out"
+    result = convert(ConvertSettings(data=data, out=out))
+    assert data_digest(load_runs(out)) == result.digest == data_digest(load_runs(data))

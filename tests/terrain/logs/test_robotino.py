@@ -5,10 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.data.convert import Settings as ConvertSettings
+from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from terrain.errors import LogError
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.logs import robotino
+from terrain.logs.digest import data_digest
 from terrain.logs.robotino import HELD, NO_SIGN, SCALED
 from terrain.robots import load_robot
 
@@ -218,3 +221,12 @@ def test_measured_runs_go_where_they_are_commanded(measured):
         twist = commands.values[10]
         apart = np.angle(np.exp(1j * (course - np.arctan2(twist[1], twist[0]))))
         assert abs(apart) < np.radians(8.0), run.run_id
+
+
+def test_import_and_read_again_give_one_digest(root, tmp_path):
+    written(root)
+    out = tmp_path / "runs"
+    result = convert(ConvertSettings(data=root, out=out))
+    again = load_runs(out)
+    assert data_digest(again) == data_digest(load_runs(root)) == result.digest
+    assert again[0].dropped == load_runs(root)[0].dropped

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
+from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
@@ -287,3 +288,33 @@ def test_invalid_simulations_are_refused_in_one_sentence(changed, message):
     with pytest.raises(ConfigError, match=message) as error:
         simulate(**given | changed)
     assert "\n" not in str(error.value)
+
+
+def test_a_run_reads_back_as_it_was_written(tmp_path):
+    for scenario, options in (
+        ("complex", {"gnss": Gnss(), "faults": Faults(camera_lost_s=((5.0, 8.0),))}),
+        ("stand", {}),
+        ("straight", {"faults": Faults(camera_lost_s=((0.0, math.inf),)), "run_id": "blind"}),
+    ):
+        run = run_of(scenario, "tilled_loam", 2, conditions=HILLY, **({"run_id": scenario} | options))
+        back = read_run(write_run(run, tmp_path))
+        assert same(run, back)
+        assert set(run.streams) == set(back.streams)
+        assert (run.run_id, run.robot, run.labels, run.source) == (
+            back.run_id,
+            back.robot,
+            back.labels,
+            back.source,
+        )
+        assert ("odometry" in run.streams) == (run.run_id != "blind")
+
+
+def test_a_seed_sequence_can_be_given_twice():
+    sequence = np.random.SeedSequence([3, 4])
+    one, again = (run_of("straight", "snow", sequence, 4.0) for _ in range(2))
+    assert same(one, again)
+    assert sequence.n_children_spawned == 0
+    first, second = (run_of("straight", "snow", child, 4.0) for child in sequence.spawn(2))
+    assert not np.array_equal(first.streams["imu"].values, second.streams["imu"].values)
+    assert not same(one, first)
+    assert same(run_of("straight", "snow", 7, 4.0), run_of("straight", "snow", np.int64(7), 4.0))

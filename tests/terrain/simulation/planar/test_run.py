@@ -357,3 +357,14 @@ def test_impossible_inputs_are_refused_in_one_sentence(robot, options, message):
     assert "\n" not in str(error.value)
     with pytest.raises(ConfigError, match="noise of channel 'x'"):
         noise_psd(NOISE, HUSKY, make_planar(HUSKY, Ground()), "x", np.ones(1), 0.5)
+
+
+@pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
+def test_a_finer_step_changes_little(robot):
+    coarse, fine = (
+        simulate_planar(robot, drive(robot), 2, hills=HILLS, effects={"force_slip_ratio": 0.3}, step_s=step_s)
+        for step_s in (0.01, 0.0025)
+    )
+    a, b = logged(coarse, robot), logged(fine, robot)
+    for c, channel in enumerate(CHANNELS[:-1]):
+        assert np.std(a[:, c] - b[:, c]) <= 0.02 * np.std(b[:, c]) + 1e-9, channel
