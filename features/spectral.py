@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from scipy import fft
 
+from terrain.kernels import njit
 from terrain.records import Array
 
 MAX_BANDS = 20
@@ -89,7 +89,7 @@ def channel_spectra(values: Array, rate_hz: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def _describe(power: Array, log_power: Array, edges: Array, resolution_hz: float, out: Array) -> None:
     """Fill in mean band powers, total power (both not yet under a logarithm) and the other moments."""
     n_windows, n_channels, n_lines = power.shape

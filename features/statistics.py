@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from terrain.kernels import njit
 from terrain.records import Array
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -46,7 +46,7 @@ _FLAT = 1e-9  # a standard deviation under this is rounding, not a signal
 _FLOOR = 1e-4  # SI unit, under a logarithm: the resolution of a good sensor; a constant signal is no outlier
 
 
-@njit(cache=True)
+@njit
 def _quantile(ordered: Array, q: float) -> float:
     position = q * (ordered.size - 1)
     low = int(position)
@@ -54,7 +54,7 @@ def _quantile(ordered: Array, q: float) -> float:
     return ordered[low] + (position - low) * (ordered[high] - ordered[low])  # type: ignore[no-any-return]
 
 
-@njit(cache=True)
+@njit
 def _statistics(values: Array, in_order: Array, rate_hz: float, out: Array) -> None:
     n_windows, n_channels, n = values.shape
     for i in range(n_windows):
@@ -144,7 +144,7 @@ def channel_statistics(values: Array, rate_hz: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def _correlations(values: Array, out: Array) -> None:
     n_windows, n_channels, n = values.shape
     centred = np.empty((n_channels, n))

@@ -12,8 +12,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from terrain.kernel_caches import discard_stale
-
 __version__ = "0.1.0"
 
 FACE = {
@@ -65,6 +63,3 @@ def refuse_hidden_packages() -> None:
             raise ImportError(
                 f"the package {name!r} of terrain cannot be imported: {where}; rename that folder or run elsewhere"
             )
-
-
-discard_stale(Path(__file__).parent)

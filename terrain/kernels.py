@@ -1,19 +1,239 @@
-"""Records: named numbers and arrays that compiled functions take, and write in place, as one argument.
+"""Compiled functions, cached by what they are, and the records that they take.
 
-A record is one element of a structured array.  What a plant, a filter, a controller or an observer is made of
-(parameters), remembers (state) and takes at a step (row) is one record each, so that a step reads
+**Cache.**  :func:`njit` is numba's, but a compiled function is found again by its content: a digest of its
+bytecode and constants and of every global that it reads, through all functions that it calls.  numba's own cache
+compares one file only, so that a constant or a callee of another file stays what it was when that file changes;
+here a change compiles what it reaches, and nothing else.  The cache lies in the user's cache folder, so that
+copies, virtual environments and updates of the package share it.
+
+**Records** are named numbers and arrays that compiled functions take, and write in place, as one argument: one
+element of a structured array.  What a plant, a filter, a controller or an observer is made of (parameters),
+remembers (state) and takes at a step (row) is one record each, so that a step reads
 ``step(params[0], state[0], row[0], dt_s)``, a snapshot is a copy of the array, and no number has a place.  From
 Python pass the arrays, and take their elements 0 in compiled code: numba knows an array's type at once.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dis import get_instructions
+from enum import Enum
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
+import numba
 import numpy as np
+from numba.core import typeinfer, types
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
+from numba.core.dispatcher import Dispatcher
 
 from terrain.records import Array
+
+UNUSED_S = 60 * 86400.0
+"""A compiled function that was not loaded for so long is removed when another one is saved."""
+
+
+def cache_folder() -> Path:
+    """Return where compiled functions lie: below NUMBA_CACHE_DIR, XDG_CACHE_HOME or ``~/.cache``."""
+    named = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
+    return Path(named or "~/.cache").expanduser() / "terrain-kernels"
+
+
+def njit(*signatures: Any, **options: Any) -> Any:
+    """Compile a function as :func:`numba.njit` does, and cache it by its content.
+
+    Parameters
+    ----------
+    signatures : of numba, for a function that is compiled when it is defined; none for one that is compiled when
+        it is called
+    options : of :func:`numba.njit`, but ``cache``
+
+    Raises
+    ------
+    TypeError
+        when it is first called, where the function reads a global of a kind whose content is not known.
+
+    Examples
+    --------
+    >>> @njit
+    ... def doubled(x):
+    ...     return 2.0 * x
+    >>> doubled(1.5)
+    3.0
+    """
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        kernel = numba.njit(**options)(function)
+        if not isinstance(kernel, Dispatcher):  # NUMBA_DISABLE_JIT
+            return kernel
+        vars(kernel)["_cache"] = _ContentCache(function, options)
+        if signatures:
+            with typeinfer.register_dispatcher(kernel):
+                for signature in signatures:
+                    kernel.compile(signature)
+                kernel.disable_compile()
+        return kernel
+
+    if len(signatures) == 1 and isinstance(signatures[0], FunctionType):
+        function, signatures = signatures[0], ()
+        return compiled(function)
+    return compiled
+
+
+def content_digest(function: Callable[..., Any], options: Mapping[str, Any] | None = None) -> str:
+    """Return a digest of a function: its code, its options, and all globals that it reads, through what it calls.
+
+    Raises
+    ------
+    TypeError
+        where it reads a global of a kind whose content is not known.
+    """
+    digest = sha256(f"{numba.__version__} {np.__version__} {sorted((options or {}).items())}".encode())
+    seen: set[int] = set()
+    waiting: list[Any] = [function]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, Dispatcher):
+            digest.update(repr(sorted(value.targetoptions.items())).encode())
+            value = value.py_func
+        if isinstance(value, FunctionType):
+            if id(value) in seen:
+                continue
+            seen.add(id(value))
+            digest.update(f"{value.__module__}.{value.__qualname__}".encode())
+            if value.__module__.partition(".")[0] in ("numba", "numpy", "math"):
+                continue
+            cells = [cell.cell_contents for cell in value.__closure__ or ()]
+            waiting += [value.__defaults__, *cells, *_globals_read(value.__code__, value.__globals__, digest)]
+        elif isinstance(value, (tuple, list, frozenset)):
+            digest.update(f"{type(value).__name__} {len(value)}".encode())
+            waiting += value if not isinstance(value, frozenset) else sorted(value, key=repr)
+        elif isinstance(value, np.ndarray):
+            digest.update(f"{value.dtype.descr} {value.shape}".encode() + value.tobytes())
+        elif isinstance(value, type):
+            digest.update(_type_content(value))
+        elif isinstance(value, ModuleType):
+            digest.update(value.__name__.encode())
+        elif isinstance(value, _PLAIN):
+            digest.update(f"{type(value).__name__} {value!r}".encode())
+        elif callable(value) and getattr(value, "__module__", None) in ("builtins", "math", "numpy", "numba"):
+            digest.update(repr(getattr(value, "__name__", value)).encode())
+        else:
+            raise TypeError(
+                f"{function.__module__}.{function.__qualname__} reads {value!r}, a {type(value).__name__}, "
+                "by which a compiled function cannot be cached"
+            )
+    return digest.hexdigest()
+
+
+_PLAIN = (
+    int,
+    float,
+    complex,
+    str,
+    bytes,
+    Enum,
+    np.generic,
+    np.dtype,
+    np.ufunc,
+    range,
+    types.Type,
+    type(None),
+)
+
+
+def _globals_read(code: CodeType, names: Mapping[str, Any], digest: Any) -> list[Any]:
+    """Return the values of the globals that code reads, by their names' order, and digest the code itself."""
+    digest.update(code.co_code + repr((code.co_names, code.co_varnames)).encode())
+    read = []
+    for constant in code.co_consts[1 if _has_docstring(code) else 0 :]:
+        if isinstance(constant, CodeType):
+            read += _globals_read(constant, names, digest)
+        else:
+            read.append(constant)
+    for name in _loaded_names(code):
+        if name in names:
+            value = names[name]
+            read.append(value)
+            if isinstance(value, ModuleType) and value.__name__.partition(".")[0] in ("terrain", "features"):
+                read += [vars(value)[attribute] for attribute in code.co_names if attribute in vars(value)]
+    return read
+
+
+@cache
+def _loaded_names(code: CodeType) -> list[str]:
+    """Return the names that code loads as globals, and not as attributes or fields of the same name."""
+    return sorted({step.argval for step in get_instructions(code) if step.opname == "LOAD_GLOBAL"})
+
+
+def _has_docstring(code: CodeType) -> bool:
+    return bool(code.co_consts) and isinstance(code.co_consts[0], str)
+
+
+def _type_content(value: type) -> bytes:
+    if issubclass(value, Enum):
+        return repr([(member.name, member.value) for member in value]).encode()
+    return f"{value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}".encode()
+
+
+class _ContentCache(FunctionCache):
+    """Numba's cache of one function, in files named by its content.
+
+    The content is read when it is first needed, as functions that it calls may be defined after it.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
+        self._name, self._py_func, self._options = repr(function), function, options
+        self._impl = _Placed(function)
+        self.enable()
+
+    def _load_overload(self, signature: Any, target_context: Any) -> Any:
+        self._place()
+        with suppress(OSError):  # a folder that cannot be read
+            return super()._load_overload(signature, target_context)
+        return None
+
+    def _save_overload(self, signature: Any, data: Any) -> None:
+        try:
+            self._place()
+            super()._save_overload(signature, data)
+        except OSError:  # a folder that cannot be written: compiled anew in each process
+            self.disable()
+
+    def _place(self) -> None:
+        if not hasattr(self, "_cache_file"):
+            name = f"{self._py_func.__name__.strip('<>')}-{content_digest(self._py_func, self._options)[:32]}"
+            self._cache_path = str(cache_folder())
+            self._cache_file = IndexDataCacheFile(self._cache_path, name, "")
+
+
+class _Placed(CompileResultCacheImpl):
+    """How a compiled function is written; it is its own locator."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._lineno = function.__code__.co_firstlineno
+        self._py_file = function.__code__.co_filename
+        self._locator = self
+
+    def ensure_cache_path(self) -> None:
+        """Make the folder, for this user only, and remove what is used no more, once a process."""
+        _make_folder(cache_folder())
+
+
+@cache
+def _make_folder(folder: Path) -> None:
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    oldest_s = time.time() - UNUSED_S
+    for file in folder.iterdir():
+        with suppress(OSError):  # another process may remove it first
+            if max(file.stat()[7:9]) < oldest_s:  # read, or written
+                file.unlink()
 
 
 def record(fields: Mapping[str, Any]) -> np.dtype[Any]:

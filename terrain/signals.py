@@ -21,9 +21,9 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.bootstrap import bootstrap_rows
+from terrain.kernels import njit
 from terrain.records import Array
 
 RIVAL_MARGIN = 0.15
@@ -169,7 +169,7 @@ def smooth_on_grid(time_s: Array, values: Array, sigma_s: float, n_steps: int) -
     return grid_s, np.where(supported, smooth, np.nan)
 
 
-@njit(cache=True)
+@njit
 def correlations(
     time_s: Array,
     measured: Array,

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
+from terrain.kernels import cache_folder
 from terrain.records import Label, RunLog, Stream
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -41,7 +42,7 @@ def pytest_configure_node(node):
 
     Each then takes from the cache what the other has compiled, and no kernel is compiled by both.
     """
-    if not any((REPOSITORY / "terrain").rglob("__pycache__/*.nbc")):
+    if not any(cache_folder().glob("*.nbc")):
         backward = node.workerinput["workerid"] != "gw0"
         node.workerinput["kernels"] = list(KERNELS)[:: -1 if backward else 1]
 

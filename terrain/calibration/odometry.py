@@ -30,7 +30,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.angles import unwrapped
 from terrain.bootstrap import bootstrap_counts, percentile_interval
@@ -60,6 +59,7 @@ from terrain.estimation.observers.slip_odometry import ROWS as ODOMETRY_ROWS
 from terrain.estimation.observers.tracked import ROWS, tracked_observer
 from terrain.estimation.observers.tracked_settings import TrackedSettings
 from terrain.identify import Fit, Parameter, deal, folds, identify
+from terrain.kernels import njit
 from terrain.logs.drive import WindowPoses
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
@@ -415,7 +415,7 @@ def _ends(packed: _Packed, vector: Array, mount: Array, robot: TrackedRobot, by_
     return np.asarray(_sum_legs(theta, mount, geometry, by_gyro, packed))
 
 
-@njit(cache=True)
+@njit
 def _sum_legs(
     theta: Array,
     mount: Array,

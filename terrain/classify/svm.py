@@ -31,7 +31,6 @@ from itertools import combinations
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from numba import njit
 from pydantic import Field
 from scipy.optimize import minimize_scalar
 from sklearn.feature_selection import SelectPercentile, VarianceThreshold, f_classif
@@ -44,6 +43,7 @@ from sklearn.utils.validation import check_is_fitted
 from terrain.classify.folds import block_groups, split_runs
 from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import DataError
+from terrain.kernels import njit
 from terrain.records import Array
 
 LOG_SCALE_BOUNDS = (-4.0, 5.0)
@@ -84,7 +84,7 @@ def class_probabilities(margins: Array, n_classes: int, scale: float) -> Array:
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _coupled(margins: Array, k: int, scale: float) -> Array:
     probability = np.empty((margins.shape[0], k))
     ratio = np.empty((k, k))
@@ -112,7 +112,7 @@ def _coupled(margins: Array, k: int, scale: float) -> Array:
     return probability
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy")
 def _solve_ones(system: Array, solution: Array) -> None:
     """Solve ``system z = 1``, symmetric and positive definite, by Cholesky's ``L L'`` in its place."""
     k = solution.size

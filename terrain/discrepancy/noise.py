@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.optimize import nnls
 
+from terrain.kernels import njit
 from terrain.records import Array
 
 FLOOR = 0.2
@@ -157,7 +157,7 @@ def _lag_table(signals: Sequence[Array], order: int) -> Array:
     return np.asarray(table[np.isfinite(table).all(axis=1)])
 
 
-@njit(cache=True)
+@njit
 def whiten(filters: Array, x: Array) -> Array:
     """Return signals (k, m, c) behind the whitening filters (c, order + 1); 0 where that meets a NaN.
 

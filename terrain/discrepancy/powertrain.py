@@ -24,12 +24,12 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.bootstrap import LEVEL, bootstrap_counts, percentile_interval
 from terrain.discrepancy.faults import Fault
 from terrain.discrepancy.statements import listed
 from terrain.errors import DataError
+from terrain.kernels import njit
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
@@ -178,7 +178,7 @@ def _new_samples(time_s: Array, rates: Array) -> tuple[Array, float]:
     return new, every * float(np.median(np.diff(time_s)))
 
 
-@njit(cache=True)
+@njit
 def follow(area_rad: Array, start_radps: Array, p: Array, dt: float) -> Array:
     """Return wheel speeds (m, wheels) that follow commands.
 
@@ -229,7 +229,7 @@ def follow(area_rad: Array, start_radps: Array, p: Array, dt: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def _predicted(
     area_rad: Array, first: Array, start_radps: Array, at: Array, between: Array, sample: Array, p: Array
 ) -> Array:

@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy.signal import welch
 from scipy.stats import t as student
 
@@ -20,6 +19,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.discrepancy.signals import Signals
 from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SENSED_ONLY, STEPS
 from terrain.errors import DataError
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.simulation.planar.model import Planar
 from terrain.simulation.planar.motion import move
@@ -285,7 +285,7 @@ def _evaluation_points(vector: Array, parameters: Sequence[str]) -> tuple[Array,
     return points, sensed, points[1 + 2 * rows, at] - points[2 + 2 * rows, at]
 
 
-@njit(cache=True)
+@njit
 def _predictions(
     planar: Planar,
     points: Array,
@@ -355,7 +355,7 @@ def prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, A
     )
 
 
-@njit(cache=True)
+@njit
 def decimate(values: Array, taps: Array, every: int) -> Array:
     """Return columns (m, c) of ``values`` (n, c) filtered by a window and decimated; a NaN spreads."""
     n, c = values.shape
@@ -369,7 +369,7 @@ def decimate(values: Array, taps: Array, every: int) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def decimate_known(values: Array, known: Array, taps: Array, every: int) -> Array:
     """Return the same of columns with holes: the window's mean over what is known (n, c) of each.
 

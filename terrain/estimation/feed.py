@@ -56,11 +56,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.kernels import filled, record
+from terrain.kernels import filled, njit, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS
@@ -374,7 +373,7 @@ stream the last stamp taken; positions' origin and variance; what the derived ro
 measured by last; the yaw at the start; the gyro since the last tick, and at rest; and counts of what was left
 out."""
 
-_kernel = njit(cache=True, error_model="numpy")
+_kernel = njit(error_model="numpy")
 
 
 def feed_settings(

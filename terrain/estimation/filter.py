@@ -29,13 +29,13 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import float64, njit, void
+from numba import float64, void
 from numba.core.types.function_type import CompileResultWAP
 from scipy.special import chdtri
 
 from terrain.angles import wrapped
 from terrain.errors import ConfigError, DataError, LogError
-from terrain.kernels import filled, record
+from terrain.kernels import filled, njit, record
 from terrain.logs.schema import unit_of
 from terrain.records import ABSENT, GATED, REOPENED, USED, Array, StateTrack, read_only
 
@@ -84,7 +84,7 @@ class FilterModel:
     propagate : ``propagate(x, dt, params, x_next, F)`` writes the next state (d,), and the entries of the
         Jacobian that are not zero: F (d, at least d) comes as zeros, and rows that stay short cost less
     observe : ``observe(x, params, z_hat, H)`` writes the measurement expected (m,), and the entries of H
-        (m, at least d) that are not zero.  Both are compiled, as ``@njit(PROPAGATE, cache=True)``
+        (m, at least d) that are not zero.  Both are compiled, as ``@njit(PROPAGATE)``
     params : what the two functions need of the robot; the inputs of a sample stand behind them
     inputs : names of what is known of each step beside the state; 0 where it is not given
     initial_std : (d,) how little is known of each state where nothing is known
@@ -128,9 +128,7 @@ class FilterModel:
         self._check_names()
         for what, signature in (("propagate", PROPAGATE), ("observe", OBSERVE)):
             if tuple(signature.args) not in getattr(getattr(self, what), "signatures", ()):
-                raise ConfigError(
-                    f"filter {self.name}: {what} must be compiled as @njit({what.upper()}, cache=True)"
-                )
+                raise ConfigError(f"filter {self.name}: {what} must be compiled as @njit({what.upper()})")
 
     def _check_initial(self) -> None:
         place = f"filter {self.name}"
@@ -358,7 +356,7 @@ _WORK = record(
 _SKIP, _START, _STEP, _JUMP = range(4)  # what the clock says of a row
 _UNSOUND = -1  # a use that is never reported
 
-_kernel = njit(cache=True, error_model="numpy")
+_kernel = njit(error_model="numpy")
 
 
 @_kernel

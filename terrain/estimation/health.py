@@ -23,7 +23,6 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from terrain.estimation.feed import (
     REPEATED_CAMERA,
@@ -34,7 +33,7 @@ from terrain.estimation.feed import (
     repeats,
 )
 from terrain.estimation.filter import FilterModel
-from terrain.kernels import filled, record
+from terrain.kernels import filled, njit, record
 from terrain.records import ABSENT, GATED, REOPENED, Array
 from terrain.robots import Robot
 
@@ -117,7 +116,7 @@ MEMORY = record(
 accelerometer along and across, the camera's last speeds and their instant; the sample of the wheels, and how
 often it repeated itself."""
 
-_kernel = njit(cache=True, error_model="numpy")
+_kernel = njit(error_model="numpy")
 
 
 class HealthMonitor:

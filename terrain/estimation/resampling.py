@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numba import njit
 
 from terrain.estimation.feed import LINE, TICK_S, at_tick, low_pass_step, signal_limits, take
 from terrain.estimation.table import median_step_s
-from terrain.kernels import filled
+from terrain.kernels import filled, njit
 from terrain.records import Array
 
 
@@ -32,7 +31,7 @@ def low_pass(time_s: Array, value: Array, time_constant_s: float, gap_s: float) 
     return _low_pass(time_s, value, time_constant_s, gap_s) if time_constant_s > 0 else value
 
 
-@njit(cache=True)
+@njit
 def _low_pass(time_s: Array, value: Array, time_constant_s: float, gap_s: float) -> Array:
     out = np.empty_like(value)
     for k in range(value.size):
@@ -65,7 +64,7 @@ def on_clock(
     }
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _on_clock(clock: Array, time_s: Array, signal: Array, line: Array, limit: Array) -> Array:
     out, line, limit, k = np.empty(clock.size), line[0], limit[0], 0
     for n in range(clock.size):

@@ -25,9 +25,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numba import boolean, float64, int64, njit
+from numba import boolean, float64, int64
 
 from terrain.estimation.feed import REST_S, STANDING_MPS, TICK_S
+from terrain.kernels import njit
 from terrain.records import Array
 
 MEAN_S = 1.0
@@ -85,7 +86,6 @@ def motion_memory() -> Array:
 
 @njit(
     int64(float64, float64, float64, boolean, float64, float64, float64, float64[::1]),
-    cache=True,
     error_model="numpy",
 )
 def motion_at(
@@ -177,7 +177,7 @@ def motion_track(
     return found
 
 
-@njit(cache=True)
+@njit
 def _motion_track(
     time_s: Array, measured: Array, yaw_rate_radps: Array, bias_std_radps: Array, track_m: float
 ) -> Array:

@@ -8,12 +8,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from terrain.errors import DataError
 from terrain.estimation.feed import UNMEASURED_AFTER_S
 from terrain.estimation.filter import Filter
 from terrain.estimation.table import MeasurementTable
+from terrain.kernels import njit
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array, SlipTrack, StateTrack
 from terrain.robots import Robot
@@ -143,7 +143,7 @@ def _places(robot: Robot, states: tuple[str, ...], from_encoders: bool = False) 
     return np.array([states.index(name) if name in states else -1 for name in names])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _instant_slip(
     mean: Array,
     cov: Array,
@@ -192,7 +192,7 @@ def _instant_slip(
         slip[1, i] = np.sqrt(max(variance, 0.0))
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _slips(
     mean: Array,
     cov: Array,

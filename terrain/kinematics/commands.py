@@ -19,9 +19,10 @@ from functools import singledispatch
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from terrain.errors import ConfigError
+from terrain.kernels import njit
 from terrain.kinematics.wheels import (
     above_zero,
     broadcast,
@@ -226,7 +227,7 @@ def wheel_commands(
     return _commands(positions, *numbers, desired, steer)  # type: ignore[no-any-return]
 
 
-@njit(types.UniTuple(_F8, 2)(_F8, _F8, _F8, _F8), cache=True)
+@njit(types.UniTuple(_F8, 2)(_F8, _F8, _F8, _F8))
 def _aim(along_mps: float, across_mps: float, radius_m: float, now_rad: float) -> tuple[float, float]:
     """Return speed and steering of one wheel, (2.5) with the k that moves the steering least."""
     speed_mps = math.hypot(along_mps, across_mps)
@@ -238,7 +239,7 @@ def _aim(along_mps: float, across_mps: float, radius_m: float, now_rad: float) -
     return sign * speed_mps / radius_m, heading_rad - k * math.pi
 
 
-@njit(types.UniTuple(_F8[::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _ROW, _ROW), cache=True)
+@njit(types.UniTuple(_F8[::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _ROW, _ROW))
 def wheel_command_step(
     positions_m: Array,
     radius_m: float,
@@ -293,7 +294,7 @@ def wheel_command_step(
     return admitted, speed, steer
 
 
-@njit(types.UniTuple(_F8[:, ::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _TABLE, _ROW), cache=True)
+@njit(types.UniTuple(_F8[:, ::1], 3)(_TABLE, _F8, _F8, _F8, _F8, _F8, _TABLE, _ROW))
 def _commands(
     positions_m: Array,
     radius_m: float,

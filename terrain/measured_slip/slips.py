@@ -42,9 +42,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from terrain.errors import ConfigError, DataError
+from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.wheels import TWIST, no_slip_twist, point_velocity, wheel_frame_velocities
@@ -243,7 +243,7 @@ MAX_CORRELATION = 0.95
 """Of residuals; beyond, too few independent samples are left for a variance."""
 
 
-@njit(cache=True)
+@njit
 def window_rates(
     time_s: Array, sums: Array, part: Array, start_s: Array, end_s: Array, min_samples: int, coverage: float
 ) -> tuple[Array, Array]:

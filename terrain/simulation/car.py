@@ -29,12 +29,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kernels import filled, numbers, record
+from terrain.kernels import filled, njit, numbers, record
 from terrain.logs.schema import GNSS_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot
@@ -180,7 +179,7 @@ def initial_state(x_m: float = 0.0, y_m: float = 0.0, yaw_rad: float = 0.0, spee
     return filled(CAR_STATE, body=body)
 
 
-@njit(cache=True)
+@njit
 def side_force(slip_rad: float, stiffness_npr: float, limit_n: float) -> float:
     """Return the side force of an axle at a slip angle, opposed to it and never over its limit.
 
@@ -192,7 +191,7 @@ def side_force(slip_rad: float, stiffness_npr: float, limit_n: float) -> float:
     return -math.copysign(limit_n * -math.expm1(-stiffness_npr * abs(slip_rad) / limit_n), slip_rad)
 
 
-@njit(cache=True)
+@njit
 def _axle(
     car: Any, slip: float, ahead: float, side: float, stiffness: float, limit: float, mass: float
 ) -> tuple[float, float]:
@@ -207,7 +206,7 @@ def _axle(
     return math.atan(carcass), min(max(force, -limit), limit)
 
 
-@njit(cache=True)
+@njit
 def step(car: Any, grid: Array, state: Any, steer_command: float, speed_command: float) -> None:
     """Advance the state in place by :data:`STEP_S`."""
     body, command = state.body, steer_command
@@ -257,7 +256,7 @@ def step(car: Any, grid: Array, state: Any, steer_command: float, speed_command:
     body.side_front_n, body.side_rear_n = f_front, f_rear
 
 
-@njit(cache=True)
+@njit
 def advance(
     car: Array, grid: Array, state: Array, steer_rad: float, speed_mps: float, rows: Array, each: int
 ) -> None:

@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from terrain.kernels import njit
 from terrain.records import Array
 
 DEFLECTION_DAMPING_S = 0.005
 """Damping of the contact as a lead on its deflection; it vanishes in steady rolling and so moves no slip."""
 
 
-@njit(cache=True)
+@njit
 def shear_slip(force_ratio: float, grip_ratio: float) -> float:
     """Return the slip of a shear curve whose slip per force is 1 at the start; its end at 95 % of the grip.
 
@@ -41,7 +40,7 @@ def shear_slip(force_ratio: float, grip_ratio: float) -> float:
     return math.copysign(0.5 * grip_ratio * x, force_ratio)
 
 
-@njit(cache=True)
+@njit
 def softness(soft_ratio: Array, slip: float) -> float:
     """Return slip over traction of the ground at a slip.
 
@@ -57,7 +56,7 @@ def softness(soft_ratio: Array, slip: float) -> float:
     return float(soft_ratio[i] + (at - i) * (soft_ratio[i + 1] - soft_ratio[i]))
 
 
-@njit(cache=True)
+@njit
 def shear_softness(force_ratio: float, grip_ratio: float) -> float:
     """Return slip over traction of a shear curve that starts with 1."""
     return shear_slip(force_ratio, grip_ratio) / force_ratio if abs(force_ratio) > 1e-9 else 1.0

@@ -20,11 +20,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.kernels import numbers, record
+from terrain.kernels import njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera, turned
 from terrain.kinematics.wheels import point_velocity
@@ -181,7 +180,7 @@ class LowPass:
         return values
 
 
-@njit(cache=True)
+@njit
 def _low_pass(values: Array, keep: Array, start: Array, state: Array) -> None:
     for i in range(values.shape[0]):
         for j in range(values.shape[1]):
@@ -473,7 +472,7 @@ def white_imu(
     return Stream(time_s, values, IMU_CHANNELS)
 
 
-@njit(cache=True)
+@njit
 def _force_and_rates(record: Array, up: Array, first: int, height_m: float, out: Array) -> None:
     """Write specific force and body rates (n, 6) of the rows from ``first`` on."""
     for i in range(out.shape[0]):
@@ -564,7 +563,7 @@ class CameraSensor(Sensor):
             turned(self.values[new], self.channels, self._mounting_rad)
 
 
-@njit(cache=True)
+@njit
 def camera_samples(
     position_m: Array, motion: Array, errors: Array, lever_m: Array, yaw_0: float, values: Array
 ) -> None:
@@ -609,7 +608,7 @@ def camera_samples(
         row[13] = 1.0
 
 
-@njit(cache=True)
+@njit
 def _rotated(
     w: float, x: float, y: float, z: float, a: float, b: float, c: float
 ) -> tuple[float, float, float]:

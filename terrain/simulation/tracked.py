@@ -67,12 +67,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kernels import filled, numbers, record
+from terrain.kernels import filled, njit, numbers, record
 from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import TrackedRobot
@@ -178,7 +177,7 @@ LEVEL = Slope()
 """No slope."""
 
 
-@njit(cache=True)
+@njit
 def tilt_at(angle_rad: float, uphill_rad: float, yaw_rad: float) -> tuple[float, float]:
     """Return grade and roll of a body on a slope.
 
@@ -258,7 +257,7 @@ def tracks_on(
     return tracks
 
 
-@njit(cache=True)
+@njit
 def track_loads(tracks: Any, grade_rad: float, roll_rad: float) -> tuple[float, float, float]:
     """Return the loads of the left and the right track, and how far ahead of the middle they act.
 
@@ -275,7 +274,7 @@ def track_loads(tracks: Any, grade_rad: float, roll_rad: float) -> tuple[float, 
     return left, normal - left, min(max(ahead, -third), third)
 
 
-@njit(cache=True)
+@njit
 def rut_depth(tracks: Any, load_n: float) -> float:
     """Return the depth of a track's rut; 0 on ground that has no numbers of sinkage."""
     if tracks.kphi_npmn2 == 0.0:
@@ -286,7 +285,7 @@ def rut_depth(tracks: Any, load_n: float) -> float:
     )
 
 
-@njit(cache=True)
+@njit
 def track_forces(
     tracks: Any, belt_mps: Array, twist: Array, grade_rad: float, roll_rad: float, heap_m2: float, out: Array
 ) -> None:
@@ -312,7 +311,7 @@ def track_forces(
         _add_track(tracks, belt_mps[side], twist, load, ahead, y, heap, out)
 
 
-@njit(cache=True)
+@njit
 def inner_share(twist: Array, y: float) -> float:
     """Return how far the track at y is the inner one of a turn, from 0 to 1; half of it in turning in place.
 
@@ -331,7 +330,7 @@ def inner_share(twist: Array, y: float) -> float:
     return 0.5 * (1.0 + math.copysign(tight, side))
 
 
-@njit(cache=True)
+@njit
 def _add_track(
     tracks: Any,
     belt_mps: float,
@@ -378,7 +377,7 @@ def _add_track(
     out[2] += y * resists
 
 
-@njit(cache=True)
+@njit
 def _earth_pressure(tracks: Any, depth_m: float, heap_m2: float) -> float:
     """Return the force on each metre of a side that pushes soil of a depth, and of a heap on it."""
     if tracks.bulldozing_ratio == 0.0:
@@ -389,7 +388,7 @@ def _earth_pressure(tracks: Any, depth_m: float, heap_m2: float) -> float:
     return float(tracks.bulldozing_ratio * (0.5 * UNIT_WEIGHT_NPM3 * square * passive + cohesive))
 
 
-@njit(cache=True)
+@njit
 def slipped_twist(
     tracks: Any, left_mps: float, right_mps: float, grade_rad: float, roll_rad: float
 ) -> tuple[float, float, float]:
@@ -417,7 +416,7 @@ def slipped_twist(
     return v_x, -abs(v_x) * tracks.side_slip_ratio * roll_rad, (right - left) / (2.0 * tracks.half_m)
 
 
-@njit(cache=True)
+@njit
 def twist_on_soil(
     tracks: Any, state: Any, belt_mps: Array, grade_rad: float, roll_rad: float, dt_s: float
 ) -> Array:
@@ -460,7 +459,7 @@ def twist_on_soil(
     return twist
 
 
-@njit(cache=True)
+@njit
 def _residual(
     tracks: Any,
     belt_mps: Array,
@@ -482,7 +481,7 @@ def _residual(
     return math.sqrt(total)
 
 
-@njit(cache=True)
+@njit
 def step(tracks: Any, slope: Array, state: Any, belt_mps: Array, after: Any, dt_s: float) -> None:
     """Write the state a step later.
 
@@ -516,7 +515,7 @@ def step(tracks: Any, slope: Array, state: Any, belt_mps: Array, after: Any, dt_
     after.travelled_m = state.travelled_m + dt_s * math.hypot(x, y)
 
 
-@njit(cache=True)
+@njit
 def drive(tracks: Array, slope: Array, belt_mps: Array, states: Array, dt_s: float) -> None:
     """Write all states of a drive but the first, which is its start.
 

@@ -34,12 +34,12 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.resampling import on_clock
 from terrain.estimation.table import MeasurementTable
+from terrain.kernels import njit
 from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack
 from terrain.robots import Robot
@@ -110,7 +110,7 @@ def wheel_contacts(robot: Robot, track: StateTrack, table: MeasurementTable) -> 
     return Contacts(steer, rate, wheel_speed, forward, left, reference, np.column_stack(slips))
 
 
-@njit(cache=True)
+@njit
 def contact_slip(
     time_s: Array, slip_speed_mps: Array, reference_speed_mps: Array, relaxation_m: float
 ) -> Array:

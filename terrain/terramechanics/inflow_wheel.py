@@ -49,9 +49,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.kernels import njit
 from terrain.records import Array
 
 FORCE: dict[str, tuple[float, float, float, float]] = {
@@ -112,7 +112,7 @@ def bulldozing_ratio(tan_friction: float) -> float:
     return (cot + math.tan(broken + phi)) * (cot + cot**2 * tan_friction)
 
 
-@njit(cache=True)
+@njit
 def arc_sums(p: Array, r: float, b: float, motion: tuple[float, float, float], h: float) -> Array:
     """Return forces (2, 3) in N of the arc: for a pressure amplitude of 1 Pa, and of the cohesion.
 
@@ -166,7 +166,7 @@ def arc_sums(p: Array, r: float, b: float, motion: tuple[float, float, float], h
     return out
 
 
-@njit(cache=True)
+@njit
 def side_sums(p: Array, r: float, b: float, motion: tuple[float, float, float], h: float) -> Array:
     """Return forces (3,) in N on the side face; parameters as :func:`arc_sums`."""
     omega, ahead, across = motion
@@ -192,7 +192,7 @@ def side_sums(p: Array, r: float, b: float, motion: tuple[float, float, float], 
     return out
 
 
-@njit(cache=True)
+@njit
 def wheel_forces(p: Array, r: float, b: float, trials: Array, depths: Array) -> Array:
     """Return traction and side force in N and the apparent modulus A in Pa of each trial (n, 3).
 

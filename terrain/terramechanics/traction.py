@@ -33,10 +33,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.optimize import brentq
 
-from terrain.kernels import filled, numbers, record
+from terrain.kernels import filled, njit, numbers, record
 from terrain.records import Array
 from terrain.terramechanics.soil import Soil
 
@@ -58,7 +57,7 @@ _N_BRACKETS = 1000
 """Steps of slip in which a balance is sought: a reach within the 0.001 beside a peak goes unseen."""
 
 
-@njit(cache=True)
+@njit
 def mobilised_ratio(x: float) -> float:
     """Return the share of the limit that shearing by ``x = s l / K >= 0`` mobilises: 1 - (1 - exp(-x)) / x.
 
@@ -72,7 +71,7 @@ def mobilised_ratio(x: float) -> float:
     return 1.0 + math.expm1(-x) / x
 
 
-@njit(cache=True)
+@njit
 def janosi_force(slip: float, limit_n: float, contact_length_m: float, shear_modulus_m: float) -> float:
     """Return the force in N of ground that shears; it has the sign of the slip and rises towards the limit.
 
@@ -91,13 +90,13 @@ def janosi_force(slip: float, limit_n: float, contact_length_m: float, shear_mod
     return math.copysign(limit_n, slip) * share
 
 
-@njit(cache=True)
+@njit
 def friction_limit(normal_n: float, area_m2: float, cohesion_pa: float, tan_friction: float) -> float:
     """Return the largest force in N of Mohr and Coulomb: c A + N tan(phi)."""
     return cohesion_pa * area_m2 + normal_n * tan_friction
 
 
-@njit(cache=True)
+@njit
 def magic_force(
     slip: float, normal_n: float, stiffness: float, shape: float, peak_friction: float, curvature: float
 ) -> float:
@@ -115,7 +114,7 @@ def magic_force(
     return math.copysign(normal_n * peak_friction, slip) * max(math.sin(angle), 0.0)
 
 
-@njit(cache=True)
+@njit
 def bekker_pressure(
     sinkage_m: float, width_m: float, kc_npmn1: float, kphi_npmn2: float, exponent: float
 ) -> float:
@@ -129,7 +128,7 @@ def bekker_pressure(
     return (kc_npmn1 / width_m + kphi_npmn2) * math.pow(sinkage_m, exponent)
 
 
-@njit(cache=True)
+@njit
 def rigid_wheel_sinkage(normal_n: float, wheel_radius_m: float, modulus: float, exponent: float) -> float:
     """Return the depth in m at which soil carries a rigid wheel.
 
@@ -149,7 +148,7 @@ def rigid_wheel_sinkage(normal_n: float, wheel_radius_m: float, modulus: float, 
     return math.pow(first, 2.0 / (2.0 * exponent + 1.0))
 
 
-@njit(cache=True)
+@njit
 def plate_sinkage(
     pressure_pa: float, width_m: float, kc_npmn1: float, kphi_npmn2: float, exponent: float
 ) -> float:
@@ -172,7 +171,7 @@ def plate_sinkage(
     return math.pow(pressure_pa / (kc_npmn1 / width_m + kphi_npmn2), 1.0 / exponent)
 
 
-@njit(cache=True)
+@njit
 def slip_sinkage_factor(slip_ratio: float, exponent: float) -> float:
     """Return by what slip multiplies sinkage: ((1 + |s|) / (1 - |s| / 2))^exponent, 1 for an exponent of 0.
 
@@ -190,7 +189,7 @@ def slip_sinkage_factor(slip_ratio: float, exponent: float) -> float:
     return math.pow((1.0 + slip) / (1.0 - 0.5 * slip), exponent)
 
 
-@njit(cache=True)
+@njit
 def compaction_resistance(sinkage_m: float, modulus: float, exponent: float) -> float:
     """Return the force in N that presses a rut of that depth: the work of p(z) b, a metre travelled.
 
@@ -202,13 +201,13 @@ def compaction_resistance(sinkage_m: float, modulus: float, exponent: float) -> 
     return modulus * math.pow(sinkage_m, exponent + 1.0) / (exponent + 1.0)
 
 
-@njit(cache=True)
+@njit
 def rolling_resistance(normal_n: float, ratio: float) -> float:
     """Return the force in N against rolling that goes with the load; no load, no resistance."""
     return max(normal_n, 0.0) * ratio
 
 
-@njit(cache=True)
+@njit
 def contact_length(sinkage_m: float, wheel_radius_m: float, tyre_contact_m: float) -> float:
     """Return over which length in m the wheel shears: its arc in the ground, at least the tyre's own contact.
 
@@ -240,7 +239,7 @@ def ground_record(soil: Soil, wheel_radius_m: float, tyre_width_m: float, contac
     return filled(GROUND, hard=soil.law == "magic", **known)
 
 
-@njit(cache=True)
+@njit
 def wheel_ground(
     ground: Any, normal_n: float, slip_x: float, slip_y: float
 ) -> tuple[float, float, float, float]:

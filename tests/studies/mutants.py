@@ -3,7 +3,7 @@
 ``mutants.yaml`` holds one fault an entry: its name, what it is, the file, the text that is there and the text in
 its place, and the tests that have to fail with it; ``mutants_terrain.yaml`` holds those of the mechanisms of
 ``terrain``.  Each is put into a copy of the working tree, and the tests are run there.  Kernels that call what
-was changed are compiled anew, as :mod:`terrain.kernel_caches` finds them; the copy keeps the others.
+was changed are compiled anew, and the others are shared (:mod:`terrain.kernels`).
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numba import njit
 
 from terrain.angles import wrapped
+from terrain.kernels import njit
 
 
 @njit

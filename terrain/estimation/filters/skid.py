@@ -35,10 +35,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from terrain.estimation.feed import REST_ROW, SIDE_ROWS
 from terrain.estimation.filter import OBSERVE, PROPAGATE, FilterModel, Noise
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import Robot, SkidSteerRobot, as_drive
 
@@ -75,7 +75,7 @@ _ROWS = (*WHEELS_AND_GYRO, REST_ROW)
 _X, _Y, _YAW, _V, _W, _TRACK, _BIAS, _DIFFERENCE = range(8)
 
 
-@njit(cache=True)
+@njit
 def wheel_weight(yaw_rate_radps: float, difference_mps: float, track_m: float) -> float:
     """Return a, from 0 to 1: how much a difference of the sides is believed beside a yaw rate.
 
@@ -97,7 +97,7 @@ def wheel_weight(yaw_rate_radps: float, difference_mps: float, track_m: float) -
     return 1.0 / (1.0 + (apart / DISAGREEMENT_RADPS) ** 2) / slip
 
 
-@njit(PROPAGATE, cache=True)
+@njit(PROPAGATE)
 def _propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
     cos, sin = math.cos(x[_YAW]), math.sin(x[_YAW])
     for i in range(x.size):
@@ -121,7 +121,7 @@ def _propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> N
         f[_W, _TRACK] = -near * x[_DIFFERENCE] / track**2
 
 
-@njit(OBSERVE, cache=True)
+@njit(OBSERVE)
 def _observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
     for row, side in ((0, -0.5), (1, 0.5)):
         z_hat[row] = x[_V] + side * x[_DIFFERENCE]

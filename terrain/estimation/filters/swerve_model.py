@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
 from terrain.estimation.filter import OBSERVE, PROPAGATE
+from terrain.kernels import njit
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array
 
@@ -31,7 +30,7 @@ _X, _Y, _YAW, _VX, _VY, _W, _AX, _AY = range(8)
 _STEER, _BIAS, _SLIP, _OFFSET, _ACCEL_BIAS = 8, 11, 12, 15, 16
 
 
-@njit(PROPAGATE, cache=True)
+@njit(PROPAGATE)
 def propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
     """(4.30)-(4.35): the motion, accelerations that fade; what comes behind these eight is a random walk."""
     cos, sin = math.cos(x[_YAW]), math.sin(x[_YAW])
@@ -55,7 +54,7 @@ def propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> No
     f[_VY, _AY], f[_VY, _W], f[_VY, _VX] = dt, -dt * x[_VX], -dt * x[_W]
 
 
-@njit(PROPAGATE, cache=True)
+@njit(PROPAGATE)
 def propagate_slip_speed(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
     """vio15: slip speeds grow as their wheels' speeds, biases fade, the gyro's moves the IMU's yaw."""
     propagate(x, dt, params, x_next, f)
@@ -75,7 +74,7 @@ def propagate_slip_speed(x: Array, dt: float, params: Array, x_next: Array, f: A
         f[_SLIP + i, _SLIP + i] = grown
 
 
-@njit(cache=True)
+@njit
 def _observe_wheel(
     x: Array, params: Array, wheel: int, steer: int, scale: float, z_hat: Array, h: Array
 ) -> None:
@@ -90,13 +89,13 @@ def _observe_wheel(
     h[wheel, steer] = scale * across
 
 
-@njit(cache=True)
+@njit
 def _observe_direct(z_hat: Array, h: Array, row: int, x: Array, state: int) -> None:
     z_hat[row] = x[state]
     h[row, state] = 1.0
 
 
-@njit(cache=True)
+@njit
 def _observe_body(
     x: Array, params: Array, steer: int, bias: int, at_rest: bool, z_hat: Array, h: Array
 ) -> None:
@@ -128,7 +127,7 @@ def _observe_body(
         _observe_gnss(x, params[_ANTENNA_X], params[_ANTENNA_Y], row, z_hat, h)
 
 
-@njit(cache=True)
+@njit
 def _observe_gnss(x: Array, antenna_x: float, antenna_y: float, row: int, z_hat: Array, h: Array) -> None:
     """Position and velocity of the antenna in the world."""
     cos, sin = math.cos(x[_YAW]), math.sin(x[_YAW])
@@ -143,7 +142,7 @@ def _observe_gnss(x: Array, antenna_x: float, antenna_y: float, row: int, z_hat:
     h[row + 3, _VX], h[row + 3, _VY], h[row + 3, _W], h[row + 3, _YAW] = sin, cos, east, speed_east
 
 
-@njit(OBSERVE, cache=True)
+@njit(OBSERVE)
 def observe_without_slip(x: Array, params: Array, z_hat: Array, h: Array) -> None:
     """(4.48) and (6.6): 12 states."""
     for i in range(3):
@@ -151,7 +150,7 @@ def observe_without_slip(x: Array, params: Array, z_hat: Array, h: Array) -> Non
     _observe_body(x, params, 8, 11, False, z_hat, h)
 
 
-@njit(OBSERVE, cache=True)
+@njit(OBSERVE)
 def observe_slip_ratio(x: Array, params: Array, z_hat: Array, h: Array) -> None:
     """(4.28): 14 states."""
     for i in range(3):
@@ -161,7 +160,7 @@ def observe_slip_ratio(x: Array, params: Array, z_hat: Array, h: Array) -> None:
     _observe_body(x, params, 11, -1, False, z_hat, h)
 
 
-@njit(OBSERVE, cache=True)
+@njit(OBSERVE)
 def observe_slip_speed(x: Array, params: Array, z_hat: Array, h: Array) -> None:
     """vio15: slip speeds, and the offset of the IMU's yaw."""
     for i in range(3):

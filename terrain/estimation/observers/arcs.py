@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from terrain.kernels import njit
 
 _SMALL_RAD = 1e-4  # of half an angle: the series is exact to rounding below
 
 
-@njit(cache=True)
+@njit
 def arc_displacement(
     yaw_rad: float, velocity_x_mps: float, velocity_y_mps: float, yaw_rate_radps: float, dt_s: float
 ) -> tuple[float, float]:

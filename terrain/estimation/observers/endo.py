@@ -28,10 +28,10 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from terrain.kernels import njit
 
 
-@njit(cache=True)
+@njit
 def slip_imbalance(speed_left_mps: float, speed_right_mps: float, exponent: float) -> tuple[float, float]:
     """Return kappa, the right track's part of the slip less the left one's, and its derivative by n.
 
@@ -55,7 +55,7 @@ def slip_imbalance(speed_left_mps: float, speed_right_mps: float, exponent: floa
     return kappa, -0.5 * log * (1.0 - kappa * kappa)
 
 
-@njit(cache=True)
+@njit
 def endo_slip_speeds(
     speed_left_mps: float, speed_right_mps: float, yaw_rate_radps: float, half_track_m: float, exponent: float
 ) -> tuple[float, float]:

@@ -25,7 +25,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.errors import ConfigError
 from terrain.estimation.observers import sideslip_pose as pose
@@ -68,6 +67,7 @@ from terrain.estimation.observers.sideslip_pose import (
     status_of,
     take_inputs,
 )
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import BicycleRobot
 
@@ -166,7 +166,7 @@ def sideslip_dynamic_observer(
     )
 
 
-@njit(cache=True)
+@njit
 def motion_slips(params: Array, after: Array) -> tuple[Array, Array]:
     """Return slip angles (2,) of yaw rate and w, and their derivative (2, 2) by both."""
     speed = after[SPEED]
@@ -182,7 +182,7 @@ def motion_slips(params: Array, after: Array) -> tuple[Array, Array]:
     return slips, by_motion
 
 
-@njit(cache=True)
+@njit
 def _predict(params: Array, after: Array, cov: Array, excited: bool, dt_s: float) -> None:
     """Predict state and covariance in place."""
     slips, by_motion = motion_slips(params, after)
@@ -217,7 +217,7 @@ def _predict(params: Array, after: Array, cov: Array, excited: bool, dt_s: float
         cov[2, 3] = cov[3, 2] = min(max(both, -most), most)
 
 
-@njit(cache=True)
+@njit
 def _condition(after: Array, cov: Array, error: float, row: Array, std: float, excited: bool) -> bool:
     """Condition in place on a measurement; return False where it is too far to be one."""
     variance, gain = std * std, np.zeros(4)
@@ -243,7 +243,7 @@ def _condition(after: Array, cov: Array, error: float, row: Array, std: float, e
     return True
 
 
-@njit(cache=True)
+@njit
 def _correct(params: Array, after: Array, cov: Array, row: Array, excited: bool) -> bool:
     """Correct in place by yaw rate and force; return False where one was rejected."""
     used, seen = True, np.zeros(4)
@@ -273,7 +273,7 @@ def _correct(params: Array, after: Array, cov: Array, row: Array, excited: bool)
     return used
 
 
-@njit(cache=True)
+@njit
 def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     after = memory.copy()
     if take_inputs(params, after, row, dt_s) != ObserverStatus.OK.value:
@@ -310,7 +310,7 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     return after
 
 
-@njit(cache=True)
+@njit
 def _status(before: Array, after: Array, fix: int, used: bool, excited: bool) -> int:
     if after[SEEN_AT] == 0.0:
         return ObserverStatus.STARTING.value
@@ -326,7 +326,7 @@ def _status(before: Array, after: Array, fix: int, used: bool, excited: bool) ->
     return ObserverStatus.OK.value if excited else ObserverStatus.UNEXCITED.value
 
 
-@njit(cache=True)
+@njit
 def _figures(memory: Array) -> Array:
     """Return means (7,), their deviations, slips (2,) and theirs, in one array."""
     out = np.empty(18)

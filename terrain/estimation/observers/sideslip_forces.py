@@ -14,10 +14,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.observers.sideslip_pose import AHEAD, N_SHARED
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import BicycleRobot
 
@@ -54,7 +54,7 @@ def set_dynamics(params: Array, robot: BicycleRobot, excited_mps2: float, as_pri
     params[EXCITED], params[PRINTED] = excited_mps2, float(as_printed)
 
 
-@njit(cache=True)
+@njit
 def rates(
     params: Array, speed: float, steer: float, roll: float, rate: float, slips: Array, stiffness: Array
 ) -> tuple[float, float]:
@@ -66,7 +66,7 @@ def rates(
     return turning, (push if params[PRINTED] == 1.0 else -push) - gravity
 
 
-@njit(cache=True)
+@njit
 def rates_by_force(params: Array, steer: float) -> Array:
     """Return the derivative (2, 2) of r' and w' by C b of front and rear."""
     by = np.empty((2, 2))
@@ -76,7 +76,7 @@ def rates_by_force(params: Array, steer: float) -> Array:
     return by
 
 
-@njit(cache=True)
+@njit
 def inverted(matrix: Array) -> Array:
     """Return the inverse of a matrix (2, 2)."""
     det = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
@@ -86,7 +86,7 @@ def inverted(matrix: Array) -> Array:
     return inverse
 
 
-@njit(cache=True)
+@njit
 def is_excited(params: Array, speed: float, roll: float, rate: float) -> bool:
     """Return whether side forces are large enough to show a cornering stiffness."""
     return bool(abs(speed * rate + GRAVITY_MPS2 * math.sin(roll)) > params[EXCITED])

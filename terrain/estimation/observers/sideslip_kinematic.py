@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from terrain.estimation.observers import sideslip_pose as pose
 from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
@@ -41,6 +40,7 @@ from terrain.estimation.observers.sideslip_pose import (
     take_inputs,
     yaw_rate_of,
 )
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import BicycleRobot
 
@@ -90,7 +90,7 @@ def sideslip_kinematic_observer(
     )
 
 
-@njit(cache=True)
+@njit
 def error_growth(params: Array, after: Array, size: int, dt_s: float) -> Array:
     """Return the transition (size, size) of errors of pose and slip over a tick."""
     grown = np.eye(size)
@@ -98,7 +98,7 @@ def error_growth(params: Array, after: Array, size: int, dt_s: float) -> Array:
     return grown
 
 
-@njit(cache=True)
+@njit
 def add_pose_noise(params: Array, after: Array, cov: Array, slip_walk: float, dt_s: float) -> None:
     """Add in place what the walk of the slip and the measured heading bring."""
     moved = abs(after[SPEED]) * dt_s
@@ -108,7 +108,7 @@ def add_pose_noise(params: Array, after: Array, cov: Array, slip_walk: float, dt
         cov[3, 3] = min(cov[3, 3] + slip_walk**2 * dt_s, 0.25)
 
 
-@njit(cache=True)
+@njit
 def predict_pose(params: Array, after: Array, dt_s: float) -> None:
     """Carry the pose on in place by the slip angles; a robot that stands stays."""
     speed = after[SPEED]
@@ -118,7 +118,7 @@ def predict_pose(params: Array, after: Array, dt_s: float) -> None:
     advance_pose(after, speed, abs(speed) * math.tan(after[SLIP_R]), rate, dt_s)
 
 
-@njit(cache=True)
+@njit
 def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     after = memory.copy()
     if take_inputs(params, after, row, dt_s) != ObserverStatus.OK.value:
@@ -132,7 +132,7 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     return after
 
 
-@njit(cache=True)
+@njit
 def set_slips(after: Array, slips: Array, std: Array) -> None:
     """Set the slip angles (2,) in place, NaN and so is their deviation where nothing shows them."""
     slips[0], slips[1] = after[SLIP_F], after[SLIP_R]
@@ -141,7 +141,7 @@ def set_slips(after: Array, slips: Array, std: Array) -> None:
             slips[i] = std[i] = math.nan
 
 
-@njit(cache=True)
+@njit
 def _figures(memory: Array) -> Array:
     """Return means (3,), their deviations, slips (2,) and theirs, in one array."""
     out = np.empty(10)

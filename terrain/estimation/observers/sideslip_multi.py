@@ -37,7 +37,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
@@ -88,6 +87,7 @@ from terrain.estimation.observers.sideslip_pose import (
     take_inputs,
     yaw_rate_of,
 )
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import BicycleRobot
 
@@ -188,14 +188,14 @@ def sideslip_multi_observer(
     )
 
 
-@njit(cache=True)
+@njit
 def _motion_of(params: Array, after: Array) -> tuple[float, float]:
     """Return yaw rate and w by (4), of the slip angles; w is the lateral speed ahead of the rear axle."""
     rate = yaw_rate_of(params, after[SPEED], after[STEER], after[SLIP_F], after[SLIP_R])
     return rate, abs(after[SPEED]) * math.tan(after[SLIP_R]) + params[AHEAD] * rate
 
 
-@njit(cache=True)
+@njit
 def _motion_by_slip(params: Array, after: Array) -> Array:
     """Return derivatives (2, 2) of the same by slip angles."""
     by_slip = slip_jacobian(params, after[SPEED], after[STEER], after[SLIP_F], after[SLIP_R])
@@ -204,7 +204,7 @@ def _motion_by_slip(params: Array, after: Array) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def _error_model(params: Array, after: Array, adapted: bool, rate: float) -> tuple[Array, Array, Array]:
     """Return derivatives of g by b and by C (2, 2), 0 where C is not adapted, and of w in (4) by b (2,)."""
     regressors = np.array([after[SLIP_F], after[SLIP_R]])
@@ -223,7 +223,7 @@ def _error_model(params: Array, after: Array, adapted: bool, rate: float) -> tup
     return by_slip, by_stiffness, _motion_by_slip(params, after)[1]
 
 
-@njit(cache=True)
+@njit
 def _dynamic_gains(params: Array, by_slip: Array, by_stiffness: Array, measured: bool, dt_s: float) -> Array:
     """Return the gains (_N, 2) of a tick on the errors of yaw rate and of w."""
     kept = np.eye(2) * (1.0 + dt_s * params[K_DYN])
@@ -247,7 +247,7 @@ def _dynamic_gains(params: Array, by_slip: Array, by_stiffness: Array, measured:
     return gains
 
 
-@njit(cache=True)
+@njit
 def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: float, dt_s: float) -> bool:
     """Predict and correct yaw rate, w, slip and C in place by a tick; return whether C was adapted."""
     measured = after[RATE_AGE] == 0.0
@@ -287,7 +287,7 @@ def _correct_dynamics(params: Array, after: Array, cov: Array, rate_measured: fl
     return bool(adapted)
 
 
-@njit(cache=True)
+@njit
 def _follow_slips(params: Array, after: Array, cov: Array, dt_s: float) -> None:
     """Predict a tick without dynamics in place: yaw rate and w, and their errors, are those of the slips."""
     add_pose_noise(params, after, cov, params[SLIP_WALK], dt_s)
@@ -300,7 +300,7 @@ def _follow_slips(params: Array, after: Array, cov: Array, dt_s: float) -> None:
     spread(cov, grown)
 
 
-@njit(cache=True)
+@njit
 def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     after = memory.copy()
     if take_inputs(params, after, row, dt_s) != ObserverStatus.OK.value:
@@ -329,7 +329,7 @@ def _step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     return after
 
 
-@njit(cache=True)
+@njit
 def _figures(memory: Array) -> Array:
     """Return means (7,), their deviations, slips (2,) and theirs, in one array."""
     out = np.empty(18)

@@ -36,11 +36,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.angles import wrapped
 from terrain.errors import ConfigError
 from terrain.estimation.observers.family import ObserverStatus
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import BicycleRobot
 
@@ -126,7 +126,7 @@ def shared_start(size: int) -> Array:
     return memory
 
 
-@njit(cache=True)
+@njit
 def take_inputs(params: Array, after: Array, row: Array, dt_s: float) -> int:
     """Take speed, steering and roll into the memory in place; return OK or BAD_INPUT.
 
@@ -143,7 +143,7 @@ def take_inputs(params: Array, after: Array, row: Array, dt_s: float) -> int:
     return ObserverStatus.OK.value
 
 
-@njit(cache=True)
+@njit
 def yaw_rate_of(params: Array, speed: float, steer: float, slip_f: float, slip_r: float) -> float:
     """Return yaw' of slip angles."""
     sign = -1.0 if speed < 0.0 else 1.0
@@ -151,7 +151,7 @@ def yaw_rate_of(params: Array, speed: float, steer: float, slip_f: float, slip_r
     return float(speed * (math.tan(front) - math.tan(sign * slip_r)) / params[BASE])
 
 
-@njit(cache=True)
+@njit
 def slip_jacobian(params: Array, speed: float, steer: float, slip_f: float, slip_r: float) -> Array:
     """Return J (2, 2): lateral speed and yaw rate by the slip angles of front and rear."""
     jacobian, size = np.zeros((2, 2)), abs(speed)
@@ -163,7 +163,7 @@ def slip_jacobian(params: Array, speed: float, steer: float, slip_f: float, slip
     return jacobian
 
 
-@njit(cache=True)
+@njit
 def advance_pose(after: Array, speed_mps: float, lateral_mps: float, yaw_rate: float, dt_s: float) -> None:
     """Carry the pose on in place, at the speeds of the rear axle and a yaw rate."""
     middle = after[YAW] + after[YAW_LEFT] + 0.5 * dt_s * yaw_rate
@@ -175,7 +175,7 @@ def advance_pose(after: Array, speed_mps: float, lateral_mps: float, yaw_rate: f
         after[since] = min(after[since] + dt_s, 1e6)
 
 
-@njit(cache=True)
+@njit
 def _pole_factor(square: float, gain: float, ratio: float, time_s: float) -> float:
     """Return h for g^2 = ``square``."""
     stiff, decay = ratio * square, math.exp(-gain * time_s)
@@ -190,7 +190,7 @@ def _pole_factor(square: float, gain: float, ratio: float, time_s: float) -> flo
     return (1.0 - both + decay) / (square * time_s)
 
 
-@njit(cache=True)
+@njit
 def fix_gains(jacobian: Array, gain: float, ratio: float, time_s: float) -> tuple[float, Array]:
     """Return G_e and G_b (2, 2) of a fix that comes a time after the one before.
 
@@ -220,7 +220,7 @@ def fix_gains(jacobian: Array, gain: float, ratio: float, time_s: float) -> tupl
     return 1.0 - math.exp(-gain * time_s), g_b
 
 
-@njit(cache=True)
+@njit
 def spread(cov: Array, moved: Array) -> None:
     """Set a covariance (n, n) in place to A P A^T; zeros of A, of which there are many, are left out."""
     n = cov.shape[0]
@@ -240,7 +240,7 @@ def spread(cov: Array, moved: Array) -> None:
                     cov[i, j] += half[i, k] * a
 
 
-@njit(cache=True)
+@njit
 def _persists(params: Array, after: Array, place: int, agree: bool) -> bool:
     """Count a rejected fix in place, and return whether such fixes agree for long enough to begin anew."""
     if after[place] == 0.0 or not agree:
@@ -251,7 +251,7 @@ def _persists(params: Array, after: Array, place: int, agree: bool) -> bool:
     return True
 
 
-@njit(cache=True)
+@njit
 def _judge_yaw(params: Array, after: Array, row: Array, std_rad: float) -> tuple[int, float]:
     """Return whether a heading is used (OK), REJECTED, begins anew (RESET), absent (STARTING); its error."""
     if not abs(row[IN_YAW]) < 1e6:
@@ -269,7 +269,7 @@ def _judge_yaw(params: Array, after: Array, row: Array, std_rad: float) -> tuple
     return ObserverStatus.RESET.value, 0.0
 
 
-@njit(cache=True)
+@njit
 def _judge_position(params: Array, after: Array, row: Array, std_m: float) -> tuple[int, float, float]:
     """Return the same for a position, and its errors along and across the robot."""
     x, y = row[IN_X], row[IN_Y]
@@ -292,7 +292,7 @@ def _judge_position(params: Array, after: Array, row: Array, std_m: float) -> tu
     return ObserverStatus.RESET.value, 0.0, 0.0
 
 
-@njit(cache=True)
+@njit
 def _forget(cov: Array, place: int, std: float) -> None:
     """Set the variance of one error in place, and its covariances to 0."""
     cov[place, :] = 0.0
@@ -300,7 +300,7 @@ def _forget(cov: Array, place: int, std: float) -> None:
     cov[place, place] = std * std
 
 
-@njit(cache=True)
+@njit
 def correct_by_fix(params: Array, after: Array, cov: Array, row: Array) -> int:
     """Correct pose, slip and covariance in place by what a row has of a fix; return the status.
 
@@ -343,7 +343,7 @@ def correct_by_fix(params: Array, after: Array, cov: Array, row: Array) -> int:
     return ObserverStatus.OK.value
 
 
-@njit(cache=True)
+@njit
 def _condition(params: Array, cov: Array, g_e: Array, g_b: Array) -> None:
     """Set a covariance in place to (I - G H) P (I - G H)^T + G R G^T of a fix; ``g_e`` (2,) has its parts."""
     kept, gains = np.eye(cov.shape[0]), np.zeros((4, 2))
@@ -357,12 +357,12 @@ def _condition(params: Array, cov: Array, g_e: Array, g_b: Array) -> None:
             cov[i, j] += gains[i, 1] * gains[j, 1] * params[YAW_STD] ** 2
 
 
-@njit(cache=True)
+@njit
 def _bounded(slip_rad: float) -> float:
     return min(max(slip_rad, -SLIP_MAX_RAD), SLIP_MAX_RAD)
 
 
-@njit(cache=True)
+@njit
 def status_of(before: Array, after: Array, fix: int) -> int:
     """Return the status of a tick, of what its fix gave."""
     if after[HAS_POSITION] == 0.0 or after[HAS_YAW] == 0.0:

@@ -30,7 +30,7 @@ import math
 from dataclasses import dataclass, field, fields
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from terrain.angles import wrapped
 from terrain.errors import ConfigError
@@ -59,6 +59,7 @@ from terrain.estimation.observers.slip_odometry import (
     read_odometry,
 )
 from terrain.estimation.observers.slip_odometry import ROWS as ODOMETRY_ROWS
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import TrackedRobot
 
@@ -129,7 +130,7 @@ _LOCATED, _REJECTED, _OFFSET = SIZE, SIZE + 1, SIZE + 2
 LEARNING_SIZE = SIZE + 4
 
 
-@njit(cache=True)
+@njit
 def _correct(after: Array, prior: Array, place: int, innovation: float, variance: float) -> None:
     """Take a measurement of one entry of pose and parameters."""
     covariance = after[COVARIANCE : COVARIANCE + N * N].reshape((N, N))
@@ -151,7 +152,7 @@ def _correct(after: Array, prior: Array, place: int, innovation: float, variance
         after[THETA + i] = min(max(after[THETA + i], -100.0), 100.0)
 
 
-@njit(cache=True)
+@njit
 def _learn_track_ratio(params: Array, after: Array, row: Array, dt_s: float) -> None:
     """Compare the yaw rate of the gyro with that of the tracks, at the pace of independent samples."""
     rate, tracks = row[2], (row[1] - row[0]) / (2.0 * params[0])
@@ -163,7 +164,7 @@ def _learn_track_ratio(params: Array, after: Array, row: Array, dt_s: float) -> 
             _correct(after, params[_PRIOR:], 3 + TRACK_RATIO, innovation, variance)
 
 
-@njit(cache=True)
+@njit
 def _locate(params: Array, after: Array, x_m: float, y_m: float) -> None:
     """Begin the position anew at a fix; parameters stay."""
     covariance = after[COVARIANCE : COVARIANCE + N * N].reshape((N, N))
@@ -175,7 +176,7 @@ def _locate(params: Array, after: Array, x_m: float, y_m: float) -> None:
     after[_LOCATED], after[_REJECTED] = 1.0, 0.0
 
 
-@njit(cache=True)
+@njit
 def _take_fix(params: Array, after: Array, x_m: float, y_m: float) -> int:
     """Correct by a position, or reject it, and return the status."""
     covariance = after[COVARIANCE : COVARIANCE + N * N].reshape((N, N))
@@ -197,7 +198,7 @@ def _take_fix(params: Array, after: Array, x_m: float, y_m: float) -> int:
     return ObserverStatus.RESET.value
 
 
-@njit(STEP, cache=True)
+@njit(STEP)
 def learning_step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     """Return the memory a tick later: as :data:`~terrain.estimation.observers.family.Step`."""
     after = memory.copy()
@@ -239,7 +240,7 @@ def learning_step(params: Array, memory: Array, row: Array, dt_s: float) -> Arra
     return after
 
 
-@njit(_F8[:, ::1](READ_ONLY, READ_ONLY), cache=True)
+@njit(_F8[:, ::1](READ_ONLY, READ_ONLY))
 def read_parameters(params: Array, memory: Array) -> Array:
     """Return parameters and their standard deviations (2, 16); NaN where one is not observed yet."""
     out = np.full((2, N_MODEL), np.nan)
@@ -250,7 +251,7 @@ def read_parameters(params: Array, memory: Array) -> Array:
     return out
 
 
-@njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(READ_ONLY, READ_ONLY), cache=True)
+@njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(READ_ONLY, READ_ONLY))
 def _read(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int]:
     motion, motion_std, slip, slip_std, status = read_odometry(params, memory)
     found = read_parameters(params, memory)

@@ -42,10 +42,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from terrain.errors import ConfigError
 from terrain.estimation.observers.endo import slip_imbalance
+from terrain.kernels import njit
 from terrain.records import Array, read_only
 
 REGRESSORS: tuple[str, ...] = (
@@ -162,7 +162,7 @@ def model_of(vector: Array, **also: Any) -> SlipModel:
     return SlipModel(**first, angle=angle, track_ratio=ratio, **also)
 
 
-@njit(cache=True)
+@njit
 def turn_weight(speed_left_mps: float, speed_right_mps: float) -> float:
     """Return eta, 0 in straight motion and 1 in a tight turn; 0 where both tracks stand.
 
@@ -178,7 +178,7 @@ def turn_weight(speed_left_mps: float, speed_right_mps: float) -> float:
     return q * q * (3.0 - 2.0 * q)
 
 
-@njit(cache=True)
+@njit
 def next_displacement(
     displacement_rad: float,
     speeds_mps: tuple[float, float],
@@ -195,7 +195,7 @@ def next_displacement(
     return (displacement_rad + yaw_rate_radps * dt_s) * math.exp(-straight * travelled / length_m)
 
 
-@njit(cache=True)
+@njit
 def angle_regressors(
     speeds_mps: tuple[float, float],
     yaw_rate_radps: float,
@@ -219,7 +219,7 @@ def angle_regressors(
     out[7] = turn * forward * slope
 
 
-@njit(cache=True)
+@njit
 def body_velocity(
     theta: Array,
     half_track_m: float,

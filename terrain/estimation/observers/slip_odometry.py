@@ -28,7 +28,7 @@ import math
 from dataclasses import astuple, dataclass, fields
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from terrain.errors import ConfigError
 from terrain.estimation.observers.arcs import arc_displacement
@@ -44,6 +44,7 @@ from terrain.estimation.observers.slip_model import (
     body_velocity,
     next_displacement,
 )
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import TrackedRobot
 
@@ -149,7 +150,7 @@ def odometry_memory(model: SlipModel, settings: OdometrySettings) -> Array:
     return start
 
 
-@njit(cache=True)
+@njit
 def yaw_rate_of(params: Array, theta: Array, row: Array, slopes: Array) -> tuple[float, float, int]:
     """Return the yaw rate, the variance of its noise and a status; write its derivatives by parameters.
 
@@ -170,7 +171,7 @@ def yaw_rate_of(params: Array, theta: Array, row: Array, slopes: Array) -> tuple
     return tracks, 2.0 * (params[_ENCODER_STD] / by_track) ** 2, status
 
 
-@njit(cache=True)
+@njit
 def _quadratic(covariance: Array, slope: Array) -> float:
     """Return the variance that parameters of a covariance give a quantity with these derivatives."""
     total = 0.0
@@ -181,7 +182,7 @@ def _quadratic(covariance: Array, slope: Array) -> float:
     return total
 
 
-@njit(cache=True)
+@njit
 def _propagate(covariance: Array, moved: tuple[float, float], step_slopes: Array) -> None:
     """Move the covariance of pose and parameters over a step that moves by (dx, dy)."""
     by = np.zeros((3, N))
@@ -197,7 +198,7 @@ def _propagate(covariance: Array, moved: tuple[float, float], step_slopes: Array
             covariance[i, j] = 0.5 * (pose[i, j] + pose[j, i])
 
 
-@njit(cache=True)
+@njit
 def take_tilt(after: Array, row: Array) -> bool:
     """Take roll and pitch where they are measured, and return whether; else those last known stay."""
     if abs(row[3]) <= 0.5 * math.pi and abs(row[4]) <= 0.5 * math.pi:
@@ -206,7 +207,7 @@ def take_tilt(after: Array, row: Array) -> bool:
     return False
 
 
-@njit(cache=True)
+@njit
 def _widen(params: Array, after: Array, covariance: Array, dt_s: float) -> None:
     """Widen the pose by a motion that was not measured: as fast as the tracks were, or :data:`BLIND_MPS`."""
     moved = max(abs(after[BELTS]), abs(after[BELTS + 1]), BLIND_MPS) * dt_s
@@ -217,7 +218,7 @@ def _widen(params: Array, after: Array, covariance: Array, dt_s: float) -> None:
         covariance[i, i] = grown * grown
 
 
-@njit(cache=True)
+@njit
 def advance(params: Array, after: Array, row: Array, dt_s: float) -> None:
     """Take the measurements of a tick, and move pose and covariance in place."""
     valid = 0.0 <= dt_s <= LONGEST_STEP_S and abs(row[0]) <= FASTEST_MPS and abs(row[1]) <= FASTEST_MPS
@@ -264,7 +265,7 @@ def advance(params: Array, after: Array, row: Array, dt_s: float) -> None:
         _move(after, covariance, slopes, rate_slopes, noise, dt_s)
 
 
-@njit(cache=True)
+@njit
 def _stand(
     params: Array, after: Array, covariance: Array, rate: float, rate_variance: float, dt_s: float
 ) -> None:
@@ -281,7 +282,7 @@ def _stand(
         covariance[2, 2] += rate_variance * dt_s * dt_s
 
 
-@njit(cache=True)
+@njit
 def _move(
     after: Array,
     covariance: Array,
@@ -310,7 +311,7 @@ def _move(
     after[POSE + 2] += rate * dt_s
 
 
-@njit(STEP, cache=True)
+@njit(STEP)
 def odometry_step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     """Return the memory a tick later: as :data:`~terrain.estimation.observers.family.Step`."""
     after = memory.copy()
@@ -318,7 +319,7 @@ def odometry_step(params: Array, memory: Array, row: Array, dt_s: float) -> Arra
     return after
 
 
-@njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(READ_ONLY, READ_ONLY), cache=True)
+@njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(READ_ONLY, READ_ONLY))
 def read_odometry(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int]:
     """Return states, their standard deviations, slips, theirs, and the status of a memory."""
     mean, std = memory[: VELOCITY + 3].copy(), np.empty(6)

@@ -38,13 +38,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
 
 from terrain.angles import wrapped
 from terrain.estimation.observers import tracked_settings as at
 from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
 from terrain.estimation.observers.tracked_interval import inverse_3, normalised_gain, observe_interval
 from terrain.estimation.observers.tracked_settings import TrackedSettings, tracked_params
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import TrackedRobot
 
@@ -78,7 +79,7 @@ _OK, _STARTING, _STANDING, _PREDICTED = (ObserverStatus(k).value for k in range(
 _REJECTED, _RESET, _UNEXCITED, _PUSHED, _BAD = (ObserverStatus(k).value for k in range(4, 9))
 
 
-@njit(cache=True)
+@njit
 def _moved_on(params: Array, after: Array, left: float, right: float, rate: float, dt_s: float) -> None:
     """Integrate M over a tick: speeds at its end, 0 of a track that stands, and its mean yaw rate."""
     mean_left, mean_right = 0.5 * (after[SPEED] + left), 0.5 * (after[SPEED + 1] + right)
@@ -115,7 +116,7 @@ def _moved_on(params: Array, after: Array, left: float, right: float, rate: floa
             after[DIRECTION + j] = math.copysign(1.0, after[SPEED + j])
 
 
-@njit(cache=True)
+@njit
 def _begin_at(params: Array, after: Array, pose: Array) -> None:
     """Begin the pose anew at a fix; efficiencies are kept."""
     cov, cross = after[COVARIANCE:CROSS].reshape(5, 5), after[CROSS:MISFIT].reshape(5, 3)
@@ -127,7 +128,7 @@ def _begin_at(params: Array, after: Array, pose: Array) -> None:
     _begin_interval(after, pose[2])
 
 
-@njit(cache=True)
+@njit
 def _begin_interval(after: Array, heading_rad: float) -> None:
     """Forget the travel before a fix."""
     after[TRAVEL:SPAN] = 0.0
@@ -135,7 +136,7 @@ def _begin_interval(after: Array, heading_rad: float) -> None:
     after[HEADING] = heading_rad
 
 
-@njit(cache=True)
+@njit
 def _is_plausible(params: Array, after: Array, pose: Array) -> bool:
     """Return whether noise, and efficiencies from 0 to 2, explain how a fix deviates from dead reckoning."""
     if after[BROKEN] != 0.0:
@@ -148,7 +149,7 @@ def _is_plausible(params: Array, after: Array, pose: Array) -> bool:
     return bool(near and abs(wrapped(pose[2] - after[HEADING])) <= turn)
 
 
-@njit(cache=True)
+@njit
 def _correct(params: Array, after: Array, pose: Array) -> None:
     """Integrate the observer from the last fix to this one."""
     span, start = after[SPAN], after[FIX + 2]
@@ -192,7 +193,7 @@ def _correct(params: Array, after: Array, pose: Array) -> None:
     _begin_interval(after, pose[2])
 
 
-@njit(cache=True)
+@njit
 def _take_fix(params: Array, after: Array, pose: Array) -> int:
     """Use, reject or begin anew at a fix; returns the status that it gives, -1 for none of its own."""
     if not (max(abs(pose[0]), abs(pose[1])) <= _FURTHEST_M and math.isfinite(pose[2])):
@@ -219,7 +220,7 @@ _F8, _ROW = types.float64, types.Array(types.float64, 1, "A", readonly=True)
 _NUMBERS = types.Array(types.float64, 1, "C", readonly=True)
 
 
-@njit(_F8[::1](_NUMBERS, _NUMBERS, _ROW, _F8), cache=True)
+@njit(_F8[::1](_NUMBERS, _NUMBERS, _ROW, _F8))
 def tracked_step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
     """Return the next memory (MEMORY_SIZE,); see :data:`~terrain.estimation.observers.family.Step`.
 
@@ -266,7 +267,7 @@ def tracked_step(params: Array, memory: Array, row: Array, dt_s: float) -> Array
     return after
 
 
-@njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(_NUMBERS, _NUMBERS), cache=True)
+@njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(_NUMBERS, _NUMBERS))
 def _read(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int]:
     mean, std = np.full(len(STATES), np.nan), np.full(len(STATES), np.nan)
     slip, slip_std = np.full(2, np.nan), np.full(2, np.nan)

@@ -41,8 +41,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from terrain.kernels import njit
 from terrain.records import Array
 
 PART = 0.25
@@ -51,7 +51,7 @@ PART = 0.25
 MAX_PARTS = 64
 
 
-@njit(cache=True)
+@njit
 def inverse_3(a: Array) -> Array:
     """Return the inverse of a symmetric positive definite matrix (3, 3), by its cofactors."""
     c00 = a[1, 1] * a[2, 2] - a[1, 2] * a[1, 2]
@@ -65,7 +65,7 @@ def inverse_3(a: Array) -> Array:
     return inverse
 
 
-@njit(cache=True)
+@njit
 def normalised_gain(travel: Array, span_s: float, gain_ps: Array, least: float) -> Array:
     """Return the adaptation gain (2, 2) that damps the error system critically at every speed.
 
@@ -97,7 +97,7 @@ def normalised_gain(travel: Array, span_s: float, gain_ps: Array, least: float) 
     return gain
 
 
-@njit(cache=True)
+@njit
 def n_parts(travel: Array, span_s: float, gain_ps: Array, adaptation: Array) -> int:
     """Return into how many parts an interval is cut."""
     coupling = 0.0
@@ -109,7 +109,7 @@ def n_parts(travel: Array, span_s: float, gain_ps: Array, adaptation: Array) -> 
     return max(1, min(MAX_PARTS, math.ceil(fastest / PART - 1e-9)))
 
 
-@njit(cache=True)
+@njit
 def observe_interval(
     travel: Array,
     span_s: float,

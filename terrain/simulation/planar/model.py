@@ -39,10 +39,10 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
+from terrain.kernels import njit
 from terrain.kinematics.wheels import rolling_matrix, velocity_matrix
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
@@ -300,7 +300,7 @@ def _slip_per_traction(ground: Ground) -> Array:
     return ratio
 
 
-@njit(cache=True)
+@njit
 def slopes(values: Array, dt: float) -> Array:
     """Return the rate (n,) of a signal, right to the fourth order where two neighbours are there.
 
@@ -320,7 +320,7 @@ def slopes(values: Array, dt: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def delayed(values: Array, late: float, rate: float) -> Array:
     """Return a signal (n,) that shows at sample k what was at ``k - late - rate k``; its ends are held.
 
@@ -356,7 +356,7 @@ def delayed(values: Array, late: float, rate: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def _between(values: Array, at: float) -> float:
     """Return a signal between its samples; its ends are held."""
     n = values.size
@@ -373,7 +373,7 @@ def _between(values: Array, at: float) -> float:
     return float(values[i] + x * (values[i + 1] - values[i]))
 
 
-@njit(cache=True)
+@njit
 def lagged(values: Array, tau_s: float, dt: float) -> Array:
     """Return a signal (n,) behind a first-order lag, exact for what runs straight from sample to sample.
 
@@ -395,7 +395,7 @@ def lagged(values: Array, tau_s: float, dt: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def play(angle: Array, half: float) -> None:
     """Let an angle follow itself through a play of half width ``half``, from the middle; in place."""
     follower = angle[0]

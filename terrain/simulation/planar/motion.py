@@ -48,10 +48,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import EFFECTS
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_softness, softness
 from terrain.simulation.planar.model import (
@@ -108,7 +108,7 @@ STEEPEST_RAD = 1.3
 """Steering angle at the most, where its tangent is 3.6."""
 
 
-@njit(cache=True)
+@njit
 def move(
     planar: Planar,
     vector: Array,
@@ -153,7 +153,7 @@ def move(
     return out
 
 
-@njit(cache=True)
+@njit
 def direction(speed_mps: float) -> float:
     """Return the direction of a motion, -1 to 1, and 0 at rest.
 
@@ -165,7 +165,7 @@ def direction(speed_mps: float) -> float:
     return speed_mps / math.sqrt(speed_mps * speed_mps + STANDSTILL_MPS * STANDSTILL_MPS)
 
 
-@njit(cache=True)
+@njit
 def _kept(before_s: float, after_s: float, dt: float) -> float:
     """Return what a step leaves of an offset where the time constant runs straight: ``v' = -v / tau``."""
     change = math.log(after_s / before_s)
@@ -174,7 +174,7 @@ def _kept(before_s: float, after_s: float, dt: float) -> float:
     return math.exp(-dt * change / (after_s - before_s))
 
 
-@njit(cache=True)
+@njit
 def slip_along(
     planar: Planar, p: Any, dt: float, u: Array, scrub_n: Array, grade_rad: Array, disturbance: Array
 ) -> tuple[Array, Array, Array]:
@@ -225,7 +225,7 @@ def slip_along(
     return speed, rest, slips
 
 
-@njit(cache=True)
+@njit
 def move_skid(
     planar: Planar, p: Any, dt: float, wheel_speed_mps: Array, grade_rad: Array, disturbance: Array
 ) -> Array:
@@ -254,7 +254,7 @@ def move_skid(
     return out
 
 
-@njit(cache=True)
+@njit
 def _differed(planar: Planar, p: Any, dt: float, wheel_speed_mps: Array) -> tuple[Array, Array, Array, Array]:
     """Return speed without slip, yaw rate, how tight the turn is and the difference of the sides (n,)."""
     n = wheel_speed_mps.shape[0]
@@ -286,7 +286,7 @@ def _differed(planar: Planar, p: Any, dt: float, wheel_speed_mps: Array) -> tupl
     return u, turn, tight, difference
 
 
-@njit(cache=True)
+@njit
 def move_swerve(
     planar: Planar,
     p: Any,
@@ -388,7 +388,7 @@ def move_swerve(
     return out
 
 
-@njit(cache=True)
+@njit
 def decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, float]:
     """Return ``a, b`` of ``exp(A dt) = a 1 + b A`` of a matrix (2, 2) that does not grow.
 
@@ -415,7 +415,7 @@ def decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, fl
     return both - half_trace * b, b
 
 
-@njit(cache=True)
+@njit
 def _rolled(
     planar: Planar, p: Any, dt: float, wheel_speed_mps: Array, steer_rad: Array
 ) -> tuple[Array, Array, Array, Array]:
@@ -456,7 +456,7 @@ def _rolled(
     return u, pace, mean_wheel_speed, heading
 
 
-@njit(cache=True)
+@njit
 def move_bicycle(
     planar: Planar,
     p: Any,
@@ -489,7 +489,7 @@ def move_bicycle(
     return out
 
 
-@njit(cache=True)
+@njit
 def _turn(planar: Planar, p: Any, dt: float, steer: Array, roll_rad: Array, out: Array) -> None:
     """Fill in yaw rate and lateral speed of the rear axle of a body that drives at ``out[:, VX]``."""
     mass = planar.mass_kg * (1.0 + p.payload_ratio)
@@ -534,7 +534,7 @@ def _turn(planar: Planar, p: Any, dt: float, steer: Array, roll_rad: Array, out:
         out[k, VY], out[k, W] = c - a * w, w
 
 
-@njit(cache=True)
+@njit
 def _front(mass: float, wheelbase: float, a: float, front: float, rear: float, v: float) -> float:
     """Return the compliance of the front axle at a speed: one with which the body does not spin."""
     fast = v * abs(v)

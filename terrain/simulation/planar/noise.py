@@ -11,10 +11,10 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.files.documents import number, read_yaml
 from terrain.files.names import data_folder
+from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -142,7 +142,7 @@ def _numbers(part: str, names: tuple[str, ...]) -> dict[str, float]:
     }
 
 
-@njit(cache=True)
+@njit
 def coloured(white: Array, std: Array, tau_s: Array, dt: float) -> Array:
     """Return noise (c, n) of given size and memory from white noise (c, n) of size 1.
 
@@ -164,7 +164,7 @@ def coloured(white: Array, std: Array, tau_s: Array, dt: float) -> Array:
     return out
 
 
-@njit(cache=True)
+@njit
 def lag_weights(time_constant_s: float, dt: float) -> tuple[float, float, float]:
     """Return weights of this sample, the one before and the last output in an exact first-order low-pass.
 

@@ -48,10 +48,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import EFFECTS
+from terrain.kernels import njit
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array
 from terrain.simulation.contact import softness
@@ -68,7 +68,7 @@ SUBSTEPS = 4
 """Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond."""
 
 
-@njit(cache=True)
+@njit
 def move_omni(
     planar: Planar,
     vector: Array,
@@ -140,7 +140,7 @@ def move_omni(
     return out
 
 
-@njit(cache=True)
+@njit
 def currents_of(planar: Planar, vector: Array, dt: float, wheel_speed_mps: Array, truth: Array) -> Array:
     """Return the current (n, wheels) of each motor along a motion: traction, its own inertia and friction.
 
@@ -176,7 +176,7 @@ def currents_of(planar: Planar, vector: Array, dt: float, wheel_speed_mps: Array
     return out
 
 
-@njit(cache=True)
+@njit
 def placed(planar: Planar, p: Any) -> tuple[Array, Array, Array]:
     """Return ``along`` and ``across`` (wheels, 3) and the loads (wheels,) with wheels and load as p has them.
 
@@ -200,14 +200,14 @@ def placed(planar: Planar, p: Any) -> tuple[Array, Array, Array]:
     return along, across, load / total
 
 
-@njit(cache=True)
+@njit
 def stiffness(planar: Planar, p: Any, slip_ratio: float) -> float:
     """Return traction over load and slip of the ground, with the effect that makes it softer."""
     soft = max(softness(planar.soft_ratio, slip_ratio), STIFFEST_GROUND)
     return float(1.0 / max(soft + p.force_slip_ratio, STIFFEST * soft))
 
 
-@njit(cache=True)
+@njit
 def fastest(along: Array, wheel_speed_mps: Array, twist: Array) -> float:
     """Return the speed U that slip is over: of wheels (wheels,) or their centres, never below a minimum."""
     rolled, moved, n = 0.0, 0.0, wheel_speed_mps.shape[0]
@@ -217,14 +217,14 @@ def fastest(along: Array, wheel_speed_mps: Array, twist: Array) -> float:
     return math.sqrt(max(rolled, moved) / n + ROLLING_MPS * ROLLING_MPS)
 
 
-@njit(cache=True)
+@njit
 def dot(row: Array, twist: Array) -> float:
     """Return the product of two rows of three."""
     product: float = row[0] * twist[0] + row[1] * twist[1] + row[2] * twist[2]
     return product
 
 
-@njit(cache=True)
+@njit
 def solve3(matrix: Array, pushed: Array, out: Array) -> None:
     """Solve a symmetric positive system of three in place of ``out``, by Cramer's rule.
 
@@ -246,7 +246,7 @@ def solve3(matrix: Array, pushed: Array, out: Array) -> None:
     out[2] = (p2 * x + q2 * y + r2 * z) * by
 
 
-@njit(cache=True)
+@njit
 def _body_slip(planar: Planar, wheel_speed_mps: Array, v_x: float, v_y: float) -> float:
     """Return the slip of the body along what the wheels roll; 0 where neither moves, and in place."""
     x, y = 0.0, 0.0

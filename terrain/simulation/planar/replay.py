@@ -11,16 +11,16 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
 from terrain.effects import EFFECTS
+from terrain.kernels import njit
 from terrain.kinematics.wheels import point_velocity
 from terrain.records import Array
 from terrain.simulation.planar.model import AMPS, AX, TURNING_AMPS, VX, VY, Planar, W, delayed, slopes
 from terrain.simulation.planar.motion import move
 
 
-@njit(cache=True)
+@njit
 def replay(
     planar: Planar,
     vector: Array,
@@ -44,7 +44,7 @@ def replay(
     return shown
 
 
-@njit(cache=True)
+@njit
 def undone(
     planar: Planar, vector: Array, dt: float, wheel_speed_mps: Array, grade_rad: Array, roll_rad: Array
 ) -> tuple[Array, Array, Array]:
@@ -63,7 +63,7 @@ def undone(
     return wheel_speed, grade, roll
 
 
-@njit(cache=True)
+@njit
 def sense(planar: Planar, vector: Array, dt: float, truth: Array) -> Array:
     """Return the channels (n, len(CHANNELS)) that sensors without noise measure.
 

@@ -22,7 +22,6 @@ from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import (
@@ -37,6 +36,7 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import ConfigError
+from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.commands import WheelMotion, wheel_motion
 from terrain.kinematics.wheels import point_velocity, wheel_frame_velocities
@@ -319,7 +319,7 @@ def commands_stream(robot: Robot, desired: WheelMotion) -> Stream:
     return Stream(np.arange(len(desired.twist)) / COMMANDS_HZ, np.hstack(columns), channels)
 
 
-@njit(cache=True)
+@njit
 def follow_commands(
     desired_mps: Array, desired_rad: Array, parts: int, dt: float, rate_max: float
 ) -> tuple[Array, Array]:
@@ -357,7 +357,7 @@ def undulations(hills: Hills, rng: np.random.Generator) -> Array:
     return waves
 
 
-@njit(cache=True)
+@njit
 def path_of(truth: Array, dt: float) -> Array:
     """Return east, north and heading (n, 3) of the body's origin, from 0."""
     n = truth.shape[0]
@@ -373,7 +373,7 @@ def path_of(truth: Array, dt: float) -> Array:
     return pose
 
 
-@njit(cache=True)
+@njit
 def tilt_along(pose: Array, grade_ratio: Array, waves: Array) -> tuple[Array, Array]:
     """Return grade (nose up positive) and roll (left side up positive) (n,) of a body along its path."""
     n = pose.shape[0]
@@ -535,7 +535,7 @@ def encoder_scales(robot: Robot, p: Any) -> Array:
     return np.array([1.0 + p[name] if name in INDEX else 1.0 for name in names])
 
 
-@njit(cache=True)
+@njit
 def encoder_speed(
     wheel_speed_mps: Array, every: int, dt: float, step_m: float, jitter_m: Array, lag_s: float
 ) -> Array:

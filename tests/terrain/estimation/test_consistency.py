@@ -1,10 +1,10 @@
 import numpy as np
 import pytest
-from numba import njit
 
 from terrain.errors import DataError
 from terrain.estimation.consistency import consistency_report, nees, sample_from_model
 from terrain.estimation.filter import OBSERVE, PROPAGATE, FilterModel, Noise, run_filter
+from terrain.kernels import njit
 from terrain.records import StateTrack
 
 DT_S = 0.05

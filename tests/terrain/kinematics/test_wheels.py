@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from numba import njit
 from scipy.linalg import block_diag
 
 from terrain.errors import ConfigError
+from terrain.kernels import njit
 from terrain.kinematics.commands import inverse
 from terrain.kinematics.wheels import (
     in_wheel_frame,

@@ -2,7 +2,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from numba import njit
 from scipy.stats import chi2
 
 from terrain.errors import ConfigError
@@ -15,6 +14,7 @@ from terrain.estimation.filters.swerve_model import (
     propagate_slip_speed,
 )
 from terrain.estimation.filters.swerve_noise import adaptive_noise, default_noise, thesis_noise
+from terrain.kernels import njit
 from terrain.robots import load_robot
 
 ROBOT = load_robot("agrimaro")
