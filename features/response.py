@@ -12,9 +12,9 @@ from features.windows import WindowRule, cut_windows, layout_of
 from terrain.classify.response import ResponseColumns
 from terrain.errors import DataError
 from terrain.logs.regimes import regime_of
-from terrain.measured_slip.predict import Cases
-from terrain.measured_slip.slips import MeasuredSlip
 from terrain.records import Array, RunLog, Windows
+from terrain.slip_learning.currents import Cases
+from terrain.slip_learning.measured import MeasuredSlip
 
 RESPONSES: Mapping[str, tuple[str, str]] = {"currents": ("current", "a"), "slip": ("slip", "ratio")}
 """Quantity and unit of the channels that are responses, by signal set."""

@@ -11,10 +11,10 @@ from pipelines.learn.parallel import parallel
 from pipelines.report.numbers import format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Report, Table, Text, sections
-from terrain.measured_slip.ground_changes import WatchedRun, quiet_detector, watch
-from terrain.measured_slip.measure import one_robot
 from terrain.records import RunLog
 from terrain.robots import load_robot
+from terrain.slip_learning.ground_changes import WatchedRun, quiet_detector, watch
+from terrain.slip_learning.measured import one_robot
 
 MAX_ROWS = 12
 

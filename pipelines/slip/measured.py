@@ -16,15 +16,28 @@ from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
-from terrain.measured_slip import measure
-from terrain.measured_slip.delay import delay_sentence
-from terrain.measured_slip.predict import PredictionFigures, predictions
-from terrain.measured_slip.rollers import DistanceBound, RollerFindings
-from terrain.measured_slip.slips import measured_slip
-from terrain.measured_slip.surfaces import SurfaceSlip, surface_slip
 from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, SwerveRobot, as_drive
 from terrain.signals import Delay
+from terrain.slip_learning.currents import PredictionFigures, predictions
+from terrain.slip_learning.measured import (
+    Measured,
+    SurfaceSlip,
+    delay_sentence,
+    measure,
+    measured_slip,
+    one_robot,
+    surface_slip,
+)
+from terrain.slip_learning.rollers import (
+    NO_ROLLERS,
+    DistanceBound,
+    NamedSurface,
+    RollerFindings,
+    distances_of,
+    named_surfaces,
+    rollers_of,
+)
 
 if TYPE_CHECKING:
     from pipelines.slip.estimate import EstimateOptions
@@ -50,9 +63,7 @@ class MeasuredSlipResult(TracksResult, kw_only=True):
     surfaces: tuple[SurfaceSlip, ...] = described("by terrain, runs without a label last")
     predictions: tuple[PredictionFigures, ...] = described("of slip from currents and wheel speeds")
     rollers: RollerFindings | None = described("what makes an omni robot slip; none unless asked for")
-    named: tuple[measure.NamedSurface, ...] = described(
-        "surfaces that rollers name window by window, by group"
-    )
+    named: tuple[NamedSurface, ...] = described("surfaces that rollers name window by window, by group")
     distances: Mapping[str, DistanceBound] = described(
         "of the wheels of an omni robot from its middle, by surface, where its turns follow the wheels"
     )
@@ -72,11 +83,11 @@ def estimate_all(
 
     ``keep`` gets each run with the stream ``slip``, over windows of :data:`SHORT_S`.
     """
-    robot, seed = measure.one_robot(runs, robot), options.seed
+    robot, seed = one_robot(runs, robot), options.seed
     if options.rollers:
-        as_drive(OmniRobot, robot, measure.NO_ROLLERS)
+        as_drive(OmniRobot, robot, NO_ROLLERS)
     asked: dict[str, Any] = {"window_s": options.window_s, "stride_s": options.stride_s, "seed": seed}
-    found = measure.measure(runs, robot, **asked, delay_s=options.delay_s, progress=progress)
+    found = measure(runs, robot, **asked, delay_s=options.delay_s, progress=progress)
     if not found.slips:
         raise DataError(f"none of {len(runs)} runs has a slip; the first for this: {found.failed[0]}")
     rng, by_terrain = np.random.default_rng(seed), found.by_terrain()
@@ -85,7 +96,7 @@ def estimate_all(
     if options.predict:
         cases = slip_cases(found.runs, found.slips, options.window_s)
         predicted = predictions(cases, options.hold_out, seed, progress)
-    rollers = measure.rollers_of(found, robot, seed) if options.rollers else None
+    findings = rollers_of(found, robot, seed) if options.rollers else None
     if keep is not None:
         for done, run in enumerate(found.runs, start=1):
             late_s = found.delays[run.session].applied_s
@@ -100,9 +111,9 @@ def estimate_all(
         delays=found.delays,
         surfaces=surfaces,
         predictions=tuple(predicted),
-        rollers=rollers,
-        named=() if rollers is None else measure.named_surfaces(found, robot, rollers),
-        distances=measure.distances_of(found, robot, seed) if options.rollers else {},
+        rollers=findings,
+        named=() if findings is None else named_surfaces(found, robot, findings),
+        distances=distances_of(found, robot, seed) if options.rollers else {},
         not_measured=tuple(found.failed),
         n_runs=len(runs),
         pictures=_pictures(robot, options.window_s, surfaces, by_terrain),
@@ -213,7 +224,7 @@ def _roller_parts(result: MeasuredSlipResult, found: RollerFindings) -> list[Par
 
 
 def _pictures(
-    robot: Robot, window_s: float, surfaces: Sequence[SurfaceSlip], by_terrain: Mapping[str, measure.Measured]
+    robot: Robot, window_s: float, surfaces: Sequence[SurfaceSlip], by_terrain: Mapping[str, Measured]
 ) -> dict[str, Figure]:
     """Return slip by surface, by run, and by the direction of travel or, of robots that only drive ahead, the turn."""
     names = [terrain or UNLABELLED for terrain in by_terrain]

@@ -20,17 +20,19 @@ from terrain.errors import DataError
 from terrain.files.atomic import atomic_write, ensure_writable
 from terrain.logs.digest import data_digest
 from terrain.records import RunLog
-from terrain.soil_identification.comparison import (
+from terrain.slip_learning.soil import (
     BAR_RATIO,
     GIVEN,
     HELD_OUT,
+    WHEELS,
     Misfit,
+    Prediction,
+    Trials,
     WheelResult,
     compare_laws,
+    soil_yaml,
+    trials_of,
 )
-from terrain.soil_identification.fit import Prediction
-from terrain.soil_identification.plain_soil import soil_yaml
-from terrain.soil_identification.trials import WHEELS, Trials, trials_of
 
 if TYPE_CHECKING:
     from pipelines.slip.calibrate import Settings

@@ -16,10 +16,9 @@ from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields
 from terrain.control.learned_table import MIN_RUNS, Transfer, learn_surfaces
 from terrain.errors import DataError
 from terrain.logs.digest import data_digest
-from terrain.measured_slip.measure import measure_steady
-from terrain.measured_slip.surfaces import OperatingPoints
 from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
+from terrain.slip_learning.measured import OperatingPoints, measure_steady
 
 
 class SteadyTargets(LearnedSlipTable, eq=False, kw_only=True):

@@ -9,10 +9,10 @@ one of motors alone where it has no terrain, nothing measured its motion from ou
 at several speeds and took no less current at the higher ones.
 
 *Driving runs* under a camera show by their slip over many directions which share :math:`n_i` of the weight
-each wheel carries (:mod:`terrain.measured_slip.rollers`), and so the centre of mass
+each wheel carries (:mod:`terrain.slip_learning.rollers`), and so the centre of mass
 :math:`\sum_i n_i p_i`; a slip that is the same in all directions is a wheel that rolls on a radius
 :math:`(1 - \kappa) r`, or an outside measurement whose scale is off, which they do not distinguish.  The
-distance of the wheels follows from how small turns agree (:mod:`terrain.measured_slip.rollers`),
+distance of the wheels follows from how small turns agree (:mod:`terrain.slip_learning.rollers`),
 surface by surface: slip in turning makes it too large, what else turns the robot moves it up or down, so that
 the mean is given with the intervals of all surfaces.
 
@@ -31,11 +31,10 @@ import numpy as np
 from terrain.calibration.finding import Finding, around, undetermined
 from terrain.errors import DataError
 from terrain.identify import half_width
-from terrain.measured_slip.delay import estimate_delay
-from terrain.measured_slip.rollers import MIN_RUNS, RollerFindings, distance_bound, roller_findings
-from terrain.measured_slip.slips import MeasuredSlip, measured_slip, outside_source
 from terrain.records import Array, RunLog
 from terrain.robots import OmniRobot
+from terrain.slip_learning.measured import MeasuredSlip, estimate_delay, measured_slip, outside_source
+from terrain.slip_learning.rollers import MIN_RUNS, RollerFindings, distance_bound, roller_findings
 
 FRICTION = "motors.friction_nm"
 COM_X, COM_Y = "body.com_x_m", "body.com_y_m"

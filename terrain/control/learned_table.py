@@ -17,9 +17,6 @@ import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.control.slip_table import DRIVE_STATES, SIGN, CurveEntry, SlipTable, load_slip_table
-from terrain.measured_slip.measure import Measured
-from terrain.measured_slip.slips import MeasuredSlip
-from terrain.measured_slip.surfaces import OperatingPoints, SurfaceSlip, operating_points, surface_slip
 from terrain.records import Array, RunLog, SlipTarget, TargetStatus
 from terrain.robots import Robot
 from terrain.simulation.run import learning_runs
@@ -32,6 +29,14 @@ from terrain.slip_learning.curve import (
     tractive_efficiency,
 )
 from terrain.slip_learning.learn import LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
+from terrain.slip_learning.measured import (
+    Measured,
+    MeasuredSlip,
+    OperatingPoints,
+    SurfaceSlip,
+    operating_points,
+    surface_slip,
+)
 from terrain.terramechanics.soil import load_soil
 
 FALLBACK = "unknown"

@@ -24,9 +24,9 @@ from terrain.errors import DataError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import POSE_CHANNELS
-from terrain.measured_slip.slips import travelled
 from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
+from terrain.slip_learning.measured import travelled
 
 MAX_RATE_HZ = 50.0
 """Clock of the replay, unless the wheels are logged slower."""

@@ -27,7 +27,6 @@ from terrain.errors import ConfigError
 from terrain.files.documents import read_yaml
 from terrain.identify import Parameter, half_width, identify
 from terrain.kinematics.wheels import rolling_matrix
-from terrain.measured_slip.rollers import roller_findings
 from terrain.records import Array, Label, RunLog, Stream
 from terrain.robots import description_file, load_robot
 from terrain.simulation.dynamic.simulate import simulate
@@ -37,8 +36,18 @@ from terrain.simulation.scenario import make_scenario
 from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio
 from terrain.slip_learning.forces import RunBins
-from terrain.soil_identification.fit import LAWS, SINKAGES, Law, fit_law, forces_of, parameters_of, sinkage_of
-from terrain.soil_identification.trials import WHEELS, Trials
+from terrain.slip_learning.rollers import roller_findings
+from terrain.slip_learning.soil import (
+    LAWS,
+    SINKAGES,
+    WHEELS,
+    Law,
+    Trials,
+    fit_law,
+    forces_of,
+    parameters_of,
+    sinkage_of,
+)
 from terrain.terramechanics.inflow_wheel import FORCE
 from terrain.terramechanics.soil import load_soil
 

@@ -13,8 +13,7 @@ from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
 from terrain.errors import ConfigError, DataError, TerrainError
 from terrain.logs.write import write_run
-from terrain.soil_identification.fit import LAWS, SINKAGES, forces_of, sinkage_of
-from terrain.soil_identification.trials import WHEELS, Trials
+from terrain.slip_learning.soil import LAWS, SINKAGES, WHEELS, Trials, forces_of, sinkage_of
 from terrain.terramechanics.inflow_wheel import FORCE
 from terrain.terramechanics.soil import load_soil
 

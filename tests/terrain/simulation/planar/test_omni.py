@@ -9,7 +9,6 @@ from terrain.errors import ConfigError
 from terrain.extension import apply_homes
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.kinematics.wheels import rolling_matrix
-from terrain.measured_slip.slips import measured_slip
 from terrain.robots import load_robot
 from terrain.simulation.contact import softness
 from terrain.simulation.planar.model import AMPS, SLIP, VX, VY, Ground, W, make_planar, planar_ground
@@ -19,6 +18,7 @@ from terrain.simulation.planar.omni import ROLLING_MPS, SUBSTEPS, currents_of, s
 from terrain.simulation.planar.run import simulate_planar
 from terrain.simulation.run import simulate_run
 from terrain.simulation.scenario import make_scenario
+from terrain.slip_learning.measured import measured_slip
 from terrain.terramechanics.soil import load_soil, soil_from
 
 ROBOT = load_robot("robotino")

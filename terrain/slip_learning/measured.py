@@ -34,15 +34,40 @@ across d over the same denominator: what drives off the desired course.
 Standard deviations are those of the two slopes, to first order.  What is common to all windows of a robot,
 an error of the wheels' radius or of the outside measurement's scale, is not in them: 1 % of it is 0.01 times
 (1 - s) of slip.
+
+**Delay.**  Of an outside measurement behind the wheels, from changes of speed in many runs: twists over short windows
+by the wheels, :math:`V_w(t)`, and from outside, :math:`V(t + \tau)`, are compared with a gain a run and a component
+that slip makes free,
+
+.. math:: \min_\tau \sum_{runs} \sum_c \min_g \sum_t \left(V_c(t + \tau) - g\,V_{w,c}(t)\right)^2 .
+
+A robot that drives steadily shows no delay at all; starts, stops and turns do.  The interval is that of draws of
+runs with replacement (of thirds of a single run), :func:`terrain.signals.common_delay`.
+
+**Surfaces.**  Windows of one run are not independent: a run counts by the median of its windows, and intervals are
+those of draws of whole runs.  How well a median carries over is what that of a fifth of the runs, held out, differs
+by from that of the others; every fifth run is held out in the order of how they were driven (speed, then
+direction), so that slip that depends on the direction is compared over the same directions.
+
+**Operating point** of wheels at constant speed: their slip beside the current and, where motors are known, the
+thrust.  Of a wheel with the current I (its magnitude, or positive where it drives),
+
+    F = (kt n eta I - T_friction) / r,    F / N with N = m g / wheels
+
+is the thrust over its share of the weight.  A run at constant speed has one such point; points that differ in slip
+on one surface differ in how the robot was driven, and are no curve of thrust over slip.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from terrain.bootstrap import bootstrap_rows, percentile_interval
+from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
 from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
@@ -50,14 +75,20 @@ from terrain.kinematics.camera import body_motion
 from terrain.kinematics.wheels import TWIST, no_slip_twist, point_velocity, wheel_frame_velocities
 from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, RunLog, SlipTrack, Stream, read_only
-from terrain.robots import Robot
+from terrain.robots import Robot, robot_named
+from terrain.signals import Delay, DelayStatus, common_delay
 from terrain.slip import slip_ratio
-
-SOURCES: tuple[str, ...] = ("pose", "lidar", "odometry", "gnss")
-"""Streams that measure motion from outside, the most direct first."""
 
 VELOCITY: tuple[str, ...] = ("velocity_x_mps", "velocity_y_mps")
 """Channels of a receiver's velocity, east and north."""
+
+SOURCES: dict[str, tuple[tuple[str, ...], ...]] = {
+    "pose": (POSE_CHANNELS,),
+    "lidar": (TWIST,),
+    "odometry": (CAMERA_CHANNELS[:-1], TWIST[:2]),
+    "gnss": (VELOCITY,),
+}
+"""Streams that measure motion from outside, the most direct first, and the channels of which each needs one set."""
 
 MAX_GAP_S = 0.5
 """Longer without a sample, what was driven meanwhile is not known well enough to be summed."""
@@ -99,17 +130,10 @@ def outside_source(run: RunLog) -> str | None:
     --------
     >>> outside_source(RunLog("a", "husky", {}))
     """
-    for name in SOURCES:
+    for name, needed in SOURCES.items():
         stream = run.streams.get(name)
-        if stream is None or len(stream) < 2:
-            continue
-        needed = {
-            "pose": (POSE_CHANNELS,),
-            "lidar": (TWIST,),
-            "odometry": (CAMERA_CHANNELS[:-1], TWIST[:2]),
-            "gnss": (VELOCITY,),
-        }[name]
-        if any(set(channels) <= set(stream.channels) for channels in needed):
+        present = set() if stream is None or len(stream) < 2 else set(stream.channels)
+        if any(set(channels) <= present for channels in needed):
             return name
     return None
 
@@ -137,7 +161,7 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
     if name is None:
         raise DataError(
             f"run {run.run_id}: nothing measured the motion from outside; a stream "
-            f"{', '.join(SOURCES[:-1])} or {SOURCES[-1]} is needed"
+            f"{', '.join(list(SOURCES)[:-1])} or {list(SOURCES)[-1]} is needed"
         )
     stream = run.streams[name]
     if name == "pose":
@@ -146,9 +170,7 @@ def travelled(run: RunLog, robot: Robot, delay_s: float = 0.0) -> Travelled:
         found = _of_twists(name, _receiver_twist(run, robot))
     else:
         found = _of_twists(name, _twist_stream(stream, robot))
-    if delay_s == 0.0:
-        return found
-    return Travelled(name, found.time_s - delay_s, found.values, found.part, found.n_jumps, found.n_gaps)
+    return found if delay_s == 0.0 else replace(found, time_s=found.time_s - delay_s)
 
 
 def _fastest_mps(run: RunLog, robot: Robot) -> float:
@@ -448,25 +470,22 @@ class _WheelSums:
         steps = np.diff(time_s)[:, None] * (speeds_mps[1:] + speeds_mps[:-1]) / 2
         rolled = np.concatenate([np.zeros((1, speeds_mps.shape[1])), np.cumsum(steps, axis=0)])
         known = np.isfinite(rolled).all(axis=1)
-        self._time_s, self._rolled = time_s[known], rolled[known]
-        self._part = np.zeros(int(known.sum()), dtype=np.int64)
+        self._sums = time_s[known], rolled[known], np.zeros(int(known.sum()), dtype=np.int64)
 
-    def rates(self, start_s: Array, end_s: Array) -> tuple[Array, Array]:
+    def rates(
+        self, start_s: Array, end_s: Array, min_samples: int = MIN_SAMPLES, coverage: float = COVERAGE
+    ) -> tuple[Array, Array]:
         """Return mean speeds (k, wheels) over windows, and their standard deviations."""
-        rates, std = window_rates(
-            self._time_s, self._rolled, self._part, start_s, end_s, MIN_SAMPLES, COVERAGE
-        )
-        return rates, std
+        rate, std = window_rates(*self._sums, start_s, end_s, min_samples, coverage)
+        return rate, std
 
     def steady(self, start_s: Array, end_s: Array, speed_mps: Array) -> Array:
         """Return whether (k,) both halves of a window have the speed of the whole."""
         middle_s = (start_s + end_s) / 2
         first, first_std = self.rates(start_s, middle_s)
         second, second_std = self.rates(middle_s, end_s)
-        allowed = np.maximum(
-            STEADY_RATIO * np.abs(speed_mps).max(axis=1, keepdims=True),
-            STEADY_STD * np.hypot(first_std, second_std),
-        )
+        least = STEADY_RATIO * np.abs(speed_mps).max(axis=1, keepdims=True)
+        allowed = np.maximum(least, STEADY_STD * np.hypot(first_std, second_std))
         return np.asarray((np.abs(second - first) <= allowed).all(axis=1))
 
 
@@ -584,3 +603,326 @@ def _body(
     speed_std = np.sqrt((u_std**2).mean(axis=1))
     slip, std = _slip(speed, speed_std, along, along_std, min_speed_mps)
     return slip, std, np.where(np.isnan(slip), np.nan, across / np.maximum(speed, np.abs(along)))
+
+
+DELAY_SEARCH_S = (-0.4, 1.2)
+"""Bounds of the search: a lidar that matches scans comes out up to 0.7 s late; beyond a second it is no delay
+but two clocks."""
+
+DELAY_STEP_S = 0.02
+DELAY_WINDOW_S = 0.3
+"""Over which twists are taken: a start takes 0.2 to 0.5 s."""
+
+REST_S = 1.0
+"""A log whose wheels stand at its first sample is taken to be of a robot at rest for so long before it: most
+recordings begin with the start that shows the delay."""
+
+MIN_KNOWN = 0.3
+"""Of the windows of a run, with every delay of the search."""
+
+MAX_DELAY_STD_S = 0.1
+"""A delay that is less certain is not applied."""
+
+
+def delay_sentence(delay: Delay) -> str:
+    """Return by how much the outside measurement is late, in words."""
+    if delay.status is not DelayStatus.ESTIMATED:
+        return "the delay of the outside measurement was not found, and none is taken off."
+    return (
+        f"the outside measurement is {delay.delay_s:+.3f} s behind the wheels "
+        f"(± {1.96 * delay.std_s:.3f}), which is taken off."
+    )
+
+
+def estimate_delay(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Delay:
+    """Return by how much the outside measurement of runs of one robot and one outside sensor lags behind their wheels.
+
+    Runs without either are passed over; ``seed`` is of the draws that the interval is from.
+    """
+    lags_s = np.arange(DELAY_SEARCH_S[0], DELAY_SEARCH_S[1] + DELAY_STEP_S / 2, DELAY_STEP_S)
+    curves = []
+    for run in runs:
+        try:
+            curves += _misfits(run, robot, lags_s, 3 if len(runs) == 1 else 1)
+        except DataError:
+            continue
+    return common_delay(lags_s, [-curve for curve in curves], MAX_DELAY_STD_S, seed)
+
+
+def _misfits(run: RunLog, robot: Robot, lags_s: Array, n_parts: int) -> list[Array]:
+    """Return the misfit (lags,) of each part of a run, relative to what its wheels vary by."""
+    time_s, speeds = wheel_speeds(run, robot)
+    path = travelled(run, robot)
+    if len(path.time_s) < 2:
+        return []
+    if not np.abs(speeds[0]).max() > 0.0:
+        rest_s = np.arange(-REST_S, -DELAY_STEP_S / 2, DELAY_STEP_S)
+        time_s, speeds = np.r_[time_s[0] + rest_s, time_s], np.pad(speeds, ((rest_s.size, 0), (0, 0)))
+        before = np.r_[np.zeros(rest_s.size, int), np.arange(len(path.time_s))]
+        times_s = np.r_[path.time_s[0] + rest_s, path.time_s]
+        path = replace(path, time_s=times_s, values=path.values[before], part=path.part[before])
+    start_s = np.arange(time_s[0], time_s[-1] - DELAY_WINDOW_S, DELAY_WINDOW_S / 6)
+    if start_s.size < 8 * n_parts:
+        return []
+    end_s = start_s + DELAY_WINDOW_S
+    u, _ = _WheelSums(time_s, speeds).rates(start_s, end_s, 3, 0.4)
+    directions = wheel_directions(run, robot, start_s, end_s)
+    rolled, _ = no_slip_twist(robot.wheel_positions_m, directions, u, robot.on_omni_wheels)
+    scale = np.array([1.0, 1.0, float(np.linalg.norm(robot.wheel_positions_m, axis=1).max())])
+    sums = path.time_s, path.values, path.part
+    seen = np.array([window_rates(*sums, start_s + lag_s, end_s + lag_s, 3, 0.4)[0] for lag_s in lags_s])
+    x, y = rolled * scale, seen * scale
+    known = np.isfinite(x).all(axis=1) & np.isfinite(y).all(axis=2)
+    curves = []
+    for rows in np.array_split(np.arange(start_s.size), n_parts):
+        if known[:, rows].sum(axis=1).min() >= max(8, MIN_KNOWN * rows.size):
+            parts = ((x[rows][k], lag[rows][k]) for lag, k in zip(y, known[:, rows], strict=True))
+            curves.append(np.array([_misfit(wheels, outside) for wheels, outside in parts]))
+    return curves
+
+
+def _misfit(x: Array, y: Array) -> float:
+    """Return the mean square of what a gain for each component leaves of y (k, 3) beside x (k, 3)."""
+    power = (x**2).sum(axis=0)
+    gain = (y * x).sum(axis=0) / np.where(power > 0.0, power, 1.0)
+    return float(((y - gain * x) ** 2).sum() / len(x))
+
+
+WINDOWS_S = (2.0, 0.5)
+"""Windows of steady motion; short ones where the outside measurement does not cover longer ones, as a lidar's
+twist."""
+
+
+class Measured(NamedTuple):
+    """Runs beside their slip, the delays by session, and a sentence for each run without a slip."""
+
+    runs: list[RunLog]
+    slips: list[MeasuredSlip]
+    delays: dict[str, Delay]
+    failed: list[str]
+
+    def by_terrain(self) -> dict[str, Measured]:
+        """Return the runs of each single terrain, sorted by its name, with those on several or none last."""
+        names = [single_terrain(run) for run in self.runs]
+        found = {}
+        for name in sorted(set(names), key=lambda name: (name == "", name)):
+            own = [i for i, each in enumerate(names) if each == name]
+            found[name] = self._replace(runs=[self.runs[i] for i in own], slips=[self.slips[i] for i in own])
+        return found
+
+
+def single_terrain(run: RunLog) -> str:
+    """Return the terrain that a run is labelled with; empty where it is on several or none."""
+    return run.terrains[0] if len(run.terrains) == 1 else ""
+
+
+def one_robot(runs: Sequence[RunLog], given: Robot | None) -> Robot:
+    """Return the robot of runs: the one that is passed, where it has the name that they state.
+
+    Raises
+    ------
+    DataError
+        if they are of several.
+    ConfigError
+        if it is unknown.
+    """
+    names = sorted({run.robot for run in runs})
+    if len(names) > 1:
+        raise DataError(f"the runs are of the robots {', '.join(names)}: measure those of one at a time")
+    return robot_named(names[0], given)
+
+
+def measure(
+    runs: Sequence[RunLog],
+    robot: Robot,
+    *,
+    window_s: float,
+    stride_s: float,
+    delay_s: float | None = None,
+    seed: int = 0,
+    progress: Callable[[str, int, int], None] = lambda task, done, total: None,
+) -> Measured:
+    """Return the slip of each run, with the delay of its session taken off.
+
+    Parameters
+    ----------
+    runs : of the robot
+    window_s, stride_s : of the slips
+    delay_s : of the outside measurement; found, a session at a time, by default
+    seed : of the intervals of delays
+    progress : gets the task, how many of its steps are done, and how many there are
+    """
+    delays: dict[str, Delay] = {}
+    sessions = sorted({run.session for run in runs})
+    for done, session in enumerate(sessions, start=1):
+        members = [run for run in runs if run.session == session]
+        if delay_s is None:
+            delays[session] = estimate_delay(members, robot, seed)
+        else:
+            delays[session] = Delay(delay_s, 0.0, len(members), DelayStatus.ESTIMATED)
+        progress("delay", done, len(sessions))
+    measured, slips, failed = [], [], []
+    for done, run in enumerate(runs, start=1):
+        late_s = delays[run.session].applied_s
+        try:
+            slips.append(measured_slip(run, robot, window_s=window_s, stride_s=stride_s, delay_s=late_s))
+            measured.append(run)
+        except DataError as error:
+            failed.append(str(error))
+        progress("slip", done, len(runs))
+    return Measured(measured, slips, delays, failed)
+
+
+def measure_steady(
+    runs: Sequence[RunLog],
+    robot: Robot,
+    seed: int,
+    progress: Callable[[str, int, int], None] = lambda task, done, total: None,
+) -> tuple[float, Measured]:
+    """Return slips over :data:`WINDOWS_S`, the first in which a robot drives steadily, and that length.
+
+    Raises
+    ------
+    DataError
+        if there is no slip in steady motion.
+    """
+    first = ""
+    for window_s in WINDOWS_S:
+        found = measure(runs, robot, window_s=window_s, stride_s=window_s / 2, seed=seed, progress=progress)
+        if any(slip.known.size for slip in found.slips):
+            return window_s, found
+        first = first or (found.failed[0] if found.failed else "no window is driven steadily")
+    raise DataError(f"none of {len(runs)} runs has a slip; the first for this: {first}")
+
+
+N_FOLDS = 5
+N_DRAWS = 1000
+
+MIN_TURN_RADPS = 0.2
+"""Of wheels, from which their yaw rate is compared with that measured from outside."""
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceSlip:
+    """Slip of a robot on a surface; NaN where it is not known.
+
+    Parameters
+    ----------
+    terrain : name of the surface; empty for runs without a label
+    n_runs, n_windows : with a slip in steady motion
+    n_standing : windows without a slip because the robot stood, or because it was too uncertain
+    slip_ratio, interval : median over runs of the slip of the body, and its 95 % interval over runs
+    spread : quartiles of the windows
+    std : median standard deviation of a window's slip
+    held_out : largest difference of the median of a fifth of the runs from that of the others
+    wheel_slip : median of each wheel, positive in traction whichever direction it rolls in
+    turn_ratio : median yaw rate measured from outside over that of wheels without slip
+    spinning : runs with a wheel that spins or lifts, and which
+    """
+
+    terrain: str
+    n_runs: int
+    n_windows: int
+    n_standing: int
+    slip_ratio: float
+    interval: tuple[float, float]
+    spread: tuple[float, float]
+    std: float
+    held_out: float
+    wheel_slip: tuple[float, ...]
+    turn_ratio: float
+    spinning: tuple[str, ...]
+
+
+def surface_slip(terrain: str, runs: Sequence[MeasuredSlip], rng: np.random.Generator) -> SurfaceSlip:
+    """Return what runs on one surface measured, of their windows in steady motion."""
+    some = [run for run in runs if run.known.size]
+    of_runs = [run.body_slip[run.known] for run in some]
+    medians, windows = np.array([np.median(slip) for slip in of_runs]), np.concatenate([[], *of_runs])
+    interval = (np.nan, np.nan)
+    if medians.size > 1:
+        draws = medians[bootstrap_rows(medians.size, N_DRAWS, rng)]
+        interval = percentile_interval(np.median(draws, axis=1))
+    low, high = np.quantile(windows, [0.25, 0.75]).tolist() if windows.size else (np.nan, np.nan)
+    driven = [run.slip_ratio * np.where(run.wheel_speed_mps < 0.0, -1.0, 1.0) for run in runs]
+    wheels = np.concatenate([slip[run.steady] for slip, run in zip(driven, runs, strict=True)])
+    turns = np.concatenate(
+        [np.column_stack([run.rolled_twist, run.twist])[run.steady][:, [2, 5]] for run in runs]
+    )
+    with np.errstate(invalid="ignore"):
+        turns = turns[np.abs(turns[:, 0]) >= MIN_TURN_RADPS]
+    return SurfaceSlip(
+        terrain=terrain,
+        n_runs=len(some),
+        n_windows=int(windows.size),
+        n_standing=int(sum((~np.isfinite(run.body_slip)).sum() for run in runs)),
+        slip_ratio=_median(medians),
+        interval=interval,
+        spread=(low, high),
+        std=_median(np.concatenate([run.body_slip_std[run.steady] for run in runs])),
+        held_out=_held_out(medians, some),
+        wheel_slip=tuple(_median(wheel) for wheel in wheels.T),
+        turn_ratio=_median(turns[:, 1] / turns[:, 0]),
+        spinning=tuple(
+            f"{run.run_id} ({', '.join(names)})" for run in runs if (names := spinning_wheels(run))
+        ),
+    )
+
+
+def _median(values: Array) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else float("nan")
+
+
+def _held_out(medians: Array, runs: Sequence[MeasuredSlip]) -> float:
+    """Return the largest difference of a fold's median from that of the rest; NaN with too few runs.
+
+    Folds are dealt in the order of the speed that wheels roll at, then of direction.
+    """
+    if medians.size < N_FOLDS:
+        return float("nan")
+    twist = np.array([np.nanmedian(run.rolled_twist, axis=0) for run in runs])
+    speed = np.round(np.linalg.norm(twist[:, :2], axis=1), 1)
+    order = np.lexsort((np.arctan2(twist[:, 1], twist[:, 0]), speed))
+    parts = (order[k::N_FOLDS] for k in range(N_FOLDS))
+    return max(float(abs(np.median(medians[part]) - np.median(np.delete(medians, part)))) for part in parts)
+
+
+class OperatingPoints(NamedTuple):
+    """Points of runs, (n,) each; NaN where it is not known.
+
+    Parameters
+    ----------
+    slip_ratio : median of the body over a run's windows in steady motion
+    current_a : median over these of the mean of the wheels
+    thrust_ratio : mean thrust of a wheel over its share of the weight
+    """
+
+    slip_ratio: Array
+    current_a: Array
+    thrust_ratio: Array
+
+
+def operating_points(runs: Sequence[RunLog], slips: Sequence[MeasuredSlip], robot: Robot) -> OperatingPoints:
+    """Return the operating point of each run."""
+    names = [f"current_{wheel}_a" for wheel in robot.wheels]
+    points = np.full((len(runs), 3), np.nan)
+    for point, run, slip in zip(points, runs, slips, strict=True):
+        wheels = run.streams["wheels"]
+        if not slip.known.size:
+            continue
+        point[0] = np.median(slip.body_slip[slip.known])
+        if not set(names) <= set(wheels.channels):
+            continue
+        current = np.abs(np.column_stack([wheels.channel(name) for name in names]))
+        ends = zip(slip.start_s[slip.known], slip.end_s[slip.known], strict=True)
+        inside = np.any([(wheels.time_s >= a) & (wheels.time_s <= b) for a, b in ends], axis=0)
+        known = np.isfinite(current).all(axis=1) & inside
+        if not known.any():
+            continue
+        point[1] = current[known].mean()
+        if robot.describes("motors"):
+            load_n = robot.mass_kg * GRAVITY_MPS2 / len(robot.wheels)
+            thrust_n = (point[1] * robot.motors.nm_per_a - robot.motors.friction_nm) / robot.wheel_radius_m
+            point[2] = thrust_n / load_n
+    return OperatingPoints(*points.T)

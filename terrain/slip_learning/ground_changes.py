@@ -16,9 +16,9 @@ import numpy as np
 
 from terrain.classify.response_change import DetectorSettings, GroundChange, calibrate, changes_of
 from terrain.errors import DataError
-from terrain.measured_slip.slips import MeasuredSlip, measured_slip, outside_source, wheel_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
+from terrain.slip_learning.measured import MeasuredSlip, measured_slip, outside_source, wheel_speeds
 
 WINDOW_S, STRIDE_S = 0.5, 0.1
 

@@ -10,25 +10,23 @@ from studies.intervals import SPEEDS_MMPS, wheel_trials
 
 from pipelines.data.datasets import load_runs
 from terrain.errors import DataError
-from terrain.soil_identification.comparison import (
+from terrain.slip_learning.soil import (
+    LAWS,
+    WHEELS,
+    calibration_rows,
+    cohesion_profile,
+    fit_law,
+    fit_plain_soil,
+    force_vector,
     held_out_predictions,
     law_predictor,
     misfit,
-    regime_misfits,
-)
-from terrain.soil_identification.fit import (
-    LAWS,
-    cohesion_profile,
-    fit_law,
-    force_vector,
     modulus_spread,
     parameters_of,
+    plain_prediction,
+    plain_soil,
     predict,
-)
-from terrain.soil_identification.plain_soil import fit_plain_soil, plain_prediction, plain_soil
-from terrain.soil_identification.trials import (
-    WHEELS,
-    calibration_rows,
+    regime_misfits,
     setting_means,
     side_coupling,
     trials_of,

@@ -3,7 +3,7 @@ import pytest
 
 from terrain.classify.response import ResponseColumns
 from terrain.errors import DataError
-from terrain.measured_slip.predict import SlipRegressor
+from terrain.slip_learning.currents import SlipRegressor
 
 WHEELS = np.radians([150.0, 270.0, 390.0])
 COLUMNS = ResponseColumns(3, 3)

@@ -16,6 +16,7 @@ those of draws of runs; how far surfaces differ says what else there is.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -26,10 +27,10 @@ import numpy as np
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.errors import DataError
 from terrain.identify import Parameter, folds, identify
-from terrain.measured_slip.slips import MeasuredSlip
 from terrain.records import Array
-from terrain.robots import OmniRobot, Robot
+from terrain.robots import OmniRobot, Robot, as_drive
 from terrain.simulation.planar.omni import steady_twist
+from terrain.slip_learning.measured import Measured, MeasuredSlip, single_terrain
 
 N_FOLDS = 5
 N_DRAWS = 100
@@ -306,3 +307,76 @@ def distance_bound(
     draws = described_m * (rolled[rows] ** 2).sum(axis=1) / (rolled[rows] * seen[rows]).sum(axis=1)
     found_m = described_m * float(rolled @ rolled) / float(rolled @ seen)
     return DistanceBound(found_m, percentile_interval(draws), correlation, len(turns))
+
+
+NO_ROLLERS = "robot {name}: drive {drive!r} has no rollers, only 'omni' has"
+
+
+def rollers_of(found: Measured, robot: Robot, seed: int) -> RollerFindings:
+    """Return what makes an omni robot slip; sessions are groups that are asked for their load."""
+    known = [i for i, run in enumerate(found.runs) if single_terrain(run)]
+    groups = [found.runs[i].session or single_terrain(found.runs[i]) for i in known]
+    surfaces = sorted({single_terrain(found.runs[i]) for i in known if not found.runs[i].session})
+    return roller_findings([found.slips[i] for i in known], groups, robot, surfaces, seed)
+
+
+def named_surfaces(found: Measured, robot: Robot, rollers: RollerFindings) -> tuple[NamedSurface, ...]:
+    """Return which surface rollers name in the windows of each group, runs without a label by session."""
+    windows: dict[str, Counter[str]] = {}
+    right: dict[str, list[bool]] = {}
+    for run, slip in zip(found.runs, found.slips, strict=True):
+        names = [name for name in surface_of_windows(slip, rollers, robot) if name]
+        if not names:
+            continue
+        group = run.session or single_terrain(run)
+        windows.setdefault(group, Counter()).update(names)
+        if single_terrain(run) in rollers.roller_ratio:
+            right.setdefault(group, []).append(Counter(names).most_common(1)[0][0] == single_terrain(run))
+    rows = []
+    for group, counts in sorted(windows.items()):
+        judged = right.get(group)
+        n_right = sum(judged) if judged else None
+        n_runs = (
+            len(judged)
+            if judged
+            else sum((run.session or single_terrain(run)) == group for run in found.runs)
+        )
+        rows.append(NamedSurface(group, n_runs, n_right, dict(sorted(counts.items()))))
+    return tuple(rows)
+
+
+def distances_of(found: Measured, robot: Robot, seed: int) -> dict[str, DistanceBound]:
+    """Return the distance of the wheels by each surface on which the robot's turns follow them."""
+    omni, bounds = as_drive(OmniRobot, robot, NO_ROLLERS), {}
+    alone = [pair for pair in zip(found.runs, found.slips, strict=True) if not pair[0].session]
+    for name in sorted({single_terrain(run) for run, _ in alone} - {""}):
+        slips = [slip for run, slip in alone if single_terrain(run) == name]
+        bound = distance_bound(slips, omni, np.random.default_rng(seed))
+        if bound is not None:
+            bounds[name] = bound
+    return bounds
+
+
+class NamedSurface(NamedTuple):
+    """Which surface the rollers of an omni robot say that runs of a group were on.
+
+    Parameters
+    ----------
+    group : surface or, of runs that were not fitted, session
+    n_runs : of the group; where ``n_right`` is known those with a label of a fitted surface
+    n_right : whose windows are mostly named as their label; None without such labels
+    windows : by the surface that they are named
+    """
+
+    group: str
+    n_runs: int
+    n_right: int | None
+    windows: Mapping[str, int]
+
+    @property
+    def text(self) -> str:
+        """How many runs are named rightly or, without labels, what windows look like, in words."""
+        if self.n_right is not None:
+            return f"{self.n_right} of {self.n_runs} runs are named by their slip"
+        counts = ", ".join(f"{name} {n}" for name, n in sorted(self.windows.items(), key=lambda x: -x[1]))
+        return f"windows of {self.n_runs} runs look like {counts}"

@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
-from terrain.measured_slip.delay import estimate_delay
-from terrain.measured_slip.ground_changes import slip_step
-from terrain.measured_slip.slips import (
-    measured_slip,
-    outside_source,
-    spinning_wheels,
-    travelled,
-    window_rates,
-)
-from terrain.measured_slip.surfaces import surface_slip
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.signals import DelayStatus
 from terrain.simulation.planar.run import simulate_planar
+from terrain.slip_learning.ground_changes import slip_step
+from terrain.slip_learning.measured import (
+    estimate_delay,
+    measured_slip,
+    outside_source,
+    spinning_wheels,
+    surface_slip,
+    travelled,
+    window_rates,
+)
 
 HUSKY = load_robot("husky")
 

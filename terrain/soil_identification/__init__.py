@@ -1,1 +1,0 @@
-"""Which law of a wheel in sand, with which numbers, agrees with trials of measured forces and sinkage."""
