@@ -299,13 +299,21 @@ class Peak(NamedTuple):
     status: PeakStatus
 
 
-def net_peak(net_ratio: Callable[[Array], Array], low_slip: float, high_slip: float) -> Peak:
+def net_peak(
+    net_ratio: Callable[[Array], Array],
+    low_slip: float,
+    high_slip: float,
+    status: PeakStatus | None = None,
+    n: int | None = None,
+) -> Peak:
     """Return where net traction is largest within a range, or has 95 % of it where it rises to the end.
 
     Parameters
     ----------
     net_ratio : net traction at each of an array of slips, in any unit of force
     low_slip, high_slip : the range
+    status : which of the two, of a bootstrap draw for instance; by default the one that the maximum's place says
+    n : slips that are compared; one every 0.0005 by default
 
     Examples
     --------
@@ -314,25 +322,15 @@ def net_peak(net_ratio: Callable[[Array], Array], low_slip: float, high_slip: fl
     >>> net_peak(lambda s: s, 0.0, 0.6)
     Peak(slip_ratio=0.57, status=<PeakStatus.NO_PEAK: 'no_peak'>)
     """
-    slips = np.linspace(low_slip, high_slip, max(2, 1 + round((high_slip - low_slip) / 0.0005)))
+    slips = np.linspace(low_slip, high_slip, n or max(2, 1 + round((high_slip - low_slip) / 0.0005)))
     net = net_ratio(slips)
-    top = int(np.argmax(net))
-    if slips[top] < high_slip - EDGE_SLIP and top > 0:
-        return Peak(round(float(slips[top]), 6), PeakStatus.PEAK)
-    near = net >= NEAR_PEAK_RATIO * net[top] if net[top] > 0 else np.arange(len(net)) >= top
-    return Peak(round(float(slips[int(np.argmax(near))]), 6), PeakStatus.NO_PEAK)
-
-
-def peak_slip_of_kind(
-    status: PeakStatus, net_ratio: Callable[[Array], Array], low_slip: float, high_slip: float
-) -> float:
-    """Return the peak slip by the definition of a given status, of a bootstrap draw for instance."""
-    slips = np.linspace(low_slip, high_slip, 1001)
-    net = net_ratio(slips)
-    top = int(np.argmax(net))
-    if status is PeakStatus.PEAK or net[top] <= 0:
-        return float(slips[top])
-    return float(slips[int(np.argmax(net >= NEAR_PEAK_RATIO * net[top]))])
+    best = top = int(np.argmax(net))
+    if status is None:
+        inside = slips[top] < high_slip - EDGE_SLIP and top > 0
+        status = PeakStatus.PEAK if inside else PeakStatus.NO_PEAK
+    if status is PeakStatus.NO_PEAK and net[top] > 0:
+        best = int(np.argmax(net >= NEAR_PEAK_RATIO * net[top]))
+    return Peak(float(slips[best]) if n else round(float(slips[best]), 6), status)
 
 
 def peak_interval(
@@ -344,6 +342,10 @@ def peak_interval(
 ) -> tuple[float, float]:
     """Return the 90 % interval of a peak slip.
 
+    What all runs share is the radius' error and a tilt of the curve by :data:`SHAPE_STD_RATIO`: near a peak
+    ``f = f_0 (1 - a (s - s_0)^2)``, with a by the thrust at two thirds of s_0, and the tilt is over the peak's slip;
+    without a peak the tilt over the observed slips raises f here against f there.
+
     Parameters
     ----------
     draws : (m,) peak slips of the bootstrap over runs
@@ -352,24 +354,15 @@ def peak_interval(
     thrust_ratio : thrust over load of the curve at each of an array of slips
     high_slip : largest slip observed
     """
-    shared = math.hypot(SYSTEMATIC_SLIP_STD, _shape_std(thrust_ratio, peak, high_slip))
-    return expanded_interval(draws, n_informative_runs(runs, peak, high_slip), peak.slip_ratio, shared)
-
-
-def _shape_std(thrust_ratio: Callable[[Array], Array], peak: Peak, high_slip: float) -> float:
-    """Return how far a tilt of the curve by :data:`SHAPE_STD_RATIO` moves a peak or the slip at 95 %.
-
-    Near a peak ``f = f_0 (1 - a (s - s_0)^2)``, with a by the thrust at two thirds of s_0; the tilt
-    is over the peak's slip.  Without a peak, the tilt over the observed slips raises f here against f there.
-    """
     slip = peak.slip_ratio
     below, here, third = thrust_ratio(np.array([slip - 1e-3, slip, 2 / 3 * slip]))
     if peak.status is PeakStatus.NO_PEAK:
         slope = max((here - below) / 1e-3, 1e-6)
-        moved = SHAPE_STD_RATIO * here * (high_slip - slip) / high_slip / slope
+        shape_std = SHAPE_STD_RATIO * here * (high_slip - slip) / high_slip / slope
     else:
-        moved = SHAPE_STD_RATIO / (2 * max(1.0 - third / here, 1e-4) / (slip / 3) ** 2 * slip)
-    return float(min(moved, slip / 2))
+        shape_std = SHAPE_STD_RATIO / (2 * max(1.0 - third / here, 1e-4) / (slip / 3) ** 2 * slip)
+    shared = math.hypot(SYSTEMATIC_SLIP_STD, float(min(shape_std, slip / 2)))
+    return expanded_interval(draws, n_informative_runs(runs, peak, high_slip), slip, shared)
 
 
 def n_informative_runs(runs: Sequence[RunBins], peak: Peak, high_slip: float) -> int:
@@ -534,7 +527,7 @@ def learn_curve(
     rows = bootstrap_rows(len(runs), n_bootstrap, rng)
     draws = [_refitted(model, runs, resistances, drawn) for drawn in rows]
     peak = net_peak(model.net_traction, low, high)
-    peaks = np.array([peak_slip_of_kind(peak.status, draw.net_traction, low, high) for draw in draws])
+    peaks = np.array([net_peak(draw.net_traction, low, high, peak.status, 1001).slip_ratio for draw in draws])
     slips = np.linspace(0.0, high, 101)
     thrusts = np.array([draw.thrust(slips) for draw in draws])
     return SlipCurve(

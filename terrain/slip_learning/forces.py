@@ -54,62 +54,6 @@ SMALL_SLIP = 0.02
 """Lateral slip up to which the reduction of the longitudinal thrust is negligible."""
 
 
-class Contacts(NamedTuple):
-    """Motion of the wheels, (n, wheels) each.
-
-    Parameters
-    ----------
-    steer_rad, rate_radps : of the wheels
-    wheel_speed_mps : wheel circumferential speed w r
-    forward_mps, left_mps : velocity over ground in the wheel's frame
-    reference_speed_mps : denominator of the slip, the larger magnitude of w r and ``forward_mps``
-    slip_ratio : longitudinal slip of the contact
-    """
-
-    steer_rad: Array
-    rate_radps: Array
-    wheel_speed_mps: Array
-    forward_mps: Array
-    left_mps: Array
-    reference_speed_mps: Array
-    slip_ratio: Array
-
-    @property
-    def side_ratio(self) -> Array:
-        """Magnitude of the lateral slip."""
-        return np.asarray(np.abs(self.left_mps) / np.maximum(self.reference_speed_mps, MIN_SPEED_MPS))
-
-    @property
-    def oblique(self) -> Array:
-        """Whether the lateral slip is neither negligible nor too large for its share in the slip vector."""
-        side = self.side_ratio
-        return np.asarray((side >= SMALL_SLIP) & (side <= MAX_SIDE_RATIO * np.abs(self.slip_ratio)))
-
-    @property
-    def vector_factor(self) -> Array:
-        """Length of the slip vector over its longitudinal component, negative where a wheel rolls back."""
-        oblique = self.oblique
-        side = self.side_ratio / np.where(oblique, self.slip_ratio, 1.0)
-        rolling = np.where(self.wheel_speed_mps + self.forward_mps < 0.0, -1.0, 1.0)
-        return np.asarray(rolling * np.where(oblique, np.hypot(1.0, side), 1.0))
-
-
-def wheel_contacts(robot: Robot, track: StateTrack, table: MeasurementTable) -> Contacts:
-    """Return the motion of each wheel by a state track and the wheel rates measured beside it."""
-    steer = np.column_stack([track.state(f"steer_{wheel}_rad") for wheel in robot.wheels])
-    rate = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
-    twist = np.column_stack([track.state(name) for name in TWIST])
-    forward, left = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
-    wheel_speed = rate * robot.wheel_radius_m
-    slip_speed = wheel_speed - forward
-    reference = np.maximum(np.abs(wheel_speed), np.abs(forward))
-    slips = [
-        contact_slip(track.time_s, slip_speed[:, i], reference[:, i], robot.body.relaxation_length_m)
-        for i in range(len(robot.wheels))
-    ]
-    return Contacts(steer, rate, wheel_speed, forward, left, reference, np.column_stack(slips))
-
-
 @njit
 def contact_slip(
     time_s: Array, slip_speed_mps: Array, reference_speed_mps: Array, relaxation_m: float
@@ -274,18 +218,36 @@ def wheel_forces(
     if "slip_speed_1_mps" not in track.states:
         raise DataError(f"run {run.run_id}: the track has no slip speeds: estimate it with vio15")
     clock, sensors = track.time_s, robot.sensors
-    up = _up(run, clock, sensors.imu_latency_s, sensors.encoder_time_constant_s)
+    imu, wheels, time_constant_s = run.streams["imu"], run.streams["wheels"], sensors.encoder_time_constant_s
+    angles = {name: imu.channel(name) for name in ("roll_rad", "pitch_rad")}
+    roll, pitch = on_clock(clock, imu.time_s - sensors.imu_latency_s, angles, time_constant_s).values()
+    up = np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
     accel = [track.state("accel_x_mps2"), track.state("accel_y_mps2"), np.zeros(clock.size)]
     force = GRAVITY_MPS2 * up + np.column_stack(accel)
-    contacts = wheel_contacts(robot, track, table)
+    steer = np.column_stack([track.state(f"steer_{wheel}_rad") for wheel in robot.wheels])
+    rate = table.columns([f"wheel_{wheel}_radps" for wheel in robot.wheels])
+    twist = np.column_stack([track.state(name) for name in TWIST])
+    forward, left = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
+    wheel_speed = rate * robot.wheel_radius_m
+    reference = np.maximum(np.abs(wheel_speed), np.abs(forward))
+    relaxation_m = robot.body.relaxation_length_m
+    pairs = zip((wheel_speed - forward).T, reference.T, strict=True)
+    along_slip = np.column_stack([contact_slip(clock, *pair, relaxation_m) for pair in pairs])
+    side_slip = np.abs(left) / np.maximum(reference, MIN_SPEED_MPS)
+    oblique = (side_slip >= SMALL_SLIP) & (side_slip <= MAX_SIDE_RATIO * np.abs(along_slip))
+    # length of the slip vector over its longitudinal component, negative where a wheel rolls back
+    rolling = np.where(wheel_speed + forward < 0.0, -1.0, 1.0)
+    factor = rolling * np.where(oblique, np.hypot(1.0, side_slip / np.where(oblique, along_slip, 1.0)), 1.0)
     velocity = np.column_stack([track.state("speed_x_mps"), track.state("speed_y_mps")])
     speed = np.hypot(*velocity.T)
     moving = speed > MIN_SPEED_MPS
     along = np.divide(velocity, speed[:, None], out=np.zeros_like(velocity), where=moving[:, None])
-    torque = _wheel_torque(run, robot, clock)
-    wheel_accel = _smooth(np.gradient(contacts.rate_radps, clock, axis=0), clock)
+    currents_a = {name: wheels.channel(name) for name in (f"current_{wheel}_a" for wheel in robot.wheels)}
+    filtered = on_clock(clock, wheels.time_s, currents_a, time_constant_s)
+    torque = np.column_stack(list(filtered.values())) * robot.motors.nm_per_a
+    wheel_accel = _smooth(np.gradient(rate, clock, axis=0), clock)
     resistance = robot.motors.friction_nm, robot.body.wheel_inertia_kgm2, robot.wheel_radius_m
-    thrust = ground_thrust(torque, contacts.rate_radps, wheel_accel, *resistance)
+    thrust = ground_thrust(torque, rate, wheel_accel, *resistance)
     load = wheel_loads(robot, force)
     fresh = ~slip.stale & np.isfinite(track.reference_age_s)
     with np.errstate(invalid="ignore"):
@@ -295,28 +257,30 @@ def wheel_forces(
     conditions = {
         "slip known": np.isfinite(slip.slip_ratio) & (slip.slip_std < MAX_SLIP_STD),
         "speed fresh": np.repeat(fresh[:, None], 3, axis=1),
-        "moving": np.abs(contacts.forward_mps) > MIN_SPEED_MPS,
-        "rolling straight": contacts.oblique | (contacts.side_ratio < SMALL_SLIP),
-        "slip followed": np.abs(np.gradient(contacts.slip_ratio, clock, axis=0)) < MAX_SLIP_RATE_PS,
+        "moving": np.abs(forward) > MIN_SPEED_MPS,
+        "rolling straight": oblique | (side_slip < SMALL_SLIP),
+        "slip followed": np.abs(np.gradient(along_slip, clock, axis=0)) < MAX_SLIP_RATE_PS,
         "thrust followed": thrust_rate < MAX_THRUST_RATE_PS,
         "loaded": load > MIN_LOAD_RATIO * standing,
         "torque free": np.abs(torque) < MAX_TORQUE_RATIO * robot.motors.torque_max_nm,
         "current known": np.isfinite(thrust),
         "attitude known": np.repeat(np.asarray(np.isfinite(load).all(axis=1))[:, None], 3, axis=1),
     }
-    straight = np.abs(contacts.left_mps) < math.tan(MAX_SLIP_ANGLE_RAD) * np.abs(contacts.forward_mps)
+    straight = np.abs(left) < math.tan(MAX_SLIP_ANGLE_RAD) * np.abs(forward)
     balanced = moving & fresh & (np.abs(track.state("yaw_rate_radps")) < MAX_YAW_RATE_RADPS)
     known = straight & conditions["current known"] & conditions["attitude known"]
-    noise_a = sensors.current_std_a * math.sqrt(_noise_gain(clock, sensors.encoder_time_constant_s))
-    cos_along = np.cos(contacts.steer_rad) * along[:, :1] + np.sin(contacts.steer_rad) * along[:, 1:]
-    factor = contacts.vector_factor
+    noise_a = sensors.current_std_a
+    if time_constant_s > 0 and clock.size > 1:  # of white noise behind a low-pass filter at this rate
+        remaining = math.exp(-float(np.median(np.diff(clock))) / time_constant_s)
+        noise_a *= math.sqrt((1.0 - remaining) / (1.0 + remaining))
+    cos_along = np.cos(steer) * along[:, :1] + np.sin(steer) * along[:, 1:]
     return WheelForces(
         time_s=clock,
-        slip_ratio=np.where(conditions["slip known"], contacts.slip_ratio * factor, np.nan),
+        slip_ratio=np.where(conditions["slip known"], along_slip * factor, np.nan),
         slip_std=slip.slip_std,
         thrust_n=thrust * factor,
         load_npkg=load,
-        reference_speed_mps=contacts.reference_speed_mps,
+        reference_speed_mps=reference,
         total_thrust_n=(thrust * cos_along).sum(axis=1),
         speed_mps=speed,
         grade_mps2=GRAVITY_MPS2 * (up[:, :2] * along).sum(axis=1),
@@ -336,36 +300,11 @@ def _check_channels(run: RunLog, robot: Robot) -> None:
             raise DataError(f"run {run.run_id}: stream {stream!r} has no channel {missing[0]!r}")
 
 
-def _up(run: RunLog, clock: Array, imu_latency_s: float, time_constant_s: float) -> Array:
-    """Return the direction of up (n, 3) in the body frame."""
-    imu = run.streams["imu"]
-    angles = {name: imu.channel(name) for name in ("roll_rad", "pitch_rad")}
-    tilt = on_clock(clock, imu.time_s - imu_latency_s, angles, time_constant_s)
-    roll, pitch = tilt["roll_rad"], tilt["pitch_rad"]
-    return np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
-
-
-def _wheel_torque(run: RunLog, robot: Robot, clock: Array) -> Array:
-    """Return the torque (n, wheels) at each wheel by its current."""
-    wheels = run.streams["wheels"]
-    current_a = {name: wheels.channel(name) for name in (f"current_{wheel}_a" for wheel in robot.wheels)}
-    filtered = on_clock(clock, wheels.time_s, current_a, robot.sensors.encoder_time_constant_s)
-    return np.column_stack(list(filtered.values())) * robot.motors.nm_per_a
-
-
 def _smooth(values: Array, time_s: Array) -> Array:
     """Return a centred mean over :data:`RATE_SMOOTHING_S`."""
     half = round(0.5 * RATE_SMOOTHING_S / float(np.median(np.diff(time_s)))) if time_s.size > 1 else 0
     padded = np.pad(values, ((half, half), (0, 0)), mode="edge")
     return np.asarray(np.mean([padded[i : i + len(values)] for i in range(2 * half + 1)], axis=0))
-
-
-def _noise_gain(time_s: Array, time_constant_s: float) -> float:
-    """Return the variance of white noise behind a low-pass filter at this rate, relative to that before."""
-    if time_constant_s <= 0 or time_s.size < 2:
-        return 1.0
-    keep = math.exp(-float(np.median(np.diff(time_s))) / time_constant_s)
-    return (1.0 - keep) / (1.0 + keep)
 
 
 def valid_intervals(time_s: Array, valid: Array, length_s: float) -> list[slice]:
