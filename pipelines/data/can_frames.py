@@ -32,10 +32,9 @@ from terrain.files.documents import read_yaml
 from terrain.files.names import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.labels import whole_run_label
-from terrain.logs.mapping import check_unit
 from terrain.logs.parts import Assembler, Part
 from terrain.logs.samples import checked_stream
-from terrain.logs.schema import UNIT_SCALES, canonical_unit, unit_of
+from terrain.logs.schema import UNIT_SCALES, canonical_unit, check_unit, unit_of
 from terrain.records import Reading, RunLog, Stream
 
 if TYPE_CHECKING:

@@ -71,7 +71,7 @@ from terrain.logs.held import CHANNELS as TWIST_CHANNELS
 from terrain.logs.held import (
     N_FRAME,
     body_twists,
-    dated,
+    dated_poses,
     frame_coefficient,
     is_first_pose,
     new_poses,
@@ -79,28 +79,22 @@ from terrain.logs.held import (
     usual_hold,
     usual_wait,
 )
-from terrain.logs.imu_axes import ImuAxes, find_axes
+from terrain.logs.imu_axes import find_axes
 from terrain.logs.samples import check_log_file, checked_names, checked_stream, short_name
-from terrain.logs.tables import data_row, read_columns
+from terrain.logs.tables import read_table, row_number
 from terrain.records import Array, Label, RunLog
 
 FILE_NAME = "samples.csv.gz"
 
 STREAMS: dict[str, dict[str, tuple[str, float]]] = {
-    "wheels": {
-        "speed_left_mps": ("wheel_left", 1.0),
-        "speed_right_mps": ("wheel_right", 1.0),
-    },
+    "wheels": {"speed_left_mps": ("wheel_left", 1.0), "speed_right_mps": ("wheel_right", 1.0)},
     "imu": {
         "gyro_z_radps": ("imu_yaw", 1.0),
         "accel_x_mps2": ("imu_ax", -1.0),
         "accel_y_mps2": ("imu_ay", -1.0),
         "accel_z_mps2": ("imu_az", 1.0),
     },
-    "commands": {
-        "wheel_left_radps": ("cmd_left", 1.0),
-        "wheel_right_radps": ("cmd_right", 1.0),
-    },
+    "commands": {"wheel_left_radps": ("cmd_left", 1.0), "wheel_right_radps": ("cmd_right", 1.0)},
 }
 """Column and factor of each channel that is read as it stands; those of the wheels are times the radius."""
 
@@ -108,21 +102,12 @@ MAX_OVERSPEED = 1.5
 """Wheels that turn so many times as fast as the robot's own ever do are those of another robot; downhill, or
 with a measurement's noise, they turn 1.1 times as fast."""
 
-_KEYS = ("step", "window", "steady", "time")
-_POSE = ("icp_x", "icp_y", "icp_yaw")
+_KEYS, _POSE = ("step", "window", "steady", "time"), ("icp_x", "icp_y", "icp_yaw")
 _MAX_OVERLAP = 5  # samples; 3 is the most that is there
-_SESSION_NAME = re.compile(r"(.+)_\d+")
 
 
 class DriveRobot(NamedTuple):
-    """What a reader has to know of the robot that a log does not name.
-
-    Parameters
-    ----------
-    name : as run logs have it
-    wheel_radius_m : nominal
-    wheel_rate_max_radps : fastest that its wheels turn; infinite where unknown
-    """
+    """What a reader has to know of the robot that a log does not name; its fastest wheel rate may be infinite."""
 
     name: str
     wheel_radius_m: float
@@ -130,10 +115,10 @@ class DriveRobot(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class DriveWindows:
+class _Session:
     """A whole session: n windows of k samples."""
 
-    name: str
+    file: str
     robot: str
     session: str  # empty where it has no name
     terrain: str  # empty where unknown
@@ -147,15 +132,77 @@ class DriveWindows:
     frame_yaw: Array  # (n,) heading of the frame of a window's positions
 
 
+class _Command(NamedTuple):
+    """The windows ``start`` to ``end``, not included, of a session that make a run."""
+
+    windows: _Session
+    start: int
+    end: int
+
+    def name(self) -> tuple[str, int]:
+        """Return the id of the run and the step of the command."""
+        windows, steps = self.windows, np.unique(self.windows.step[self.start + 1 : self.end])
+        if not steps.size:
+            raise LogError(
+                f"{windows.file}: the command of step {windows.step[self.start]} has one window only, "
+                "at least one with steady 1 must follow it"
+            )
+        if steps.size > 1:
+            listed = ", ".join(map(str, steps))
+            raise LogError(f"{windows.file}: the windows of one command have the steps {listed}")
+        return "_".join([*filter(None, [windows.session]), f"step_{steps[0]:03d}"]), int(steps[0])
+
+    def clock(self) -> tuple[Array, Array]:
+        """Return which samples (windows, k) to keep, and the time of these from the first one of the run."""
+        time_s, steady = self.windows.time_s, self.windows.steady[self.start : self.end]
+        period_s = float(time_s[1] - time_s[0])
+        logged = [self.windows.values[name][self.start : self.end] for name in ("wheels", "imu")]
+        logged_all = np.concatenate(logged, axis=-1)
+        kept, at_s = np.ones(logged_all.shape[:2], dtype=bool), np.zeros(len(steady))
+        for i in range(1, len(steady)):
+            before, after = logged_all[i - 1], logged_all[i]
+            lengths = range(1, _MAX_OVERLAP + 1)
+            if np.array_equal(before[-2], before[-1], equal_nan=True):
+                lengths = range(0)  # a row that was held shows nothing
+            again = max(
+                (n for n in lengths if np.array_equal(before[-n:], after[:n], equal_nan=True)), default=0
+            )
+            kept[i, :again] = False
+            lost = 1 if steady[i - 1] == 0 and not again else 0
+            at_s[i] = at_s[i - 1] + (time_s.size - again + lost) * period_s
+        return kept, (at_s[:, None] + time_s - time_s[0])[kept]
+
+    def run(self, *, repair: bool = False) -> RunLog:
+        windows = self.windows
+        run_id, step = self.name()
+        kept, time_s = self.clock()
+        dropped: Counter[str] = Counter(windows.repairs)
+        streams = {}
+        for name, logged in windows.values.items():
+            values = logged[self.start : self.end][kept]
+            if name == "wheels":
+                values = undo_hold(values, time_s, windows.held)
+            sources = STREAMS.get(name, {})
+            streams[name] = checked_stream(
+                f"{windows.file}, {run_id}",
+                time_s,
+                values,
+                list(sources) or TWIST_CHANNELS,
+                columns=[column for column, _ in sources.values()],
+                repairs=dropped if repair else None,
+                unknown_is_a_value=name == "lidar",
+            )
+        until_s = float(time_s[-1] + windows.time_s[1] - windows.time_s[0])
+        labels = (Label(0.0, until_s, windows.terrain),) if windows.terrain else ()
+        source = f"{windows.file}, step {step}, DRIVE layout"
+        run = RunLog(run_id, windows.robot, streams, labels, source, dropped, windows.session)
+        return checked_names(windows.file, run)
+
+
 def find_sessions(folder: Path) -> list[Path]:
     """Return the folders of the sessions: ``folder`` itself, or, if any in it has a log, all those in it.
 
-    Hidden folders are passed over.
-
-    Raises
-    ------
-    LogError
-        if there is a log in ``folder`` and in a folder in it.
+    Hidden folders are passed over.  ``LogError`` where there is a log in ``folder`` and in a folder in it.
     """
     inside = sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
     logged = [path for path in inside if (path / FILE_NAME).is_file()]
@@ -188,112 +235,35 @@ def find_runs(folder: Path, robot: DriveRobot) -> list[Callable[..., RunLog]]:
     """
     readers: list[Callable[..., RunLog]] = []
     for path in find_sessions(folder):
-        if not (path / FILE_NAME).is_file():
+        if (path / FILE_NAME).is_file():
+            readers += [partial(_Command.run, command) for command in _commands_of(path, folder, robot)]
+        else:
             readers.append(partial(_refuse, path))
-            continue
-        readers += [partial(_run, *command) for command in commands_of(path, path != folder, robot)]
     return readers
-
-
-def commands_of(path: Path, named: bool, robot: DriveRobot) -> list[tuple[DriveWindows, int, int]]:
-    """Return the commands of a session: all its windows, and which of them are the command's.
-
-    Parameters
-    ----------
-    path : folder of the session
-    named : whether the name of its folder is that of the session, even without a number
-    robot : that drove it
-    """
-    name = normal_name(path.resolve().name)
-    numbered = _SESSION_NAME.fullmatch(name)
-    session = name if numbered or named else ""
-    windows = _read_windows(
-        check_log_file(path / FILE_NAME, path), robot, session, numbered[1] if numbered else ""
-    )
-    starts = np.flatnonzero(windows.steady == 0)
-    if starts.size == 0 or starts[0] != 0:
-        raise LogError(f"{windows.name}: the first window has steady 1; a command begins with steady 0")
-    ends = [*starts[1:].tolist(), len(windows.steady)]
-    return [(windows, start, end) for start, end in zip(starts.tolist(), ends, strict=True)]
 
 
 def _refuse(folder: Path, *, repair: bool = False) -> RunLog:
     raise LogError(f"{folder}: has no {FILE_NAME}, which the other sessions beside it have")
 
 
-def _run(windows: DriveWindows, start: int, end: int, *, repair: bool = False) -> RunLog:
-    """Return the run of the windows ``start`` to ``end``, the last not included."""
-    run_id, step = named_run(windows, start, end)
-    kept, time_s = on_one_clock(windows, start, end)
-    dropped: Counter[str] = Counter(windows.repairs)
-    streams = {}
-    for name, logged in windows.values.items():
-        is_lidar = name == "lidar"
-        values = logged[start:end][kept]
-        if name == "wheels":
-            values = undo_hold(values, time_s, windows.held)
-        columns = () if is_lidar else [column for column, _ in STREAMS[name].values()]
-        streams[name] = checked_stream(
-            f"{windows.name}, {run_id}",
-            time_s,
-            values,
-            TWIST_CHANNELS if is_lidar else list(STREAMS[name]),
-            row_of=int,  # times are made here: no row is at fault
-            columns=columns,
-            repairs=dropped if repair else None,
-            unknown_is_a_value=is_lidar,
-        )
-    until_s = float(time_s[-1] + windows.time_s[1] - windows.time_s[0])
-    run = RunLog(
-        run_id,
-        windows.robot,
-        streams,
-        (Label(0.0, until_s, windows.terrain),) if windows.terrain else (),
-        source=f"{windows.name}, step {step}, DRIVE layout",
-        dropped=dropped,
-        session=windows.session,
-    )
-    return checked_names(windows.name, run)
+def _commands_of(path: Path, data: Path, robot: DriveRobot) -> list[_Command]:
+    """Return the commands of a session; the name of its folder is that of the session if it has a number."""
+    name = normal_name(path.resolve().name)
+    numbered = re.fullmatch(r"(.+)_\d+", name)
+    session = name if numbered or path != data else ""
+    terrain = numbered[1] if numbered else ""
+    windows = _read_session(check_log_file(path / FILE_NAME, path), robot, session, terrain)
+    starts = np.flatnonzero(windows.steady == 0).tolist()
+    if not starts or starts[0] != 0:
+        raise LogError(f"{windows.file}: the first window has steady 1; a command begins with steady 0")
+    ends = [*starts[1:], len(windows.steady)]
+    return [_Command(windows, start, end) for start, end in zip(starts, ends, strict=True)]
 
 
-def named_run(windows: DriveWindows, start: int, end: int) -> tuple[str, int]:
-    """Return the name and the step of the run of some windows."""
-    if end - start < 2:
-        raise LogError(
-            f"{windows.name}: the command of step {windows.step[start]} has one window only, "
-            f"at least one with steady 1 must follow it"
-        )
-    steps = np.unique(windows.step[start + 1 : end])
-    if steps.size > 1:
-        raise LogError(
-            f"{windows.name}: the windows of one command have the steps {', '.join(map(str, steps))}"
-        )
-    return "_".join([*filter(None, [windows.session]), f"step_{steps[0]:03d}"]), int(steps[0])
-
-
-def on_one_clock(windows: DriveWindows, start: int, end: int) -> tuple[Array, Array]:
-    """Return which samples (windows, k) to keep, and the time of these from the first one of the run."""
-    time_s = windows.time_s
-    period_s = float(time_s[1] - time_s[0])
-    logged = np.concatenate([windows.values[name][start:end] for name in ("wheels", "imu")], axis=-1)
-    kept = np.ones(logged.shape[:2], dtype=bool)
-    at_s = np.zeros(end - start)
-    for i in range(1, end - start):
-        before, after = logged[i - 1], logged[i]
-        lengths = range(1, _MAX_OVERLAP + 1)
-        if np.array_equal(before[-2], before[-1], equal_nan=True):
-            lengths = range(0)  # a row that was held says nothing
-        again = max((n for n in lengths if np.array_equal(before[-n:], after[:n], equal_nan=True)), default=0)
-        kept[i, :again] = False
-        lost = 1 if windows.steady[start + i - 1] == 0 and not again else 0
-        at_s[i] = at_s[i - 1] + (time_s.size - again + lost) * period_s
-    return kept, (at_s[:, None] + time_s - time_s[0])[kept]
-
-
-def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> DriveWindows:
+def _read_session(path: Path, robot: DriveRobot, session: str, terrain: str) -> _Session:
     sources = {name: list(columns.values()) for name, columns in STREAMS.items()}
     read = [*_KEYS, *_POSE, *(column for pairs in sources.values() for column, _ in pairs)]
-    table = read_columns(path, read)
+    table = read_table(path, read)
     keys = _checked_keys(path, table[:, : len(_KEYS)])
     n, k, _ = keys.shape
     time_s = keys[0, :, 3]
@@ -303,41 +273,26 @@ def _read_windows(path: Path, robot: DriveRobot, session: str, terrain: str) -> 
         name: np.stack([columns[column] * factor for column, factor in pairs], axis=-1)
         for name, pairs in sources.items()
     }
-    held = tuple(usual_hold(wheel, period_s) for wheel in np.moveaxis(values["wheels"], -1, 0))
-    refuse_other_robot(short_name(path), values["wheels"], robot)
-    values["wheels"] *= robot.wheel_radius_m
-    axes = _imu_axes(values["wheels"], values["imu"], period_s)
-    values["imu"] *= (axes.gyro_z, *axes.accel)
+    wheels, imu = values["wheels"], values["imu"]
+    held = tuple(usual_hold(wheel, period_s) for wheel in np.moveaxis(wheels, -1, 0))
+    refuse_other_robot(short_name(path), wheels, robot)
+    wheels *= robot.wheel_radius_m
+    axes = find_axes([(*w.T, i[:, 0], i[:, 1:]) for w, i in zip(wheels, imu, strict=True)], period_s)
+    imu *= (axes.gyro_z, *axes.accel)
+    repairs = axes.repairs()
     pose = np.stack([columns[name] for name in _POSE], axis=-1)
-    own_frame = is_first_pose(*frame_coefficient(pose, values["wheels"], period_s))
-    frame_yaw = pose[:, 0, 2] if own_frame else pose[:, :N_FRAME, 2].mean(axis=1)
-    values["lidar"], _ = body_twists(pose, period_s, frame_yaw=frame_yaw)
-    step, steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
-    time_s = np.arange(k) * period_s
-    name, repairs = short_name(path), axes.repairs()
-    if own_frame:
+    frame_yaw = pose[:, :N_FRAME, 2].mean(axis=1)
+    if is_first_pose(*frame_coefficient(pose, wheels, period_s)):
+        frame_yaw = pose[:, 0, 2]
         repairs["lidar: positions in the frame of the first pose"] = len(pose)
-    labels = (name, robot.name, session, terrain)
-    return DriveWindows(*labels, step, steady, time_s, values, held, repairs, pose, frame_yaw)
-
-
-def _imu_axes(wheels_mps: Array, imu: Array, period_s: float) -> ImuAxes:
-    """Return what brings the imu of a session, read as the Husky's, into the robot's axes."""
-    return find_axes(
-        [(each[:, 0], each[:, 1], own[:, 0], own[:, 1:]) for each, own in zip(wheels_mps, imu, strict=True)],
-        period_s,
-    )
+    values["lidar"], _ = body_twists(pose, period_s, frame_yaw)
+    step, steady = (keys[:, 0, i].astype(np.int64) for i in (0, 2))
+    about = (short_name(path), robot.name, session, terrain, step, steady, np.arange(k) * period_s)
+    return _Session(*about, values, held, repairs, pose, frame_yaw)
 
 
 def refuse_other_robot(name: str, wheel_radps: Array, robot: DriveRobot) -> None:
-    """Refuse wheels that turn much faster than those of a robot ever do.
-
-    Parameters
-    ----------
-    name : of the file, for the message
-    wheel_radps : (..., 2)
-    robot : that is taken for the one that drove
-    """
+    """Refuse wheels (..., 2) of a file that turn much faster than those of a robot ever do; ``LogError``."""
     fastest = float(np.nanmax(np.abs(wheel_radps), initial=0.0))
     if fastest > MAX_OVERSPEED * robot.wheel_rate_max_radps:
         raise LogError(
@@ -353,7 +308,7 @@ def _checked_keys(path: Path, keys: Array) -> Array:
         raise LogError(f"{name}: has no rows of data")
     for row, key in np.argwhere(~np.isfinite(keys)):
         raise LogError(
-            f"{name}: {_KEYS[key]} at row {data_row(path, int(row))} is not finite ({keys[row, key]})"
+            f"{name}: {_KEYS[key]} at row {row_number(path, int(row))} is not finite ({keys[row, key]})"
         )
     starts = np.flatnonzero(np.diff(keys[:, 1], prepend=np.nan) != 0.0)
     sizes = np.diff(starts, append=len(keys))
@@ -381,13 +336,7 @@ def _checked_keys(path: Path, keys: Array) -> Array:
 
 
 class WindowPoses(NamedTuple):
-    """Poses of a window of a command, in the frame of the first of them.
-
-    Parameters
-    ----------
-    time_s : (m,) on the clock of the run
-    pose : (m, 3) x, y and yaw of the lidar's point
-    """
+    """Poses (m, 3) of a window in the frame of the first, x, y, yaw of the lidar's point, by time (m,) of the run."""
 
     time_s: Array
     pose: Array
@@ -396,34 +345,24 @@ class WindowPoses(NamedTuple):
 def read_window_poses(folder: Path, robot: DriveRobot) -> dict[str, tuple[WindowPoses, ...]]:
     """Return the lidar poses of each run's windows, as far as their time is known.
 
-    A window without two such poses is left out.
-
-    Parameters
-    ----------
-    folder, robot : as :func:`terrain.logs.drive.find_runs` takes them
+    A window without two such poses is left out; ``folder`` and ``robot`` are as :func:`find_runs` takes them.
     """
-    found: dict[str, tuple[WindowPoses, ...]] = {}
+    runs: dict[str, tuple[WindowPoses, ...]] = {}
     for path in find_sessions(folder):
-        for windows, start, end in commands_of(path, path != folder, robot):
-            run_id, _ = named_run(windows, start, end)
-            kept, time_s = on_one_clock(windows, start, end)
-            begins_s = time_s[np.cumsum(kept.sum(axis=1)) - 1] - windows.time_s[-1]
-            scan = usual_wait(new_poses(windows.pose))
-            poses = (_window_poses(windows, start + i, begins_s[i], scan) for i in range(end - start))
-            found[run_id] = tuple(window for window in poses if len(window.time_s) > 1)
-    return found
-
-
-def _window_poses(windows: DriveWindows, which: int, begins_s: float, scan: int) -> WindowPoses:
-    """Return the poses of one window whose time is known, in the frame of the first."""
-    published = windows.pose[which]
-    arrival = np.flatnonzero(new_poses(published[None])[0])
-    at, usable = dated(arrival, len(published), scan)
-    pose = published[arrival[usable]].copy()
-    pose[:, 2] = np.unwrap(pose[:, 2])
-    if not len(pose):
-        return WindowPoses(np.empty(0), pose)
-    heading = pose[0, 2] - windows.frame_yaw[which]
-    offset = (pose[:, 0] - pose[0, 0] + 1j * (pose[:, 1] - pose[0, 1])) * np.exp(-1j * heading)
-    moved = np.column_stack([offset.real, offset.imag, pose[:, 2] - pose[0, 2]])
-    return WindowPoses(begins_s + windows.time_s[at[usable]], moved)
+        for command in _commands_of(path, folder, robot):
+            session = command.windows
+            kept, time_s = command.clock()
+            begins_s = time_s[np.cumsum(kept.sum(axis=1)) - 1] - session.time_s[-1]
+            new = new_poses(session.pose)
+            scan = usual_wait(new)
+            windows = []
+            for i, begin_s in enumerate(begins_s, command.start):
+                at, pose, _ = dated_poses(session.pose[i], new[i], scan)
+                if len(pose) < 2:
+                    continue
+                turn = np.exp(-1j * (pose[0, 2] - session.frame_yaw[i]))
+                place = (pose[:, 0] - pose[0, 0] + 1j * (pose[:, 1] - pose[0, 1])) * turn
+                at_first = np.column_stack([place.real, place.imag, pose[:, 2] - pose[0, 2]])
+                windows.append(WindowPoses(begin_s + session.time_s[at], at_first))
+            runs[command.name()[0]] = tuple(windows)
+    return runs

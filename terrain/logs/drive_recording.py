@@ -46,8 +46,7 @@ A recording is cut into runs: one a command, and what an operator drove between 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -59,7 +58,7 @@ from terrain.files.names import normal_name
 from terrain.logs.drive import FILE_NAME as SAMPLES_FILE
 from terrain.logs.drive import DriveRobot, refuse_other_robot
 from terrain.logs.held import CHANNELS as TWIST_CHANNELS
-from terrain.logs.held import MAX_STD, body_twists, dated, new_poses, undo_hold, usual_hold, usual_wait
+from terrain.logs.held import MAX_STD, body_twists, dated_poses, new_poses, undo_hold, usual_hold, usual_wait
 from terrain.logs.imu_axes import MIN_MOVING_RADPS, POWER_SIGN, current_sign, find_axes, with_sign_of_torque
 from terrain.logs.samples import (
     BAD_TIME,
@@ -70,7 +69,7 @@ from terrain.logs.samples import (
     short_name,
 )
 from terrain.logs.schema import POSE_CHANNELS
-from terrain.logs.tables import data_row, read_columns, read_words
+from terrain.logs.tables import read_table, row_number, text_rows
 from terrain.records import Array, Label, RunLog
 
 MIN_RUN_S = 2.0
@@ -82,94 +81,8 @@ STANDING_S = 2.0
 MARGIN_S = 0.5
 """What is kept of the standing before and after it: starts and stops are whole."""
 
-
-class Cut(NamedTuple):
-    """Rows ``first`` to ``end`` (not included) of a recording that make one run.
-
-    Parameters
-    ----------
-    name : ``step_003``, or ``hand_000`` of what an operator drove
-    first, end : rows
-    commanded : whether the logged command drove it
-    """
-
-    name: str
-    first: int
-    end: int
-    commanded: bool
-
-
-def cut_recording(
-    step: Array, commanded: Array, moving: Array, breaks: Array, period_s: float
-) -> tuple[tuple[Cut, ...], int]:
-    """Return the runs of a recording, and how many commands were left out because nothing moved.
-
-    A run is what follows without a break in one step under the logged command (``step_003``; where an
-    operator intervened, so that it was begun anew, ``step_003_2``), or what was driven otherwise, between two
-    times of standing (``hand_000``, ``hand_001``).
-
-    Parameters
-    ----------
-    step : (n,) number of the command
-    commanded : (n,) whether the logged command drives
-    moving : (n,) whether a wheel turns
-    breaks : (n,) whether samples are lost before a row
-    period_s : from row to row
-
-    Examples
-    --------
-    >>> step = np.repeat([0, 1, 2], 60)
-    >>> moving = np.repeat([False, True, True, False], 45)
-    >>> cut_recording(step, step > 0, moving, np.zeros(180, bool), 0.05)[0][:2]
-    (Cut(name='step_001', first=60, end=120, commanded=True),
-     Cut(name='step_002', first=120, end=180, commanded=True))
-    """
-    n_min = round(MIN_RUN_S / period_s)
-    runs: list[Cut] = []
-    seen: dict[int, int] = {}
-    n_still = 0
-    for first, end in _stretches(np.column_stack([step, commanded]), breaks):
-        if not commanded[first] or end - first < n_min:
-            continue
-        if not moving[first:end].any():
-            n_still += 1
-            continue
-        number = int(step[first])
-        seen[number] = seen.get(number, 0) + 1
-        again = f"_{seen[number]}" if seen[number] > 1 else ""
-        runs.append(Cut(f"step_{number:03d}{again}", first, end, True))
-    n_hand = 0
-    for first, end in _stretches(np.asarray(commanded)[:, None], breaks):
-        if commanded[first]:
-            continue
-        for start, stop in _driven(moving[first:end], period_s):
-            if stop - start >= n_min:
-                runs.append(Cut(f"hand_{n_hand:03d}", first + start, first + stop, False))
-                n_hand += 1
-    return tuple(sorted(runs, key=lambda cut: cut.first)), n_still
-
-
-def _stretches(keys: Array, breaks: Array) -> Sequence[tuple[int, int]]:
-    """Return first row and end of each stretch of equal keys (n, k) without a break."""
-    if not len(keys):
-        return []
-    starts = np.flatnonzero(np.r_[True, (keys[1:] != keys[:-1]).any(axis=1) | breaks[1:].astype(bool)])
-    return list(zip(starts.tolist(), [*starts[1:].tolist(), len(keys)], strict=True))
-
-
-def _driven(moving: Array, period_s: float) -> list[tuple[int, int]]:
-    """Return what lies between two times of standing, with a margin on both sides."""
-    rows = np.flatnonzero(moving)
-    if not rows.size:
-        return []
-    apart = np.flatnonzero(np.diff(rows) * period_s > STANDING_S)
-    margin = round(MARGIN_S / period_s)
-    firsts, lasts = rows[np.r_[0, apart + 1]], rows[np.r_[apart, rows.size - 1]]
-    return [
-        (max(int(first) - margin, 0), min(int(last) + 1 + margin, len(moving)))
-        for first, last in zip(firsts, lasts, strict=True)
-    ]
-
+BREAK_PERIODS = 2.5
+"""A longer wait between two rows ends a run: samples are lost."""
 
 SUFFIX = ".csv.gz"
 
@@ -192,40 +105,97 @@ COMMANDS: dict[str, str] = {"speed_x_mps": "cmd_vel_x", "yaw_rate_radps": "cmd_v
 POSE: tuple[str, ...] = ("icp_pos_x", "icp_pos_y", "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w")
 STATE, STEP, TIME = "calib_state", "calib_step", "time"
 
-BREAK_PERIODS = 2.5
-"""A longer wait between two rows ends a run: samples are lost."""
-
 NOT_RECORDED = "columns that were not recorded"
 LOST = "poses where the lidar lost the robot"
 STILL = "commands under which nothing moved"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Recording:
-    """A whole recording, row by row; streams that it lacks are missing."""
+class Cut(NamedTuple):
+    """Rows ``first`` to ``end`` (not included) of a recording that make one run, driven by a command or by hand."""
 
-    name: str
-    session: str
-    robot: str
-    terrain: str
-    time_s: Array  # (n,)
-    period_s: float
-    values: dict[str, Array]  # by stream (n, channels)
-    channels: dict[str, tuple[str, ...]]
-    posed: Array  # (n,) whether a pose is of a row
-    dropped: Counter[str]
+    name: str  # step_003, or hand_000
+    first: int
+    end: int
+    commanded: bool
+
+
+def cut_recording(
+    step: Array, commanded: Array, moving: Array, breaks: Array, period_s: float
+) -> tuple[tuple[Cut, ...], int]:
+    """Return the runs of a recording, and how many commands were left out because nothing moved.
+
+    A run is what follows without a break in one step under the logged command (``step_003``; where an
+    operator intervened, so that it was begun anew, ``step_003_2``), or what was driven otherwise, between two
+    times of standing (``hand_000``, ``hand_001``).
+
+    Parameters
+    ----------
+    step, commanded, moving, breaks : (n,) number of the command, and whether the logged command drives, a wheel
+        turns, and samples are lost before a row
+    period_s : from row to row
+
+    Examples
+    --------
+    >>> step = np.repeat([0, 1, 2], 60)
+    >>> moving = np.repeat([False, True, True, False], 45)
+    >>> cut_recording(step, step > 0, moving, np.zeros(180, bool), 0.05)[0][:2]
+    (Cut(name='step_001', first=60, end=120, commanded=True),
+     Cut(name='step_002', first=120, end=180, commanded=True))
+    """
+    n_min = round(MIN_RUN_S / period_s)
+    runs: list[Cut] = []
+    seen: Counter[int] = Counter()
+    n_still = 0
+    for first, end in _stretches(np.column_stack([step, commanded]), breaks):
+        if not commanded[first] or end - first < n_min:
+            continue
+        if not moving[first:end].any():
+            n_still += 1
+            continue
+        number = int(step[first])
+        seen[number] += 1
+        again = f"_{seen[number]}" if seen[number] > 1 else ""
+        runs.append(Cut(f"step_{number:03d}{again}", first, end, True))
+    n_hand = 0
+    for first, end in _stretches(np.asarray(commanded)[:, None], breaks):
+        for start, stop in () if commanded[first] else _driven(moving[first:end], period_s):
+            if stop - start >= n_min:
+                runs.append(Cut(f"hand_{n_hand:03d}", first + start, first + stop, False))
+                n_hand += 1
+    return tuple(sorted(runs, key=lambda cut: cut.first)), n_still
+
+
+def _stretches(keys: Array, breaks: Array) -> Iterator[tuple[int, int]]:
+    """Return first row and end of each stretch of equal keys (n, k) without a break."""
+    changes = (keys[1:] != keys[:-1]).any(axis=1) | breaks[1:].astype(bool)
+    starts = np.flatnonzero(np.r_[len(keys) > 0, changes]).tolist()
+    return zip(starts, [*starts[1:], len(keys)], strict=False)
+
+
+def _driven(moving: Array, period_s: float) -> list[tuple[int, int]]:
+    """Return what lies between two times of standing, with a margin on both sides."""
+    rows = np.flatnonzero(moving)
+    if not rows.size:
+        return []
+    apart = np.flatnonzero(np.diff(rows) * period_s > STANDING_S)
+    margin = round(MARGIN_S / period_s)
+    firsts = np.maximum(rows[np.r_[0, apart + 1]] - margin, 0).tolist()
+    ends = np.minimum(rows[np.r_[apart, rows.size - 1]] + 1 + margin, len(moving)).tolist()
+    return list(zip(firsts, ends, strict=True))
 
 
 def find_recordings(folder: Path) -> list[Path]:
     """Return the recordings in a folder, or in the folders in it, sorted; hidden ones are passed over."""
-    own = [path for path in folder.glob(f"*{SUFFIX}") if _is_recording(path)]
-    return sorted(own or [path for path in folder.glob(f"*/*{SUFFIX}") if _is_recording(path)])
+    for pattern in (f"*{SUFFIX}", f"*/*{SUFFIX}"):
+        if paths := [
+            path for path in folder.glob(pattern) if path.name != SAMPLES_FILE and not _is_hidden(path)
+        ]:
+            return sorted(paths)
+    return []
 
 
-def _is_recording(path: Path) -> bool:
-    return (
-        not path.name.startswith(".") and not path.parent.name.startswith(".") and path.name != SAMPLES_FILE
-    )
+def _is_hidden(path: Path) -> bool:
+    return path.name.startswith(".") or path.parent.name.startswith(".")
 
 
 def find_runs(folder: Path, robot_of: Callable[[str], DriveRobot]) -> list[Callable[..., RunLog]]:
@@ -236,152 +206,158 @@ def find_runs(folder: Path, robot_of: Callable[[str], DriveRobot]) -> list[Calla
 
     Parameters
     ----------
-    folder : of recordings, or of such folders, named ``<robot>_<terrain>``
-    robot_of : the robot of a name
-
-    Raises
-    ------
-    LogError
-        if a folder's name has no terrain.
-    ConfigError
-        if there is no robot of a folder's name.
+    folder : of recordings, or of such folders, named ``<robot>_<terrain>``; ``LogError`` where a name has no terrain
+    robot_of : the robot of a name; ``ConfigError`` where there is none
     """
     readers: list[Callable[..., RunLog]] = []
     for path in find_recordings(folder):
-        robot, terrain = named_by_folder(path)
-        readers += _readers_of(path, robot_of(robot), terrain)
-    return readers
-
-
-def named_by_folder(path: Path) -> tuple[str, str]:
-    """Return robot and terrain of a recording by the name of its folder.
-
-    Examples
-    --------
-    >>> named_by_folder(Path("husky_wet_grass/wetgrass.csv.gz"))
-    ('husky', 'wet_grass')
-    """
-    name = normal_name(path.resolve().parent.name)
-    robot, _, terrain = name.partition("_")
-    if not robot or not terrain:
-        raise LogError(
-            f"{short_name(path)}: its folder is called {name!r}, which has to name robot and terrain, as "
-            "husky_wet_grass"
-        )
-    return robot, terrain
-
-
-def _readers_of(path: Path, robot: DriveRobot, terrain: str) -> list[Callable[..., RunLog]]:
-    fault: LogError | None = None
-    try:
-        recording, cuts = _read(path, robot, terrain, repair=False)
-    except LogError as error:
-        fault = error
+        name = normal_name(path.resolve().parent.name)
+        robot_name, _, terrain = name.partition("_")
+        if not robot_name or not terrain:
+            raise LogError(
+                f"{short_name(path)}: its folder is called {name!r}, which has to name robot and terrain, as "
+                "husky_wet_grass"
+            )
+        robot = robot_of(robot_name)
+        fault: LogError | None = None
         try:
-            recording, cuts = _read(path, robot, terrain, repair=True)
-        except LogError:
-            return [partial(_refuse, error)]
-    return [partial(_run, recording, cut, fault, index == 0) for index, cut in enumerate(cuts)]
+            recording = _Recording(path, robot, terrain, repair=False)
+        except LogError as error:
+            fault = error
+            try:
+                recording = _Recording(path, robot, terrain, repair=True)
+            except LogError:
+                readers.append(partial(_refuse, error))
+                continue
+        readers += [partial(recording.run, cut, fault) for cut in recording.cuts]
+    return readers
 
 
 def _refuse(fault: LogError, *, repair: bool = False) -> RunLog:
     raise fault
 
 
-def _run(
-    recording: _Recording, cut: Cut, fault: LogError | None, first: bool, *, repair: bool = False
-) -> RunLog:
-    """Return one run; what concerns the whole recording is counted with its first one."""
-    if fault is not None and not repair:
-        raise fault
-    dropped: Counter[str] = Counter(recording.dropped if first else {})
-    rows = slice(cut.first, cut.end)
-    run_id = f"{recording.session}_{cut.name}"
-    time_s = recording.time_s[rows] - recording.time_s[cut.first]
-    streams = {}
-    for name, values in recording.values.items():
-        if name == "commands" and not cut.commanded:
-            continue
-        kept = np.ones(len(time_s), dtype=bool)
-        if name == "pose":
-            kept = recording.posed[rows]
-            if kept.sum() < 2:
+class _Recording:
+    """A whole recording, row by row, cut into runs; streams that it lacks are missing."""
+
+    def __init__(self, path: Path, robot: DriveRobot, terrain: str, *, repair: bool) -> None:
+        self.name, self.robot, self.terrain = short_name(check_log_file(path, path.parent)), robot, terrain
+        self.session = normal_name(f"{path.resolve().parent.name}_{path.name.removesuffix(SUFFIX)}")
+        self.dropped: Counter[str] = Counter()
+        repairs = self.dropped if repair else None
+        columns = [TIME, STEP, *WHEELS.values(), *IMU.values(), *COMMANDS.values(), *POSE]
+        table = read_table(path, columns, repairs=repairs)
+        state = np.array([cells[0] for _, cells in text_rows(path, [STATE]) if cells is not None])
+        if len(table) < 2:
+            raise LogError(f"{self.name}: has {len(table)} rows of data, at least 2 are needed")
+        table, state = _with_rising_time(path, table, state, repairs)
+        column = dict(zip(columns, table.T, strict=True))
+        self.time_s, step = column[TIME], column[STEP]
+        for row in np.flatnonzero(~((step >= 0) & (step == np.floor(step)))):
+            raise LogError(
+                f"{self.name}: {STEP} at row {row + 2} is {step[row]:.15g}; it must be a whole number from 0 up"
+            )
+        wheels, imu, pose, commands = (
+            np.column_stack([column[name] for name in names])
+            for names in (WHEELS.values(), IMU.values(), POSE, COMMANDS.values())
+        )
+        refuse_other_robot(self.name, wheels[:, :2], robot)
+        self.period_s = float(np.median(np.diff(self.time_s)))
+        moving = (np.abs(wheels[:, :2]) >= MIN_MOVING_RADPS).any(axis=1)
+        breaks = np.diff(self.time_s, prepend=self.time_s[0]) > BREAK_PERIODS * self.period_s
+        self.cuts, n_still = cut_recording(step, state == COMMANDED, moving, breaks, self.period_s)
+        if not self.cuts:
+            raise LogError(f"{self.name}: its wheels turn for no more than a moment: it holds no run")
+        channels, wheels = self._wheels(wheels)
+        self.streams = {"wheels": (channels, wheels)}
+        if imu.any():
+            self.streams["imu"] = tuple(IMU), self._imu(imu, wheels[:, :2])
+        else:
+            self.dropped[NOT_RECORDED] += imu.shape[1]
+        poses, self.posed, twist = self._lidar(pose)
+        if not np.isfinite(twist).any():
+            raise LogError(f"{self.name}: its lidar has lost the robot throughout: no pose gives a speed")
+        self.streams |= {"lidar": (TWIST_CHANNELS, twist), "pose": (POSE_CHANNELS, poses)}
+        self.streams["commands"] = tuple(COMMANDS), commands
+        self.dropped[STILL] += n_still
+
+    def run(self, cut: Cut, fault: LogError | None, *, repair: bool = False) -> RunLog:
+        """Return one run; what concerns the whole recording is counted with its first one."""
+        if fault is not None and not repair:
+            raise fault
+        dropped: Counter[str] = Counter(self.dropped if cut == self.cuts[0] else {})
+        rows = slice(cut.first, cut.end)
+        run_id = f"{self.session}_{cut.name}"
+        time_s = self.time_s[rows] - self.time_s[cut.first]
+        streams = {}
+        for name, (channels, logged) in self.streams.items():
+            values, kept = logged[rows], np.ones(len(time_s), dtype=bool)
+            if name == "pose":
+                kept = self.posed[rows]
+            elif name == "imu":
+                kept = np.asarray(~np.isnan(values).all(axis=1))
+            if (name == "commands" and not cut.commanded) or (name == "pose" and kept.sum() < 2):
                 continue
-        if name == "imu":
-            kept = np.asarray(~np.isnan(values[rows]).all(axis=1))
-        streams[name] = checked_stream(
-            f"{recording.name}, {run_id}",
-            time_s[kept],
-            values[rows][kept],
-            recording.channels[name],
-            row_of=lambda row: row + cut.first + 2,
-            repairs=dropped if repair else None,
-            unknown_is_a_value=name in ("lidar", "pose"),
-        )
-    if "pose" in streams:
-        dropped[LOST] += int(np.isnan(streams["pose"].values[:, 0]).sum())
-    run = RunLog(
-        run_id,
-        recording.robot,
-        streams,
-        (Label(0.0, float(time_s[-1]) + recording.period_s, recording.terrain),),
-        source=f"{recording.name}, rows {cut.first + 2} to {cut.end + 1}, recording of DRIVE",
-        dropped={kind: n for kind, n in dropped.items() if n},
-        session=recording.session,
-    )
-    return checked_names(recording.name, run)
+            streams[name] = checked_stream(
+                f"{self.name}, {run_id}",
+                time_s[kept],
+                values[kept],
+                channels,
+                row_of=lambda row: row + cut.first + 2,
+                repairs=dropped if repair else None,
+                unknown_is_a_value=name in ("lidar", "pose"),
+            )
+        if "pose" in streams:
+            dropped[LOST] += int(np.isnan(streams["pose"].values[:, 0]).sum())
+        labels = (Label(0.0, float(time_s[-1]) + self.period_s, self.terrain),)
+        source = f"{self.name}, rows {cut.first + 2} to {cut.end + 1}, recording of DRIVE"
+        run = RunLog(run_id, self.robot.name, streams, labels, source, +dropped, self.session)
+        return checked_names(self.name, run)
 
+    def _wheels(self, logged: Array) -> tuple[tuple[str, ...], Array]:
+        """Return what was recorded of the wheels, as it really changes, and its channels."""
+        recorded = [i for i, values in enumerate(logged.T) if i < 2 or np.nan_to_num(values).any()]
+        self.dropped[NOT_RECORDED] += logged.shape[1] - len(recorded)
+        currents = [i for i in (2, 3) if i in recorded]
+        if currents:
+            kind = current_sign(logged[:, currents], logged[:, [i - 2 for i in currents]])
+            self.dropped[kind] += len(currents) if kind else 0
+            for i in currents if kind == POWER_SIGN else ():
+                logged[:, i] = with_sign_of_torque(logged[:, i], logged[:, i - 2], self.period_s)
+        values = logged[:, recorded]
+        holds = [usual_hold(column[None], self.period_s) for column in values.T]
+        values = undo_hold(values, self.time_s, holds)
+        values[:, :2] *= self.robot.wheel_radius_m
+        return tuple(tuple(WHEELS)[i] for i in recorded), values
 
-def _read(path: Path, robot: DriveRobot, terrain: str, *, repair: bool) -> tuple[_Recording, tuple[Cut, ...]]:
-    """Read a recording, and cut it into runs."""
-    name = short_name(path)
-    check_log_file(path, path.parent)
-    dropped: Counter[str] = Counter()
-    columns = [TIME, STEP, *WHEELS.values(), *IMU.values(), *COMMANDS.values(), *POSE]
-    table = read_columns(path, columns, repair=repair, dropped=dropped)
-    state = np.array(read_words(path, STATE))
-    if len(table) < 2:
-        raise LogError(f"{name}: has {len(table)} rows of data, at least 2 are needed")
-    table, state = _with_rising_time(path, table, state, dropped if repair else None)
-    column = dict(zip(columns, table.T, strict=True))
-    time_s, step = column[TIME], column[STEP]
-    for row in np.flatnonzero(~((step >= 0) & (step == np.floor(step)))):
-        raise LogError(
-            f"{name}: {STEP} at row {row + 2} is {step[row]:.15g}; it must be a whole number from 0 up"
-        )
-    period_s = float(np.median(np.diff(time_s)))
-    wheels = np.column_stack([column[each] for each in WHEELS.values()])
-    refuse_other_robot(name, wheels[:, :2], robot)
-    moving = (np.abs(wheels[:, :2]) >= MIN_MOVING_RADPS).any(axis=1)
-    breaks = np.diff(time_s, prepend=time_s[0]) > BREAK_PERIODS * period_s
-    runs, n_still = cut_recording(step, state == COMMANDED, moving, breaks, period_s)
-    if not runs:
-        raise LogError(f"{name}: its wheels turn for no more than a moment: it holds no run")
-    values, channels = {}, {}
-    values["wheels"], channels["wheels"] = _wheels(wheels, time_s, period_s, robot, dropped)
-    imu = np.column_stack([column[each] for each in IMU.values()])
-    if imu.any():
-        values["imu"], channels["imu"] = (
-            _imu(imu, values["wheels"][:, :2], runs, period_s, dropped),
-            tuple(IMU),
-        )
-    else:
-        dropped[NOT_RECORDED] += imu.shape[1]
-    pose, posed, twist = _lidar(np.column_stack([column[each] for each in POSE]), time_s, period_s)
-    if not np.isfinite(twist).any():
-        raise LogError(f"{name}: its lidar has lost the robot throughout: no pose gives a speed")
-    values |= {
-        "lidar": twist,
-        "pose": pose,
-        "commands": np.column_stack([column[each] for each in COMMANDS.values()]),
-    }
-    channels |= {"lidar": TWIST_CHANNELS, "pose": POSE_CHANNELS, "commands": tuple(COMMANDS)}
-    dropped[STILL] += n_still
-    session = normal_name(f"{path.resolve().parent.name}_{path.name.removesuffix(SUFFIX)}")
-    recording = _Recording(
-        name, session, robot.name, terrain, time_s, period_s, values, channels, posed, dropped
-    )
-    return recording, runs
+    def _imu(self, imu: Array, wheels_mps: Array) -> Array:
+        """Return gyro and accelerometer in the robot's axes; NaN before the first message."""
+        imu[: int(np.flatnonzero(imu.any(axis=1))[0])] = np.nan
+        rows = [slice(cut.first, cut.end) for cut in self.cuts]
+        axes = find_axes([(*wheels_mps[each].T, imu[each, 2], imu[each, 3:]) for each in rows], self.period_s)
+        self.dropped.update(axes.repairs())
+        return np.asarray(imu * (*axes.gyro(), *axes.accel))
+
+    def _lidar(self, logged: Array) -> tuple[Array, Array, Array]:
+        """Return poses (n, 3), which rows (n,) they are of, and the twist (n, 3) at each row."""
+        x, y, z, w = logged[:, 2:].T
+        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        pose = np.column_stack([logged[:, :2], np.where(x * x + y * y + z * z + w * w > 0.5, yaw, np.nan)])
+        place = np.round((self.time_s - self.time_s[0]) / self.period_s).astype(np.intp)  # on an even grid
+        even = pose[np.searchsorted(place, np.arange(place[-1] + 1), side="right") - 1]
+        twists, stds = body_twists(even[None], self.period_s, np.zeros(1))
+        twist, std = twists[0], stds[0]
+        twist[~(std <= MAX_STD).all(axis=1)] = np.nan
+        new = new_poses(even[None])
+        at, _, arrival = dated_poses(even, new[0], usual_wait(new))
+        came = even[arrival]
+        came[:, 2] = np.unwrap(
+            came[:, 2]
+        )  # without what is left out, which may be a registration that jumped
+        came[(std[at] > MAX_STD).any(axis=1)] = np.nan
+        poses, posed = np.full((len(even), 3), np.nan), np.zeros(len(even), dtype=bool)
+        poses[at], posed[at] = came, True
+        return poses[place], posed[place], twist[place]
 
 
 def _with_rising_time(
@@ -397,69 +373,10 @@ def _with_rising_time(
     if repairs is None:
         row = int(fallen[0]) + 1 if fallen.size else int(np.flatnonzero(~np.isfinite(time_s))[0])
         raise LogError(
-            f"{short_name(path)}: time does not rise at row {data_row(path, row)} "
+            f"{short_name(path)}: time does not rise at row {row_number(path, row)} "
             f"({time_s[row]:.15g} s after {time_s[row - 1]:.15g} s): a clock that restarts?"
         )
     finite = np.flatnonzero(np.isfinite(time_s))
     kept = finite[longest_rise(time_s[finite])]
     repairs[BAD_TIME] += len(table) - len(kept)
     return table[kept], state[kept]
-
-
-def _wheels(
-    logged: Array, time_s: Array, period_s: float, robot: DriveRobot, dropped: Counter[str]
-) -> tuple[Array, tuple[str, ...]]:
-    """Return what was recorded of the wheels, as it really changes, and its channels."""
-    recorded = [i for i, values in enumerate(logged.T) if i < 2 or np.nan_to_num(values).any()]
-    dropped[NOT_RECORDED] += logged.shape[1] - len(recorded)
-    channels = tuple(tuple(WHEELS)[i] for i in recorded)
-    currents = [i for i in (2, 3) if i in recorded]
-    if currents:
-        kind = current_sign(logged[:, currents], logged[:, [i - 2 for i in currents]])
-        dropped[kind] += len(currents) if kind else 0
-        if kind == POWER_SIGN:
-            logged = logged.copy()
-            for i in currents:
-                logged[:, i] = with_sign_of_torque(logged[:, i], logged[:, i - 2], period_s)
-    values = logged[:, recorded]
-    values = undo_hold(values, time_s, tuple(usual_hold(column[None], period_s) for column in values.T))
-    values[:, :2] *= robot.wheel_radius_m
-    return values, channels
-
-
-def _imu(
-    imu: Array, wheels_mps: Array, runs: tuple[Cut, ...], period_s: float, dropped: Counter[str]
-) -> Array:
-    """Return gyro and accelerometer in the robot's axes; NaN before the first message."""
-    first = int(np.flatnonzero(imu.any(axis=1))[0])
-    imu = imu.copy()
-    imu[:first] = np.nan
-    rows = [slice(cut.first, cut.end) for cut in runs]
-    axes = find_axes([(*wheels_mps[each].T, imu[each, 2], imu[each, 3:]) for each in rows], period_s)
-    dropped.update(axes.repairs())
-    return np.asarray(imu * (*axes.gyro(), *axes.accel))
-
-
-def _lidar(logged: Array, time_s: Array, period_s: float) -> tuple[Array, Array, Array]:
-    """Return poses (n, 3), which rows (n,) they are of, and the twist (n, 3) at each row."""
-    position, (x, y, z, w) = logged[:, :2], logged[:, 2:].T
-    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    pose = np.column_stack([position, np.where(x * x + y * y + z * z + w * w > 0.5, yaw, np.nan)])
-    place = np.round((time_s - time_s[0]) / period_s).astype(np.intp)  # on an even grid, gaps and all
-    last = np.searchsorted(place, np.arange(place[-1] + 1), side="right") - 1
-    even = pose[last][None]
-    twists, stds = body_twists(even, period_s, frame_yaw=np.zeros(1))
-    twist, std = twists[0], stds[0]
-    lost = (std > MAX_STD).any(axis=1)
-    twist[~(std <= MAX_STD).all(axis=1)] = np.nan
-    new = new_poses(even)
-    arrival = np.flatnonzero(new[0])
-    at, usable = dated(arrival, len(last), usual_wait(new))
-    at, came = at[usable], even[0, arrival[usable]]
-    came[:, 2] = np.unwrap(came[:, 2])
-    came[lost[at]] = np.nan
-    poses = np.full((len(last), 3), np.nan)
-    poses[at] = came
-    posed = np.zeros(len(last), dtype=bool)
-    posed[at] = True
-    return poses[place], posed[place], twist[place]

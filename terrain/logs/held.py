@@ -15,66 +15,18 @@ window's path alike, and w its mean yaw rate.  A robot that changes its turning 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from terrain.records import Array
 
+CHANNELS: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
+"""What :func:`body_twists` returns."""
+
 MAX_HELD_S = 0.1
 """A value that is usually held for longer is read as straight lines.  Held for 0.1 s it lags by 0.025 s
 on samples at 20 Hz, half a sample; held for 0.25 s by 0.1 s."""
-
-
-def between_updates(values: Array, time_s: Array, held: int) -> Array:
-    """Return a held signal as straight lines between the samples where it is new.
-
-    A value that stays for longer than usual was measured again and found the same: it is held until the usual
-    time before the next one.
-
-    Parameters
-    ----------
-    values : (n,) as held
-    time_s : (n,)
-    held : usual number of samples from one new value to the next
-
-    Examples
-    --------
-    >>> between_updates(np.array([0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 8.0]), np.arange(7.0), 2).tolist()
-    [0.0, 0.0, 0.0, 2.0, 4.0, 6.0, 8.0]
-    """
-    new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
-    stayed = new[1:][np.diff(new) > held] - held
-    known = np.sort(np.concatenate([new, stayed]))
-    return np.asarray(np.interp(time_s, time_s[known], values[known]))
-
-
-def usual_hold(values: Array, period_s: float) -> int:
-    """Return the median samples from one new value to the next; 1 where that is short or unknown.
-
-    Parameters
-    ----------
-    values : (n, k) n stretches of k samples
-    period_s : from sample to sample
-
-    Examples
-    --------
-    >>> usual_hold(np.arange(40.0)[None] // 5, 0.05), usual_hold(np.arange(40.0)[None] // 2, 0.05)
-    (5, 1)
-    """
-    stretch, sample = np.nonzero(np.diff(values, axis=1) != 0.0)
-    waits = np.diff(sample)[np.diff(stretch) == 0]
-    usual = int(np.median(waits)) if waits.size else 1
-    return usual if usual * period_s > MAX_HELD_S * (1.0 + 1e-6) else 1
-
-
-def undo_hold(values: Array, time_s: Array, holds: tuple[int, ...]) -> Array:
-    """Return held columns (n, c) as straight lines where they are usually held for more than one sample."""
-    return np.column_stack(
-        [between_updates(v, time_s, n) if n > 1 else v for v, n in zip(values.T, holds, strict=True)]
-    )
-
-
-CHANNELS: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
-"""What :func:`body_twists` returns."""
 
 HALF_WIDTH_SCANS = 3
 """Poses to either side that a speed is fitted to: about six, enough for a parabola and its noise."""
@@ -92,7 +44,6 @@ samples with a pose in every second one."""
 N_FRAME = 5
 """Samples whose mean heading the authors of DRIVE turned the positions of a window by."""
 
-
 MAX_STD = (0.2, 0.2, 0.2)
 """Standard deviations, in m/s and rad/s, beyond which a recording's lidar has lost the robot: poses scatter
 by 0.01 m about a parabola elsewhere, which is 0.03 m/s, and by 0.3 m where a registration jumps.  Of
@@ -101,19 +52,92 @@ recordings of a Warthog that takes 1 % of the twists, of a Husky on wet grass a 
 MIN_JUDGED_SCANS = 5.0
 """So few poses at least show their scatter about a parabola, which takes three of them."""
 
+MIN_DISTANCE_M = 0.15
+"""Windows with a shorter path have no direction: poses scatter by a centimetre."""
 
-def body_twists(
-    pose: Array,
-    period_s: float,
-    *,
-    frame_yaw: Array | None = None,
-) -> tuple[Array, Array]:
+MIN_WINDOWS = 20
+"""So few windows show nothing of a session."""
+
+STEADY_RAD = 0.1
+"""Deviation from which a window counts less: wheels that spin, registrations that jump."""
+
+ITERATIONS = 30
+"""Of the reweighted least squares."""
+
+
+def undo_hold(values: Array, time_s: Array, holds: Sequence[int]) -> Array:
+    """Return held columns (n, c) as straight lines between the samples where they are new, if held for several.
+
+    A value that stays for longer than the usual number of samples, one a column, was measured again and is the
+    same: it is held until the usual time before the next one.
+
+    Examples
+    --------
+    >>> undo_hold(np.array([[0.0, 0.0, 0.0, 0.0, 4.0, 4.0, 8.0]]).T, np.arange(7.0), [2]).T.tolist()
+    [[0.0, 0.0, 0.0, 2.0, 4.0, 6.0, 8.0]]
+    """
+    columns = []
+    for column, held in zip(values.T, holds, strict=True):
+        new = np.flatnonzero(np.diff(column, prepend=np.nan) != 0.0)
+        known = np.sort(np.concatenate([new, new[1:][np.diff(new) > held] - held]))
+        columns.append(np.interp(time_s, time_s[known], column[known]) if held > 1 else column)
+    return np.column_stack(columns)
+
+
+def usual_hold(values: Array, period_s: float) -> int:
+    """Return the median samples from one new value (n stretches, k samples) to the next; 1: short or unknown.
+
+    Examples
+    --------
+    >>> usual_hold(np.arange(40.0)[None] // 5, 0.05), usual_hold(np.arange(40.0)[None] // 2, 0.05)
+    (5, 1)
+    """
+    usual = usual_wait(np.diff(values, axis=1) != 0.0)
+    return usual if usual * period_s > MAX_HELD_S * (1.0 + 1e-6) else 1
+
+
+def usual_wait(new: Array) -> int:
+    """Return the median number of samples from one new value (n, k) to the next, at least 1."""
+    stretch, sample = np.nonzero(new)
+    waits = np.diff(sample)[np.diff(stretch) == 0]
+    return max(int(np.median(waits)), 1) if waits.size else 1
+
+
+def new_poses(pose: Array) -> Array:
+    """Return (n, k) true where a pose (n, k, 3) is not the one before."""
+    new = np.zeros(pose.shape[:2], dtype=bool)
+    new[:, 1:] = (np.diff(pose, axis=1) != 0.0).any(axis=-1)
+    return new & np.isfinite(pose).all(axis=-1)
+
+
+def dated_poses(pose: Array, new: Array, scan: int) -> tuple[Array, Array, Array]:
+    """Return when (m,) the usable new poses of a window (k, 3) are dated, these, yaw unwrapped, and when they came.
+
+    A pose is of the time at which its registration began, when the one before came out: one that took longer than
+    the usual wait ``scan`` is that much older.  (On sand, where a Warthog's waits are uneven, that takes the error of
+    the yaw rate against the gyro from 0.44 to 0.24 rad/s.)  The first pose of a window that comes late is not used,
+    since its age is unknown; nor are poses that come out of a queue or after an outage (:data:`OUTAGE_SCANS`,
+    :data:`QUEUE`).
+    """
+    arrival = np.flatnonzero(new)
+    came = pose[arrival]
+    came[:, 2] = np.unwrap(came[:, 2])
+    if not arrival.size:
+        return arrival, came, arrival
+    waited = np.diff(arrival, prepend=0)
+    heads = np.concatenate([[True], waited[1:] > 1])  # of rows of poses that came sample by sample
+    row = np.cumsum(heads) - 1
+    queued = (waited[heads] >= OUTAGE_SCANS * scan) | (np.bincount(row) >= QUEUE)
+    at = np.concatenate([arrival[:1], arrival[:-1] + scan])
+    usable = ~queued[row] & (at < len(pose))
+    usable[0] &= arrival[0] <= scan  # what came before the window is not known
+    return at[usable], came[usable], arrival[usable]
+
+
+def body_twists(pose: Array, period_s: float, frame_yaw: Array | None = None) -> tuple[Array, Array]:
     r"""Return speeds forward and to the left and yaw rate from poses that are held between two scans, and deviations.
 
-    A pose is of the time at which its registration began, when the one before came out: one that took longer
-    than the usual wait (the median of all) is that much older, and is dated so.  (On sand, where a Warthog's
-    waits are uneven, that takes the error of the yaw rate against the gyro from 0.44 to 0.24 rad/s.)
-    What the robot drove from one dated pose to the next, as an arc, is summed in its own axes,
+    What the robot drove from one dated pose (:func:`dated_poses`) to the next, as an arc, is summed in its own axes,
 
     .. math:: \Delta s = \frac{\Delta\psi / 2}{\sin(\Delta\psi / 2)} R(-\bar\psi)\,\Delta p, \qquad
               \psi = \texttt{yaw} - \tfrac15 \textstyle\sum_{i<5} \texttt{yaw}_i ,
@@ -121,11 +145,8 @@ def body_twists(
     with the mean heading :math:`\bar\psi` of the two, so that a steady twist is a straight line in time,
     however tight the turn; the sum over the first five is of the angles as published, with their jumps of a
     full turn.  A parabola is fitted to the sums within :data:`HALF_WIDTH_SCANS` usual waits of each sample,
-    and its slope is the twist.
-
-    NaN where poses are too few or too much to one side for a slope (:data:`MAX_GAIN_PER_S`), as within
-    three waits of a window's edge.  The first pose of a window is not used, since its age is
-    unknown; nor are poses that come out of a queue or after an outage (:data:`OUTAGE_SCANS`, :data:`QUEUE`).
+    and its slope is the twist.  NaN where poses are too few or too much to one side for a slope
+    (:data:`MAX_GAIN_PER_S`), as within three waits of a window's edge.
 
     Parameters
     ----------
@@ -156,12 +177,9 @@ def body_twists(
     if frame_yaw is None:
         frame_yaw = pose[:, :N_FRAME, 2].mean(axis=1)
     for window in range(n):
-        arrival = np.flatnonzero(new[window])
-        at, usable = dated(arrival, k, scan)
-        came = pose[window, arrival]
-        came[:, 2] = np.unwrap(came[:, 2])
-        weight[window, at[usable]] = 1.0
-        driven[window, at[usable]] = _driven(came[usable], frame_yaw[window])
+        at, came, _ = dated_poses(pose[window], new[window], scan)
+        weight[window, at] = 1.0
+        driven[window, at] = _driven(came, frame_yaw[window])
     half = HALF_WIDTH_SCANS * scan
     powers = (np.arange(-half, half + 1) / half)[:, None] ** np.arange(3)
     padding = [(0, 0), (half, half)]
@@ -186,34 +204,6 @@ def body_twists(
     return np.where(certain[..., None], slope, np.nan), np.where(certain[..., None], std, np.nan)
 
 
-def new_poses(pose: Array) -> Array:
-    """Return (n, k) true where a pose is not the one before."""
-    new = np.zeros(pose.shape[:2], dtype=bool)
-    new[:, 1:] = (np.diff(pose, axis=1) != 0.0).any(axis=-1)
-    return new & np.isfinite(pose).all(axis=-1)
-
-
-def usual_wait(new: Array) -> int:
-    """Return the median number of samples from one new value (n, k) to the next."""
-    window, sample = np.nonzero(new)
-    waits = np.diff(sample)[np.diff(window) == 0]
-    return max(int(np.median(waits)), 1) if waits.size else 1
-
-
-def dated(arrival: Array, k: int, scan: int) -> tuple[Array, Array]:
-    """Return the samples that poses are dated at, by those of k at which they came, and which are usable."""
-    if not arrival.size:
-        return arrival, arrival.astype(bool)
-    waited = np.diff(arrival, prepend=0)
-    heads = np.concatenate([[True], waited[1:] > 1])  # of rows of poses that came sample by sample
-    row = np.cumsum(heads) - 1
-    queued = (waited[heads] >= OUTAGE_SCANS * scan) | (np.bincount(row) >= QUEUE)
-    at = np.concatenate([arrival[:1], arrival[:-1] + scan])
-    usable = ~queued[row] & (at < k)
-    usable[0] &= arrival[0] <= scan  # what came before the window is not known
-    return at, usable
-
-
 def _driven(pose: Array, frame_yaw: float) -> Array:
     """Return distance forward, to the left, and yaw (m, 3), each from the first of the poses (m, 3)."""
     turned = np.diff(pose[:, 2])
@@ -226,44 +216,35 @@ def _driven(pose: Array, frame_yaw: float) -> Array:
     return np.concatenate([np.zeros((min(len(pose), 1), 3)), np.cumsum(along, axis=0)])
 
 
-MIN_DISTANCE_M = 0.15
-"""Windows with a shorter path have no direction: poses scatter by a centimetre."""
-
-MIN_WINDOWS = 20
-"""So few windows say nothing of a session."""
-
-STEADY_RAD = 0.1
-"""Deviation from which a window counts less: wheels that spin, registrations that jump."""
-
-ITERATIONS = 30
-"""Of the reweighted least squares."""
-
-
 def frame_coefficient(pose: Array, wheels_mps: Array, period_s: float) -> tuple[float, float]:
     """Return a, and its standard deviation; NaN where too few windows turn and move.
+
+    Windows whose published heading jumps by a turn within its first samples are left out: their mean is no heading.
 
     Parameters
     ----------
     pose : (n, k, 3) x, y and yaw of n windows, as published
     wheels_mps : (n, k, 2) circumferential speeds, of which the sign of the mean is used
     period_s : time from sample to sample
-
-    Notes
-    -----
-    Windows whose published heading jumps by a turn within its first samples are left out: their mean is no
-    heading.
     """
     new = new_poses(pose)
     scan = usual_wait(new)
-    found = [
-        row
-        for window, arrived, ahead in zip(pose, new, np.nanmean(wheels_mps, axis=(1, 2)), strict=True)
-        if (row := _direction(window, np.flatnonzero(arrived), scan, period_s, ahead)) is not None
-    ]
-    if len(found) < MIN_WINDOWS:
+    rows = []
+    for window, arrived, ahead_mps in zip(pose, new, np.nanmean(wheels_mps, axis=(1, 2)), strict=True):
+        at, came, _ = dated_poses(window, arrived, scan)
+        if len(came) < 4 or np.abs(np.diff(window[: N_FRAME + 1, 2])).max() > np.pi / 2:
+            continue
+        yaw = came[:, 2]
+        chords = np.diff(came[:, 0] + 1j * came[:, 1]) * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
+        path = np.sign(ahead_mps) * chords.sum()
+        if abs(path) >= MIN_DISTANCE_M:
+            rate = (yaw[-1] - yaw[0]) / (np.ptp(at) * period_s)
+            first = window[:N_FRAME, 2].mean() - window[0, 2]
+            rows.append((float(np.angle(path)), first, rate, min(abs(path), 1.0)))
+    if len(rows) < MIN_WINDOWS:
         return np.nan, np.nan
-    direction, first, turned, weight = np.array(found).T
-    terms = np.column_stack([first, turned, np.ones(len(found))])
+    direction, first, turned, weight = np.array(rows).T
+    terms = np.column_stack([first, turned, np.ones(len(rows))])
     fitted, left, believed = np.zeros(3), direction, weight
     for _ in range(ITERATIONS):
         normal = (terms * believed[:, None]).T @ terms
@@ -285,20 +266,3 @@ def is_first_pose(coefficient: float, std: float) -> bool:
     (True, False, False)
     """
     return bool(abs(coefficient) < 3.0 * std and coefficient + 1.0 > 3.0 * std)
-
-
-def _direction(
-    window: Array, arrival: Array, scan: int, period_s: float, ahead_mps: float
-) -> tuple[float, float, float, float] | None:
-    """Return direction, mean of the first headings, yaw rate and weight of a window; None without any."""
-    at, usable = dated(arrival, len(window), scan)
-    came = window[arrival][usable]
-    if len(came) < 4 or np.abs(np.diff(window[: N_FRAME + 1, 2])).max() > np.pi / 2:
-        return None
-    yaw = np.unwrap(came[:, 2])
-    chords = np.diff(came[:, 0] + 1j * came[:, 1]) * np.exp(-0.5j * (yaw[1:] + yaw[:-1]))
-    path = np.sign(ahead_mps) * chords.sum()
-    if not abs(path) >= MIN_DISTANCE_M:
-        return None
-    rate = (yaw[-1] - yaw[0]) / (np.ptp(at[usable]) * period_s)
-    return float(np.angle(path)), window[:N_FRAME, 2].mean() - window[0, 2], rate, min(abs(path), 1.0)

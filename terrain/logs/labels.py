@@ -28,6 +28,14 @@ from terrain.records import Label, Stream
 SLACK_S = 0.01
 """An interval may be that far outside of a run: times are typed with two digits."""
 
+WINDOWS_FILE = "windows.json"
+
+MAX_BYTES = 64 * MEBIBYTE
+"""Windows each second of a week with ten classes."""
+
+Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
+"""A number that is null in JSON where it is not finite."""
+
 
 class ChangedLabels(NamedTuple):
     """Interval whose label was set or removed, and all labels of the run."""
@@ -36,6 +44,51 @@ class ChangedLabels(NamedTuple):
     start_s: float
     end_s: float
     labels: tuple[Label, ...]
+
+
+class RecordedWindow(BaseModel):
+    """A window of a recorded run, on the clock of the run.
+
+    ``terrain`` and ``probability`` are of the class of the largest probability; empty and NaN, as all
+    ``probabilities``, where the model refused the window, for the reason in ``refused``.  It is ``doubtful`` where the
+    probability is below that from which an output counts, or no terrain is named.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    start_s: float
+    end_s: float
+    terrain: str
+    probability: Number
+    probabilities: dict[str, Number]
+    doubtful: bool
+    refused: str = ""
+
+
+class _File(BaseModel):
+    version: Literal[1]
+    windows: list[RecordedWindow]
+
+
+class DoubtfulWindow(NamedTuple):
+    """A recorded window whose output does not count; ``label`` is that of the run which covers all of it."""
+
+    run_id: str
+    start_s: float
+    end_s: float
+    terrain: str
+    probability: float
+    refused: str
+    label: str | None
+
+
+class RunWindows(NamedTuple):
+    """Windows of a run: how many there are, are doubtful, and of those lack a label; None: none recorded."""
+
+    run_id: str
+    n_windows: int | None
+    n_doubtful: int
+    n_without_label: int
 
 
 def whole_run_label(streams: Mapping[str, Stream], terrain: str) -> Label:
@@ -55,13 +108,9 @@ def whole_run_label(streams: Mapping[str, Stream], terrain: str) -> Label:
 def label_intervals(
     texts: Sequence[tuple[int, str]], start_ns: int, streams: Mapping[str, Stream]
 ) -> tuple[Label, ...]:
-    """Return the terrain intervals of a run from the terrains as they change.
+    """Return the terrain intervals of a run from the terrains as they change, by log time in ns, in order.
 
-    Parameters
-    ----------
-    texts : log time in ns and terrain, in order; an empty text ends a terrain
-    start_ns : of the run
-    streams : of the run; the last terrain lasts until their end
+    An empty text ends a terrain; the last one lasts until the end of the streams.
 
     Examples
     --------
@@ -71,25 +120,32 @@ def label_intervals(
     """
     end_s = whole_run_label(streams, "all").end_s
     changes = [((log_ns - start_ns) / 1e9, terrain.strip()) for log_ns, terrain in texts]
-    labels: list[Label] = []
-    for (begin_s, terrain), (stop_s, _) in pairwise([*changes, (end_s, "")]):
-        stop_s = min(stop_s, end_s)
-        if not terrain or stop_s <= begin_s:
-            continue
-        if labels and labels[-1].terrain == terrain and labels[-1].end_s == begin_s:
-            begin_s = labels.pop().start_s
-        labels.append(Label(begin_s, stop_s, terrain))
-    return tuple(labels)
+    spans = (
+        Label(begin_s, min(stop_s, end_s), name)
+        for (begin_s, name), (stop_s, _) in pairwise([*changes, (end_s, "")])
+    )
+    return _joined(label for label in spans if label.terrain and label.start_s < label.end_s)
+
+
+def _joined(labels: Iterable[Label]) -> tuple[Label, ...]:
+    """Return labels in order, of which those of one terrain that meet are one."""
+    joined: list[Label] = []
+    for label in labels:
+        if joined and joined[-1].terrain == label.terrain and joined[-1].end_s == label.start_s:
+            joined[-1] = joined[-1]._replace(end_s=label.end_s)
+        else:
+            joined.append(label)
+    return tuple(joined)
 
 
 def label_changes(labels: Iterable[Label]) -> list[tuple[float, str]]:
     """Return the terrains as they change, the inverse of :func:`label_intervals`; an empty one where none holds."""
-    found: list[tuple[float, str]] = []
+    changes: list[tuple[float, str]] = []
     for label in sorted(labels):
-        if found and found[-1] == (label.start_s, ""):
-            found.pop()
-        found += [(label.start_s, label.terrain), (label.end_s, "")]
-    return found
+        if changes and changes[-1] == (label.start_s, ""):
+            changes.pop()
+        changes += [(label.start_s, label.terrain), (label.end_s, "")]
+    return changes
 
 
 def set_label(
@@ -99,19 +155,14 @@ def set_label(
 
     Parameters
     ----------
-    data : a run folder, or a folder of run folders
-    run_id : of the run
+    data, run_id : a run folder, or a folder of run folders, and the run
     terrain : of the label; an empty one removes what is there
     start_s, end_s : of the interval; the whole run, with labels beyond its samples, where neither is given
 
     Raises
     ------
-    LogError
-        if there is no run, or the run is damaged.
     ConfigError
-        if there is no run of the id, or the interval is outside of it.
-    TerrainError
-        if the file cannot be written; it is as it was then.
+        if there is no run of the id, or the interval is outside of it; ``LogError`` where it is damaged.
     """
     folder = folder_of(run_id, labelled_folders(data), data)
     run = read_run(folder, repair=True)
@@ -151,13 +202,7 @@ def relabelled(labels: Iterable[Label], start_s: float, end_s: float, terrain: s
     for label in labels:
         parts = (label.start_s, min(label.end_s, start_s)), (max(label.start_s, end_s), label.end_s)
         kept += [Label(begin_s, until_s, label.terrain) for begin_s, until_s in parts if begin_s < until_s]
-    joined: list[Label] = []
-    for label in sorted(kept):
-        if joined and joined[-1].terrain == label.terrain and joined[-1].end_s == label.start_s:
-            joined[-1] = joined[-1]._replace(end_s=label.end_s)
-        else:
-            joined.append(label)
-    return tuple(joined)
+    return _joined(sorted(kept))
 
 
 def label_over(labels: Sequence[Label], start_s: float, end_s: float) -> str | None:
@@ -172,59 +217,20 @@ def labelled_folders(data: Path) -> list[Path]:
     """Return the run folders under a folder, which are the ones that labels can be set of; none is refused."""
     if not data.is_dir():
         raise LogError(f"{data}: {'is no folder' if data.exists() else 'does not exist'}")
-    found = run_folders(data)
-    if not found:
+    folders = run_folders(data)
+    if not folders:
         raise LogError(f"{data}: holds no run folder (run.json); 'terrain convert' makes them of other logs")
-    return found
+    return folders
 
 
 def folder_of(run_id: str, folders: Sequence[Path], data: Path) -> Path:
     """Return the one folder of a run; none and several are refused."""
-    found = [folder for folder in folders if read_run_head(folder).run_id == run_id]
-    if len(found) > 1:
-        raise LogError(f"{data}: {len(found)} runs have the id {run_id!r}")
-    if not found:
+    named = [folder for folder in folders if read_run_head(folder).run_id == run_id]
+    if len(named) > 1:
+        raise LogError(f"{data}: {len(named)} runs have the id {run_id!r}")
+    if not named:
         raise ConfigError(f"{data}: there is no run {run_id!r}")
-    return found[0]
-
-
-WINDOWS_FILE = "windows.json"
-
-MAX_BYTES = 64 * MEBIBYTE
-"""Windows each second of a week with ten classes."""
-
-Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
-"""A number that is null in JSON where it is not finite."""
-
-
-class RecordedWindow(BaseModel):
-    """A window of a recorded run.
-
-    Parameters
-    ----------
-    start_s, end_s : on the clock of the run
-    terrain, probability : class of the largest probability; empty and NaN where the model refused the window
-    probabilities : of each class; NaN where it was refused
-    doubtful : the probability is below that from which an output counts, or no terrain is named
-    refused : why; empty where there is an output
-    """
-
-    model_config = ConfigDict(frozen=True)
-
-    start_s: float
-    end_s: float
-    terrain: str
-    probability: Number
-    probabilities: dict[str, Number]
-    doubtful: bool
-    refused: str = ""
-
-
-class _File(BaseModel):
-    """Content of ``windows.json``."""
-
-    version: Literal[1]
-    windows: list[RecordedWindow]
+    return named[0]
 
 
 def windows_text(windows: Iterable[RecordedWindow]) -> str:
@@ -247,35 +253,6 @@ def window_of_text(place: str, text: str) -> RecordedWindow:
     return accepted(RecordedWindow, text, place, LogError, "a recorded window is damaged")
 
 
-class DoubtfulWindow(NamedTuple):
-    """A window whose output does not count.
-
-    Parameters
-    ----------
-    run_id, start_s, end_s : which one
-    terrain, probability : output of the model; empty and NaN where it refused the window
-    refused : why it did
-    label : of the run, where one covers the whole window
-    """
-
-    run_id: str
-    start_s: float
-    end_s: float
-    terrain: str
-    probability: float
-    refused: str
-    label: str | None
-
-
-class RunWindows(NamedTuple):
-    """Windows of a run: how many there are, are doubtful, and of those lack a label; None: none recorded."""
-
-    run_id: str
-    n_windows: int | None
-    n_doubtful: int
-    n_without_label: int
-
-
 def doubtful_windows(
     data: Path, run_id: str | None = None
 ) -> tuple[tuple[RunWindows, ...], tuple[DoubtfulWindow, ...]]:
@@ -284,26 +261,17 @@ def doubtful_windows(
     if run_id is not None:
         folders = [folder_of(run_id, folders, data)]
     runs: list[RunWindows] = []
-    found: list[DoubtfulWindow] = []
+    doubtful: list[DoubtfulWindow] = []
     for folder in folders:
         head, windows = read_run_head(folder), read_windows(folder)
         labels = head.checked_labels(short_name(folder / "run.json"))
-        if windows is None:
-            runs.append(RunWindows(head.run_id, None, 0, 0))
-            continue
         rows = [
-            DoubtfulWindow(
-                head.run_id,
-                window.start_s,
-                window.end_s,
-                window.terrain,
-                window.probability,
-                window.refused,
-                label_over(labels, window.start_s, window.end_s),
-            )
-            for window in windows
-            if window.doubtful
+            DoubtfulWindow(head.run_id, w.start_s, w.end_s, w.terrain, w.probability, w.refused, label)
+            for w in windows or ()
+            if w.doubtful
+            for label in [label_over(labels, w.start_s, w.end_s)]
         ]
-        runs.append(RunWindows(head.run_id, len(windows), len(rows), sum(row.label is None for row in rows)))
-        found += rows
-    return tuple(runs), tuple(found)
+        n_windows = None if windows is None else len(windows)
+        runs.append(RunWindows(head.run_id, n_windows, len(rows), sum(row.label is None for row in rows)))
+        doubtful += rows
+    return tuple(runs), tuple(doubtful)

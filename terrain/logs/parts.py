@@ -23,14 +23,9 @@ LONGEST = 1.02
 
 
 class Part(NamedTuple):
-    """What one frame or message has of a sample.
+    """What one frame or message has of a sample of a stream: values in SI by column, NaN where none was measured.
 
-    Parameters
-    ----------
-    stream : that the sample belongs to
-    counter : of the sample; None where the message has none
-    values : by column of the stream, SI; NaN where nothing was measured
-    n_out_of_range : values beyond the bounds of their signal, which are NaN too
+    ``counter`` is None where the message has none; ``n_out_of_range`` values beyond their bounds are NaN, too.
     """
 
     stream: str
@@ -40,11 +35,10 @@ class Part(NamedTuple):
 
 
 class Assembler:
-    """Samples of one stream from their parts as they come.
+    """Samples of one stream of some width from their parts as they come.
 
     Parameters
     ----------
-    stream, width : its name and its number of columns
     columns : that the parts have together; a sample with all of them is complete
     dropped : where what is not used is counted
     most : samples that are held between two readings; the oldest are dropped

@@ -67,29 +67,28 @@ def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
 
 
 def run_folders(folder: Path) -> list[Path]:
-    """Return the run folders: ``folder`` itself, or those in it, sorted.
-
-    Hidden folders (unfinished writes) are passed over.
-    """
+    """Return the run folders: ``folder`` itself, or those in it, sorted; hidden ones are unfinished writes."""
     if (folder / "run.json").exists():
         return [folder]
     return sorted(path.parent for path in folder.glob("*/run.json") if not path.parent.name.startswith("."))
 
 
-class LabelEntry(BaseModel):
-    """A terrain interval as files state it."""
+class Strict(BaseModel):
+    """Part of a file: a text is no number."""
 
     model_config = ConfigDict(strict=True)
+
+
+class LabelEntry(Strict):
+    """A terrain interval as files state it."""
 
     start_s: float
     end_s: float
     terrain: str
 
 
-class RunHead(BaseModel):
+class RunHead(Strict):
     """What a run states of itself beside its streams, in a run folder and in a file of messages."""
-
-    model_config = ConfigDict(strict=True)
 
     run_id: str
     robot: str
@@ -102,15 +101,9 @@ class RunHead(BaseModel):
     @classmethod
     def of(cls, run: RunLog) -> RunHead:
         """Return what a run states of itself."""
-        return cls(
-            run_id=run.run_id,
-            robot=run.robot,
-            session=run.session,
-            filter=run.filter,
-            source=run.source,
-            labels=[LabelEntry(**label._asdict()) for label in run.labels],
-            dropped=dict(sorted(run.dropped.items())),
-        )
+        plain = {name: getattr(run, name) for name in ("run_id", "robot", "session", "filter", "source")}
+        labels = [LabelEntry(**label._asdict()) for label in run.labels]
+        return cls(**plain, labels=labels, dropped=dict(sorted(run.dropped.items())))
 
     def checked_labels(self, place: str) -> tuple[Label, ...]:
         """Return the terrain intervals; ``LogError`` where one ends before it starts, or two overlap."""
@@ -128,23 +121,12 @@ class RunHead(BaseModel):
     def run(self, place: str, streams: Mapping[str, Stream], dropped: Mapping[str, int]) -> RunLog:
         """Return the run of its streams; names that are no plain ones and streams apart are refused."""
         refuse_apart(self.run_id, streams)
-        run = RunLog(
-            self.run_id,
-            self.robot,
-            streams,
-            self.checked_labels(place),
-            source=self.source,
-            dropped=dropped,
-            session=self.session,
-            filter=self.filter,
-        )
-        return checked_names(place, run)
+        about = (self.checked_labels(place), self.source, dropped, self.session, self.filter)
+        return checked_names(place, RunLog(self.run_id, self.robot, streams, *about))
 
 
-class StreamFile(BaseModel):
+class StreamFile(Strict):
     """File of a stream, and the unit of each of its channels."""
-
-    model_config = ConfigDict(strict=True)
 
     file: str
     channels: Annotated[dict[str, str], Field(min_length=1)]
@@ -160,11 +142,8 @@ class RunFile(RunHead):
 def read_run_head(folder: str | Path) -> RunFile:
     """Return what ``run.json`` states, without reading the streams.
 
-    Raises
-    ------
-    LogError
-        if ``run.json`` is missing, is not JSON, has another schema version, lacks a key or holds something
-        that is not accepted there.
+    ``LogError`` where it is missing, is not JSON, has another schema version, lacks a key or holds something that is
+    not accepted there.
     """
     path = Path(folder) / "run.json"
     place = short_name(path)
@@ -180,12 +159,7 @@ def read_run_head(folder: str | Path) -> RunFile:
 
 
 def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
-    """Return the run that a run folder holds.
-
-    Parameters
-    ----------
-    folder : folder with ``run.json``
-    repair : drop and count what a strict read refuses in the streams
+    """Return the run of a folder with ``run.json``; a repairing read drops and counts what is wrong with streams.
 
     Raises
     ------
@@ -214,15 +188,13 @@ def read_run(folder: str | Path, *, repair: bool = False) -> RunLog:
                     f"{place}: stream {name}: channel {channel!r} is declared in {shown(unit)}, "
                     "its name states otherwise"
                 )
-        time_s, *values = read_parquet(
-            check_log_file(folder / entry.file, folder), ["time_s", *entry.channels]
-        )
+        file = check_log_file(folder / entry.file, folder)
+        time_s, *values = read_parquet(file, ["time_s", *entry.channels])
         streams[name] = checked_stream(
-            short_name(folder / entry.file),
+            short_name(file),
             time_s,
             np.column_stack(values),
             list(entry.channels),
-            row_of=lambda index: index + 1,
             repairs=dropped if repair else None,
             unknown_is_a_value=name in MAY_BE_UNKNOWN,
         )

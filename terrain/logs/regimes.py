@@ -10,12 +10,7 @@ from terrain.records import RunLog
 def regime_of(run: RunLog) -> str:
     """Return in words how a run was driven: its command where it has one alone, else its mean wheel speeds.
 
-    Examples
-    --------
-    >>> from terrain.records import Stream
-    >>> commands = Stream([0.0, 1.0], [[0.1, 0.0], [0.1, 0.0]], ("speed_x_mps", "yaw_rate_radps"))
-    >>> regime_of(RunLog("a", "husky", {"commands": commands}))
-    'speed_x_mps 0.1, yaw_rate_radps 0'
+    As ``speed_x_mps 0.1, yaw_rate_radps 0``.
     """
     for name, decimals in (("commands", 3), ("wheels", 1)):
         stream = run.streams.get(name)
@@ -35,15 +30,7 @@ def regime_of(run: RunLog) -> str:
 
 
 def driven_at(run: RunLog, low_mps: float, high_mps: float) -> bool:
-    """Return whether a run's mean commanded speed, or without one that of its wheels, is within bounds.
-
-    Examples
-    --------
-    >>> from terrain.records import Stream
-    >>> commands = Stream([0.0, 1.0], [[0.03, 0.04], [0.03, 0.04]], ("speed_x_mps", "speed_y_mps"))
-    >>> driven_at(RunLog("a", "robotino", {"commands": commands}), 0.0, 0.06)
-    True
-    """
+    """Return whether a run's mean commanded speed, or without one that of its wheels, is within bounds."""
     commands, wheels = run.streams.get("commands"), run.streams.get("wheels")
     if commands is not None and "speed_x_mps" in commands.channels:
         parts = [name for name in ("speed_x_mps", "speed_y_mps") if name in commands.channels]

@@ -23,13 +23,7 @@ _SLACK_S = 1e-9  # stamps that differ by less are the same instant, written by t
 
 
 class NamedReadings(dict[str, Reading]):
-    """Readings by stream, and the names of their columns.
-
-    Parameters
-    ----------
-    readings : by stream
-    channels : of each stream, in the order of the columns
-    """
+    """Readings by stream, and of each stream the channels in the order of the columns."""
 
     def __init__(self, readings: Mapping[str, Reading], channels: Mapping[str, tuple[str, ...]]) -> None:
         super().__init__(readings)
@@ -37,30 +31,19 @@ class NamedReadings(dict[str, Reading]):
 
 
 def replay(run: RunLog, rate_hz: float = 50.0) -> Iterator[Sample]:
-    """Yield what a controller would have been given at each of its steps.
+    """Yield what a controller would have been given at each of its steps, from the first stamp of the wheels on.
 
-    Parameters
-    ----------
-    run : with at least one of :data:`SENSORS`
-    rate_hz : of the steps, the first one at the first stamp of the wheels or, without wheels, of any sensor
-
-    Yields
-    ------
-    Sample
-        with the readings stamped after the step before and up to this one, in the order of the log, and all
-        channels of it, which they name; the last twist desired by then, zeros where the log has none; the label there
+    Without wheels the first stamp of any sensor is taken.  A sample has the readings stamped after the step before and
+    up to this one, in the order of the log, and all channels of it, which they name; the last twist desired by then,
+    zeros where the log has none; the label there.  A stamp is taken for the instant at which a sample came.  One that
+    is out of order, or no number, came with the next one in order.
 
     Raises
     ------
     ConfigError
         if the rate is not above zero.
     DataError
-        if no sensor has a sample.
-
-    Notes
-    -----
-    A stamp is taken for the instant at which a sample came.  One that is out of order, or no number, came
-    with the next one in order.
+        if no sensor (:data:`SENSORS`) has a sample, or the stamps are too far apart.
 
     Examples
     --------

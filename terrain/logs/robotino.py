@@ -14,14 +14,8 @@ folder                                     run                 label, session
 ``dc_motor/<name>.csv.gz``                 ``dc_motor_<name>`` none; some of these have no camera
 =========================================  ==================  ==============================================
 
-============  ================================================  =============================================
-stream        channels                                          from
-============  ================================================  =============================================
-``wheels``    ``motor_1_radps`` ...                             ``m1vel``, on the scale of ``m1pos``
-\             ``current_1_a`` ...                               ``m1cur``, magnitudes
-``commands``  ``speed_x_mps speed_y_mps yaw_rate_radps``        ``xsetspeed ysetspeed setvel``
-``pose``      ``position_x_m position_y_m yaw_rad``             ``xpos ypos ang``
-============  ================================================  =============================================
+Stream ``wheels``: ``motor_1_radps`` ... of ``m1vel``, on the scale of ``m1pos``, and ``current_1_a`` ... of
+``m1cur``; ``commands``: the twist ``xsetspeed ysetspeed setvel``; ``pose``: ``xpos ypos ang``.
 
 What is assumed here was compared with the other columns:
 
@@ -41,7 +35,7 @@ What is assumed here was compared with the other columns:
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -51,12 +45,12 @@ import numpy as np
 from terrain.errors import LogError
 from terrain.files.documents import read_json
 from terrain.files.names import normal_name, shown
+from terrain.logs.labels import whole_run_label
+from terrain.logs.replay import TWIST
 from terrain.logs.samples import check_log_file, checked_names, checked_stream, short_name
-from terrain.logs.schema import POSE_CHANNELS
-from terrain.logs.tables import TextLayout, data_row, header_of, read_columns
-from terrain.records import Array, Label, RunLog, Stream
-
-ROBOT = "robotino"
+from terrain.logs.schema import POSE_CHANNELS, WHEELS_CHANNELS
+from terrain.logs.tables import TextLayout, header_of, read_table, row_number
+from terrain.records import Array, RunLog, Stream
 
 CAMERA_FILE = "camera_params.json"
 
@@ -73,12 +67,6 @@ MIN_TICKS = 2000
 """Counts, one turn of a motor, that a ratio is taken from: the hold of 155 counts is then under 8 %, and over
 a run of 10 s at 0.1 m/s under 0.5 %."""
 
-GEAR = 16.0
-TICKS_PER_TURN = 2000.0
-WHEEL_RADIUS_M = 0.04
-WHEEL_DISTANCE_M = 0.125
-"""Of the robot that drove the logs: what the commanded motor speeds follow from the commanded twist by."""
-
 MAX_SCALE_ERROR = 0.1
 """Of a ratio against the usual one; beyond, counts or rates are damaged and the usual one is taken."""
 
@@ -88,35 +76,23 @@ MIN_POSES = 10
 MAX_COMMAND_ERROR_RADPS = 2.0
 """Of a commanded motor speed against the commanded twist: 5 % of the slowest drive."""
 
-_FORM = TextLayout(delimiter=";", skip_rows=2)
-_MOTORS = (1, 2, 3)
-_RATES, _COUNTS, _CURRENTS = ([f"m{i}{name}" for i in _MOTORS] for name in ("vel", "pos", "cur"))
-_SET_RATES = [f"m{i}setvel" for i in _MOTORS]
+_GEAR, _TICKS_PER_TURN, _WHEEL_RADIUS_M, _WHEEL_DISTANCE_M = 16.0, 2000.0, 0.04, 0.125
+"""Of the robot that drove the logs: what the commanded motor speeds follow from the commanded twist by."""
+
+_LAYOUT = TextLayout(delimiter=";", skip_rows=2)
+_RATES, _COUNTS, _CURRENTS, _SET_RATES = (
+    [f"m{i}{name}" for i in (1, 2, 3)] for name in ("vel", "pos", "cur", "setvel")
+)
 _TWIST, _POSE = ["xsetspeed", "ysetspeed", "setvel"], ["xpos", "ypos", "ang"]
 _MOTORS_ONLY = "dc_motor"
 _MAX_DEPTH = 3  # folders from a run's file up to that of the camera
 
 
-class Camera(NamedTuple):
-    """Millimetres a pixel of the camera above, over 1000."""
-
-    x_m: float
-    y_m: float
-
-
 def find_root(folder: Path) -> Path | None:
-    """Return the folder of the data set that a folder is or lies in; None where there is none.
-
-    Examples
-    --------
-    >>> find_root(Path("/")) is None
-    True
-    """
+    """Return the folder of the data set that a folder is or lies in; None where there is none."""
     folder = folder.resolve()
-    for place in (folder, *folder.parents[:_MAX_DEPTH]):
-        if (place / CAMERA_FILE).is_file():
-            return place
-    return None
+    places = (folder, *folder.parents[:_MAX_DEPTH])
+    return next((place for place in places if (place / CAMERA_FILE).is_file()), None)
 
 
 def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
@@ -136,14 +112,36 @@ def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
     return [partial(read_run, path, root) for path in files]
 
 
-def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
-    """Return the run that a file holds.
+class _Log(NamedTuple):
+    """Columns of a file by name, what a repairing read drops of it (None refuses), and what any read changes."""
 
-    Parameters
-    ----------
-    path : ``.csv.gz``
-    root : folder of the data set, with ``camera_params.json``
-    repair : drop and count what a strict read refuses
+    path: Path
+    table: dict[str, Array]
+    repairs: Counter[str] | None
+    converted: Counter[str]
+
+    def columns(self, names: Sequence[str]) -> Array:
+        return np.column_stack([self.table[name] for name in names])
+
+    def row(self, sample: int) -> int:
+        return row_number(self.path, sample, layout=_LAYOUT)
+
+    def stream(
+        self,
+        values: Array,
+        channels: Sequence[str],
+        columns: Sequence[str],
+        rows: slice | Array = slice(None),
+    ) -> Stream:
+        time_s = self.table["t"][rows] * 1e-3
+        name, repairs = short_name(self.path), self.repairs
+        return checked_stream(
+            name, time_s, values, channels, row_of=self.row, columns=columns, repairs=repairs
+        )
+
+
+def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
+    """Return the run that a ``.csv.gz`` of the data set in ``root`` holds.
 
     Raises
     ------
@@ -154,38 +152,27 @@ def read_run(path: Path, root: Path, *, repair: bool = False) -> RunLog:
     """
     path = check_log_file(path, root)
     parts = path.relative_to(root).parts
-    log = _Log(path, Counter() if repair else None, Counter())
-    with_camera = parts[0] != _MOTORS_ONLY or _POSE[0] in header_of(path, _FORM)
-    table = _read(log, with_camera)
-    streams = {"wheels": _wheels(log, table)}
+    repairs = Counter[str]() if repair else None
+    with_camera = parts[0] != _MOTORS_ONLY or _POSE[0] in header_of(path, _LAYOUT)
+    names = ["t", *_SET_RATES, *_COUNTS, *_RATES, *_CURRENTS, *((*_TWIST, *_POSE) if with_camera else ())]
+    table = dict(zip(names, read_table(path, names, layout=_LAYOUT, repairs=repairs).T, strict=True))
+    log = _Log(path, table, repairs, Counter())
+    streams = {"wheels": _wheels(log)}
     if with_camera:
-        streams["commands"] = _commands(log, table)
-        if (pose := _pose(log, table, read_camera(root))) is not None:
+        streams["commands"] = _commands(log)
+        if (pose := _pose(log, read_camera(root))) is not None:
             streams["pose"] = pose
     run_id, terrain, session = _names(parts)
-    wheels = streams["wheels"].time_s
-    until_s = float(wheels[-1] + np.median(np.diff(wheels)))
-    return checked_names(
-        log.name,
-        RunLog(
-            run_id,
-            ROBOT,
-            streams,
-            (Label(float(wheels[0]), until_s, terrain),) if terrain else (),
-            source=f"{'/'.join(parts)}, Robotino layout",
-            dropped=log.converted + (log.repairs or Counter()),
-            session=session,
-        ),
-    )
+    labels = (whole_run_label({"wheels": streams["wheels"]}, terrain),) if terrain else ()
+    source, dropped = f"{'/'.join(parts)}, Robotino layout", log.converted + (repairs or Counter())
+    run = RunLog(run_id, "robotino", streams, labels, source, dropped, session)
+    return checked_names(short_name(path), run)
 
 
-def read_camera(root: Path) -> Camera:
-    """Return the scale of the camera of a data set.
+def read_camera(root: Path) -> tuple[float, float]:
+    """Return the metres a pixel, in x and y, of the camera of a data set.
 
-    Raises
-    ------
-    LogError
-        if the file is missing, no JSON, or lacks a scale above zero.
+    ``LogError`` where the file is missing, no JSON, or lacks a scale above zero.
     """
     path = root / CAMERA_FILE
     place = short_name(path)
@@ -198,47 +185,16 @@ def read_camera(root: Path) -> Camera:
                 f"{place}: pixel_resolution_{axis} is {shown(value)}, millimetres a pixel are required"
             )
         scales.append(float(value) * 1e-3)
-    return Camera(*scales)
+    return scales[0], scales[1]
 
 
-class _Log(NamedTuple):
-    """A file, what a repairing read drops of it (None refuses), and what is changed in any read."""
-
-    path: Path
-    repairs: Counter[str] | None
-    converted: Counter[str]
-
-    @property
-    def name(self) -> str:
-        return short_name(self.path)
-
-    def stream(self, time_s: Array, values: Array, channels: list[str], columns: list[str]) -> Stream:
-        """Return a stream of some of the file's rows, as they stand in it."""
-        row_of = partial(data_row, self.path, layout=_FORM)
-        return checked_stream(
-            self.name, time_s, values, channels, row_of=row_of, columns=columns, repairs=self.repairs
-        )
-
-
-def _read(log: _Log, with_camera: bool) -> dict[str, Array]:
-    """Return the columns of a file by name; rows without a time stay in."""
-    names = ["t", *_SET_RATES, *_COUNTS, *_RATES, *_CURRENTS, *((*_TWIST, *_POSE) if with_camera else ())]
-    table = read_columns(log.path, names, layout=_FORM, repair=log.repairs is not None, dropped=log.repairs)
-    columns = dict(zip(names, table.T, strict=True))
-    columns["t"] = columns["t"] * 1e-3
-    return columns
-
-
-def _wheels(log: _Log, table: dict[str, Array]) -> Stream:
-    rates = np.column_stack([table[name] for name in _RATES])
-    counts = np.column_stack([table[name] for name in _COUNTS])
-    for i in range(len(_MOTORS)):
-        rates[:, i] *= _scale(table["t"], rates[:, i], counts[:, i])
-    log.converted[SCALED] += len(_MOTORS)
-    log.converted[NO_SIGN] += len(_MOTORS)
-    values = np.column_stack([rates, *(table[name] for name in _CURRENTS)])
-    channels = [f"motor_{i}_radps" for i in _MOTORS] + [f"current_{i}_a" for i in _MOTORS]
-    return log.stream(table["t"], values, channels, [*_RATES, *_CURRENTS])
+def _wheels(log: _Log) -> Stream:
+    rates, counts = log.columns(_RATES), log.columns(_COUNTS)
+    for rate, count in zip(rates.T, counts.T, strict=True):
+        rate *= _scale(log.table["t"] * 1e-3, rate, count)
+    log.converted.update({SCALED: len(_RATES), NO_SIGN: len(_CURRENTS)})
+    values = np.column_stack([rates, log.columns(_CURRENTS)])
+    return log.stream(values, WHEELS_CHANNELS, [*_RATES, *_CURRENTS])
 
 
 def _scale(time_s: Array, rate_radps: Array, counts: Array) -> float:
@@ -247,66 +203,55 @@ def _scale(time_s: Array, rate_radps: Array, counts: Array) -> float:
     if known.sum() < 2 or np.ptp(counts[known]) < MIN_TICKS:
         return USUAL_SCALE
     time_s, rate_radps = time_s[known], rate_radps[known]
-    angle = counts[known] * (2.0 * np.pi / TICKS_PER_TURN)
+    angle = counts[known] * (2.0 * np.pi / _TICKS_PER_TURN)
     turned = np.concatenate([[0.0], np.cumsum(np.diff(time_s) * (rate_radps[1:] + rate_radps[:-1]) / 2.0)])
     turned = turned - turned.mean()
     slope = float(turned @ angle / (turned @ turned))
     return slope if abs(slope / USUAL_SCALE - 1.0) < MAX_SCALE_ERROR else USUAL_SCALE
 
 
-def _commands(log: _Log, table: dict[str, Array]) -> Stream:
-    twist = np.column_stack([table[name] for name in _TWIST])
-    set_rates = np.column_stack([table[name] for name in _SET_RATES])
-    expected = np.nan_to_num(twist) @ _to_motors().T
-    apart = np.nanmax(np.abs(set_rates - expected), axis=1, initial=0.0)
-    if (apart > MAX_COMMAND_ERROR_RADPS).any():
-        row = int(np.argmax(apart > MAX_COMMAND_ERROR_RADPS))
+def _commands(log: _Log) -> Stream:
+    """Return the commanded twist; motor speeds that are not those of it are refused.
+
+    The motor speeds are those of :func:`terrain.kinematics.wheels.rolling_matrix`.
+    """
+    twist, direction = log.columns(_TWIST), np.radians([150.0, 270.0, 390.0])
+    rolling = np.stack([np.cos(direction), np.sin(direction), np.full(3, _WHEEL_DISTANCE_M)], axis=-1)
+    expected = np.nan_to_num(twist) @ (rolling * (_GEAR / _WHEEL_RADIUS_M)).T
+    apart = np.nanmax(np.abs(log.columns(_SET_RATES) - expected), axis=1, initial=0.0)
+    for row in np.flatnonzero(apart > MAX_COMMAND_ERROR_RADPS)[:1].tolist():
         raise LogError(
-            f"{log.name}: at row {data_row(log.path, row, layout=_FORM)} the commanded motor speeds are "
-            f"{apart[row]:.3g} rad/s away from those of the commanded twist; at most "
-            f"{MAX_COMMAND_ERROR_RADPS:g} rad/s are accepted (are they of another robot or session?)"
+            f"{short_name(log.path)}: at row {log.row(row)} the commanded motor speeds are {apart[row]:.3g} "
+            f"rad/s away from those of the commanded twist; at most {MAX_COMMAND_ERROR_RADPS:g} rad/s are "
+            "accepted (are they of another robot or session?)"
         )
-    return log.stream(table["t"], twist, ["speed_x_mps", "speed_y_mps", "yaw_rate_radps"], _TWIST)
+    return log.stream(twist, TWIST, _TWIST)
 
 
-def _to_motors() -> Array:
-    """Return the matrix (3, 3) from a twist to motor speeds (:func:`terrain.kinematics.wheels.rolling_matrix`)."""
-    direction = np.radians([150.0, 270.0, 390.0])
-    rows = np.stack([np.cos(direction), np.sin(direction), np.full(3, WHEEL_DISTANCE_M)], axis=-1)
-    return np.asarray(rows * (GEAR / WHEEL_RADIUS_M))
-
-
-def _pose(log: _Log, table: dict[str, Array], camera: Camera) -> Stream | None:
-    """Return the poses that are new; None where a repairing read finds none while the wheels turn."""
-    seen = np.column_stack([table[name] for name in _POSE])
-    new = np.isfinite(seen).all(axis=1)
+def _pose(log: _Log, metres: tuple[float, float]) -> Stream | None:
+    """Return the poses that are new; None where a repairing read has none while the wheels turn."""
+    seen, counts = log.columns(_POSE), log.columns(_COUNTS)
+    new = np.asarray(np.isfinite(seen).all(axis=1))
     new[1:] &= (np.diff(seen, axis=0) != 0.0).any(axis=1)
-    moves = any(
-        np.ptp(
-            table[name][np.isfinite(table[name])],
-        )
-        >= MIN_TICKS
-        for name in _COUNTS
-    )
+    moves = any(np.ptp(count[np.isfinite(count)]) >= MIN_TICKS for count in counts.T)
     if moves and new.sum() < MIN_POSES:
         if log.repairs is None:
             raise LogError(
-                f"{log.name}: the camera shows {int(new.sum())} different poses while the wheels turn; at "
-                f"least {MIN_POSES} are required"
+                f"{short_name(log.path)}: the camera shows {int(new.sum())} different poses while the wheels "
+                f"turn; at least {MIN_POSES} are required"
             )
         log.repairs[BLIND] += 1
         return None
     log.converted[HELD] += int((~new).sum())
     yaw = np.unwrap(np.radians(seen[new, 2])) + np.pi / 2
-    pose = np.column_stack([seen[new, 0] * camera.x_m, -seen[new, 1] * camera.y_m, yaw])
-    return log.stream(table["t"][new], pose, list(POSE_CHANNELS), _POSE)
+    pose = np.column_stack([seen[new, 0] * metres[0], -seen[new, 1] * metres[1], yaw])
+    return log.stream(pose, POSE_CHANNELS, _POSE, new)
 
 
 def _names(parts: tuple[str, ...]) -> tuple[str, str, str]:
     """Return id, terrain and session of a run by the folders of its file."""
     parts = tuple(normal_name(part) for part in parts)
-    stem = parts[-1].removesuffix(".csv.gz")
-    number = stem.removeprefix("exp")
+    number = parts[-1].removesuffix(".csv.gz").removeprefix("exp")
     if len(parts) == 3 and parts[0] == "one_surface":
         return f"{parts[1]}_{number}", parts[1], ""
     if len(parts) == 3 and parts[0] == "weights":

@@ -96,20 +96,15 @@ def check_recordable(channels: Mapping[str, Sequence[str]]) -> None:
             unit_of(channel)
 
 
-def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[str] = ()) -> StreamTopic:
-    """Return the topic of a stream; names that ROS does not accept are replaced.
-
-    Parameters
-    ----------
-    stream, channels : names of both
-    taken : topics of the run's other streams
+def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[StreamTopic] = ()) -> StreamTopic:
+    """Return the topic of a stream beside the run's others; names that ROS does not accept are replaced.
 
     Examples
     --------
     >>> stream_topic("imu", ("gyro_z_radps",))
     StreamTopic(topic='/terrain/imu', kind='terrain_msgs/msg/Imu', fields={'gyro_z_radps': 'gyro_z_radps'})
     """
-    others = [topic.removeprefix(PREFIX) for topic in taken]
+    others = [each.topic.removeprefix(PREFIX) for each in taken]
     (name,) = _accepted_names([stream], f"stream_{len(others)}", [*RESERVED, *others])
     fields = _accepted_names(channels, "channel", (TIME_FIELD, "header"))
     kind = "".join(part.capitalize() for part in name.split("_"))
@@ -120,16 +115,15 @@ def stream_topic(stream: str, channels: Sequence[str], taken: Iterable[str] = ()
 
 def _accepted_names(names: Iterable[str], fallback: str, reserved: Iterable[str]) -> list[str]:
     """Return a name for each, as ROS accepts them: lower-case letters, digits and single underlines."""
-    taken = set(reserved)
-    found = []
+    taken, accepted_names = {each.replace("_", "") for each in reserved}, []
     for number, name in enumerate(names):
         plain = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
         plain = plain if re.match(r"[a-z]", plain) else f"{fallback}_{number}"
-        while plain in taken or plain.replace("_", "") in {each.replace("_", "") for each in taken}:
+        while plain.replace("_", "") in taken:
             plain = f"{plain}_{number}"
-        taken.add(plain)
-        found.append(plain)
-    return found
+        taken.add(plain.replace("_", ""))
+        accepted_names.append(plain)
+    return accepted_names
 
 
 class RunDocument(RunHead):
@@ -150,25 +144,13 @@ def run_document(head: RunHead, topics: Mapping[str, StreamTopic], *, live: bool
 
 
 def string_message(text: str) -> bytes:
-    r"""Return a message of ``std_msgs/String``.
-
-    Examples
-    --------
-    >>> string_message("a")
-    b'\x00\x01\x00\x00\x02\x00\x00\x00a\x00'
-    """
+    """Return a message of ``std_msgs/String``."""
     content = text.encode() + b"\0"
     return struct.pack("<4BI", 0, 1, 0, 0, len(content)) + content
 
 
 def string_of(place: str, message: bytes) -> str:
-    r"""Return the text of a message of ``std_msgs/String``.
-
-    Examples
-    --------
-    >>> string_of("a.mcap", string_message("a"))
-    'a'
-    """
+    """Return the text of a message of ``std_msgs/String``."""
     end = 8 + int.from_bytes(message[4:8], "little")
     try:
         if message[:2] != b"\0\1" or not 8 < end <= len(message):
@@ -179,28 +161,14 @@ def string_of(place: str, message: bytes) -> str:
 
 
 def stamps_ns(time_s: Array | Sequence[float], origin_s: float) -> Array:
-    """Return times in whole nanoseconds since an origin.
-
-    Examples
-    --------
-    >>> stamps_ns(np.array([-0.5, 0.25]), -1.0)
-    array([ 500000000, 1250000000])
-    """
+    """Return times in whole nanoseconds since an origin."""
     return np.asarray(np.rint((np.asarray(time_s) - origin_s) * 1e9)).astype(np.int64)
 
 
 def _record(n_channels: int) -> np.dtype[Any]:
     """Return a message of a stream as it lies in a file: a header with an empty frame, and its numbers."""
-    return np.dtype(
-        [
-            ("encapsulation", "u1", 4),
-            ("sec", "<i4"),
-            ("nanosec", "<u4"),
-            ("frame_bytes", "<u4"),
-            ("frame_and_padding", "u1", 4),
-            ("numbers", "<f8", (1 + n_channels,)),
-        ]
-    )
+    header = [("encapsulation", "u1", 4), ("sec", "<i4"), ("nanosec", "<u4"), ("frame_bytes", "<u4")]
+    return np.dtype([*header, ("frame_and_padding", "u1", 4), ("numbers", "<f8", (1 + n_channels,))])
 
 
 def text_messages(
@@ -218,14 +186,9 @@ def stream_messages(
     values: Array | Sequence[Sequence[float]],
     origin_s: float = 0.0,
 ) -> Messages:
-    """Return samples of a stream as messages.
+    """Return samples (n,) and (n, c) of a stream, in the order of its topic's fields, as messages.
 
-    Parameters
-    ----------
-    topic : of the stream
-    time_s : (n,) on the clock of the run
-    values : (n, c) in the order of the topic's fields
-    origin_s : time that is stamped 0
+    ``origin_s`` is the time on the clock of the run that is stamped 0.
     """
     numbers = np.asarray(values, dtype=float)
     log_ns = stamps_ns(time_s, origin_s)
@@ -242,10 +205,7 @@ def stream_messages(
 def origin_of(run: RunLog) -> float:
     """Return the time of a run that is stamped 0: 0, where stamps allow it.
 
-    Raises
-    ------
-    DataError
-        if the run is longer than stamps can tell apart, 68 years.
+    ``DataError`` where the run is longer than stamps can distinguish, 68 years.
     """
     first_s = min(float(stream.time_s[0]) for stream in run.streams.values())
     last_s = max(float(stream.time_s[-1]) for stream in run.streams.values())
@@ -259,16 +219,13 @@ def origin_of(run: RunLog) -> float:
 def run_messages(run: RunLog, windows: Sequence[tuple[float, str]] = ()) -> Iterator[Messages]:
     """Yield the topics of a run: its document, its labels, what was recorded with it, and its streams.
 
-    Parameters
-    ----------
-    run : with any streams
-    windows : time of the end and description of each window that was recorded with it
+    ``windows`` are time of the end and description of each window that was recorded with it.
     """
     origin_s = origin_of(run)
     start_s = min(float(stream.time_s[0]) for stream in run.streams.values())
     topics: dict[str, StreamTopic] = {}
     for name, stream in run.streams.items():
-        topics[name] = stream_topic(name, stream.channels, [each.topic for each in topics.values()])
+        topics[name] = stream_topic(name, stream.channels, topics.values())
     document = run_document(RunHead.of(run), topics)
     yield text_messages(RUN_TOPIC, [start_s], [document], origin_s)
     changes = label_changes(run.labels)
@@ -304,13 +261,8 @@ class Writer(Protocol):
 class RunRecorder:
     """A run that is written as it comes: topics as those of a run that was exported.
 
-    After :meth:`flush` all that was appended is in the file; if the process is killed then, readers find it.
-
-    Parameters
-    ----------
-    writer : of a file
-    head : of the run
-    origin_s : time on the clock of the run that is stamped 0; stamps reach 68 years from there
+    After :meth:`flush` all that was appended is in the file; if the process is killed then, readers read it.
+    ``origin_s`` is the time on the clock of the run that is stamped 0; stamps reach 68 years from there.
 
     Examples
     --------
@@ -340,8 +292,7 @@ class RunRecorder:
     ) -> None:
         """Append samples (n,) and (n, c) of a stream; one may come later than samples of others."""
         if stream not in self._topics:
-            taken = [each.topic for each in self._topics.values()]
-            self._topics[stream] = stream_topic(stream, channels, taken)
+            self._topics[stream] = stream_topic(stream, channels, self._topics.values())
             self._is_described = False
         messages = stream_messages(self._topics[stream], time_s, values, self._origin_s)
         if not self._is_described and len(messages.log_ns):
@@ -368,13 +319,7 @@ class RunRecorder:
         self._writer.flush()
 
     def finish(self, labels: Iterable[Label] = (), dropped: Mapping[str, int] | None = None) -> None:
-        """Write the end of the file, which stays open.
-
-        Parameters
-        ----------
-        labels : of the run
-        dropped : counts by kind of what was not recorded
-        """
+        """Write the end of the file, which stays open: labels, and counts by kind of what was not recorded."""
         entries = [LabelEntry(**label._asdict()) for label in labels]
         counts = dict(sorted((dropped or {}).items()))
         self._head = self._head.model_copy(update={"labels": entries, "dropped": counts})
@@ -383,19 +328,10 @@ class RunRecorder:
 
 
 def read_document(place: str, text: str, topics: Mapping[str, Topic]) -> RunDocument:
-    """Return the document of a run in a file of messages.
+    """Return the document of a run in a file of messages, of its text and the topics of the file by name.
 
-    Parameters
-    ----------
-    place : of the file, as messages name it
-    text : of the document
-    topics : of the file, by name
-
-    Raises
-    ------
-    LogError
-        if the document is damaged, or the file lacks a topic of a stream, or has one of another type or with
-        other fields.
+    ``LogError`` where the document is damaged, or the file lacks a topic of a stream, or has one of another type or
+    with other fields.
     """
     place = f"{place}: {RUN_TOPIC}"
     try:
@@ -425,17 +361,8 @@ def run_of(
     without a value, streams of fewer than two samples and streams that no instant has in common with the
     others are dropped and counted.
 
-    Parameters
-    ----------
-    place : of the file, as messages name it
-    document : of the run
-    messages : of each topic, in the order of the file
-    faults : counts what is dropped instead of refused, or refuses
-
-    Raises
-    ------
-    LogError
-        if a stream or a label is broken, or no stream is left.
+    ``messages`` are those of each topic, in the order of the file; ``LogError`` where a stream or a label is broken
+    and ``faults`` refuses that, or no stream is left.
     """
     place = f"{place}: {RUN_TOPIC}"
     dropped = Counter(document.dropped)
@@ -452,7 +379,6 @@ def run_of(
             numbers[:, 0],
             numbers[:, 1:],
             channels,
-            row_of=lambda index: index + 1,
             repairs=faults.repairs,
             unknown_is_a_value=name in MAY_BE_UNKNOWN,
         )
@@ -470,13 +396,7 @@ def _recorded_stream(
     """Return the samples of a recorded stream in order of time, without channels that never had a value."""
     try:
         stream = checked_stream(
-            name,
-            numbers[:, 0],
-            numbers[:, 1:],
-            channels,
-            row_of=lambda index: index + 1,
-            repairs=dropped,
-            unknown_is_a_value=True,
+            name, numbers[:, 0], numbers[:, 1:], channels, repairs=dropped, unknown_is_a_value=True
         )
     except LogError:
         dropped[SHORT_STREAM] += 1

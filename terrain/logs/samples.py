@@ -1,12 +1,11 @@
 """From arrays to a :class:`~terrain.records.Stream`, and from files to arrays: the one place where a log is judged.
 
 Files of a log and the names in it do not lead elsewhere, whoever wrote it.  Every reader hands its arrays to
-:func:`checked_stream`.  A strict read refuses times that are not finite,
-go back or repeat, channels with nothing finite in them and streams of fewer than two samples.  A
-repairing read drops the rows at fault, keeps a dead channel as NaN (all runs of a data set must have the
-same channels), and counts what it did.  NaN among finite values is no fault: it stays NaN, infinite values
-become NaN, and the windows that touch them are dropped and counted later.  A finite value that no quantity
-can have, as of damaged bytes, stays as it is; a repairing read makes it NaN and counts it.
+:func:`checked_stream`.  A strict read refuses times that are not finite, go back or repeat, channels with nothing
+finite in them and streams of fewer than two samples.  A repairing read drops the rows at fault, keeps a dead channel
+as NaN (all runs of a data set must have the same channels), and counts what it did.  NaN among finite values is no
+fault: it stays NaN, infinite values become NaN, and the windows that touch them are dropped and counted later.  A
+finite value that no quantity can have, as of damaged bytes, stays as it is; a repairing read makes it NaN.
 """
 
 from __future__ import annotations
@@ -20,6 +19,7 @@ import numpy as np
 
 from terrain.errors import DataError, LogError
 from terrain.files.names import check_inside, check_name, check_regular, has_control_characters, shown
+from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES
 from terrain.records import Array, RunLog, Stream
 
 MAX_MAGNITUDE = 1e12
@@ -27,16 +27,24 @@ MAX_MAGNITUDE = 1e12
 in s has 10); the fourth power of what is much larger, which features need, is no finite number."""
 
 BEYOND = f"beyond {MAX_MAGNITUDE:g} in its SI unit no quantity is plausible: --repair leaves such values out"
-"""What a message states of a value that is larger, wherever it is found."""
+"""What a message states of a value that is larger, wherever it occurs."""
+
+BAD_TIME = "rows with a bad time"
+BAD_CELL = "cells that are no number"
+SHORT_ROW = "rows with missing or extra cells"
+DEAD_CHANNEL = "channels with nothing finite"
+IMPLAUSIBLE = "values beyond any quantity"
+
+
+def to_si(numbers: Array, unit: str, scale: float = 1.0, offset: float = 0.0) -> Array:
+    """Return ``scale * number + offset``, which is in a unit, in the SI unit; what overflows is not finite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        si: Array = (numbers * scale + offset) * UNIT_SCALES[unit][1] + UNIT_OFFSETS.get(unit, 0.0)
+    return si
 
 
 def usable_rows(samples: Array, *, unknown_is_a_value: bool = False) -> Array:
-    """Return which rows (n,) of samples (n, c) hold plausible values only.
-
-    Parameters
-    ----------
-    samples : SI units
-    unknown_is_a_value : NaN is plausible, as unobservable slip is
+    """Return which rows (n,) of samples (n, c) in SI units hold plausible values only; NaN, if stated, is one.
 
     Examples
     --------
@@ -50,7 +58,7 @@ def usable_rows(samples: Array, *, unknown_is_a_value: bool = False) -> Array:
 
 
 def refuse_implausible(run: RunLog, channels: Mapping[str, Sequence[str]]) -> None:
-    """Refuse a finite value that no quantity can have, in the channels of some streams of a run."""
+    """Refuse a finite value that no quantity can have, in the channels of some streams of a run; ``DataError``."""
     for name, of_stream in channels.items():
         stream = run.streams[name]
         for channel in of_stream:
@@ -69,13 +77,7 @@ def short_name(path: Path) -> str:
 
 
 def check_log_file(path: Path, folder: Path) -> Path:
-    """Return a regular file that lies in a folder, links resolved; the folder itself may be a link.
-
-    Raises
-    ------
-    LogError
-        if the file is missing or a link that leads out of the folder, or is no regular file.
-    """
+    """Return a regular file that lies in a folder, links resolved, or raise ``LogError``; the folder may be a link."""
     place = short_name(path)
     if not path.is_symlink() and not path.exists():
         raise LogError(f"{place}: is missing")
@@ -85,18 +87,7 @@ def check_log_file(path: Path, folder: Path) -> Path:
 
 
 def checked_names(place: str, run: RunLog) -> RunLog:
-    """Return a run whose names are plain ones: it says nothing of where a file lies.
-
-    Parameters
-    ----------
-    place : file, as messages name it
-    run : run log; a session that is empty is unknown
-
-    Raises
-    ------
-    LogError
-        if a run, robot, session, terrain, stream or channel has no plain name, or what was dropped a name
-        with control characters.
+    """Return a run whose names are plain ones, or raise ``LogError``: it says nothing of where a file lies.
 
     Examples
     --------
@@ -104,44 +95,24 @@ def checked_names(place: str, run: RunLog) -> RunLog:
     Traceback (most recent call last):
     terrain.errors.LogError: run.json: robot 'robots/husky.yaml' is no plain name: it holds a path separator
     """
-    check_name(f"{place}: run_id", run.run_id, LogError)
-    check_name(f"{place}: robot", run.robot, LogError)
-    if run.session:
-        check_name(f"{place}: session", run.session, LogError)
-    if run.filter:
-        check_name(f"{place}: filter", run.filter, LogError)
-    for terrain in run.terrains:
-        check_name(f"{place}: terrain", terrain, LogError)
-    for name, stream in run.streams.items():
-        check_name(f"{place}: stream", name, LogError)
-        for channel in stream.channels:
-            check_name(f"{place}: channel", channel, LogError)
+    names = [("run_id", run.run_id), ("robot", run.robot)]
+    names += [(key, name) for key in ("session", "filter") if (name := getattr(run, key))]
+    names += [("terrain", terrain) for terrain in run.terrains]
+    for stream, content in run.streams.items():
+        names += [("stream", stream), *(("channel", channel) for channel in content.channels)]
+    for key, name in names:
+        check_name(f"{place}: {key}", name, LogError)
     for kind in run.dropped:
         if has_control_characters(kind):
             raise LogError(f"{place}: key {shown(kind)} of 'dropped' holds a control character")
     return run
 
 
-BAD_TIME = "rows with a bad time"
-BAD_CELL = "cells that are no number"
-SHORT_ROW = "rows with missing or extra cells"
-DEAD_CHANNEL = "channels with nothing finite"
-IMPLAUSIBLE = "values beyond any quantity"
-
-
 def longest_rise(time_s: Array) -> Array:
-    """Return the indices of the longest strictly increasing subsequence of finite times.
+    """Return the indices (m,) of the longest strictly increasing subsequence of finite times (n,).
 
-    One forward spike costs one row and not the rest of the run, as dropping whatever is not later than
-    the row before would.
-
-    Parameters
-    ----------
-    time_s : (n,) finite
-
-    Returns
-    -------
-    (m,) indices, increasing
+    One forward spike costs one row and not the rest of the run, as dropping whatever is not later than the row
+    before would.
 
     Examples
     --------
@@ -155,12 +126,8 @@ def longest_rise(time_s: Array) -> Array:
         length = bisect_left(last_times, time)
         if length:
             before[row] = last_rows[length - 1]
-        if length == len(last_times):
-            last_times.append(time)
-            last_rows.append(row)
-        elif time < last_times[length]:
-            last_times[length] = time
-            last_rows[length] = row
+        if length == len(last_times) or time < last_times[length]:
+            last_times[length : length + 1], last_rows[length : length + 1] = [time], [row]
     chain = []
     row = last_rows[-1] if last_rows else -1
     while row >= 0:
@@ -175,29 +142,22 @@ def checked_stream(
     values: Array,
     channels: Sequence[str],
     *,
-    row_of: Callable[[int], int],
+    row_of: Callable[[int], int] = lambda sample: sample + 1,
     columns: Sequence[str] = (),
     repairs: Counter[str] | None = None,
     unknown_is_a_value: bool = False,
 ) -> Stream:
-    """Return the stream that the arrays hold, or say what is wrong with them.
+    """Return the stream that the arrays hold, or raise ``LogError`` that says what is wrong with them.
 
     Parameters
     ----------
     name : what the message calls the file
-    time_s : (n,) seconds
-    values : (n, c) SI units
-    channels : c names
+    time_s, values, channels : (n,) seconds, (n, c) SI units, c names
     row_of : row number in the file of a sample, for the message
     columns : c names of the columns in the file, for the message, where they are not the channels
-    repairs : counts by kind of what is dropped instead of refused; None refuses
+    repairs : counts by kind of what is dropped instead of refused; None refuses.  Fewer than two samples are
+        refused in any case
     unknown_is_a_value : a channel may hold nothing but NaN, as unobservable slip does
-
-    Raises
-    ------
-    LogError
-        if the times are not finite or not strictly increasing, a channel has nothing finite in it, or
-        fewer than two samples are there (the last also when repairing).
 
     Examples
     --------
@@ -207,42 +167,36 @@ def checked_stream(
     terrain.errors.LogError: a.csv: time goes back at row 4 (0.1 s after 0.2 s)
     """
     values = np.where(np.isfinite(values), values, np.nan)
-    if repairs is not None:
+    if repairs is None:
+        _refuse_bad_time(name, time_s, row_of)
+    else:
         kept = np.flatnonzero(np.isfinite(time_s))
         if np.any(np.diff(time_s[kept]) <= 0.0):
             kept = kept[longest_rise(time_s[kept])]
         if kept.size < time_s.size:
             repairs[BAD_TIME] += time_s.size - kept.size
             time_s, values = time_s[kept], values[kept]
-    else:
-        _refuse_bad_time(name, time_s, row_of)
     if time_s.size < 2:
         raise LogError(f"{name}: has {time_s.size} usable rows of data, at least 2 are needed")
     implausible = np.abs(values) > MAX_MAGNITUDE
     if repairs is not None and implausible.any():
         repairs[IMPLAUSIBLE] += int(implausible.sum())
         values = np.where(implausible, np.nan, values)
-    dead = [
-        channel
-        for channel, column in zip(channels, values.T, strict=True)
-        if not np.isfinite(column).any() and not unknown_is_a_value
-    ]
+    dead = [] if unknown_is_a_value else np.flatnonzero(~np.isfinite(values).any(axis=0)).tolist()
     if dead and repairs is None:
-        column = f" (column {columns[list(channels).index(dead[0])]})" if columns else ""
-        raise LogError(f"{name}: channel {dead[0]}{column} has nothing finite in its {time_s.size} rows")
+        column = f" (column {columns[dead[0]]})" if columns else ""
+        raise LogError(
+            f"{name}: channel {channels[dead[0]]}{column} has nothing finite in its {time_s.size} rows"
+        )
     if dead and repairs is not None:
         repairs[DEAD_CHANNEL] += len(dead)
     return Stream(time_s, values, tuple(channels))
 
 
 def _refuse_bad_time(name: str, time_s: Array, row_of: Callable[[int], int]) -> None:
-    broken = np.flatnonzero(~np.isfinite(time_s))
-    if broken.size:
-        row = int(broken[0])
+    for row in np.flatnonzero(~np.isfinite(time_s))[:1].tolist():
         raise LogError(f"{name}: time at row {row_of(row)} is not finite ({time_s[row]})")
-    fallen = np.flatnonzero(np.diff(time_s) <= 0.0)
-    if fallen.size:
-        row = int(fallen[0]) + 1
+    for row in (np.flatnonzero(np.diff(time_s) <= 0.0)[:1] + 1).tolist():
         now, then = float(time_s[row]), float(time_s[row - 1])
         if now == then:
             raise LogError(f"{name}: time repeats at row {row_of(row)} ({now:.15g} s twice)")
@@ -250,13 +204,7 @@ def _refuse_bad_time(name: str, time_s: Array, row_of: Callable[[int], int]) -> 
 
 
 def refuse_apart(run_id: str, streams: Mapping[str, Stream]) -> None:
-    """Raise :class:`LogError` when no instant is covered by every stream of a run.
-
-    Examples
-    --------
-    >>> early = Stream([0.0, 1.0], [[1.0], [2.0]], ("gyro_z_radps",))
-    >>> refuse_apart("SNOW_01", {"imu": early, "wheels": early})
-    """
+    """Raise ``LogError`` when no instant is covered by every stream of a run."""
     if max(s.time_s[0] for s in streams.values()) >= min(s.time_s[-1] for s in streams.values()):
         spans = ", ".join(f"{n} {s.time_s[0]:.15g} to {s.time_s[-1]:.15g} s" for n, s in streams.items())
         raise LogError(f"{run_id}: the streams do not overlap in time ({spans})")

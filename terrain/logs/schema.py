@@ -1,8 +1,7 @@
 """Names, units and signal sets of the channels of a run log.
 
-A channel is named ``<quantity>_<place>_<unit>``: ``gyro_z_radps``, ``speed_left_mps``, ``current_3_a``.
-The unit is the last word; the quantity is the first and decides the signal set by which features are
-switched on and off.
+A channel is named ``<quantity>_<place>_<unit>``: ``gyro_z_radps``, ``speed_left_mps``, ``current_3_a``.  The unit is
+the last word; the quantity is the first and decides the signal set by which features are switched on and off.
 """
 
 from __future__ import annotations
@@ -53,36 +52,33 @@ _SCALES: dict[str, dict[str, float]] = {
 UNIT_SCALES: dict[str, tuple[str, float]] = {
     unit: (word, factor) for word, units in _SCALES.items() for unit, factor in units.items()
 }
-"""Unit accepted in a mapping file: the SI unit word it becomes, and the factor.
-
-``g`` is standard gravity, ``t`` a tonne."""
+"""Unit accepted in a mapping: the SI unit word it becomes, and the factor; ``g`` is standard gravity, ``t`` a tonne."""
 
 UNIT_OFFSETS: dict[str, float] = {"degC": 273.15, "degF": 273.15 - 32.0 * 5.0 / 9.0}
 """What is added after the factor, where the zero of a unit is not that of the SI unit."""
 
-_SPELLINGS: dict[str, tuple[str, ...]] = {
-    "s": ("sec", "seconds"),
-    "ms": ("msec",),
-    "us": ("\u00b5s", "\u03bcs"),
-    "m/s^2": ("m/s2", "m/s\u00b2", "m s^-2"),
-    "mm/s^2": ("mm/s2", "mm/s\u00b2"),
-    "km/h": ("kmh", "kph", "km/hr"),
-    "m/s": ("m s^-1", "m/sec"),
-    "deg": ("\u00b0", "degree", "degrees"),
-    "deg/s": ("\u00b0/s", "deg/sec"),
-    "rad/s": ("rad/sec",),
-    "rpm": ("1/min", "r/min", "U/min", "RPM"),
-    "Nm": ("N m", "N*m", "N\u00b7m"),
-    "degC": ("\u00b0C",),
-    "degF": ("\u00b0F",),
-    "%": ("percent",),
+_SPELLINGS = {
+    "s": "sec, seconds",
+    "ms": "msec",
+    "us": "\u00b5s, \u03bcs",
+    "m/s": "m s^-1, m/sec",
+    "m/s^2": "m/s2, m/s\u00b2, m s^-2",
+    "mm/s^2": "mm/s2, mm/s\u00b2",
+    "km/h": "kmh, kph, km/hr",
+    "deg": "\u00b0, degree, degrees",
+    "rad/s": "rad/sec",
+    "deg/s": "\u00b0/s, deg/sec",
+    "rpm": "1/min, r/min, U/min, RPM",
+    "Nm": "N m, N*m, N\u00b7m",
+    "degC": "\u00b0C",
+    "degF": "\u00b0F",
+    "%": "percent",
 }
-UNIT_ALIASES: dict[str, str] = {other: unit for unit, others in _SPELLINGS.items() for other in others}
-"""Other spellings of units, as labs and instruments write them."""
+_ALIASES = {other: unit for unit, others in _SPELLINGS.items() for other in others.split(", ")}
 
 
 def canonical_unit(unit: str) -> str:
-    """Return a unit as :data:`UNIT_SCALES` spells it; one that is unknown as it is.
+    """Return a unit as :data:`UNIT_SCALES` spells it, however labs and instruments do; an unknown one as it is.
 
     Examples
     --------
@@ -90,37 +86,48 @@ def canonical_unit(unit: str) -> str:
     ('m/s^2', 'km/h', 'furlong')
     """
     text = unit.strip()
-    return UNIT_ALIASES.get(text, text if text in UNIT_SCALES else unit)
+    return _ALIASES.get(text, text if text in UNIT_SCALES else unit)
 
 
-WHEELS_CHANNELS: tuple[str, ...] = (
-    *(f"motor_{i}_radps" for i in (1, 2, 3)),
-    *(f"current_{i}_a" for i in (1, 2, 3)),
-)
+def check_unit(place: str, unit: str, desired: str) -> None:
+    """Raise ``ConfigError`` where a unit is unknown, or another than that of an SI unit word.
+
+    Examples
+    --------
+    >>> check_unit("gyro_z_radps", "m", "radps")
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: gyro_z_radps: unit 'm' does not suit it (accepted here: rad/s, deg/s, rpm)
+    """
+    unit = canonical_unit(unit)
+    if UNIT_SCALES.get(unit, ("",))[0] != desired:
+        fault = "does not suit it" if unit in UNIT_SCALES else "is unknown"
+        suitable = ", ".join(name for name, (word, _) in UNIT_SCALES.items() if word == desired)
+        raise ConfigError(f"{place}: unit {unit!r} {fault} (accepted here: {suitable})")
+
+
+WHEELS_CHANNELS = (*(f"motor_{i}_radps" for i in (1, 2, 3)), *(f"current_{i}_a" for i in (1, 2, 3)))
 """Channels of the motor drivers of a swerve robot: motor rates and motor currents."""
 
-STEERING_CHANNELS: tuple[str, ...] = tuple(f"angle_{i}_rad" for i in (1, 2, 3))
+STEERING_CHANNELS = tuple(f"angle_{i}_rad" for i in (1, 2, 3))
 """Channels of its steering encoders."""
 
-IMU_CHANNELS: tuple[str, ...] = (
+IMU_CHANNELS = (
     *(f"gyro_{axis}_radps" for axis in "xyz"),
     *(f"accel_{axis}_mps2" for axis in "xyz"),
     *("roll_rad", "pitch_rad", "yaw_rad"),
 )
-"""Channels of an IMU that fuses its attitude; the accelerometer tells specific force."""
+"""Channels of an IMU that fuses its attitude; the accelerometer measures specific force."""
 
-GNSS_CHANNELS: tuple[str, ...] = (
+GNSS_CHANNELS = (
     *("position_x_m", "position_y_m", "velocity_x_mps", "velocity_y_mps"),
     *("std_position_m", "fix_ratio"),
 )
 """Channels of a receiver: the antenna, east and north."""
 
-POSE_CHANNELS: tuple[str, ...] = ("position_x_m", "position_y_m", "yaw_rad")
+POSE_CHANNELS = ("position_x_m", "position_y_m", "yaw_rad")
 """Of a stream of poses of the body's origin, in a frame that is fixed and right-handed."""
 
-ESTIMATOR_CHANNELS: tuple[str, ...] = (
-    *("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2"),
-)
+ESTIMATOR_CHANNELS = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
 """States of a filter that go into windows."""
 
 ESTIMATED = ("estimator", "slip")
@@ -128,6 +135,11 @@ ESTIMATED = ("estimator", "slip")
 
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""
+
+NO_FEATURES = ("truth", "commands", "control", "odometry", "state", "lidar", "pose", "compass", "testbed")
+"""Streams that no feature is made of."""
+
+_SET_OF_QUANTITY = {"gyro": "imu", "accel": "imu", "speed": "wheels", "current": "currents", "slip": "slip"}
 
 
 def check_signal_sets(names: tuple[str, ...]) -> tuple[str, ...]:
@@ -140,33 +152,11 @@ def check_signal_sets(names: tuple[str, ...]) -> tuple[str, ...]:
     return names
 
 
-NO_FEATURES: tuple[str, ...] = (
-    *("truth", "commands", "control", "odometry", "state", "lidar", "pose", "compass", "testbed"),
-)
-"""Streams that no feature is made of."""
-
-_SET_OF_QUANTITY: dict[str, str] = {
-    "gyro": "imu",
-    "accel": "imu",
-    "speed": "wheels",
-    "current": "currents",
-    "slip": "slip",
-}
-_SET_OF_STREAM: dict[str, str] = {"estimator": "estimator", "slip": "slip"}
-
-
 def unit_of(channel: str) -> str:
-    """Return the SI unit word of a channel name; a name that ends in none is refused.
-
-    Examples
-    --------
-    >>> unit_of("accel_z_mps2")
-    'mps2'
-    """
+    """Return the SI unit word of a channel name, as ``mps2``; ``LogError`` where a name ends in none."""
     unit = channel.rpartition("_")[2]
     if unit not in UNIT_SYMBOLS:
-        known = ", ".join(UNIT_SYMBOLS)
-        raise LogError(f"channel {channel!r} does not end in a known unit (one of {known})")
+        raise LogError(f"channel {channel!r} does not end in a known unit (one of {', '.join(UNIT_SYMBOLS)})")
     return unit
 
 
@@ -180,4 +170,4 @@ def signal_set_of(stream: str, channel: str) -> str | None:
     """
     if stream in NO_FEATURES:
         return None
-    return _SET_OF_STREAM.get(stream) or _SET_OF_QUANTITY.get(channel.partition("_")[0])
+    return stream if stream in ESTIMATED else _SET_OF_QUANTITY.get(channel.partition("_")[0])

@@ -17,18 +17,10 @@ RESPELT = "labels in another spelling of their terrain"
 
 
 def one_spelling(place: str, runs: Sequence[RunLog], *, repair: bool = False) -> list[RunLog]:
-    """Return runs whose terrains differ by more than upper and lower case.
+    """Return the runs of a data set, ``place`` in messages, whose terrains differ by more than upper and lower case.
 
-    Parameters
-    ----------
-    place : data set, as the message calls it
-    runs : all of it
-    repair : take the spelling of most runs, the first in the alphabet among equals, and count the labels
-
-    Raises
-    ------
-    LogError
-        if a terrain has two spellings, unless repairing.
+    ``LogError`` where a terrain has two spellings; a repairing read takes that of most runs, the first in the alphabet
+    among equals, and counts the labels.
 
     Examples
     --------

@@ -18,10 +18,8 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import DataError
+from terrain.logs.schema import TIME_TOLERANCE_S
 from terrain.records import Array, Label, RunLog, Stream, Windows
-
-TIME_TOLERANCE_S = 1e-6
-"""Stamps are compared to this, far below any sample period."""
 
 SHORTEST_S, LONGEST_S = 10.0, 30.0
 """Time on a ground before the next: shorter ones are no more than five windows, longer ones hardly ever
@@ -77,15 +75,7 @@ def order_stretches(stretches: Sequence[Part], rng: np.random.Generator) -> list
 
 
 def parts_under(runs: Mapping[str, RunLog], windows: Windows) -> list[Part]:
-    """Return the parts of runs that windows lie in, one a label.
-
-    A run of which some windows are there gives what they span.
-
-    Parameters
-    ----------
-    runs : by id
-    windows : of these runs
-    """
+    """Return the parts of runs, by id, that windows lie in, one a label: what the windows of a run span."""
     run_id, terrain = windows.run_id.astype(str), windows.terrain.astype(str)
     parts = []
     for name in np.unique(run_id):
@@ -113,11 +103,6 @@ def sequences_of(
     """Return a spliced sequence through all parts, each second at most once, and the runs over several grounds.
 
     None is spliced where the terrain never changes.
-
-    Parameters
-    ----------
-    parts, channels, run_id : as :func:`splice_runs`
-    rng : of the lengths and the order of stretches
     """
     found = []
     ordered = order_stretches([s for part in parts for s in stretches_of(part, rng)], rng)
@@ -130,18 +115,10 @@ def sequences_of(
 
 
 def splice_runs(parts: Sequence[Part], channels: Mapping[str, Sequence[str]], run_id: str) -> RunLog:
-    """Return one log of all parts, from 0 s on, labelled with their grounds.
+    """Return one log of all parts, in order, from 0 s on, labelled with their grounds.
 
-    Parameters
-    ----------
-    parts : in order, at least one; their runs have all channels at about one rate
-    channels : of each stream, those that are taken and their order
-    run_id : of the log
-
-    Raises
-    ------
-    DataError
-        if there is no part, or one holds no sample of a stream.
+    Their runs have all channels, which are taken in this order, at about one rate; ``DataError`` where there is no
+    part, or one holds no sample of a stream.
 
     Examples
     --------

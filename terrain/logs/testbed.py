@@ -8,24 +8,14 @@ row of data, so that splits by run hold trials out.
 The only stream is ``testbed``.  The files do not state how long a trial lasted: it is a steady state, and its
 means stand in two equal samples, at 0 s and at 1 s, since a stream has at least two.
 
-==============  =========================================  ==================================================
-column          channel                                    note
-==============  =========================================  ==================================================
-``trial_num``   ``trial_attempt_code``                     attempt at this setting; repeats, names no row
-``beta``        ``slip_angle_commanded_rad``               90 degrees: the wheel is dragged along its axle
-``Vry``         ``speed_wheel_commanded_mps``              wheel circumferential speed, rounded by the authors
-``slip``        ``slip_measured_ratio``                    ``avg_Vry`` and ``avg_Vx`` by (1)
-``avg_angle``   ``slip_angle_measured_rad``
-``avg_Vx``      ``speed_travel_mps``, ``..._std_mps``      of the carriage, along the direction of travel
-``avg_Vry``     ``speed_wheel_mps``, ``..._std_mps``
-``avg_Fy``      ``force_x_n``, ``force_x_std_n``           sign turned: traction, positive ahead
-``avg_Fx``      ``force_y_n``, ``force_y_std_n``           side force, positive to the left
-``avg_Fz``      ``force_z_n``, ``force_z_std_n``           sign turned: load, the ground's push upwards
-``avg_Z``       ``sinkage_wheel_m``, ``..._std_m``         sign turned: depth of the lowest point, downwards
-==============  =========================================  ==================================================
+Columns and channels are those of :data:`MEANS` and :data:`SPREADS`.  ``trial_num`` is the attempt at this setting: it
+repeats, and names no row.  A ``beta`` of 90 degrees: the wheel is dragged along its axle.  ``Vry`` is the wheel
+circumferential speed, rounded by the authors; ``avg_Vx`` that of the carriage, along the direction of travel.  Forces
+are traction, positive ahead, side force, positive to the left, and load, the ground's push upwards; sinkage is the
+depth of the lowest point, downwards: the signs of ``avg_Fy``, ``avg_Fz`` and ``avg_Z`` are turned.
 
-(1) ``slip = (speed_wheel - speed_travel) / max(|speed_wheel|, |speed_travel|)``: the speed is that of the
-travel, not its part along the wheel.  ``slip_commanded_ratio`` is the same of the commanded speeds; the
+``slip = (speed_wheel - speed_travel) / max(|speed_wheel|, |speed_travel|)`` of ``avg_Vry`` and ``avg_Vx``: the speed
+is that of the travel, not its part along the wheel.  ``slip_commanded_ratio`` is the same of the commanded speeds; the
 smallest positive slip was commanded as 12 mm/s (0.17) and driven as 13 mm/s (0.23).
 
 Signs.  A locked wheel (slip -1) that moves straight ahead is pushed back: ``avg_Fy`` is +39 N there, so that
@@ -42,10 +32,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -58,8 +47,6 @@ from terrain.records import Label, RunLog
 WHEELS = ("smooth", "grouser")
 """Names of the files; each is a wheel, a session, and the end of the robot's name."""
 
-ROBOT = "testbed_{wheel}"
-SOIL = "dry_sand"
 STREAM = "testbed"
 HELD_S = 1.0
 """Time from the first of the two equal samples of a trial to the other; it stands for no duration."""
@@ -93,33 +80,16 @@ SPREADS: dict[str, tuple[str, float]] = {
 
 COLUMNS = tuple(column for column, _ in (*MEANS.values(), *SPREADS.values()))
 MAX_SLIP_MISFIT = 0.01
-"""By how much ``slip`` may differ from the slip of the mean speeds; 0.002 is the most that was found."""
+"""By how much ``slip`` may differ from the slip of the mean speeds; 0.002 is the most that was measured."""
 
 BAD_SPREAD = "spreads that are negative or no number"
 
 
-class _Row(NamedTuple):
-    """A row of a file: its number as an editor shows it, its texts, and the row that it repeats, or 0."""
-
-    number: int
-    cells: tuple[str, ...] | None
-    repeats: int
-
-
 def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
-    """Return one reader per trial of the files in ``folder``; call it with ``repair=``.
+    """Return one reader per trial of ``smooth.csv`` and ``grouser.csv`` in ``folder``; call it with ``repair=``.
 
-    The list is empty when neither file is there.  A row that cannot be read has a reader, too: it raises
-    :class:`LogError`, and who repairs skips it by name.
-
-    Parameters
-    ----------
-    folder : with ``smooth.csv``, ``grouser.csv`` or both
-
-    Raises
-    ------
-    LogError
-        if a file is no text, lacks a column or has no row of data.
+    The list is empty when neither file is there; ``LogError`` where one is no text, lacks a column or has no row of
+    data.  A row that cannot be read has a reader, too: it raises ``LogError``, and who repairs skips it by name.
     """
     readers: list[Callable[..., RunLog]] = []
     for wheel in WHEELS:
@@ -130,22 +100,30 @@ def find_runs(folder: Path) -> list[Callable[..., RunLog]]:
         if not rows:
             raise LogError(f"{short_name(path)}: has no rows of data, a trial a row is needed")
         first: dict[tuple[str, ...], int] = {}
-        for index, (number, cells) in enumerate(rows, start=1):
-            repeats = first.setdefault(cells, number) if cells is not None else number
-            row = _Row(number, cells, 0 if repeats == number else repeats)
-            readers.append(partial(read_trial, short_name(path), wheel, index, row))
+        for index, (row, cells) in enumerate(rows, start=1):
+            repeated = row if cells is None else first.setdefault(cells, row)
+            readers.append(partial(read_trial, short_name(path), wheel, index, row, cells, repeated))
     return readers
 
 
-def read_trial(name: str, wheel: str, index: int, row: _Row, *, repair: bool = False) -> RunLog:
+def read_trial(
+    name: str,
+    wheel: str,
+    index: int,
+    row: int,
+    cells: tuple[str, ...] | None,
+    repeated: int,
+    *,
+    repair: bool = False,
+) -> RunLog:
     """Return a trial as a run.
 
     Parameters
     ----------
-    name : what messages call the file
-    wheel : one of :data:`WHEELS`
-    index : of the row among those of data, from 1
-    row : its texts
+    name, wheel : what messages call the file, and one of :data:`WHEELS`
+    index, row : of the trial among the rows of data, from 1, and its number as an editor shows it
+    cells : its texts; None of a row that is too short or too long
+    repeated : number of the first row with these texts
     repair : a spread that is not accepted becomes NaN and is counted
 
     Raises
@@ -154,66 +132,41 @@ def read_trial(name: str, wheel: str, index: int, row: _Row, *, repair: bool = F
         if the row is too short or too long or repeats another, a cell is no number, a mean is missing or not
         finite, or the numbers contradict each other.
     """
+    if cells is None:
+        raise LogError(f"{name}: row {row} has missing or extra cells")
+    if repeated != row:
+        raise LogError(f"{name}: row {row} repeats the trial of row {repeated}, number for number")
     dropped: Counter[str] = Counter()
-    column = dict(zip(COLUMNS, _numbers(name, row, repair, dropped), strict=True))
-    _refuse_contradictions(f"{name}: row {row.number}", column)
-    channels = MEANS | SPREADS
-    values = {channel: column[source] * factor for channel, (source, factor) in channels.items()}
+    column = {}
+    for source, cell in zip(COLUMNS, cells, strict=True):
+        place, number = f"{name}: {source} at row {row} is {shown(cell)}", number_in(cell)
+        if source.startswith("std"):
+            if number is None or not (math.isnan(number) or 0.0 <= number < math.inf):
+                if not repair:
+                    raise LogError(f"{place}, a standard deviation is a number from 0 up")
+                number = math.nan
+                dropped[BAD_SPREAD] += 1
+        elif number is None:
+            raise LogError(f"{place}, which is no number")
+        elif not math.isfinite(number):
+            raise LogError(f"{place}, a finite mean is required")
+        column[source] = number
+    _refuse_contradictions(f"{name}: row {row}", column)
+    values = {channel: column[source] * factor for channel, (source, factor) in (MEANS | SPREADS).items()}
     values["slip_commanded_ratio"] = slip_of(values["speed_wheel_commanded_mps"], TRAVEL_SPEED_MPS)
-    stream = checked_stream(
-        name,
-        np.array([0.0, HELD_S]),
-        np.tile(list(values.values()), (2, 1)),
-        list(values),
-        row_of=lambda _: row.number,
-        unknown_is_a_value=True,
-    )
+    twice = np.tile([*values.values()], (2, 1))
+    stream = checked_stream(name, np.array([0.0, HELD_S]), twice, [*values], unknown_is_a_value=True)
+    labels = (Label(0.0, 2.0 * HELD_S, "dry_sand"),)
+    source = f"{name}, row {row}, layout of the wheel testbed"
     run = RunLog(
-        f"{wheel}_trial_{index:03d}",
-        ROBOT.format(wheel=wheel),
-        {STREAM: stream},
-        (Label(0.0, 2.0 * HELD_S, SOIL),),
-        source=f"{name}, row {row.number}, layout of the wheel testbed",
-        dropped=dropped,
-        session=wheel,
+        f"{wheel}_trial_{index:03d}", f"testbed_{wheel}", {STREAM: stream}, labels, source, dropped, wheel
     )
     return checked_names(name, run)
 
 
 def slip_of(wheel_mps: float, travel_mps: float) -> float:
-    """Return the slip ratio of two speeds of which one at least is not 0.
-
-    Examples
-    --------
-    >>> slip_of(0.02, 0.01), slip_of(0.0, 0.01)
-    (0.5, -1.0)
-    """
+    """Return the slip ratio of two speeds of which one at least is not 0."""
     return (wheel_mps - travel_mps) / max(abs(wheel_mps), abs(travel_mps))
-
-
-def _numbers(name: str, row: _Row, repair: bool, dropped: Counter[str]) -> Sequence[float]:
-    if row.cells is None:
-        raise LogError(f"{name}: row {row.number} has missing or extra cells")
-    if row.repeats:
-        raise LogError(f"{name}: row {row.number} repeats the trial of row {row.repeats}, number for number")
-    spreads = {column for column, _ in SPREADS.values()}
-    numbers = []
-    for column, cell in zip(COLUMNS, row.cells, strict=True):
-        place = f"{name}: {column} at row {row.number} is {shown(cell)}"
-        number = number_in(cell)
-        if column in spreads and (number is None or not (math.isnan(number) or 0.0 <= number < math.inf)):
-            if not repair:
-                raise LogError(f"{place}, a standard deviation is a number from 0 up")
-            number = math.nan
-            dropped[BAD_SPREAD] += 1
-        if number is None:
-            raise LogError(f"{place}, which is no number")
-        if column not in spreads and not math.isfinite(number):
-            raise LogError(
-                f"{name}: {column} at row {row.number} is {shown(cell)}, a finite mean is required"
-            )
-        numbers.append(number)
-    return numbers
 
 
 def _refuse_contradictions(place: str, column: dict[str, float]) -> None:

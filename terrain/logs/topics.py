@@ -1,23 +1,4 @@
-"""Messages of topics as streams: what a small YAML mapping describes, or what the types of a bag's topics tell.
-
-::
-
-    robot: husky                      # may be left out where --robot is given
-    time: header                      # stamps of the headers, log times where there are none; log: log times
-    labels: /terrain                  # std_msgs/String with the names of terrains as they change
-    streams:
-      imu: {topic: /imu/data, kind: imu}
-      odometry: {topic: /zed/odom, kind: odometry}
-      commands: {topic: /cmd_vel, kind: twist}
-      wheels:
-        topic: /joint_states
-        kind: joints
-        channels:
-          speed_left_mps: {joint: front_left_wheel, field: velocity}
-      battery:
-        topic: /status
-        channels:
-          voltage_v: {field: "cells[0].volts", unit: V, scale: 2, offset: 0.1}
+"""Messages of topics as streams: what a small YAML mapping describes (``docs/bags.md``), or the types of the topics.
 
 A number becomes ``(scale * number + offset)`` in the unit given, and then SI.  A channel may name a topic of
 its own.  Samples of several topics are joined by ``join``: ``equal`` takes the instants that all topics have,
@@ -44,15 +25,56 @@ from terrain.errors import ConfigError, LogError
 from terrain.files.documents import accepted, read_yaml
 from terrain.files.names import check_name, data_folder, listed, plain_name, shown
 from terrain.logs.labels import label_intervals
-from terrain.logs.mapping import Strict, Unit, Word, check_unit
-from terrain.logs.samples import checked_stream, longest_rise
-from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES, unit_of
+from terrain.logs.mapping import Strict, Unit, Word, unit_required
+from terrain.logs.samples import checked_stream, longest_rise, to_si
+from terrain.logs.schema import UNIT_SCALES, check_unit, unit_of
 from terrain.logs.tables import MAX_VALUES
 from terrain.records import Array, Label, Stream
 
 EARLY_END = "files that end early"
 DAMAGED_BLOCK = "damaged blocks of messages"
 DAMAGED_MESSAGE = "damaged messages"
+UNMATCHED = "messages without one of equal stamp on the other topics"
+
+STAMPS = (
+    ("header.stamp.sec", "header.stamp.nanosec"),
+    ("header.stamp.secs", "header.stamp.nsecs"),
+    ("timestamp.seconds", "timestamp.nanos"),
+    ("timestamp.sec", "timestamp.nsec"),
+)
+"""Where messages of ROS, and those of Foxglove in Protobuf and JSON, have the time of a measurement."""
+
+TYPES: Mapping[str, tuple[str, ...]] = {
+    "gnss": ("sensor_msgs/NavSatFix",),
+    "imu": ("sensor_msgs/Imu",),
+    "joints": ("sensor_msgs/JointState",),
+    "odometry": ("nav_msgs/Odometry",),
+    "pose": ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"),
+    "twist": ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"),
+}
+"""Types of the messages of each kind of stream."""
+
+STANDARD_STREAMS: Mapping[str, str] = {"imu": "imu", "odometry": "odometry", "commands": "twist"}
+"""Stream of each kind that needs no mapping, where one topic alone is of its types."""
+
+LABELS_TYPE = "std_msgs/String"
+
+DISTRO = "ROS2_HUMBLE"
+"""Release whose definitions are written, and taken for a bag that holds none and does not name its own."""
+
+MAX_LABELS = 1_000_000
+"""Messages with terrains; ten a second are 28 hours."""
+
+LATEST_NS = 2**62
+"""Latest stamp that a message may have."""
+
+_JOINT_UNITS: Mapping[str, str] = {"velocity": "rad/s", "position": "rad", "effort": "Nm"}
+_PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
+
+Kind = Literal["fields", "gnss", "imu", "joints", "odometry", "pose", "twist"]
+Number = Callable[[Any], float]
+Converted = tuple[tuple[str, ...], Array]
+"""Channels, and their values (n, c)."""
 
 
 class Topic(NamedTuple):
@@ -68,16 +90,27 @@ class Topic(NamedTuple):
     definition: str
 
 
-class Faults:
-    """Faults of one log.
+class MessageKind(NamedTuple):
+    """A type of message that becomes channels of its own.
 
     Parameters
     ----------
-    repairs : counts by kind; None refuses
+    paths : of its numbers
+    channels : from those (n, k) to channels
+    numbers : from a stream to those (n, k), None where the stream lacks channels; None where none is written
+    fixed : what else is written, by path
+    """
 
-    Attributes
-    ----------
-    first : what a strict read would refuse first; empty without a fault
+    paths: tuple[str, ...]
+    channels: Callable[[Array], Converted]
+    numbers: Callable[[Stream], Array | None] | None = None
+    fixed: Mapping[str, Any] = MappingProxyType({})
+
+
+class Faults:
+    """Faults of one log: counts by kind in ``repairs``, None of which refuses.
+
+    ``first`` is what a strict read would refuse first; empty without a fault.
     """
 
     def __init__(self, repairs: Counter[str] | None) -> None:
@@ -91,15 +124,63 @@ class Faults:
         self.repairs[kind] += n
 
 
-STAMPS = (
-    ("header.stamp.sec", "header.stamp.nanosec"),
-    ("header.stamp.secs", "header.stamp.nsecs"),
-    ("timestamp.seconds", "timestamp.nanos"),
-    ("timestamp.sec", "timestamp.nsec"),
-)
-"""Where messages of ROS, and those of Foxglove in Protobuf and JSON, have the time of a measurement."""
+class WheelRadius(Strict):
+    """Radius by which rates of wheels become speeds."""
 
-Number = Callable[[Any], float]
+    value: Annotated[FiniteFloat, Field(gt=0.0)]
+    unit: Literal["m", "mm"]
+    source: Word
+
+
+class Channel(Strict):
+    """Where a channel is: ``(scale * number + offset)`` is in ``unit``; ``source`` is that of those."""
+
+    field: Word
+    joint: str = ""
+    topic: str = ""
+    unit: Unit = ""
+    scale: FiniteFloat = 1.0
+    offset: FiniteFloat = 0.0
+    source: str = ""
+
+    @property
+    def number_unit(self) -> str:
+        """Unit as stated, else that of ROS for a joint."""
+        return self.unit or (_JOINT_UNITS.get(self.field, "") if self.joint else "")
+
+    def turns(self, desired: str) -> bool:
+        """Return whether it is a speed whose joint turns: its rate is multiplied by the wheel's radius."""
+        turning = self.number_unit in ("rad/s", "deg/s", "rpm")
+        return desired == "mps" and bool(self.joint) and self.field == "velocity" and turning
+
+
+class StreamMapping(Strict):
+    """Where a stream is."""
+
+    topic: Word
+    kind: Kind = "fields"
+    channels: Annotated[dict[str, Channel], Field(default_factory=dict)]
+    time: Literal["header", "log", ""] = ""
+    join: Literal["equal", "previous"] = "equal"
+    wheel_radius: WheelRadius | None = None
+
+    @property
+    def by_topic(self) -> dict[str, dict[str, Channel]]:
+        """Channels by their topic, those of the stream's own first."""
+        topics: dict[str, dict[str, Channel]] = {self.topic: {}}
+        for name, channel in self.channels.items():
+            topics.setdefault(channel.topic or self.topic, {})[name] = channel
+        return {topic: channels for topic, channels in topics.items() if channels}
+
+
+class TopicMapping(Strict):
+    """How topics become streams."""
+
+    streams: Annotated[dict[Word, StreamMapping], Field(min_length=1)]
+    robot: str = ""
+    time: Literal["header", "log"] = "header"
+    terrain: str = ""
+    labels: str = ""
 
 
 def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -> Number:
@@ -108,14 +189,10 @@ def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -
     Parameters
     ----------
     topic, kind : name and type, as messages name them
-    message : the first one, which shows what fields there are
+    message : the first one, which shows what fields there are; without such a field, or a number in it,
+        ``ConfigError`` is raised
     path : as ``twist.linear.x`` or ``data[2]``; of a joint the array that has its number
     joint : name that stands for an index: its place in the field ``name``
-
-    Raises
-    ------
-    ConfigError
-        if there is no such field, or it holds no number.
 
     Examples
     --------
@@ -127,7 +204,7 @@ def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -
     if joint:
         if not {path, "name"} <= set(_fields(message)) or not _is_array(_field(message, path)):
             raise ConfigError(f"{place} is no array of joints")
-        return lambda message: _of_joint(message, path, joint)
+        return lambda message: _number_of_joint(message, path, joint)
     steps: list[str | int] = []
     value, owner = message, kind
     for name, index in re.findall(r"(\w+)(?:\[(\d+)\])?", path):
@@ -142,14 +219,13 @@ def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -
         steps += [name, int(index)] if index else [name]
         if index:
             if int(index) >= len(value):  # another message may have more elements
-                return lambda message: _following(message, steps)
+                return lambda message: _number_along(message, steps)
             value = value[int(index)]
     if value is not None and not isinstance(value, int | float | np.number | np.bool_):
-        fields = _fields(value)
-        inner = f" (it has {listed(fields)})" if fields else ""
+        inner = f" (it has {listed(fields)})" if (fields := _fields(value)) else ""
         raise ConfigError(f"{place} is of type {type(value).__name__}, a number is required{inner}")
     if isinstance(message, dict) or not all(isinstance(step, str) for step in steps):
-        return lambda message: _following(message, steps)
+        return lambda message: _number_along(message, steps)
     return attrgetter(path)
 
 
@@ -164,7 +240,7 @@ def stamp_at(topic: str, kind: str, message: Any) -> tuple[Number, Number] | Non
     return None
 
 
-def _following(message: Any, steps: list[str | int]) -> float:
+def _number_along(message: Any, steps: list[str | int]) -> float:
     for step in steps:
         if isinstance(step, str):
             message = _field(message, step)
@@ -175,7 +251,7 @@ def _following(message: Any, steps: list[str | int]) -> float:
     return float(message)
 
 
-def _of_joint(message: Any, path: str, joint: str) -> float:
+def _number_of_joint(message: Any, path: str, joint: str) -> float:
     names, values = list(_field(message, "name")), _field(message, path)
     place = names.index(joint) if joint in names else len(values)
     return float(values[place]) if place < len(values) else np.nan
@@ -198,89 +274,14 @@ def _is_array(value: Any) -> bool:
     return hasattr(value, "__getitem__") and not isinstance(value, str | bytes | dict) and np.ndim(value) > 0
 
 
-Kind = Literal["fields", "gnss", "imu", "joints", "odometry", "pose", "twist"]
-
-TYPES: Mapping[str, tuple[str, ...]] = {
-    "gnss": ("sensor_msgs/NavSatFix",),
-    "imu": ("sensor_msgs/Imu",),
-    "joints": ("sensor_msgs/JointState",),
-    "odometry": ("nav_msgs/Odometry",),
-    "pose": ("geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"),
-    "twist": ("geometry_msgs/Twist", "geometry_msgs/TwistStamped"),
-}
-"""Types of the messages of each kind."""
-
-STANDARD_STREAMS: Mapping[str, str] = {"imu": "imu", "odometry": "odometry", "commands": "twist"}
-"""Stream of each kind that needs no mapping, where one topic alone is of its types."""
-
-LABELS_TYPE = "std_msgs/String"
-
-DISTRO = "ROS2_HUMBLE"
-"""Release whose definitions are written, and taken for a bag that holds none and does not name its own."""
-
-_JOINT_UNITS: Mapping[str, str] = {"velocity": "rad/s", "position": "rad", "effort": "Nm"}
-_PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
-
-
-class WheelRadius(Strict):
-    """Radius by which rates of wheels become speeds."""
-
-    value: Annotated[FiniteFloat, Field(gt=0.0)]
-    unit: Literal["m", "mm"]
-    source: Word
-
-
-class Channel(Strict):
-    """Where a channel is: ``(scale * number + offset)`` is in ``unit``; ``source`` is that of those."""
-
-    field: Word
-    joint: str = ""
-    topic: str = ""
-    unit: Unit = ""
-    scale: FiniteFloat = 1.0
-    offset: FiniteFloat = 0.0
-    source: str = ""
-
-
-class StreamMapping(Strict):
-    """Where a stream is."""
-
-    topic: Word
-    kind: Kind = "fields"
-    channels: Annotated[dict[str, Channel], Field(default_factory=dict)]
-    time: Literal["header", "log", ""] = ""
-    join: Literal["equal", "previous"] = "equal"
-    wheel_radius: WheelRadius | None = None
-
-
-class TopicMapping(Strict):
-    """How topics become streams."""
-
-    streams: Annotated[dict[Word, StreamMapping], Field(min_length=1)]
-    robot: str = ""
-    time: Literal["header", "log"] = "header"
-    terrain: str = ""
-    labels: str = ""
-
-
 def short_type(name: str) -> str:
-    """Return the name of a type without its middle part.
-
-    Examples
-    --------
-    >>> short_type("sensor_msgs/msg/Imu")
-    'sensor_msgs/Imu'
-    """
+    """Return the name of a type without its middle part: ``sensor_msgs/Imu`` of ``sensor_msgs/msg/Imu``."""
     parts = name.split("/")
     return f"{parts[0]}/{parts[-1]}" if len(parts) == 3 else name
 
 
 def load_mapping(path: str | Path) -> TopicMapping:
-    """Return the mapping that a YAML file describes.
-
-    Parameters
-    ----------
-    path : of the file, or the name of a packaged one
+    """Return the mapping that a YAML file, or a packaged one of that name, describes.
 
     Raises
     ------
@@ -305,84 +306,42 @@ def load_mapping(path: str | Path) -> TopicMapping:
         raise ConfigError(f"{path.name}: has both 'terrain' and 'labels', one of them is accepted")
     for name, stream in mapping.streams.items():
         check_name(f"{path.name}: stream", name, ConfigError)
-        _check_stream(f"{path.name}: stream {name}", stream)
+        check_stream(f"{path.name}: stream {name}", stream)
     return mapping
 
 
-def check_stream(place: str, described: Mapping[str, object]) -> StreamMapping:
-    """Return a stream of messages that is described in a mapping of files.
-
-    Parameters
-    ----------
-    place : of the stream, as messages name it
-    described : its keys
-    """
-    stream = accepted(StreamMapping, dict(described), place, ConfigError)
-    _check_stream(place, stream)
-    return stream
-
-
-def _check_stream(place: str, stream: StreamMapping) -> None:
+def check_stream(place: str, described: StreamMapping | Mapping[str, object]) -> StreamMapping:
+    """Return a stream of messages, as a mapping of topics or of files describes it at a place; ``ConfigError``."""
+    stream = described
+    if not isinstance(stream, StreamMapping):
+        stream = accepted(StreamMapping, dict(stream), place, ConfigError)
     has_channels = stream.kind in ("fields", "joints")
     if has_channels != bool(stream.channels):
-        fault = (
-            "has no channels"
-            if has_channels
-            else f"is of kind {stream.kind!r}, which has channels of its own"
-        )
-        raise ConfigError(f"{place}: {fault}")
+        own = f"is of kind {stream.kind!r}, which has channels of its own"
+        raise ConfigError(f"{place}: {'has no channels' if has_channels else own}")
     if stream.wheel_radius is not None and stream.kind != "joints":
         raise ConfigError(f"{place}: 'wheel_radius' is for kind 'joints'")
     for name, channel in stream.channels.items():
-        try:
-            desired = unit_of(name)
-        except LogError as error:
-            raise ConfigError(f"{place}: {error}") from error
-        at = f"{place}: channel {name}"
+        desired, at = unit_required(f"{place}:", name), f"{place}: channel {name}"
         if stream.kind == "joints":
-            _check_joint(at, channel, desired)
-            continue
-        if channel.joint:
+            if channel.field not in _JOINT_UNITS:
+                raise ConfigError(f"{at}: field {channel.field!r} is none of {', '.join(_JOINT_UNITS)}")
+            if not channel.joint:
+                raise ConfigError(f"{at}: key 'joint' is missing")
+            if channel.topic:
+                raise ConfigError(f"{at}: 'topic' is for streams without a kind")
+        elif channel.joint:
             raise ConfigError(f"{at}: 'joint' is for kind 'joints'")
-        if not _PATH.fullmatch(channel.field):
-            raise ConfigError(
-                f"{at}: field {channel.field!r} is no path, as 'twist.linear.x' or 'data[2]' is one"
-            )
-        if desired != "code":
-            check_unit(at, channel.unit, desired)
-
-
-def _check_joint(place: str, channel: Channel, desired: str) -> None:
-    if channel.field not in _JOINT_UNITS:
-        raise ConfigError(f"{place}: field {channel.field!r} is none of {', '.join(_JOINT_UNITS)}")
-    if not channel.joint:
-        raise ConfigError(f"{place}: key 'joint' is missing")
-    if channel.topic:
-        raise ConfigError(f"{place}: 'topic' is for streams without a kind")
-    unit = channel.unit or _JOINT_UNITS[channel.field]
-    if not by_radius(channel, desired):
-        check_unit(place, unit, desired)
-
-
-def joint_unit(channel: Channel) -> str:
-    """Return the unit of a joint's number: as stated, else that of ROS."""
-    return channel.unit or _JOINT_UNITS[channel.field]
-
-
-def by_radius(channel: Channel, desired: str) -> bool:
-    """Return whether a channel is a speed whose joint turns: its rate is multiplied by the wheel's radius."""
-    return (
-        desired == "mps" and channel.field == "velocity" and joint_unit(channel) in ("rad/s", "deg/s", "rpm")
-    )
+        elif not _PATH.fullmatch(channel.field):
+            path = "no path, as 'twist.linear.x' or 'data[2]' is one"
+            raise ConfigError(f"{at}: field {channel.field!r} is {path}")
+        if (channel.joint or desired != "code") and not channel.turns(desired):
+            check_unit(at, channel.number_unit, desired)
+    return stream
 
 
 def standard_mapping(place: str, topics: list[Topic]) -> TopicMapping:
-    """Return the mapping of a bag by the types of its topics.
-
-    Parameters
-    ----------
-    place : as messages name it
-    topics : of the bag
+    """Return the mapping of a bag, which messages call ``place``, by the types of its topics.
 
     Raises
     ------
@@ -400,47 +359,17 @@ def standard_mapping(place: str, topics: list[Topic]) -> TopicMapping:
         if len(fitting) > 1:
             raise ConfigError(
                 f"{place}: the topics {listed(fitting)} are all of type {' or '.join(TYPES[kind])}: "
-                f"choose one with --mapping"
+                "choose one with --mapping"
             )
         if fitting:
             streams[stream] = StreamMapping.model_validate({"topic": fitting[0], "kind": kind})
     if not streams:
-        raise ConfigError(f"{place}: needs a mapping (--mapping): it has {described(topics)}")
+        raise ConfigError(f"{place}: needs a mapping (--mapping): it has {_described(topics)}")
     return TopicMapping(streams=streams)
 
 
-def described(topics: list[Topic]) -> str:
-    """Return topics with their types, as messages list them."""
+def _described(topics: Sequence[Topic]) -> str:
     return listed([f"{topic.name} ({topic.kind})" for topic in sorted(topics)]) if topics else "no topic"
-
-
-MAX_LABELS = 1_000_000
-"""Messages with terrains; ten a second are 28 hours."""
-
-LATEST_NS = 2**62
-"""Latest stamp that a message may have."""
-
-UNMATCHED = "messages without one of equal stamp on the other topics"
-
-Converted = tuple[tuple[str, ...], Array]
-"""Channels, and their values (n, c)."""
-
-
-class MessageKind(NamedTuple):
-    """A type of message that becomes channels of its own.
-
-    Parameters
-    ----------
-    paths : of its numbers
-    channels : from those (n, k) to channels
-    numbers : from a stream to those (n, k), None where the stream lacks channels; None where none is written
-    fixed : what else is written, by path
-    """
-
-    paths: tuple[str, ...]
-    channels: Callable[[Array], Converted]
-    numbers: Callable[[Stream], Array | None] | None = None
-    fixed: Mapping[str, Any] = MappingProxyType({})
 
 
 class MappedTopics:
@@ -449,8 +378,7 @@ class MappedTopics:
     Parameters
     ----------
     place : of the messages, as errors name it
-    mapping : of the topics
-    topics : that there are, by name
+    mapping, topics : of the topics, and those that there are, by name
     kinds : by type of message, those that become channels of their own
     decoder : returns what makes an object of each message of a topic
     wheel_radius_m : of the robot; None where unknown
@@ -478,17 +406,12 @@ class MappedTopics:
         self._wheel_radius_m, self._faults = wheel_radius_m, faults
         self._check()
         self._of_topic: dict[str, _TopicNumbers] = {}
-        for stream in mapping.streams.values():
-            for topic, paths in self._paths(stream).items():
-                numbers = self._of_topic.get(topic)
-                if numbers is None:
-                    numbers = _TopicNumbers(place, topics[topic], decoder(topics[topic]), faults)
-                    self._of_topic[topic] = numbers
-                for path in paths:
-                    numbers.paths.setdefault(path, len(numbers.paths))
-        if mapping.labels:
-            labels = topics[mapping.labels]
-            self._of_topic.setdefault(labels.name, _TopicNumbers(place, labels, decoder(labels), faults))
+        paths = [each for stream in mapping.streams.values() for each in self._paths(stream).items()]
+        for name, numbers in [*paths, *([(mapping.labels, [])] if mapping.labels else [])]:
+            if name not in self._of_topic:
+                self._of_topic[name] = _TopicNumbers(place, topics[name], decoder(topics[name]), faults)
+            for path in numbers:
+                self._of_topic[name].paths.setdefault(path, len(self._of_topic[name].paths))
 
     @property
     def names(self) -> frozenset[str]:
@@ -502,31 +425,24 @@ class MappedTopics:
     def streams(self, start_ns: int | None = None) -> tuple[int, dict[str, Stream]]:
         """Return the stamp in ns at which the time of the streams begins, and the streams.
 
-        Parameters
-        ----------
-        start_ns : that stamp; the first one by default, when repairing of those in order
-
-        Raises
-        ------
-        LogError
-            if a topic has no message, topics of a stream have no stamp in common, stamps go back or repeat,
-            a channel has nothing finite, or there are fewer than two samples.
+        That stamp is the first one unless it is given; when repairing the first of those in order.  ``LogError``
+        where a topic has no message, topics of a stream have no stamp in common, stamps go back or repeat, a
+        channel has nothing finite, or there are fewer than two samples.
         """
         raw = {name: self._raw(name, stream) for name, stream in self._mapping.streams.items()}
         repairs = self._faults.repairs
-        begin_ns = (
-            start_of([stamp_ns for stamp_ns, _ in raw.values()], repairs) if start_ns is None else start_ns
-        )
+        if start_ns is None:
+            stamps = [stamp_ns for stamp_ns, *_ in raw.values()]
+            firsts = [each.min() if repairs is None else each[longest_rise(each)[0]] for each in stamps]
+            start_ns = min(map(int, firsts))
         streams = {}
-        for name, (stamp_ns, (channels, values)) in raw.items():
+        for name, (stamp_ns, channels, values) in raw.items():
             at = f"{self._place}: stream {name}"
             if stamp_ns.size > 1 and not np.any(stamp_ns):
                 raise LogError(f"{at}: all headers are stamped 0; take the log times (time: log)")
-            time_s = (stamp_ns - begin_ns) / 1e9
-            streams[name] = checked_stream(
-                at, time_s, values, channels, row_of=lambda sample: sample + 1, repairs=repairs
-            )
-        return begin_ns, streams
+            time_s = (stamp_ns - start_ns) / 1e9
+            streams[name] = checked_stream(at, time_s, values, channels, repairs=repairs)
+        return start_ns, streams
 
     def labels(self, start_ns: int, streams: Mapping[str, Stream]) -> tuple[Label, ...]:
         """Return the terrain intervals of the topic of labels."""
@@ -535,7 +451,7 @@ class MappedTopics:
 
     def _check(self) -> None:
         """Refuse topics that are not there or of another type, and speeds without a radius."""
-        topics, there = self._topics, described([*self._topics.values()])
+        topics, there = self._topics, _described([*self._topics.values()])
         for name, stream in self._mapping.streams.items():
             at = f"{self._place}: stream {name}"
             for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
@@ -548,65 +464,74 @@ class MappedTopics:
                     f"kind {stream.kind!r} is {' or '.join(TYPES[stream.kind])} (there are {there})"
                 )
             for channel, entry in stream.channels.items():
-                turns = stream.kind == "joints" and by_radius(entry, unit_of(channel))
-                if turns and stream.wheel_radius is None and self._wheel_radius_m is None:
+                if (
+                    entry.turns(unit_of(channel))
+                    and stream.wheel_radius is None
+                    and self._wheel_radius_m is None
+                ):
                     raise ConfigError(
                         f"{at}: channel {channel} is the speed of a joint that turns: "
-                        f"'wheel_radius' is missing, and the robot has no description"
+                        "'wheel_radius' is missing, and the robot has no description"
                     )
         labels = self._mapping.labels
         if labels and labels not in topics:
             raise LogError(f"{self._place}: labels: there is no topic {shown(labels)} (there are {there})")
         if labels and short_type(topics[labels].kind) != LABELS_TYPE:
+            kind = topics[labels].kind
             raise LogError(
-                f"{self._place}: labels: topic {labels} is of type {topics[labels].kind}, "
-                f"{LABELS_TYPE} is required"
+                f"{self._place}: labels: topic {labels} is of type {kind}, {LABELS_TYPE} is required"
             )
 
     def _paths(self, stream: StreamMapping) -> dict[str, list[tuple[str, str]]]:
         """Return path and joint of each number of a stream, by topic."""
-        if stream.channels:
-            return {
-                topic: [(channel.field, channel.joint) for channel in channels.values()]
-                for topic, channels in _channels_by_topic(stream).items()
-            }
-        kind = self._kinds[short_type(self._topics[stream.topic].kind)]
-        return {stream.topic: [(path, "") for path in kind.paths]}
+        if not stream.channels:
+            return {stream.topic: [(path, "") for path in self._kind(stream).paths]}
+        return {
+            topic: [(channel.field, channel.joint) for channel in channels.values()]
+            for topic, channels in stream.by_topic.items()
+        }
 
-    def _raw(self, name: str, stream: StreamMapping) -> tuple[Array, Converted]:
-        """Return the stamps (n,) in ns and the channels of a stream."""
+    def _kind(self, stream: StreamMapping) -> MessageKind:
+        return self._kinds[short_type(self._topics[stream.topic].kind)]
+
+    def _raw(self, name: str, stream: StreamMapping) -> tuple[Array, tuple[str, ...], Array]:
+        """Return the stamps (n,) in ns, the channels and the values (n, c) of a stream."""
         by_header = (stream.time or self._mapping.time) == "header"
-        found = []
+        parts = []
         for topic, paths in self._paths(stream).items():
             stamps, values = self._of_topic[topic].numbers(paths, by_header=by_header)
             if not stamps.size:
                 what = " with any of the joints" if stream.kind == "joints" else ""
                 raise LogError(f"{self._place}: topic {shown(topic)} has no message{what}")
-            found.append((stamps, values))
-        stamp_ns, values = found[0] if len(found) == 1 else self._joined(name, stream, found)
+            parts.append((stamps, values))
+        stamp_ns, values = parts[0] if len(parts) == 1 else self._joined(name, stream, parts)
         if stream.channels:
-            return stamp_ns, (tuple(stream.channels), _in_si(stream, values, self._wheel_radius_m))
-        channels, values = self._kinds[short_type(self._topics[stream.topic].kind)].channels(values)
+            return stamp_ns, tuple(stream.channels), _in_si(stream, values, self._wheel_radius_m)
+        channels, values = self._kind(stream).channels(values)
         if not channels:
             raise LogError(f"{self._place}: topic {shown(stream.topic)} states that it measures nothing")
-        return stamp_ns, (channels, values)
+        return stamp_ns, channels, values
 
     def _joined(
-        self, name: str, stream: StreamMapping, found: list[tuple[Array, Array]]
+        self, name: str, stream: StreamMapping, parts: list[tuple[Array, Array]]
     ) -> tuple[Array, Array]:
         """Return the samples of several topics at stamps that all of them have, or at those of the first."""
-        orders = [np.argsort(stamps, kind="stable") for stamps, _ in found]
-        stamps = [each[order] for (each, _), order in zip(found, orders, strict=True)]
-        values = [each[order] for (_, each), order in zip(found, orders, strict=True)]
+        orders = [np.argsort(stamps, kind="stable") for stamps, _ in parts]
+        stamps = [each[order] for (each, _), order in zip(parts, orders, strict=True)]
+        values = [each[order] for (_, each), order in zip(parts, orders, strict=True)]
         if stream.join == "previous":
-            others = [_previous(stamps[0], *other) for other in zip(stamps[1:], values[1:], strict=True)]
+            rows = [np.searchsorted(each, stamps[0], side="right") - 1 for each in stamps[1:]]
+            others = [
+                np.where((row >= 0)[:, None], value[np.maximum(row, 0)], np.nan)
+                for row, value in zip(rows, values[1:], strict=True)
+            ]
             return stamps[0], np.concatenate([values[0], *others], axis=1)
         common = stamps[0]
         for each in stamps[1:]:
             common = np.intersect1d(common, each)
         n_lost = sum(each.size for each in stamps) - common.size * len(stamps)
         if n_lost:
-            topics = " and ".join(shown(topic) for topic in _channels_by_topic(stream))
+            topics = " and ".join(shown(topic) for topic in stream.by_topic)
             text = f"{name}: {n_lost} messages of {topics} lack one of equal stamp (join: previous)"
             self._faults.found(self._place, UNMATCHED, text, n_lost)
         if not common.size:
@@ -680,52 +605,15 @@ class _TopicNumbers:
         return stamp_ns[order][kept], values[kept]
 
 
-def _channels_by_topic(stream: StreamMapping) -> dict[str, dict[str, Channel]]:
-    """Return the channels of a stream by their topic, those of the stream's own first."""
-    found: dict[str, dict[str, Channel]] = {stream.topic: {}}
-    for name, channel in stream.channels.items():
-        found.setdefault(channel.topic or stream.topic, {})[name] = channel
-    return {topic: channels for topic, channels in found.items() if channels}
-
-
 def _in_si(stream: StreamMapping, values: Array, wheel_radius_m: float | None) -> Array:
     """Return the channels (n, c) of numbers (n, c) that are in the order of their topics."""
     if stream.wheel_radius is not None:
         wheel_radius_m = stream.wheel_radius.value * UNIT_SCALES[stream.wheel_radius.unit][1]
-    names = [name for channels in _channels_by_topic(stream).values() for name in channels]
+    names = [name for channels in stream.by_topic.values() for name in channels]
     columns = []
     for name, channel in stream.channels.items():
         desired = unit_of(name)
-        unit = joint_unit(channel) if stream.kind == "joints" else channel.unit
-        factor = 1.0 if desired == "code" else UNIT_SCALES[unit][1]
-        if stream.kind == "joints" and by_radius(channel, desired):
-            factor *= wheel_radius_m or np.nan
-        with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is judged later
-            scaled = (values[:, names.index(name)] * channel.scale + channel.offset) * factor
-            columns.append(scaled + UNIT_OFFSETS.get(unit, 0.0))
+        unit = "1" if desired == "code" else channel.number_unit
+        si = to_si(values[:, names.index(name)], unit, channel.scale, channel.offset)
+        columns.append(si * (wheel_radius_m or np.nan) if channel.turns(desired) else si)
     return np.column_stack(columns)
-
-
-def _previous(at_ns: Array, stamp_ns: Array, values: Array) -> Array:
-    """Return the last values (m, k) by each of some instants; NaN before the first.
-
-    Examples
-    --------
-    >>> _previous(np.array([1, 5]), np.array([3, 4]), np.array([[1.0], [2.0]])).tolist()
-    [[nan], [2.0]]
-    """
-    last = np.searchsorted(stamp_ns, at_ns, side="right") - 1
-    return np.where((last >= 0)[:, None], values[np.maximum(last, 0)], np.nan)
-
-
-def start_of(stamps: list[Array], repairs: Counter[str] | None) -> int:
-    """Return the stamp in ns at which a run begins: the first one; when repairing, of those in order.
-
-    Examples
-    --------
-    >>> start_of([np.array([50, 40, 60])], None), start_of([np.array([0, 40, 50, 60])], Counter())
-    (40, 0)
-    """
-    if repairs is None:
-        return min(int(each.min()) for each in stamps)
-    return min(int(each[longest_rise(each)[0]]) for each in stamps)

@@ -19,14 +19,7 @@ LABELS_FILE = "labels.csv"
 
 
 def run_folder(run_id: str, folder: str | Path) -> Path:
-    """Return where a run lies within a data-set folder.
-
-    Examples
-    --------
-    >>> run_folder("../SNOW", "logs")
-    Traceback (most recent call last):
-    terrain.errors.LogError: run id '../SNOW' cannot name a folder: use letters, digits and ' ._+-'
-    """
+    """Return where a run lies within a data-set folder; ``LogError`` where its id cannot name one."""
     if not plain_name(run_id):
         raise LogError(f"run id {shown(run_id)} cannot name a folder: use letters, digits and ' ._+-'")
     return Path(folder) / run_id
@@ -39,16 +32,10 @@ def write_run(
     replace: bool = False,
     beside: Mapping[str, str] = MappingProxyType({}),
 ) -> Path:
-    """Write one run as ``<folder>/<run_id>/`` and return that folder.
+    """Write one run as ``<folder>/<run_id>/``, whole or not at all, and return that folder.
 
-    The run folder appears whole or not at all, and the same run gives the same bytes.
-
-    Parameters
-    ----------
-    run : run log with at least one stream
-    folder : folder of the data set; made when missing
-    replace : replace a run folder of that name; refused otherwise
-    beside : text of further files of the folder, by name; readers pass them over
+    The same run gives the same bytes.  ``replace`` replaces a run folder of that name, which is refused otherwise;
+    ``beside`` has the texts of further files, by name, which readers pass over.
 
     Raises
     ------

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from terrain.errors import LogError
-from terrain.logs.borealtc import COLUMNS, find_runs
+from terrain.files.names import data_folder
+from terrain.logs.borealtc import find_runs
+from terrain.logs.mapping import load_mapping
 
 
 def read_run(folder, number, repair=False):
@@ -18,14 +20,16 @@ def read_run(folder, number, repair=False):
 
 def test_the_reader_agrees_with_the_plain_csv_module(datasets_dir):
     """Two routes; the column order of the two data sets differs."""
+    mapping = load_mapping(data_folder("layouts") / "borealtc.yaml")
     for folder, number in (("borealtc/ICE", "04"), ("vulpi/DIRT_ROAD", "1")):
         run = read_run(datasets_dir / folder, number)
         for prefix, stream in (("imu", "imu"), ("pro", "wheels")):
             with (datasets_dir / folder / f"{prefix}_{number}.csv").open(newline="") as file:
                 rows = list(csv.DictReader(file))
             assert run.streams[stream].time_s.tolist() == [float(row["time"]) for row in rows]
-            for channel, (column, _) in COLUMNS[stream].items():
-                assert run.streams[stream].channel(channel).tolist() == [float(row[column]) for row in rows]
+            for channel, entry in mapping.streams[stream].channels.items():
+                listed = [float(row[entry.column]) for row in rows]
+                assert run.streams[stream].channel(channel).tolist() == listed
 
 
 def test_the_whole_run_is_labelled_with_its_class(borealtc_dir):

@@ -10,7 +10,7 @@ from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.digest import data_digest
 from terrain.logs.drive import FILE_NAME, STREAMS, DriveRobot, find_runs
-from terrain.logs.held import between_updates, body_twists
+from terrain.logs.held import body_twists, undo_hold
 from terrain.logs.imu_axes import GYRO_TURNED
 from terrain.robots import load_robot
 
@@ -407,17 +407,17 @@ def test_a_wheel_speed_held_for_long_is_a_measurement_where_it_is_new(tmp_path):
     assert not found[time_s < 2.2].any()
 
 
-def test_between_updates_keeps_every_measurement_and_holds_what_was_measured_again():
+def test_straight_lines_keep_every_measurement_and_holds_what_was_measured_again():
     rng = np.random.default_rng(3)
     measured = rng.normal(size=12)
     measured[5] = measured[4]  # measured again, and the same
     held = measured.repeat(4)
     time_s = np.arange(held.size) * PERIOD_S
-    found = between_updates(held, time_s, 4)
+    found = undo_hold(held[:, None], time_s, [4])[:, 0]
     np.testing.assert_array_equal(found[::4], measured)
     assert (found[16:21] == measured[4]).all()
     assert np.ptp(found[20:24]) > 0.0
-    assert np.isnan(between_updates(np.full(8, np.nan), time_s[:8], 4)).all()
+    assert np.isnan(undo_hold(np.full((8, 1), np.nan), time_s[:8], [4])).all()
 
 
 WARTHOG = ("asphalt_1", "asphalt_2", "asphalt_3", "gravel_1", "sand_1", "sand_2")

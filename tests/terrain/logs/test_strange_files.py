@@ -205,10 +205,10 @@ def test_a_packed_csv_file_that_grows_too_large_is_refused(tmp_path, monkeypatch
 
     path = tmp_path / "samples.csv.gz"
     path.write_bytes(gzip.compress(b"a\n" + b"0\n" * 2_000_000))
-    assert len(tables.read_columns(path, ["a"])) == 2_000_000
+    assert len(tables.read_table(path, ["a"])) == 2_000_000
     monkeypatch.setattr(tables, "MAX_UNPACKED_BYTES", 2**20)
     with pytest.raises(LogError, match="unpacks to more than 1 MiB"):
-        tables.read_columns(path, ["a"])
+        tables.read_table(path, ["a"])
 
 
 def fuzzed(whole, rng):

@@ -119,7 +119,7 @@ def test_a_spreadsheet_is_read_by_its_names_dates_and_sheet(tmp_path):
 
 def test_two_header_rows_of_a_spreadsheet_are_named_with_the_key_that_reads_them(tmp_path):
     write_sheet(tmp_path / "drive.xlsx", [("t", "wz"), ("s", "deg/s"), *zip(T, 90 * T, strict=True)])
-    with pytest.raises(LogError, match=r"row 2 has 's'.*is read with 'header_rows: 2'"):
+    with pytest.raises(LogError, match=r"t at row 2 is 's'.*is read with 'header_rows: 2'"):
         read(tmp_path, {"imu": imu_of("drive.xlsx")})
     run = read(tmp_path, {"imu": imu_of("drive.xlsx", header_rows=2)})
     assert len(run.streams["imu"]) == 6
@@ -134,7 +134,7 @@ def test_cells_of_a_spreadsheet_that_are_no_numbers_are_refused_or_counted(tmp_p
     run = read(tmp_path, {"imu": imu_of("drive.xlsx")}, repair=True)
     assert np.isnan(run.streams["imu"].values[:, 0]).tolist() == [False, False, True, False, False, False]
     assert run.dropped == {"cells that are no number": 1}
-    with pytest.raises(LogError, match=r"column 'wx' is missing \(the sheet has t, wz\)"):
+    with pytest.raises(LogError, match=r"column 'wx' is missing \(the file has t, wz\)"):
         read(tmp_path, {"imu": imu_of("drive.xlsx", "wx")})
 
 
