@@ -110,6 +110,7 @@ def identify(
     clusters: Array | None = None,
     robust: bool = False,
     starts: Sequence[Array] = (),
+    derivative: Callable[[Array], Array] | None = None,
     **search: Any,
 ) -> Fit:
     r"""Identify parameters.
@@ -121,6 +122,8 @@ def identify(
     clusters : (n,) number of the cluster of each measurement, 0 to G - 1; None where all are independent
     robust : whether rho is the soft L1, :math:`2 (\sqrt{1 + z} - 1)`, of residuals and priors; else z
     starts : values (k,) to begin at, of which the best end counts; the nominal ones by default
+    derivative : of the residuals, flat (n, k), by the values; by small differences otherwise, which see nothing where a
+        residual goes in steps
     search : further arguments of :func:`scipy.optimize.least_squares`
 
     Examples
@@ -140,6 +143,8 @@ def identify(
     def whole(scaled: Array) -> Array:
         return np.concatenate([np.ravel(residual(nominal + unit * scaled)), held * scaled])
 
+    if derivative is not None:
+        search["jac"] = lambda scaled: np.vstack([derivative(nominal + unit * scaled) * unit, np.diag(held)])
     best, loss = None, "soft_l1" if robust else "linear"
     for start in starts if len(starts) else [nominal]:
         inside = np.clip((start - nominal) / unit, bounds[0] + 1e-6, bounds[1] - 1e-6)

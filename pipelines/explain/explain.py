@@ -145,7 +145,7 @@ def explain(
     from pipelines.report.results import silent
     from terrain.discrepancy.diagnosed_runs import diagnose_runs, extended_effects, held_out_gain
     from terrain.discrepancy.next_drive import next_command
-    from terrain.discrepancy.powertrain import powertrain_answer
+    from terrain.discrepancy.powertrain import powertrain_of
     from terrain.discrepancy.robot_terms import in_robot_terms
     from terrain.discrepancy.statements import notes_of, statements_of, terrains_apart
     from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain
@@ -190,5 +190,5 @@ def explain(
         terms={cause.name: in_robot_terms(cause.name, cause.values, robot) for cause in diagnosis.causes},
         next_command=next_command(diagnosis, description, robot, diagnosed.terrains),
         notes=notes_of(diagnosis, diagnosed.terrains, terrains_apart(diagnosis, diagnosed.compared)),
-        powertrain=powertrain_answer(chosen, robot, diagnosis.faults, seed),
+        powertrain=powertrain_of(chosen, robot, diagnosis.faults, seed),
     )

@@ -14,7 +14,7 @@ from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, T
 from pipelines.report.versions import versions
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
-from terrain.discrepancy.powertrain import PowertrainAnswer
+from terrain.discrepancy.powertrain import Powertrain
 from terrain.discrepancy.robot_terms import quantity
 from terrain.discrepancy.statements import (
     CHANNEL_WORDS,
@@ -81,7 +81,7 @@ class ExplainResult(Result, eq=False):
     terms: Mapping[str, str] = described("by cause, its value in quantities of the robot's description")
     notes: tuple[str, ...] = described("what a reader has to know of the terrains and sessions")
     next_command: str | None = described("simulates the next drive; null where none is suggested")
-    powertrain: PowertrainAnswer | None = described("from commanded to measured wheel speeds, where logged")
+    powertrain: Powertrain | None = described("from commanded to measured wheel speeds, where logged")
     model: str | None = described(
         "extended description that was tested; null for the robot's own", default=None
     )

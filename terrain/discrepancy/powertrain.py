@@ -1,4 +1,4 @@
-r"""How wheels follow commanded speeds: a stepped model of the powertrain, and runs prepared for it.
+r"""How wheels follow commanded speeds: a stepped model of the powertrain, and which parts of it runs show.
 
 A command ``c`` (rad/s of each wheel) becomes a wheel speed ``y`` by parts, each of which may be absent::
 
@@ -13,6 +13,9 @@ first, until the first command arrives.
 
 Loggers hold a measurement until the next one comes.  Of each wheel only new samples are compared, so that the
 period of the logger is no part of the delay; what its messages need to arrive is.
+
+Parts are added one at a time, and a part stays if it reduces the squared error of runs left out of the fit by more
+than chance.  A gain that is not 1 says that the commands are no wheel speeds; the other parts hold behind it.
 """
 
 from __future__ import annotations
@@ -20,7 +23,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import Enum
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,8 +30,8 @@ import numpy as np
 from terrain.bootstrap import LEVEL, bootstrap_counts, percentile_interval
 from terrain.discrepancy.faults import Fault
 from terrain.discrepancy.statements import listed
-from terrain.errors import DataError
-from terrain.kernels import njit
+from terrain.identify import Fit, Parameter, deal, folds, identify
+from terrain.kernels import njit, record
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
@@ -39,25 +41,167 @@ STEP_S = 0.02
 MIN_RUNS = 5
 """Fewer do not tell an error from the scatter between runs."""
 
-NAMES = (
-    "delay_s",
-    "time_constant_s",
-    "slew_radps2",
-    "deadband_radps",
-    "gain_ratio",
-    "difference_gain_ratio",
-    "common_limit_radps",
-    "difference_limit_radps",
-    "wheel_limit_radps",
-)
-"""Parts, as the kernel takes them."""
+FOLDS = 5
+"""Into which runs are dealt, to be left out of a fit one after the other."""
 
-DELAY, TIME_CONSTANT, SLEW, DEADBAND, GAIN, DIFFERENCE_GAIN, COMMON_LIMIT, DIFFERENCE_LIMIT, WHEEL_LIMIT = (
-    range(9)
-)
+DRAWS = 1000
+"""Bootstrap samples of runs."""
 
-ABSENT = np.array([0.0, 0.0, math.inf, 0.0, 1.0, 1.0, math.inf, math.inf, math.inf])
-"""Values of parts that do nothing."""
+MIN_GAIN_RATIO = 0.002
+"""Of the squared error, that a part removes of the runs fitted; less is not worth a number, whatever its
+significance: a thousandth of 0.1 rad/s rms is 3 mrad/s."""
+
+EXCITED_SIGMAS = 3.0
+"""A part of a usual size has to change the squared error by so many standard deviations to be visible."""
+
+GRID_ROOM_S = STEP_S
+"""What the grid leaves open of delay and time constant, whatever the number of runs: commands that change with the
+grid answer alike to all delays within a step."""
+
+SCALE_TOLERANCE = 0.1
+"""Gains further from 1 than that: the commands are no wheel speeds."""
+
+TOLERANCE = 1e-4
+"""A fit ends where a step reduces the squared error by less, relative to it."""
+
+LIMIT_STARTS = (0.3, 0.5, 0.7, 0.9)
+"""Ratios of the largest measured speed, from which fits of limits start."""
+
+
+class _Kind(NamedTuple):
+    """Of a part: value that does nothing, bounds, step of derivatives, size that robots have, starts, words."""
+
+    absent: float
+    low: float
+    high: float
+    step: float
+    usual: float
+    starts: tuple[float, ...]
+    label: str
+    words: str
+
+
+# fmt: off
+KINDS = {
+    "delay_s": _Kind(0.0, 0.0, 1.0, STEP_S, 0.1, (0.05, 0.15, 0.3, 0.5),
+                     "a delay", "the wheels answer {} s late"),
+    "time_constant_s": _Kind(0.0, 0.0, 2.0, 0.01, 0.1, (0.05, 0.15, 0.4, 1.0),
+                             "a time constant", "they settle with a time constant of {} s"),
+    "slew_radps2": _Kind(math.inf, 0.1, 500.0, 0.5, 5.0, (2.0, 5.0, 10.0, 20.0, 40.0),
+                         "a slew limit", "they speed up and slow down by at most {} rad/s²"),
+    "deadband_radps": _Kind(0.0, 0.0, 5.0, 0.05, 0.3, (0.1, 0.3, 1.0, 2.0),
+                            "a deadband", "commands below {} rad/s do not move them"),
+    "gain_ratio": _Kind(1.0, 0.05, 5.0, 0.01, 1.2, (0.6, 0.8, 1.25, 1.7),
+                        "a gain", "they turn {} times as fast as commanded"),
+    "difference_gain_ratio": _Kind(1.0, 0.05, 5.0, 0.01, 1.2, (0.4, 0.6, 0.8, 1.25),
+                                   "a gain of the difference of the sides",
+                                   "they turn {} times as fast against each other as commanded"),
+    "common_limit_radps": _Kind(math.inf, 0.1, 200.0, 0.05, 2.0, (),
+                                "a limit of the mean of both sides",
+                                "the mean of both sides is at most {} rad/s"),
+    "difference_limit_radps": _Kind(math.inf, 0.1, 200.0, 0.05, 1.0, (),
+                                    "a limit of the difference of the sides",
+                                    "half the difference of the sides is at most {} rad/s"),
+    "wheel_limit_radps": _Kind(math.inf, 0.1, 200.0, 0.05, 2.0, (),
+                               "a largest wheel speed", "no wheel turns faster than {} rad/s"),
+}
+# fmt: on
+"""Parts by name; limits start from ratios of the largest measured speed."""
+
+NAMES = tuple(KINDS)
+OF_TWO_SIDES = ("difference_gain_ratio", "common_limit_radps", "difference_limit_radps")
+ABSENT = np.array([kind.absent for kind in KINDS.values()])
+VALUES = record(dict.fromkeys(NAMES, float))
+"""Values (len(NAMES),) of all parts as kernels take them: ``values.view(VALUES)[0]``."""
+
+
+class PartStatus(Enum):
+    """Whether a part of the powertrain is there."""
+
+    FOUND = "it reduces the error of runs left out"
+    NOT_NEEDED = "it does not reduce the error of runs left out"
+    NOT_EXCITED = "the commands would not show it"
+
+
+class Part(NamedTuple):
+    """One part of the powertrain, with its 95 % interval over runs; NaN where it was not found.
+
+    ``gain_ratio`` is what it removes, beside the others, of the squared error of runs left out.  A delay of wheels
+    that then follow at once is known to a period of the logger at the best.
+    """
+
+    name: str
+    status: PartStatus
+    value: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    gain_ratio: float = math.nan
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the fields as JSON names them."""
+        named = {"name": self.name, "unit": self.name.rpartition("_")[2], "status": self.status.name.lower()}
+        return {**named, "value": self.value, "ci": (self.low, self.high), "held_out_gain": self.gain_ratio}
+
+
+class Powertrain(NamedTuple):
+    """From commanded to measured wheel speeds.
+
+    Parameters
+    ----------
+    parts : in the order of :data:`NAMES`; without those of two sides where a robot has not just two
+    rms_before_radps, rms_after_radps : measured minus commanded, and minus predicted of runs left out of the fit
+    reduction : of the squared error of these runs, over that of the commands, with its 95 % interval over runs
+    hold_s : period at which new wheel speeds are logged
+    reason : why nothing of it is known; empty where it is
+    """
+
+    parts: tuple[Part, ...] = ()
+    rms_before_radps: float = math.nan
+    rms_after_radps: float = math.nan
+    reduction: tuple[float, float, float] = (math.nan, math.nan, math.nan)
+    hold_s: float = math.nan
+    n_runs: int = 0
+    reason: str = ""
+
+    @property
+    def found(self) -> tuple[Part, ...]:
+        """Parts that are there."""
+        return tuple(part for part in self.parts if part.status is PartStatus.FOUND)
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether commands are no wheel speeds: a gain is not 1."""
+        return any(abs(part.value - 1.0) > SCALE_TOLERANCE for part in self.found if "gain" in part.name)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What was found, with its interval, what that gains, and what was not excited; or why it is not known."""
+        if self.reason:
+            return (f"The wheel speeds are not compared with their commands: {self.reason}.",)
+        missed = [KINDS[part.name].label for part in self.parts if part.status is PartStatus.NOT_EXCITED]
+        last = [f"The commands would not have shown {listed(missed, 'or')}."] if missed else []
+        if not self.found:
+            return ("The wheels turn as they are commanded, as far as the runs show it.", *last)
+        stated = []
+        for part in self.found:
+            words = KINDS[part.name].words.format(f"{part.value:.3g}")
+            stated.append(f"{words[0].upper()}{words[1:]} ({part.low:.3g} to {part.high:.3g}).")
+        if self.is_scaled:
+            stated.append("The commands are no wheel speeds: they are scaled before the wheels get them.")
+        ratio, low, high = self.reduction
+        stated.append(
+            f"On runs left out of the fit the wheel speeds are then off by {self.rms_after_radps:.3g} rad/s "
+            f"rms instead of {self.rms_before_radps:.3g}, a squared error less by {ratio:.1%} ({low:.1%} to "
+            f"{high:.1%})."
+        )
+        return (*stated, *last)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the answer as JSON has it."""
+        if self.reason:
+            return {"measured": False, "reason": self.reason, "sentences": self.sentences}
+        fields = {name: value for name, value in self._asdict().items() if name != "reason"}
+        return {"measured": True, "sentences": self.sentences, **fields}
 
 
 class Traces(NamedTuple):
@@ -68,30 +212,77 @@ class Traces(NamedTuple):
     area_rad : (m, wheels) integrals of the commands from the start of each run
     first : (runs + 1,) rows of each run in the grid
     start_radps : (runs, wheels) first measured wheel speeds
-    at, between : (n,) row ahead of each sample, and share of a step behind it
+    run : (n,) number of the run of each sample
+    place : (n,) of each sample in the grid of its run, in steps
     measured : (n, wheels) wheel speeds
     new : (n, wheels) 1 where a sample of a wheel is new, else 0
-    sample : (runs + 1,) samples of each run
-    hold_s : period at which new wheel speeds are logged
     """
 
     area_rad: Array
     first: Array
     start_radps: Array
-    at: Array
-    between: Array
+    run: Array
+    place: Array
     measured: Array
     new: Array
-    sample: Array
-    hold_s: float
-
-    @property
-    def n_values(self) -> int:
-        """How many values are compared."""
-        return int(self.new.sum())
 
 
-def is_commanded(run: RunLog, robot: Robot) -> bool:
+def powertrain_of(
+    runs: Sequence[RunLog], robot: Robot, faults: Sequence[Fault] = (), seed: int = 0
+) -> Powertrain | None:
+    """Return what is between commanded and measured wheel speeds; None where no run logs both.
+
+    Parameters
+    ----------
+    runs : with a stream ``commands`` that has a channel ``wheel_<wheel>_radps`` for each wheel
+    robot : names of its wheels, wheel radius and reduction
+    faults : of their logs; runs whose wheel speeds have one are left out
+    seed : of the folds and of the bootstrap
+    """
+    commanded = [run for run in runs if _is_commanded(run, robot)]
+    if not commanded:
+        return None
+    faulty = {run_id for fault in faults if fault.change.of_wheels for run_id in fault.run_ids}
+    traces, hold_s = traces_of([run for run in commanded if run.run_id not in faulty], robot)
+    n_runs = len(traces.start_radps)
+    if n_runs < MIN_RUNS:
+        left_out = f" ({len(faulty)} have a fault of their wheel speeds)" if faulty else ""
+        return Powertrain(
+            reason=f"runs: {n_runs} have commanded and measured wheel speeds; at least {MIN_RUNS} are "
+            f"required{left_out}"
+        )
+    two_sides = traces.measured.shape[1] == 2
+    candidates = [name for name in NAMES if two_sides or name not in OF_TWO_SIDES]
+    fold = deal(np.arange(n_runs), FOLDS, np.random.default_rng(seed))
+    draws = bootstrap_counts(n_runs, DRAWS, seed)
+    gains, values, error = _select_parts(traces, candidates, fold, draws)
+    values, fit = _fit(traces, list(gains), values)
+    parts = []
+    for name in candidates:
+        if name not in gains:
+            seen = PartStatus.NOT_NEEDED if _is_excited(traces, values, name) else PartStatus.NOT_EXCITED
+            parts.append(Part(name, seen))
+            continue
+        assert fit is not None
+        room_s = GRID_ROOM_S if name in ("delay_s", "time_constant_s") else 0.0
+        if name == "delay_s" and not {"time_constant_s", "slew_radps2"} & gains.keys():
+            room_s += hold_s  # the next sample shows all of a step
+        low, high = fit.interval[:, list(gains).index(name)]
+        low, high = (
+            max(float(low) - room_s, KINDS[name].low, 0.0),
+            min(float(high), KINDS[name].high) + room_s,
+        )
+        parts.append(Part(name, PartStatus.FOUND, float(values[NAMES.index(name)]), low, high, gains[name]))
+    raw = squared_errors(traces, ABSENT)
+    reduction = (0.0, 0.0, 0.0)
+    if raw.sum() > 0:
+        drawn = 1.0 - (draws @ error) / np.maximum(draws @ raw, 1e-12)
+        reduction = (1.0 - float(error.sum() / raw.sum()), *percentile_interval(drawn))
+    before, after = (math.sqrt(float(each.sum()) / int(traces.new.sum())) for each in (raw, error))
+    return Powertrain(tuple(parts), before, after, reduction, hold_s, n_runs)
+
+
+def _is_commanded(run: RunLog, robot: Robot) -> bool:
     """Return whether a run logs the commanded and the measured speed of each wheel."""
     if not {"commands", "wheels"} <= run.streams.keys():
         return False
@@ -100,20 +291,12 @@ def is_commanded(run: RunLog, robot: Robot) -> bool:
     return commanded and set(robot.rate_channels) <= set(run.streams["wheels"].channels)
 
 
-def traces_of(runs: Sequence[RunLog], robot: Robot) -> Traces:
-    """Return the runs that log commanded and measured wheel speeds on one grid.
-
-    Raises
-    ------
-    DataError
-        if fewer than :data:`MIN_RUNS` do.
-    """
-    area, start, at, between, measured, news, holds = [], [], [], [], [], [], []
-    first, sample = [0], [0]
+def traces_of(runs: Sequence[RunLog], robot: Robot) -> tuple[Traces, float]:
+    """Return runs that log commanded and measured wheel speeds on one grid, and the period of new samples (s)."""
     per_radps = robot.logged_rates(np.full(len(robot.wheels), robot.wheel_radius_m))
+    n_wheels = len(robot.rate_channels)
+    traced = []
     for run in runs:
-        if not is_commanded(run, robot):
-            continue
         commands, wheels = run.streams["commands"], run.streams["wheels"]
         rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels]) / per_radps
         orders = np.column_stack([commands.channel(f"wheel_{wheel}_radps") for wheel in robot.logged_wheels])
@@ -123,36 +306,22 @@ def traces_of(runs: Sequence[RunLog], robot: Robot) -> Traces:
         if len(time_s) < 3 or not np.isfinite(orders).all():
             continue
         new, hold_s = _new_samples(time_s, rates)
-        any_new = new.any(axis=1)
-        if not any_new.any():
-            continue
-        grid_s = np.arange(time_s[0], time_s[-1] + 2.0 * STEP_S, STEP_S)
-        area.append(np.column_stack([_integral(grid_s, commands.time_s, each) for each in orders.T]))
-        place = (time_s[any_new] - grid_s[0]) / STEP_S
-        row = np.minimum(place.astype(np.int64), len(grid_s) - 2)
-        at.append(row + first[-1])
-        between.append(place - row)
-        measured.append(rates[any_new])
-        news.append(new[any_new].astype(float))
-        start.append(rates[0])
-        holds.append(hold_s)
-        first.append(first[-1] + len(grid_s))
-        sample.append(sample[-1] + len(row))
-    if len(start) < MIN_RUNS:
-        raise DataError(
-            f"runs: {len(start)} have commanded and measured wheel speeds; at least {MIN_RUNS} are required"
-        )
-    return Traces(
-        np.vstack(area),
-        np.array(first),
-        np.vstack(start),
-        np.concatenate(at),
-        np.concatenate(between),
-        np.vstack(measured),
-        np.vstack(news),
-        np.array(sample),
-        float(np.median(holds)),
-    )
+        some = new.any(axis=1)
+        if some.any():
+            grid_s = np.arange(time_s[0], time_s[-1] + 2.0 * STEP_S, STEP_S)
+            area = np.column_stack([_integral(grid_s, commands.time_s, held) for held in orders.T])
+            traced.append(
+                (area, rates[0], (time_s[some] - grid_s[0]) / STEP_S, rates[some], new[some], hold_s)
+            )
+    if not traced:
+        none = np.empty((0, n_wheels))
+        return Traces(none, np.zeros(1, int), none, np.empty(0, int), np.empty(0), none, none), math.nan
+    areas, start, place, measured, news = ([each[i] for each in traced] for i in range(5))
+    first = np.cumsum([0, *map(len, areas)])
+    of_run = np.repeat(np.arange(len(traced)), [len(each) for each in place])
+    columns = np.concatenate(place), np.vstack(measured), np.vstack(news).astype(float)
+    hold_s = float(np.median([each[5] for each in traced]))
+    return Traces(np.vstack(areas), first, np.vstack(start), of_run, *columns), hold_s
 
 
 def _integral(time_s: Array, stamps_s: Array, held: Array) -> Array:
@@ -179,14 +348,14 @@ def _new_samples(time_s: Array, rates: Array) -> tuple[Array, float]:
 
 
 @njit
-def follow(area_rad: Array, start_radps: Array, p: Array, dt: float) -> Array:
+def follow(area_rad: Array, start_radps: Array, values: Array, dt: float) -> Array:
     """Return wheel speeds (m, wheels) that follow commands.
 
     Parameters
     ----------
     area_rad : (m, wheels) integral of the commands (rad/s) up to each step
     start_radps : (wheels,) wheel speeds until the first command arrives
-    p : (len(NAMES),) parts
+    values : (len(NAMES),) of the parts
     dt : step in s
 
     Examples
@@ -194,17 +363,17 @@ def follow(area_rad: Array, start_radps: Array, p: Array, dt: float) -> Array:
     A step from 0 to 1 rad/s, a tenth of a second late:
 
     >>> step = np.maximum(np.arange(40) - 9.0, 0.0)[:, None] * 0.01
-    >>> late = ABSENT.copy()
-    >>> late[DELAY] = 0.1
+    >>> late = np.where(np.array(NAMES) == "delay_s", 0.1, ABSENT)
     >>> follow(step, np.zeros(1), late, 0.01)[[18, 20], 0]
     array([0., 1.])
     """
+    p = values.view(VALUES)[0]
     m, wheels = area_rad.shape
     out = np.empty((m, wheels))
     state, x = start_radps.copy(), np.empty(wheels)
-    late = p[0] / dt
-    quick = 1.0 - math.exp(-dt / p[1]) if p[1] > 0.0 else 1.0
-    furthest = p[2] * dt
+    late = p.delay_s / dt
+    quick = 1.0 - math.exp(-dt / p.time_constant_s) if p.time_constant_s > 0.0 else 1.0
+    furthest = p.slew_radps2 * dt
     for k in range(m):
         at = k - late
         if at >= 1.0:
@@ -215,504 +384,169 @@ def follow(area_rad: Array, start_radps: Array, p: Array, dt: float) -> Array:
                 if part > 0.0:
                     x[j] += (area_rad[i + 1, j] - area_rad[i, j]) * part / dt
             if wheels == 2:
-                common = min(max(0.5 * p[4] * (x[1] + x[0]), -p[6]), p[6])
-                half = min(max(0.5 * p[5] * (x[1] - x[0]), -p[7]), p[7])
+                common, half = (
+                    0.5 * p.gain_ratio * (x[1] + x[0]),
+                    0.5 * p.difference_gain_ratio * (x[1] - x[0]),
+                )
+                common = min(max(common, -p.common_limit_radps), p.common_limit_radps)
+                half = min(max(half, -p.difference_limit_radps), p.difference_limit_radps)
                 x[0], x[1] = common - half, common + half
             for j in range(wheels):
-                goal = x[j] if wheels == 2 else p[4] * x[j]
+                goal = x[j] if wheels == 2 else p.gain_ratio * x[j]
                 size = abs(goal)
-                if size < 2.0 * p[3]:
-                    goal = math.copysign(max(2.0 * (size - p[3]), 0.0), goal)
-                goal = min(max(goal, -p[8]), p[8])
+                if size < 2.0 * p.deadband_radps:
+                    goal = math.copysign(max(2.0 * (size - p.deadband_radps), 0.0), goal)
+                goal = min(max(goal, -p.wheel_limit_radps), p.wheel_limit_radps)
                 state[j] += min(max(quick * (goal - state[j]), -furthest), furthest)
         out[k] = state
     return out
 
 
 @njit
-def _predicted(
-    area_rad: Array, first: Array, start_radps: Array, at: Array, between: Array, sample: Array, p: Array
-) -> Array:
+def predict(traces: Traces, values: Array) -> Array:
     """Return predicted wheel speeds (n, wheels) at the samples of all runs."""
-    out = np.empty((at.size, area_rad.shape[1]))
-    for run in range(start_radps.shape[0]):
-        speed = follow(area_rad[first[run] : first[run + 1]], start_radps[run], p, STEP_S)
-        for n in range(sample[run], sample[run + 1]):
-            k = at[n] - first[run]
+    out, n = np.empty_like(traces.measured), 0
+    for run in range(traces.start_radps.shape[0]):
+        area = traces.area_rad[traces.first[run] : traces.first[run + 1]]
+        speed = follow(area, traces.start_radps[run], values, STEP_S)
+        while n < traces.run.size and traces.run[n] == run:
+            k = min(int(traces.place[n]), len(speed) - 2)
             for j in range(out.shape[1]):
-                out[n, j] = speed[k, j] + between[n] * (speed[k + 1, j] - speed[k, j])
+                out[n, j] = speed[k, j] + (traces.place[n] - k) * (speed[k + 1, j] - speed[k, j])
+            n += 1
     return out
 
 
-def predict(traces: Traces, p: Array) -> Array:
-    """Return predicted wheel speeds (n, wheels) at the samples."""
-    shown: Array = _predicted(
-        traces.area_rad, traces.first, traces.start_radps, traces.at, traces.between, traces.sample, p
-    )
-    return shown
-
-
-def settled(traces: Traces, p: Array) -> Array:
-    """Return the wheel speeds (runs, wheels) that the first commands lead to."""
-    at_once = p.copy()
-    at_once[[DELAY, TIME_CONSTANT]], at_once[SLEW] = 0.0, math.inf
-    first = traces.first[:-1]
-    starts = [traces.area_rad[k : k + 2] for k in first.tolist()]
-    zero = np.zeros(traces.area_rad.shape[1])
-    return np.array([follow(area, zero, at_once, STEP_S)[1] for area in starts])
-
-
-def left_over(traces: Traces, p: Array) -> Array:
+def left_over(traces: Traces, values: Array) -> Array:
     """Return measured minus predicted wheel speeds (n, wheels), 0 where a sample is not new."""
-    return np.asarray((traces.measured - predict(traces, p)) * traces.new)
+    return np.asarray((traces.measured - predict(traces, values)) * traces.new)
 
 
-def squared_errors(traces: Traces, p: Array) -> Array:
+def squared_errors(traces: Traces, values: Array) -> Array:
     """Return the sum of the squared errors of each run (runs,)."""
-    square = (left_over(traces, p) ** 2).sum(axis=1)
-    return np.asarray(np.add.reduceat(square, traces.sample[:-1]))
-
-
-# -- What is between commanded and measured wheel speeds, as stated: parts with intervals, and sentences ---
-
-SCALE_TOLERANCE = 0.1
-"""Gains further from 1 than that: the commands are no wheel speeds."""
-
-WORDS = {
-    "delay_s": "the wheels answer {} s late",
-    "time_constant_s": "they settle with a time constant of {} s",
-    "slew_radps2": "they speed up and slow down by at most {} rad/s²",
-    "deadband_radps": "commands below {} rad/s do not move them",
-    "gain_ratio": "they turn {} times as fast as commanded",
-    "difference_gain_ratio": "they turn {} times as fast against each other as commanded",
-    "common_limit_radps": "the mean of both sides is at most {} rad/s",
-    "difference_limit_radps": "half the difference of the sides is at most {} rad/s",
-    "wheel_limit_radps": "no wheel turns faster than {} rad/s",
-}
-"""What each part does, with a place for its value."""
-
-
-LABELS = {
-    "delay_s": "a delay",
-    "time_constant_s": "a time constant",
-    "slew_radps2": "a slew limit",
-    "deadband_radps": "a deadband",
-    "gain_ratio": "a gain",
-    "difference_gain_ratio": "a gain of the difference of the sides",
-    "common_limit_radps": "a limit of the mean of both sides",
-    "difference_limit_radps": "a limit of the difference of the sides",
-    "wheel_limit_radps": "a largest wheel speed",
-}
-"""What each part is called."""
-
-
-class PartStatus(Enum):
-    """Whether a part of the powertrain is there."""
-
-    FOUND = "it reduces the error of runs left out"
-    NOT_NEEDED = "it does not reduce the error of runs left out"
-    NOT_EXCITED = "the commands would not show it"
-
-
-class Part(NamedTuple):
-    """One part of the powertrain.
-
-    Parameters
-    ----------
-    name : of :data:`NAMES`, ends in its unit
-    status : whether it is there
-    value, low, high : with its 95 % interval over runs; NaN where it was not found.  A delay of wheels that
-        then follow at once is known to a period of the logger at the best
-    gain_ratio : of the squared error of runs left out, that it removes beside the others; NaN where not found
-    """
-
-    name: str
-    status: PartStatus
-    value: float
-    low: float
-    high: float
-    gain_ratio: float
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        named = {"name": self.name, "unit": self.name.rpartition("_")[2], "status": self.status.name.lower()}
-        return {**named, "value": self.value, "ci": (self.low, self.high), "held_out_gain": self.gain_ratio}
-
-
-class Powertrain(NamedTuple):
-    """From commanded to measured wheel speeds.
-
-    Parameters
-    ----------
-    parts : in the order of :data:`NAMES`; without those of two sides where a robot has not just two
-    rms_before_radps, rms_after_radps : measured minus commanded, and minus predicted of runs left out of the
-        fit
-    reduction : of the squared error of these runs, over that of the commands, with its 95 % interval over
-        runs
-    hold_s : period at which new wheel speeds are logged
-    n_runs : that have both
-    """
-
-    parts: tuple[Part, ...]
-    rms_before_radps: float
-    rms_after_radps: float
-    reduction: tuple[float, float, float]
-    hold_s: float
-    n_runs: int
-
-    @property
-    def found(self) -> tuple[Part, ...]:
-        """Parts that are there."""
-        return tuple(part for part in self.parts if part.status is PartStatus.FOUND)
-
-    @property
-    def vector(self) -> Array:
-        """Values (len(NAMES),) as :func:`follow` takes them."""
-        vector = ABSENT.copy()
-        for part in self.found:
-            vector[NAMES.index(part.name)] = part.value
-        return vector
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """What was found, a sentence each, with its interval, what that gains, and what was not excited."""
-        if not self.found:
-            return ("The wheels turn as they are commanded, as far as the runs show it.", *self._missed)
-        parts = ((WORDS[p.name].format(f"{p.value:.3g}"), f"{p.low:.3g} to {p.high:.3g}") for p in self.found)
-        stated = [f"{words[0].upper()}{words[1:]} ({interval})." for words, interval in parts]
-        if self.is_scaled:
-            stated.append("The commands are no wheel speeds: they are scaled before the wheels get them.")
-        ratio, low, high = self.reduction
-        stated.append(
-            f"On runs left out of the fit the wheel speeds are then off by {self.rms_after_radps:.3g} rad/s "
-            f"rms instead of {self.rms_before_radps:.3g}, a squared error less by {ratio:.1%} ({low:.1%} to "
-            f"{high:.1%})."
-        )
-        return (*stated, *self._missed)
-
-    @property
-    def _missed(self) -> tuple[str, ...]:
-        """One sentence on the parts that the commands would not show, if there are any."""
-        missed = [LABELS[part.name] for part in self.parts if part.status is PartStatus.NOT_EXCITED]
-        return (f"The commands would not have shown {listed(missed, 'or')}.",) if missed else ()
-
-    @property
-    def is_scaled(self) -> bool:
-        """Whether commands are no wheel speeds: a gain is not 1."""
-        gains = [part for part in self.found if "gain" in part.name]
-        return any(abs(part.value - 1.0) > SCALE_TOLERANCE for part in gains)
-
-
-class PowertrainAnswer(NamedTuple):
-    """The powertrain of runs that log commands.
-
-    Parameters
-    ----------
-    powertrain : None where it is not known
-    reason : why it is not
-    """
-
-    powertrain: Powertrain | None
-    reason: str = ""
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """What is between commands and wheels, or why that is not known."""
-        if self.powertrain is None:
-            return (f"The wheel speeds are not compared with their commands: {self.reason}.",)
-        return self.powertrain.sentences
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the answer as JSON has it."""
-        if self.powertrain is None:
-            return {"measured": False, "reason": self.reason, "sentences": self.sentences}
-        return {"measured": True, "sentences": self.sentences, **self.powertrain._asdict()}
-
-
-# -- From commanded to measured wheel speeds: what the powertrain does to a command, where commands are logged --
-# The model is that of :mod:`terrain.discrepancy.powertrain`.  Its parts are added one at a time, and a
-# part stays if it reduces the squared error of runs left out of the fit, with an interval over runs that
-# excludes 0.
-# A gain that is not 1 says that the commands are no wheel speeds; the other parts hold behind it.
-
-FOLDS = 5
-"""Into which runs are dealt, to be left out of a fit one after the other."""
-
-DRAWS = 1000
-"""Bootstrap samples of an interval."""
-
-MIN_GAIN_RATIO = 0.002
-"""Of the squared error, that a part removes of the runs fitted; less is not worth a number, whatever its
-significance: a thousandth of 0.1 rad/s rms is 3 mrad/s."""
-
-EXCITED_SIGMAS = 3.0
-"""A part of a usual size has to change the squared error by so many standard deviations to be visible."""
-
-GRID_ROOM_S = STEP_S / 2
-"""What the grid leaves open of delay and time constant: no number of runs makes their intervals narrower."""
-
-LOW = np.array([0.0, 0.0, 0.1, 0.0, 0.05, 0.05, 0.1, 0.1, 0.1])
-HIGH = np.array([1.0, 2.0, 500.0, 5.0, 5.0, 5.0, 200.0, 200.0, 200.0])
-"""Bounds of the fit."""
-
-STEPS = np.array([STEP_S, 0.01, 0.5, 0.05, 0.01, 0.01, 0.05, 0.05, 0.05])
-"""Changes over which derivatives are taken."""
-
-USUAL = np.array([0.1, 0.1, 5.0, 0.3, 1.2, 1.2, 2.0, 1.0, 2.0])
-"""A size of each part that robots have; what the runs would show of it says whether they excite it."""
-
-MAX_STEPS, MAX_DAMPING, TOLERANCE = 20, 1e4, 1e-4
-"""Of the Gauss-Newton fit; it ends where a step reduces the error, or would, by less than the tolerance."""
-
-STARTS: tuple[tuple[float, ...], ...] = (
-    (0.05, 0.15, 0.3, 0.5),
-    (0.05, 0.15, 0.4, 1.0),
-    (2.0, 5.0, 10.0, 20.0, 40.0),
-    (0.1, 0.3, 1.0, 2.0),
-    (0.6, 0.8, 1.25, 1.7),
-    (0.4, 0.6, 0.8, 1.25),
-    (),
-    (),
-    (),
-)
-"""Where the fit of each part starts from; limits start from shares of the largest measured speed."""
-
-LIMIT_STARTS = (0.3, 0.5, 0.7, 0.9)
-
-
-def powertrain_of(runs: Sequence[RunLog], robot: Robot, seed: int = 0) -> Powertrain:
-    """Return what is between commanded and measured wheel speeds, over all runs that log both.
-
-    Parameters
-    ----------
-    runs : with a stream ``commands`` that has a channel ``wheel_<wheel>_radps`` for each wheel
-    robot : names of its wheels, wheel radius and reduction
-    seed : of the folds and of the bootstrap
-
-    Raises
-    ------
-    DataError
-        if fewer than five runs have commanded and measured wheel speeds.
-    """
-    traces = traces_of(runs, robot)
-    n_runs = len(traces.start_radps)
-    two_sides = traces.measured.shape[1] == 2
-    of_two_sides = (DIFFERENCE_GAIN, COMMON_LIMIT, DIFFERENCE_LIMIT)
-    candidates = [i for i in range(len(NAMES)) if two_sides or i not in of_two_sides]
-    fold_of = np.random.default_rng(seed).permutation(n_runs) % FOLDS
-    present, vector = _add_parts(traces, candidates, fold_of, seed)
-    present, vector, error, gains = _drop_parts(traces, present, vector, fold_of, seed)
-    vector = _fit(traces, present, vector, np.ones(n_runs), both_sides=True)
-    intervals = _intervals(traces, present, vector, seed)
-    parts = []
-    for i in candidates:
-        if i in present:
-            room_s = GRID_ROOM_S if i in (DELAY, TIME_CONSTANT) else 0.0
-            low, high = max(intervals[i][0] - room_s, 0.0), intervals[i][1] + room_s
-            if i == DELAY and not {TIME_CONSTANT, SLEW} & set(present):  # the next sample shows all of a step
-                low, high = max(low - traces.hold_s, 0.0), high + traces.hold_s
-            parts.append(Part(NAMES[i], PartStatus.FOUND, float(vector[i]), low, high, gains[i]))
-        else:
-            shown = PartStatus.NOT_NEEDED if _is_excited(traces, vector, i) else PartStatus.NOT_EXCITED
-            parts.append(Part(NAMES[i], shown, math.nan, math.nan, math.nan, math.nan))
-    size, raw = traces.n_values, squared_errors(traces, ABSENT)
-    before, after = (math.sqrt(float(each.sum()) / size) for each in (raw, error))
-    return Powertrain(tuple(parts), before, after, _reduction(raw, error, seed), traces.hold_s, n_runs)
-
-
-def powertrain_answer(
-    runs: Sequence[RunLog], robot: Robot, faults: Sequence[Fault], seed: int = 0
-) -> PowertrainAnswer | None:
-    """Return what is between commanded and measured wheel speeds; None where no run logs both.
-
-    Parameters
-    ----------
-    runs : of the robot
-    robot : names of its wheels, wheel radius and reduction
-    faults : of their logs; runs whose wheel speeds have one are left out
-    seed : of the folds and of the bootstrap
-    """
-    if not any(is_commanded(run, robot) for run in runs):
-        return None
-    faulty = {run_id for fault in faults if fault.change.of_wheels for run_id in fault.run_ids}
-    try:
-        return PowertrainAnswer(powertrain_of([run for run in runs if run.run_id not in faulty], robot, seed))
-    except DataError as error:
-        left_out = f" ({len(faulty)} have a fault of their wheel speeds)" if faulty else ""
-        return PowertrainAnswer(None, f"{error}{left_out}")
-
-
-def _reduction(before: Array, after: Array, seed: int) -> tuple[float, float, float]:
-    """Return by what the squared errors (runs,) are less, with its interval over runs; 0 of none at all."""
-    if not before.sum() > 0:
-        return 0.0, 0.0, 0.0
-    counts = bootstrap_counts(len(before), DRAWS, seed)
-    drawn = 1.0 - (counts @ after) / np.maximum(counts @ before, 1e-12)
-    return (1.0 - float(after.sum() / before.sum()), *percentile_interval(drawn))
-
-
-def _normal(traces: Traces, active: Sequence[int], p: Array, both_sides: bool = False) -> tuple[Array, Array]:
-    """Return the normal equations of each run: (runs, k, k) and (runs, k)."""
-    left, here = left_over(traces, p), predict(traces, p)
-    change = np.empty((len(active), *left.shape))
-    for row, i in enumerate(active):
-        far, near = p.copy(), p.copy()
-        far[i] += STEPS[i]
-        near[i] = max(p[i] - STEPS[i], LOW[i]) if both_sides else p[i]
-        back = predict(traces, near) if both_sides else here
-        change[row] = (predict(traces, far) - back) / (far[i] - near[i]) * traces.new
-    ends = list(pairwise(traces.sample.tolist()))
-    parts = [(change[:, i:j].reshape(len(active), -1), left[i:j].ravel()) for i, j in ends]
-    return np.array([d @ d.T for d, _ in parts]), np.array([d @ r for d, r in parts])
+    return np.bincount(traces.run, (left_over(traces, values) ** 2).sum(axis=1))
 
 
 def _fit(
-    traces: Traces,
-    active: Sequence[int],
-    start: Array,
-    used: Array,
-    both_sides: bool = False,
-    first: tuple[Array, Array] | None = None,
-) -> Array:
-    """Return the values that fit runs with weights ``used`` (runs,) best, by guarded Gauss-Newton steps.
+    traces: Traces, names: Sequence[str], start: Array, used: Array | None = None
+) -> tuple[Array, Fit | None]:
+    """Return the values of all parts, those named fitted to some runs, to all by default; and the fit."""
+    if not names:
+        return start, None
+    at = [NAMES.index(name) for name in names]
+    weight = np.ones((len(traces.run), 1))
+    if used is not None:
+        weight[:, 0] = np.isin(traces.run, used)
 
-    ``first`` are the normal equations of the runs at the start, where they are known.
-    """
-    p, damping = start.copy(), 1e-3
-    if not active:
-        return p
-    at = list(active)
-    best = float(used @ squared_errors(traces, p))
-    for n in range(MAX_STEPS):
-        normal = first if first is not None and n == 0 else _normal(traces, at, p, both_sides)
-        a, g = (np.tensordot(used, each, axes=1) for each in normal)
-        before = best
-        while damping < MAX_DAMPING:
-            scaled = a + damping * np.diag(np.diag(a)) + 1e-12 * np.eye(len(at))
-            step = np.linalg.solve(scaled, g)
-            if not step @ (2.0 * g - a @ step) > TOLERANCE * before:
-                return p
-            trial = p.copy()
-            trial[at] = np.clip(p[at] + step, LOW[at], HIGH[at])
-            error = float(used @ squared_errors(traces, trial))
-            if error < best:
-                p, best, damping = trial, error, damping / 5.0
-                break
-            damping *= 5.0
-        if not before - best > TOLERANCE * before:
-            break
-        damping = max(damping, 1e-6)
-    return p
+    def inserted(values: Array) -> Array:
+        whole = start.copy()
+        whole[at] = values
+        return whole
+
+    def derivative(values: Array) -> Array:
+        columns = []
+        for i, name in zip(at, names, strict=True):
+            ahead, back = inserted(values), inserted(values)
+            ahead[i] += KINDS[name].step
+            back[i] = max(back[i] - KINDS[name].step, KINDS[name].low)
+            change = (predict(traces, ahead) - predict(traces, back)) / (ahead[i] - back[i])
+            columns.append(-np.ravel(change * traces.new * weight))
+        return np.column_stack(columns)
+
+    fit = identify(
+        lambda values: left_over(traces, inserted(values)) * weight,
+        [
+            Parameter(name, start[i], KINDS[name].low, KINDS[name].high, step=KINDS[name].usual)
+            for i, name in zip(at, names, strict=True)
+        ],
+        clusters=traces.run if used is None else None,
+        derivative=derivative,
+        ftol=TOLERANCE,
+    )
+    return inserted(fit.value), fit
 
 
-def _left_out(traces: Traces, active: Sequence[int], start: Array, fold_of: Array) -> Array:
+def _left_out(traces: Traces, names: Sequence[str], start: Array, fold: Array) -> Array:
     """Return the squared error of each run (runs,), of a fit that it is left out of."""
-    error = np.empty(len(fold_of))
-    first = _normal(traces, active, start) if active else None
-    for fold in range(FOLDS):
-        out = fold_of == fold
-        if out.any():
-            p = _fit(traces, active, start, (~out).astype(float), first=first)
-            error[out] = squared_errors(traces, p)[out]
+    error = np.empty(len(fold))
+    for train, test in folds(fold):
+        error[test] = squared_errors(traces, _fit(traces, names, start, train)[0])[test]
     return error
 
 
-def _add_parts(
-    traces: Traces, candidates: Sequence[int], fold_of: Array, seed: int
-) -> tuple[list[int], Array]:
-    """Return the parts that reduce the error of runs left out, added one at a time, and all values."""
-    every = np.ones(len(fold_of))
-    present: list[int] = []
-    vector, error = ABSENT.copy(), squared_errors(traces, ABSENT)
-    while True:
-        fits = []
-        for i in candidates:
-            if i not in present:
-                p = _fit(traces, [*present, i], _started(traces, vector, i), every)
-                fits.append((float(squared_errors(traces, p).sum()), i, p))
-        least = (1.0 - MIN_GAIN_RATIO) * float(squared_errors(traces, vector).sum())
-        for fitted, i, p in sorted(fits, key=lambda each: each[0]):
-            if fitted >= least:
-                return present, vector
-            left = _left_out(traces, [*present, i], p, fold_of)
-            if _low_gain(error, left, seed) > 0.0:
-                present, vector, error = sorted([*present, i]), p, left
-                break
-        else:
-            return present, vector
+def _is_less(after: Array, before: Array, draws: Array) -> bool:
+    """Return whether squared errors (runs,) are less over bootstrap samples of the runs (n_draws, runs).
 
-
-def _drop_parts(
-    traces: Traces, present: list[int], vector: Array, fold_of: Array, seed: int
-) -> tuple[list[int], Array, Array, dict[int, float]]:
-    """Return the parts without those that a later one made needless, and what each removes beside the others.
-
-    Further returned are all values and the squared error of each run (runs,) that is left out.
+    The level leaves to all parts together what an interval leaves to one.
     """
-    every = np.ones(len(fold_of))
+    return percentile_interval(draws @ (before - after), 1.0 - (1.0 - LEVEL) / len(NAMES))[0] > 0.0
+
+
+def _select_parts(
+    traces: Traces, candidates: Sequence[str], fold: Array, draws: Array
+) -> tuple[dict[str, float], Array, Array]:
+    """Return the parts that reduce the error of runs left out, each with what it removes beside the others.
+
+    Further returned are all values, and the squared error of each run (runs,) left out.  Parts are added one at a
+    time; those that a later one made needless are dropped again.
+    """
+    present: list[str] = []
+    values, error = ABSENT, squared_errors(traces, ABSENT)
+    added = True
+    while added:
+        least = (1.0 - MIN_GAIN_RATIO) * float(squared_errors(traces, values).sum())
+        fits = {}
+        for name in candidates:
+            if name not in present:
+                fitted = _fit(traces, [*present, name], _started(traces, values, name))[0]
+                fits[name] = float(squared_errors(traces, fitted).sum()), fitted
+        added = False
+        for name in sorted(fits, key=lambda name: fits[name][0]):
+            size, fitted = fits[name]
+            if size < least:
+                left = _left_out(traces, [*present, name], fitted, fold)
+                if _is_less(left, error, draws):
+                    present, values, error = sorted([*present, name], key=NAMES.index), fitted, left
+                    added = True
+                    break
     while True:
-        error = _left_out(traces, present, vector, fold_of)
+        error = _left_out(traces, present, values, fold)
         gains, needless = {}, {}
-        for i in present:
-            rest = [j for j in present if j != i]
-            without = _fit(traces, rest, _without(vector, i), every)
-            left = _left_out(traces, rest, without, fold_of)
-            gains[i] = float(1.0 - error.sum() / left.sum())
-            if _low_gain(left, error, seed) <= 0.0:
-                needless[i] = rest, without
+        for name in present:
+            rest = [other for other in present if other != name]
+            without = np.where(np.array(NAMES) == name, ABSENT, values)
+            without = _fit(traces, rest, without)[0]
+            left = _left_out(traces, rest, without, fold)
+            gains[name] = float(1.0 - error.sum() / left.sum())
+            if not _is_less(error, left, draws):
+                needless[name] = rest, without
         if not needless:
-            return present, vector, error, gains
-        present, vector = needless[min(needless, key=lambda i: gains[i])]
+            return gains, values, error
+        present, values = needless[min(needless, key=lambda name: gains[name])]
 
 
-def _started(traces: Traces, vector: Array, i: int) -> Array:
+def _started(traces: Traces, values: Array, name: str) -> Array:
     """Return the values with a part added, at the best of those that its fit may start from."""
-    top = float(np.abs(traces.measured).max())
-    starts = STARTS[i] or tuple(ratio * top for ratio in LIMIT_STARTS)
-    shorter = vector.copy()
-    shorter[TIME_CONSTANT] *= 0.5  # a slew limit takes over much of what a time constant did without it
-    points = np.repeat([vector, shorter], len(starts), axis=0)
-    points[:, i] = np.clip(np.tile(starts, 2), LOW[i], HIGH[i])
-    return np.asarray(min(points, key=lambda p: float(squared_errors(traces, p).sum())))
+    kind, top = KINDS[name], float(np.abs(traces.measured).max())
+    starts = kind.starts or tuple(ratio * top for ratio in LIMIT_STARTS)
+    shorter = values.copy()
+    shorter[NAMES.index("time_constant_s")] *= 0.5  # a slew limit takes over much of it
+    points = np.repeat([values, shorter], len(starts), axis=0)
+    points[:, NAMES.index(name)] = np.clip(np.tile(starts, 2), kind.low, kind.high)
+    return np.asarray(min(points, key=lambda point: float(squared_errors(traces, point).sum())))
 
 
-def _without(vector: Array, i: int) -> Array:
-    rest = vector.copy()
-    rest[i] = ABSENT[i]
-    return rest
+def _is_excited(traces: Traces, values: Array, name: str) -> bool:
+    """Return whether a part of a usual size would change the wheel speeds noticeably.
 
-
-def _low_gain(before: Array, after: Array, seed: int) -> float:
-    """Return the low end of the reduction of squared errors (runs,), over bootstrap samples of the runs.
-
-    Its level leaves to all parts together what an interval leaves to one.
+    The runs then start at the speeds that their first commands lead to: noise of the first samples is no motion.
     """
-    counts = bootstrap_counts(len(before), DRAWS, seed)
-    return percentile_interval(counts @ (before - after), 1.0 - (1.0 - LEVEL) / len(NAMES))[0]
-
-
-def _intervals(
-    traces: Traces, present: Sequence[int], vector: Array, seed: int
-) -> dict[int, tuple[float, float]]:
-    """Return the interval of each part over bootstrap samples of the runs, by one Gauss-Newton step each."""
-    if not present:
-        return {}
-    a, g = _normal(traces, present, vector, both_sides=True)
-    counts = bootstrap_counts(len(a), DRAWS, seed).astype(float)
-    total = np.tensordot(counts, a, axes=1) + 1e-12 * np.eye(len(present))
-    change = np.linalg.solve(total, (counts @ g)[..., None])[..., 0]
-    draws = np.clip(vector[list(present)] + change, LOW[list(present)], HIGH[list(present)])
-    return {i: percentile_interval(draws[:, k]) for k, i in enumerate(present)}
-
-
-def _is_excited(traces: Traces, vector: Array, i: int) -> bool:
-    """Return whether a part of a usual size would change the wheel speeds noticeably."""
-    there = vector.copy()
-    there[i] = USUAL[i]
-    traces = traces._replace(start_radps=settled(traces, vector))  # noise of the first samples is no motion
-    change = (predict(traces, there) - predict(traces, vector)) * traces.new
-    runs = traces.sample[:-1]
-    removed = float((change**2).sum())
-    scatter = np.add.reduceat(2.0 * (change * left_over(traces, vector)).sum(axis=1), runs)
-    least = MIN_GAIN_RATIO * float(squared_errors(traces, vector).sum())
-    return removed > max(EXCITED_SIGMAS * float(np.sqrt((scatter**2).sum())), least, 1e-9)
+    there = np.where(np.array(NAMES) == name, KINDS[name].usual, values)
+    at_once = np.where(np.isin(NAMES, ("delay_s", "time_constant_s", "slew_radps2")), ABSENT, values)
+    none = np.zeros(traces.measured.shape[1])
+    settled = [follow(traces.area_rad[k : k + 2], none, at_once, STEP_S)[1] for k in traces.first[:-1]]
+    traces = traces._replace(start_radps=np.array(settled))
+    change = (predict(traces, there) - predict(traces, values)) * traces.new
+    scatter = np.bincount(traces.run, 2.0 * (change * left_over(traces, values)).sum(axis=1))
+    least = MIN_GAIN_RATIO * float(squared_errors(traces, values).sum())
+    return float((change**2).sum()) > max(EXCITED_SIGMAS * float(np.linalg.norm(scatter)), least, 1e-9)

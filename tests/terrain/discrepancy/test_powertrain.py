@@ -13,10 +13,8 @@ from terrain.discrepancy.powertrain import (
     STEP_S,
     PartStatus,
     follow,
-    powertrain_answer,
     powertrain_of,
 )
-from terrain.errors import DataError
 from terrain.logs.drive import DriveRobot, find_runs
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
@@ -107,7 +105,8 @@ def test_what_is_hidden_comes_back_and_nothing_else(case):
         room = 0.0 if part.name.endswith("_s") else 0.01 * part.value  # so much of limits is left to the grid
         assert part.low - room <= hidden[part.name] <= part.high + room, part
         coarse = part.name == "delay_s" and not {"time_constant_s", "slew_radps2"} & set(hidden)
-        assert part.value == pytest.approx(hidden[part.name], rel=0.05, abs=PERIOD_S * coarse)
+        grid_s = PERIOD_S if coarse else STEP_S * (part.name == "delay_s")
+        assert part.value == pytest.approx(hidden[part.name], rel=0.05, abs=grid_s)
         assert part.gain_ratio > 0.0
     assert found.rms_after_radps < 1.3 * NOISE_RADPS
     assert (found.rms_before_radps > 3 * found.rms_after_radps) == bool(hidden)
@@ -153,14 +152,7 @@ def test_what_the_commands_do_not_show_is_not_excited():
 
 def test_the_same_seed_gives_the_same_answer():
     runs = commanded_runs({"delay_s": 0.2, "time_constant_s": 0.3}, n=10)
-    assert repr(powertrain_of(runs, HUSKY, 5)) == repr(powertrain_of(runs, HUSKY, 5))
-
-
-def test_runs_without_commands_are_refused_in_one_sentence():
-    runs = commanded_runs({}, n=6)
-    bare = [RunLog(run.run_id, "husky", {"wheels": run.streams["wheels"]}) for run in runs[:2]]
-    with pytest.raises(DataError, match=r"runs: 4 have commanded and measured wheel speeds; at least 5"):
-        powertrain_of([*bare, *runs[2:]], HUSKY)
+    assert repr(powertrain_of(runs, HUSKY, seed=5)) == repr(powertrain_of(runs, HUSKY, seed=5))
 
 
 def test_the_answer_is_stated_in_sentences():
@@ -168,7 +160,6 @@ def test_the_answer_is_stated_in_sentences():
     late, slow, gained = found.sentences
     assert re.fullmatch(r"The wheels answer 0\.\d+ s late \(0\.\d+ to 0\.\d+\)\.", late)
     assert slow.startswith("They settle with a time constant of 0.")
-    assert found.vector[0] == found.found[0].value
     nothing = powertrain_of(commanded_runs({}, n=10), HUSKY)
     assert "as they are commanded" in nothing.sentences[0]
     assert nothing.reduction == (0.0, 0.0, 0.0)
@@ -183,21 +174,19 @@ def test_the_answer_is_stated_in_sentences():
 def test_an_answer_leaves_out_what_is_no_command_or_a_wheel_speed_with_a_fault():
     runs = commanded_runs({"delay_s": 0.2, "time_constant_s": 0.3}, n=10)
     bare = [RunLog(run.run_id, "husky", {"wheels": run.streams["wheels"]}) for run in runs]
-    assert powertrain_answer(bare, HUSKY, ()) is None
-    few = powertrain_answer([*bare[:7], *runs[7:]], HUSKY, ())
-    assert few.powertrain is None
+    assert powertrain_of(bare, HUSKY) is None
+    few = powertrain_of([*bare[:7], *runs[7:]], HUSKY)
+    assert few.as_json()["measured"] is False
     assert few.sentences == (
         "The wheel speeds are not compared with their commands: runs: 3 have commanded and measured wheel "
         "speeds; at least 5 are required.",
     )
     in_kmh = [replaced(run, 3.6) if i < 3 else run for i, run in enumerate(runs)]
-    change = Change(FaultKind.UNIT, Column.WHEELS, 1 / 3.6)
-    fault = Fault(change, ("run_0", "run_1", "run_2"), "", "")
-    assert powertrain_answer(in_kmh, HUSKY, ()).powertrain.n_runs == len(runs)
-    assert repr(powertrain_answer(in_kmh, HUSKY, (fault,)).powertrain) == repr(powertrain_of(runs[3:], HUSKY))
-    gyro = Change(FaultKind.SIGN, Column.GYRO, -1.0)
-    turned = Fault(gyro, fault.run_ids, "", "")
-    assert repr(powertrain_answer(runs, HUSKY, (turned,)).powertrain) == repr(powertrain_of(runs, HUSKY))
+    fault = Fault(Change(FaultKind.UNIT, Column.WHEELS, 1 / 3.6), ("run_0", "run_1", "run_2"), "", "")
+    assert powertrain_of(in_kmh, HUSKY).n_runs == len(runs)
+    assert repr(powertrain_of(in_kmh, HUSKY, (fault,))) == repr(powertrain_of(runs[3:], HUSKY))
+    turned = Fault(Change(FaultKind.SIGN, Column.GYRO, -1.0), fault.run_ids, "", "")
+    assert repr(powertrain_of(runs, HUSKY, (turned,))) == repr(powertrain_of(runs, HUSKY))
 
 
 def replaced(run, factor):

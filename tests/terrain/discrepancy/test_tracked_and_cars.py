@@ -119,7 +119,7 @@ def test_a_log_of_a_car_has_one_wheel_a_region_and_no_columns_to_exchange():
     with pytest.raises(DataError, match="no stream 'steering'"):
         signals_of(without, CAR)
     assert all(change.wheel < 1 and change.pair == (0, 1) for change in candidate_changes(CAR))
-    assert traces_of([logged() for _ in range(5)], CAR).measured.shape[1] == 1
+    assert traces_of([logged() for _ in range(5)], CAR)[0].measured.shape[1] == 1
 
 
 def test_words_are_those_of_the_robot():
