@@ -1,13 +1,18 @@
-"""Faults of channels: what is wrong with a column of the logs, in words, with its repair."""
+"""Faults of channels: what is wrong with a column of the logs, in words, with its repair.
+
+A fault is a linear map of columns (:class:`Change`): a sign that is turned, columns that are exchanged, another unit,
+an offset.  The right reading of logs is one under which every channel follows what the wheels predict, with a gain
+above zero (:func:`gains_of`), of a size that robots and effects reach, without an offset that no bias has.  The
+simulation may be wrong: a fault is what no effect of the catalogue does.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from enum import StrEnum
-from functools import partial
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -18,16 +23,7 @@ from terrain.discrepancy.clocks import CLOCKED, INDEPENDENT_HZ, Latencies, Shift
 from terrain.discrepancy.residuals import INPUTS, LowPass, Rows, rows_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.effects import (
-    ACCEL,
-    CHANNELS,
-    CURRENT,
-    GYRO,
-    HEADING,
-    SPEED_X,
-    SPEED_Y,
-    TURNING_CURRENT,
-)
+from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.records import Array
 from terrain.robots import Robot
 
@@ -40,6 +36,9 @@ G, X, Y, A, AMPS, T, H = (
 
 MOTION = (G, X, H)
 """Channels that follow the wheels whatever the effects are: of a lateral speed, a lever arm sets the sign."""
+
+FOLLOWERS = (*MOTION, A, AMPS, T)
+"""Channels whose gain is above zero, whatever the effects are."""
 
 CLOCK_OF = {G: GYRO, X: SPEED_X, Y: SPEED_X, A: GYRO, H: HEADING}
 """Channel that measures the clock of a channel; currents are on that of the wheels."""
@@ -55,12 +54,8 @@ MAX_FIT = 0.9999
 class Response(NamedTuple):
     """A run, each measured row beside the prediction of its own clock.
 
-    Parameters
-    ----------
-    run_id, terrain : of the run
-    period_s : of its rows
-    measured, predicted : (m, channels)
-    climb_mps2 : (m,) part of the predicted specific force that is gravity
+    ``measured, predicted`` are (m, channels), ``climb_mps2`` (m,) is the part of the predicted specific force that
+    is gravity, and ``period_s`` that of the rows.
     """
 
     run_id: str
@@ -82,28 +77,28 @@ def responses_of(
     latencies : of all runs together; without them the medians of those that each run measures
     shift : of each run, where it measures one of its own
     """
-    common: dict[str, float] = {}
+    lag_s = np.full((len(rows), len(CLOCKED)), np.nan) if shift is None else shift.lag_s
+    rate = 0.0 if shift is None else shift.rate
     if latencies is not None:
         common = {lag.channel: lag.lag_s for lag in latencies.channels}
-    elif shift is not None:
-        for name, lag_s in zip(CLOCKED, shift.lag_s.T, strict=True):
-            if np.isfinite(lag_s).any():
-                common[name] = float(np.median(lag_s[np.isfinite(lag_s)]))
+    else:
+        known = [column[np.isfinite(column)] for column in lag_s.T]
+        common = {
+            name: float(np.median(lags)) for name, lags in zip(CLOCKED, known, strict=True) if lags.size
+        }
     usual_s = float(np.median(list(common.values()))) if common else 0.0
-    found = []
-    for i, run in enumerate(rows):
-        own = {} if shift is None else dict(zip(CLOCKED, shift.lag_s[i], strict=True))
-        known = {name: float(lag) for name, lag in own.items() if np.isfinite(lag)}
+    responses = []
+    for run, own_s in zip(rows, lag_s, strict=True):
         predicted = run.predicted.copy()
-        centred_s = run.time_s - run.time_s.mean() if run.time_s.size else run.time_s
-        rate = 0.0 if shift is None else shift.rate
         for c, name in CLOCK_OF.items() if run.time_s.size else ():
-            late_s = known.get(name, common.get(name, usual_s)) + rate * centred_s
-            predicted[:, c] = np.interp(run.time_s - late_s, run.time_s, run.predicted[:, c])
+            late_s = own_s[CLOCKED.index(name)]
+            late_s = late_s if np.isfinite(late_s) else common.get(name, usual_s)
+            at_s = run.time_s - late_s - rate * (run.time_s - run.time_s.mean())
+            predicted[:, c] = np.interp(at_s, run.time_s, run.predicted[:, c])
         period_s = float(np.median(np.diff(run.time_s))) if run.time_s.size > 1 else 0.0
         climb = GRAVITY_MPS2 * np.sin(run.inputs[:, INPUTS.index("grade_rad")])
-        found.append(Response(run.run_id, run.terrain, period_s, run.measured, predicted, climb))
-    return tuple(found)
+        responses.append(Response(run.run_id, run.terrain, period_s, run.measured, predicted, climb))
+    return tuple(responses)
 
 
 def fits(response: Response) -> tuple[Array, Array]:
@@ -112,13 +107,11 @@ def fits(response: Response) -> tuple[Array, Array]:
     Both are 0 where the prediction is too small to ask for.  The accelerometer's is about its mean, since
     its bias is large.
     """
-    measured, predicted = response.measured, response.predicted
-    known = np.isfinite(measured) & np.isfinite(predicted)
-    n = known.sum(axis=0)
-    m, p = np.where(known, measured, 0.0), np.where(known, predicted, 0.0)
+    n, m, p = _known_pairs(response)
     if n[A]:
-        for each in (m, p):
-            each[:, A] -= np.where(known[:, A], each[:, A].sum() / n[A], 0.0)
+        known = np.isfinite(response.measured[:, A]) & np.isfinite(response.predicted[:, A])
+        for values in (m, p):
+            values[:, A] -= np.where(known, values[:, A].sum() / n[A], 0.0)
     power = (p * p).sum(axis=0)
     asked = np.sqrt(power / np.maximum(n, 1)) > np.array([LEAST[c] for c in range(len(CHANNELS))])
     norm = np.sqrt(power * (m * m).sum(axis=0))
@@ -134,19 +127,22 @@ def gains_of(response: Response) -> tuple[Array, Array]:
     The accelerometer's is that of its acceleration, beside gravity and a bias.
     """
     correlation = fits(response)[0]
-    known = np.isfinite(response.measured) & np.isfinite(response.predicted)
-    m, p = np.where(known, response.measured, 0.0), np.where(known, response.predicted, 0.0)
+    _, m, p = _known_pairs(response)
     power = (p * p).sum(axis=0)
     gain = np.divide((m * p).sum(axis=0), power, out=np.full(len(power), np.nan), where=correlation != 0.0)
-    rows = known[:, A]
     if correlation[A] != 0.0:
+        rows = np.isfinite(response.measured[:, A]) & np.isfinite(response.predicted[:, A])
         climb = response.climb_mps2[rows]
         basis = np.column_stack([p[rows, A] - climb, climb, np.ones(climb.size)])
-        if np.std(basis[:, 0]) > 0.5 * LEAST[A]:
-            gain[A] = np.linalg.lstsq(basis, m[rows, A], rcond=None)[0][0]
-        else:
-            gain[A] = np.nan
+        varies = np.std(basis[:, 0]) > 0.5 * LEAST[A]
+        gain[A] = np.linalg.lstsq(basis, m[rows, A], rcond=None)[0][0] if varies else np.nan
     return gain, correlation
+
+
+def _known_pairs(response: Response) -> tuple[Array, Array, Array]:
+    """Return how many rows of each channel are known, and both sides (m, channels), 0 where either is not."""
+    known = np.isfinite(response.measured) & np.isfinite(response.predicted)
+    return known.sum(axis=0), *(np.where(known, x, 0.0) for x in (response.measured, response.predicted))
 
 
 # -- A fault: what is wrong with a column, in words, with its repair ------------------------------------------
@@ -177,27 +173,33 @@ class Column(StrEnum):
     SIDES = "wheel speeds and currents"
 
 
-CHANNELS_OF: dict[Column, tuple[int, ...]] = {
-    Column.GYRO: (G,),
-    Column.HEADING: (H,),
-    Column.SPEED: (X, Y),
-    Column.ACCEL: (A,),
-    Column.CURRENTS: (AMPS, T),
-    Column.WHEELS: (),
-    Column.SIDES: (),
-}
-"""Measured channels of each; those of wheels are the inputs of the simulation."""
+DEG, RPM, KMH, MILLI = math.pi / 180.0, math.pi / 30.0, 1.0 / 3.6, 1e-3
 
-LOGGED: dict[Column, str] = {
-    Column.GYRO: "gyro_z_radps",
-    Column.HEADING: "yaw_rate_radps",
-    Column.SPEED: "speed_x_mps and speed_y_mps",
-    Column.ACCEL: "accel_x_mps2",
-    Column.CURRENTS: "the currents",
-    Column.WHEELS: "the wheel speeds",
-    Column.SIDES: "the wheel speeds and currents",
+
+class _Kind(NamedTuple):
+    """Of a column: measured channels, name in logs, unit, other units that loggers have, largest offset."""
+
+    channels: tuple[int, ...]
+    logged: str
+    si: str
+    units: dict[str, float]
+    largest: float = math.inf
+
+
+KINDS = {
+    Column.GYRO: _Kind((G,), "gyro_z_radps", "rad/s", {"deg/s": DEG, "rpm": RPM}, 0.3),
+    Column.HEADING: _Kind((H,), "yaw_rate_radps", "rad/s", {"deg/s": DEG, "rpm": RPM}, 0.3),
+    Column.SPEED: _Kind((X, Y), "speed_x_mps and speed_y_mps", "m/s", {"km/h": KMH, "mm/s": MILLI}, 0.3),
+    Column.ACCEL: _Kind((A,), "accel_x_mps2", "m/s^2", {"g": GRAVITY_MPS2}, 3.0),
+    Column.CURRENTS: _Kind((AMPS, T), "the currents", "A", {"mA": MILLI}),
+    Column.WHEELS: _Kind((), "the wheel speeds", "", {"deg/s": DEG, "rpm": RPM, "km/h": KMH, "mm/s": MILLI}),
+    Column.SIDES: _Kind((), "the wheel speeds and currents", "", {}),
 }
-"""Names as logs have them."""
+"""By column; wheel speeds are the inputs of the simulation.  The largest offset is half more than the bounds of the
+catalogue's biases, and for a heading rate and a speed, which have none, as much and a slow robot's speed."""
+
+NOT_IN_MAPPINGS = ("mm/s",)
+"""Units that a mapping file has no word for; there the scale is changed."""
 
 
 class Change(NamedTuple):
@@ -228,7 +230,7 @@ class Change(NamedTuple):
     def measured(self, values: Array) -> Array:
         """Return measured channels (n, channels) as they are without the fault."""
         order, factor, offset = np.arange(len(CHANNELS)), np.ones(len(CHANNELS)), np.zeros(len(CHANNELS))
-        own = list(CHANNELS_OF[self.column])
+        own = list(KINDS[self.column].channels)
         if self.kind is not FaultKind.SWAPPED:
             factor[own], offset[own] = self.factor, self.offset
         elif self.column is Column.SPEED:
@@ -251,36 +253,21 @@ class Change(NamedTuple):
         return replace(run, measured=measured, wheel_speed_mps=run.wheel_speed_mps[:, order] * factor)
 
 
-class Fault(NamedTuple):
-    """A fault of a column in some runs.
+Changes = tuple[Change, ...]
 
-    Parameters
-    ----------
-    change : that makes the log right
-    run_ids : of the runs that have it
-    sentence : what is wrong, how that is seen, and what to do
-    repair : what to do alone
-    """
+
+class Fault(NamedTuple):
+    """A fault of a column in some runs: what makes the log right, a sentence on what is wrong, and what to do."""
 
     change: Change
     run_ids: tuple[str, ...]
     sentence: str
     repair: str
 
-    @property
-    def kind(self) -> FaultKind:
-        """What is wrong."""
-        return self.change.kind
-
-    @property
-    def column(self) -> Column:
-        """With what."""
-        return self.change.column
-
     def as_json(self) -> dict[str, Any]:
         """Return the fields as JSON names them."""
-        of_change = {"kind": self.kind, "column": self.column, "factor": self.change.factor}
-        return {**of_change, "runs": self.run_ids, "sentence": self.sentence, "repair": self.repair}
+        change = {name: getattr(self.change, name) for name in ("kind", "column", "factor")}
+        return {**change, "runs": self.run_ids, "sentence": self.sentence, "repair": self.repair}
 
 
 def repaired(signals: Sequence[Signals], faults: Sequence[Fault]) -> tuple[Signals, ...]:
@@ -323,6 +310,57 @@ def in_runs(ids: Sequence[str], every: Sequence[str]) -> str:
     return f"in {len(ids)} of {len(every)} runs ({shown})"
 
 
+def _fault_words(change: Change, robot: Robot) -> tuple[str, str]:
+    """Return what a change says is wrong, and how to repair it, in words."""
+    column, kind = change.column, KINDS[change.column]
+    name, plural = f"the {column.value}", column in (Column.WHEELS, Column.CURRENTS)
+    if change.kind is FaultKind.SWAPPED:
+        what = f"{column.value} of left and right are exchanged"
+        names = {
+            Column.CURRENTS: "current_left_a and current_right_a",
+            Column.WHEELS: "speed_left_mps and speed_right_mps",
+            Column.SIDES: "left and right of the wheel speeds, and of the currents,",
+        }.get(column, kind.logged)
+        if column is Column.SPEED:
+            what = "the speeds forward and to the left are exchanged"
+        elif not robot.skids:
+            names = " and ".join(robot.rate_channels[i] for i in change.pair)
+            what = "wheel speeds of {} and {} are exchanged".format(*(robot.wheels[i] for i in change.pair))
+        return what, f"exchange {names} (mapping file: exchange their columns)"
+    if change.kind is FaultKind.OFFSET:
+        size = f"{-change.offset:.3g} {kind.si}"
+        repair = f"subtract {size} from {kind.logged.split(' and ')[0]} (mapping file: offset: {change.offset:.3g})"
+        return f"{name} has an offset of {size}", repair
+    logged, hint = kind.logged, "scale: -1"
+    if change.kind is FaultKind.SIGN:
+        what = f"the sign of {name} is turned" if plural else f"{name}'s sign is turned"
+        if change.wheel >= 0:
+            wheel = robot.wheels[change.wheel]
+            what, logged = (
+                f"the sign of the {wheel} wheel's speed is turned",
+                f"the speed of the wheel {wheel}",
+            )
+    else:
+        what, unit = _unit_words(change)
+        what = f"{name} {what}"
+        hint = f"unit: {unit}" if unit and unit not in NOT_IN_MAPPINGS else f"scale: {change.factor:.4g}"
+    return what, f"multiply {logged} by {change.factor:.4g} (mapping file: {hint})"
+
+
+def _unit_words(change: Change) -> tuple[str, str]:
+    """Return what is wrong with a unit, and the unit that the samples have."""
+    is_, was = ("are", "were") if change.column in (Column.WHEELS, Column.CURRENTS) else ("is", "was")
+    for unit, size in KINDS[change.column].units.items():
+        si = KINDS[change.column].si or ("m/s" if unit in ("km/h", "mm/s") else "rad/s")
+        if math.isclose(change.factor, size):
+            return f"{is_} in {unit} instead of {si}", unit
+        if math.isclose(change.factor, 1.0 / size):
+            return f"{is_} in {si}, and {was} read as {unit}", si
+    if change.factor < 1.0:
+        return "are rates in rad/s instead of speeds in m/s", ""
+    return "are speeds in m/s, and were read as rates in rad/s", ""
+
+
 # -- Signs that are turned and columns that are exchanged, found by what makes all channels of a run agree --
 # Every reading of a run that is one fault away is tried: a change of its measured channels, or of its wheels,
 # which are then simulated again.  Under the right one all channels follow the wheels, each with a gain above
@@ -345,9 +383,6 @@ hundreds of runs."""
 
 TIE, TIE_RATIO = 10.0, 0.03
 """Readings whose gains differ by less, or by less than that ratio, cannot be distinguished."""
-
-FOLLOWERS = (*MOTION, A, AMPS, T)
-"""Channels whose gain is above zero, whatever the effects are."""
 
 WORDS = dict(zip(CHANNELS, ("gyro", "speed", "lateral speed", "accelerometer", "sum of the currents",
                             "difference of the currents", "heading rate"), strict=True))  # fmt: skip
@@ -372,8 +407,8 @@ class Reading(NamedTuple):
     suits: Array
 
 
-def candidate_changes(robot: Robot) -> tuple[Change, ...]:
-    """Return the changes that are tried, those of fewest columns first."""
+def candidate_changes(robot: Robot) -> Changes:
+    """Return the signs and exchanges that are tried, those of fewest columns first."""
     sign, swapped, n_wheels = FaultKind.SIGN, FaultKind.SWAPPED, len(robot.rate_channels)
     single = (Column.GYRO, Column.HEADING, Column.SPEED, Column.ACCEL, Column.CURRENTS)
     changes = [Change(sign, column, -1.0) for column in single]
@@ -381,23 +416,15 @@ def candidate_changes(robot: Robot) -> tuple[Change, ...]:
     if robot.skids:
         changes += [Change(swapped, column) for column in (Column.CURRENTS, Column.WHEELS, Column.SIDES)]
     else:
-        pairs = combinations(range(n_wheels), 2)
-        changes += [Change(swapped, Column.WHEELS, pair=pair) for pair in pairs]
+        changes += [Change(swapped, Column.WHEELS, pair=pair) for pair in combinations(range(n_wheels), 2)]
     each = range(n_wheels) if n_wheels > 1 else ()
-    changes += [Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *each)]
-    return tuple(changes)
-
-
-def is_suspect(response: Response) -> bool:
-    """Whether a channel of a run that is asked does not follow the wheels well."""
-    correlation = fits(response)[0]
-    return any(correlation[c] != 0.0 and correlation[c] < RIGHT for c in FOLLOWERS)
+    return (*changes, *(Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *each)))
 
 
 def reading_of(change: Change, before: Sequence[Response], after: Sequence[Response]) -> Reading:
     """Return what a change makes of runs."""
     was, now = ([fits(run) for run in runs] for runs in (before, after))
-    old, new = (np.array([each[0] for each in fitted]) for fitted in (was, now))
+    old, new = (np.array([correlation for correlation, _ in fitted]) for fitted in (was, now))
     gain = np.array([b[1].sum() - a[1].sum() for a, b in zip(was, now, strict=True)])
     keys = list(FOLLOWERS)
     turned = (old < TURNED) & (new > RIGHT)
@@ -408,10 +435,10 @@ def reading_of(change: Change, before: Sequence[Response], after: Sequence[Respo
     return Reading(change, new, gain, mended & suits, suits)
 
 
-def best_reading(readings: Sequence[Reading]) -> tuple[Reading, list[Reading]] | None:
+def _best_reading(readings: Sequence[Reading]) -> tuple[Reading, list[Reading]] | None:
     """Return the reading that gains most over the runs that it mends, and those as good on the same runs."""
-    best = max(readings, key=lambda reading: float(reading.gain[reading.mends].sum()), default=None)
-    if best is None or not best.mends.any():
+    best = max(readings, key=lambda reading: float(reading.gain[reading.mends].sum()))
+    if not best.mends.any():
         return None
     most = float(best.gain[best.mends].sum())
     near = [
@@ -423,125 +450,46 @@ def best_reading(readings: Sequence[Reading]) -> tuple[Reading, list[Reading]] |
     return near[0], near[1:]
 
 
-def runs_with(reading: Reading, ids: Sequence[str], responses: Sequence[Response]) -> list[int]:
+def _runs_with(reading: Reading, responses: Sequence[Response]) -> list[int]:
     """Return the runs that have a fault: those that it suits, and of their sessions those that cannot say.
 
     A run that drives straight measures no sign of a gyro; it has that of the others.
     """
+    session = [session_of(run.run_id) for run in responses]
     has = set(np.flatnonzero(reading.suits).tolist())
     old = np.array([fits(run)[0] for run in responses])
-    mended = np.flatnonzero(reading.mends)
-    shift = np.median(np.abs(reading.correlation[mended] - old[mended]), axis=0)
+    shift = np.median(np.abs(reading.correlation - old)[reading.mends], axis=0)
     shows = [c for c in FOLLOWERS if shift[c] > RISE]
-    for session in {session_of(ids[i]) for i in has}:
-        members = [i for i in range(len(ids)) if session_of(ids[i]) == session]
+    for name in {session[i] for i in has}:
+        members = [i for i in range(len(responses)) if session[i] == name]
         asked = [i for i in members if (np.abs(old[i, shows]) > RIGHT).any()]
         if all(i in has for i in asked):
             has |= set(members)
     return sorted(has)
 
 
-def sign_fault(
-    best: Reading,
-    rivals: Sequence[Reading],
-    has: Sequence[int],
-    responses: Sequence[Response],
-    robot: Robot,
-) -> Fault:
-    """Return the fault of a reading, in words.
-
-    Readings that are as good are mirror images, left for right or ahead for back: the change of fewest
-    columns is taken, and the diagnosis is that of either but for the side.
-    """
-    change, every = best.change, [run.run_id for run in responses]
-    ids = tuple(every[i] for i in has)
-    where = in_runs(ids, every)
-    shown = [i for i in has if best.mends[i]]
-    seen = _evidence(change, responses, shown, best)
-    what, repair = _fault_words(change, robot)
-    other = ""
-    if rivals:
-        words = " or ".join(_fault_words(rival.change, robot)[0] for rival in rivals)
-        other = f" (these channels cannot distinguish it from another reading: {words})"
-    sentence = f"{what} {where}: {seen}{other}; {repair}"
-    return Fault(change, ids, sentence, repair)
-
-
-def _evidence(change: Change, responses: Sequence[Response], shown: Sequence[int], best: Reading) -> str:
-    """Return how a fault is seen: the gains of the channels that it turns."""
-    runs = [responses[i] for i in shown]
-    gains, old = (np.array(each) for each in zip(*(gains_of(run) for run in runs), strict=True))
-    new = best.correlation[list(shown)]
-    own = [c for c in FOLLOWERS if c in CHANNELS_OF[change.column] or change.of_wheels]
+def _gain_sentence(best: Reading, responses: Sequence[Response], shown: Sequence[int]) -> str:
+    """Return how a sign or exchange is seen: the gains of the channels that it turns."""
+    gains, old = (np.array(each) for each in zip(*(gains_of(responses[i]) for i in shown), strict=True))
+    rise = best.correlation[list(shown)] - old
     asked = (old != 0.0) & np.isfinite(gains)
-    turned = [c for c in own if asked[:, c].any() and np.median((new - old)[asked[:, c], c]) > RISE]
     words = []
-    for c in turned:
+    for c in FOLLOWERS:
         on = asked[:, c]
+        own = c in KINDS[best.change.column].channels or best.change.of_wheels
+        if not (own and on.any() and np.median(rise[on, c]) > RISE):
+            continue
         text = f"the {WORDS[CHANNELS[c]]} follows the wheels with the factor {np.median(gains[on, c]):.2f}"
         both = on & np.isfinite(gains[:, H])
-        if change.column is Column.GYRO and both.any():
-            ratio = float(np.median(gains[both, c] / gains[both, H]))
-            text += f", and the heading rate with {ratio:.2f}"
+        if best.change.column is Column.GYRO and both.any():
+            text += f", and the heading rate with {float(np.median(gains[both, c] / gains[both, H])):.2f}"
         words.append(text)
     return " and ".join(words)
-
-
-def _fault_words(change: Change, robot: Robot) -> tuple[str, str]:
-    """Return a fault and its repair in words."""
-    if change.kind is FaultKind.SWAPPED:
-        if change.column is Column.SPEED:
-            names = "speed_x_mps and speed_y_mps"
-            what = "the speeds forward and to the left are exchanged"
-        elif not robot.skids:
-            names = " and ".join(robot.rate_channels[i] for i in change.pair)
-            what = "wheel speeds of {} and {} are exchanged".format(*(robot.wheels[i] for i in change.pair))
-        else:
-            what = f"{change.column.value} of left and right are exchanged"
-            names = {
-                Column.CURRENTS: "current_left_a and current_right_a",
-                Column.WHEELS: "speed_left_mps and speed_right_mps",
-                Column.SIDES: "left and right of the wheel speeds, and of the currents,",
-            }[change.column]
-        return what, f"exchange {names} (mapping file: exchange their columns)"
-    if change.wheel >= 0:
-        wheel = robot.wheels[change.wheel]
-        what, logged = f"the sign of the {wheel} wheel's speed is turned", f"the speed of the wheel {wheel}"
-    else:
-        plural = change.column in (Column.WHEELS, Column.CURRENTS)
-        what = f"the sign of the {change.column.value} is turned"
-        logged = LOGGED[change.column]
-        if not plural:
-            what = f"the {change.column.value}'s sign is turned"
-    return what, f"multiply {logged} by -1 (mapping file: scale: -1)"
 
 
 # -- Units that are not those of the channel's name, found by gains that no effect reaches -----------------
 # The logarithms of the gains have a prior: what robots and effects do to them.  A reading of the logs in which
 # a column is in another unit costs a fixed evidence, and is taken where the gains cost more without it.
-
-DEG, RPM, KMH, MILLI = math.pi / 180.0, math.pi / 30.0, 1.0 / 3.6, 1e-3
-
-UNITS: dict[Column, dict[str, float]] = {
-    Column.GYRO: {"deg/s": DEG, "rpm": RPM},
-    Column.HEADING: {"deg/s": DEG, "rpm": RPM},
-    Column.SPEED: {"km/h": KMH, "mm/s": MILLI},
-    Column.ACCEL: {"g": GRAVITY_MPS2},
-    Column.CURRENTS: {"mA": MILLI},
-    Column.WHEELS: {"deg/s": DEG, "rpm": RPM, "km/h": KMH, "mm/s": MILLI},
-}
-"""By column, units that loggers have, and their size in SI."""
-
-SI = {
-    Column.GYRO: "rad/s",
-    Column.HEADING: "rad/s",
-    Column.SPEED: "m/s",
-    Column.ACCEL: "m/s^2",
-    Column.CURRENTS: "A",
-}
-
-NOT_IN_MAPPINGS = ("mm/s",)
-"""Units that a mapping file has no word for; there the scale is changed."""
 
 MIN_FIT = 0.7
 """Correlation about zero from which a gain is used: of a run that hardly responds it says nothing."""
@@ -590,48 +538,56 @@ KEYS = (G, X, A, AMPS, H)
 _PLACE = {c: i for i, c in enumerate(KEYS)}
 _MOTION = [_PLACE[c] for c in (G, X, A, H)]
 
-Changes = tuple[Change, ...]
+GAIN_WORDS = {
+    G: "the gyro reads {:.3g} times what the wheels predict",
+    X: "the speed {:.3g} times",
+    A: "the acceleration {:.3g} times",
+    AMPS: "the currents {:.3g} times",
+    H: "the heading rate {:.3g} times",
+}
 
 
 def unit_faults(responses: Sequence[Response], robot: Robot) -> tuple[Fault, ...]:
     """Return columns whose unit is not that of their name, in all runs or in some of them."""
-    logs, fit = (np.array(each) for each in zip(*(_log_gains(run) for run in responses), strict=True))
-    informed = [i for i in range(len(logs)) if np.isfinite(logs[i]).any()]
-    if not informed:
-        return ()
+    gain, fit = (np.array(each)[:, list(KEYS)] for each in zip(*map(gains_of, responses), strict=True))
+    clear = np.isfinite(gain) & (gain > 0) & (np.abs(fit) > MIN_FIT)
+    logs = np.log(np.where(clear, gain, np.nan))
+    informed = np.flatnonzero(clear.any(axis=1)).tolist()
     options = _options(logs, robot)
-    turn = SKID_TURN if robot.skids else SWERVE_TURN
-    own = {i: _best(logs[i], options, turn)[0] for i in informed}
+    own = {i: _best(logs[i], options, robot)[0] for i in informed}
     suggested = {changes for changes in own.values() if changes}
-    usual = [i for i in informed if not own[i] and any(_shows(logs[i], changes) for changes in suggested)]
     if not suggested:
         return ()
+    shows = {
+        i: [not np.array_equal(_repaired_logs(logs[i], [c])[0], logs[i], equal_nan=True) for c in suggested]
+        for i in informed
+    }
+    usual = [i for i in informed if not own[i] and any(shows[i])]
     if len(usual) < MIN_USUAL_RATIO * len(informed):
-        best, rivals = _best(_middle(logs[[i for i in informed if i not in usual]]), options, turn)
+        best, rivals = _best(_middle(logs[[i for i in informed if i not in usual]]), options, robot)
         has = [i for i in range(len(logs)) if i not in usual]
-        return tuple(_fault(best, change, rivals, has, responses, logs) for change in best)
+        return tuple(_unit_fault(best, change, rivals, has, responses, logs, robot) for change in best)
     middle, scatter = _middle(logs[usual]), 1.48 * _middle(np.abs(logs[usual] - _middle(logs[usual])))
     near = np.clip(SCATTERS * np.where(np.isfinite(scatter), scatter, TIGHT), TIGHT, NEAR)
     of_runs: dict[Changes, list[int]] = {}
     for i in (i for i in informed if own[i]):
         off = np.where(fit[i] > CLEAR_FIT, logs[i], np.nan) - middle
-        fitting = [changes for changes in options if changes and _agrees(off, changes, near)]
-        if fitting:
-            nearest = min(fitting, key=partial(_distance, off))
-            of_runs.setdefault(nearest, []).append(i)
+        left = np.abs(_repaired_logs(off, options))
+        distance = np.nansum(left, axis=1) + [COST * (len(changes) - 1) for changes in options]
+        distance[
+            [
+                not changes or not _agrees(off, after, near)
+                for changes, after in zip(options, left, strict=True)
+            ]
+        ] = np.inf
+        if np.isfinite(distance).any():
+            of_runs.setdefault(options[int(np.argmin(distance))], []).append(i)
     return tuple(
-        _fault(changes, change, (), has, responses, logs)
+        _unit_fault(changes, change, (), has, responses, logs, robot)
         for changes, has in of_runs.items()
         if len(has) >= MIN_FAULTY_RATIO * len(informed)
         for change in changes
     )
-
-
-def _log_gains(response: Response) -> tuple[Array, Array]:
-    """Return the logarithms of the gains (len(KEYS),), NaN where none is clear, and correlations."""
-    gain, correlation = gains_of(response)
-    clear = np.isfinite(gain) & (gain > 0) & (np.abs(correlation) > MIN_FIT)
-    return np.log(np.where(clear, gain, np.nan))[list(KEYS)], correlation[list(KEYS)]
 
 
 def _middle(logs: Array) -> Array:
@@ -644,83 +600,62 @@ def _options(logs: Array, robot: Robot) -> list[Changes]:
 
     Wheels and what they turn in one other unit would hide each other: then a body that slips looks like it.
     """
-    known = np.array([np.isfinite(column).any() for column in logs.T])
-    units = {column: list(sizes.values()) for column, sizes in UNITS.items()}
-    units[Column.WHEELS].append(robot.wheel_radius_m)  # rates of wheels in the place of speeds
-    single = [
-        Change(FaultKind.UNIT, column, factor)
-        for column, sizes in units.items()
-        if column is Column.WHEELS or any(known[_PLACE[c]] for c in CHANNELS_OF[column] if c in _PLACE)
-        for size in sizes
-        for factor in (size, 1.0 / size)
-    ]
+    known = {c for c, column in zip(KEYS, logs.T, strict=True) if np.isfinite(column).any()}
+    single = []
+    for column, kind in KINDS.items():
+        rates = [robot.wheel_radius_m] if column is Column.WHEELS else []  # of wheels in the place of speeds
+        if rates or known & {*kind.channels}:
+            factors = [factor for size in (*kind.units.values(), *rates) for factor in (size, 1.0 / size)]
+            single += [Change(FaultKind.UNIT, column, factor) for factor in factors]
     measured = [change for change in single if not change.of_wheels]
     pairs = [pair for pair in combinations(measured, 2) if pair[0].column is not pair[1].column]
     return [(), *((change,) for change in single), *pairs]
 
 
-def _repaired_logs(logs: Array, changes: Changes) -> Array:
-    """Return the logarithms of gains after changes: of measured channels up, of a larger prediction down.
+def _repaired_logs(logs: Array, options: Sequence[Changes]) -> Array:
+    """Return the logarithms of gains (options, keys) after changes: a larger prediction makes them less.
 
     The currents are not in proportion to the wheel speeds: beside a motion their gain says nothing of these.
     """
-    after = logs.copy()
-    for change in changes:
-        if change.of_wheels:
-            after[_MOTION] -= math.log(change.factor)
-            if np.isfinite(after[_MOTION]).any():
-                after[_PLACE[AMPS]] = np.nan
-        else:
-            for c in CHANNELS_OF[change.column]:
-                if c in _PLACE:
-                    after[_PLACE[c]] += math.log(change.factor)
+    after = np.tile(logs, (len(options), 1))
+    for row, changes in zip(after, options, strict=True):
+        for change in changes:
+            if change.of_wheels:
+                row[_MOTION] -= math.log(change.factor)
+                if np.isfinite(row[_MOTION]).any():
+                    row[_PLACE[AMPS]] = np.nan
+            else:
+                row[[_PLACE[c] for c in KINDS[change.column].channels if c in _PLACE]] += math.log(
+                    change.factor
+                )
     return after
 
 
-def _cost(logs: Array, turn: tuple[float, float, float]) -> float:
-    """Return minus twice the logarithm of the prior of gains, up to a constant."""
-    gyro, speed, accel, current, heading = logs
-    yaw = heading if math.isfinite(heading) else gyro
-    along = speed if math.isfinite(speed) else SPEED_GAIN[0]
+def _best(logs: Array, options: Sequence[Changes], robot: Robot) -> tuple[Changes, list[Changes]]:
+    """Return the reading whose gains are likeliest by their prior, and those that are hardly less likely."""
+    gyro, speed, accel, current, heading = _repaired_logs(logs, options).T
+    mean, below, above = SKID_TURN if robot.skids else SWERVE_TURN
+    yaw = np.where(np.isfinite(heading), heading, gyro)
+    along = np.where(np.isfinite(speed), speed, SPEED_GAIN[0])
     terms = (
-        (yaw - turn[0]) / (turn[1] if yaw < turn[0] else turn[2]),
+        (yaw - mean) / np.where(yaw < mean, below, above),
         (gyro - heading) / GYRO_SPREAD,
         (speed - SPEED_GAIN[0]) / SPEED_GAIN[1],
         (accel - along) / ACCEL_SPREAD,
         (current - CURRENT_GAIN[0]) / CURRENT_GAIN[1],
     )
-    return float(sum(term**2 for term in terms if math.isfinite(term)))
-
-
-def _shows(logs: Array, changes: Changes) -> bool:
-    """Whether a run has the channels in which changes show."""
-    return not np.array_equal(_repaired_logs(logs, changes), logs, equal_nan=True)
-
-
-def _best(
-    logs: Array, options: Sequence[Changes], turn: tuple[float, float, float]
-) -> tuple[Changes, list[Changes]]:
-    """Return the reading of least cost, and those that cost hardly more."""
-    costs = [_cost(_repaired_logs(logs, changes), turn) for changes in options]
-    total = [cost + COST * len(changes) for cost, changes in zip(costs, options, strict=True)]
+    cost = np.nansum(np.square(terms), axis=0)
+    n_changes = np.array([len(changes) for changes in options])
+    total = cost + COST * n_changes
     best = int(np.argmin(total))
-    if not options[best] or costs[best] > LEFT:
+    if not options[best] or cost[best] > LEFT:
         return (), []
-    rivals = [
-        changes
-        for i, changes in enumerate(options)
-        if i != best and changes and len(changes) == len(options[best]) and total[i] - total[best] < UNIT_TIE
-    ]
-    return options[best], rivals
+    near = (total - total[best] < UNIT_TIE) & (n_changes == n_changes[best])
+    return options[best], [options[i] for i in np.flatnonzero(near).tolist() if i != best]
 
 
-def _distance(off: Array, changes: Changes) -> float:
-    return float(np.nansum(np.abs(_repaired_logs(off, changes)))) + COST * (len(changes) - 1)
-
-
-def _agrees(off: Array, changes: Changes, near: Array) -> bool:
+def _agrees(off: Array, after: Array, near: Array) -> bool:
     """Whether a run that is off from the others agrees with them after changes, and may not just stall."""
-    after = np.abs(_repaired_logs(off, changes))
     known = np.isfinite(off)
     if not known.any() or (after[known] > near[known]).any() or not (np.abs(off[known]) > 2 * NEAR).any():
         return False
@@ -729,74 +664,37 @@ def _agrees(off: Array, changes: Changes, near: Array) -> bool:
     return not small or (bool((after[small] < TIGHT).all()) and len(small) + len(sound) > 1)
 
 
-def _fault(
+def _unit_fault(
     changes: Changes,
     change: Change,
     rivals: Sequence[Changes],
     has: Sequence[int],
     responses: Sequence[Response],
     logs: Array,
+    robot: Robot,
 ) -> Fault:
     """Return the fault of a change in words; it is left out where other readings are as good."""
     every = [run.run_id for run in responses]
-    ids = tuple(every[i] for i in has)
-    seen = ", ".join(_gain_words(_middle(logs[list(has)]), change.column))
-    what, unit = _words(change)
-    scale = unit in NOT_IN_MAPPINGS or not unit
-    hint = f"scale: {change.factor:.4g}" if scale else f"unit: {unit}"
-    repair = f"multiply {LOGGED[change.column]} by {change.factor:.4g} (mapping file: {hint})"
+    ids, middle = tuple(every[i] for i in has), _middle(logs[list(has)])
+    seen = ", ".join(
+        GAIN_WORDS[c].format(math.exp(middle[place]))
+        for c, place in _PLACE.items()
+        if math.isfinite(middle[place]) and (c == AMPS) is (change.column is Column.CURRENTS)
+    )
+    what, repair = _fault_words(change, robot)
     sentence = f"{what} {in_runs(ids, every)}: {seen}"
     if not rivals:
         return Fault(change, ids, f"{sentence}; {repair}", repair)
-    others = " or ".join(" and ".join(_words(each)[0] for each in reading) for reading in rivals)
+    others = " or ".join(" and ".join(_fault_words(each, robot)[0] for each in reading) for reading in rivals)
+    sentence = f"{sentence}; another reading is as good ({others})"
     measured = next((each for reading in (changes, *rivals) for each in reading if not each.of_wheels), None)
     if measured is None:  # of the wheels in either case: without them there is nothing to compare
-        sentence = f"{sentence}; another reading is as good ({others}); {repair}"
-        return Fault(change, ids, sentence, repair)
-    left_out = f"{LOGGED[measured.column]} is left out; state the units that the logger has"
-    sentence = f"{sentence}; another reading is as good ({others}), so that {left_out}"
-    return Fault(measured._replace(factor=math.nan), ids, sentence, left_out)
-
-
-def _words(change: Change) -> tuple[str, str]:
-    """Return what is wrong with a unit, and the unit that the samples have."""
-    sizes = UNITS[change.column]
-    plural = change.column in (Column.WHEELS, Column.CURRENTS)
-    subject, verb = ("the " + change.column.value, "are" if plural else "is")
-    for unit, size in sizes.items():
-        si = SI.get(change.column, "m/s" if unit in ("km/h", "mm/s") else "rad/s")
-        if math.isclose(change.factor, size):
-            return f"{subject} {verb} in {unit} instead of {si}", unit
-        if math.isclose(change.factor, 1.0 / size):
-            return f"{subject} {verb} in {si}, and {'were' if plural else 'was'} read as {unit}", si
-    if change.factor < 1.0:
-        return f"{subject} are rates in rad/s instead of speeds in m/s", ""
-    return f"{subject} are speeds in m/s, and were read as rates in rad/s", ""
-
-
-def _gain_words(middle: Array, column: Column) -> Iterator[str]:
-    names = {
-        G: "the gyro reads {:.3g} times what the wheels predict",
-        X: "the speed {:.3g} times",
-        A: "the acceleration {:.3g} times",
-        AMPS: "the currents {:.3g} times",
-        H: "the heading rate {:.3g} times",
-    }
-    for c, place in _PLACE.items():
-        if math.isfinite(middle[place]) and (c == AMPS) is (column is Column.CURRENTS):
-            yield names[c].format(math.exp(middle[place]))
+        return Fault(change, ids, f"{sentence}; {repair}", repair)
+    left_out = f"{KINDS[measured.column].logged} is left out; state the units that the logger has"
+    return Fault(measured._replace(factor=math.nan), ids, f"{sentence}, so that {left_out}", left_out)
 
 
 # -- Constant offsets of sensors that no bias of the catalogue reaches: sensors not zeroed, or turned ------
-
-LARGEST: dict[Column, tuple[int, float, str]] = {
-    Column.GYRO: (G, 0.3, "rad/s"),
-    Column.HEADING: (H, 0.3, "rad/s"),
-    Column.SPEED: (X, 0.3, "m/s"),
-    Column.ACCEL: (A, 3.0, "m/s^2"),
-}
-"""Channel, offset and unit: half more than the bounds of the catalogue's biases, and for a heading rate and a
-speed, which have none, as much and a slow robot's speed."""
 
 SIGMAS = 4.0
 """An offset is over the largest by so many standard deviations."""
@@ -804,23 +702,23 @@ SIGMAS = 4.0
 MIN_ROWS = 10
 
 
-def offset_faults(responses: Sequence[Response]) -> tuple[Fault, ...]:
+def offset_faults(responses: Sequence[Response], robot: Robot) -> tuple[Fault, ...]:
     """Return columns with an offset that no effect has, in all runs or in some of them."""
     every = [run.run_id for run in responses]
-    found = []
-    for column, (c, largest, unit) in LARGEST.items():
-        offsets = np.array([_offset(run, c) for run in responses])
-        has = np.flatnonzero(np.abs(offsets[:, 0]) > largest + SIGMAS * offsets[:, 1])
+    faults = []
+    for column, kind in KINDS.items():
+        if not math.isfinite(kind.largest):
+            continue
+        offsets = np.array([_offset(run, kind.channels[0]) for run in responses])
+        has = np.flatnonzero(np.abs(offsets[:, 0]) > kind.largest + SIGMAS * offsets[:, 1])
         if has.size < max(MIN_FAULTY_RATIO * np.isfinite(offsets[:, 0]).sum(), 1):
             continue
-        offset = float(np.median(offsets[has, 0]))
+        change = Change(FaultKind.OFFSET, column, offset=-float(np.median(offsets[has, 0])))
         ids = tuple(every[i] for i in has)
-        what = f"the {column.value} has an offset of {offset:.3g} {unit} {in_runs(ids, every)}"
-        logged = LOGGED[column].split(" and ")[0]
-        repair = f"subtract {offset:.3g} {unit} from {logged} (mapping file: offset: {-offset:.3g})"
-        sentence = f"{what}, where a sensor's is below {largest:g}; {repair}"
-        found.append(Fault(Change(FaultKind.OFFSET, column, offset=-offset), ids, sentence, repair))
-    return tuple(found)
+        what, repair = _fault_words(change, robot)
+        where = f"{in_runs(ids, every)}, where a sensor's is below {kind.largest:g}"
+        faults.append(Fault(change, ids, f"{what} {where}; {repair}", repair))
+    return tuple(faults)
 
 
 def _offset(run: Response, c: int) -> tuple[float, float]:
@@ -831,21 +729,60 @@ def _offset(run: Response, c: int) -> tuple[float, float]:
     measured, predicted = run.measured[known, c], run.predicted[known, c]
     if np.std(predicted) < LEAST[c] and np.sqrt(np.mean(predicted**2)) > LEAST[c]:
         return np.nan, np.nan  # of one motion throughout, a gain looks the same
-    columns = [np.ones(measured.size)]
-    if np.std(predicted) > LEAST[c]:
-        columns.append(predicted)
-    basis = np.column_stack(columns)
+    varies = [predicted] if np.std(predicted) > LEAST[c] else []
+    basis = np.column_stack([np.ones(measured.size), *varies])
     value, *_ = np.linalg.lstsq(basis, measured, rcond=None)
-    left = measured - basis @ value
     n_independent = max(measured.size * min(run.period_s, 1.0), 1.0)  # what is left changes within seconds
     spread = np.linalg.inv(basis.T @ basis / measured.size)[0, 0] / n_independent
-    return float(value[0]), float(np.std(left) * np.sqrt(spread))
+    return float(value[0]), float(np.std(measured - basis @ value) * np.sqrt(spread))
 
 
 # -- Faults of channels of all runs: signs, exchanged columns and units, before any cause is searched ------
 
 MAX_FAULTS = 4
 """Signs and exchanges that are searched one after the other; logs with more are no logs of this robot."""
+
+
+class _Logs(NamedTuple):
+    """Runs as repaired so far, with the prediction of the simulation, and their clocks."""
+
+    signals: tuple[Signals, ...]
+    rows: tuple[Rows, ...]
+    simulation: Simulation
+    low_pass: LowPass
+    latencies: Latencies
+    shift: Shift | None
+
+    def changed_rows(self, change: Change, i: int) -> Rows:
+        """Return the rows of a run after a change; one of the wheels is simulated again."""
+        if not change.of_wheels:
+            return self.rows[i]._replace(measured=change.measured(self.rows[i].measured))
+        run = change.applied(self.signals[i])
+        return rows_of(run, self.simulation.planar_on(run.terrain), self.simulation.vector, (), self.low_pass)
+
+    def without(self, fault: Fault) -> _Logs:
+        """Return the runs without a fault."""
+        rows = tuple(
+            self.changed_rows(fault.change, i) if run.run_id in fault.run_ids else run
+            for i, run in enumerate(self.rows)
+        )
+        return self._replace(signals=repaired(self.signals, [fault]), rows=rows)
+
+    def responses(self) -> tuple[Response, ...]:
+        return responses_of(self.rows, self.latencies, self.shift)
+
+    def tried(self, change: Change, before: Sequence[Response], places: Iterable[int]) -> Reading:
+        """Return what a change makes of the runs at some places."""
+        after = list(before)
+        for i in places:
+            shift, one = self.shift, slice(i, i + 1)
+            own = (
+                None
+                if shift is None
+                else Shift(shift.lag_s[one], shift.std_s[one], shift.rate, shift.lost[one])
+            )
+            (after[i],) = responses_of([self.changed_rows(change, i)], self.latencies, own)
+        return reading_of(change, before, after)
 
 
 def faults_of(
@@ -858,91 +795,45 @@ def faults_of(
 ) -> tuple[Fault, ...]:
     """Return the faults of channels, in the order in which they are to be repaired: signs, units, offsets.
 
-    The simulation may be wrong: a fault is what no effect of the catalogue does.
-
     Parameters
     ----------
     signals, rows : of all runs, in the same order; the rows with the prediction of the simulation
     simulation, low_pass : of the rows
     shift, latencies : clocks of the runs where they are known already; from the runs otherwise
     """
-    if latencies is None:
-        latencies = latencies_of(signals, simulation)
-    found: list[Fault] = []
-    runs, now = tuple(signals), tuple(rows)
-    responses = responses_of(now, latencies, shift)
-    while len(found) < MAX_FAULTS:
-        fault = _turned(runs, now, simulation, low_pass, shift, latencies, responses)
-        if fault is None:
-            break
-        found.append(fault)
-        now = _with_rows(runs, now, fault, simulation, low_pass)
-        runs = repaired(runs, [fault])
-        responses = responses_of(now, latencies, shift)
-    units = unit_faults(responses, simulation.robot)
+    latencies = latencies_of(signals, simulation) if latencies is None else latencies
+    logs = _Logs(tuple(signals), tuple(rows), simulation, low_pass, latencies, shift)
+    faults: list[Fault] = []
+    while len(faults) < MAX_FAULTS and (fault := _turned(logs)) is not None:
+        faults.append(fault)
+        logs = logs.without(fault)
+    units = unit_faults(logs.responses(), simulation.robot)
     for fault in units:
-        now = _with_rows(runs, now, fault, simulation, low_pass)
-        runs = repaired(runs, [fault])
-    return (*found, *units, *offset_faults(responses_of(now, latencies, shift)))
+        logs = logs.without(fault)
+    return (*faults, *units, *offset_faults(logs.responses(), simulation.robot))
 
 
-def _turned(
-    runs: Sequence[Signals],
-    rows: Sequence[Rows],
-    simulation: Simulation,
-    low_pass: LowPass,
-    shift: Shift | None,
-    latencies: Latencies,
-    responses: Sequence[Response],
-) -> Fault | None:
-    """Return the sign or exchange that mends most, or None if there is none."""
-    suspects = [i for i, run in enumerate(responses) if is_suspect(run)]
+def _turned(logs: _Logs) -> Fault | None:
+    """Return the sign or exchange that mends most, or None if there is none.
+
+    Readings that are as good are mirror images, left for right or ahead for back: the change of fewest columns is
+    taken, and the diagnosis is that of either but for the side.
+    """
+    responses, robot = logs.responses(), logs.simulation.robot
+    fit = np.array([fits(run)[0] for run in responses])[:, list(FOLLOWERS)]
+    suspects = np.flatnonzero(((fit != 0.0) & (fit < RIGHT)).any(axis=1)).tolist()
     if not suspects:
         return None
-    robot = simulation.robot
-
-    def tried(change: Change, places: Iterable[int]) -> Reading:
-        after = list(responses)
-        for i in places:
-            if change.of_wheels:
-                changed = _simulated(change.applied(runs[i]), simulation, low_pass)
-            else:
-                changed = rows[i]._replace(measured=change.measured(rows[i].measured))
-            own = None if shift is None else _of_run(shift, i)
-            after[i] = responses_of([changed], latencies, own)[0]
-        return reading_of(change, responses, after)
-
-    found = best_reading([tried(change, suspects) for change in candidate_changes(robot)])
+    found = _best_reading([logs.tried(change, responses, suspects) for change in candidate_changes(robot)])
     if found is None:
         return None
-    best = tried(found[0].change, range(len(runs)))
-    has = runs_with(best, [run.run_id for run in runs], responses)
-    return sign_fault(best, found[1], has, responses, robot)
-
-
-def _of_run(shift: Shift, i: int) -> Shift:
-    one = slice(i, i + 1)
-    return Shift(shift.lag_s[one], shift.std_s[one], shift.rate, shift.lost[one])
-
-
-def _simulated(run: Signals, simulation: Simulation, low_pass: LowPass) -> Rows:
-    return rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass)
-
-
-def _with_rows(
-    runs: Sequence[Signals],
-    rows: Sequence[Rows],
-    fault: Fault,
-    simulation: Simulation,
-    low_pass: LowPass,
-) -> tuple[Rows, ...]:
-    """Return the rows of repaired runs."""
-    ids = set(fault.run_ids)
-    return tuple(
-        each
-        if each.run_id not in ids
-        else _simulated(fault.change.applied(run), simulation, low_pass)
-        if fault.change.of_wheels
-        else each._replace(measured=fault.change.measured(each.measured))
-        for run, each in zip(runs, rows, strict=True)
-    )
+    change, rivals = found[0].change, found[1]
+    best = logs.tried(change, responses, range(len(responses)))
+    has, every = _runs_with(best, responses), [run.run_id for run in responses]
+    seen = _gain_sentence(best, responses, [i for i in has if best.mends[i]])
+    what, repair = _fault_words(change, robot)
+    if rivals:
+        words = " or ".join(_fault_words(rival.change, robot)[0] for rival in rivals)
+        seen += f" (these channels cannot distinguish it from another reading: {words})"
+    ids = tuple(every[i] for i in has)
+    return Fault(change, ids, f"{what} {in_runs(ids, every)}: {seen}; {repair}", repair)

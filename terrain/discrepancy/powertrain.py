@@ -295,7 +295,7 @@ def traces_of(runs: Sequence[RunLog], robot: Robot) -> tuple[Traces, float]:
     """Return runs that log commanded and measured wheel speeds on one grid, and the period of new samples (s)."""
     per_radps = robot.logged_rates(np.full(len(robot.wheels), robot.wheel_radius_m))
     n_wheels = len(robot.rate_channels)
-    traced = []
+    traced: list[tuple[Any, ...]] = []
     for run in runs:
         commands, wheels = run.streams["commands"], run.streams["wheels"]
         rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels]) / per_radps

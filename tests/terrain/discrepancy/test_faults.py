@@ -16,7 +16,6 @@ from terrain.discrepancy.clocks import latencies_of
 from terrain.discrepancy.faults import (
     AMPS,
     KEYS,
-    SWERVE_TURN,
     A,
     Change,
     Column,
@@ -115,7 +114,7 @@ def test_a_fault_of_all_runs_is_named_and_its_repair_gives_the_log_back(written,
     was = sound(track=track)
     signals = on_one_clock([write(run) for run in was])
     (fault,) = faults(signals)
-    assert (fault.kind, fault.column) == (kind, column)
+    assert (fault.change.kind, fault.change.column) == (kind, column)
     assert fault.run_ids == tuple(run.run_id for run in was)
     assert fault.change.factor == pytest.approx(factor, rel=1e-4)
     assert "in all 8 runs" in fault.sentence
@@ -134,7 +133,7 @@ def test_a_fault_of_one_run_is_named_by_the_run(written):
     write, kind, column, _ = WRITTEN[written]
     runs = [write(run) if i == 2 else run for i, run in enumerate(sound())]
     (fault,) = faults(on_one_clock(runs))
-    assert (fault.kind, fault.column, fault.run_ids) == (kind, column, ("run_03",))
+    assert (fault.change.kind, fault.change.column, fault.run_ids) == (kind, column, ("run_03",))
     assert "in 1 of 8 runs (run_03)" in fault.sentence
 
 
@@ -143,7 +142,7 @@ def test_half_of_the_runs_in_another_unit_are_named(written):
     write, kind, column, _ = WRITTEN[written]
     half = (0, 1, 4, 5)  # run_04 drives straight: it could not show the unit of a gyro
     (fault,) = faults(on_one_clock([write(run) if i in half else run for i, run in enumerate(sound())]))
-    assert (fault.kind, fault.column) == (kind, column)
+    assert (fault.change.kind, fault.change.column) == (kind, column)
     assert fault.run_ids == tuple(sound()[i].run_id for i in half)
     assert "in 4 of 8 runs (run_01, run_02, run_05, run_06)" in fault.sentence
 
@@ -154,7 +153,7 @@ def test_two_wheels_of_a_swerve_robot_are_exchanged(of_one):
     write = edit("wheels", ("motor_2", "motor_3"), exchanged)
     runs = [write(run) if i == 2 or not of_one else run for i, run in enumerate(was)]
     (fault,) = faults(on_one_clock(runs), "agrimaro")
-    assert (fault.kind, fault.column) == (SWAPPED, Column.WHEELS)
+    assert (fault.change.kind, fault.change.column) == (SWAPPED, Column.WHEELS)
     assert fault.run_ids == tuple(run.run_id for i, run in enumerate(was) if i == 2 or not of_one)
     assert fault.sentence.startswith("wheel speeds of 2 and 3 are exchanged in")
     assert "exchange motor_2_radps and motor_3_radps" in fault.repair
@@ -168,7 +167,7 @@ def test_the_unit_of_wheels_is_not_judged_by_the_currents():
     logs[:, [KEYS.index(G), KEYS.index(X)]] = -2.25, -2.15
     logs[5, KEYS.index(A)], logs[[2, 5, 6], KEYS.index(AMPS)] = -2.56, -2.28
     robot = load_robot("agrimaro")
-    (change,), rivals = _best(_middle(logs), _options(logs, robot), SWERVE_TURN)
+    (change,), rivals = _best(_middle(logs), _options(logs, robot), robot)
     assert (change.column, change.factor) == (Column.WHEELS, pytest.approx(1 / RPM))
     assert rivals == []
 
@@ -188,7 +187,7 @@ def test_one_run_of_many_is_no_other_unit():
 def test_a_swerve_robot_has_the_same_faults(written):
     write, kind, column, _ = WRITTEN[written]
     (fault,) = faults(on_one_clock([write(run) for run in sound("agrimaro")]), "agrimaro")
-    assert (fault.kind, fault.column, len(fault.run_ids)) == (kind, column, 8)
+    assert (fault.change.kind, fault.change.column, len(fault.run_ids)) == (kind, column, 8)
 
 
 def test_a_session_is_named_also_where_a_run_of_it_drives_straight():
@@ -214,12 +213,12 @@ def with_heading(run: RunLog) -> RunLog:
 def test_a_heading_says_whether_the_gyro_or_the_wheels_are_turned():
     runs = [with_heading(run) for run in sound(track=True)]
     (gyro,) = faults(on_one_clock([WRITTEN["the gyro's sign"][0](run) for run in runs]))
-    assert gyro.column is Column.GYRO
+    assert gyro.change.column is Column.GYRO
     assert "the heading rate with -1.00" in gyro.sentence
     (wheels,) = faults(on_one_clock([WRITTEN["left and right wheels"][0](run) for run in runs]))
-    assert (wheels.kind, wheels.column) == (SWAPPED, Column.WHEELS)
+    assert (wheels.change.kind, wheels.change.column) == (SWAPPED, Column.WHEELS)
     (both,) = faults(on_one_clock([edit("lidar", ("yaw",), times(DEG))(run) for run in runs]))
-    assert (both.kind, both.column) == (UNIT, Column.HEADING)
+    assert (both.change.kind, both.change.column) == (UNIT, Column.HEADING)
 
 
 def test_with_a_gyro_alone_both_readings_are_named():
@@ -233,7 +232,7 @@ def test_with_a_gyro_alone_both_readings_are_named():
         replace(run, grade_rad=0 * run.grade_rad) for run in on_one_clock(map(alone, map(write, sound())))
     ]
     (fault,) = faults([_only_gyro(run) for run in signals])
-    assert fault.column is Column.GYRO
+    assert fault.change.column is Column.GYRO
     assert "cannot distinguish" in fault.sentence
     assert "left and right are exchanged" in fault.sentence
 
@@ -271,7 +270,7 @@ def test_faults_of_two_columns_are_both_named():
         runs = [step(run) for run in runs]
     signals = on_one_clock(runs)
     found = faults(signals)
-    assert {(fault.kind, fault.column) for fault in found} == {
+    assert {(fault.change.kind, fault.change.column) for fault in found} == {
         (SIGN, Column.GYRO),
         (UNIT, Column.GYRO),
         (SWAPPED, Column.CURRENTS),
@@ -288,7 +287,7 @@ def test_faults_of_two_columns_are_both_named():
 def test_an_offset_that_no_bias_has_is_named_and_subtracted(stream, start, offset, column):
     was = sound(track=True)
     (fault,) = faults(on_one_clock([edit(stream, (start,), lambda v: v + offset)(run) for run in was]))
-    assert (fault.kind, fault.column) == (FaultKind.OFFSET, column)
+    assert (fault.change.kind, fault.change.column) == (FaultKind.OFFSET, column)
     assert fault.change.offset == pytest.approx(-offset, abs=0.1)
     assert "in all 8 runs" in fault.sentence
 
@@ -296,7 +295,7 @@ def test_an_offset_that_no_bias_has_is_named_and_subtracted(stream, start, offse
 def test_one_run_alone_and_a_run_without_rows_are_no_special_case():
     write = WRITTEN["gyro in deg/s"][0]
     (fault,) = faults(on_one_clock([write(sound()[0])]))
-    assert fault.column is Column.GYRO
+    assert fault.change.column is Column.GYRO
     (run,) = on_one_clock(sound()[:1])
     simulation, low_pass = simulation_of(load_robot("husky")), low_pass_of([run])
     (rows,) = (rows_of(run, simulation.planar_on(""), simulation.vector, (), low_pass),)
@@ -342,7 +341,7 @@ def test_the_gyro_of_the_measured_marmotte_is_turned(measured):
     assert all(run.dropped[GYRO_TURNED] == 1 for run in runs)
     logged = [_with_gyro_turned(run) for run in runs]
     (fault,) = faults(on_one_clock(logged))
-    assert (fault.kind, fault.column, len(fault.run_ids)) == (SIGN, Column.GYRO, len(runs))
+    assert (fault.change.kind, fault.change.column, len(fault.run_ids)) == (SIGN, Column.GYRO, len(runs))
     assert "the heading rate with -0.9" in fault.sentence
     assert latencies_of(repaired(on_one_clock(logged), [fault]), simulation_of(load_robot("husky"))).channels
 
