@@ -5,9 +5,8 @@ rate, with a gain and a constant that are free because they may be wrong::
 
     y(t) = gain x(t - lag - rate (t - middle)) + constant + noise
 
-:func:`correlations` over a bounded grid of lags and rates finds the peaks (a free search locks on to mirror images of
-manoeuvres), a second peak that explains nearly as much makes the answer ambiguous (:func:`nearly_as_good`), and
-:func:`refine_delay` finds lag and rate by least squares.
+:func:`delay` looks at correlations over a bounded grid of lags and rates (a free search locks on to mirror images of
+manoeuvres), refines the best by least squares, and calls it ambiguous where a second peak explains nearly as much.
 
 *Many runs.*  A lag that is common to them is measured by all: each gives a curve over the lags, a likelihood say, and
 their sum has one peak (:func:`common_delay`).
@@ -16,9 +15,9 @@ their sum has one peak (:func:`common_delay`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,6 +46,9 @@ EDGE_SIGMAS = 3.0
 MAX_GAP_SIGMAS = 3.0
 """Across a longer gap, in widths of the low-pass, nothing is interpolated."""
 
+MAX_SEARCH_SAMPLES = 1500
+"""A search looks at this many instants of a long run; least squares at all of them."""
+
 N_DRAWS = 200
 
 
@@ -66,13 +68,25 @@ class DelayStatus(StrEnum):
     UNDETERMINED = "undetermined"
 
 
+class DelayFit(NamedTuple):
+    """Lag at the middle of a pair and rate, their covariance (2, 2), gain with its deviation, and correlation."""
+
+    lag_s: float
+    rate: float
+    cov: Array
+    gain: float
+    gain_std: float
+    correlation: float
+
+
 class Delay(NamedTuple):
-    """How late a signal is, its standard deviation, and the number of runs that it is from."""
+    """How late a signal is, its standard deviation, the number of runs that it is from, and the fit of a pair."""
 
     delay_s: float
     std_s: float
     n_runs: int
     status: DelayStatus
+    fit: DelayFit | None = None
 
     @property
     def applied_s(self) -> float:
@@ -109,17 +123,6 @@ class Pair(NamedTuple):
         return np.asarray(
             correlations(self.time_s, self.measured, self.reference, self.step_s, self.middle_s, lags_s, rate)
         )
-
-
-class DelayFit(NamedTuple):
-    """Lag at the middle of a pair and rate, their covariance (2, 2), gain with its deviation, and correlation."""
-
-    lag_s: float
-    rate: float
-    cov: Array
-    gain: float
-    gain_std: float
-    correlation: float
 
 
 def low_pass(values: Array, step_s: float, time_constant_s: float, at_first: bool = False) -> Array:
@@ -208,18 +211,71 @@ def correlations(
     return out
 
 
-def nearly_as_good(rival: Array | float, best: float, floor: float) -> Array:
-    """Return whether correlations leave no more than the best one does, but for a margin, of the variance."""
-    left, rival_left = 1.0 - np.clip(best, 0.0, 1.0) ** 2, 1.0 - np.clip(rival, 0.0, 1.0) ** 2
-    return np.asarray(rival_left < (1 + RIVAL_MARGIN) * left + floor)
+def delay(
+    pair: Pair,
+    lags_s: Array,
+    rates: Sequence[float] = (0.0,),
+    *,
+    same_peak_s: float,
+    floor: float,
+    min_correlation: float = 0.0,
+    within: Callable[[Array, Array], Array] | None = None,
+    mirrored: bool = False,
+    near_s: float | None = None,
+    **refine: Any,
+) -> Delay:
+    """Return by how much a signal is behind its reference, at the middle of the pair.
 
+    The status is ``not excited`` where no lag fits, ``ambiguous`` where another does about as well.
 
-def has_rival(lags_s: Array, column: Array, best: int, same_peak_s: float, floor: float) -> bool:
-    """Return whether a peak elsewhere of correlations (lags,) explains nearly as much as the best one."""
-    rises = np.diff(column) >= 0
-    top = np.append(True, rises) & np.append(~rises, True)
-    elsewhere = top & (np.abs(lags_s - lags_s[best]) > same_peak_s)
-    return bool(nearly_as_good(column[elsewhere], float(column[best]), floor).any())
+    Parameters
+    ----------
+    pair : signal and reference
+    lags_s, rates : grid of the search
+    same_peak_s : peaks that shift no sample further apart are one
+    floor : of the variance, by which a rival must leave more, beside a relative margin
+    min_correlation : at the best point of the grid
+    within : of lags (lags, 1) and rates (rates,), which points of the grid count; by default all
+    mirrored : whether the most negative correlation is a rival too: a gain may be mirrored
+    near_s, refine : of :func:`refine_delay`
+    """
+    every = -(-pair.time_s.size // MAX_SEARCH_SAMPLES)
+    few = pair._replace(time_s=pair.time_s[::every].copy(), measured=pair.measured[::every].copy())
+    table = np.stack([few.correlations(lags_s, rate) for rate in rates], axis=1)
+    if within is not None:
+        table[~within(lags_s[:, None], np.asarray(rates))] = 0.0
+    reach_s = float(np.max(np.abs(few.time_s - few.middle_s)))
+
+    def refined(seen: Pair, heights: Array) -> DelayFit | None:
+        row, column = map(int, np.unravel_index(np.argmax(heights), heights.shape))
+        if not heights[row, column] > 0.0:
+            return None
+        return refine_delay(
+            seen, float(lags_s[row]), float(rates[column]), near_s=near_s or same_peak_s, **refine
+        )
+
+    row, column = map(int, np.unravel_index(np.argmax(table), table.shape))
+    fit = refined(pair, table) if table[row, column] > min_correlation else None
+    if fit is None:
+        return Delay(math.nan, math.nan, 1, DelayStatus.NOT_EXCITED)
+    # A ridge askew to the grid has several points above their neighbours: they are one peak.
+    apart_s = np.abs(lags_s[:, None] - lags_s[row]) + np.abs(np.asarray(rates) - rates[column]) * reach_s
+    around = np.pad(table, 1, constant_values=-np.inf)
+    top = table == np.max(
+        [around[i:, j:][: table.shape[0], : table.shape[1]] for i in range(3) for j in range(3)], axis=0
+    )
+    rivals = [(pair, np.where(top & (apart_s > same_peak_s), table, -1.0))]
+    rivals += [(pair._replace(measured=-pair.measured), -table)] if mirrored else []
+    status = DelayStatus.ESTIMATED
+    for seen, heights in rivals:
+        rival = refined(seen, heights)
+        if rival is None:
+            continue
+        moved_s = abs(rival.lag_s - fit.lag_s) + abs(rival.rate - fit.rate) * reach_s
+        left, rival_left = (1.0 - min(max(each.correlation, 0.0), 1.0) ** 2 for each in (fit, rival))
+        if (seen is not pair or moved_s > same_peak_s) and rival_left < (1 + RIVAL_MARGIN) * left + floor:
+            status = DelayStatus.AMBIGUOUS
+    return Delay(fit.lag_s, math.sqrt(fit.cov[0, 0]), 1, status, fit)
 
 
 def refine_delay(

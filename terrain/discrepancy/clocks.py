@@ -1,15 +1,16 @@
-"""Delay of the logger of IMU and camera behind that of the wheels, run by run.
+"""Delay of the logger of IMU and camera behind that of the wheels, run by run, and that common to all runs.
 
-Each of its channels is compared with the shifted prediction from the wheel speeds.  The search is bounded,
-because a free one locks on to mirror images of the manoeuvres; gain and offset are free, because they may be
-wrong.  The rate between the two clocks is common to all runs.
+Each of its channels is compared with the shifted prediction from the wheel speeds, by :func:`terrain.signals.delay`:
+the search is bounded, gain and offset are free, because they may be wrong, and the rate between the two clocks is
+common to all runs.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -21,7 +22,7 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Array
-from terrain.signals import MIN_ROWS, DelayFit, Pair, common_delay, has_rival, refine_delay
+from terrain.signals import MIN_ROWS, Delay, DelayFit, DelayStatus, Pair, common_delay, delay, refine_delay
 from terrain.simulation.planar.replay import replay
 
 MIN_LAG_S, MAX_LAG_S = -1.0, 2.0
@@ -73,6 +74,8 @@ EVENT_S, EVENT_RATIO = 3.0, 0.7
 FURTHEST = 1.5
 """A rate is refused that is so many times out of the bounds."""
 
+SEARCH: dict[str, Any] = {"rate_max": FURTHEST * max(RATES), "event": (EVENT_S, EVENT_RATIO)}
+
 
 class Shift(NamedTuple):
     """How far what IMU and camera saw is behind the wheels.
@@ -104,27 +107,25 @@ def shifts_of(info: Evidence) -> Shift:
     """
     n = len(info.rows)
     pairs = {(i, c): pair for i, run in enumerate(info.rows) for c, pair in _pairs(run).items()}
-    searched, tables = _search_rates(pairs, RATES)
-    fits = _fit_lags(pairs, tables, searched)
-    rate = _shared_rate(fits)
+    searched = _search_rates(pairs)
+    fits, rate = _fit_lags(pairs, searched)
     if abs(rate - searched) > RATE_STEP:
-        _, tables = _search_rates(pairs, (rate,))
-        fits = _fit_lags(pairs, tables, rate)
-        rate = _shared_rate(fits)
+        searched = rate
+        fits, rate = _fit_lags(pairs, searched)
     lag_s, std_s = np.full((2, n, len(CLOCKED)), np.nan)
     for at, free in fits.items():
         fit: DelayFit | None = free
         if abs(free.rate - rate) * 0.5 * pairs[at].time_s[-1] > LAG_STEP_S:
-            fit = _refine_lag(pairs[at], float(LAGS_S[np.argmax(tables[at])]), rate, rate_stays=True)
+            start_s = float(LAGS_S[np.argmax(pairs[at].correlations(LAGS_S, searched))])
+            fit = refine_delay(pairs[at], start_s, rate, near_s=SAME_PEAK_S, rate_stays=True, **SEARCH)
         if fit is not None:
             follow = fit.cov[0, 1] / fit.cov[1, 1]  # of the lag, as the rate goes to that of all
             std = math.sqrt(max(fit.cov[0, 0] - follow * fit.cov[0, 1], 1e-12))
             if std < MAX_STD_S:
                 lag_s[at], std_s[at] = fit.lag_s + follow * (rate - fit.rate), std
-    beyond = np.zeros((n, len(CLOCKED)), dtype=bool)
-    for at, column in tables.items():
-        beyond[at] = column.max() < MIN_CORRELATION and _fits_further(pairs[at], float(column.max()))
-    lost = beyond.any(axis=1) & ~np.isfinite(lag_s).any(axis=1)
+    lost = np.zeros(n, dtype=bool)
+    for (i, _), pair in pairs.items():
+        lost[i] |= not np.isfinite(lag_s[i]).any() and _fits_further(pair, searched)
     if 2 * lost.sum() > len({i for i, _ in pairs}):
         raise DataError(
             f"runs: unsynchronised clocks beyond the search in {lost.sum()} of {n}, IMU and camera are not "
@@ -138,10 +139,8 @@ def offsets_of(shift: Shift) -> tuple[Array, Array]:
 
     It is the least lag of its channels and of those that agree with it: any of them may be late by itself.
     """
-    n = len(shift.lag_s)
-    offset_s, std_s = np.full((2, n), np.nan)
-    for i in range(n):
-        known = np.isfinite(shift.lag_s[i])
+    offset_s, std_s = np.full((2, len(shift.lag_s)), np.nan)
+    for i, known in enumerate(np.isfinite(shift.lag_s)):
         if known.any():
             lag_s, error_s = shift.lag_s[i][known], shift.std_s[i][known]
             least = int(np.argmin(lag_s))
@@ -154,82 +153,50 @@ def offsets_of(shift: Shift) -> tuple[Array, Array]:
 
 def _pairs(run: Rows) -> dict[int, Pair]:
     """Return the channels that are measured and of which something is expected, by their place in CLOCKED."""
-    compared = {}
+    pairs = {}
     for c, name in enumerate(CLOCKED):
         measured, expected = (values[:, CHANNELS.index(name)] for values in (run.measured, run.predicted))
         known = np.isfinite(measured)
         if 2 * known.sum() > max(known.size, MIN_ROWS) and np.std(expected[known]) > MIN_EXCITATION:
-            compared[c] = measured, expected
-    if not compared:
-        return {}
-    fine_s = np.arange(run.time_s[0], run.time_s[-1], FINE_S)
-    curve = CubicSpline(run.time_s, np.column_stack([expected for _, expected in compared.values()]))
-    values, slopes = np.asarray(curve(fine_s)).T.copy(), np.asarray(curve(fine_s, 1)).T.copy()
-    time_s = run.time_s - run.time_s[0]
-    return {
-        c: Pair(time_s, np.ascontiguousarray(measured), FINE_S, values[k], slopes[k], 0.5 * time_s[-1])
-        for k, (c, (measured, _)) in enumerate(compared.items())
-    }
+            fine_s = np.arange(run.time_s[0], run.time_s[-1], FINE_S)
+            curve, time_s = CubicSpline(run.time_s, expected), run.time_s - run.time_s[0]
+            values, slope = np.asarray(curve(fine_s)), np.asarray(curve(fine_s, 1))
+            pairs[c] = Pair(time_s, np.ascontiguousarray(measured), FINE_S, values, slope, 0.5 * time_s[-1])
+    return pairs
 
 
-def _search_rates(pairs: _Pairs, rates: Sequence[float]) -> tuple[float, dict[tuple[int, int], Array]]:
-    """Return the rate that fits all best, and under it the correlations (lags,) of each."""
-    rate, least = 0.0, np.inf
-    best: dict[tuple[int, int], Array] = {}
-    for tried in rates:
-        found = {at: pair.correlations(LAGS_S, tried) for at, pair in pairs.items()}
-        peaks = np.array([min(max(column.max(), 0.0), 0.9999) for column in found.values()])
-        loss = float(np.log1p(-(peaks**2)).sum())  # minus a log-likelihood, gains and constants free
+def _search_rates(pairs: _Pairs) -> float:
+    """Return the rate of the coarse search that fits all channels best."""
+    best, least = 0.0, np.inf
+    for rate in RATES:
+        peaks = np.array([pair.correlations(LAGS_S, rate).max() for pair in pairs.values()])
+        loss = float(np.log1p(-(np.clip(peaks, 0.0, 0.9999) ** 2)).sum())  # gains and constants free
         if loss < least:
-            rate, least, best = tried, loss, found
+            best, least = rate, loss
         if not pairs or np.median(peaks) > CLEAR_CORRELATION:
             break
-    return rate, best
+    return best
 
 
-def _fit_lags(
-    pairs: _Pairs, tables: dict[tuple[int, int], Array], rate: float
-) -> dict[tuple[int, int], DelayFit]:
-    """Return the fits from the best lags, of the channels that have one best."""
-    fits = {}
-    for at, column in tables.items():
-        best = int(np.argmax(column))
-        if column[best] > MIN_CORRELATION and not has_rival(LAGS_S, column, best, SAME_PEAK_S, RIVAL_FLOOR):
-            fit = _refine_lag(pairs[at], float(LAGS_S[best]), rate)
-            if fit is not None:
-                fits[at] = fit
-    return fits
-
-
-def _shared_rate(fits: dict[tuple[int, int], DelayFit]) -> float:
-    """Return the median of the rates, weighted by their information."""
+def _fit_lags(pairs: _Pairs, rate: float) -> tuple[dict[tuple[int, int], DelayFit], float]:
+    """Return the fits of channels that have one best lag, and the median of their rates by their information."""
+    find = partial(delay, lags_s=LAGS_S, rates=(rate,), same_peak_s=SAME_PEAK_S, floor=RIVAL_FLOOR)
+    found = {at: find(pair, min_correlation=MIN_CORRELATION, **SEARCH) for at, pair in pairs.items()}
+    fits = {at: each.fit for at, each in found.items() if each.fit and each.status is DelayStatus.ESTIMATED}
     if not fits:
-        return 0.0
+        return {}, 0.0
     rates = sorted((fit.rate, 1.0 / float(fit.cov[1, 1])) for fit in fits.values())
     total = np.cumsum([weight for _, weight in rates])
-    return rates[int(np.searchsorted(total, 0.5 * total[-1]))][0]
+    return fits, rates[int(np.searchsorted(total, 0.5 * total[-1]))][0]
 
 
-def _fits_further(pair: Pair, best: float) -> bool:
+def _fits_further(pair: Pair, rate: float) -> bool:
     """Whether a channel that fits at no shift within the search fits well at one beyond it."""
-    if pair.time_s[-1] < 2 * FAR_LAG_S:
+    best = float(pair.correlations(LAGS_S, rate).max())
+    if best >= MIN_CORRELATION or pair.time_s[-1] < 2 * FAR_LAG_S:
         return False
     lags_s = np.arange(-FAR_LAG_S, FAR_LAG_S + 1e-9, LAG_STEP_S)
-    beyond = float(pair.correlations(lags_s, 0.0).max())
-    return beyond > MIN_CORRELATION and beyond > best + 0.15
-
-
-def _refine_lag(pair: Pair, lag_s: float, rate: float, rate_stays: bool = False) -> DelayFit | None:
-    """Return lag and rate, or the lag alone, by least squares from a start, or None if they diverge."""
-    return refine_delay(
-        pair,
-        lag_s,
-        rate,
-        near_s=SAME_PEAK_S,
-        rate_max=FURTHEST * max(RATES),
-        rate_stays=rate_stays,
-        event=(EVENT_S, EVENT_RATIO),
-    )
+    return float(pair.correlations(lags_s, 0.0).max()) > max(MIN_CORRELATION, best + 0.15)
 
 
 # -- Lag of each sensor behind the wheels, from all runs together, and its parts: a clock, and latencies ---
@@ -245,8 +212,6 @@ EDGE_S = MAX_LAG_S + 10 * FINE_S
 SMOOTH = np.hanning(27)[1:-1] / np.hanning(27).sum()
 """Window of half a second over the prediction: encoders that are read a few times a second are held, and the
 likelihood of a lag has kinks where edges meet samples."""
-
-NO_LAG_S = np.zeros(1)
 
 MIN_KNOWN = 10
 """Samples of a channel in a run, below which gain and constant leave nothing to compare."""
@@ -272,52 +237,43 @@ looks like 0.08 s."""
 SHAPE_GAIN = 10.0
 """Twice the log-likelihood by which a delay has to fit better than a low-pass of the encoders."""
 
-
-class Latency(NamedTuple):
-    """How far a channel is behind what the wheels predict, common to all runs.
-
-    Parameters
-    ----------
-    channel : of :data:`~terrain.discrepancy.clocks.CLOCKED`
-    lag_s, std_s : over what the simulation has of it already, and its standard deviation by bootstrap over
-        runs; negative where the wheels are late
-    n_runs : that measure it
-    """
-
-    channel: str
-    lag_s: float
-    std_s: float
-    n_runs: int
+UNKNOWN = (math.nan, math.nan)
 
 
 class Latencies(NamedTuple):
-    """Lags of all channels, and their parts.
+    """Lags of all channels behind what the wheels predict, and their parts.
 
     Parameters
     ----------
-    channels : those of which a lag is measured
-    clock_s, clock_std_s : of the earlier of IMU and camera behind the wheels; NaN if neither is measured
-    imu_s, imu_std_s : of the IMU behind that; NaN where it is not measured, or where a delay of the
-        yaw motion looks the same
-    camera_s, camera_std_s : of the camera behind that; NaN where it is not measured
+    channels : by name of :data:`CLOCKED`, those of which a lag is measured, over what the simulation has of it
+        already; negative where the wheels are late
+    clock : of the earlier of IMU and camera behind the wheels, and its standard deviation (s); NaN if unknown
+    imu : of the IMU behind that; NaN where it is not measured, or where a delay of the yaw motion looks the same
+    camera : of the camera behind that; NaN where it is not measured
     is_delay : whether the wheels are late by a delay, and not by a low-pass of their encoders
     """
 
-    channels: tuple[Latency, ...]
-    clock_s: float
-    clock_std_s: float
-    imu_s: float
-    imu_std_s: float
-    camera_s: float
-    camera_std_s: float
+    channels: Mapping[str, Delay]
+    clock: tuple[float, float]
+    imu: tuple[float, float]
+    camera: tuple[float, float]
     is_delay: bool
 
+    def starting_values(self) -> dict[str, float]:
+        """Return parameters by which a search may start, of what is significant; none where nothing is late.
 
-class _RunPair(NamedTuple):
-    """A channel of a run beside what is expected of it, and how many of its samples are independent."""
+        Keys are ``clock_offset_s``, which is negative where the wheels are late, ``camera_latency_s`` and
+        ``imu_latency_s``.  A clock is left out where a low-pass of the encoders explains late wheels as well.
+        """
+        lags = {"clock_offset_s": self.clock, "camera_latency_s": self.camera, "imu_latency_s": self.imu}
+        found = {n: lag_s for n, (lag_s, std_s) in lags.items() if abs(lag_s) > max(SIGMAS * std_s, GROSS_S)}
+        if found.get("clock_offset_s", 1.0) < 0.0 and not self.is_delay:
+            del found["clock_offset_s"]
+        return found
 
-    pair: Pair
-    n_independent: float
+
+_RunPairs = dict[str, tuple[Pair, float]]
+"""Channels of a run beside what is expected of them, and how many of their samples are independent."""
 
 
 def latencies_of(signals: Sequence[Signals], simulation: Simulation, seed: int = 0) -> Latencies:
@@ -333,104 +289,66 @@ def latencies_of(signals: Sequence[Signals], simulation: Simulation, seed: int =
     simulation : its prediction may be wrong in size and in sign
     seed : of the bootstrap
     """
-    pairs = [_run_pairs(run, simulation) for run in signals]
-    lags = {}
-    for c, name in enumerate(CLOCKED):
-        own = [pair[c] for pair in pairs if c in pair]
-        if len(own) < MIN_RUNS:
-            continue
-        table = np.array([_gain(pair, FINE_LAGS_S) for pair in own])
-        total = table.sum(axis=0)
-        if total.max() - np.median(total) < MIN_GAIN:
-            continue
-        found = common_delay(FINE_LAGS_S, list(table), seed=seed)
-        lags[name] = Latency(name, found.delay_s, max(found.std_s, MIN_STD_S), len(own))
-    return Latencies(tuple(lags.values()), *_parts(lags), is_delay=_is_delay(pairs, lags))
-
-
-def _parts(lags: Mapping[str, Latency]) -> tuple[float, float, float, float, float, float]:
-    """Return clock, latency of the IMU and latency of the camera, each with its standard deviation."""
+    pairs, lags = [_run_pairs(run, simulation) for run in signals], {}
+    for name in CLOCKED:
+        table = [_gain(*run[name], FINE_LAGS_S) for run in pairs if name in run]
+        total = np.sum(table, axis=0)
+        if len(table) >= MIN_RUNS and total.max() - np.median(total) >= MIN_GAIN:
+            found = common_delay(FINE_LAGS_S, table, seed=seed)
+            lags[name] = found._replace(std_s=max(found.std_s, MIN_STD_S))
     gyro, heading = lags.get(GYRO), lags.get(HEADING)
-    camera = min((lags[name] for name in (HEADING, SPEED_X) if name in lags), key=_lag_s, default=None)
-    if gyro is None or camera is None:
-        only = gyro or camera
-        clock = (math.nan, math.nan) if only is None else (only.lag_s, only.std_s)
-        return (*clock, math.nan, math.nan, math.nan, math.nan)
-    std_s = math.hypot(gyro.std_s, camera.std_s)
-    if gyro.lag_s <= camera.lag_s:
-        return gyro.lag_s, gyro.std_s, 0.0, std_s, camera.lag_s - gyro.lag_s, std_s
-    imu = (math.nan, math.nan)
-    if heading is not None:
-        imu = max(gyro.lag_s - heading.lag_s, 0.0), math.hypot(gyro.std_s, heading.std_s)
-    return camera.lag_s, camera.std_s, *imu, 0.0, std_s
+    behind = [lags[name] for name in (HEADING, SPEED_X) if name in lags]
+    camera = min(behind, key=lambda lag: lag.delay_s, default=None)
+    first, imu, later = gyro or camera, UNKNOWN, UNKNOWN
+    if gyro is not None and camera is not None:
+        std_s = math.hypot(gyro.std_s, camera.std_s)
+        if gyro.delay_s <= camera.delay_s:
+            imu, later = (0.0, std_s), (camera.delay_s - gyro.delay_s, std_s)
+        else:
+            first, later = camera, (0.0, std_s)
+            if heading is not None:
+                imu = max(gyro.delay_s - heading.delay_s, 0.0), math.hypot(gyro.std_s, heading.std_s)
+    clock = UNKNOWN if first is None else (first.delay_s, first.std_s)
+    return Latencies(lags, clock, imu, later, _is_delay(pairs, lags))
 
 
-def _lag_s(latency: Latency) -> float:
-    return latency.lag_s
-
-
-def starting_values(latencies: Latencies) -> dict[str, float]:
-    """Return parameters by which a search may start, of what is significant; none where nothing is late.
-
-    Keys are ``clock_offset_s``, which is negative where the wheels are late, ``camera_latency_s`` and
-    ``imu_latency_s``.  A clock is left out where a low-pass of the encoders explains late wheels as well.
-    """
-    values = {}
-    clock_s = latencies.clock_s
-    if _is_significant(clock_s, latencies.clock_std_s) and (clock_s > 0 or latencies.is_delay):
-        values["clock_offset_s"] = clock_s
-    if _is_significant(latencies.camera_s, latencies.camera_std_s):
-        values["camera_latency_s"] = latencies.camera_s
-    if _is_significant(latencies.imu_s, latencies.imu_std_s):
-        values["imu_latency_s"] = latencies.imu_s
-    return values
-
-
-def _is_significant(lag_s: float, std_s: float) -> bool:
-    return bool(abs(lag_s) > max(SIGMAS * std_s, GROSS_S))
-
-
-def _run_pairs(run: Signals, simulation: Simulation) -> dict[int, _RunPair]:
-    """Return the channels of a run that are measured and of which something is expected, by place."""
+def _run_pairs(run: Signals, simulation: Simulation) -> _RunPairs:
+    """Return the channels of a run that are measured and of which something is expected."""
     dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(run, low_pass_of([run]))
     planar = simulation.planar_on(run.terrain)
     predicted = np.asarray(replay(planar, simulation.vector, dt, wheel_speed, steer, grade, roll))
     at_s = dt * np.arange(len(predicted))
-    half_s = FINE_S * (SMOOTH.size // 2)
-    wide_s = np.arange(-EDGE_S - half_s, at_s[-1] + EDGE_S + half_s, FINE_S)
-    fine_s = wide_s[SMOOTH.size // 2 : -(SMOOTH.size // 2)]
+    half = SMOOTH.size // 2
+    wide_s = np.arange(-EDGE_S - FINE_S * half, at_s[-1] + EDGE_S + FINE_S * half, FINE_S)
     pairs = {}
-    for c, name in enumerate(CLOCKED):
+    for name in CLOCKED:
         values, expected = (each[:, CHANNELS.index(name)] for each in (measured, predicted))
         known = np.isfinite(values)
         if known.sum() >= MIN_KNOWN and np.std(expected[known]) > MIN_EXCITATION:
             fine = np.convolve(np.interp(wide_s, at_s, expected), SMOOTH, mode="valid")
-            n = float(known.sum() * dt * INDEPENDENT_HZ)
-            time_s = at_s - fine_s[0]
-            slope = np.gradient(fine, FINE_S)
-            pairs[c] = _RunPair(Pair(time_s, np.ascontiguousarray(values), FINE_S, fine, slope, 0.0), n)
+            time_s, slope = at_s - wide_s[half], np.gradient(fine, FINE_S)
+            pair = Pair(time_s, np.ascontiguousarray(values), FINE_S, fine, slope, 0.0)
+            pairs[name] = pair, float(known.sum() * dt * INDEPENDENT_HZ)
     return pairs
 
 
-def _gain(run: _RunPair, lags_s: Array) -> Array:
+def _gain(pair: Pair, n_independent: float, lags_s: Array) -> Array:
     """Return twice the log-likelihood (lags,) that a run gains by following the prediction."""
-    return np.asarray(
-        -run.n_independent * np.log1p(-np.minimum(run.pair.correlations(lags_s, 0.0) ** 2, 0.9999))
-    )
+    fit = np.minimum(pair.correlations(lags_s, 0.0) ** 2, 0.9999)
+    return np.asarray(-n_independent * np.log1p(-fit))
 
 
-def _is_delay(pairs: Sequence[dict[int, _RunPair]], lags: Mapping[str, Latency]) -> bool:
+def _is_delay(pairs: Sequence[_RunPairs], names: Mapping[str, Delay]) -> bool:
     """Return whether wheels that are late are so by a delay, and not by a low-pass of time constant ``T``.
 
     What a body does is ahead of late wheels: ``x(t + T)`` by a delay, ``x + T dx/dt`` by a low-pass.
     """
-    late_s = np.arange(0.0, -MIN_LAG_S, FINE_S)
-    gained = 0.0
-    for name in lags:
-        delay, low_pass = np.zeros((2, late_s.size))
-        for run, n in (each[CLOCKED.index(name)] for each in pairs if CLOCKED.index(name) in each):
-            delay += _gain(_RunPair(run, n), -late_s)
-            ahead = [run._replace(reference=run.reference + late * run.slope) for late in late_s]
-            low_pass += [_gain(_RunPair(each, n), NO_LAG_S)[0] for each in ahead]
-        gained += delay.max() - low_pass.max()
+    late_s, gained = np.arange(0.0, -MIN_LAG_S, FINE_S), 0.0
+    for name in names:
+        delayed, low_pass = np.zeros((2, late_s.size))
+        for pair, n in (run[name] for run in pairs if name in run):
+            delayed += _gain(pair, n, -late_s)
+            ahead = [pair._replace(reference=pair.reference + late * pair.slope) for late in late_s]
+            low_pass += [_gain(each, n, np.zeros(1))[0] for each in ahead]
+        gained += delayed.max() - low_pass.max()
     return bool(gained > SHAPE_GAIN)

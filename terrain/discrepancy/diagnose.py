@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.clocks import Latencies, Shift, latencies_of, shifts_of, starting_values
+from terrain.discrepancy.clocks import Latencies, Shift, latencies_of, shifts_of
 from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of, values_by_session
 from terrain.discrepancy.evidence import Evidence, move_point, partial_information, recentre
 from terrain.discrepancy.faults import Fault, faults_of, repaired
@@ -362,7 +362,7 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
 
 def _aligned(problem: Problem, latencies: Latencies) -> tuple[dict[str, float], Evidence, Shift]:
     """Return lags to start from, the information of the runs with them built in, and their clocks there."""
-    values = starting_values(latencies)
+    values = latencies.starting_values()
     seeds = {name: value for name, value in values.items() if name in problem.parameters}
     there = move_point(problem.simulation.vector, tuple(seeds), np.array(list(seeds.values())))
     aligned = problem.at(there)

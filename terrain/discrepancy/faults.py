@@ -80,7 +80,7 @@ def responses_of(
     lag_s = np.full((len(rows), len(CLOCKED)), np.nan) if shift is None else shift.lag_s
     rate = 0.0 if shift is None else shift.rate
     if latencies is not None:
-        common = {lag.channel: lag.lag_s for lag in latencies.channels}
+        common = {name: lag.delay_s for name, lag in latencies.channels.items()}
     else:
         known = [column[np.isfinite(column)] for column in lag_s.T]
         common = {

@@ -6,8 +6,7 @@ The gyro and the wheels both see the robot turn, each on its own clock::
     gyro_z(t_imu) = gain (v_right - v_left)(t_wheels) / track + bias + noise
 
 with ``t_ref`` the first wheel sample.  Both signals pass the same Gaussian low-pass, as wide as a period of
-the slower stream and 0.1 s at least.  A coarse grid over (offset, rate) finds the highest correlation, least
-squares refines it (:mod:`terrain.signals`).
+the slower stream and 0.1 s at least, and :func:`terrain.signals.delay` finds offset and rate.
 The search is bounded: the gain is positive (a skid-steer robot turns less than its wheels indicate, never
 more), offset and rate lie within a range; so a periodic manoeuvre cannot lock it on to a mirror image.
 
@@ -25,11 +24,10 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 from terrain.errors import DataError
-from terrain.records import Array, RunLog, Stream
-from terrain.signals import DelayFit, DelayStatus, Pair, nearly_as_good, refine_delay, smooth_on_grid
+from terrain.records import RunLog, Stream
+from terrain.signals import DelayStatus, Pair, delay, smooth_on_grid
 
 MIN_SAMPLES = 30
 """Fewer samples of the slower stream tell no correlation from chance."""
@@ -70,9 +68,6 @@ RIVAL_FLOOR = 0.05
 SAME_PEAK_SIGMAS = 4.0
 """Two peaks of the grid that lie closer than this many widths of the low-pass are one."""
 
-MAX_SEARCH_SAMPLES = 1500
-"""The coarse search looks at this many instants of a long run; least squares at all of them."""
-
 MAX_APART_S = 0.1
 """Between the clocks of wheels and IMU: in more, a robot that begins to turn is seen to turn without wheels,
 and the effective track is wrong by as much as its turns are short."""
@@ -102,9 +97,10 @@ class ClockEstimate(NamedTuple):
     status: str
     reference_s: float
 
-
-Peak = tuple[float, float]
-"""Lag and rate of a point of the grid."""
+    @property
+    def is_known(self) -> bool:
+        """Whether the offset was found."""
+        return self.status in ("estimated", "offset only")
 
 
 def yaw_rate_pair(run: RunLog, track_m: float) -> tuple[Pair, float, float] | None:
@@ -123,14 +119,18 @@ def yaw_rate_pair(run: RunLog, track_m: float) -> tuple[Pair, float, float] | No
     sigma_s = max(1.0 / wheels.rate_hz, 1.0 / imu.rate_hz, MIN_SIGMA_S)
     n_steps = int(np.ceil(sigma_s * wheels.rate_hz))
     wheels_s, wheels_radps = smooth_on_grid(wheels.time_s, (right_mps - left_mps) / track_m, sigma_s, n_steps)
-    kept = np.flatnonzero(np.isfinite(wheels_radps))[::n_steps]
+    supported = np.flatnonzero(np.isfinite(wheels_radps))[::n_steps]
     n_steps = max(int(np.ceil(sigma_s * imu.rate_hz)), MIN_GYRO_STEPS)
     gyro_s, gyro = smooth_on_grid(imu.time_s, gyro_radps, sigma_s, n_steps)
-    if kept.size < MIN_SAMPLES or np.isfinite(gyro).sum() < MIN_SAMPLES:
+    if supported.size < MIN_SAMPLES or np.isfinite(gyro).sum() < MIN_SAMPLES:
         return None
     step_s, start_s = sigma_s / n_steps, float(gyro_s[0])
-    time_s = wheels_s[kept] - start_s
-    return Pair(time_s, wheels_radps[kept], step_s, gyro, np.gradient(gyro, step_s), 0.0), start_s, sigma_s
+    time_s = wheels_s[supported] - start_s
+    return (
+        Pair(time_s, wheels_radps[supported], step_s, gyro, np.gradient(gyro, step_s), 0.0),
+        start_s,
+        sigma_s,
+    )
 
 
 def estimate_clock(
@@ -167,77 +167,69 @@ def estimate_clock(
     """
     found = yaw_rate_pair(run, track_m)
     reference_s = float(run.streams["wheels"].time_s[0])
+
+    def none(status: DelayStatus, correlation: float = np.nan) -> ClockEstimate:
+        return ClockEstimate(*5 * (np.nan,), correlation, status, reference_s)
+
     if found is None:
-        return _no_estimate(DelayStatus.NOT_EXCITED, reference_s)
+        return none(DelayStatus.NOT_EXCITED)
     pair, start_s, sigma_s = found
     turning = (pair.measured - np.mean(pair.measured)) ** 2
     if np.sqrt(np.mean(turning)) < MIN_YAW_RATE_STD_RADPS:
-        return _no_estimate(DelayStatus.NOT_EXCITED, reference_s)
+        return none(DelayStatus.NOT_EXCITED)
     turning[turning < MIN_YAW_RATE_STD_RADPS**2] = 0.0
     # Lag and rate hardly trade against each other when the lag refers to the centre of the turning.
     centre_s = float(np.average(pair.time_s, weights=turning))
     pair, lever_s = pair._replace(middle_s=centre_s), centre_s + start_s - reference_s
-
-    def refined(seen: Pair, at: Peak, rate_bound: float) -> DelayFit | None:
-        return refine_delay(
-            seen,
-            *at,
-            near_s=SAME_PEAK_SIGMAS * sigma_s,
+    # Where all rates within the bounds move the turns by less than the low-pass smears them, none is tried.
+    spread_s = float(np.sqrt(np.average((pair.time_s - centre_s) ** 2, weights=turning)))
+    reach_s = float(np.max(np.abs(pair.time_s - centre_s)))
+    for rate_bound in (max_rate, 0.0) if max_rate * spread_s > sigma_s else (0.0,):
+        n_rates = int(np.ceil(rate_bound * reach_s / sigma_s))
+        furthest_s = max_offset_s + rate_bound * lever_s
+        n_lags = int(np.ceil(furthest_s / sigma_s))
+        best = delay(
+            pair,
+            np.linspace(-furthest_s, furthest_s, 2 * n_lags + 1),
+            np.linspace(-rate_bound, rate_bound, 2 * n_rates + 1).tolist(),
+            same_peak_s=SAME_PEAK_SIGMAS * sigma_s,
+            floor=RIVAL_FLOOR,
+            within=lambda lag_s, rate: np.abs(lag_s - rate * lever_s) <= max_offset_s * (1.0 + 1e-9),
+            mirrored=True,
             rate_max=max_rate,
             rate_stays=rate_bound == 0.0,
             at_bounds=True,
             memory_s=None,
             min_rows=MIN_SAMPLES // 2,
         )
-
-    # Where all rates within the bounds move the turns by less than the low-pass smears them, none is tried.
-    spread_s = float(np.sqrt(np.average((pair.time_s - centre_s) ** 2, weights=turning)))
-    for rate_bound in (max_rate, 0.0) if max_rate * spread_s > sigma_s else (0.0,):
-        best, rival_at, mirror_at = _search(pair, sigma_s, lever_s, max_offset_s, rate_bound)
-        fit = None if best is None else refined(pair, best, rate_bound)
-        if fit is None:
-            continue
-        rate_std = float(np.sqrt(fit.cov[1, 1]))
-        if rate_std <= RATE_KNOWN:
+        if (fit := best.fit) is not None and np.sqrt(fit.cov[1, 1]) <= RATE_KNOWN:
             break
     if fit is None:
-        return _no_estimate(DelayStatus.NOT_EXCITED, reference_s)
+        return none(DelayStatus.NOT_EXCITED)
     if fit.correlation < MIN_CORRELATION or fit.gain < MIN_GAIN_SIGMAS * fit.gain_std:
-        return _no_estimate(DelayStatus.NOT_EXCITED, reference_s, fit.correlation)
+        return none(DelayStatus.NOT_EXCITED, fit.correlation)
     offset_s = -fit.lag_s + fit.rate * lever_s
     if abs(offset_s) > 0.98 * max_offset_s or abs(fit.rate) > 0.98 * max_rate:
-        return _no_estimate(DelayStatus.AT_BOUND, reference_s, fit.correlation)
-    mirrored = pair._replace(measured=-pair.measured)
-    for peak, seen in ((rival_at, pair), (mirror_at, mirrored)):
-        rival = None if peak is None else refined(seen, peak, rate_bound)
-        if rival is None:
-            continue
-        apart = seen is mirrored or _apart_s(pair, rival, fit) > SAME_PEAK_SIGMAS * sigma_s
-        if apart and nearly_as_good(rival.correlation, fit.correlation, RIVAL_FLOOR):
-            return _no_estimate(DelayStatus.AMBIGUOUS, reference_s, fit.correlation)
+        return none(DelayStatus.AT_BOUND, fit.correlation)
+    if best.status is DelayStatus.AMBIGUOUS:
+        return none(DelayStatus.AMBIGUOUS, fit.correlation)
     # of the gyro over the wheels, as the model has it, where the fit is that of the wheels over the gyro
     gain = fit.correlation**2 / fit.gain
     if rate_bound == 0.0:
         std_s = float(np.hypot(np.sqrt(fit.cov[0, 0]), lever_s * max_rate / np.sqrt(3.0)))
-        rate = rate_std = np.nan
-        status = DelayStatus.OFFSET_ONLY
+        rates, status = (np.nan, np.nan), DelayStatus.OFFSET_ONLY
     else:
         to_start = np.array([1.0, -lever_s])
-        std_s, rate, status = float(np.sqrt(to_start @ fit.cov @ to_start)), -fit.rate, DelayStatus.ESTIMATED
-    return ClockEstimate(offset_s, std_s, rate, rate_std, gain, fit.correlation, status, reference_s)
+        std_s, status = float(np.sqrt(to_start @ fit.cov @ to_start)), DelayStatus.ESTIMATED
+        rates = -fit.rate, float(np.sqrt(fit.cov[1, 1]))
+    return ClockEstimate(offset_s, std_s, *rates, gain, fit.correlation, status, reference_s)
 
 
 def align(run: RunLog, estimate: ClockEstimate) -> RunLog:
-    """Return the run with its wheel stream on the clock of the IMU.
+    """Return the run with its wheel stream on the clock of the IMU, which is the clock of the run.
 
     With the status ``offset only`` the times are shifted and not stretched; where the clocks could not be
-    compared the run comes back as it is.  Labels and all other streams stay as they are: the clock of the
-    IMU is the clock of the run.
-
-    Parameters
-    ----------
-    run : run log with the streams that the estimate was made from
-    estimate : as :func:`terrain.logs.clock.estimate_clock` returns it
+    compared the run comes back as it is.
 
     Examples
     --------
@@ -246,7 +238,7 @@ def align(run: RunLog, estimate: ClockEstimate) -> RunLog:
     >>> align(RunLog("SNOW_01", "husky", {"wheels": wheels}), estimate).streams["wheels"].time_s
     array([10.5 , 11.52, 12.54])
     """
-    if estimate.status not in ("estimated", "offset only"):
+    if not estimate.is_known:
         return run
     wheels = run.streams["wheels"]
     rate = 0.0 if np.isnan(estimate.rate) else estimate.rate
@@ -256,59 +248,13 @@ def align(run: RunLog, estimate: ClockEstimate) -> RunLog:
 
 
 def offsets_apart_s(runs: Sequence[RunLog], track_m: Callable[[RunLog], float]) -> dict[str, float]:
-    """Return by run the offset of the clocks of wheels and IMU, of those runs where they clearly differ.
-
-    Parameters
-    ----------
-    runs : logs
-    track_m : of the robot of a run
-    """
+    """Return by run the offset of the clocks of wheels and IMU, of those runs where they clearly differ."""
     offsets_s = {}
     for run in runs:
         try:
             found = estimate_clock(run, track_m=track_m(run))
         except DataError:  # no gyro, or no speeds of two sides
             continue
-        known = found.status in ("estimated", "offset only")
-        if known and abs(found.offset_s) > max(MAX_APART_S, 3.0 * found.offset_std_s):
+        if found.is_known and abs(found.offset_s) > max(MAX_APART_S, 3.0 * found.offset_std_s):
             offsets_s[run.run_id] = found.offset_s
     return offsets_s
-
-
-def _no_estimate(status: DelayStatus, reference_s: float, correlation: float = np.nan) -> ClockEstimate:
-    return ClockEstimate(np.nan, np.nan, np.nan, np.nan, np.nan, correlation, status, reference_s)
-
-
-def _search(
-    pair: Pair, sigma_s: float, lever_s: float, max_offset_s: float, max_rate: float
-) -> tuple[Peak | None, Peak | None, Peak | None]:
-    """Return the best peak on a grid of lag and rate, its best rival, and the best of the mirror image, if any."""
-    every = -(-pair.time_s.size // MAX_SEARCH_SAMPLES)
-    pair = pair._replace(time_s=pair.time_s[::every].copy(), measured=pair.measured[::every].copy())
-    reach_s = float(np.max(np.abs(pair.time_s - pair.middle_s)))
-    n_rates = int(np.ceil(max_rate * reach_s / sigma_s))
-    rates = np.linspace(-max_rate, max_rate, 2 * n_rates + 1)
-    furthest_s = max_offset_s + max_rate * lever_s
-    n_lags = int(np.ceil(furthest_s / sigma_s))
-    lags_s = np.linspace(-furthest_s, furthest_s, 2 * n_lags + 1)
-    found = np.stack([pair.correlations(lags_s, rate) for rate in rates], axis=1)
-    found[np.abs(lags_s[:, None] - rates * lever_s) > max_offset_s * (1.0 + 1e-9)] = 0.0
-    row, column = (int(i) for i in np.unravel_index(np.argmax(found), found.shape))
-    if found[row, column] <= 0.0:
-        return None, None, None
-    # A ridge askew to the grid has several points above their neighbours: they are one peak as long as no
-    # sample is shifted by more than the low-pass smears it.
-    apart_s = np.abs(lags_s[:, None] - lags_s[row]) + np.abs(rates - rates[column]) * reach_s
-    tops = (found == maximum_filter(found, size=3)) & (apart_s > SAME_PEAK_SIGMAS * sigma_s)
-
-    def peak(heights: Array) -> Peak | None:
-        at, along = np.unravel_index(np.argmax(heights), heights.shape)
-        return (float(lags_s[at]), float(rates[along])) if heights[at, along] > 0.0 else None
-
-    return peak(found), peak(np.where(tops, found, -1.0)), peak(-found)
-
-
-def _apart_s(pair: Pair, one: DelayFit, other: DelayFit) -> float:
-    """Return the most by which any sample is shifted between two fits."""
-    reach_s = float(np.max(np.abs(pair.time_s - pair.middle_s)))
-    return abs(one.lag_s - other.lag_s) + abs(one.rate - other.rate) * reach_s

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from terrain.signals import DelayStatus, Pair, at_times, common_delay, has_rival, low_pass, peak, refine_delay
+from terrain.signals import DelayStatus, Pair, at_times, common_delay, delay, low_pass, peak, refine_delay
 
 STEP_S = 0.02
 LAGS_S = np.arange(-1.0, 2.0 + 1e-9, 0.1)
@@ -28,10 +28,9 @@ def test_a_hidden_delay_and_rate_come_back_within_their_errors(lag_s, rate):
     scores = []
     for seed in range(6):
         pair = hidden_pair(seed, lag_s, rate)
-        column = pair.correlations(LAGS_S, 0.0)
-        best = int(np.argmax(column))
-        assert not has_rival(LAGS_S, column, best, 0.5, 0.02)
-        fit = refine_delay(pair, float(LAGS_S[best]), 0.0, near_s=0.5, rate_max=0.03)
+        found = delay(pair, LAGS_S, same_peak_s=0.5, floor=0.02, rate_max=0.03)
+        assert found.status is DelayStatus.ESTIMATED
+        fit = found.fit
         scores.append((np.array([fit.lag_s, fit.rate]) - [lag_s, rate]) / np.sqrt(np.diag(fit.cov)))
         assert fit.gain == pytest.approx(0.7, abs=5 * fit.gain_std)
     assert np.abs(scores).max() < 4.0
@@ -51,8 +50,7 @@ def test_a_periodic_signal_has_a_rival_and_what_diverges_is_no_delay():
     fine_s, time_s = STEP_S * np.arange(4000), np.arange(3.0, 76.0, 0.1)
     wave, slope = np.sin(2 * np.pi * fine_s), 2 * np.pi * np.cos(2 * np.pi * fine_s)
     pair = Pair(time_s, np.sin(2 * np.pi * (time_s - 0.3)), STEP_S, wave, slope, 0.0)
-    column = pair.correlations(LAGS_S, 0.0)
-    assert has_rival(LAGS_S, column, int(np.argmax(column)), 0.5, 0.02)
+    assert delay(pair, LAGS_S, same_peak_s=0.5, floor=0.02, rate_max=0.03).status is DelayStatus.AMBIGUOUS
     assert refine_delay(pair, 0.8, 0.0, near_s=0.1, rate_max=0.03) is None  # the gain would be negative
 
 

@@ -10,7 +10,7 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 
 from pipelines.data.datasets import load_runs
-from terrain.discrepancy.clocks import latencies_of, starting_values
+from terrain.discrepancy.clocks import latencies_of
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import GYRO, HEADING, SPEED_X
@@ -62,24 +62,24 @@ def latencies(runs: Sequence[RunLog], robot=HUSKY):
     ],
 )
 def test_nothing_late_and_other_delays_start_no_search(robot, effects):
-    assert starting_values(latencies(drive(robot, effects=effects), robot)) == {}
+    assert latencies(drive(robot, effects=effects), robot).starting_values() == {}
 
 
 @pytest.mark.parametrize(("streams", "late_s"), [(("wheels",), 0.27), (("imu", "odometry"), 0.3)])
 def test_a_clock_is_found_in_both_signs(streams, late_s):
     found = latencies([moved(run, streams, late_s) for run in drive()])
     expected_s = -late_s if streams == ("wheels",) else late_s
-    assert_allclose(found.clock_s, expected_s, atol=0.01)
-    assert set(starting_values(found)) == {"clock_offset_s"}
-    assert [lag.channel for lag in found.channels] == [GYRO, SPEED_X]
+    assert_allclose(found.clock[0], expected_s, atol=0.01)
+    assert set(found.starting_values()) == {"clock_offset_s"}
+    assert list(found.channels) == [GYRO, SPEED_X]
 
 
 def test_a_sensor_that_is_late_by_itself_is_distinguished_from_the_clock():
-    camera = starting_values(latencies([moved(run, ["odometry"], 0.3) for run in drive()]))
+    camera = latencies([moved(run, ["odometry"], 0.3) for run in drive()]).starting_values()
     assert camera == {"camera_latency_s": pytest.approx(0.3, abs=0.02)}
     imu = latencies([moved(with_lidar(run, 0.0), ["imu"], 0.3) for run in drive()])
-    assert starting_values(imu) == {"imu_latency_s": pytest.approx(0.3, abs=0.02)}
-    assert np.isnan(latencies([moved(run, ["imu"], 0.3) for run in drive()]).imu_s)  # or it turns late
+    assert imu.starting_values() == {"imu_latency_s": pytest.approx(0.3, abs=0.02)}
+    assert np.isnan(latencies([moved(run, ["imu"], 0.3) for run in drive()]).imu[0])  # or it turns late
 
 
 def test_short_runs_of_a_wrong_simulation_measure_clocks_together():
@@ -93,25 +93,25 @@ def test_short_runs_of_a_wrong_simulation_measure_clocks_together():
         runs[i] = replace(run, streams={**run.streams, "imu": replace(imu, values=values)})
     found = latencies(runs)
     truth_s = {GYRO: -0.27, SPEED_X: -0.11, HEADING: -0.11}
-    for lag in found.channels:
-        assert abs(lag.lag_s - truth_s[lag.channel]) < 4 * lag.std_s + 0.02
-    assert starting_values(found) == {
+    for name, lag in found.channels.items():
+        assert abs(lag.delay_s - truth_s[name]) < 4 * lag.std_s + 0.02
+    assert found.starting_values() == {
         "clock_offset_s": pytest.approx(-0.27, abs=0.03),
         "camera_latency_s": pytest.approx(0.16, abs=0.04),
     }
 
 
 def test_runs_without_a_manoeuvre_or_too_few_measure_nothing():
-    assert latencies(drive(n=2)).channels == ()
+    assert latencies(drive(n=2)).channels == {}
     found = latencies(drive(n=2))
-    assert np.isnan([found.clock_s, found.imu_s, found.camera_s]).all()
-    assert starting_values(found) == {}
+    assert np.isnan([found.clock, found.imu, found.camera]).all()
+    assert found.starting_values() == {}
 
 
 def test_wheels_and_lidar_of_the_measured_husky_are_late(measured):
     runs = load_runs(measured("drive_husky"))
     found = latencies(runs)
-    values = starting_values(found)
+    values = found.starting_values()
     assert values["clock_offset_s"] == pytest.approx(-0.265, abs=0.03)
     assert values["camera_latency_s"] == pytest.approx(0.16, abs=0.05)
     assert set(values) == {"clock_offset_s", "camera_latency_s"}
