@@ -236,7 +236,8 @@ def _answered(answer: Diagnosis | None) -> dict[str, Any]:
             for each in answer.varying
         ),
         "statements": tuple(
-            Statement(fault.change.kind.value, fault.change.column.value, fault.sentence) for fault in answer.faults
+            Statement(fault.change.kind.value, fault.change.column.value, fault.sentence)
+            for fault in answer.faults
         ),
     }
 
