@@ -19,28 +19,16 @@ from terrain.errors import TerrainError
 
 POLL_S = 0.05
 
+ATTEMPTS = 100
+"""How often a folder is made that another process removes; each attempt takes some microseconds."""
+
 
 @contextmanager
 def file_lock(path: Path, timeout_s: float, purpose: str) -> Iterator[None]:
-    """Hold the lock of a file, which is made where it is missing and stays.
+    """Hold the lock of a file, which is made with its folder where it is missing, and stays.
 
-    Parameters
-    ----------
-    path : of the lock file; its folder is made when missing
-    timeout_s : how long another process is waited for
-    purpose : what the other process does, for the message
-
-    Raises
-    ------
-    TerrainError
-        if another process holds the lock for too long, or the file cannot be made.
-
-    Examples
-    --------
-    >>> import tempfile
-    >>> with tempfile.TemporaryDirectory() as folder, file_lock(Path(folder) / ".lock", 1.0, "writes"):
-    ...     (Path(folder) / ".lock").exists()
-    True
+    ``TerrainError`` where another process, which does what ``purpose`` states, holds the lock for too long, or the
+    file cannot be made.
     """
     until_s = time.monotonic() + timeout_s
     descriptor = _opened(path, until_s)
@@ -69,27 +57,13 @@ def _opened(path: Path, until_s: float) -> int:
             return os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         except (FileNotFoundError, FileExistsError) as error:
             if path.parent.is_file() or time.monotonic() >= until_s:
-                raise TerrainError(f"{path}: cannot be written ({error.strerror})") from error
+                raise _not_written(path, error) from error
         except OSError as error:
-            raise TerrainError(f"{path}: cannot be written ({error.strerror or error})") from error
-
-
-ATTEMPTS = 100
-"""How often a folder is made that another process removes; each attempt takes some microseconds."""
+            raise _not_written(path, error) from error
 
 
 def atomic_write(path: str | Path, content: bytes | str) -> None:
-    """Write a file so that at every instant either the old content or all of the new one is there.
-
-    Parameters
-    ----------
-    path : file to write or replace; its folder is made when missing
-    content : bytes, or text that is written as UTF-8
-
-    Raises
-    ------
-    TerrainError
-        if the place cannot be written; nothing is left behind.
+    """Write a file, text as UTF-8, so that at every instant either the old content or all of the new one is there.
 
     Examples
     --------
@@ -107,14 +81,7 @@ def atomic_write(path: str | Path, content: bytes | str) -> None:
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Give a file to write; when the block ends well it becomes ``path``, else it is removed.
 
-    Parameters
-    ----------
-    path : file to write or replace; its folder is made when missing
-
-    Raises
-    ------
-    TerrainError
-        if the place cannot be written; what was there is there still.
+    Its folder is made when missing.  ``TerrainError`` where the place cannot be written; what was there is there still.
     """
     temporary = _name_beside(path)
     try:
@@ -132,62 +99,27 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         raise _not_written(path, error) from error
 
 
-def ensure_writable(folder: str | Path) -> None:
-    """Find out whether a folder can be made and written, so that long work does not end in a refusal.
-
-    Raises
-    ------
-    TerrainError
-        if the folder cannot be made or written; nothing is left behind.
-    """
-    folder = Path(folder).absolute()
-    made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
-    try:
-        _try_to_write(folder)
-    except OSError as error:
-        raise _not_written(folder, error) from error
-    finally:
-        for parent in made:
-            with suppress(OSError):  # another process writes there already
-                parent.rmdir()
-
-
-def _try_to_write(folder: Path) -> None:
-    """Make a folder and a file in it; another process that tries the same may remove the folder meanwhile."""
-    probe = _name_beside(folder / "probe")
-    for attempt in range(ATTEMPTS):
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            probe.touch()
-            probe.unlink()
-            return
-        except (FileNotFoundError, FileExistsError):  # removed between two calls
-            if attempt == ATTEMPTS - 1:
-                raise
-
-
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
     """Give an empty folder to fill; when the block ends well it becomes ``path``, else it is removed.
 
-    A folder that already lies at ``path`` is set aside only once the new one is whole.
-
-    Parameters
-    ----------
-    path : folder to make or replace; its parent is made when missing
-
-    Raises
-    ------
-    TerrainError
-        if the place cannot be written; what was there is there still.
+    A folder that already lies at ``path`` is set aside only once the new one is whole; errors as :func:`atomic_file`.
     """
-    temporary = _name_beside(path)
+    temporary, aside = _name_beside(path), _name_beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.mkdir()
         try:
             yield temporary
-            _take_place(temporary, path)
+            if path.exists():
+                path.rename(aside)
+            try:
+                temporary.rename(path)
+            except BaseException:
+                if aside.exists():
+                    aside.rename(path)
+                raise
+            shutil.rmtree(aside, ignore_errors=True)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
@@ -195,18 +127,31 @@ def atomic_folder(path: Path) -> Iterator[Path]:
         raise _not_written(path, error) from error
 
 
-def _take_place(new: Path, path: Path) -> None:
-    if not path.exists():
-        new.rename(path)
-        return
-    aside = _name_beside(path)
-    path.rename(aside)
+def ensure_writable(folder: str | Path) -> None:
+    """Find out whether a folder can be made and written, so that long work does not end in a refusal.
+
+    ``TerrainError`` where it cannot; nothing is left behind.  Another process that tries the same may remove the
+    folder meanwhile.
+    """
+    folder = Path(folder).absolute()
+    made = [parent for parent in (folder, *folder.parents) if not parent.exists()]
+    probe = _name_beside(folder / "probe")
     try:
-        new.rename(path)
-    except BaseException:
-        aside.rename(path)
-        raise
-    shutil.rmtree(aside, ignore_errors=True)
+        for attempt in range(ATTEMPTS):
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                probe.touch()
+                probe.unlink()
+                break
+            except (FileNotFoundError, FileExistsError):  # removed between two calls
+                if attempt == ATTEMPTS - 1:
+                    raise
+    except OSError as error:
+        raise _not_written(folder, error) from error
+    finally:
+        for parent in made:
+            with suppress(OSError):  # another process writes there already
+                parent.rmdir()
 
 
 def _name_beside(path: Path) -> Path:

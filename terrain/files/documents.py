@@ -19,21 +19,17 @@ import yaml
 from terrain.errors import ConfigError, TerrainError
 from terrain.files.names import MEBIBYTE, read_regular, shown
 
+if TYPE_CHECKING:
+    from pydantic import BaseModel, ValidationError
+
+Document = TypeVar("Document", bound="BaseModel")
+
 
 def number(place: str, entry: Any, unit: str, low: float | None = None) -> float:
     """Return the number of an entry ``{value, unit, source}``, with ``interval`` where it was calibrated.
 
-    Parameters
-    ----------
-    place : file and key, as messages name them
-    entry : what the file holds
-    unit : the one accepted
-    low : least value; None where it must be above zero
-
-    Raises
-    ------
-    ConfigError
-        if a key is unknown or missing, the unit another, no source there, or the number out of range.
+    ``ConfigError`` where a key is unknown or missing, the unit another, no source there, or the number below ``low``;
+    without one it must be above zero.
     """
     check_keys(place, entry, ["value", "unit", "source"], optional=("interval",))
     if entry["unit"] != unit:
@@ -64,14 +60,6 @@ def check_keys(place: str, entry: Any, desired: list[str], optional: tuple[str, 
         raise ConfigError(f"{place}: key {missing[0]!r} is missing")
 
 
-if TYPE_CHECKING:
-    from pydantic import BaseModel
-
-Document = TypeVar("Document", bound="BaseModel")
-
-if TYPE_CHECKING:
-    from pydantic import ValidationError
-
 MAX_JSON_BYTES = 16 * MEBIBYTE
 """A run with a label each second of 24 hours has 7 MiB of them."""
 
@@ -97,17 +85,8 @@ _BAD_VALUES = (ValueError, LookupError, AttributeError, TypeError, OverflowError
 def read_json(path: Path, place: str, kind: type[TerrainError], most_bytes: int = MAX_JSON_BYTES) -> Any:
     """Return what a JSON file holds, unchecked.
 
-    Parameters
-    ----------
-    path : file to read
-    place : as messages name it
-    kind : of error that is raised
-    most_bytes : that it may have
-
-    Raises
-    ------
-    TerrainError
-        of the kind, if it is missing, no regular file or too large, or as :func:`parse_json` does.
+    An error of a kind, which names the place, where it is missing, no regular file or too large, or as
+    :func:`parse_json` raises.
     """
     try:
         return parse_json(read_regular(path, place, kind, most_bytes))
@@ -118,11 +97,8 @@ def read_json(path: Path, place: str, kind: type[TerrainError], most_bytes: int 
 def parse_json(content: bytes | str) -> Any:
     """Return what a JSON text holds.
 
-    Raises
-    ------
-    ValueError
-        if it is no JSON or no UTF-8, nests too deep, gives a key twice, or holds a number that is not finite
-        or a whole number of more than 64 bits; the message says what the text does.
+    ``ValueError``, whose message says what the text does, where it is no JSON or no UTF-8, nests too deep, gives a key
+    twice, or holds a number that is not finite or a whole number of more than 64 bits.
 
     Examples
     --------
@@ -209,14 +185,10 @@ def _is_deep(found: Any) -> bool:
 def accepted(
     model: type[Document], content: Any, place: str, kind: type[TerrainError], fault: str = ""
 ) -> Document:
-    """Return what a pydantic model makes of a mapping or of a JSON text; refused in one sentence.
+    """Return what a pydantic model makes of a mapping or of a JSON text.
 
-    Parameters
-    ----------
-    model, content : the latter a text where it is JSON
-    place : as messages name it
-    kind : of error that is raised
-    fault : what a document is that the model does not accept; what it does not accept follows
+    An error of a kind in one sentence, which names the place, what the document is (``fault``) and what is not
+    accepted.
     """
     from pydantic import ValidationError
 
@@ -232,10 +204,7 @@ def accepted(
 def read_yaml(path: Path, text: str | None = None) -> Any:
     """Return what a YAML file holds, or a text in place of it, unchecked; no file can run code.
 
-    Raises
-    ------
-    ConfigError
-        if it cannot be opened, is no regular file or too large, or as :func:`parse_yaml` does.
+    ``ConfigError`` where it cannot be opened, is no regular file or too large, or as :func:`parse_yaml` raises.
     """
     try:
         return parse_yaml(
@@ -248,11 +217,8 @@ def read_yaml(path: Path, text: str | None = None) -> Any:
 def parse_yaml(content: bytes | str) -> Any:
     """Return what a YAML text holds; no text can run code.
 
-    Raises
-    ------
-    ValueError
-        if it is no YAML or no UTF-8, nests too deep, gives a key twice, or holds too many values, a whole
-        number of more than 64 bits or an alias of itself; the message says what the text does.
+    ``ValueError``, whose message says what the text does, where it is no YAML or no UTF-8, nests too deep, gives a key
+    twice, or holds too many values, a whole number of more than 64 bits or an alias of itself.
 
     Examples
     --------

@@ -15,6 +15,8 @@ from typing import Any
 
 from terrain.errors import TerrainError
 
+MEBIBYTE = 2**20
+
 MAX_NAME = 128
 """Characters of the longest name; file systems take 255 bytes, and writing adds some for a temporary name."""
 
@@ -37,12 +39,6 @@ def name_fault(name: str) -> str | None:
     """Return why a text is no plain name, None where it is one.
 
     Letters of any language are accepted, and all signs but path separators and control characters.
-
-    Examples
-    --------
-    >>> name_fault("мокрая трава 2")
-    >>> name_fault("../husky.yaml")
-    'begins with a dot'
     """
     if not name.strip():
         return "is empty"
@@ -63,26 +59,13 @@ def has_control_characters(text: str) -> bool:
 
 
 def check_name(place: str, name: str, kind: type[TerrainError]) -> str:
-    """Return a name that is a plain one.
-
-    Parameters
-    ----------
-    place : file and key, as messages name them
-    name : what the file holds
-    kind : of error that is raised
-
-    Raises
-    ------
-    TerrainError
-        of the kind, if it is empty, too long, begins with a dot, or holds a path separator or a control
-        character.
+    """Return a name that is a plain one, or raise an error of a kind; ``place`` is file and key, as messages name them.
 
     Examples
     --------
-    >>> from terrain.errors import LogError
-    >>> check_name("run.json: robot", "/etc/robot.yaml", LogError)
+    >>> check_name("run.json: robot", "/etc/robot.yaml", TerrainError)
     Traceback (most recent call last):
-    terrain.errors.LogError: run.json: robot '/etc/robot.yaml' is no plain name: it holds a path separator
+    terrain.errors.TerrainError: run.json: robot '/etc/robot.yaml' is no plain name: it holds a path separator
     """
     fault = name_fault(name)
     if fault is not None:
@@ -91,39 +74,21 @@ def check_name(place: str, name: str, kind: type[TerrainError]) -> str:
 
 
 def printable(text: str) -> str:
-    r"""Return a text on one line, with escapes for what cannot be printed and a terminal would act on.
-
-    Examples
-    --------
-    >>> print(printable("wet\tgrass"))
-    wet\tgrass
-    """
+    """Return a text on one line, with escapes for what cannot be printed and a terminal would act on."""
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return names as messages list them: the first ones, control characters as escapes.
-
-    Examples
-    --------
-    >>> listed(["time_s", "gyro_z_radps"])
-    'time_s, gyro_z_radps'
-    """
+    """Return names as messages list them: the first ones, control characters as escapes."""
     first = [printable(name[:MAX_NAME]) for name in names[:MAX_LISTED]]
     more = f" and {len(names) - MAX_LISTED} more" if len(names) > MAX_LISTED else ""
     return ", ".join(first) + more
 
 
 def shown(value: Any) -> str:
-    """Return a value as messages show it, in quotes where it is a text, and cut where it is long.
-
-    Examples
-    --------
-    >>> shown("a b"), len(shown("x" * 10**6))
-    ("'a b'", 123)
-    """
+    """Return a value as messages show it, in quotes where it is a text, and cut where it is long."""
     text = repr(value)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}..."
 
@@ -140,34 +105,12 @@ def plain_name(name: str) -> bool:
 
 
 def normal_name(name: str) -> str:
-    r"""Return a name in Unicode's normal form C, in which names are compared; file systems keep either form.
-
-    Examples
-    --------
-    >>> len("Ac\N{COMBINING ACUTE ACCENT}"), len(normal_name("Ac\N{COMBINING ACUTE ACCENT}"))
-    (3, 2)
-    """
+    """Return a name in Unicode's normal form C, in which names are compared; file systems keep either form."""
     return unicodedata.normalize("NFC", name)
 
 
-MEBIBYTE = 2**20
-
-
 def read_regular(path: Path, place: str, kind: type[TerrainError], most_bytes: int) -> bytes:
-    """Return the content of a regular file.
-
-    Parameters
-    ----------
-    path : file to read
-    place : as messages name it
-    kind : of error that is raised
-    most_bytes : that it may have
-
-    Raises
-    ------
-    TerrainError
-        of the kind, if it is missing, cannot be opened, is no regular file or is larger.
-    """
+    """Return the content of a regular file of so many bytes at most; an error of a kind, which names the place."""
     check_regular(path, place, kind)
     try:
         with path.open("rb") as file:
@@ -193,13 +136,7 @@ def check_regular(path: Path, place: str, kind: type[TerrainError]) -> None:
 
 
 def check_inside(path: Path, folder: Path, place: str, kind: type[TerrainError]) -> None:
-    """Refuse a file that links lead out of a folder; the folder itself may be a link.
-
-    Raises
-    ------
-    TerrainError
-        of the kind, if the file lies elsewhere, or its links lead in a circle.
-    """
+    """Refuse a file that links lead out of a folder, or in a circle; the folder itself may be a link."""
     try:
         inside = path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError, ValueError) as error:
@@ -209,13 +146,7 @@ def check_inside(path: Path, folder: Path, place: str, kind: type[TerrainError])
 
 
 def data_folder(kind: str) -> Path:
-    """Return the folder of packaged YAML of one kind: ``robots``, ``target_slip``.
-
-    Examples
-    --------
-    >>> (data_folder("robots") / "husky.yaml").is_file()
-    True
-    """
+    """Return the folder of packaged YAML of one kind: ``robots``, ``target_slip``."""
     package = Path(__file__).parents[1]
     installed = package / "_data" / kind
     return installed if installed.is_dir() else package.parent / "data" / kind

@@ -247,8 +247,8 @@ def run_files(folder: Path, mapping: Mapping) -> list[RunFiles]:
     """Return the files of each run that a mapping finds under a folder; none where no file fits."""
     runs: dict[str, RunFiles] = {}
     for name, stream in mapping.streams.items():
-        anywhere, pattern = _patterns(normal_name(stream.file))
-        for path in folder.glob(anywhere):
+        glob_text, pattern = _patterns(normal_name(stream.file))
+        for path in folder.glob(glob_text):
             place = path.relative_to(folder).as_posix()
             if match := pattern.fullmatch(normal_name(place)):
                 words = match.groupdict()
@@ -258,17 +258,17 @@ def run_files(folder: Path, mapping: Mapping) -> list[RunFiles]:
 
 def _patterns(file: str) -> tuple[str, re.Pattern[str]]:
     """Return what finds a file pattern in any of Unicode's forms (:mod:`glob`), and what takes its words."""
-    anywhere, pattern, seen = "", "", set[str]()
+    glob_text, pattern, seen = "", "", set[str]()
     for part in re.split(r"(\{[^\W\d]\w*\})", file):
         word = _FIELD.fullmatch(part)
         if word is None:
-            anywhere += re.sub(r"[^\x00-\x7f]+", "*", glob.escape(part))
+            glob_text += re.sub(r"[^\x00-\x7f]+", "*", glob.escape(part))
             pattern += re.escape(part)
             continue
-        anywhere += "*"
+        glob_text += "*"
         pattern += f"(?P={word[1]})" if word[1] in seen else f"(?P<{word[1]}>[^/]+)"
         seen.add(word[1])
-    return anywhere, re.compile(pattern)
+    return glob_text, re.compile(pattern)
 
 
 def read_run(
