@@ -1,140 +1,48 @@
-import unicodedata
+"""Tables of labs by a mapping: formats, units, headers, names in any language, positions; and mistakes in mappings."""
 
+import sys
+import unicodedata
+from datetime import datetime, timedelta
+
+import h5py
 import numpy as np
+import openpyxl
 import pytest
 import yaml
+from scipy.io import savemat
 
 from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
 from terrain.logs.digest import data_digest
-from terrain.logs.mapping import find_runs, load_mapping
+from terrain.logs.mapping import load_mapping, local_metres
 from terrain.logs.spelling import RESPELT
 
+T, TIME = 0.1 * np.arange(6), {"column": "t", "unit": "s"}
+SPEED = {"speed_left_mps": {"column": "v", "unit": "m/s"}}
+GYRO = {"gyro_z_radps": {"column": "wz", "unit": "deg/s"}}
 
-def like_borealtc():
-    imu = {f"gyro_{a}_radps": {"column": f"w{a}", "unit": "rad/s"} for a in "xyz"}
-    imu |= {f"accel_{a}_mps2": {"column": f"a{a}", "unit": "m/s^2"} for a in "xyz"}
-    wheels = {f"speed_{s}_mps": {"column": f"vel{s[0].upper()}", "unit": "m/s"} for s in ("left", "right")}
-    wheels |= {f"current_{s}_a": {"column": f"cur{s[0].upper()}", "unit": "A"} for s in ("left", "right")}
-    time = {"column": "time", "unit": "s"}
-    return {
-        "robot": "husky",
-        "terrain": "{class}",
-        "streams": {
-            "imu": {"file": "{class}/imu_{n}.csv", "time": time, "channels": imu},
-            "wheels": {"file": "{class}/pro_{n}.csv", "time": dict(time), "channels": wheels},
-        },
-    }
+
+def imu_of(file, column="wz", **more):
+    channels = {"gyro_z_radps": {"column": column, "unit": "deg/s"}}
+    return {"file": file, "time": TIME, "channels": channels} | more
 
 
 @pytest.fixture
-def save(tmp_path):
-    def write(mapping):
-        path = tmp_path / "map.yaml"
-        path.write_text(mapping if isinstance(mapping, str) else yaml.safe_dump(mapping))
-        return path
+def read(tmp_path):
+    """Return what reads the run of streams in the folder, or of a text in ``data.csv``."""
 
-    return write
+    def apply(streams=None, text=None, keys=None, **options):
+        if text is not None:
+            (tmp_path / "data.csv").write_text(text)
+            streams = {"logger": {"file": "data.csv", "time": TIME, "channels": SPEED} | (keys or {})}
+        described = {"robot": "husky", "run_id": "drive", "terrain": "GRASS", "streams": streams}
+        (tmp_path / "map.yaml").write_text(yaml.safe_dump(described))
+        (run,) = load_runs(tmp_path, mapping=tmp_path / "map.yaml", **options)
+        return run
 
-
-def test_units_scale_and_offset_become_si(tmp_path, save):
-    (tmp_path / "drive.csv").write_text("stamp;yaw;v\n1000;90;36\n1500;-90;72\n2000;;0\n")
-    mapping = {
-        "robot": "husky",
-        "run_id": "field trial",
-        "terrain": "GRASS",
-        "streams": {
-            "imu": {
-                "file": "drive.csv",
-                "delimiter": ";",
-                "time": {"column": "stamp", "unit": "ms"},
-                "channels": {
-                    "gyro_z_radps": {"column": "yaw", "unit": "deg/s", "scale": -1},
-                    "speed_left_mps": {"column": "v", "unit": "km/h", "scale": 2.0, "offset": -36.0},
-                },
-            }
-        },
-    }
-    (run,) = load_runs(tmp_path, mapping=save(mapping))
-    assert (run.run_id, run.terrains) == ("field trial", ("GRASS",))
-    assert run.streams["imu"].time_s.tolist() == [1.0, 1.5, 2.0]
-    np.testing.assert_allclose(run.streams["imu"].channel("gyro_z_radps"), [-np.pi / 2, np.pi / 2, np.nan])
-    np.testing.assert_allclose(run.streams["imu"].channel("speed_left_mps"), [10.0, 30.0, -10.0])
-
-
-def deep(path, value):
-    def change(mapping):
-        *parents, last = path
-        for key in parents:
-            mapping = mapping[key]
-        mapping[last] = value
-
-    return change
-
-
-GYRO = ("streams", "imu", "channels", "gyro_z_radps")
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (deep(["colour"], "red"), "map.yaml: key 'colour' is unknown"),
-        (deep([*GYRO, "units"], "rad/s"), "key 'streams.imu.channels.gyro_z_radps.units' is unknown"),
-        (lambda m: m.pop("robot"), "key 'robot' is missing"),
-        (lambda m: m["streams"]["imu"].pop("time"), "key 'streams.imu.time' is missing"),
-        (deep([*GYRO, "unit"], "dps"),
-         "imu: channel gyro_z_radps: unit 'dps' is unknown (accepted here: rad/s, deg/s, rpm)"),
-        (deep([*GYRO, "unit"], "m/s"),
-         "channel gyro_z_radps: unit 'm/s' does not suit it (accepted here: rad/s"),
-        (deep(["streams", "imu", "time", "unit"], "min"),
-         "time: unit 'min' is unknown (accepted here: s, ms, us, ns)"),
-        (deep(["streams", "imu", "channels", "gyro_z"], {"column": "wz", "unit": "rad/s"}),
-         "channel 'gyro_z' does not end in a known unit"),
-        (deep([*GYRO, "scale"], "twice"), "scale is 'twice'"),
-        (deep([*GYRO, "scale"], float("inf")), "scale is inf"),
-        (deep(["streams", "imu", "file"], "{class}/imu.csv"),
-         "imu and wheels do not have the same words in braces"),
-        (deep(["terrain"], "{ground}"),
-         "terrain '{ground}' uses a word that the files lack (they have {class}, {n})"),
-        (deep(["streams", "imu", "file"], "../{class}/{n}.csv"), "must lie under the data folder"),
-        (deep(["streams"], {}), "streams is {}"),
-    ],
-)  # fmt: skip
-def test_a_wrong_mapping_is_refused_in_one_sentence(save, change, message):
-    mapping = like_borealtc()
-    change(mapping)
-    with pytest.raises(ConfigError) as error:
-        load_mapping(save(mapping))
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"), [("a: [", "is no YAML"), ("", "the file is None"), ("- 1", "the file is")]
-)
-def test_a_file_that_is_no_mapping_is_refused(save, text, message):
-    with pytest.raises(ConfigError, match=message) as error:
-        load_mapping(save(text))
-    assert "\n" not in str(error.value)
-
-
-def test_a_missing_partner_and_an_empty_folder_are_named(borealtc_dir, save):
-    mapping = load_mapping(save(like_borealtc()))
-    (borealtc_dir / "ICE" / "pro_01.csv").unlink()
-    readers = find_runs(borealtc_dir, mapping)
-    with pytest.raises(LogError, match=r"ICE/pro_01\.csv: is missing"):
-        [read() for read in readers]
-    (borealtc_dir / "empty").mkdir()
-    with pytest.raises(LogError, match="no file there fits the mapping"):
-        find_runs(borealtc_dir / "empty", mapping)
-
-
-def one_stream(channels, **keys):
-    """Return a mapping of the file data.csv with one stream."""
-    stream = {"file": "data.csv", "time": {"column": "t", "unit": "s"}, "channels": channels, **keys}
-    return {"robot": "husky", "run_id": "r", "streams": {"logger": stream}}
+    return apply
 
 
 UNITS = [
@@ -154,25 +62,26 @@ UNITS = [
 ]
 
 
-@pytest.mark.parametrize(("channel", "unit", "cell", "si"), UNITS)
-def test_units_of_a_lab_become_si(tmp_path, save, channel, unit, cell, si):
-    (tmp_path / "data.csv").write_text(f"t,v\n0,{cell}\n1,{cell}\n")
-    mapping = one_stream({channel: {"column": "v", "unit": unit}})
-    (run,) = load_runs(tmp_path, mapping=save(mapping))
-    assert run.streams["logger"].channel(channel) == pytest.approx(si, rel=1e-9, abs=1e-9)
+def test_units_of_a_lab_with_scale_and_offset_become_si(read):
+    header = ",".join(f"c{i}" for i in range(len(UNITS)))
+    cells = ",".join(f"{2 * cell - 1}" for *_, cell, _ in UNITS)
+    channels = {f"a{i}_{name}": {"column": f"c{i}", "unit": unit} for i, (name, unit, *_) in enumerate(UNITS)}
+    for entry in channels.values():
+        entry |= {"scale": 0.5, "offset": 0.5}
+    text = f"t,{header}\n0,{cells}\n1,{cells}\n2,{',' * (len(UNITS) - 1)}\n"
+    stream = read(text=text, keys={"channels": channels}).streams["logger"]
+    for i, (name, *_, si) in enumerate(UNITS):
+        values = stream.channel(f"a{i}_{name}")
+        assert values == pytest.approx([si, si, np.nan], rel=1e-9, abs=1e-9, nan_ok=True), UNITS[i]
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("\u00b5s", 1e-6)])
-def test_times_in_any_unit_become_seconds(tmp_path, save, unit, factor):
-    (tmp_path / "data.csv").write_text(f"t,v\n0,1\n{round(1 / factor)},2\n")
-    mapping = one_stream(
-        {"speed_left_mps": {"column": "v", "unit": "m/s"}}, time={"column": "t", "unit": unit}
-    )
-    (run,) = load_runs(tmp_path, mapping=save(mapping))
-    assert run.streams["logger"].time_s.tolist() == pytest.approx([0.0, 1.0])
+def test_times_in_any_unit_become_seconds(read, unit, factor):
+    time = {"column": "t", "unit": unit, "offset": 1 / factor}
+    run = read(text=f"t,v\n0,1\n{round(1 / factor)},2\n", keys={"time": time})
+    assert run.streams["logger"].time_s.tolist() == pytest.approx([1.0, 2.0])
 
 
-SPEED = {"speed_left_mps": {"column": "v", "unit": "m/s"}}
 TEXTS = {
     "lines above the names": ("Logger 3\nstarted 8:15, by hand\nt,v\n0,1.5\n1,2.5\n", {"skip_rows": 2}),
     "units below the names": ("t,v\ns,m/s\n0,1.5\n1,2.5\n", {"header_rows": 2}),
@@ -189,15 +98,16 @@ TEXTS = {
 
 @pytest.mark.parametrize("text", TEXTS)
 @pytest.mark.parametrize("slow", [False, True])
-def test_headers_delimiters_and_decimals_of_instruments_are_read(tmp_path, save, monkeypatch, text, slow):
+def test_headers_delimiters_and_decimals_of_instruments_are_read(read, monkeypatch, text, slow):
     """By pyarrow, and cell by cell."""
     if slow:
         monkeypatch.setattr("terrain.logs.tables._fast", lambda *_: None)
-    content, keys = TEXTS[text]
-    (tmp_path / "data.csv").write_text(content)
-    (run,) = load_runs(tmp_path, mapping=save(one_stream(SPEED, **keys)))
-    assert run.streams["logger"].time_s.tolist() == [0.0, 1.0]
-    assert run.streams["logger"].channel("speed_left_mps").tolist() == [1.5, 2.5]
+    stream = read(text=TEXTS[text][0], keys=TEXTS[text][1]).streams["logger"]
+    assert stream.time_s.tolist() == [0.0, 1.0]
+    assert stream.channel("speed_left_mps").tolist() == [1.5, 2.5]
+
+
+COMMA = {"delimiter": ";", "decimal": ","}
 
 
 @pytest.mark.parametrize(
@@ -205,41 +115,249 @@ def test_headers_delimiters_and_decimals_of_instruments_are_read(tmp_path, save,
     [
         ("a\nt,v\n0,x\n1,2\n", {"skip_rows": 1}, "v at row 3 is 'x', which is no number"),
         ("t,v\n0,1\n", {"skip_rows": 9}, "has no names of columns in row 10"),
+        ("t;v\n0;1.5\n1;2,5\n", COMMA, "v at row 2 is '1.5', which is no number"),
         (
-            "t;v\n0;1.5\n1;2,5\n",
-            {"delimiter": ";", "decimal": ","},
-            "v at row 2 is '1.5', which is no number",
+            "t,v\n0,1e300\n1,2e300\n",
+            {"channels": {"v_mps": SPEED["speed_left_mps"] | {"scale": 1e300}}},
+            "nothing finite",
         ),
     ],
 )
-def test_what_does_not_fit_the_stated_layout_is_named_by_its_row(tmp_path, save, content, keys, message):
-    (tmp_path / "data.csv").write_text(content)
+def test_what_does_not_fit_the_stated_layout_is_named_by_its_row(read, content, keys, message):
     with pytest.raises(LogError, match=message):
-        load_runs(tmp_path, mapping=save(one_stream(SPEED, **keys)))
+        read(text=content, keys=keys)
+
+
+def write_hdf5(path, content):
+    """Write a file as MATLAB 7.3 does: a struct is a group, columns come first."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, value in content.items():
+            for field, inner in value.items() if isinstance(value, dict) else ():
+                file[f"{name}/{field}"] = np.atleast_2d(inner)
+            if not isinstance(value, dict):
+                file[name] = np.atleast_2d(value) if np.ndim(value) < 2 else value.T
+    with path.open("r+b") as file:
+        file.write(b"MATLAB 7.3 MAT-file")
+
+
+@pytest.mark.parametrize("write", [savemat, write_hdf5], ids=["5", "7.3"])
+def test_a_mat_file_is_read_by_variables_fields_and_columns(tmp_path, read, write):
+    wz = np.linspace(0.0, 90.0, 6)
+    content = {"t": T, "wz": wz, "log": {"wz": wz, "note": T}, "data": np.column_stack([T, wz])}
+    write(tmp_path / "drive.mat", content)
+    for column in ("wz", "log.wz", "data[1]"):
+        stream = read({"imu": imu_of("drive.mat", column)}).streams["imu"]
+        np.testing.assert_allclose(stream.channel("gyro_z_radps"), np.radians(wz), rtol=1e-12)
+        np.testing.assert_array_equal(stream.time_s, T)
 
 
 @pytest.mark.parametrize(
-    ("keys", "message"),
+    ("column", "sentence"),
     [
-        ({"decimal": ","}, "delimiter and decimal are both ','"),
-        ({"decimal": "'"}, 'streams.logger.decimal is "\'"'),
-        ({"skip_rows": -1}, "streams.logger.skip_rows is -1"),
-        ({"header_rows": 0}, "streams.logger.header_rows is 0"),
+        ("wx", "variable 'wx' is missing (there are "),
+        ("log.wx", "variable 'log.wx' is missing (there are wz)"),
+        ("log", "variable 'log' is a struct: name a field, as log.wz"),
+        ("name", "variable 'name' holds no numbers"),
+        ("data", "is 6 x 2, a vector is required: data[0] is its first column"),
+        ("data[2]", "is 6 x 2, data[2] is not in it"),
+        ("short", "variable 'short' has 3 values, 't' has 6"),
     ],
 )
-def test_a_layout_that_cannot_be_is_refused(save, keys, message):
+def test_a_mat_file_without_what_is_mapped_is_one_sentence(tmp_path, read, column, sentence):
+    content = {"t": T, "log": {"wz": T}, "name": "husky", "data": np.ones((6, 2)), "short": T[:3]}
+    savemat(tmp_path / "drive.mat", content)
+    with pytest.raises(LogError) as raised:
+        read({"imu": imu_of("drive.mat", column)})
+    assert sentence in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"no mat file at all" * 20, b"\x89HDF\r\n\x1a\n" + bytes(600)])
+def test_a_damaged_mat_file_or_spreadsheet_is_one_sentence(tmp_path, read, content):
+    for name in ("drive.mat", "drive.xlsx"):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(LogError, match=name) as raised:
+            read({"imu": imu_of(name)})
+        assert "\n" not in str(raised.value)
+
+
+def write_sheet(path, rows, title="log", first=()):
+    book = openpyxl.Workbook()
+    for row in first:
+        book.active.append(row)
+    sheet = book.create_sheet(title) if first else book.active
+    for row in rows:
+        sheet.append(row)
+    book.save(path)
+
+
+def test_a_spreadsheet_is_read_by_its_names_dates_and_sheet(tmp_path, read):
+    dates = [datetime(2024, 5, 1, 12) + timedelta(seconds=float(t)) for t in T]
+    rows = [("drive of May",), ("t", "wz"), *zip(dates, 90 * T, strict=True)]
+    write_sheet(tmp_path / "drive.xlsx", rows, "second", first=[("nothing",)])
+    stream = read({"imu": imu_of("drive.xlsx", sheet="second", skip_rows=1)}).streams["imu"]
+    np.testing.assert_allclose(stream.time_s - stream.time_s[0], T, atol=1e-6)
+    np.testing.assert_allclose(stream.channel("gyro_z_radps"), np.radians(90 * T), atol=1e-12)
+    with pytest.raises(LogError, match=r"has no sheet 'third' \(it has Sheet, second\)"):
+        read({"imu": imu_of("drive.xlsx", sheet="third", skip_rows=1)})
+
+
+def test_cells_of_a_spreadsheet_that_are_no_numbers_are_refused_or_counted(tmp_path, read):
+    rows = [("t", "wz"), ("s", "deg/s"), *zip(T, 90 * T, strict=True)]
+    rows[4] = (T[2], "wet")
+    write_sheet(tmp_path / "drive.xlsx", rows)
+    with pytest.raises(LogError, match=r"t at row 2 is 's'.*is read with 'header_rows: 2'"):
+        read({"imu": imu_of("drive.xlsx")})
+    two = imu_of("drive.xlsx", header_rows=2)
+    with pytest.raises(LogError, match="wz at row 5 is 'wet', which is no number"):
+        read({"imu": two})
+    run = read({"imu": two}, repair=True)
+    assert np.isnan(run.streams["imu"].values[:, 0]).tolist() == [False, False, True, False, False, False]
+    assert run.dropped == {"cells that are no number": 1}
+    with pytest.raises(LogError, match=r"column 'wx' is missing \(the file has t, wz\)"):
+        read({"imu": imu_of("drive.xlsx", "wx")})
+
+
+@pytest.mark.parametrize("package", ["h5py", "openpyxl", "pymap3d"])
+def test_a_missing_package_is_one_sentence(tmp_path, read, monkeypatch, package):
+    write_hdf5(tmp_path / "drive.mat", {"t": T, "wz": T})
+    write_sheet(tmp_path / "drive.xlsx", [("t", "wz"), *zip(T, T, strict=True)])
+    monkeypatch.setitem(sys.modules, package, None)
+    stream = imu_of({"h5py": "drive.mat"}.get(package, "drive.xlsx"))
+    if package == "pymap3d":
+        stream["position"] = {"latitude": "t", "longitude": "t"}
+    with pytest.raises(ConfigError, match=rf"{package}.*terrain-slip\[logs\]"):
+        read({"imu": stream})
+
+
+def test_latitude_and_longitude_become_metres_of_the_first_fix_or_an_origin(tmp_path, read):
+    """Known lengths: 111.13 km are a degree of latitude at 45 degrees, 78.85 km one of longitude."""
+    (tmp_path / "gps.csv").write_text(
+        "t,lat,lon,alt\n0,,,\n0.2,45.0,7.0,200\n0.4,45.0001,7.0,201\n0.6,45.0,7.0001,202\n0.8,45,7,200\n"
+    )
+    position = {"latitude": "lat", "longitude": "lon", "height": "alt"}
+    gps = {"file": "gps.csv", "time": TIME, "position": position}
+    stream = read({"gnss": gps}).streams["gnss"]
+    assert stream.channels == ("position_x_m", "position_y_m", "position_z_m")
+    assert np.isnan(stream.values[0]).all()
+    np.testing.assert_allclose(
+        stream.values[1:], [[0, 0, 0], [0, 11.113, 1], [7.885, 0, 2], [0, 0, 0]], atol=2e-3
+    )
+    del position["height"]
+    moved = gps | {"position": position | {"origin": [45.0, 7.0001, 0.0]}}
+    np.testing.assert_allclose(read({"gnss": moved}).streams["gnss"].values[1], [-7.885, 0.0], atol=2e-3)
+    (tmp_path / "gps.csv").write_text("t,lat,lon\n0,145,7\n1,45,7\n")
+    with pytest.raises(LogError, match=r"gps.csv: latitude reaches 145 deg"):
+        read({"gnss": gps})
+    with pytest.raises(LogError, match="no latitude and longitude are known"):
+        local_metres(np.array([np.nan]), np.array([0.0]))
+
+
+def test_a_run_is_joined_of_files_of_different_formats_on_one_clock(tmp_path, read):
+    savemat(tmp_path / "drive.mat", {"t": T, "wz": T})
+    write_sheet(tmp_path / "wheels.xlsx", [("stamp", "v"), *zip(1000 * (T + 0.05), 3.6 + T, strict=True)])
+    time = {"column": "stamp", "unit": "ms", "offset": -50.0}
+    speed = {"speed_left_mps": {"column": "v", "unit": "km/h"}}
+    wheels = {"file": "wheels.xlsx", "time": time, "channels": speed}
+    run = read({"imu": imu_of("drive.mat"), "wheels": wheels})
+    np.testing.assert_allclose(run.streams["wheels"].time_s, T, atol=1e-9)
+    np.testing.assert_allclose(run.streams["wheels"].values[0], [1.0])
+    assert (run.run_id, run.terrains) == ("drive", ("GRASS",))
+
+
+MAPPING = {
+    "robot": "husky",
+    "terrain": "{class}",
+    "streams": {
+        "imu": {"file": "{class}/imu_{n}.csv", "time": TIME, "channels": GYRO},
+        "wheels": {"file": "{class}/pro_{n}.csv", "time": TIME, "channels": SPEED},
+    },
+}
+AT, IN = ("streams", "imu"), ("streams", "imu", "channels", "gyro_z_radps")
+NO_TABLE = {"messages": {"topic": "/a"}, "time": None, "channels": {}}
+
+
+@pytest.mark.parametrize(
+    ("place", "change", "message"),
+    [
+        ((), {"colour": "red"}, "map.yaml: key 'colour' is unknown"),
+        (IN, {"units": "rad/s"}, "key 'streams.imu.channels.gyro_z_radps.units' is unknown"),
+        ((), {"robot": None}, "key 'robot' is missing"),
+        ((), {"robot": "../husky.yaml"}, "map.yaml: robot '../husky.yaml' is no plain name"),
+        (AT, {"time": None}, "key 'streams.imu.time' is missing"),
+        (IN, {"unit": "dps"}, "imu: channel gyro_z_radps: unit 'dps' is unknown (accepted here: rad/s, deg/s, rpm)"),
+        (IN, {"unit": "m/s"}, "channel gyro_z_radps: unit 'm/s' does not suit it (accepted here: rad/s"),
+        (AT, {"time": {"column": "t", "unit": "min"}}, "time: unit 'min' is unknown (accepted here: s, ms, us, ns)"),
+        (AT, {"channels": {"gyro_z": GYRO["gyro_z_radps"]}}, "channel 'gyro_z' does not end in a known unit"),
+        (IN, {"scale": "twice"}, "scale is 'twice'"),
+        (IN, {"scale": float("inf")}, "scale is inf"),
+        (AT, {"file": "{class}/imu.csv"}, "imu and wheels do not have the same words in braces"),
+        (AT, {"file": "{class}/{n}/{0}.csv"}, "has a brace without its partner"),
+        (AT, {"file": "{class}{n}/a\0b"}, "names no file"),
+        (AT, {"file": "../{class}/{n}.csv"}, "must lie under the data folder"),
+        ((), {"terrain": "{ground}"}, "terrain '{ground}' uses a word that the files lack (they have {class}, {n})"),
+        ((), {"streams": {}}, "streams is {}"),
+        (AT, {"decimal": ","}, "delimiter and decimal are both ','"),
+        (AT, {"decimal": "'"}, 'streams.imu.decimal is "\'"'),
+        (AT, {"skip_rows": -1}, "streams.imu.skip_rows is -1"),
+        (AT, {"header_rows": 0}, "streams.imu.header_rows is 0"),
+        (AT, {"channels": {}}, "has no channels and no position"),
+        (AT, {"position": {"latitude": "a"}}, "longitude' is missing"),
+        (AT, {"channels": {"position_x_m": {"column": "a", "unit": "m"}},
+              "position": {"latitude": "a", "longitude": "b"}}, "'position' gives the channel position_x_m too"),
+        (AT, {"messages": {"topic": "/a"}}, "'messages' leave out time, channels and position"),
+        (AT, NO_TABLE, "has no channels"),
+        (AT, NO_TABLE | {"messages": {"topic": "/a", "topics": "/a"}}, "key 'topics' is unknown"),
+        (None, "a: [", "is no YAML"),
+        (None, "", "the file is None"),
+        (None, "- 1", "the file is"),
+    ],
+)  # fmt: skip
+def test_a_wrong_mapping_is_refused_in_one_sentence(tmp_path, place, change, message):
+    if place is None:
+        text = change
+    else:
+        mapping = yaml.safe_load(yaml.safe_dump(MAPPING))
+        inner = mapping
+        for key in place:
+            inner = inner[key]
+        inner |= change
+        for key in [key for key, value in inner.items() if value is None]:
+            del inner[key]
+        text = yaml.safe_dump(mapping)
+    (tmp_path / "map.yaml").write_text(text)
     with pytest.raises(ConfigError) as error:
-        load_mapping(save(one_stream(SPEED, **keys)))
+        load_runs(tmp_path, mapping=tmp_path / "map.yaml")
     assert message in str(error.value)
+    assert "\n" not in str(error.value)
 
 
-def per_terrain():
-    mapping = one_stream({"speed_left_mps": {"column": "geschw\u00e4ndigkeit", "unit": "m/s"}})
-    mapping.pop("run_id")
-    mapping["terrain"] = "{terrain}"
-    mapping["streams"]["logger"]["file"] = "{terrain}/Fahrt \u00fcber {run}.csv"
-    mapping["streams"]["copy"] = dict(mapping["streams"]["logger"])
-    return mapping
+def test_a_missing_partner_and_an_empty_folder_are_named(tmp_path):
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(MAPPING))
+    assert load_mapping(tmp_path / "map.yaml").terrain == "{class}"
+    with pytest.raises(LogError, match="no file there fits the mapping"):
+        load_runs(tmp_path, mapping=tmp_path / "map.yaml")
+    (tmp_path / "ICE").mkdir()
+    (tmp_path / "ICE" / "imu_01.csv").write_text("t,wz\n0,1\n1,2\n")
+    with pytest.raises(LogError, match=r"ICE/pro_01\.csv: is missing"):
+        load_runs(tmp_path, mapping=tmp_path / "map.yaml")
+
+
+@pytest.fixture
+def per_terrain(tmp_path):
+    """Return what writes a run of a terrain with names of files in a form of Unicode, and the mapping's file."""
+    channels = {"speed_left_mps": {"column": "geschw\u00e4ndigkeit", "unit": "m/s"}}
+    stream = {"file": "{terrain}/Fahrt \u00fcber {run}.csv", "time": TIME, "channels": channels}
+    mapping = {"robot": "husky", "terrain": "{terrain}", "streams": {"logger": stream, "copy": dict(stream)}}
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping))
+
+    def write(terrain, run, form):
+        path = tmp_path / "data" / unicodedata.normalize(form, f"{terrain}/Fahrt \u00fcber {run}.csv")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(unicodedata.normalize(form, "t,geschw\u00e4ndigkeit\n0,1\n1,2\n"), encoding="utf-8")
+        return {"data": tmp_path / "data", "mapping": tmp_path / "map.yaml"}
+
+    return write
 
 
 @pytest.mark.parametrize(
@@ -253,35 +371,28 @@ def per_terrain():
     ],
 )
 @pytest.mark.parametrize("form", ["NFC", "NFD"])
-def test_names_in_any_language_and_form_are_read_imported_and_read_again(tmp_path, save, terrain, form):
+def test_names_in_any_language_and_form_are_read_imported_and_read_again(
+    tmp_path, per_terrain, terrain, form
+):
     """macOS keeps names of files in form D; the mapping is written in form C."""
-    data = tmp_path / "data"
-    for run in ("1", "2"):
-        path = data / unicodedata.normalize(form, f"{terrain}/Fahrt \u00fcber {run}.csv")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(unicodedata.normalize(form, "t,geschw\u00e4ndigkeit\n0,1\n1,2\n"), encoding="utf-8")
-    mapping = save(per_terrain())
-    runs = load_runs(data, mapping=mapping)
+    per_terrain(terrain, "1", form)
+    where = per_terrain(terrain, "2", form)
+    runs = load_runs(where["data"], mapping=where["mapping"])
     assert [run.run_id for run in runs] == [f"{terrain}_1", f"{terrain}_2"]
     assert {run.terrains for run in runs} == {(terrain,)}
-    convert(ConvertSettings(data=data, mapping=mapping, out=tmp_path / "out"))
+    convert(ConvertSettings(**where, out=tmp_path / "out"))
     assert data_digest(load_runs(tmp_path / "out")) == data_digest(runs)
 
 
-def test_one_terrain_in_two_unicode_forms_is_one_terrain(tmp_path, save):
-    for run, form in (("1", "NFC"), ("2", "NFD")):
-        path = tmp_path / unicodedata.normalize(form, f"Fels\u00f6l/Fahrt \u00fcber {run}.csv")
-        path.parent.mkdir(exist_ok=True)
-        path.write_text("t,geschw\u00e4ndigkeit\n0,1\n1,2\n", encoding="utf-8")
-    runs = load_runs(tmp_path, mapping=save(per_terrain()))
+def test_one_terrain_in_two_unicode_forms_or_cases_is_one_terrain(per_terrain):
+    per_terrain("Fels\u00f6l", "1", "NFC")
+    where = per_terrain("Fels\u00f6l", "2", "NFD")
+    runs = load_runs(where["data"], mapping=where["mapping"])
     assert [run.terrains for run in runs] == [("Fels\u00f6l",)] * 2
     assert not any(run.dropped for run in runs)
-
-
-def test_a_terrain_in_upper_and_lower_case_is_one_sentence_or_merged(borealtc_dir):
-    (borealtc_dir / "ICE").rename(borealtc_dir / "Snow")
-    with pytest.raises(LogError, match="'SNOW' and 'Snow' differ in upper and lower case only"):
-        load_runs(borealtc_dir)
-    runs = load_runs(borealtc_dir, repair=True)
-    assert {run.terrains for run in runs} == {("SNOW",)}
+    per_terrain("FELS\u00d6L", "3", "NFC")
+    with pytest.raises(LogError, match="'FELS\u00d6L' and 'Fels\u00f6l' differ in upper and lower case only"):
+        load_runs(where["data"], mapping=where["mapping"])
+    runs = load_runs(where["data"], mapping=where["mapping"], repair=True)
+    assert {run.terrains for run in runs} == {("Fels\u00f6l",)}
     assert sum(run.dropped.get(RESPELT, 0) for run in runs) == 1
