@@ -47,18 +47,11 @@ class Label(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stream:
-    """Samples of one logger: ``values[i]`` was sampled at ``time_s[i]``.
+    """Samples of one logger: ``values[i]`` was sampled at ``time_s[i]``."""
 
-    Parameters
-    ----------
-    time_s : (n,) seconds, strictly increasing
-    values : (n, c) SI units; NaN where a sample is missing
-    channels : c names, each ending in its unit (``gyro_z_radps``)
-    """
-
-    time_s: Array
-    values: Array
-    channels: tuple[str, ...]
+    time_s: Array  #: (n,) seconds, strictly increasing
+    values: Array  #: (n, c) SI units; NaN where a sample is missing
+    channels: tuple[str, ...]  #: c names, each ending in its unit (``gyro_z_radps``)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "time_s", read_only(self.time_s))
@@ -101,30 +94,23 @@ class Stream:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunLog:
-    """One uninterrupted recording of one robot: several streams at their own rates, and its labels.
+    """One uninterrupted recording of one robot: several streams at their own rates, and its labels."""
 
-    Parameters
-    ----------
-    run_id : unique within a data set
-    robot : name of a robot description (``data/robots/<robot>.yaml``)
-    streams : by name: ``imu``, ``wheels``, ``steering``, ``odometry``, ``commands``, ``slip``,
-        ``estimator``, ``truth``
-    labels : terrain intervals; one for the whole run in the simple case, none when unlabelled
-    source : where the log comes from, as text
-    dropped : what a reader removed or changed, as counts by kind; after a strict read no more than signs and
-        axes that were turned, and what the log lacks
-    session : outing that the run is part of, by name: runs of one session share what changes from one to the
-        next, as the weather, the ground and how the sensors were mounted; empty where unknown
-    filter : that made the streams ``estimator``, ``slip`` and ``state``, by name; empty without them
-    """
-
-    run_id: str
-    robot: str
+    run_id: str  #: unique within a data set
+    robot: str  #: name of a robot description (``data/robots/<robot>.yaml``)
+    #: by name: ``imu``, ``wheels``, ``steering``, ``odometry``, ``commands``, ``slip``, ``estimator``,
+    #: ``truth``
     streams: Mapping[str, Stream]
+    #: terrain intervals; one for the whole run in the simple case, none when unlabelled
     labels: tuple[Label, ...] = ()
-    source: str = ""
+    source: str = ""  #: where the log comes from, as text
+    #: what a reader removed or changed, as counts by kind; after a strict read no more than signs and axes
+    #: that were turned, and what the log lacks
     dropped: Mapping[str, int] = field(default_factory=dict)
+    #: outing that the run is part of, by name: runs of one session share what changes from one to the next, as
+    #: the weather, the ground and how the sensors were mounted; empty where unknown
     session: str = ""
+    #: that made the streams ``estimator``, ``slip`` and ``state``, by name; empty without them
     filter: str = ""
 
     def __post_init__(self) -> None:
@@ -168,36 +154,23 @@ class Reading(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What a controller is given at one of its steps.
+    """What a controller is given at one of its steps."""
 
-    Parameters
-    ----------
-    time_s : of the step
-    twist : (3,) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
-    readings : by stream, what arrived since the previous step; a stream without new samples is missing
-    terrain : true terrain under the wheels where it is known, as in a simulation; else empty
-    """
-
-    time_s: float
-    twist: Array
+    time_s: float  #: of the step
+    twist: Array  #: (3,) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``
+    #: by stream, what arrived since the previous step; a stream without new samples is missing
     readings: Mapping[str, Reading]
-    terrain: str = ""
+    terrain: str = ""  #: true terrain under the wheels where it is known, as in a simulation; else empty
 
 
 class Command(NamedTuple):
-    """What a controller commands the wheels to do.
+    """What a controller commands the wheels to do."""
 
-    Parameters
-    ----------
-    wheel_radps, steer_rad : (wheels,)
-    twist : (3,) the part of the desired twist that is driven
-    status : figures of the decision, by name ending in a unit; always the same names
-    """
-
+    #: (wheels,), as ``steer_rad``
     wheel_radps: Array
     steer_rad: Array
-    twist: Array
-    status: Mapping[str, float]
+    twist: Array  #: (3,) the part of the desired twist that is driven
+    status: Mapping[str, float]  #: figures of the decision, by name ending in a unit; always the same names
 
 
 ABSENT, USED, GATED, REOPENED = 0, 1, 2, 3
@@ -206,33 +179,20 @@ ABSENT, USED, GATED, REOPENED = 0, 1, 2, 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateTrack:
-    """State estimate of a filter over time, and how consistent its measurements were with it.
+    """State estimate of a filter over time, and how consistent its measurements were with it."""
 
-    Parameters
-    ----------
-    time_s : (n,) seconds
-    mean : (n, d) state after the measurements of that instant
-    cov : (n, d, d) its covariance
-    states : name of each state, ending in its unit
-    nis : (n, k) squared innovation of each sensor over its covariance; NaN where it gave nothing
-    nis_dof : (n, k) number of measurements in it
-    use : (n, k) :data:`ABSENT`, :data:`USED`, :data:`GATED` or :data:`REOPENED`
-    sensors : name of each of the k sensors
-    reference_age_s : (n,) time since a sensor of speed over ground was last used; infinite before the first
-    log_likelihood : of all measurements that were used
-    dropped : measurements that the filter did not accept, as counts by kind
-    """
-
-    time_s: Array
-    mean: Array
-    cov: Array
-    states: tuple[str, ...]
-    nis: Array
-    nis_dof: Array
-    use: Array
-    sensors: tuple[str, ...]
+    time_s: Array  #: (n,) seconds
+    mean: Array  #: (n, d) state after the measurements of that instant
+    cov: Array  #: (n, d, d) its covariance
+    states: tuple[str, ...]  #: name of each state, ending in its unit
+    nis: Array  #: (n, k) squared innovation of each sensor over its covariance; NaN where it gave nothing
+    nis_dof: Array  #: (n, k) number of measurements in it
+    use: Array  #: (n, k) :data:`ABSENT`, :data:`USED`, :data:`GATED` or :data:`REOPENED`
+    sensors: tuple[str, ...]  #: name of each of the k sensors
+    #: (n,) time since a sensor of speed over ground was last used; infinite before the first
     reference_age_s: Array
-    log_likelihood: float
+    log_likelihood: float  #: of all measurements that were used
+    #: measurements that the filter did not accept, as counts by kind
     dropped: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -259,21 +219,13 @@ class StateTrack:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlipTrack:
-    """Longitudinal slip of each wheel over time; NaN where it is undefined, never a silent 0.
+    """Longitudinal slip of each wheel over time; NaN where it is undefined, never a silent 0."""
 
-    Parameters
-    ----------
-    time_s : (n,) seconds
-    slip_ratio : (n, wheels), positive in traction
-    slip_std : (n, wheels), one standard deviation
-    wheels : name of each wheel
-    stale : (n,) true where the speed over ground was not measured lately; never by default
-    """
-
-    time_s: Array
-    slip_ratio: Array
-    slip_std: Array
-    wheels: tuple[str, ...]
+    time_s: Array  #: (n,) seconds
+    slip_ratio: Array  #: (n, wheels), positive in traction
+    slip_std: Array  #: (n, wheels), one standard deviation
+    wheels: tuple[str, ...]  #: name of each wheel
+    #: (n,) true where the speed over ground was not measured lately; never by default
     stale: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def __post_init__(self) -> None:
@@ -298,25 +250,15 @@ class Windows:
 
     Supports ``len``, ``shape`` and indexing by an integer or boolean array or a slice, so that
     ``cross_validate(recipe, windows, windows.terrain, groups=windows.run_id)`` works.
-
-    Parameters
-    ----------
-    values : per stream ``(n_windows, n_channels, n_samples)``
-    channels : per stream the channel names
-    rate_hz : per stream the sampling rate
-    length_s : nominal length of a window
-    start_s : (n_windows,) start on the clock of the run
-    run_id : (n_windows,) run of each window
-    terrain : (n_windows,) label, ``""`` where there is none
     """
 
-    values: Mapping[str, Array]
-    channels: Mapping[str, tuple[str, ...]]
-    rate_hz: Mapping[str, float]
-    length_s: float
-    start_s: Array
-    run_id: Array
-    terrain: Array
+    values: Mapping[str, Array]  #: per stream ``(n_windows, n_channels, n_samples)``
+    channels: Mapping[str, tuple[str, ...]]  #: per stream the channel names
+    rate_hz: Mapping[str, float]  #: per stream the sampling rate
+    length_s: float  #: nominal length of a window
+    start_s: Array  #: (n_windows,) start on the clock of the run
+    run_id: Array  #: (n_windows,) run of each window
+    terrain: Array  #: (n_windows,) label, ``""`` where there is none
 
     def __post_init__(self) -> None:
         for name in ("values", "channels", "rate_hz"):

@@ -219,19 +219,9 @@ def find_sessions(folder: Path) -> list[Path]:
 def find_runs(folder: Path, robot: DriveRobot) -> list[Callable[..., RunLog]]:
     """Return one reader per command of the sessions in ``folder``; call it with ``repair=``.
 
-    The list is empty when there is none.  The files are read at once, for all runs.  A folder beside sessions
-    that has no log has a reader too: it raises :class:`LogError`.
-
-    Parameters
-    ----------
-    folder : of a session, with the file ``samples.csv.gz``, or of folders of sessions
-    robot : that drove them
-
-    Raises
-    ------
-    LogError
-        if a file is broken or lacks a column, holds a cell that is no number, windows that are not
-        all sampled alike, or wheels that turn faster than the robot's can.
+    The list is empty when there is none.  The files are read at once, for all runs; ``LogError`` where one is broken
+    or lacks a column, holds a cell that is no number, windows that are not all sampled alike, or wheels that turn
+    faster than the robot's can.  A folder beside sessions that has no log has a reader too, which raises it.
     """
     readers: list[Callable[..., RunLog]] = []
     for path in find_sessions(folder):

@@ -126,13 +126,8 @@ def cut_recording(
 
     A run is what follows without a break in one step under the logged command (``step_003``; where an
     operator intervened, so that it was begun anew, ``step_003_2``), or what was driven otherwise, between two
-    times of standing (``hand_000``, ``hand_001``).
-
-    Parameters
-    ----------
-    step, commanded, moving, breaks : (n,) number of the command, and whether the logged command drives, a wheel
-        turns, and samples are lost before a row
-    period_s : from row to row
+    times of standing (``hand_000``, ``hand_001``).  The arrays (n,) are number of the command, and whether the logged
+    command drives, a wheel turns, and samples are lost before a row.
 
     Examples
     --------
@@ -204,10 +199,7 @@ def find_runs(folder: Path, robot_of: Callable[[str], DriveRobot]) -> list[Calla
     The recordings are read at once.  One that cannot be read has a reader too, which raises
     :class:`LogError`; where a repairing read can, its runs' readers raise unless they repair.
 
-    Parameters
-    ----------
-    folder : of recordings, or of such folders, named ``<robot>_<terrain>``; ``LogError`` where a name has no terrain
-    robot_of : the robot of a name; ``ConfigError`` where there is none
+    ``robot_of`` gives the robot of a name, or raises ``ConfigError``.
     """
     readers: list[Callable[..., RunLog]] = []
     for path in find_recordings(folder):

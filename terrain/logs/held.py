@@ -221,11 +221,7 @@ def frame_coefficient(pose: Array, wheels_mps: Array, period_s: float) -> tuple[
 
     Windows whose published heading jumps by a turn within its first samples are left out: their mean is no heading.
 
-    Parameters
-    ----------
-    pose : (n, k, 3) x, y and yaw of n windows, as published
-    wheels_mps : (n, k, 2) circumferential speeds, of which the sign of the mean is used
-    period_s : time from sample to sample
+    ``pose`` is (n, k, 3), as published; of the wheels' circumferential speeds (n, k, 2) the sign of the mean is used.
     """
     new = new_poses(pose)
     scan = usual_wait(new)

@@ -151,18 +151,11 @@ def label_changes(labels: Iterable[Label]) -> list[tuple[float, str]]:
 def set_label(
     data: Path, run_id: str, terrain: str, start_s: float | None = None, end_s: float | None = None
 ) -> ChangedLabels:
-    """Set or remove a label of a run; all else in its ``run.json`` stays.
+    """Set a label of a run, or remove it by an empty terrain; all else in its ``run.json`` stays.
 
-    Parameters
-    ----------
-    data, run_id : a run folder, or a folder of run folders, and the run
-    terrain : of the label; an empty one removes what is there
-    start_s, end_s : of the interval; the whole run, with labels beyond its samples, where neither is given
-
-    Raises
-    ------
-    ConfigError
-        if there is no run of the id, or the interval is outside of it; ``LogError`` where it is damaged.
+    ``data`` is a run folder or has them.  The whole run, with labels beyond its samples, is taken where no interval is
+    given.  ``ConfigError`` where there is no such run, or the interval is outside of it; ``LogError`` where it is
+    damaged.
     """
     folder = folder_of(run_id, labelled_folders(data), data)
     run = read_run(folder, repair=True)

@@ -119,17 +119,8 @@ def local_metres(
 ) -> Array:
     """Return positions (n, 3) in m, east, north and up, by the ellipsoid WGS 84; NaN where one is unknown.
 
-    Parameters
-    ----------
-    latitude_rad, longitude_rad, height_m : (n,) geodetic; an unknown height is that of the origin
-    origin : latitude and longitude in rad, height in m; the first known position by default
-
-    Raises
-    ------
-    LogError
-        if no position is known, or a latitude is beyond a pole.
-    ConfigError
-        if pymap3d is not installed.
+    Latitude, longitude and height (n,) are geodetic; the origin is one of each, the first known position by default,
+    and its height that of what is unknown.  ``LogError`` where no position is known, or a latitude is beyond a pole.
 
     Examples
     --------
@@ -157,18 +148,10 @@ def local_metres(
 def load_mapping(
     path: str | Path, check_messages: Callable[[str, Map[str, Any]], object] | None = None
 ) -> Mapping:
-    """Return the mapping that a YAML file describes.
+    """Return the mapping that a YAML file describes; ``check_messages`` gets place and keys of a stream of messages.
 
-    Parameters
-    ----------
-    path : of the file
-    check_messages : gets the place of a stream of messages, as messages name it, and its description
-
-    Raises
-    ------
-    ConfigError
-        if the file cannot be read, a key is unknown or missing, a unit is unknown or does not suit its
-        channel, or the file patterns do not agree on the words in braces.
+    ``ConfigError`` where the file cannot be read, a key is unknown or missing, a unit is unknown or does not suit its
+    channel, or the file patterns do not agree on the words in braces.
     """
     path = Path(path)
     mapping = accepted(Mapping, read_yaml(path), path.name, ConfigError)
@@ -281,23 +264,11 @@ def read_run(
     by: str = "by a mapping",
     linked_folders: bool = False,
 ) -> RunLog:
-    """Return the run of some files.
+    """Return the run of some files in a folder, which states ``by`` of how it was read.
 
-    Parameters
-    ----------
-    folder, mapping : that the file patterns start from, and as :func:`load_mapping` returns it
-    files : words and files; a stream whose file does not exist is missing there
-    repair : drop and count what a strict read refuses
-    read_messages : reads streams whose files are bags
-    by : what the run states of how it was read
-    linked_folders : whether the folder of a file may be a link that leads elsewhere
-
-    Raises
-    ------
-    LogError
-        if a file is missing, empty or broken, or the streams do not overlap in time.
-    ConfigError
-        if a package is missing, or nothing reads messages here.
+    The folder of a file may be a link that leads elsewhere if that is accepted.  ``LogError`` where a file is missing,
+    empty or broken, or the streams do not overlap in time; ``ConfigError`` where a package is missing, or nothing
+    reads messages here.
     """
     words = files.words
     dropped: Counter[str] = Counter()

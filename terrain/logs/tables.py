@@ -85,22 +85,11 @@ def read_table(
 ) -> Array:
     """Return the named columns of a file as (n, len(columns)) floats, NaN where a cell is missing.
 
-    Parameters
-    ----------
-    path : of a ``.mat``, an ``.xlsx`` or, with any other ending, a CSV file; in this a delimiter too many at the end
-        of each row, or of the header, is passed over
-    columns : names, in the required order
-    layout : of a CSV file or a spreadsheet
-    sheet : of a spreadsheet; the first by default
-    repairs : counts cells that are no number, which become NaN, and rows of the wrong length, which are left out;
-        None refuses both
-
-    Raises
-    ------
-    LogError
-        if the file is missing, empty or damaged, lacks a column or has it twice, or holds what is refused.
-    ConfigError
-        if a package is missing.
+    A ``.mat``, an ``.xlsx`` (the first sheet by default) or, with any other ending, a CSV file; in this a delimiter too
+    many at the end of each row, or of the header, is passed over.  ``repairs`` counts cells that are no number, which
+    become NaN, and rows of the wrong length, which are left out; None refuses both.  ``LogError`` where the file is
+    missing, empty or damaged, lacks a column or has it twice, or holds what is refused; ``ConfigError`` where a package
+    is missing.
     """
     kind = path.suffix.lower()
     if kind == ".mat":

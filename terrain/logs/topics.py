@@ -91,20 +91,13 @@ class Topic(NamedTuple):
 
 
 class MessageKind(NamedTuple):
-    """A type of message that becomes channels of its own.
+    """A type of message that becomes channels of its own."""
 
-    Parameters
-    ----------
-    paths : of its numbers
-    channels : from those (n, k) to channels
-    numbers : from a stream to those (n, k), None where the stream lacks channels; None where none is written
-    fixed : what else is written, by path
-    """
-
-    paths: tuple[str, ...]
-    channels: Callable[[Array], Converted]
+    paths: tuple[str, ...]  #: of its numbers
+    channels: Callable[[Array], Converted]  #: from those (n, k) to channels
+    #: from a stream to those (n, k), None where the stream lacks channels; None where none is written
     numbers: Callable[[Stream], Array | None] | None = None
-    fixed: Mapping[str, Any] = MappingProxyType({})
+    fixed: Mapping[str, Any] = MappingProxyType({})  #: what else is written, by path
 
 
 class Faults:
@@ -184,15 +177,10 @@ class TopicMapping(Strict):
 
 
 def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -> Number:
-    """Return what takes a number from each message of a topic; NaN where one lacks it.
+    """Return what takes a number from each message of a topic, of which ``message`` is one; NaN where one lacks it.
 
-    Parameters
-    ----------
-    topic, kind : name and type, as messages name them
-    message : the first one, which shows what fields there are; without such a field, or a number in it,
-        ``ConfigError`` is raised
-    path : as ``twist.linear.x`` or ``data[2]``; of a joint the array that has its number
-    joint : name that stands for an index: its place in the field ``name``
+    The path is as ``twist.linear.x`` or ``data[2]``, of a joint that of the array that has its number, at its place in
+    the field ``name``.  ``ConfigError`` where the message has no such field, or no number in it.
 
     Examples
     --------
@@ -375,21 +363,9 @@ def _described(topics: Sequence[Topic]) -> str:
 class MappedTopics:
     """The topics of a mapping: takes their messages, each once, and gives the streams that they become.
 
-    Parameters
-    ----------
-    place : of the messages, as errors name it
-    mapping, topics : of the topics, and those that there are, by name
-    kinds : by type of message, those that become channels of their own
-    decoder : returns what makes an object of each message of a topic
-    wheel_radius_m : of the robot; None where unknown
-    faults : gets what is damaged
-
-    Raises
-    ------
-    LogError
-        if there is no such topic, or one of another type.
-    ConfigError
-        if speeds of wheels need a radius that is unknown.
+    ``topics`` are those that there are, by name; ``kinds`` by type of message those that become channels of their own;
+    ``decoder`` returns what makes an object of each message of a topic.  ``LogError`` where there is no such topic, or
+    one of another type; ``ConfigError`` where speeds of wheels need the radius and none is known.
     """
 
     def __init__(
