@@ -18,8 +18,8 @@ take no part.
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -55,59 +55,75 @@ MIN_DISTINCT = 64
 """Values that a stream must have taken for its bytes to identify it."""
 
 
-class Peaks(NamedTuple):
-    """Peaks of all channels of all runs, one after the other; ``spread`` is that of the channel."""
+MIN_CORRELATION = 0.99
+"""Of the heights of two stretches whose order agrees already; copies rounded to a tenth of the standard
+deviation of their channel are above 0.995."""
 
-    run: Array
-    time_s: Array
-    height: Array
-    spread: Array
-    period_s: Array
+MAX_RATE_RATIO = 1.1
+"""Clocks of two copies may run at rates that differ by less than this; those of loggers differ by 4 %."""
+
+MIN_STRETCHES = 3
+"""Fingerprints that must agree in their offset; three are one more peak each, not three times the time."""
+
+MIN_EQUAL = 6
+"""Equal fingerprints without their heights: 21 peaks of one channel, or fewer of several.  Of 10000 runs of
+noise of one kind, some hundred pairs agree in so many by chance."""
+
+OFFSET_TOLERANCE_S = 0.3
+"""Fingerprints of one overlap agree in their offset within this, and a tenth of the time between them."""
+
+MAX_HOLE_S = 15.0
+"""An overlap may lose its fingerprints for so long, as at a standstill, and is one overlap still."""
+
+EDGE_S = 1.5
+"""An overlap that reaches so close to the end of a run reaches its end: the first peaks come later."""
+
+N_FILES = 32
+SPREADING = np.uint64(0x9E3779B97F4A7C15)
+"""2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of
+Computer Programming 3, section 6.4)."""
+
+PEAK = np.dtype([("run", int), ("time_s", float), ("height", float), ("spread", float), ("period_s", float)])
+"""A peak of a channel of a run; ``spread`` is that of the channel."""
+
+PRINT = np.dtype([("code", "<i8"), ("time_s", "<f8"), ("run", "<i4")])
+"""A fingerprint, the time of its first peak, and the run."""
 
 
-def measured_streams(run: RunLog) -> list[tuple[Stream, list[int]]]:
+# -- Fingerprints ---------------------------------------------------------------------------------------------
+
+
+def _measured(run: RunLog) -> list[tuple[Stream, list[int]]]:
     """Return the streams that were measured, with the places of the channels that features are made of."""
-    chosen = []
-    for name, stream in run.streams.items():
-        places = _measured_places(name, tuple(stream.channels))
-        if places and len(stream) > 1:
-            chosen.append((stream, list(places)))
-    return chosen
+    chosen = ((stream, _places(name, tuple(stream.channels))) for name, stream in run.streams.items())
+    return [(stream, list(places)) for stream, places in chosen if places and len(stream) > 1]
 
 
 @lru_cache(maxsize=1024)
-def _measured_places(stream: str, channels: tuple[str, ...]) -> tuple[int, ...]:
+def _places(stream: str, channels: tuple[str, ...]) -> tuple[int, ...]:
     """Return the places of the measured channels of a stream; all runs of a data set ask for the same."""
     return tuple(i for i, each in enumerate(channels) if signal_set_of(stream, each) in MEASURED_SETS)
 
 
-def fingerprints(runs: Sequence[RunLog]) -> tuple[Array, Array, Peaks]:
-    """Return the fingerprints (n,), the place (n,) of their first peak, and all peaks."""
-    parts: list[tuple[Array, ...]] = []
-    codes: list[Array] = []
-    starts: list[Array] = []
+def _fingerprints(runs: Sequence[RunLog]) -> tuple[Array, Array, Array]:
+    """Return the fingerprints (n,), the place (n,) of their first peak, and all peaks, as :data:`PEAK`."""
+    codes, starts, peaks = [np.empty(0, np.int64)], [np.empty(0, int)], [np.empty(0, PEAK)]
     n_peaks = 0
     for number, run in enumerate(runs):
-        for stream, places in measured_streams(run):
-            period_s = 1.0 / stream.rate_hz
+        for stream, places in _measured(run):
             for place in places:
-                smooth = _low_pass(stream.values[:, place], SMOOTHING_S / period_s)
+                smooth = _low_pass(stream.values[:, place], SMOOTHING_S * stream.rate_hz)
                 at = 1 + np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:]))
                 if len(at) < N_PEAKS:
                     continue
-                height = smooth[at]
-                codes.append(_codes(height))
+                own = np.empty(len(at), PEAK)
+                own["run"], own["time_s"], own["height"] = number, stream.time_s[at], smooth[at]
+                own["spread"], own["period_s"] = np.nanstd(smooth), 1.0 / stream.rate_hz
+                codes.append(_codes(own["height"]))
                 starts.append(n_peaks + np.arange(len(codes[-1])))
-                spread = float(np.nanstd(smooth))
-                constant = (np.full(len(at), each) for each in (number, spread, period_s))
-                of_run, of_spread, of_period = constant
-                parts.append((of_run.astype(int), stream.time_s[at], height, of_spread, of_period))
-                n_peaks += len(at)
-    if not parts:
-        nothing = np.empty(0)
-        return np.empty(0, np.int64), np.empty(0, int), Peaks(*[nothing] * 5)
-    peaks = Peaks(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-    return np.concatenate(codes), np.concatenate(starts), peaks
+                peaks.append(own)
+                n_peaks += len(own)
+    return np.concatenate(codes), np.concatenate(starts), np.concatenate(peaks)
 
 
 def _low_pass(values: Array, std_samples: float) -> Array:
@@ -134,8 +150,9 @@ def _codes(height: Array) -> Array:
     return codes
 
 
-def scaled_heights(height: Array, spread: Array) -> tuple[Array, Array]:
-    """Return heights (m, N_PEAKS) less their mean over their norm, and where (m,) they vary enough."""
+def _scaled_heights(peaks: Array) -> tuple[Array, Array]:
+    """Return heights of peaks (m, N_PEAKS) less their mean over their norm, and where (m,) they vary enough."""
+    height, spread = peaks["height"], peaks["spread"][:, 0]
     centred = height - height.mean(axis=1, keepdims=True)
     norm = np.sqrt(np.einsum("ij,ij->i", centred, centred))
     varies = norm > MIN_SPREAD_RATIO * spread * np.sqrt(N_PEAKS)
@@ -145,12 +162,11 @@ def scaled_heights(height: Array, spread: Array) -> tuple[Array, Array]:
     return centred / np.where(norm > 0.0, norm, 1.0)[:, None], varies
 
 
-def samples_digest(run: RunLog) -> bytes:
+def _digest(run: RunLog) -> bytes:
     """Return what identifies the samples of the fastest measured stream; empty where they may repeat."""
-    measured = measured_streams(run)
-    if not measured:
+    stream, places = max(_measured(run), key=lambda each: each[0].rate_hz, default=(None, []))
+    if stream is None:
         return b""
-    stream, places = max(measured, key=lambda each: each[0].rate_hz)
     with np.errstate(over="ignore"):
         values = stream.values[:, places].astype(np.float32)
     if max(len(np.unique(column)) for column in values.T) < min(MIN_DISTINCT, len(values)):
@@ -158,68 +174,18 @@ def samples_digest(run: RunLog) -> bytes:
     return hashlib.blake2b(np.ascontiguousarray(values + np.float32(0.0)).tobytes()).digest()
 
 
-class RunPrint(NamedTuple):
-    """What of a run shows whether another one may hold a stretch of it.
-
-    Parameters
-    ----------
-    codes, time_s : (n,) fingerprints of peaks whose heights vary, and the times of their first peaks
-    digest : of the fastest stream; empty where its samples may repeat
-    """
-
-    codes: Array
-    time_s: Array
-    digest: bytes
+def _same_digests(digests: Iterable[bytes]) -> list[tuple[int, int]]:
+    """Return the places of the first and of each later one of equal digests."""
+    seen: dict[bytes, int] = {}
+    pairs = [(seen.setdefault(digest, i), i) for i, digest in enumerate(digests) if digest]
+    return [(first, i) for first, i in pairs if first != i]
 
 
-def run_print(run: RunLog) -> RunPrint:
-    """Return the fingerprints of a run."""
-    codes, start, peaks = fingerprints([run])
-    if len(codes):
-        varies = scaled_heights(peaks.height[start[:, None] + np.arange(N_PEAKS)], peaks.spread[start])[1]
-        codes, start = codes[varies], start[varies]
-    return RunPrint(codes, peaks.time_s[start], samples_digest(run))
-
-
-MIN_CORRELATION = 0.99
-"""Of the heights of two stretches whose order agrees already; copies rounded to a tenth of the standard
-deviation of their channel are above 0.995."""
-
-MAX_RATE_RATIO = 1.1
-"""Clocks of two copies may run at rates that differ by less than this; those of loggers differ by 4 %."""
-
-MIN_STRETCHES = 3
-"""Fingerprints that must agree in their offset; three are one more peak each, not three times the time."""
-
-MIN_EQUAL = 6
-"""Equal fingerprints without their heights: 21 peaks of one channel, or fewer of several.  Of 10000 runs of
-noise of one kind, some hundred pairs agree in so many by chance."""
-
-OFFSET_TOLERANCE_S = 0.3
-"""Fingerprints of one overlap agree in their offset within this, and a tenth of the time between them."""
-
-MAX_HOLE_S = 15.0
-"""An overlap may lose its fingerprints for so long, as at a standstill, and is one overlap still."""
-
-EDGE_S = 1.5
-"""An overlap that reaches so close to the end of a run reaches its end: the first peaks come later."""
-
-N_FILES = 32
-RECORD = np.dtype([("code", "<i8"), ("time_s", "<f8"), ("run", "<i4")])
-SPREADING = np.uint64(0x9E3779B97F4A7C15)
-"""2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of
-Computer Programming 3, section 6.4)."""
+# -- Stretches that two runs share ----------------------------------------------------------------------------
 
 
 class SharedStretch(NamedTuple):
-    """A stretch of one run that another run holds as well, each on its own clock.
-
-    Parameters
-    ----------
-    first, second : run ids, in the order of the runs
-    first_start_s, first_end_s : of the stretch in the first run
-    second_start_s, second_end_s : of the stretch in the second run
-    """
+    """A stretch of one run that another run holds as well, each on its own clock; in the order of the runs."""
 
     first: str
     second: str
@@ -230,25 +196,12 @@ class SharedStretch(NamedTuple):
 
     def of(self, run_id: str) -> tuple[float, float]:
         """Return start and end of the stretch on the clock of one of the two runs."""
-        if run_id == self.first:
-            return self.first_start_s, self.first_end_s
-        return self.second_start_s, self.second_end_s
+        return self[2:4] if run_id == self.first else self[4:]
 
     @property
     def duration_s(self) -> float:
         """Length of the stretch on the clock of the first run."""
         return self.first_end_s - self.first_start_s
-
-
-class _Matches(NamedTuple):
-    """Stretches (m,) of two runs whose peaks agree."""
-
-    first: Array
-    second: Array
-    first_start_s: Array
-    first_end_s: Array
-    second_start_s: Array
-    second_end_s: Array
 
 
 def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
@@ -271,111 +224,98 @@ def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
     >>> found.first, found.second, round(found.first_start_s), round(found.second_start_s)
     ('a', 'b', 10, 100)
     """
-    found = [
-        stretch
-        for (first, second), rows in _by_pair(_matches(*fingerprints(runs))).items()
-        for stretch in _stretches(rows, runs[first], runs[second])
-    ]
-    known = {(stretch.first, stretch.second) for stretch in found}
-    found += [stretch for stretch in _same_bytes(runs) if (stretch.first, stretch.second) not in known]
-    return tuple(sorted(found, key=lambda stretch: (stretch.first, stretch.second, stretch.first_start_s)))
+    pairs, times_s = _matches(*_fingerprints(runs))
+    found, known = [], set()
+    for first, second in dict.fromkeys(map(tuple, pairs.tolist())):
+        rows = times_s[(pairs == (first, second)).all(axis=1)]
+        stretches = _stretches(rows, runs[first], runs[second])
+        found += stretches
+        known |= {(first, second)} if stretches else set()
+    for first, second in _same_digests(map(_digest, runs)):
+        if (first, second) not in known:
+            ids = runs[first].run_id, runs[second].run_id
+            found.append(SharedStretch(*ids, *_span(runs[first]), *_span(runs[second])))
+    return tuple(sorted(found))
 
 
-def _matches(codes: Array, start: Array, peaks: Peaks) -> _Matches:
-    """Return where two runs have one fingerprint, and heights and times of its peaks agree."""
+def _matches(codes: Array, start: Array, peaks: Array) -> tuple[Array, Array]:
+    """Return where two runs have one fingerprint, and heights and times of its peaks agree, in order of time.
+
+    Returned are the places of both runs (m, 2), and start and end of the peaks in the first and in the second (m, 4).
+    """
     order = np.argsort(codes, kind="stable")
     codes, start = codes[order], start[order]
-    same = np.flatnonzero((codes[1:] == codes[:-1]) & (peaks.run[start[1:]] != peaks.run[start[:-1]]))
-    a, b = start[same], start[same + 1]  # stable: the run of a comes before that of b
-    rows = np.arange(N_PEAKS)
-    heights = [peaks.height[each[:, None] + rows] for each in (a, b)]
-    times_s = [peaks.time_s[each[:, None] + rows] for each in (a, b)]
-    agree = _heights_agree(heights, [peaks.spread[each] for each in (a, b)])
-    agree &= _times_agree(times_s, np.maximum(peaks.period_s[a], peaks.period_s[b]))
-    (of_a, of_b), a, b = (each[agree] for each in times_s), a[agree], b[agree]
-    return _Matches(peaks.run[a], peaks.run[b], of_a[:, 0], of_a[:, -1], of_b[:, 0], of_b[:, -1])
-
-
-def _heights_agree(heights: Sequence[Array], spreads: Sequence[Array]) -> Array:
-    """Return where heights (m, N_PEAKS) of both runs are one another's up to offset and factor."""
-    (a, a_varies), (b, b_varies) = map(scaled_heights, heights, spreads)
-    return np.asarray(a_varies & b_varies & (np.einsum("ij,ij->i", a, b) > MIN_CORRELATION))
-
-
-def _times_agree(times_s: Sequence[Array], period_s: Array) -> Array:
-    """Return where times (m, N_PEAKS) of both runs differ by an offset and a rate, within two samples."""
-    of_a, of_b = (each - each[:, :1] for each in times_s)
-    rate = of_b[:, -1] / of_a[:, -1]
-    near = np.abs(of_b - rate[:, None] * of_a).max(axis=1) <= 2.0 * period_s
-    return np.asarray(near & (rate < MAX_RATE_RATIO) & (rate > 1.0 / MAX_RATE_RATIO))
-
-
-def _by_pair(matches: _Matches) -> dict[tuple[int, int], Array]:
-    """Return the matched stretches (m, 4) of each pair of runs in order of time."""
-    pairs: dict[tuple[int, int], list[Array]] = defaultdict(list)
-    times_s = np.column_stack(matches[2:])
-    for first, second, row in zip(
-        matches.first.astype(int).tolist(), matches.second.astype(int).tolist(), times_s, strict=True
-    ):
-        pairs[first, second].append(row)
-    return {
-        pair: np.array(rows)[np.argsort(np.array(rows)[:, 0], kind="stable")]
-        for pair, rows in sorted(pairs.items())
-        if len(rows) >= MIN_STRETCHES
-    }
+    same = np.flatnonzero((codes[1:] == codes[:-1]) & (peaks["run"][start[1:]] != peaks["run"][start[:-1]]))
+    # stable: the run of a comes before that of b
+    a, b = (peaks[start[at][:, None] + np.arange(N_PEAKS)] for at in (same, same + 1))
+    (of_a, a_varies), (of_b, b_varies) = _scaled_heights(a), _scaled_heights(b)
+    agree = a_varies & b_varies & (np.einsum("ij,ij->i", of_a, of_b) > MIN_CORRELATION)
+    since_a, since_b = (each["time_s"] - each["time_s"][:, :1] for each in (a, b))
+    rate = since_b[:, -1] / since_a[:, -1]  # times differ by an offset and a rate, within two samples
+    off_s = np.abs(since_b - rate[:, None] * since_a).max(axis=1)
+    agree &= off_s <= 2.0 * np.maximum(a["period_s"], b["period_s"])[:, 0]
+    agree &= (rate < MAX_RATE_RATIO) & (rate > 1.0 / MAX_RATE_RATIO)
+    a, b = a[agree], b[agree]
+    pairs = np.column_stack([a["run"][:, 0], b["run"][:, 0]])
+    times_s = np.column_stack([each["time_s"][:, i] for each in (a, b) for i in (0, -1)])
+    order = np.lexsort((times_s[:, 0], pairs[:, 1], pairs[:, 0]))
+    return pairs[order], times_s[order]
 
 
 def _stretches(rows: Array, first: RunLog, second: RunLog) -> list[SharedStretch]:
-    """Join matched stretches (m, 4) with one offset between two clocks."""
+    """Join matches (m, 4) with one offset between two clocks, up to the end of a run that is near."""
     offset_s = rows[:, 2] - rows[:, 0]
     joined: list[list[int]] = []
     for number in range(len(rows)):
         for members in joined:
-            last = members[-1]
-            apart_s = rows[number, 0] - rows[last, 1]
+            apart_s = rows[number, 0] - rows[members[-1], 1]
             drift_s = OFFSET_TOLERANCE_S + 0.1 * max(apart_s, 0.0)
-            if apart_s <= MAX_HOLE_S and abs(offset_s[number] - offset_s[last]) <= drift_s:
+            if apart_s <= MAX_HOLE_S and abs(offset_s[number] - offset_s[members[-1]]) <= drift_s:
                 members.append(number)
                 break
         else:
             joined.append([number])
-    return [_widened(rows[members], first, second) for members in joined if len(members) >= MIN_STRETCHES]
+    stretches = []
+    (begin_a, end_a), (begin_b, end_b) = _span(first), _span(second)
+    for members in joined:
+        if len(members) >= MIN_STRETCHES:
+            start_a, _, start_b, _ = rows[members].min(axis=0).tolist()
+            _, stop_a, _, stop_b = rows[members].max(axis=0).tolist()
+            margins_s = min(start_a - begin_a, start_b - begin_b), min(end_a - stop_a, end_b - stop_b)
+            before_s, after_s = (each if 0.0 < each <= EDGE_S else 0.0 for each in margins_s)
+            own = start_a - before_s, stop_a + after_s, start_b - before_s, stop_b + after_s
+            stretches.append(SharedStretch(first.run_id, second.run_id, *own))
+    return stretches
 
 
-def _widened(rows: Array, first: RunLog, second: RunLog) -> SharedStretch:
-    """Return the stretch that matches cover, up to the end of a run that is near."""
-    begin_a, begin_b = float(rows[:, 0].min()), float(rows[:, 2].min())
-    end_a, end_b = float(rows[:, 1].max()), float(rows[:, 3].max())
-    before_s = min(begin_a - _begin_s(first), begin_b - _begin_s(second))
-    after_s = min(_end_s(first) - end_a, _end_s(second) - end_b)
-    before_s, after_s = (each if 0.0 < each <= EDGE_S else 0.0 for each in (before_s, after_s))
-    return SharedStretch(
-        first.run_id, second.run_id,
-        begin_a - before_s, end_a + after_s, begin_b - before_s, end_b + after_s,
-    )  # fmt: skip
+def _span(run: RunLog) -> tuple[float, float]:
+    """Return the first and the last time of what was measured."""
+    streams = [stream for stream, _ in _measured(run)]
+    return min(float(s.time_s[0]) for s in streams), max(float(s.time_s[-1]) for s in streams)
 
 
-def _begin_s(run: RunLog) -> float:
-    return min(float(stream.time_s[0]) for stream, _ in measured_streams(run))
+# -- Many runs: fingerprints in files -------------------------------------------------------------------------
 
 
-def _end_s(run: RunLog) -> float:
-    return max(float(stream.time_s[-1]) for stream, _ in measured_streams(run))
+class RunPrint(NamedTuple):
+    """What of a run shows whether another one may hold a stretch of it.
+
+    Parameters
+    ----------
+    codes, time_s : (n,) fingerprints of peaks whose heights vary, and the times of their first peaks
+    digest : of the fastest stream; empty where its samples may repeat
+    """
+
+    codes: Array
+    time_s: Array
+    digest: bytes
 
 
-def _same_bytes(runs: Sequence[RunLog]) -> list[SharedStretch]:
-    """Return runs whose fastest measured stream is the same, however short it is."""
-    seen: dict[bytes, RunLog] = {}
-    found = []
-    for run in runs:
-        digest = samples_digest(run)
-        if digest and (first := seen.setdefault(digest, run)) is not run:
-            found.append(
-                SharedStretch(
-                    first.run_id, run.run_id, _begin_s(first), _end_s(first), _begin_s(run), _end_s(run)
-                )
-            )
-    return found
+def run_print(run: RunLog) -> RunPrint:
+    """Return the fingerprints of a run."""
+    codes, start, peaks = _fingerprints([run])
+    varies = _scaled_heights(peaks[start[:, None] + np.arange(N_PEAKS)])[1]
+    return RunPrint(codes[varies], peaks["time_s"][start[varies]], _digest(run))
 
 
 class PrintFiles:
@@ -406,7 +346,7 @@ class PrintFiles:
 
     def add(self, prints: RunPrint) -> None:
         """Take the fingerprints of the next run."""
-        records = np.empty(len(prints.codes), RECORD)
+        records = np.empty(len(prints.codes), PRINT)
         records["code"], records["time_s"], records["run"] = prints.codes, prints.time_s, len(self._digests)
         self._digests.append(prints.digest)
         number = (prints.codes.astype(np.uint64) * SPREADING) // np.uint64(2**64 // N_FILES)
@@ -421,7 +361,7 @@ class PrintFiles:
         found = []
         for file in self._files:
             file.seek(0)
-            records = np.frombuffer(file.read(), RECORD)
+            records = np.frombuffer(file.read(), PRINT)
             records = records[np.argsort(records["code"], kind="stable")]
             one, next_ = records[:-1], records[1:]
             same = (one["code"] == next_["code"]) & (one["run"] != next_["run"])
@@ -434,27 +374,10 @@ class PrintFiles:
         near = offset_s[b] - offset_s[a] <= (MIN_EQUAL - 1) * (OFFSET_TOLERANCE_S + 0.1 * MAX_HOLE_S)
         near &= (first[a] == first[b]) & (second[a] == second[b])
         pairs = set(zip(first[a][near].tolist(), second[a][near].tolist(), strict=True))
-        seen: dict[bytes, int] = {}
-        for place, digest in enumerate(self._digests):
-            if digest and (before := seen.setdefault(digest, place)) != place:
-                pairs.add((before, place))
-        return sorted(pairs)
+        return sorted(pairs.union(_same_digests(self._digests)))
 
 
-def groups_of(stretches: Sequence[SharedStretch]) -> tuple[tuple[str, ...], ...]:
-    """Return the ids of runs that are linked by shared stretches, at least two a group, sorted.
-
-    Examples
-    --------
-    >>> groups_of([SharedStretch("a", "c", 0, 9, 0, 9), SharedStretch("c", "d", 0, 9, 0, 9)])
-    (('a', 'c', 'd'),)
-    """
-    group: dict[str, set[str]] = {}
-    for stretch in stretches:
-        joined = group.get(stretch.first, {stretch.first}) | group.get(stretch.second, {stretch.second})
-        group |= dict.fromkeys(joined, joined)
-    return tuple(sorted({tuple(sorted(members)) for members in group.values()}))
-
+# -- One run of those that share a stretch --------------------------------------------------------------------
 
 PART_GAP_S = 1.0
 """Between two parts of a merged run; far longer than the gaps that a window may have."""
@@ -464,9 +387,6 @@ LABEL_MARGIN_S = 2.0
 
 MAX_SHOWN = 3
 """Pairs that a refusal names."""
-
-Part = tuple[RunLog, float, float]
-"""A run, and start and end of what is kept of it."""
 
 
 class DistinctRuns(NamedTuple):
@@ -492,7 +412,7 @@ def distinct_runs(runs: Sequence[RunLog], *, merge: bool) -> DistinctRuns:
     found = shared_stretches(runs)
     if not found:
         return DistinctRuns(list(runs))
-    refuse_other_labels(runs, found)
+    _refuse_other_labels(runs, found)
     if not merge:
         raise DataError(
             f"{'; '.join(sentences(found))}: held out, they would be recognised and not classified; remove "
@@ -519,6 +439,21 @@ def sentences(found: Sequence[SharedStretch]) -> list[str]:
     return shown
 
 
+def groups_of(stretches: Sequence[SharedStretch]) -> tuple[tuple[str, ...], ...]:
+    """Return the ids of runs that are linked by shared stretches, at least two a group, sorted.
+
+    Examples
+    --------
+    >>> groups_of([SharedStretch("a", "c", 0, 9, 0, 9), SharedStretch("c", "d", 0, 9, 0, 9)])
+    (('a', 'c', 'd'),)
+    """
+    group: dict[str, set[str]] = {}
+    for stretch in stretches:
+        joined = group.get(stretch.first, {stretch.first}) | group.get(stretch.second, {stretch.second})
+        group |= dict.fromkeys(joined, joined)
+    return tuple(sorted({tuple(sorted(members)) for members in group.values()}))
+
+
 def merge_runs(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> list[RunLog]:
     """Return runs of which no two share a stretch.
 
@@ -543,52 +478,39 @@ def merge_runs(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> li
     >>> [run.run_id for run in merge_runs([a, b], [SharedStretch("a", "b", 0.0, 3.0, 0.0, 3.0)])]
     ['a']
     """
-    refuse_other_labels(runs, stretches)
-    by_id = {run.run_id: run for run in runs}
-    merged: dict[str, RunLog] = {}
-    absorbed: set[str] = set()
+    _refuse_other_labels(runs, stretches)
+    merged = {run.run_id: run for run in runs}
     for group in groups_of(stretches):
-        in_order = [run for run in runs if run.run_id in group]
-        members = sorted(in_order, key=lambda run: not run.labels)  # stable: labelled runs first
-        first = members[0]
-        parts: list[Part] = []
+        members = sorted((run for run in runs if run.run_id in group), key=lambda run: not run.labels)
+        parts = []  # a stable order: labelled runs first
         for number, run in enumerate(members[1:], 1):
-            before = {earlier.run_id for earlier in members[:number]}
-            taken = [
-                stretch.of(run.run_id)
-                for stretch in stretches
-                if run.run_id in (stretch.first, stretch.second)
-                and (stretch.first in before or stretch.second in before)
-            ]
-            parts += [(run, *span) for span in _complement(run, taken)]
-        merged[first.run_id] = _join(first, parts)
-        absorbed |= set(group) - {first.run_id}
-    return [merged.get(run_id, run) for run_id, run in by_id.items() if run_id not in absorbed]
+            earlier = {other.run_id for other in members[:number]}
+            own = [each for each in stretches if run.run_id in each[:2] and earlier.intersection(each[:2])]
+            parts += [(run, *span) for span in _complement(run, [each.of(run.run_id) for each in own])]
+            del merged[run.run_id]
+        merged[members[0].run_id] = _join(members[0], parts)
+    return list(merged.values())
 
 
-def refuse_other_labels(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> None:
+def _refuse_other_labels(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> None:
     """Refuse runs that hold the same measurements under different labels."""
     by_id = {run.run_id: run for run in runs}
     for stretch in stretches:
-        first, second = (
-            _terrains(by_id[name], *stretch.of(name)) for name in (stretch.first, stretch.second)
-        )
-        if first and second and first != second:
+        labels = []
+        for name in (stretch.first, stretch.second):
+            start_s, end_s = stretch.of(name)
+            margin_s = min(LABEL_MARGIN_S, (end_s - start_s) / 4)
+            inside = [
+                label.terrain
+                for label in by_id[name].labels
+                if label.start_s < end_s - margin_s and label.end_s > start_s + margin_s
+            ]
+            labels.append(list(dict.fromkeys(inside)))
+        if all(labels) and labels[0] != labels[1]:
             raise DataError(
                 f"runs {stretch.first} and {stretch.second} hold the same measurements under the labels "
-                f"{' and '.join(first)} and {' and '.join(second)}: correct one, or remove a run"
+                f"{' and '.join(labels[0])} and {' and '.join(labels[1])}: correct one, or remove a run"
             )
-
-
-def _terrains(run: RunLog, start_s: float, end_s: float) -> tuple[str, ...]:
-    """Return the labels inside of a stretch."""
-    margin_s = min(LABEL_MARGIN_S, (end_s - start_s) / 4)
-    inside = [
-        label.terrain
-        for label in run.labels
-        if label.start_s < end_s - margin_s and label.end_s > start_s + margin_s
-    ]
-    return tuple(dict.fromkeys(inside))
 
 
 def _complement(run: RunLog, taken: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -604,17 +526,13 @@ def _complement(run: RunLog, taken: Sequence[tuple[float, float]]) -> list[tuple
     return spans
 
 
-def _join(first: RunLog, parts: Sequence[Part]) -> RunLog:
-    """Return a run followed by parts of others."""
-    if not parts:
-        return first
-    times_s = {name: [stream.time_s] for name, stream in first.streams.items()}
-    values = {name: [stream.values] for name, stream in first.streams.items()}
-    labels = list(first.labels)
-    end_s = max(float(stream.time_s[-1]) for stream in first.streams.values())
+def _join(first: RunLog, parts: Sequence[tuple[RunLog, float, float]]) -> RunLog:
+    """Return a run followed by parts of others, each a run with start and end of what is kept of it."""
+    streams, labels = dict(first.streams), list(first.labels)
+    end_s = max(float(stream.time_s[-1]) for stream in streams.values())
     for run, start_s, stop_s in parts:
         shift_s = end_s + PART_GAP_S - start_s
-        for name, stream in first.streams.items():
+        for name, stream in streams.items():
             other = run.streams.get(name)
             if other is None or set(other.channels) != set(stream.channels):
                 raise DataError(
@@ -623,19 +541,13 @@ def _join(first: RunLog, parts: Sequence[Part]) -> RunLog:
                 )
             inside = (other.time_s >= start_s) & (other.time_s < stop_s)
             order = [other.channels.index(channel) for channel in stream.channels]
-            times_s[name].append(other.time_s[inside] + shift_s)
-            values[name].append(other.values[inside][:, order])
+            time_s = np.concatenate([stream.time_s, other.time_s[inside] + shift_s])
+            values = np.concatenate([stream.values, other.values[inside][:, order]])
+            streams[name] = Stream(time_s, values, stream.channels)
         labels += [
             Label(max(each.start_s, start_s) + shift_s, min(each.end_s, stop_s) + shift_s, each.terrain)
             for each in run.labels
             if each.start_s < stop_s and each.end_s > start_s
         ]
         end_s = shift_s + stop_s
-    streams = {
-        name: Stream(np.concatenate(times_s[name]), np.concatenate(values[name]), stream.channels)
-        for name, stream in first.streams.items()
-    }
-    return RunLog(
-        first.run_id, first.robot, streams, tuple(labels), first.source, first.dropped, first.session,
-        first.filter,
-    )  # fmt: skip
+    return replace(first, streams=streams, labels=tuple(labels))

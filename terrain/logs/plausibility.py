@@ -8,7 +8,8 @@ Gyro and wheels of a robot with two sides agree by ``w = k (v_right - v_left)``;
 which skidding makes 1 to 2.6 times the nominal one, and more where wheels dig in.  A gyro in degrees makes k 57
 times as large, a sign that is turned makes it negative.
 
-Thresholds were chosen so that no measured run of four robots is implausible (BorealTC, Vulpi, DRIVE), and
+A respect in which a run is judged is a table of cases, from the first of which that holds it has its level and its
+sentence.  Thresholds were chosen so that no measured run of four robots is implausible (BorealTC, Vulpi, DRIVE), and
 that the usual mistakes are: a factor of 9.81, 57.3, 3.6, 1000, a turned sign or axis.
 
 :func:`stream_quality` states what shape a stream is in: rate, gaps, jitter, stuck channels, missing values.
@@ -22,6 +23,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +35,6 @@ from terrain.logs.clock import yaw_rate_pair
 from terrain.logs.samples import BEYOND, MAX_MAGNITUDE
 from terrain.logs.schema import NO_FEATURES, signal_set_of, unit_of
 from terrain.records import Array, RunLog, Stream
-from terrain.signals import Pair
 
 GAP_PERIODS = 1.5
 """An interval of this many median periods has lost at least one sample."""
@@ -53,9 +54,8 @@ IMU_QUANTITIES = ("gyro", "accel")
 class StreamQuality(NamedTuple):
     """Sampling of a stream and the quality of its channels.
 
-    A gap is an interval of more than ``GAP_PERIODS`` median periods.  ``longest_gap_s`` is 0 and
-    ``longest_gap_at_s`` NaN where there is none.  ``jitter_s`` is the standard deviation of the other
-    intervals.  ``stuck`` names channels; missing samples and the longest stretch of one value are by channel.
+    ``longest_gap_s`` is 0 and ``longest_gap_at_s`` NaN where there is no gap; ``jitter_s`` is the standard deviation
+    of the other intervals; missing samples and the longest stretch of one value are by channel.
     """
 
     n: int
@@ -152,6 +152,9 @@ class Level(StrEnum):
     IMPLAUSIBLE = "implausible"
 
 
+OK, UNKNOWN, DOUBTFUL, IMPLAUSIBLE = Level
+
+
 class Check(NamedTuple):
     """One respect in which a run was judged.
 
@@ -172,99 +175,119 @@ class Check(NamedTuple):
     sentence: str
 
 
-FEATURE_UNITS: dict[str, str] = {
-    "gyro": "radps",
-    "accel": "mps2",
-    "speed": "mps",
-    "current": "a",
-}
-"""Unit of each quantity that features are made of by name."""
+class Scale(NamedTuple):
+    """What is known of the robot: nominal track, NaN where unknown, and top speed, infinite where unknown."""
+
+    track_m: float = math.nan
+    speed_max_mps: float = math.inf
 
 
-OTHER_QUANTITIES: tuple[str, ...] = (
-    *("motor", "angle", "roll", "pitch", "yaw", "voltage", "position", "velocity", "quaternion", "rate"),
-    *("std", "fix", "confidence", "torque", "temperature", "wheel", "steer", "status", "force", "load"),
-    *(
-        "sinkage",
-        "slip",
-        "traction",
-        "side",
-        "normal",
-        "heading",
-        "power",
-        "pressure",
-        "magnetic",
-        "height",
-        "tick",
-        "pulse",
-    ),
-)
-"""Quantities that logs have and no feature is made of."""
+UNKNOWN_ROBOT = Scale()
 
-AXES = ("x", "y", "z")
+MIN_SAMPLES = 5
+"""Fewer show no rate."""
 
-NEAR = 0.75
-"""Similarity (:mod:`difflib`) from which a name is taken for a misspelt one: two letters that changed places
-in ``gyor`` make 0.75, and no two known quantities are nearer than 0.67."""
+Case = tuple[bool | np.bool_, Level, str]
+"""Whether it holds, how plausible a run is then, and why."""
 
 
-def check_names(name: str, stream: Stream) -> list[Check]:
-    """Return what is odd about the names of a stream's channels; one ok where nothing is.
+def _first(check: str, place: str, measured: float, *cases: Case) -> Check:
+    """Return a check by the first case that holds."""
+    level, sentence = next((level, sentence) for holds, level, sentence in cases if holds)
+    return Check(check, level, place, measured, sentence)
+
+
+def judge(run: RunLog, scale: Scale = UNKNOWN_ROBOT) -> tuple[Check, ...]:
+    """Return the verdict on a run in each respect; several of one where several apply.
+
+    Parameters
+    ----------
+    run : as a reader returns it
+    scale : what is known of the robot
 
     Examples
     --------
-    >>> [check] = check_names("imu", Stream([0.0, 1.0], [[0.0], [0.0]], ("gyor_z_radps",)))
-    >>> check.sentence
-    "channel 'gyor_z_radps' of stream 'imu': no feature is made of 'gyor'; is it 'gyro_z_radps'?"
+    An accelerometer in g:
+
+    >>> accel = Stream(0.01 * np.arange(300), np.tile([0.0, 0.0, 1.0], (300, 1)),
+    ...                ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2"))
+    >>> [check.sentence for check in judge(RunLog("a", "husky", {"imu": accel})) if check.check == "gravity"]
+    ['gravity: the mean specific force is 1 m/s^2, 9.81 is expected: an accelerometer in g read as m/s^2?']
     """
-    if name in NO_FEATURES or name in ("estimator", "slip"):
-        return [_check(Level.OK, name, f"stream {name!r}: no feature is made of its channels by name")]
-    found = [check for channel in stream.channels if (check := _odd(name, channel)) is not None]
-    return found or [_check(Level.OK, name, f"stream {name!r}: all quantities are known")]
+    streams = {  # without values that no quantity can have, which one check is about
+        name: Stream(s.time_s, np.where(np.abs(s.values) > MAX_MAGNITUDE, np.nan, s.values), s.channels)
+        for name, s in run.streams.items()
+    }
+    known = replace(run, streams=streams)
+    checks = [_gravity(known), _turns(known, scale), _speeds(known, scale)]
+    for name, stream in run.streams.items():
+        checks += [_sampling(name, stream), *check_names(name, stream)]
+    return (*checks, *_values(run), *_constants(known), _overlap(run))
 
 
-def _odd(stream: str, channel: str) -> Check | None:
-    quantity, _, rest = channel.partition("_")
-    place = f"channel {channel!r} of stream {stream!r}"
-    known = tuple(dict.fromkeys((*FEATURE_UNITS, *OTHER_QUANTITIES)))
-    if quantity not in known:
-        near = difflib.get_close_matches(quantity, known, 1, NEAR)
-        if near:
-            return _check(
-                Level.IMPLAUSIBLE if near[0] in FEATURE_UNITS else Level.DOUBTFUL,
-                channel,
-                f"{place}: no feature is made of {quantity!r}; is it {f'{near[0]}_{rest}'!r}?",
-            )
-        of_features = ", ".join(FEATURE_UNITS)
-        return _check(
-            Level.DOUBTFUL,
-            channel,
-            f"{place}: no feature is made of {quantity!r} (features are made of {of_features})",
-        )
-    if signal_set_of(stream, channel) is None or quantity not in FEATURE_UNITS:
-        return None
-    try:
-        unit = unit_of(channel)
-    except LogError as error:
-        return _check(Level.DOUBTFUL, channel, str(error))
-    expected = FEATURE_UNITS[quantity]
-    if unit != expected:
-        return _check(
-            Level.IMPLAUSIBLE if quantity in IMU_QUANTITIES else Level.DOUBTFUL,
-            channel,
-            f"{place}: {quantity} is in {unit!r}, {expected!r} is expected (a name ends in its unit)",
-        )
-    axis = rest.rpartition("_")[0]
-    if quantity in IMU_QUANTITIES and axis not in AXES:
-        return _check(
-            Level.DOUBTFUL, channel, f"{place}: {axis!r} is no axis, one of {', '.join(AXES)} is expected"
-        )
-    return None
+# -- Gravity: what an accelerometer measures on Earth ---------------------------------------------------------
+
+GRAVITY_RATIO = (0.9, 1.1)
+"""Mean specific force over gravity: scale errors of cheap accelerometers are 3 %, and over 6 s of rough
+driving measured runs reach 0.93 to 1.085."""
+
+IMPLAUSIBLE_GRAVITY_RATIO = (0.8, 1.2)
+"""Beyond, no driving explains it: the mean acceleration of a run is that of its change of speed."""
+
+NO_GRAVITY_RATIO = 0.2
+"""Less is an accelerometer without gravity, as some fusing IMUs report it: of use for vibration, not for
+tilt, so that it is doubtful."""
+
+UPRIGHT_RATIO = 0.9
+"""Least part of the mean specific force along z, a tilt of 26 degrees; measured runs reach 0.97."""
+
+TILTED_RATIO = 0.7
+"""Less is a tilt of 45 degrees: another axis points up."""
+
+MIN_GRAVITY_S = 1.0
+"""Over shorter runs a brake is as large as gravity."""
 
 
-def _check(level: Level, place: str, sentence: str) -> Check:
-    return Check("channel names", level, place, math.nan, sentence)
+def _gravity(run: RunLog) -> Check:
+    stream, names = run.streams.get("imu"), [f"accel_{axis}_mps2" for axis in AXES]
+    judged = partial(_first, "gravity", "imu")
+    if stream is None or not set(names) <= set(stream.channels):
+        return judged(math.nan, (True, UNKNOWN, "gravity: the run has no accelerometer of three axes"))
+    values = np.column_stack([stream.channel(name) for name in names])
+    finite = np.isfinite(values).all(axis=1)
+    if finite.sum() < MIN_SAMPLES or np.ptp(stream.time_s[finite]) < MIN_GRAVITY_S:
+        few = f"gravity: fewer than {MIN_GRAVITY_S:g} s of the accelerometer"
+        return judged(math.nan, (True, UNKNOWN, few))
+    mean = values[finite].mean(axis=0)
+    size = float(np.linalg.norm(mean))
+    ratio, near = size / GRAVITY_MPS2, 1.0 - IMPLAUSIBLE_GRAVITY_RATIO[0]
+    upright = float(mean[2] / size) if size else math.nan
+    force = f"gravity: the mean specific force is {size:.3g} m/s^2"
+    measured, along = f"{force}, {GRAVITY_MPS2:.3g} is expected", ", ".join(f"{part:.3g}" for part in mean)
+    axes = f"gravity: it is ({along}) m/s^2 along x, y and z, mostly along +z is expected"
+    return judged(
+        size,
+        (abs(size - 1.0) <= near, IMPLAUSIBLE, f"{measured}: an accelerometer in g read as m/s^2?"),
+        (abs(ratio / GRAVITY_MPS2 - 1.0) <= near, IMPLAUSIBLE, f"{measured}: one in m/s^2 read as g?"),
+        (ratio < NO_GRAVITY_RATIO, DOUBTFUL, f"{measured}: gravity removed?"),
+        (
+            not _within(ratio, IMPLAUSIBLE_GRAVITY_RATIO),
+            IMPLAUSIBLE,
+            f"{measured}: another unit, or a scale?",
+        ),
+        (upright < -TILTED_RATIO, IMPLAUSIBLE, f"{axes}: z points down?"),
+        (upright < TILTED_RATIO, IMPLAUSIBLE, f"{axes}: another axis points up?"),
+        (upright < UPRIGHT_RATIO, DOUBTFUL, f"{axes}: a tilted sensor, or a steep slope?"),
+        (not _within(ratio, GRAVITY_RATIO), DOUBTFUL, f"{measured}: a wrong scale, or an offset?"),
+        (True, OK, f"{force}, along z"),
+    )
 
+
+def _within(value: float, bounds: tuple[float, float]) -> bool:
+    return bounds[0] <= value <= bounds[1]
+
+
+# -- Yaw rate: the gyro beside the turn of a left and a right wheel -------------------------------------------
 
 MAX_SHIFT_S = 1.5
 """Two loggers that were started by hand are apart by up to this on the published runs."""
@@ -288,6 +311,54 @@ to 1.0; two of 200 dig in and hardly turn (0.03, 0.05), so that less is doubtful
 MAX_IMPLAUSIBLE_TURN_RATIO = 8.0
 """Nothing turns a robot faster than its wheels by so much; degrees make it 20 to 60."""
 
+
+def _turns(run: RunLog, scale: Scale) -> Check:
+    """Return how the gyro's yaw rate agrees with the turn of a left and a right wheel."""
+    judged, described = partial(_first, "yaw rate", "gyro_z_radps"), math.isfinite(scale.track_m)
+    try:
+        found = yaw_rate_pair(run, scale.track_m if described else 1.0)
+    except DataError:
+        return judged(
+            math.nan, (True, UNKNOWN, "yaw rate: no gyro about z, or no left and right wheel speed")
+        )
+    if found is None:
+        return judged(math.nan, (True, UNKNOWN, "yaw rate: too few samples of gyro and wheels together"))
+    fits = []  # likeness at a shift, slope of the gyro over the wheels, and the larger of both rates
+    for shift_s in np.linspace(-MAX_SHIFT_S, MAX_SHIFT_S, N_SHIFTS):
+        gyro = found[0].at(found[0].time_s + shift_s)
+        there = np.isfinite(gyro)
+        gyro, wheels = gyro[there], found[0].measured[there]
+        power = float(gyro @ gyro), float(wheels @ wheels)
+        if there.sum() >= max(MIN_YAW_RATES, 0.5 * there.size) and min(power) > 0.0:
+            product = float(gyro @ wheels)
+            rate_radps = math.sqrt(max(power) / len(gyro))
+            fits.append((product / math.sqrt(power[0] * power[1]), product / power[1], rate_radps))
+    if not fits:
+        return judged(math.nan, (True, UNKNOWN, "yaw rate: gyro and wheels hardly overlap"))
+    likeness, ratio, rate_radps = max(fits, key=lambda fit: abs(fit[0]))
+    other = max(-math.copysign(1.0, likeness) * fit[0] for fit in fits)
+    if rate_radps < MIN_TURN_RADPS or abs(likeness) < MIN_LIKENESS or other > MAX_OTHER_LIKENESS:
+        none = f"yaw rate: gyro and wheels show no turns in common (likeness {likeness:.2f} of 1)"
+        return judged(likeness, (True, UNKNOWN, none))
+    measured = (
+        f"yaw rate: the gyro shows {ratio:.3g} times the yaw rate of the wheels (likeness {likeness:.2f} of 1)"
+        if described
+        else f"yaw rate: the gyro shows {ratio:.3g} rad/s for each m/s between the sides"
+    )
+    low, high = TURN_RATIO
+    odd = f"{measured}, {low:g} to {high:g} is expected"
+    return judged(
+        ratio,
+        (likeness < 0.0, IMPLAUSIBLE, f"{odd}: turned sign of the gyro, or sides swapped"),
+        (ratio > MAX_IMPLAUSIBLE_TURN_RATIO, IMPLAUSIBLE, f"{odd}: a gyro in deg/s read as rad/s?"),
+        (ratio < low, DOUBTFUL, f"{odd}: wheels that dig in, or in rad/s or km/h read as m/s?"),
+        (ratio > high, DOUBTFUL, f"{odd}: another track?"),
+        (True, OK, measured),
+    )
+
+
+# -- Wheel speed: what a robot reaches ------------------------------------------------------------------------
+
 MAX_SPEED_MPS = (12.0, 50.0)
 """Of off-road robots without a described top speed; from the first on doubtful, then implausible."""
 
@@ -298,149 +369,38 @@ gear may explain; in rad/s 3.3 (a wheel of 0.3 m) to 6."""
 SPEED_QUANTILE = 0.99
 
 
-class Scale(NamedTuple):
-    """What is known of the robot.
-
-    Parameters
-    ----------
-    track_m : nominal; NaN where unknown
-    speed_max_mps : described top speed; infinite where unknown
-    """
-
-    track_m: float = math.nan
-    speed_max_mps: float = math.inf
-
-
-def check_turns(run: RunLog, scale: Scale) -> Check:
-    """Return how the gyro's yaw rate agrees with the turn of a left and a right wheel."""
-    place = "gyro_z_radps"
-
-    def check(level: Level, measured: float, sentence: str) -> Check:
-        return Check("yaw rate", level, place, measured, sentence)
-
-    track_m = scale.track_m if math.isfinite(scale.track_m) else 1.0
-    try:
-        found = yaw_rate_pair(run, track_m)
-    except DataError:
-        return check(Level.UNKNOWN, math.nan, "yaw rate: no gyro about z, or no left and right wheel speed")
-    if found is None:
-        return check(Level.UNKNOWN, math.nan, "yaw rate: too few samples of gyro and wheels together")
-    fits = [
-        fit for shift in np.linspace(-MAX_SHIFT_S, MAX_SHIFT_S, N_SHIFTS) for fit in _fit(found[0], shift)
-    ]
-    if not fits:
-        return check(Level.UNKNOWN, math.nan, "yaw rate: gyro and wheels hardly overlap")
-    best = max(fits, key=lambda fit: abs(fit.likeness))
-    r, ratio = best.likeness, best.ratio
-    other = max(-math.copysign(1.0, r) * fit.likeness for fit in fits)
-    if best.turn_radps < MIN_TURN_RADPS or abs(r) < MIN_LIKENESS or other > MAX_OTHER_LIKENESS:
-        return check(
-            Level.UNKNOWN, r, f"yaw rate: gyro and wheels show no turns in common (likeness {r:.2f} of 1)"
-        )
-    measured = (
-        f"yaw rate: the gyro shows {ratio:.3g} times the yaw rate of the wheels (likeness {r:.2f} of 1)"
-        if math.isfinite(scale.track_m)
-        else f"yaw rate: the gyro shows {ratio:.3g} rad/s for each m/s between the sides"
-    )
-    low, high = TURN_RATIO
-    expected = f"{low:g} to {high:g} is expected"
-    if r < 0.0:
-        return check(
-            Level.IMPLAUSIBLE, ratio, f"{measured}, {expected}: turned sign of the gyro, or sides swapped"
-        )
-    if ratio > MAX_IMPLAUSIBLE_TURN_RATIO:
-        return check(Level.IMPLAUSIBLE, ratio, f"{measured}, {expected}: a gyro in deg/s read as rad/s?")
-    if not low <= ratio <= high:
-        why = "wheels that dig in, or in rad/s or km/h read as m/s?" if ratio < low else "another track?"
-        return check(Level.DOUBTFUL, ratio, f"{measured}, {expected}: {why}")
-    return check(Level.OK, ratio, measured)
-
-
-class _Fit(NamedTuple):
-    """How alike both yaw rates are at a shift, slope of the gyro's over the wheels', and the larger one."""
-
-    likeness: float
-    ratio: float
-    turn_radps: float
-
-
-def _fit(pair: Pair, shift_s: float) -> list[_Fit]:
-    """Return the fit at a shift; none where less than half of the run overlaps."""
-    gyro = pair.at(pair.time_s + shift_s)
-    there = np.isfinite(gyro)
-    if there.sum() < max(MIN_YAW_RATES, 0.5 * there.size):
-        return []
-    gyro, wheels = gyro[there], pair.measured[there]
-    sizes = float(gyro @ gyro), float(wheels @ wheels)
-    if min(sizes) == 0.0:
-        return []
-    product = float(gyro @ wheels)
-    turn_radps = math.sqrt(max(sizes) / len(gyro))
-    return [_Fit(product / math.sqrt(sizes[0] * sizes[1]), product / sizes[1], turn_radps)]
-
-
-def check_speeds(run: RunLog, scale: Scale) -> Check:
-    """Return whether the wheel speeds are ones that a robot reaches."""
-
-    def check(level: Level, measured: float, sentence: str) -> Check:
-        return Check("wheel speed", level, "wheels", measured, sentence)
-
-    speeds = _wheel_speeds(run)
+def _speeds(run: RunLog, scale: Scale) -> Check:
+    judged, stream = partial(_first, "wheel speed", "wheels"), run.streams.get("wheels")
+    speeds = np.empty(0)
+    if stream is not None:
+        speeds = stream.values[:, [name.startswith("speed_") for name in stream.channels]]
+        speeds = np.abs(speeds[np.isfinite(speeds)])
     if not speeds.size:
-        return check(Level.UNKNOWN, math.nan, "wheel speed: the run has none")
-    fast = float(np.quantile(np.abs(speeds), SPEED_QUANTILE))
-    described = math.isfinite(scale.speed_max_mps)
-    low, high = (factor * scale.speed_max_mps for factor in MAX_OVERSPEED) if described else MAX_SPEED_MPS
-    of_robot = (
-        f"the robot's top speed is {scale.speed_max_mps:.3g} m/s" if described else f"up to {low:g} m/s"
-    )
+        return judged(math.nan, (True, UNKNOWN, "wheel speed: the run has none"))
+    fast = float(np.quantile(speeds, SPEED_QUANTILE))
+    low, high = MAX_SPEED_MPS
+    expected = f"up to {low:g} m/s is expected"
+    if math.isfinite(scale.speed_max_mps):
+        low, high = (factor * scale.speed_max_mps for factor in MAX_OVERSPEED)
+        expected = f"the robot's top speed is {scale.speed_max_mps:.3g} m/s"
     measured = f"wheel speed: {fast:.3g} m/s ({SPEED_QUANTILE:.0%} of the samples are slower)"
-    if fast > low:
-        level = Level.IMPLAUSIBLE if fast > high else Level.DOUBTFUL
-        why = "" if described else " is expected"
-        return check(level, fast, f"{measured}, {of_robot}{why}: rad/s or km/h read as m/s?")
-    if fast == 0.0:
-        return check(Level.UNKNOWN, fast, "wheel speed: the wheels never turn")
-    return check(Level.OK, fast, measured)
+    odd = f"{measured}, {expected}: rad/s or km/h read as m/s?"
+    return judged(
+        fast,
+        (fast > max(low, high), IMPLAUSIBLE, odd),
+        (fast > low, DOUBTFUL, odd),
+        (fast == 0.0, UNKNOWN, "wheel speed: the wheels never turn"),
+        (True, OK, measured),
+    )
 
 
-def _wheel_speeds(run: RunLog) -> Array:
-    stream = run.streams.get("wheels")
-    if stream is None:
-        return np.zeros(0)
-    columns = [i for i, name in enumerate(stream.channels) if name.startswith("speed_")]
-    values = stream.values[:, columns].ravel()
-    return np.asarray(values[np.isfinite(values)])
-
-
-GRAVITY_RATIO = (0.9, 1.1)
-"""Mean specific force over gravity: scale errors of cheap accelerometers are 3 %, and over 6 s of rough
-driving measured runs reach 0.93 to 1.085."""
-
-IMPLAUSIBLE_GRAVITY_RATIO = (0.8, 1.2)
-"""Beyond, no driving explains it: the mean acceleration of a run is that of its change of speed."""
-
-NO_GRAVITY_RATIO = 0.2
-"""Less is an accelerometer without gravity, as some fusing IMUs report it: of use for vibration, not for
-tilt, so that it is doubtful."""
-
-UPRIGHT_RATIO = 0.9
-"""Least part of the mean specific force along z, a tilt of 26 degrees; measured runs reach 0.97."""
-
-TILTED_RATIO = 0.7
-"""Less is a tilt of 45 degrees: another axis points up."""
-
-MIN_GRAVITY_S = 1.0
-"""Over shorter runs a brake is as large as gravity."""
+# -- Sampling, names, values, constants, overlap --------------------------------------------------------------
 
 RATE_HZ = (0.5, 1e4)
 """Of any sensor of a vehicle; milliseconds read as seconds make 10 Hz 0.01 Hz, the reverse 10 kHz."""
 
 DURATION_S = (0.5, 2 * 24 * 3600.0)
 """Of a run: shorter holds nothing to classify, longer than two nights is no single recording."""
-
-MIN_SAMPLES = 5
-"""Fewer show no rate."""
 
 DOUBTFUL_VALUES: dict[str, float] = {"gyro": 70.0, "accel": 400.0, "current": 1000.0, "speed": 50.0}
 """Largest magnitudes, in SI units, that sensors of a vehicle report: gyros to 4000 deg/s, accelerometers to
@@ -454,39 +414,163 @@ MIN_OVERLAP_RATIO = (0.5, 0.1)
 published runs reach 0.9."""
 
 
-MAX_NAMED = 3
-"""A sentence that concerns many runs is written for so many, and counted for the others."""
+def _sampling(name: str, stream: Stream) -> Check:
+    rate_hz, duration_s = stream.rate_hz, stream.duration_s
+    place, n = f"sampling of stream {name!r}", len(stream)
+    slow_fast = ("ms read as s?", "s read as ms?")
+    rate = f"{place}: {rate_hz:.3g} Hz, {RATE_HZ[0]:g} Hz to {RATE_HZ[1] / 1e3:g} kHz is expected"
+    length = (
+        f"{place}: {duration_s:.3g} s long, {DURATION_S[0]:g} s to {DURATION_S[1] / 3600:g} h is expected"
+    )
+    slow = DOUBTFUL if name in NO_FEATURES else IMPLAUSIBLE
+    long = n >= MIN_SAMPLES and _within(rate_hz, RATE_HZ) and not _within(duration_s, DURATION_S)
+    return _first(
+        "sampling",
+        name,
+        duration_s if long else rate_hz,
+        (n < MIN_SAMPLES, UNKNOWN, f"{place}: {n} samples show no rate"),
+        (rate_hz < RATE_HZ[0], slow, f"{rate}: {slow_fast[0]}"),
+        (rate_hz > RATE_HZ[1], IMPLAUSIBLE, f"{rate}: {slow_fast[1]}"),
+        (duration_s < DURATION_S[0], DOUBTFUL, f"{length}: {slow_fast[1]}"),
+        (duration_s > DURATION_S[1], DOUBTFUL, f"{length}: {slow_fast[0]}"),
+        (True, OK, f"{place}: {rate_hz:.3g} Hz over {duration_s:.3g} s"),
+    )
 
-UNKNOWN_ROBOT = Scale()
-"""Nothing is known of the robot."""
+
+FEATURE_UNITS: dict[str, str] = {"gyro": "radps", "accel": "mps2", "speed": "mps", "current": "a"}
+"""Unit of each quantity that features are made of by name."""
+
+OTHER_QUANTITIES = (
+    "motor angle roll pitch yaw voltage position velocity quaternion rate std fix confidence torque temperature "
+    "wheel steer status force load sinkage slip traction side normal heading power pressure magnetic height tick pulse"
+)
+"""Quantities that logs have and no feature is made of."""
+
+AXES = ("x", "y", "z")
+
+NEAR = 0.75
+"""Similarity (:mod:`difflib`) from which a name is taken for a misspelt one: two letters that changed places
+in ``gyor`` make 0.75, and no two known quantities are nearer than 0.67."""
 
 
-def judge(run: RunLog, scale: Scale = UNKNOWN_ROBOT) -> tuple[Check, ...]:
-    """Return the verdict on a run in each respect; several of one where several apply.
-
-    Parameters
-    ----------
-    run : as a reader returns it
-    scale : what is known of the robot
+def check_names(name: str, stream: Stream) -> list[Check]:
+    """Return what is odd about the names of a stream's channels; one ok where nothing is.
 
     Examples
     --------
-    An accelerometer in g:
-
-    >>> accel = Stream(0.01 * np.arange(300), np.tile([0.0, 0.0, 1.0], (300, 1)),
-    ...                ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2"))
-    >>> [check.sentence for check in judge(RunLog("a", "husky", {"imu": accel})) if check.check == "gravity"]
-    ['gravity: the mean specific force is 1 m/s^2, 9.81 is expected: an accelerometer in g read as m/s^2?']
+    >>> [check] = check_names("imu", Stream([0.0, 1.0], [[0.0], [0.0]], ("gyor_z_radps",)))
+    >>> check.sentence
+    "channel 'gyor_z_radps' of stream 'imu': no feature is made of 'gyor'; is it 'gyro_z_radps'?"
     """
-    known = _within_bounds(run)
-    checks: list[Check] = [_gravity(known), check_turns(known, scale), check_speeds(known, scale)]
+    sound = f"stream {name!r}: all quantities are known"
+    if name in NO_FEATURES or name in ("estimator", "slip"):
+        checks, sound = [], f"stream {name!r}: no feature is made of its channels by name"
+    else:
+        checks = [_named(name, channel) for channel in stream.channels]
+    odd = [check for check in checks if check.level is not OK]
+    return odd or [Check("channel names", OK, name, math.nan, sound)]
+
+
+def _named(stream: str, channel: str) -> Check:
+    quantity, _, rest = channel.partition("_")
+    place, known = f"channel {channel!r} of stream {stream!r}", (*FEATURE_UNITS, *OTHER_QUANTITIES.split())
+    near = "" if quantity in known else next(iter(difflib.get_close_matches(quantity, known, 1, NEAR)), "")
+    other = f"{place}: no feature is made of {quantity!r}"
+    unit, expected, fault = "", FEATURE_UNITS.get(quantity, ""), ""
+    features = signal_set_of(stream, channel) is not None and bool(expected)
+    if features:
+        try:
+            unit = unit_of(channel)
+        except LogError as error:
+            fault = str(error)
+    of_imu, axis = quantity in IMU_QUANTITIES, rest.rpartition("_")[0]
+    wrong = f"{place}: {quantity} is in {unit!r}, {expected!r} is expected (a name ends in its unit)"
+    return _first(
+        "channel names",
+        channel,
+        math.nan,
+        (near in FEATURE_UNITS, IMPLAUSIBLE, f"{other}; is it {f'{near}_{rest}'!r}?"),
+        (bool(near), DOUBTFUL, f"{other}; is it {f'{near}_{rest}'!r}?"),
+        (quantity not in known, DOUBTFUL, f"{other} (features are made of {', '.join(FEATURE_UNITS)})"),
+        (bool(fault), DOUBTFUL, fault),
+        (features and unit != expected, IMPLAUSIBLE if of_imu else DOUBTFUL, wrong),
+        (
+            features and of_imu and axis not in AXES,
+            *(DOUBTFUL, f"{place}: {axis!r} is no axis, one of {', '.join(AXES)} is expected"),
+        ),
+        (True, OK, ""),
+    )
+
+
+def _values(run: RunLog) -> list[Check]:
+    checks = []
     for name, stream in run.streams.items():
-        checks.append(_sampling(name, stream))
-        checks += check_names(name, stream)
-    checks += _values(run)
-    checks += _constants(known)
-    checks.append(_overlap(run))
-    return tuple(checks)
+        largest = np.nanmax(np.abs(stream.values), axis=0, initial=0.0)
+        for channel, value in zip(stream.channels, largest.tolist(), strict=True):
+            place = f"channel {channel!r} of stream {name!r}: reaches"
+            most = DOUBTFUL_VALUES.get(channel.partition("_")[0], math.inf)
+            much = value > most and signal_set_of(name, channel) is not None
+            cases = (
+                (value > MAX_MAGNITUDE, IMPLAUSIBLE, f"{place} {value:.6g}; {BEYOND}"),
+                (much, DOUBTFUL, f"{place} {value:.4g} in its SI unit, up to {most:g} is expected"),
+                (True, OK, ""),
+            )
+            checks.append(_first("values", channel, value, *cases))
+    sound = Check("values", OK, "all", math.nan, "values: all are such as sensors of a vehicle report")
+    return [check for check in checks if check.level is not OK] or [sound]
+
+
+def _constants(run: RunLog) -> list[Check]:
+    """Return channels that are constant while another one of their signals varies, or the wheels turn."""
+    still: dict[tuple[str, str, str], bool] = {}
+    for name, stream in run.streams.items():
+        if len(stream) < MIN_SAMPLES or stream.duration_s < MIN_CONSTANT_S:
+            continue
+        for channel, values in zip(stream.channels, stream.values.T, strict=True):
+            if (signals := signal_set_of(name, channel)) in ("imu", "wheels", "currents"):
+                finite = values[np.isfinite(values)]
+                still[name, channel, str(signals)] = not finite.size or not np.ptp(finite)
+    varying = {(name, signals) for (name, _, signals), constant in still.items() if not constant}
+    turning = any(signals == "wheels" for _, signals in varying)
+    checks = []
+    for (name, channel, signals), constant in still.items():
+        if constant and ((name, signals) in varying or (turning and signals == "imu")):
+            value = float(run.streams[name].channel(channel)[0])
+            is_still = f"channel {channel!r} of stream {name!r}: is {value:.4g} throughout"
+            why = f"{is_still}; a sensor that works varies"
+            checks.append(Check("constant channels", DOUBTFUL, channel, value, why))
+    what = "none is" if varying else "there is none to judge"
+    level = OK if varying else UNKNOWN
+    return checks or [Check("constant channels", level, "all", math.nan, f"constant channels: {what}")]
+
+
+def _overlap(run: RunLog) -> Check:
+    streams = {name: stream for name, stream in run.streams.items() if name not in NO_FEATURES}
+    longest_s = max((stream.duration_s for stream in streams.values()), default=0.0)
+    ratio = math.nan
+    if len(streams) > 1 and longest_s > 0.0:
+        start_s = max(stream.time_s[0] for stream in streams.values())
+        ratio = max(float(min(stream.time_s[-1] for stream in streams.values()) - start_s), 0.0) / longest_s
+    measured = f"overlap: {100 * ratio:.0f} % of the longest stream lie in all ({', '.join(streams)})"
+    doubtful, implausible = MIN_OVERLAP_RATIO
+    expected = f"{measured}, {100 * doubtful:.0f} % is expected"
+    odd = f"{expected}: other units of time, or loggers that were started apart?"
+    return _first(
+        "overlap",
+        "all",
+        ratio,
+        (len(streams) < 2, UNKNOWN, "overlap: there is one stream of sensors"),
+        (math.isnan(ratio), UNKNOWN, "overlap: the streams have no duration"),
+        (ratio < implausible, IMPLAUSIBLE, odd),
+        (ratio < doubtful, DOUBTFUL, odd),
+        (True, OK, measured),
+    )
+
+
+# -- What of it is said of many runs --------------------------------------------------------------------------
+
+MAX_NAMED = 3
+"""A sentence that concerns many runs is written for so many, and counted for the others."""
 
 
 def worst(checks: Sequence[Check]) -> Level:
@@ -497,8 +581,8 @@ def worst(checks: Sequence[Check]) -> Level:
     >>> worst([Check("gravity", Level.OK, "imu", 9.8, ""), Check("yaw rate", Level.UNKNOWN, "imu", 0.0, "")])
     <Level.OK: 'ok'>
     """
-    order = (Level.UNKNOWN, Level.OK, Level.DOUBTFUL, Level.IMPLAUSIBLE)
-    return max((check.level for check in checks), key=order.index, default=Level.UNKNOWN)
+    order = (UNKNOWN, OK, DOUBTFUL, IMPLAUSIBLE)
+    return max((check.level for check in checks), key=order.index, default=UNKNOWN)
 
 
 class Doubt(NamedTuple):
@@ -510,10 +594,8 @@ class Doubt(NamedTuple):
 
 def doubts_of(verdicts: Mapping[str, Sequence[Check]]) -> tuple[Doubt, ...]:
     """Return what is doubtful or implausible in the checks of runs, by their id."""
-    odd = (Level.DOUBTFUL, Level.IMPLAUSIBLE)
-    return tuple(
-        Doubt(run_id, check) for run_id, checks in verdicts.items() for check in checks if check.level in odd
-    )
+    doubts = (Doubt(run_id, check) for run_id, checks in verdicts.items() for check in checks)
+    return tuple(doubt for doubt in doubts if doubt.check.level in (DOUBTFUL, IMPLAUSIBLE))
 
 
 def refuse_implausible_runs(doubts: Sequence[Doubt]) -> None:
@@ -538,166 +620,11 @@ def counted(run: RunLog, checks: Sequence[Check]) -> RunLog:
 def doubt_sentences(doubts: Sequence[Doubt]) -> Iterator[str]:
     """Yield a sentence a doubt; where one check concerns many runs, some of them and their number."""
     seen: Counter[tuple[str, str, Level]] = Counter()
-    kinds = [(doubt.check.check, doubt.check.place, doubt.check.level) for doubt in doubts]
-    for doubt, kind in zip(doubts, kinds, strict=True):
+    for run_id, check in doubts:
+        kind = (check.check, check.place, check.level)
         seen[kind] += 1
         if seen[kind] <= MAX_NAMED:
-            yield f"{doubt.run_id}: {doubt.check.level} {doubt.check.sentence}"
-    for (check, place, level), n in Counter(kinds).items():
+            yield f"{run_id}: {check.level} {check.sentence}"
+    for (name, place, level), n in seen.items():
         if n > MAX_NAMED:
-            yield f"{n - MAX_NAMED} more runs: {level} {check} ({place})"
-
-
-def _within_bounds(run: RunLog) -> RunLog:
-    """Return the run with NaN for values that no quantity can have, which one check is about."""
-    streams = dict(run.streams)
-    for name, stream in streams.items():
-        beyond = np.abs(stream.values) > MAX_MAGNITUDE
-        if beyond.any():
-            streams[name] = Stream(stream.time_s, np.where(beyond, np.nan, stream.values), stream.channels)
-    return replace(run, streams=streams)
-
-
-def _gravity(run: RunLog) -> Check:
-    def check(level: Level, measured: float, sentence: str) -> Check:
-        return Check("gravity", level, "imu", measured, f"gravity: {sentence}")
-
-    stream = run.streams.get("imu")
-    names = tuple(f"accel_{axis}_mps2" for axis in "xyz")
-    if stream is None or not set(names) <= set(stream.channels):
-        return check(Level.UNKNOWN, math.nan, "the run has no accelerometer of three axes")
-    values = np.column_stack([stream.channel(name) for name in names])
-    finite = np.isfinite(values).all(axis=1)
-    if finite.sum() < MIN_SAMPLES or np.ptp(stream.time_s[finite]) < MIN_GRAVITY_S:
-        return check(Level.UNKNOWN, math.nan, f"fewer than {MIN_GRAVITY_S:g} s of the accelerometer")
-    values = values[finite]
-    mean = values.mean(axis=0)
-    size = float(np.linalg.norm(mean))
-    measured = f"the mean specific force is {size:.3g} m/s^2, {GRAVITY_MPS2:.3g} is expected"
-    ratio = size / GRAVITY_MPS2
-    low, high = IMPLAUSIBLE_GRAVITY_RATIO
-    if abs(ratio * GRAVITY_MPS2 - 1.0) <= 1.0 - low:
-        return check(Level.IMPLAUSIBLE, size, f"{measured}: an accelerometer in g read as m/s^2?")
-    if abs(size / GRAVITY_MPS2**2 - 1.0) <= 1.0 - low:
-        return check(Level.IMPLAUSIBLE, size, f"{measured}: one in m/s^2 read as g?")
-    if ratio < NO_GRAVITY_RATIO:
-        return check(Level.DOUBTFUL, size, f"{measured}: gravity removed?")
-    if not low <= ratio <= high:
-        return check(Level.IMPLAUSIBLE, size, f"{measured}: another unit, or a scale?")
-    upright = float(mean[2] / size)
-    along = ", ".join(f"{part:.3g}" for part in mean)
-    expected = f"it is ({along}) m/s^2 along x, y and z, mostly along +z is expected"
-    if upright < TILTED_RATIO:
-        why = "z points down?" if upright < -TILTED_RATIO else "another axis points up?"
-        return check(Level.IMPLAUSIBLE, size, f"{expected}: {why}")
-    if upright < UPRIGHT_RATIO:
-        return check(Level.DOUBTFUL, size, f"{expected}: a tilted sensor, or a steep slope?")
-    if not GRAVITY_RATIO[0] <= ratio <= GRAVITY_RATIO[1]:
-        return check(Level.DOUBTFUL, size, f"{measured}: a wrong scale, or an offset?")
-    return check(Level.OK, size, f"the mean specific force is {size:.3g} m/s^2, along z")
-
-
-def _sampling(name: str, stream: Stream) -> Check:
-    def check(level: Level, measured: float, sentence: str) -> Check:
-        return Check("sampling", level, name, measured, f"sampling of stream {name!r}: {sentence}")
-
-    rate_hz, duration_s = stream.rate_hz, stream.duration_s
-    if len(stream) < MIN_SAMPLES:
-        return check(Level.UNKNOWN, rate_hz, f"{len(stream)} samples show no rate")
-    low, high = RATE_HZ
-    if not low <= rate_hz <= high:
-        level = Level.DOUBTFUL if name in NO_FEATURES and rate_hz < low else Level.IMPLAUSIBLE
-        why = "ms read as s?" if rate_hz < low else "s read as ms?"
-        return check(level, rate_hz, f"{rate_hz:.3g} Hz, {low:g} Hz to {high / 1e3:g} kHz is expected: {why}")
-    if not DURATION_S[0] <= duration_s <= DURATION_S[1]:
-        why = "s read as ms?" if duration_s < DURATION_S[0] else "ms read as s?"
-        return check(
-            Level.DOUBTFUL,
-            duration_s,
-            f"{duration_s:.3g} s long, {DURATION_S[0]:g} s to {DURATION_S[1] / 3600:g} h is expected: {why}",
-        )
-    return check(Level.OK, rate_hz, f"{rate_hz:.3g} Hz over {duration_s:.3g} s")
-
-
-def _values(run: RunLog) -> Iterator[Check]:
-    n_odd = 0
-    for name, stream in run.streams.items():
-        largest = np.nanmax(np.abs(stream.values), axis=0, initial=0.0)
-        for channel, value in zip(stream.channels, largest, strict=True):
-            place = f"channel {channel!r} of stream {name!r}"
-            of_quantity = DOUBTFUL_VALUES.get(channel.partition("_")[0], math.inf)
-            if value > MAX_MAGNITUDE:
-                n_odd += 1
-                yield Check(
-                    "values",
-                    Level.IMPLAUSIBLE,
-                    channel,
-                    float(value),
-                    f"{place}: reaches {value:.6g}; {BEYOND}",
-                )
-            elif value > of_quantity and signal_set_of(name, channel) is not None:
-                n_odd += 1
-                yield Check(
-                    "values",
-                    Level.DOUBTFUL,
-                    channel,
-                    float(value),
-                    f"{place}: reaches {value:.4g} in its SI unit, up to {of_quantity:g} is expected",
-                )
-    if not n_odd:
-        yield Check(
-            "values", Level.OK, "all", math.nan, "values: all are such as sensors of a vehicle report"
-        )
-
-
-def _constants(run: RunLog) -> Iterator[Check]:
-    """Yield channels that are constant while another one of their signals varies, or the wheels turn."""
-    still: dict[tuple[str, str], bool] = {}
-    for name, stream in run.streams.items():
-        if len(stream) < MIN_SAMPLES or stream.duration_s < MIN_CONSTANT_S:
-            continue
-        for channel, values in zip(stream.channels, stream.values.T, strict=True):
-            if signal_set_of(name, channel) in ("imu", "wheels", "currents"):
-                finite = values[np.isfinite(values)]
-                still[name, channel] = not finite.size or not np.ptp(finite)
-    varying = {
-        (name, signal_set_of(name, channel)) for (name, channel), constant in still.items() if not constant
-    }
-    turning = any(signals == "wheels" for _, signals in varying)
-    n_odd = 0
-    for (name, channel), constant in still.items():
-        signals = signal_set_of(name, channel)
-        if constant and ((name, signals) in varying or (turning and signals == "imu")):
-            n_odd += 1
-            value = float(run.streams[name].channel(channel)[0])
-            yield Check(
-                "constant channels",
-                Level.DOUBTFUL,
-                channel,
-                value,
-                f"channel {channel!r} of stream {name!r}: is {value:.4g} throughout; a sensor that works "
-                "varies",
-            )
-    if not n_odd:
-        level = Level.OK if varying else Level.UNKNOWN
-        what = "none is" if varying else "there is none to judge"
-        yield Check("constant channels", level, "all", math.nan, f"constant channels: {what}")
-
-
-def _overlap(run: RunLog) -> Check:
-    streams = {name: stream for name, stream in run.streams.items() if name not in NO_FEATURES}
-    if len(streams) < 2:
-        return Check("overlap", Level.UNKNOWN, "all", math.nan, "overlap: there is one stream of sensors")
-    start_s = max(stream.time_s[0] for stream in streams.values())
-    end_s = min(stream.time_s[-1] for stream in streams.values())
-    longest_s = max(stream.duration_s for stream in streams.values())
-    ratio = float(max(end_s - start_s, 0.0) / longest_s) if longest_s > 0.0 else math.nan
-    measured = f"overlap: {100 * ratio:.0f} % of the longest stream lie in all ({', '.join(streams)})"
-    if math.isnan(ratio):
-        return Check("overlap", Level.UNKNOWN, "all", ratio, "overlap: the streams have no duration")
-    doubtful, implausible = MIN_OVERLAP_RATIO
-    if ratio < doubtful:
-        level = Level.IMPLAUSIBLE if ratio < implausible else Level.DOUBTFUL
-        why = "other units of time, or loggers that were started apart?"
-        return Check("overlap", level, "all", ratio, f"{measured}, {100 * doubtful:.0f} % is expected: {why}")
-    return Check("overlap", Level.OK, "all", ratio, measured)
+            yield f"{n - MAX_NAMED} more runs: {level} {name} ({place})"
