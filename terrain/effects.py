@@ -1,7 +1,7 @@
 """Effects: named groups of parameters of the simulation that are 0 where the effect is absent.
 
-An entry holds all about an effect: bounds, formula, source, robots, channels, where a description has it, how
-it is taken off samples, and how it is shown.
+An entry holds all about an effect: bounds, formula, source, robots, channels, the stage where it acts, where a
+description has it, how it is taken off samples, and its words.
 
 Signals of the formulas are those of :mod:`terrain.simulation.planar.model`: ``u`` the speed that the wheels
 would roll without slip, ``v`` the speed over ground, ``d`` a steering angle, ``w`` the yaw rate, ``F`` the
@@ -37,12 +37,13 @@ Examples
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from enum import Enum
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from terrain.angles import unwrapped, wrapped
 from terrain.errors import ConfigError
 from terrain.files.documents import check_keys, number
 from terrain.kernels import record
@@ -123,6 +124,28 @@ STAMPS = ("stamp",)
 """In place of channels: the stamps of the samples."""
 
 
+class Block(NamedTuple):
+    """Samples of a stream that follow on those given before, off which an effect is taken, in place.
+
+    Parameters
+    ----------
+    stream, channels : names
+    time_s, values : (k,), (k, c) as measured
+    start_s : first stamp of the wheels, from which drifts count
+    robot : with its effects, and with those applied to it that have a home
+    memory : of the samples before, of each effect by its name
+    """
+
+    stream: str
+    channels: tuple[str, ...]
+    time_s: Array
+    values: Array
+    start_s: float
+    robot: Any
+    applied: Any
+    memory: dict[str, Any]
+
+
 class Inverse(NamedTuple):
     """How a parameter is taken off the samples of a log, by :class:`terrain.extension.Correction`.
 
@@ -131,10 +154,11 @@ class Inverse(NamedTuple):
     streams : whose samples or stamps change
     formula : corrected from measured, in the signals of this module
     columns : beginnings of the channels that change, or :data:`STAMPS`; empty for what takes more than one
-        number a sample, which :class:`terrain.extension.Correction` has by the parameter's name
+        number a sample
     combine : how the corrected number follows from the measured one; of all that act on one number, offsets
         come off before factors
     without_home : samples change only where the description lacks the section of the parameter's home
+    undo : takes what is more than one number a sample off a block; two parameters may share one
     """
 
     streams: tuple[str, ...]
@@ -142,6 +166,7 @@ class Inverse(NamedTuple):
     columns: tuple[str, ...] = ()
     combine: Combine = Combine.ADDED
     without_home: bool = False
+    undo: Callable[[Block, float], None] | None = None
 
 
 class Parameter(NamedTuple):
@@ -187,8 +212,8 @@ class Parameter(NamedTuple):
         return self.name.rpartition("_")[0].replace("_", " ")
 
 
-class PlantPart(Enum):
-    """Which part of the dynamic simulation an effect acts in."""
+class Stage(Enum):
+    """Where an effect acts in the dynamic simulation."""
 
     DESCRIPTION = "the number of its home"
     BODY = "masses and wheel radii of the plant"
@@ -197,22 +222,26 @@ class PlantPart(Enum):
     SENSORS = "samples and stamps"
 
 
-class Wording(Enum):
-    """What a sentence makes of the values of an effect."""
+class Term(NamedTuple):
+    """A value as sentences write it.
 
-    NUMBER = "the number of its home, or the values themselves"
-    TRACK = "an effective track in m"
-    MEASURED_POINT = "where the measured point is"
-    LATE = "who is late, in s"
-    CAMERA_YAW = "an angle of the camera in degrees"
-    FAST_TURNS = "by how much the track acts narrower in a fast turn"
-    LOSS_IN_TURNS = "the speed that a turn takes"
-    SIDE_SLIP = "the speed to the outside of a turn"
-    GYRO_SCALE = "by how much the gyro reads too much"
-    CENTRE_OF_MASS = "where the centre of mass is"
-    WHEEL_DISTANCE = "a distance of the wheels in m"
-    SIDES = "by how much the wheels of a side are larger"
-    UNDERSTEER = "by how much less it turns at a speed"
+    Parameters
+    ----------
+    found, half : value, and half of its interval
+    total : with what the robot has of it already
+    described, extended : number of the description that it changes, without and with it; 0 and the total where
+        there is none
+    note : on the described number, in brackets
+    robot : as it was tested
+    """
+
+    found: float
+    half: float
+    total: float
+    described: float
+    extended: float
+    note: str
+    robot: Any
 
 
 class Effect(NamedTuple):
@@ -228,12 +257,12 @@ class Effect(NamedTuple):
     channels : of :data:`CHANNELS`, where it is visible: a tenth as clearly over the noise as in the clearest
     needs : the driving that excites it
     sensed_only : it changes what sensors measure, and not the motion of the body
-    plant : the part of the dynamic simulation that it acts in; None where that simulates none of its robots
+    stage : of the dynamic simulation that it acts in; None where that simulates none of its robots
     aliases : other names of the same effect, which no log distinguishes from it
     twins : names of effects that look the same, and the channel that a log needs to distinguish them
     deprecated : former names, accepted on the command line
-    wording : what sentences make of its values
-    late : who is late by a positive and by a negative value, of an effect that is worded so
+    words : what its values make of the robot, as the object of "with"; by default the number of its home, or the
+        values themselves
     modifies : name of the effect without which it does nothing; empty for an effect that acts by itself
     beside : drive, and name of the effect that has to be known before runs of it can show this one
     """
@@ -246,12 +275,11 @@ class Effect(NamedTuple):
     channels: tuple[str, ...]
     needs: str
     sensed_only: bool = False
-    plant: PlantPart | None = None
+    stage: Stage | None = None
     aliases: tuple[str, ...] = ()
     twins: tuple[tuple[str, str], ...] = ()
     deprecated: tuple[str, ...] = ()
-    wording: Wording = Wording.NUMBER
-    late: tuple[str, str] = ("", "")
+    words: Callable[[Sequence[Term]], str] | None = None
     modifies: str = ""
     beside: tuple[tuple[str, str], ...] = ()
 
@@ -277,6 +305,222 @@ def effect(
     return Effect(name, (named,), *entry, **others)
 
 
+# -- Words: what a value makes of the robot -------------------------------------------------------------------
+
+EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
+"""The turn and the speed at which losses that grow with them are stated."""
+
+FAST_RADPS, FAST_MPS = 1.0, 2.0
+"""The same of what fast turns do."""
+
+SLIDING_RADPS = 1.0
+"""Yaw rate from which the wheels mostly slide sideways, and below which they mostly deflect; of a Warthog on
+asphalt and gravel."""
+
+
+def rounded(value: float, half: float) -> str:
+    """Return a number with the digits that half its interval leaves it, three where that is not known.
+
+    Examples
+    --------
+    >>> rounded(1.4271, 0.03), rounded(0.0961, 0.025), rounded(0.165, float("nan"))
+    ('1.43', '0.10', '0.165')
+    """
+    if not (math.isfinite(half) and half > 0.0):
+        return f"{value:.3g}"
+    return f"{value:.{min(max(-math.floor(math.log10(half)), 0), 5)}f}"
+
+
+def _sided(scale: float, text: str, above: str, below: str) -> Callable[[Sequence[Term]], str]:
+    """Return words on the size of a value, and whether it is above or below zero."""
+
+    def words(terms: Sequence[Term]) -> str:
+        (term,) = terms
+        side, wheels = above if term.total > 0 else below, "wheels"
+        if term.robot.drive == TRACKED:
+            wheels = "sprockets"
+        number = rounded(scale * abs(term.total), scale * term.half)
+        return text.format(number=number, side=side, wheels=wheels)
+
+    return words
+
+
+def _late(above: str, below: str = "") -> Callable[[Sequence[Term]], str]:
+    """Return words on who is late, by a positive and by a negative value."""
+
+    def words(terms: Sequence[Term]) -> str:
+        (term,) = terms
+        who = above if term.extended > 0 else below or above
+        return f"{who} {rounded(abs(term.extended), term.half)} s late"
+
+    return words
+
+
+def _track(terms: Sequence[Term]) -> str:
+    (term,) = terms
+    return f"an effective track of {rounded(term.extended, term.described * term.half)} m {term.note}"
+
+
+def _wheel_distance(terms: Sequence[Term]) -> str:
+    (term,) = terms
+    distance_m = term.robot.wheel_distance_m
+    number = rounded(distance_m * (1.0 + term.total), distance_m * term.half)
+    return f"wheels {number} m from the middle (described: {distance_m:.3g} m)"
+
+
+def _point(term: Term, scale: float, sides: tuple[str, str]) -> str:
+    """Return where a point lies along an axis; only the sum of what is described and found is known."""
+    unit = "m" if scale == 1.0 else "mm"
+    number = rounded(scale * abs(term.extended), scale * term.half)
+    return f"{number} {unit} {sides[0 if term.extended >= 0.0 else 1]}"
+
+
+def _lever_arm(terms: Sequence[Term]) -> str:
+    """Return where the measured point is; a distance to a side that is not significant is left out."""
+    along, across = terms
+    points = [_point(along, 1.0, ("ahead", "behind"))]
+    if not abs(across.found) <= across.half:
+        points.append(_point(across, 1.0, ("left", "right")))
+    joint = " " if points[-1].endswith("behind") else " of "
+    return f"the measured point {' and '.join(points)}{joint}the centre {along.note}"
+
+
+def _centre_of_mass(terms: Sequence[Term]) -> str:
+    points = [
+        _point(t, 1e3, sides)
+        for t, sides in zip(terms, (("ahead", "behind"), ("left", "right")), strict=True)
+    ]
+    described = ", ".join(f"{1e3 * term.described:.3g}" for term in terms)
+    return f"the centre of mass {' and '.join(points)} of the middle (described: {described} mm)"
+
+
+def _turn_drag(terms: Sequence[Term]) -> str:
+    lost = terms[0].total * EXAMPLE_RADPS**2
+    percent = 100.0 * (lost / (1.0 + lost) if lost > 0 else lost)
+    change = "loses" if percent > 0 else "gains"
+    return f"a robot that {change} {abs(percent):.2g} % of its speed in a turn of {EXAMPLE_RADPS:g} rad/s"
+
+
+def _fast_turns(terms: Sequence[Term]) -> str:
+    x = terms[0].total * (FAST_MPS * FAST_RADPS) ** 2 / (1.0 + (FAST_RADPS / SLIDING_RADPS) ** 2)
+    gained = x / (1.0 + abs(x))
+    percent = 100.0 * gained / (1.0 + gained)
+    return f"a track that acts {percent:.2g} % narrower at {FAST_MPS:g} m/s and {FAST_RADPS:g} rad/s"
+
+
+def _understeer(terms: Sequence[Term]) -> str:
+    (term,) = terms
+    own, base_m = term.robot.understeer_s2pm, term.robot.wheelbase_m
+    before, after = (base_m / (base_m + each * FAST_MPS**2) for each in (own, own + term.total))
+    number = f"{rounded(own + term.total, term.half)} s²/m (described: {own:.2g} s²/m)"
+    change = f"{100.0 * abs(after / before - 1.0):.2g} % {'less' if term.total > 0 else 'more'}"
+    return f"an understeer of {number}, which turns it {change} at {FAST_MPS:g} m/s"
+
+
+# -- Inverses on samples that take more than one number a sample ----------------------------------------------
+
+
+def _undo_one_sided_radius(block: Block, e: float) -> None:
+    for i, channel in enumerate(block.channels):
+        quantity, _, rest = channel.partition("_")
+        wheel = rest.rpartition("_")[0]
+        if quantity in ("motor", "speed", "wheel") and wheel in block.robot.wheels:
+            block.values[:, i] *= 1.0 + (0.5 if wheel in ("3", "right") else -0.5) * e
+
+
+def _undo_motor_drift(block: Block, e: float) -> None:
+    warm = 1.0 + e * (block.time_s - block.start_s) / 60.0
+    block.values[:, [name.startswith("current_") for name in block.channels]] /= warm[:, None]
+
+
+def _undo_steering_backlash(block: Block, half_rad: float) -> None:
+    for channel in set(block.robot.steer_channels) & set(block.channels):
+        last_rad, follower = block.memory.get(channel, (math.nan, math.nan))
+        column = block.channels.index(channel)
+        angles = unwrapped(np.concatenate([[last_rad], block.values[:, column]]))[1:]
+        known = np.isfinite(angles)
+        for k in np.flatnonzero(known).tolist():
+            last_rad = float(angles[k])
+            follower = (
+                last_rad
+                if math.isnan(follower)
+                else min(max(follower, last_rad - half_rad), last_rad + half_rad)
+            )
+            block.values[k, column] = follower
+        block.memory[channel] = last_rad, follower
+        block.values[known, column] = wrapped(block.values[known, column])
+
+
+def _undo_gyro(block: Block, _: float) -> None:
+    """Take bias and scale off the gyro, and off the fused yaw, which is assumed to be the integral of both."""
+    bias, scale = (
+        block.robot.effects.get("gyro_bias_radps", 0.0),
+        1.0 + block.robot.effects.get("gyro_scale_ratio", 0.0),
+    )
+    if "gyro_z_radps" in block.channels:
+        gyro = block.values[:, block.channels.index("gyro_z_radps")]
+        gyro -= block.applied.effects.get("gyro_bias_radps", 0.0)  # without a home
+        if scale != 1.0:
+            described = block.applied.completed.sensors.gyro_bias_z_radps
+            gyro -= described
+            gyro /= scale
+            gyro += described
+    if "yaw_rad" in block.channels:
+        column = block.channels.index("yaw_rad")
+        first_rad, last_rad = block.memory.get("yaw_rad", (math.nan, math.nan))
+        yaw = unwrapped(np.concatenate([[last_rad], block.values[:, column]]))[1:]
+        known = np.isfinite(yaw)
+        if known.any():
+            first_rad = float(yaw[known][0]) if math.isnan(first_rad) else first_rad
+            block.memory["yaw_rad"] = first_rad, float(yaw[known][-1])
+        turned_rad = yaw[known] - first_rad - bias * (block.time_s[known] - block.start_s)
+        block.values[known, column] = wrapped(first_rad + turned_rad / scale)
+
+
+CAMERA_VECTORS = (("position", "m"), ("quaternion", "ratio"), ("velocity", "mps"), ("rate", "radps"))
+
+
+def turn_camera(values: Array, channels: tuple[str, ...], angle_rad: float) -> None:
+    """Turn what a camera tells to what it would tell were it mounted turned to the left by ``-angle_rad``.
+
+    A speed along the robot's x axis then shows as one to the left too, by the sine of the angle.  The fixed
+    frame is that of the power-on and turns with the mounting, so that position, velocity, rates and the
+    quaternion's vector part all turn alike about the body's z axis; its scalar part stays.
+
+    Parameters
+    ----------
+    values : (n, c) changed in place
+    channels : of the columns: vectors of :data:`terrain.kinematics.camera.CHANNELS`, in the camera's axes, or a
+        plane's ``speed_x_mps`` and ``speed_y_mps`` in the body's; others stay
+    angle_rad : small or not
+
+    Examples
+    --------
+    >>> seen = np.array([[1.0, 0.0]])
+    >>> turn_camera(seen, ("speed_x_mps", "speed_y_mps"), 0.1)
+    >>> seen.round(3)
+    array([[0.995, 0.1  ]])
+    """
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    # ahead is -z of the camera and left is -x: in that plane two signs make none
+    planes = [(f"{name}_z_{unit}", f"{name}_x_{unit}") for name, unit in CAMERA_VECTORS]
+    for ahead, left in [("speed_x_mps", "speed_y_mps"), *planes]:
+        if ahead in channels and left in channels:
+            i, j = channels.index(ahead), channels.index(left)
+            x, y = values[:, i].copy(), values[:, j].copy()
+            values[:, i] = cos * x - sin * y
+            values[:, j] = sin * x + cos * y
+
+
+def _undo_camera_yaw(block: Block, angle_rad: float) -> None:
+    if block.stream != "pose":
+        turn_camera(block.values, block.channels, -angle_rad)
+    elif "yaw_rad" in block.channels:
+        block.values[:, block.channels.index("yaw_rad")] += angle_rad
+
+
+# -- The catalogue --------------------------------------------------------------------------------------------
+
 KINEMATICS = "kinematics of a planar robot"
 
 
@@ -291,7 +535,7 @@ def _steering_offset(wheel: int) -> Effect:
         (*MOTION, HEADING) if wheel < 3 else MOTION,  # wheel 3 is beside the middle, and hardly turns it
         "several speeds and standstill",
         homes=(Home("steering", f"zero_{wheel}_rad", Combine.SUBTRACTED),),
-        plant=PlantPart.LINKAGE,
+        stage=Stage.LINKAGE,
     )
 
 
@@ -317,7 +561,7 @@ def _wheel_scale(wheel: int) -> Effect:
             (f"motor_{wheel}_", f"speed_{wheel}_"),
             Combine.TIMES,
         ),
-        plant=PlantPart.SENSORS,
+        stage=Stage.SENSORS,
     )
 
 
@@ -334,7 +578,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         inverse=Inverse(
             ("wheels",), "wheel speed in m/s x (1 + e), where a log has it", ("speed_",), Combine.TIMES
         ),
-        plant=PlantPart.BODY,
+        stage=Stage.BODY,
         aliases=("encoder_scale",),
     ),
     effect(
@@ -347,10 +591,14 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         (*MOTION, HEADING),
         "fast and straight",
         inverse=Inverse(
-            ("wheels", "truth"), "rates and speeds of the right side x (1 + e/2), left x (1 - e/2)"
+            ("wheels", "truth"),
+            "rates and speeds of the right side x (1 + e/2), left x (1 - e/2)",
+            undo=_undo_one_sided_radius,
         ),
-        plant=PlantPart.BODY,
-        wording=Wording.SIDES,
+        stage=Stage.BODY,
+        words=_sided(
+            100.0, "{wheels} that are {number} % {side} on the right than on the left", "larger", "smaller"
+        ),
     ),
     *(_wheel_scale(wheel) for wheel in (1, 2, 3)),
     *(_steering_offset(wheel) for wheel in (1, 2, 3)),
@@ -362,8 +610,10 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         (SWERVE, BICYCLE),
         (*MOTION, HEADING),
         "reversals of the steering",
-        inverse=Inverse(("steering",), "angles pass through a play of half width b"),
-        plant=PlantPart.LINKAGE,
+        inverse=Inverse(
+            ("steering",), "angles pass through a play of half width b", undo=_undo_steering_backlash
+        ),
+        stage=Stage.LINKAGE,
         deprecated=("steering_play",),
     ),
     effect(
@@ -375,7 +625,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         (*MOTION, HEADING),
         "steps of the steering",
         inverse=Inverse(("steering",), "stamp t + T", STAMPS, Combine.ADDED),
-        plant=PlantPart.LINKAGE,
+        stage=Stage.LINKAGE,
     ),
     effect(
         "yaw_delay",
@@ -386,8 +636,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         (GYRO, SPEED_Y, HEADING),
         "steps of the yaw rate",
         inverse=Inverse(("wheels",), "right minus left wheel speed of t - T; of whole runs only"),
-        wording=Wording.LATE,
-        late=("the robot turning", "the robot turning"),
+        words=_late("the robot turning"),
     ),
 )
 
@@ -405,9 +654,11 @@ SENSORS: tuple[Effect, ...] = (
         (GYRO,),
         "standstill; several runs, since every power-on has a bias of its own",
         homes=(Home("sensors", "gyro_bias_z_radps", Combine.ADDED),),
-        inverse=Inverse(("imu",), "gyro - b where the description has no home; fused yaw - b t"),
+        inverse=Inverse(
+            ("imu",), "gyro - b where the description has no home; fused yaw - b t", undo=_undo_gyro
+        ),
         sensed_only=True,
-        plant=PlantPart.DESCRIPTION,
+        stage=Stage.DESCRIPTION,
     ),
     effect(
         "gyro_scale",
@@ -418,11 +669,11 @@ SENSORS: tuple[Effect, ...] = (
         WITH_IMU,
         (GYRO,),
         "turns, and an absolute heading on a skid-steer robot",
-        inverse=Inverse(("imu",), "(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)"),
+        inverse=Inverse(("imu",), "(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)", undo=_undo_gyro),
         sensed_only=True,
-        plant=PlantPart.SENSORS,
+        stage=Stage.SENSORS,
         twins=(("effective_track", HEADING),),
-        wording=Wording.GYRO_SCALE,
+        words=_sided(100.0, "a gyro that reads {number} % too {side}", "much", "little"),
     ),
     effect(
         "accel_bias",
@@ -435,7 +686,7 @@ SENSORS: tuple[Effect, ...] = (
         homes=(Home("sensors", "accel_bias_x_mps2", Combine.ADDED, scaled_by="accel_scale_x_ratio"),),
         inverse=Inverse(("imu",), "accelerometer - b", ("accel_x_",), Combine.SUBTRACTED, without_home=True),
         sensed_only=True,
-        plant=PlantPart.DESCRIPTION,
+        stage=Stage.DESCRIPTION,
         aliases=("accelerometer_mounting_pitch",),
     ),
     effect(
@@ -449,9 +700,8 @@ SENSORS: tuple[Effect, ...] = (
         "steps of the yaw rate, and a camera that is not late",
         homes=(Home("sensors", "imu_latency_s", Combine.ADDED),),
         inverse=Inverse(("imu",), "stamp t - T", STAMPS, Combine.SUBTRACTED, without_home=True),
-        plant=PlantPart.DESCRIPTION,
-        wording=Wording.LATE,
-        late=("the IMU", "the IMU"),
+        stage=Stage.DESCRIPTION,
+        words=_late("the IMU"),
     ),
     effect(
         "camera_latency",
@@ -464,9 +714,8 @@ SENSORS: tuple[Effect, ...] = (
         "accelerations at two frequencies",
         homes=(Home("camera", "latency_s", Combine.ADDED),),
         sensed_only=True,
-        plant=PlantPart.DESCRIPTION,
-        wording=Wording.LATE,
-        late=("the camera or lidar", "the camera or lidar"),
+        stage=Stage.DESCRIPTION,
+        words=_late("the camera or lidar"),
     ),
     effect(
         "camera_yaw",
@@ -476,10 +725,14 @@ SENSORS: tuple[Effect, ...] = (
         EVERY,
         (SPEED_X, SPEED_Y),
         "straight, on more than one side slope",
-        inverse=Inverse(("odometry", "lidar", "pose"), "R(a) of what the camera measured; yaw of a pose + a"),
+        inverse=Inverse(
+            ("odometry", "lidar", "pose"),
+            "R(a) of what the camera measured; yaw of a pose + a",
+            undo=_undo_camera_yaw,
+        ),
         sensed_only=True,
-        plant=PlantPart.SENSORS,
-        wording=Wording.CAMERA_YAW,
+        stage=Stage.SENSORS,
+        words=_sided(math.degrees(1.0), "the camera turned {number}° to the {side}", "right", "left"),
     ),
     Effect(
         "lever_arm",
@@ -500,8 +753,8 @@ SENSORS: tuple[Effect, ...] = (
         (SPEED_X, SPEED_Y),
         "turns to both sides",
         sensed_only=True,
-        plant=PlantPart.DESCRIPTION,
-        wording=Wording.MEASURED_POINT,
+        stage=Stage.DESCRIPTION,
+        words=_lever_arm,
     ),
     effect(
         "clock_offset",
@@ -512,9 +765,8 @@ SENSORS: tuple[Effect, ...] = (
         (*MOTION, HEADING),
         "switching manoeuvres",
         inverse=Inverse(OTHER_LOGGER, "stamp t' - T", STAMPS, Combine.SUBTRACTED),
-        plant=PlantPart.SENSORS,
-        wording=Wording.LATE,
-        late=("the other sensors logged", "the wheels logged"),
+        stage=Stage.SENSORS,
+        words=_late("the other sensors logged", "the wheels logged"),
     ),
     effect(
         "clock_rate",
@@ -527,7 +779,7 @@ SENSORS: tuple[Effect, ...] = (
         inverse=Inverse(
             OTHER_LOGGER, "stamp t' / (1 + r), from the first stamp of the wheels", STAMPS, Combine.OVER
         ),
-        plant=PlantPart.SENSORS,
+        stage=Stage.SENSORS,
     ),
     effect(
         "encoder_lag",
@@ -538,7 +790,7 @@ SENSORS: tuple[Effect, ...] = (
         (*MOTION, CURRENT, TURNING_CURRENT, HEADING),
         "accelerations",
         homes=(Home("sensors", "encoder_time_constant_s", Combine.ADDED),),
-        plant=PlantPart.DESCRIPTION,
+        stage=Stage.DESCRIPTION,
     ),
 )
 """They change what a log holds of a motion; most of them nothing else."""
@@ -554,7 +806,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         "turns in place and in arcs, and an absolute heading",
         homes=(Home("", "track_m", Combine.TIMES),),
         twins=(("gyro_scale", HEADING),),
-        wording=Wording.TRACK,
+        words=_track,
     ),
     effect(
         "turning_slip",
@@ -590,7 +842,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         SKIDDING,
         (GYRO, SPEED_Y, HEADING),
         "fast arcs, and turns in place",
-        wording=Wording.FAST_TURNS,
+        words=_fast_turns,
     ),
     effect(
         "turn_drag",
@@ -603,7 +855,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         SKIDDING,
         (SPEED_X,),
         "arcs of several yaw rates",
-        wording=Wording.LOSS_IN_TURNS,
+        words=_turn_drag,
     ),
     effect(
         "force_slip",
@@ -613,7 +865,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         EVERY,
         (SPEED_X, SPEED_Y),
         "slopes and accelerations",
-        plant=PlantPart.CONTACT,
+        stage=Stage.CONTACT,
     ),
     effect(
         "shear_slip",
@@ -624,7 +876,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         WITH_IMU,
         (SPEED_X, SPEED_Y),
         "tractions over half of f_max, of both small and large size",
-        plant=PlantPart.CONTACT,
+        stage=Stage.CONTACT,
     ),
     effect(
         "slip_resistance",
@@ -634,7 +886,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         BOTH,
         (CURRENT, SPEED_X),
         "a range of slip",
-        plant=PlantPart.CONTACT,
+        stage=Stage.CONTACT,
     ),
     effect(
         "rolling_resistance",
@@ -645,7 +897,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         BOTH,
         (CURRENT, SPEED_X),
         "several speeds, forward and backward",
-        plant=PlantPart.CONTACT,
+        stage=Stage.CONTACT,
     ),
     effect(
         "viscous_drag",
@@ -655,7 +907,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         BOTH,
         (CURRENT, SPEED_X),
         "three speeds",
-        plant=PlantPart.CONTACT,
+        stage=Stage.CONTACT,
     ),
 )
 
@@ -670,7 +922,11 @@ SIDEWAYS: tuple[Effect, ...] = (
         SKIDDING,
         (SPEED_Y,),
         "arcs of several speeds, to both sides",
-        wording=Wording.SIDE_SLIP,
+        words=_sided(
+            EXAMPLE_MPS * EXAMPLE_RADPS,
+            f"a slide of {{number}} m/s to the {{side}} at {EXAMPLE_MPS:g} m/s and {EXAMPLE_RADPS:g} rad/s",
+            *("outside", "inside"),
+        ),
     ),
     effect(
         "side_slip_build_up",
@@ -700,7 +956,7 @@ SIDEWAYS: tuple[Effect, ...] = (
         WITH_IMU,
         (SPEED_Y,),
         "both signs of roll",
-        plant=PlantPart.CONTACT,
+        stage=Stage.CONTACT,
     ),
 )
 
@@ -717,7 +973,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
             Home("", "mass_kg", Combine.TIMES),
             Home("body", "yaw_inertia_kgm2", Combine.TIMES, optional=True),
         ),
-        plant=PlantPart.BODY,
+        stage=Stage.BODY,
         twins=(("motor_constant", SPEED_X),),
         beside=((OMNI, "roller_friction"),),
     ),
@@ -732,7 +988,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
         inverse=Inverse(("wheels",), "current / (1 + q)", ("current_",), Combine.OVER, without_home=True),
         sensed_only=True,
-        plant=PlantPart.DESCRIPTION,
+        stage=Stage.DESCRIPTION,
         twins=(("payload", SPEED_X),),
     ),
     effect(
@@ -747,9 +1003,10 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
             ("wheels",),
             "current / (1 + q t / 60 s), from the first stamp of the wheels",
             combine=Combine.OVER,
+            undo=_undo_motor_drift,
         ),
         sensed_only=True,
-        plant=PlantPart.SENSORS,
+        stage=Stage.SENSORS,
     ),
     effect(
         "current_offset",
@@ -762,7 +1019,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         "standstill, and driving forward and backward",
         inverse=Inverse(("wheels",), "current of each motor - b", ("current_",), Combine.SUBTRACTED),
         sensed_only=True,
-        plant=PlantPart.SENSORS,
+        stage=Stage.SENSORS,
     ),
 )
 
@@ -796,7 +1053,7 @@ OMNI_WHEELS: tuple[Effect, ...] = (
         (OMNI,),
         (SPEED_X, SPEED_Y, HEADING, GYRO),
         "straight drives in several directions over ground on which the rollers resist",
-        wording=Wording.CENTRE_OF_MASS,
+        words=_centre_of_mass,
     ),
     effect(
         "wheel_distance",
@@ -808,7 +1065,7 @@ OMNI_WHEELS: tuple[Effect, ...] = (
         (HEADING, GYRO),
         "turns",
         homes=(Home("", "track_m", Combine.TIMES), Home("", "wheelbase_m", Combine.TIMES)),
-        wording=Wording.WHEEL_DISTANCE,
+        words=_wheel_distance,
     ),
     effect(
         "camera_scale",
@@ -849,7 +1106,7 @@ CAR: tuple[Effect, ...] = (
         (BICYCLE,),
         (GYRO, HEADING),
         "arcs of several speeds, to both sides",
-        wording=Wording.UNDERSTEER,
+        words=_understeer,
     ),
     effect(
         "cornering_stiffness",
@@ -991,15 +1248,15 @@ def nuisances_of(drive: str) -> tuple[str, ...]:
     return tuple(name for name in NUISANCES if name in own)
 
 
-def in_plant(*parts: PlantPart) -> tuple[str, ...]:
-    """Return the parameters that act in some parts of the dynamic simulation.
+def in_plant(*stages: Stage) -> tuple[str, ...]:
+    """Return the parameters that act at some stages of the dynamic simulation.
 
     Examples
     --------
-    >>> in_plant(PlantPart.BODY)
+    >>> in_plant(Stage.BODY)
     ('wheel_radius_ratio', 'one_sided_radius_ratio', 'payload_ratio')
     """
-    return tuple(p.name for effect in LIBRARY if effect.plant in parts for p in effect.parameters)
+    return tuple(p.name for effect in LIBRARY if effect.stage in stages for p in effect.parameters)
 
 
 def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:

@@ -24,11 +24,12 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 import yaml
 
-from terrain.angles import unwrapped, wrapped
+from terrain.angles import unwrapped
 from terrain.effects import (
     PARAMETER,
     SCHEMA,
     STAMPS,
+    Block,
     Combine,
     Home,
     Parameter,
@@ -37,9 +38,7 @@ from terrain.effects import (
     parameters_of,
 )
 from terrain.errors import ConfigError, OutsideRegionWarning
-from terrain.files.atomic import atomic_write
 from terrain.files.documents import parse_yaml, read_yaml
-from terrain.kinematics.camera import turned
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Region, Robot, description_file, robot_from
@@ -368,8 +367,6 @@ def _delay_turning(wheels: Stream, delay_s: float) -> Stream:
 class Correction:
     """Takes a robot's effects off samples, a run in one block or block by block.
 
-    The integral of the gyro as it is, bias and scale included, is assumed to be the fused yaw.
-
     Parameters
     ----------
     robot : with its effects
@@ -377,23 +374,17 @@ class Correction:
     """
 
     def __init__(self, robot: Robot, start_s: float = math.nan) -> None:
-        self._start_s, self._wheels, self._steered = start_s, robot.wheels, robot.steer_channels
-        applied = apply_homes(robot)
-        self._gyro_bias = applied.completed.sensors.gyro_bias_z_radps
-        self._gyro_offset = applied.effects.get("gyro_bias_radps", 0.0)
-        self._yaw_bias = robot.effects.get("gyro_bias_radps", 0.0)
-        self._yaw_scale = 1.0 + robot.effects.get("gyro_scale_ratio", 0.0)
+        self._robot, self._applied, self._start_s = robot, apply_homes(robot), start_s
         acting = [
-            (name, float(robot.effects[name]), parameter.inverse)
+            (float(robot.effects[name]), inverse)
             for name, parameter in PARAMETER.items()
             if robot.effects.get(name)
-            and parameter.inverse
-            and (name in applied.effects or not parameter.inverse.without_home)
+            and (inverse := parameter.inverse)
+            and (name in self._applied.effects or not inverse.without_home)
         ]
         # what was added last comes off first: offsets, then factors
-        self._acting = sorted(acting, key=lambda each: each[2].combine in (Combine.TIMES, Combine.OVER))
-        n = len(self._steered)
-        self._follower, self._angle, self._yaw = np.full(n, np.nan), np.full(n, np.nan), (np.nan, np.nan)
+        self._acting = sorted(acting, key=lambda each: each[1].combine in (Combine.TIMES, Combine.OVER))
+        self._memory: dict[str, Any] = {}
 
     def __call__(
         self, name: str, channels: tuple[str, ...], time_s: Array, values: Array
@@ -410,92 +401,24 @@ class Correction:
             if not finite.size:
                 return time_s, values
             self._start_s = float(finite[0])
-        stamps, copied, done = np.asarray(time_s), False, set()
-        for parameter, value, inverse in self._acting:
-            if name not in inverse.streams:
-                continue
-            if inverse.columns == STAMPS:
-                stamps = np.asarray(self._start_s + inverse.combine.apply(stamps - self._start_s, value))
-                continue
-            if not copied:
-                values, copied = np.array(values, dtype=float), True
-            with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
-                for i, channel in enumerate(channels):
-                    if inverse.columns and channel.startswith(inverse.columns):
-                        values[:, i] = inverse.combine.apply(values[:, i], value)
-                undo = getattr(self, f"_{parameter}", None)
-                if undo is not None and undo not in done:
-                    undo(name, channels, np.asarray(time_s), values, value)
-                    done.add(undo)
+        stamps, done = np.asarray(time_s), set()
+        own = [(value, inverse) for value, inverse in self._acting if name in inverse.streams]
+        if any(inverse.columns != STAMPS for _, inverse in own):
+            values = np.array(values, dtype=float)
+        about = stamps, values, self._start_s, self._robot, self._applied, self._memory
+        block = Block(name, channels, *about)
+        with np.errstate(invalid="ignore", over="ignore"):  # samples may be no finite numbers
+            for value, inverse in own:
+                if inverse.columns == STAMPS:
+                    stamps = np.asarray(self._start_s + inverse.combine.apply(stamps - self._start_s, value))
+                elif inverse.undo is None:
+                    for i, channel in enumerate(channels):
+                        if inverse.columns and channel.startswith(inverse.columns):
+                            values[:, i] = inverse.combine.apply(values[:, i], value)
+                elif inverse.undo not in done:
+                    inverse.undo(block, value)
+                    done.add(inverse.undo)
         return stamps, values
-
-    def _one_sided_radius_ratio(
-        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, value: float
-    ) -> None:
-        for i, channel in enumerate(channels):
-            quantity, _, rest = channel.partition("_")
-            wheel = rest.rpartition("_")[0]
-            if quantity in ("motor", "speed", "wheel") and wheel in self._wheels:
-                values[:, i] *= 1.0 + (0.5 if wheel in ("3", "right") else -0.5) * value
-
-    def _motor_drift_ratio(
-        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, value: float
-    ) -> None:
-        warm = 1.0 + value * (time_s - self._start_s) / 60.0
-        values[:, [i for i, channel in enumerate(channels) if channel.startswith("current_")]] /= warm[
-            :, None
-        ]
-
-    def _steering_backlash_rad(
-        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, half: float
-    ) -> None:
-        for wheel, channel in enumerate(self._steered):
-            if channel not in channels:
-                continue
-            column = channels.index(channel)
-            angles = unwrapped(np.concatenate([[self._angle[wheel]], values[:, column]]))[1:]
-            follower = self._follower[wheel]
-            known = np.isfinite(angles)
-            for k in np.flatnonzero(known).tolist():
-                angle = float(angles[k])
-                follower = angle if math.isnan(follower) else min(max(follower, angle - half), angle + half)
-                self._angle[wheel] = angle
-                values[k, column] = follower
-            self._follower[wheel] = follower
-            values[known, column] = wrapped(values[known, column])
-
-    def _gyro_bias_radps(
-        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, value: float
-    ) -> None:
-        """Take bias and scale off the gyro, and off the fused yaw, which sums both."""
-        bias, scale = self._yaw_bias, self._yaw_scale
-        if "gyro_z_radps" in channels:
-            gyro = values[:, channels.index("gyro_z_radps")]
-            gyro -= self._gyro_offset
-            if scale != 1.0:
-                gyro -= self._gyro_bias
-                gyro /= scale
-                gyro += self._gyro_bias
-        if "yaw_rad" in channels:
-            column = channels.index("yaw_rad")
-            first_rad, last_rad = self._yaw
-            yaw = unwrapped(np.concatenate([[last_rad], values[:, column]]))[1:]
-            known = np.isfinite(yaw)
-            if known.any():
-                first_rad = float(yaw[known][0]) if math.isnan(first_rad) else first_rad
-                self._yaw = first_rad, float(yaw[known][-1])
-            turned_rad = yaw[known] - first_rad - bias * (time_s[known] - self._start_s)
-            values[known, column] = wrapped(first_rad + turned_rad / scale)
-
-    _gyro_scale_ratio = _gyro_bias_radps
-
-    def _camera_yaw_rad(
-        self, name: str, channels: tuple[str, ...], time_s: Array, values: Array, value: float
-    ) -> None:
-        if name != "pose":
-            turned(values, channels, -value)
-        elif "yaw_rad" in channels:
-            values[:, channels.index("yaw_rad")] += value
 
 
 class Origin(StrEnum):
@@ -530,6 +453,11 @@ class Basis(NamedTuple):
     def name(self) -> str:
         """Name of the number, as :attr:`terrain.robots.Robot.assumed` has it."""
         return f"{self.section}.{self.written}" if self.section else self.written
+
+    @property
+    def is_described(self) -> bool:
+        """Whether the description states a number that is not 0."""
+        return bool(self.described) and self.origin is not Origin.LEFT_OUT
 
 
 def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, ...]:
@@ -642,32 +570,6 @@ def extended_yaml(
         raise ConfigError(f"{path}: cannot be extended as it is written: one section a line is required")
     robot_from(path.name, content)
     return text
-
-
-def write_extended(
-    out: str | Path,
-    robot_name: str | Path,
-    values: Mapping[str, float],
-    covariance: Array,
-    intervals: Mapping[str, tuple[float, float]],
-    source: str,
-    region: Region | None = None,
-) -> Robot:
-    """Write the description of :func:`extended_yaml` to a file, and return the robot.
-
-    Raises
-    ------
-    ConfigError
-        as :func:`extended_yaml` does, or if the file is no YAML by its name, or is there already.
-    """
-    out = Path(out)
-    if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError(f"{out}: a robot's description is a .yaml file")
-    if out.exists():
-        raise ConfigError(f"{out}: is there already, and is left as it is; choose another name")
-    text = extended_yaml(robot_name, values, covariance, intervals, source, region)
-    atomic_write(out, text)
-    return robot_from(out.name, parse_yaml(text))
 
 
 def _section_lines(

@@ -265,11 +265,11 @@ class Latencies(NamedTuple):
         Keys are ``clock_offset_s``, which is negative where the wheels are late, ``camera_latency_s`` and
         ``imu_latency_s``.  A clock is left out where a low-pass of the encoders explains late wheels as well.
         """
-        lags = {"clock_offset_s": self.clock, "camera_latency_s": self.camera, "imu_latency_s": self.imu}
-        found = {n: lag_s for n, (lag_s, std_s) in lags.items() if abs(lag_s) > max(SIGMAS * std_s, GROSS_S)}
-        if found.get("clock_offset_s", 1.0) < 0.0 and not self.is_delay:
-            del found["clock_offset_s"]
-        return found
+        values = {}
+        for name, (lag_s, std_s) in (("imu", self.imu), ("camera", self.camera), ("clock", self.clock)):
+            if abs(lag_s) > max(SIGMAS * std_s, GROSS_S) and (name != "clock" or lag_s > 0 or self.is_delay):
+                values["clock_offset_s" if name == "clock" else f"{name}_latency_s"] = lag_s
+        return values
 
 
 _RunPairs = dict[str, tuple[Pair, float]]

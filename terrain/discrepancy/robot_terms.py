@@ -1,26 +1,19 @@
 """The value of an effect in quantities that the builder of a robot knows: a track in m, a lag of the wheels.
 
 A value is added to what the description has already, and the description's number stands beside the sum:
-where that number is assumed, only the sum was measured.
+where that number is assumed, only the sum was measured.  What an effect makes of the robot is said by its entry
+(:mod:`terrain.effects`), or by the number of the description that it changes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 
 from terrain.discrepancy.verdict import Value
-from terrain.effects import PARAMETER, Wording, effect_named
+from terrain.effects import PARAMETER, Term, effect_named, rounded
 from terrain.extension import Basis, Origin, basis_of
-from terrain.robots import BicycleRobot, OmniRobot, Robot, TrackedRobot, as_drive
-from terrain.simulation.planar.motion import SLIDING_RADPS
-
-EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
-"""The turn and the speed at which losses that grow with them are stated."""
-
-FAST_RADPS, FAST_MPS = 1.0, 2.0
-"""The same of what fast turns do."""
+from terrain.robots import Robot
 
 UNITS = {
     "ratio": "",
@@ -42,8 +35,6 @@ UNITS = {
 
 SMALL = {"rad": "mrad", "radps": "mrad/s", "s": "ms", "m": "mm"}
 """Units of a thousandth."""
-
-Total = Mapping[str, float]
 
 
 def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
@@ -68,21 +59,18 @@ def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
     >>> in_robot_terms("track_narrowing", [narrow], load_robot("warthog"))
     'a track that acts 6.9 % narrower at 2 m/s and 1 rad/s'
     """
-    total = {value.name: robot.effects.get(value.name, 0.0) + value.value for value in values}
-    written = TERMS.get(effect_named(effect).wording)
-    if written is not None:
-        return written(values, total, robot)
-    return " and ".join(_generic(value, total[value.name], robot) for value in values)
+    words, terms, plain = effect_named(effect).words, [], []
+    for value in values:
+        total, half = robot.effects.get(value.name, 0.0) + value.value, (value.high - value.low) / 2.0
+        basis = next(iter(basis_of(robot, value.name, total)), None)
+        about = (0.0, total, "") if basis is None else (basis.described, basis.extended, described_as(basis))
+        terms.append(Term(value.value, half, total, *about, robot))
+        plain.append(_plain_words(value.name, terms[-1], basis))
+    return " and ".join(plain) if words is None else words(terms)
 
 
 def value_in_robot_terms(parameter: str, value: float, low: float, high: float, robot: Robot) -> str:
     """Return a value and its interval by the number of the description that it changes, or as they are.
-
-    Parameters
-    ----------
-    parameter : of an effect
-    value, low, high : over what the robot has of it already
-    robot : as it was tested
 
     Examples
     --------
@@ -95,7 +83,7 @@ def value_in_robot_terms(parameter: str, value: float, low: float, high: float, 
     given = robot.effects.get(parameter, 0.0)
     numbers, unit = [given + each for each in (value, low, high)], PARAMETER[parameter].unit
     bases = [basis_of(robot, parameter, number)[:1] for number in numbers]
-    if all(basis and basis[0].described and basis[0].origin is not Origin.LEFT_OUT for basis in bases):
+    if all(basis and basis[0].is_described for basis in bases):
         numbers = [basis[0].extended for basis in bases]
         unit = bases[0][0].field.rpartition("_")[2]
     at, *ends = (rounded(number, 0.5 * abs(numbers[2] - numbers[1])) for number in numbers)
@@ -126,23 +114,6 @@ def quantity(parameter: str, value: float) -> str:
     return f"{number}\N{NO-BREAK SPACE}{written}".rstrip("\N{NO-BREAK SPACE}")
 
 
-def rounded(value: float, half: float) -> str:
-    """Return a number with the digits that half its interval leaves it, three where that is not known.
-
-    Examples
-    --------
-    >>> rounded(1.4271, 0.03), rounded(0.0961, 0.025), rounded(0.165, float("nan"))
-    ('1.43', '0.10', '0.165')
-    """
-    if not (math.isfinite(half) and half > 0.0):
-        return f"{value:.3g}"
-    return f"{value:.{min(max(-math.floor(math.log10(half)), 0), 5)}f}"
-
-
-def _half(value: Value) -> float:
-    return (value.high - value.low) / 2.0
-
-
 def described_as(basis: Basis) -> str:
     """Return the number of the description beside which a value stands, and whether it is assumed.
 
@@ -159,134 +130,20 @@ def described_as(basis: Basis) -> str:
     return f"(described: {number}{', assumed' if basis.origin is Origin.ASSUMED else ''})"
 
 
-def _generic(value: Value, total: float, robot: Robot) -> str:
+def _plain_words(name: str, term: Term, basis: Basis | None) -> str:
     """Return a value by the number of the description that it changes, or as it is."""
-    parameter = PARAMETER[value.name]
-    bases = basis_of(robot, value.name, total)
-    if bases and bases[0].described and bases[0].origin is not Origin.LEFT_OUT:
-        basis = bases[0]
-        scale = abs((basis.extended - basis.described) / total) if total else 0.0
-        name, _, unit = basis.written.rpartition("_")
-        number = f"{rounded(basis.extended, scale * _half(value))} {UNITS.get(unit, unit)}".strip()
-        name = name.replace("_", " ").removesuffix(" x").removesuffix(" z")
-        return f"{_article(name)} {name} of {number} {described_as(basis)}"
-    if parameter.as_percent:
-        number = f"{rounded(100.0 * total, 100.0 * _half(value))} %"
+    parameter = PARAMETER[name]
+    if basis is not None and basis.is_described:
+        scale = abs((term.extended - term.described) / term.total) if term.total else 0.0
+        label, _, unit = basis.written.rpartition("_")
+        number, joint = rounded(term.extended, scale * term.half), "of"
+        label, note = label.replace("_", " ").removesuffix(" x").removesuffix(" z"), f" {term.note}"
     else:
-        number = f"{rounded(total, _half(value))} {UNITS.get(parameter.unit, parameter.unit)}".strip()
-    return (
-        f"{_article(parameter.label)} {parameter.label} {'off by' if parameter.is_error else 'of'} {number}"
-    )
-
-
-def _article(name: str) -> str:
-    return "an" if name[0] in "aeiou" and not name.startswith("one") else "a"
-
-
-def _track(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    (basis,) = basis_of(robot, value.name, total[value.name])
-    number = rounded(basis.extended, basis.described * _half(value))
-    return f"an effective track of {number} m {described_as(basis)}"
-
-
-def _lever(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    """Return where the measured point is: only the sum of the lever described and the one found is known."""
-    parts: list[str] = []
-    notes: list[str] = []
-    for value, (ahead, behind) in zip(values, (("ahead", "behind"), ("left", "right")), strict=True):
-        if parts and abs(value.value) <= _half(value):
-            continue
-        (basis,) = basis_of(robot, value.name, total[value.name])
-        side = ahead if basis.extended >= 0.0 else behind
-        parts.append(f"{rounded(abs(basis.extended), _half(value))} m {side}")
-        notes.append(described_as(basis))
-    joint = {"behind": " "}.get(parts[-1].rpartition(" ")[2], " of ")
-    return f"the measured point {' and '.join(parts)}{joint}the centre {notes[0]}"
-
-
-def _centre_of_mass(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    parts, notes = [], []
-    for value, (ahead, behind) in zip(values, (("ahead", "behind"), ("left", "right")), strict=True):
-        (basis,) = basis_of(robot, value.name, total[value.name])
-        side = ahead if basis.extended >= 0.0 else behind
-        parts.append(f"{rounded(1000.0 * abs(basis.extended), 1000.0 * _half(value))} mm {side}")
-        notes.append(f"{1000.0 * basis.described:.3g}")
-    return f"the centre of mass {' and '.join(parts)} of the middle (described: {', '.join(notes)} mm)"
-
-
-def _wheel_distance(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    distance_m = as_drive(
-        OmniRobot, robot, "robot {name}: drive {drive!r} has no distance of omni wheels"
-    ).wheel_distance_m
-    number = rounded(distance_m * (1.0 + total[value.name]), distance_m * _half(value))
-    return f"wheels {number} m from the middle (described: {distance_m:.3g} m)"
-
-
-def _late(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    homes = basis_of(robot, value.name, total[value.name])
-    late_s = homes[0].extended if homes else total[value.name]
-    who = effect_named(PARAMETER[value.name].label.replace(" ", "_")).late
-    return f"{who[0 if late_s > 0 else 1]} {rounded(abs(late_s), _half(value))} s late"
-
-
-def _turn_drag(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    lost = total[value.name] * EXAMPLE_RADPS**2
-    percent = 100.0 * (lost / (1.0 + lost) if lost > 0 else lost)
-    change = "loses" if percent > 0 else "gains"
-    return f"a robot that {change} {abs(percent):.2g} % of its speed in a turn of {EXAMPLE_RADPS:g} rad/s"
-
-
-def _fast_turns(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    radps = FAST_RADPS
-    x = total[value.name] * (FAST_MPS * radps) ** 2 / (1.0 + (radps / SLIDING_RADPS) ** 2)
-    gained = x / (1.0 + abs(x))
-    percent = 100.0 * gained / (1.0 + gained)
-    return f"a track that acts {percent:.2g} % narrower at {FAST_MPS:g} m/s and {radps:g} rad/s"
-
-
-def _understeer(values: Sequence[Value], total: Total, robot: Robot) -> str:
-    (value,) = values
-    car = as_drive(BicycleRobot, robot, "robot {name}: drive {drive!r} has no understeer")
-    own, added = car.understeer_s2pm, total[value.name]
-    turned = [car.wheelbase_m / (car.wheelbase_m + each * FAST_MPS**2) for each in (own, own + added)]
-    percent = 100.0 * abs(turned[1] / turned[0] - 1.0)
-    number = f"{rounded(own + added, _half(value))} s²/m (described: {own:.2g} s²/m)"
-    change = "less" if added > 0 else "more"
-    return f"an understeer of {number}, which turns it {percent:.2g} % {change} at {FAST_MPS:g} m/s"
-
-
-def _sided(
-    scale: float, text: str, sides: tuple[str, str], values: Sequence[Value], total: Total, robot: Robot
-) -> str:
-    """Return the size of a value, and whether it is above or below zero."""
-    (value,) = values
-    number = rounded(scale * abs(total[value.name]), scale * _half(value))
-    wheels = "sprockets" if isinstance(robot, TrackedRobot) else "wheels"
-    return text.format(number=number, side=sides[0 if total[value.name] > 0 else 1], wheels=wheels)
-
-
-_SLIDE = f"a slide of {{number}} m/s to the {{side}} at {EXAMPLE_MPS:g} m/s and {EXAMPLE_RADPS:g} rad/s"
-_SIDES = "{wheels} that are {number} % {side} on the right than on the left"
-
-TERMS: dict[Wording, Callable[[Sequence[Value], Total, Robot], str]] = {
-    Wording.TRACK: _track,
-    Wording.MEASURED_POINT: _lever,
-    Wording.CENTRE_OF_MASS: _centre_of_mass,
-    Wording.WHEEL_DISTANCE: _wheel_distance,
-    Wording.LATE: _late,
-    Wording.CAMERA_YAW: partial(
-        _sided, math.degrees(1.0), "the camera turned {number}° to the {side}", ("right", "left")
-    ),
-    Wording.FAST_TURNS: _fast_turns,
-    Wording.LOSS_IN_TURNS: _turn_drag,
-    Wording.SIDE_SLIP: partial(_sided, EXAMPLE_MPS * EXAMPLE_RADPS, _SLIDE, ("outside", "inside")),
-    Wording.GYRO_SCALE: partial(_sided, 100.0, "a gyro that reads {number} % too {side}", ("much", "little")),
-    Wording.SIDES: partial(_sided, 100.0, _SIDES, ("larger", "smaller")),
-    Wording.UNDERSTEER: _understeer,
-}
-"""How the effects are worded whose numbers do not speak for themselves; the others by their home."""
+        percent = 100.0 if parameter.as_percent else 1.0
+        label, unit, note = parameter.label, "%" if parameter.as_percent else parameter.unit, ""
+        number, joint = (
+            rounded(percent * term.total, percent * term.half),
+            "off by" if parameter.is_error else "of",
+        )
+    article = "an" if label[0] in "aeiou" and not label.startswith("one") else "a"
+    return f"{article} {label} {joint} {f'{number} {UNITS.get(unit, unit)}'.strip()}{note}"

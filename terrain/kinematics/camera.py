@@ -33,8 +33,6 @@ CHANNELS: tuple[str, ...] = (
 )
 """Channels of the stream ``odometry``."""
 
-_VECTORS = (("position", "m"), ("quaternion", "ratio"), ("velocity", "mps"), ("rate", "radps"))
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyMotion:
@@ -160,38 +158,6 @@ def odometry_stream(
         np.broadcast_to(confidence, n),
     ]
     return Stream(time_s, np.column_stack(values), CHANNELS)
-
-
-def turned(values: Array, channels: tuple[str, ...], angle_rad: float) -> None:
-    """Turn what a camera tells to what it would tell were it mounted turned to the left by ``-angle_rad``.
-
-    A speed along the robot's x axis then shows as one to the left too, by the sine of the angle.  The fixed
-    frame is that of the power-on and turns with the mounting, so that position, velocity, rates and the
-    quaternion's vector part all turn alike about the body's z axis; its scalar part stays.
-
-    Parameters
-    ----------
-    values : (n, c) changed in place
-    channels : of the columns: vectors of :data:`CHANNELS`, in the camera's axes, or a plane's ``speed_x_mps``
-        and ``speed_y_mps`` in the body's; others stay
-    angle_rad : small or not
-
-    Examples
-    --------
-    >>> seen = np.array([[1.0, 0.0]])
-    >>> turned(seen, ("speed_x_mps", "speed_y_mps"), 0.1)
-    >>> seen.round(3)
-    array([[0.995, 0.1  ]])
-    """
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    # ahead is -z of the camera and left is -x: in that plane two signs make none
-    planes = [(f"{name}_z_{unit}", f"{name}_x_{unit}") for name, unit in _VECTORS]
-    for ahead, left in [("speed_x_mps", "speed_y_mps"), *planes]:
-        if ahead in channels and left in channels:
-            i, j = channels.index(ahead), channels.index(left)
-            x, y = values[:, i].copy(), values[:, j].copy()
-            values[:, i] = cos * x - sin * y
-            values[:, j] = sin * x + cos * y
 
 
 def to_body(vectors: Array) -> Array:

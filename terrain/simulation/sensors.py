@@ -23,9 +23,10 @@ import numpy as np
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
+from terrain.effects import turn_camera
 from terrain.kernels import njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.camera import to_camera, turned
+from terrain.kinematics.camera import to_camera
 from terrain.kinematics.wheels import point_velocity
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Reading, RunLog, Stream
@@ -560,7 +561,7 @@ class CameraSensor(Sensor):
             self.values[new],
         )
         if self._mounting_rad:
-            turned(self.values[new], self.channels, self._mounting_rad)
+            turn_camera(self.values[new], self.channels, self._mounting_rad)
 
 
 @njit

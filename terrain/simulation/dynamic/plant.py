@@ -52,7 +52,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import EFFECTS, PlantPart, in_plant, parameters_of, vector_of
+from terrain.effects import EFFECTS, Stage, in_plant, parameters_of, vector_of
 from terrain.errors import ConfigError
 from terrain.kernels import filled, numbers, record
 from terrain.records import Array
@@ -255,9 +255,9 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
         grade_ratio=conditions.grade_ratio,
         undulation_ratio=conditions.undulation_ratio,
         undulation_length_m=conditions.undulation_length_m,
-        linked=any(effects[name] != 0.0 for name in in_plant(PlantPart.LINKAGE)),
+        linked=any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE)),
         steer_offset_rad=[effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
-        yields=any(effects[name] != 0.0 for name in in_plant(PlantPart.CONTACT)),
+        yields=any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT)),
         weight_n=robot.mass_kg * GRAVITY_MPS2,
         effects=vector_of(effects).view(EFFECTS),
     )

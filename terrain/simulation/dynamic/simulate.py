@@ -26,7 +26,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from terrain.effects import OTHER_LOGGER, PlantPart, checked_effects, in_plant
+from terrain.effects import OTHER_LOGGER, Stage, checked_effects, in_plant
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.extension import apply_homes
 from terrain.kernels import filled, is_finite
@@ -221,7 +221,7 @@ def _built(robot: Robot, effects: Mapping[str, float]) -> Robot:
     acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
     n = len(acting)
     extended = replace(robot, effects=acting, effects_cov=np.full((n, n), np.nan))
-    return apply_homes(extended, in_plant(PlantPart.DESCRIPTION))
+    return apply_homes(extended, in_plant(Stage.DESCRIPTION))
 
 
 def _delay_steps(delay_s: float) -> int:

@@ -50,7 +50,7 @@ from typing import Any
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import EFFECTS
+from terrain.effects import EFFECTS, SLIDING_RADPS
 from terrain.kernels import njit
 from terrain.records import Array
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_softness, softness
@@ -86,10 +86,6 @@ SHORTEST_S, FALLS_MOST = 1e-6, -0.9
 ENDO_POWER = 0.5
 """Exponent n of the turning slip; assumed, Endo et al. fitted one to each ground, and ``turning_slip_power``
 does on tracks."""
-
-SLIDING_RADPS = 1.0
-"""Yaw rate from which the wheels mostly slide sideways, and below which they mostly deflect; of a Warthog on
-asphalt and gravel."""
 
 ROLLING_MPS = 0.02
 """Speed over which a resistance takes its full size, as in the dynamic simulation: it opposes motion and

@@ -15,7 +15,7 @@ from pipelines.slip import calibrate
 from pipelines.slip.estimate import estimate_runs
 from terrain.discrepancy.verdict import INTERVAL_T
 from terrain.errors import ConfigError, TerrainError
-from terrain.extension import write_extended
+from terrain.extension import extended_yaml
 from terrain.logs.write import write_run
 from terrain.robots import description_file, load_robot
 from terrain.simulation.planar.noise import load_noise
@@ -156,7 +156,8 @@ def test_an_extended_description_passes_through_the_commands(tmp_path):
     asked = {"wheel_radius_ratio": 0.04, "camera_yaw_rad": 0.05, "gyro_scale_ratio": 0.08}
     intervals = {name: (value - 0.01, value + 0.01) for name, value in asked.items()}
     out = tmp_path / "extended.yaml"
-    robot = write_extended(out, "agrimaro", asked, 1e-6 * np.eye(len(asked)), intervals, "a test")
+    out.write_text(extended_yaml("agrimaro", asked, 1e-6 * np.eye(len(asked)), intervals, "a test"))
+    robot = load_robot(out)
     run = simulate_run(load_robot("agrimaro"), "grass", "straight", 1, 1, duration_s=8.0, effects=asked)
     for tuning in ("physical", "likelihood"):
         (row,) = estimate_runs([run], robot, "vio15", tuning=tuning).result.runs

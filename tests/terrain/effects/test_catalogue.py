@@ -28,7 +28,7 @@ from terrain.effects import (
     SWERVE,
     TILT_OFFSETS,
     TURNING_CURRENT,
-    PlantPart,
+    Stage,
     effect_named,
     library_of,
     read_effects_of,
@@ -113,11 +113,8 @@ def responses():
         neutral = replay(planar, vector_of({}), DT, *inputs)
         for effect in LIBRARY:
             power = np.zeros(len(CHANNELS))
-            carrier = (
-                {p.name: 0.5 * p.high for p in effect_named(effect.modifies).parameters}
-                if effect.modifies
-                else {}
-            )
+            carriers = effect_named(effect.modifies).parameters if effect.modifies else ()
+            carrier = {p.name: 0.5 * p.high for p in carriers}
             without = replay(planar, vector_of(carrier), DT, *inputs) if carrier else neutral
             for p in effect.parameters:
                 shown = replay(planar, vector_of(carrier | {p.name: p.step}), DT, *inputs)
@@ -145,11 +142,6 @@ def test_names_are_unique_and_the_neutral_value_lies_within_the_bounds():
             assert p.unit in ("ratio", "rad", "s", "s2", "s2pm", "s2pm2", "m", "a", "radps", "mps2", "nspm")
 
 
-@pytest.mark.parametrize("name", ["steering_play=0.01", "steering_backlash=0.01"])
-def test_a_former_name_is_accepted_on_the_command_line(name):
-    assert read_effects_of([name], "swerve") == {"steering_backlash_rad": 0.01}
-
-
 def test_homes_are_numbers_of_a_description():
     for effect in LIBRARY:
         robot = ROBOTS["swerve" if SWERVE in effect.drives else effect.drives[0]]
@@ -157,9 +149,9 @@ def test_homes_are_numbers_of_a_description():
             for home in p.homes:
                 part = getattr(robot, home.section) if home.section else robot
                 assert isinstance(getattr(part, home.field), float), p.name
-        if effect.plant is PlantPart.DESCRIPTION:
+        if effect.stage is Stage.DESCRIPTION:
             assert all(p.homes for p in effect.parameters)
-        assert (effect.plant is None) == (SWERVE not in effect.drives)
+        assert (effect.stage is None) == (SWERVE not in effect.drives)
 
 
 def test_ranks_of_scatter_are_those_of_the_scatter_that_is_published():
@@ -170,7 +162,7 @@ def test_ranks_of_scatter_are_those_of_the_scatter_that_is_published():
 
 
 ADDED = r'''
-import importlib.util, json, sys, types
+import importlib.util, sys, types
 from pathlib import Path
 
 entry = """
@@ -178,8 +170,13 @@ entry = """
         "gear_wear",
         Parameter("ratio", -0.1, 0.1, 0.001, one_sided=True, scatter_rank=10, as_percent=True, is_error=True,
                   deprecated=("worn_ratio",)),
-        "x", "y", (SWERVE,), (CURRENT,), "z", True, PlantPart.DESCRIPTION, deprecated=("worn",),
+        "x", "y", (SWERVE,), (CURRENT,), "z", True, Stage.DESCRIPTION, deprecated=("worn",),
         homes=(Home("motors", "efficiency_ratio", Combine.TIMES),),
+    ),
+    effect(
+        "ticks", Parameter("ratio", -0.1, 0.1, 0.001), "x", "y", (SWERVE,), (SPEED_X,), "z", True, Stage.SENSORS,
+        inverse=Inverse(("wheels",), "x", undo=lambda block, e: block.values.__imul__(1.0 + e)),
+        words=lambda terms: f"wheels that count {100 * terms[0].total:.0f} % too much",
     ),
 """
 place = Path(importlib.util.find_spec("terrain").origin).parent / "effects.py"
@@ -189,14 +186,15 @@ assert source.count("    *CAR,\n") == 1
 exec(compile(source.replace("    *CAR,\n", "    *CAR,\n" + entry), str(place), "exec"), module.__dict__)
 
 from dataclasses import replace
+import numpy as np
 import terrain.effects as effects
 from terrain.discrepancy.statements import limit_text
-from terrain.discrepancy.robot_terms import quantity
-from terrain.discrepancy import residuals, search, evidence
+from terrain.discrepancy.robot_terms import in_robot_terms, quantity
+from terrain.discrepancy import residuals, evidence
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.verdict import Limit
-from terrain.extension import corrected
-from terrain.robots import TrackedRobot, load_robot, robot_from
+from terrain.discrepancy.verdict import Limit, Value
+from terrain.extension import Correction, corrected
+from terrain.robots import load_robot
 from terrain.simulation.dynamic.simulate import _built
 
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"
@@ -206,7 +204,7 @@ for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_O
     assert name in table
 assert name not in effects.nuisances_of("skid_steer")
 assert effects.read_effects_of(["worn=0.05"], "swerve") == {name: 0.05}
-assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[-1].name == "gear_wear"
+assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[-2].name == "gear_wear"
 entry = {"value": 0.05, "unit": "ratio", "source": "test"}
 assert effects.read_effects("here", {"schema": 1, "worn_ratio": entry}, "swerve")[0] == {name: 0.05}
 for extended in (corrected(replace(robot, effects={name: 0.05})), _built(robot, {name: 0.05})):
@@ -214,6 +212,11 @@ for extended in (corrected(replace(robot, effects={name: 0.05})), _built(robot, 
     assert not extended.effects
 assert quantity(name, 0.05) == "5\N{NO-BREAK SPACE}%"
 assert limit_text(Limit(name, 0.05, "ratio", "z"), False).startswith("A gear wear off by under 5")
+ticking = replace(robot, effects={"ticks_ratio": 0.1})
+undone = Correction(ticking)("wheels", ("motor_1_radps",), np.zeros(1), np.ones((1, 1)))[1]
+assert undone.item() == 1.1 and not corrected(ticking).effects
+value = Value("ticks_ratio", 0.1, "ratio", 0.09, 0.11)
+assert in_robot_terms("ticks", [value], robot) == "wheels that count 10 % too much"
 '''
 
 
@@ -283,6 +286,7 @@ def test_an_alias_is_the_effect():
         for name in (effect.name, *effect.aliases):
             assert effect_named(name) is effect
     assert read_effects_of(["encoder_scale=0.02"], "swerve") == {"wheel_radius_ratio": 0.02}
+    assert read_effects_of(["steering_play=0.01"], "swerve") == {"steering_backlash_rad": 0.01}
 
 
 @pytest.mark.parametrize(
@@ -307,9 +311,8 @@ def test_an_effect_that_cannot_be_is_refused_in_one_sentence(text, drive, messag
 
 
 def test_a_vector_takes_known_finite_numbers():
-    assert (
-        vector_of({"payload_ratio": 0.5}).sum() == vector_of({"payload_ratio": 0.5})[INDEX["payload_ratio"]]
-    )
+    vector = vector_of({"payload_ratio": 0.5})
+    assert vector.sum() == vector[INDEX["payload_ratio"]] == 0.5
     for values in ({"payload": 0.5}, {"payload_ratio": float("inf")}):
         with pytest.raises(ConfigError, match="a finite number of a known parameter"):
             vector_of(values)

@@ -1,7 +1,6 @@
 """Extended robots: a correction takes off a robot and a log just what its effects put on."""
 
 import ast
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,8 +10,10 @@ import pytest
 import terrain
 from terrain.effects import parameters_of
 from terrain.errors import ConfigError
-from terrain.estimation.estimate import filter_run
+from terrain.estimation.enriched import enriched
+from terrain.estimation.estimate import estimate_run, filter_run
 from terrain.estimation.live import LiveFilter
+from terrain.estimation.summary import summarize
 from terrain.estimation.table import measurement_table
 from terrain.extension import (
     Correction,
@@ -23,7 +24,6 @@ from terrain.extension import (
     corrected,
     corrected_log,
 )
-from terrain.kinematics.camera import body_motion
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
@@ -36,9 +36,6 @@ from terrain.terramechanics.soil import load_soil
 ROBOT, HUSKY, OMNI = load_robot("agrimaro"), load_robot("husky"), load_robot("robotino")
 BARE = HUSKY.without("body", "motors", "camera", "sensors")
 VALUES = {"wheel_radius_ratio": 0.031234567, "camera_yaw_rad": -0.012, "force_slip_ratio": 0.3}
-ROOT = np.array([[2e-3, 0.0, 0.0], [1e-3, 5e-4, 0.0], [0.01, -0.02, 0.03]])
-COV = ROOT @ ROOT.T
-INTERVALS = {name: (value - 0.05, value + 0.05) for name, value in VALUES.items()}
 EVERY = {name: 0.6 * p.high * 0.1 for name, p in parameters_of("swerve").items()}
 
 
@@ -51,14 +48,17 @@ def run_of(scenario="complex", length_s=30.0, effects=None):
     return simulate(ROBOT, drive, {"grass": load_soil("grass")}, 4, effects=effects)
 
 
-def test_no_effects_change_nothing():
-    run = run_of()
+def test_no_effects_change_nothing_and_corrections_are_applied_once():
+    run = run_of(effects=EVERY)
     assert corrected(ROBOT) is ROBOT
     assert corrected_log(run, ROBOT) is run
-    still = replace(ROBOT, effects=dict.fromkeys(EVERY, 0.0))
-    for name, stream in corrected_log(run, still).streams.items():
-        np.testing.assert_array_equal(stream.time_s, run.streams[name].time_s)
-        np.testing.assert_allclose(stream.values, run.streams[name].values, rtol=0, atol=1e-12)
+    once = corrected_log(run, extended(**EVERY))
+    zero = corrected_log(run, replace(ROBOT, effects=dict.fromkeys(EVERY, 0.0)))
+    twice = corrected_log(once, corrected(extended(**EVERY)))
+    for back, before, atol in ((zero, run, 1e-12), (twice, once, 0.0)):
+        for name, stream in back.streams.items():
+            np.testing.assert_array_equal(stream.time_s, before.streams[name].time_s)
+            np.testing.assert_allclose(stream.values, before.streams[name].values, rtol=0, atol=atol)
 
 
 def test_corrections_change_the_parameter_of_each_effect():
@@ -95,18 +95,10 @@ def test_corrections_change_the_parameter_of_each_effect():
 
 
 def test_the_covariance_of_what_stays_is_that_of_the_rest():
-    robot = replace(ROBOT, effects=VALUES, effects_cov=COV)
-    np.testing.assert_array_equal(apply_homes(robot).effects_cov, COV[1:, 1:])
-    np.testing.assert_array_equal(corrected(robot).effects_cov, COV[2:, 2:])
-
-
-def test_corrections_are_applied_once():
-    run = run_of(effects=EVERY)
-    once = corrected_log(run, extended(**EVERY))
-    assert corrected(extended(**EVERY)).effects
-    for name, stream in corrected_log(once, corrected(extended(**EVERY))).streams.items():
-        np.testing.assert_array_equal(stream.time_s, once.streams[name].time_s)
-        np.testing.assert_array_equal(stream.values, once.streams[name].values)
+    root = np.array([[2e-3, 0.0, 0.0], [1e-3, 5e-4, 0.0], [0.01, -0.02, 0.03]])
+    robot = replace(ROBOT, effects=VALUES, effects_cov=root @ root.T)
+    np.testing.assert_array_equal(apply_homes(robot).effects_cov, robot.effects_cov[1:, 1:])
+    np.testing.assert_array_equal(corrected(robot).effects_cov, robot.effects_cov[2:, 2:])
 
 
 def every_stream():
@@ -163,7 +155,7 @@ SENSED = {
 }
 
 
-@pytest.mark.parametrize("names", [*([name] for name in SENSED), list(SENSED)])
+@pytest.mark.parametrize("names", [[name] for name in list(SENSED)[::2]] + [list(SENSED)])
 def test_a_correction_is_the_inverse_of_what_sensors_do(names):
     """All streams come back but for the noise of the sensors, which is scaled with them."""
     effects = {name: SENSED[name] for name in names}
@@ -195,7 +187,7 @@ def test_a_pose_of_a_camera_whose_scale_and_angle_are_off_comes_back():
     np.testing.assert_allclose(back.values, clean.streams["pose"].values, atol=1e-9)
 
 
-@pytest.mark.parametrize("block", [1, 7, 1000])
+@pytest.mark.parametrize("block", [1, 7])
 def test_block_by_block_is_the_whole_run(block):
     effects = EVERY | {"steering_backlash_rad": 0.05}
     run = run_of(effects=effects)
@@ -264,16 +256,6 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
     np.testing.assert_allclose(wheels[:, 1] - wheels[:, 0], late, atol=1e-12)
 
 
-def test_motion_does_not_depend_on_the_mounting_of_the_camera():
-    effects = {"camera_yaw_rad": 0.3}
-    clean, run = run_of(), run_of(effects=effects)
-    seen, wrong = (body_motion(log.streams["odometry"], ROBOT.camera) for log in (clean, run))
-    cos, sin = math.cos(0.3), math.sin(0.3)
-    turned_mps = seen.speed_mps @ np.array([[cos, sin], [-sin, cos]])
-    np.testing.assert_allclose(wrong.speed_mps, turned_mps, atol=0.01)  # it tilts with the body as well
-    np.testing.assert_allclose(wrong.yaw_rate_radps, seen.yaw_rate_radps, atol=1e-9)
-
-
 EDGES = {
     "terrain/estimation/estimate.py",
     "terrain/estimation/observers/estimate.py",
@@ -333,3 +315,51 @@ def test_live_is_live_on_the_corrected_log():
         assert all(np.isfinite(estimate.mean).all() for estimate in raw.step(one.readings))
     np.testing.assert_allclose([t.mean for t in found], [w.mean for w in desired], atol=1e-9)
     np.testing.assert_allclose([t.slip_ratio for t in found], [w.slip_ratio for w in desired], atol=1e-9)
+
+
+# effects, and how much worse speed and slip are for them: the errors without them are 0.0028 m/s and 0.012
+WORTH = {
+    "radius, camera and gyro": (
+        {"wheel_radius_ratio": 0.04, "camera_yaw_rad": 0.05, "gyro_scale_ratio": 0.08},
+        8.0,
+        2.5,
+    ),
+    "clocks": ({"clock_offset_s": 0.1, "clock_rate_ratio": 0.001}, 8.0, 1.3),
+    "lever and latency": ({"lever_x_m": 0.2, "lever_y_m": -0.15, "camera_latency_s": 0.08}, 6.0, 1.1),
+    "one side and biases": (
+        {"one_sided_radius_ratio": 0.06, "gyro_bias_radps": 0.03, "accel_bias_mps2": 0.5},
+        0.0,
+        2.0,
+    ),
+    "steering": (
+        {"steering_offset_1_rad": 0.05, "steering_backlash_rad": 0.03, "steering_delay_s": 0.08},
+        *(0.0, 0.0),
+    ),
+}
+
+
+def errors(found):
+    """Root mean square errors of speed (m/s) and of steady slip, against the truth of wheels and ground."""
+    truth, track = found.run.streams["truth"], found.track
+    true = [np.interp(track.time_s, truth.time_s, truth.channel(f"slip_{i}_ratio")) for i in (1, 2, 3)]
+    error = (found.slip.slip_ratio - np.column_stack(true))[found.figures.steady]
+    return np.array([summarize(found).speed_rmse_mps, np.sqrt(np.nanmean(error**2))])
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=[pytest.mark.slow] * (i > 0)) for i, n in enumerate(WORTH)]
+)
+def test_the_filter_of_an_extended_robot_is_as_good_as_without_effects(name):
+    effects, *gains = WORTH[name]
+    run, clean = run_of(length_s=60.0, effects=effects), run_of(length_s=60.0)
+    before, found = (estimate_run(run, robot, "vio15") for robot in (ROBOT, extended(**effects)))
+    assert (errors(found) < [1.5, 1.2] * errors(estimate_run(clean, ROBOT, "vio15"))).all()
+    assert (errors(before) >= gains * errors(found)).all()
+    assert summarize(found).nees < 2.0
+    assert found.run is run
+    if "wheel_radius_ratio" in effects:  # the written run holds the measurements and the true wheel speeds
+        written = enriched(found)
+        assert written.streams["imu"] is run.streams["imu"]
+        rates = written.streams["wheels"].channel("motor_1_radps") / ROBOT.motors.reduction_ratio
+        speeds = written.streams["wheels"].channel("speed_1_mps")
+        np.testing.assert_allclose(speeds, rates * ROBOT.wheel_radius_m * 1.04)
