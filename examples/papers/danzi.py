@@ -20,17 +20,17 @@ from terrain.classify.metrics import run_bootstrap
 from terrain.classify.stiffness import StiffnessLevel, cost_matrix, least_cost_class
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.danzi_pid import (
+from terrain.control.pid import (
     LOW_SPEED_MPS,
     POWER_THRESHOLD_WPKG,
-    ThesisSettings,
+    Gains,
     WheelPid,
     conditioned_slip,
     desired_slip,
+    pid_step,
     power_state,
     wheel_step,
 )
-from terrain.control.pid import Gains, pid_step
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import THESIS_EMA_ALPHA, THESIS_SAMPLE_TIME_S, Estimate, estimate_run
 from terrain.estimation.filter import FilterSettings, run_filter
@@ -776,8 +776,8 @@ def normalised_step(
     state: WheelPid, gain: float, rate: float, speed: float, accel: float
 ) -> tuple[float, float, WheelPid]:
     """Return what the controller of this package does, by which an error is worth the same at any speed."""
-    settings = ThesisSettings(1.0, Gains(gain, 0.0, 0.0, limit=10.0))
-    step, after = wheel_step(settings, state, rate, rate, speed, accel, abs(speed), TARGETS, 0.02)
+    gains = Gains(gain, 0.0, 0.0, limit=10.0)
+    step, after = wheel_step(gains, 1.0, state, rate, rate, speed, accel, abs(speed), TARGETS, 0.02)
     return step.correction_radps, step.desired_ratio, after
 
 

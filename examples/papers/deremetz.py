@@ -12,8 +12,7 @@ from car_scenarios import GRIP_RATIO, STOP, Course, slope_course, stop_course
 from claims import Finding, Numbers, Trial
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
-from terrain.control.car_following import CarFollower, SlipSource
-from terrain.control.path_drive import FollowedDrive, followed_drive
+from terrain.control.car_following import CarFollower, FollowedDrive, SlipSource, followed_drive
 from terrain.estimation.observers.family import Observer
 from terrain.estimation.observers.sideslip_dynamic import DynamicSettings, sideslip_dynamic_observer
 from terrain.estimation.observers.sideslip_forces import C_LOW_NPR

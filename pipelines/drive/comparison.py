@@ -7,12 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from pipelines.drive.controllers import DriveInputs, drive_once, train_classifier
-from pipelines.drive.run_figures import run_figures
+from pipelines.drive.run_figures import DriveCurves, drive_curves, run_figures
 from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report.figure import Bars, Figure, Panel, Points
@@ -37,12 +37,10 @@ from terrain.control.drive_comparison import (
     MeanInterval,
     Metrics,
     add_energies,
-    evaluated,
     matching_ramp,
     steepest_grade,
 )
-from terrain.control.drive_curves import DriveCurves
-from terrain.control.drive_metrics import metric_label
+from terrain.control.drive_metrics import LABELS, drive_history, energy_curve, evaluate_drive
 from terrain.control.situations import COURSE, SITUATIONS, SLOPE, Situation, SituationOptions, make_situation
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.records import RunLog
@@ -170,9 +168,13 @@ def _situation(settings: Settings, inputs: DriveInputs, seed: int) -> Situation:
 
 
 def _drive_one(settings: Settings, inputs: DriveInputs, controller: Controller, seed: int) -> Drive:
-    situation = _situation(settings, inputs, seed)
+    situation, robot = _situation(settings, inputs, seed), inputs.simulated
     log = drive_once(inputs, controller, situation)
-    drive = evaluated(log, inputs.simulated, situation, controller, shown=seed == settings.first_seed)
+    history = drive_history(log, robot, situation.conditions.radius_factors)
+    adapting_to = controller.table if adapts(controller.name) else None
+    metrics = evaluate_drive(log, history, robot, situation, adapting_to)
+    curves = drive_curves(log, controller.table) if seed == settings.first_seed else None
+    drive = Drive(metrics, energy_curve(history, situation.scenario), curves)
 
     def climb(grade_deg: float) -> RunLog:
         steeper = settings.model_copy(update={"grade_deg": grade_deg})
@@ -211,6 +213,30 @@ def report(result: DriveResult) -> Report:
         ),
         next_step=f"terrain drive --faults all --robot {result.robot}",
     )
+
+
+class Label(NamedTuple):
+    """Name of a metric, and its unit or nothing."""
+
+    text: str
+    unit: str
+
+    @property
+    def with_unit(self) -> str:
+        """The name with its unit in brackets."""
+        return f"{self.text} [{self.unit}]" if self.unit else self.text
+
+
+def metric_label(key: str) -> Label:
+    """Return the label of a metric.
+
+    Examples
+    --------
+    >>> tuple(metric_label("first_distance_5s_m")), metric_label("energy_4m_j").with_unit
+    (('distance within 5 s of a start, first start', 'm'), 'energy of the first 4 m [J]')
+    """
+    text, unit = LABELS[key.removeprefix("first_")]
+    return Label(f"{text}, first start" if key.startswith("first_") else text, unit)
 
 
 def belief_notes(compared: Comparison) -> tuple[str, ...]:

@@ -43,7 +43,7 @@ from terrain.control.fault_drives import (
     make_fault_situation,
 )
 from terrain.control.learned_table import simulated_table
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import KnownTerrain
 from terrain.errors import ConfigError

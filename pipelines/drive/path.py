@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,21 +15,22 @@ from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_counts, format_value
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Pairs, Part, Report, Section, Text
-from terrain.control.car_following import SlipSource
-from terrain.control.path_drive import (
-    WHEELS,
+from terrain.control.car_following import (
+    CarFollower,
     FollowedDrive,
-    PathPlan,
-    columns_of,
-    drive_along,
-    drive_warnings,
-    path_figures,
-    tick_statuses,
+    FollowedTick,
+    SlipSource,
+    SteeringSettings,
+    SteerStatus,
+    followed_drive,
 )
-from terrain.control.paths import ReferencePath, path_warnings, read_path
+from terrain.control.paths import GRID_M, PathStatus, ReferencePath, read_path
 from terrain.errors import ConfigError
+from terrain.estimation.observers.family import ObserverStatus
 from terrain.files.atomic import atomic_write
 from terrain.robots import BicycleRobot, as_drive, load_robot
+from terrain.simulation.car import CarDrive, Ground, SpeedProfile, simulate_car
+from terrain.status import StatusCode
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,6 +44,14 @@ DISTANCE = "distance along the path [m]"
 
 SHOWN_M = 1.5
 """Lateral errors beyond this leave the figure."""
+
+STAND_S = 3.0
+"""Time of a stop."""
+
+START_M, SLOW_MPS = 2.0, 0.5
+"""Distance travelled beside that of speeding up, and speed, from which the robot counts as cruising."""
+
+WHEELS = ("front", "rear")
 
 
 class PathResult(Result, eq=False):
@@ -83,7 +93,24 @@ class PathResult(Result, eq=False):
         """Return the drive, a row a tick."""
         import pandas as pd
 
-        return pd.DataFrame(columns_of(self.drive))
+        drive = self.drive
+        columns = {
+            "time_s": drive.time_s,
+            "distance_m": drive.distance_m,
+            "lateral_m": drive.lateral_m,
+            "position_x_m": drive.position_m[:, 0],
+            "position_y_m": drive.position_m[:, 1],
+            "speed_mps": drive.speed_mps,
+            "steer_front_rad": drive.steer_rad,
+        }
+        for j, wheel in enumerate(WHEELS):
+            columns |= {
+                f"slip_{wheel}_rad": drive.slip_rad[:, j],
+                f"slip_{wheel}_std_rad": drive.slip_std_rad[:, j],
+                f"slip_{wheel}_true_rad": drive.slip_true_rad[:, j],
+                f"cornering_{wheel}_npr": drive.stiffness_npr[:, j],
+            }
+        return pd.DataFrame(columns)
 
 
 def run(settings: Settings, progress: Progress) -> PathResult:
@@ -105,15 +132,7 @@ def run(settings: Settings, progress: Progress) -> PathResult:
             f"--speed is {speed_mps:g}; {robot.name} drives at most {robot.speed_max_mps:g} m/s"
         )
     path = read_path(settings.path, settings.point_std)
-    plan = PathPlan(
-        speed_mps=speed_mps,
-        source=SlipSource(settings.observer),
-        slope_rad=np.deg2rad(settings.slope_deg),
-        grip_ratio=settings.grip,
-        offset_m=settings.offset,
-        stops_m=settings.stop,
-    )
-    drive, ticks = drive_along(robot, path, plan, settings.first_seed)
+    drive, ticks = drive_along(robot, path, settings, speed_mps)
     progress("drive", 1, 1)
     files = () if settings.out is None else (settings.out / PAGE_FILE, settings.out / "drive.csv")
     result = PathResult(
@@ -124,9 +143,9 @@ def run(settings: Settings, progress: Progress) -> PathResult:
         length_m=path.length_m,
         n_points_merged=path.n_merged,
         speed_mps=speed_mps,
-        **path_figures(drive, plan),
+        **path_figures(drive, settings, speed_mps),
         statuses=tick_statuses(ticks),
-        warnings=(*path_warnings(path, robot), *drive_warnings(drive, ticks, plan)),
+        warnings=(*path_warnings(path, robot), *drive_warnings(drive, ticks, settings.stop)),
         page=files[0] if files else None,
         files=files,
         offset_m=settings.offset,
@@ -137,6 +156,98 @@ def run(settings: Settings, progress: Progress) -> PathResult:
         table = result.to_pandas().to_csv(index=False, float_format="%.6g", na_rep="nan")
         atomic_write(files[1], table)
     return result
+
+
+def drive_along(
+    robot: BicycleRobot, path: ReferencePath, settings: Settings, speed_mps: float
+) -> tuple[FollowedDrive, Sequence[FollowedTick]]:
+    """Return the simulated drive along a path, and the ticks of its controller; the ground has the path's roll."""
+    steering = SteeringSettings(offset_m=settings.offset)
+    follower = CarFollower(robot, path, SlipSource(settings.observer), steering)
+    assert path.roll_rad is not None
+    at, known = path.distance_m[::10], path.roll_rad[::10]
+    roll = np.where(np.isnan(known), np.deg2rad(settings.slope_deg), known)
+    ground = Ground(at, np.full(len(at), settings.grip), roll)
+    stops = tuple((distance, STAND_S) for distance in settings.stop if distance < path.length_m)
+    longest_s = 2.0 * path.length_m / speed_mps + 30.0 + STAND_S * len(stops)
+    x, y, heading = path.start
+    start = (x - settings.offset * np.sin(heading), y + settings.offset * np.cos(heading), heading)
+    drive = CarDrive(ground, SpeedProfile(speed_mps, stops), longest_s, start)
+    log = simulate_car(robot, drive, follower, np.random.default_rng(settings.first_seed))
+    return followed_drive(log, path, follower.ticks), follower.ticks
+
+
+def path_figures(drive: FollowedDrive, settings: Settings, speed_mps: float) -> dict[str, Any]:
+    """Return figures of a drive by its truth; NaN where undefined, those of slip angles above :data:`SLOW_MPS`."""
+    error = drive.lateral_m - settings.offset
+    moves = drive.speed_mps > SLOW_MPS
+    cruises = moves & drive.between(START_M + speed_mps**2 / 3.0, np.inf)
+    stiffness = np.abs(drive.stiffness_error_ratio)
+    slips, errors = np.abs(drive.slip_true_rad[moves]), drive.slip_error_rad[moves]
+    errors = errors[np.isfinite(errors)]
+    observed = settings.observer != "none" and errors.size
+    worst, limit = float(np.abs(error).max()), speed_mps / 10.0
+    return {
+        "reached_end": drive.reached_end,
+        "duration_s": float(drive.time_s[-1]),
+        "slowest_mps": float(drive.speed_mps[cruises].min()) if cruises.any() else math.nan,
+        "lateral_max_m": worst,
+        "lateral_rms_m": float(np.sqrt(np.mean(error**2))),
+        "lateral_max_at_m": float(drive.distance_m[np.abs(error).argmax()]),
+        "limit_m": limit,
+        "within_limit": bool(drive.reached_end and worst <= limit),
+        "slip_max_rad": float(np.nanmax(slips)) if np.isfinite(slips).any() else math.nan,
+        "slip_error_rad": float(np.sqrt(np.mean(errors**2))) if observed else math.nan,
+        "stiffness_error_ratio": float(np.median(stiffness)) if stiffness.size else math.nan,
+        "grip_ratio": float(drive.grip_ratio[-1]),
+        "grip_std": float(drive.grip_std[-1]),
+    }
+
+
+def tick_statuses(ticks: Sequence[FollowedTick]) -> dict[str, dict[str, int]]:
+    """Return the number of ticks by the status of observer, path and steering."""
+    codes: dict[str, list[StatusCode]] = {
+        "observer": [ObserverStatus(tick.estimate.status) for tick in ticks],
+        "path": [tick.place.status for tick in ticks],
+        "steering": [tick.steer_status for tick in ticks],
+    }
+    return {
+        name: {code.label: n for code, n in sorted(Counter(found).items())} for name, found in codes.items()
+    }
+
+
+def path_warnings(path: ReferencePath, robot: BicycleRobot) -> Iterator[str]:
+    """Yield a sentence for what of a path the robot cannot drive, and for what was changed."""
+    reach = math.tan(robot.steering_max_rad) / robot.wheelbase_m
+    sharpest = int(np.abs(path.curvature_pm).argmax())
+    if abs(curvature := path.curvature_pm[sharpest]) > reach:
+        yield (
+            f"curvature is {curvature:.3f} 1/m at {sharpest * GRID_M:.1f} m; "
+            f"steering to {np.degrees(robot.steering_max_rad):.0f} degrees reaches {reach:.3f} 1/m"
+        )
+    if path.n_merged:
+        yield f"{path.n_merged} points that repeat the one before were merged with it"
+
+
+def drive_warnings(
+    drive: FollowedDrive, ticks: Sequence[FollowedTick], stops_m: Sequence[float]
+) -> Iterator[str]:
+    """Yield what a user has to know of a drive along a path, a sentence each."""
+    last_m = drive.distance_m[-1]
+    if not drive.reached_end:
+        yield f"the end was not reached: the robot came to {last_m:.1f} m"
+    for status, text in (
+        (PathStatus.FAR, "was too far from the path to find its place"),
+        (PathStatus.SINGULAR, "was near the centre of curvature of the path"),
+    ):
+        first = next((tick for tick in ticks if tick.place.status == status), None)
+        if first is not None:
+            yield f"the robot {text}, first at {first.place.distance_m:.1f} m after {first.time_s:.1f} s"
+    clamped = sum(tick.steer_status == SteerStatus.CLAMPED for tick in ticks) / len(ticks)
+    if clamped > 0.01:
+        yield f"the steering was at its limit for {clamped:.0%} of the drive"
+    if late := [distance for distance in stops_m if distance > last_m]:
+        yield f"stop at {late[0]:g} m is beyond where the drive ended"
 
 
 def report(result: PathResult) -> Report:

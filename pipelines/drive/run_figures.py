@@ -1,16 +1,22 @@
-"""Figures of single drives: speeds over ground, and slip against its target."""
+"""Curves and figures of single drives: speeds over ground, and slip against its target."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Strip
-from terrain.control.danzi_pid import DriveState
-from terrain.control.drive_curves import DriveCurves, spans
-from terrain.control.drive_metrics import PEAK_ABOVE_MPS
+from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Span, Strip, spans
+from terrain.control.drive_metrics import PEAK_ABOVE_MPS, low_passed_slip
+from terrain.control.pid import DriveState
+from terrain.control.slip_table import SlipTable
 from terrain.control.traction import TractionStatus
+from terrain.kinematics.logged_wheels import true_slip
+from terrain.records import Array, RunLog
+
+MAX_POINTS = 2500
 
 CAPTION = (
     "Above: desired and commanded speed, and the speed over ground. Below: the true slip, with the range of the "
@@ -21,6 +27,62 @@ CAPTION = (
 STATES = {int(DriveState.TRACTION): "traction: speed rises", int(DriveState.BRAKING): "braking"}
 
 BLUE, VERMILION, GREEN, ORANGE, PINK, _, GREY = range(7)
+
+
+class DriveCurves(NamedTuple):
+    """Curves of a drive, of so many points as can be seen."""
+
+    true_s: Array  # of the true speed and slip, (n,)
+    true_mps: Array
+    slip: Array  # mean of the wheels
+    slip_least: Array
+    slip_largest: Array
+    control_s: Array  # of the pilot's channels, (m,)
+    control: Mapping[str, Array]
+    aimed: Array  # target slip with its floor, negative in braking
+    is_open_loop: bool  # no slip was estimated
+    terrains: Mapping[str, Sequence[Span]]  # ``true`` and ``classified`` over time; empty on one terrain
+
+
+def drive_curves(run: RunLog, table: SlipTable) -> DriveCurves:
+    """Return the curves of a drive by a pilot that numbers the terrains by a table's entries.
+
+    True slip is low-pass filtered as its estimate, and NaN where the robot is slower than
+    :data:`terrain.control.drive_metrics.PEAK_ABOVE_MPS`.  A wheel that turns against the motion is drawn as a
+    locked one.
+    """
+    truth, control = run.streams["truth"], run.streams["control"]
+    speed = np.hypot(truth.channel("speed_x_mps"), truth.channel("speed_y_mps"))
+    wheels = [name.split("_")[1] for name in truth.channels if name.startswith("wheel_")]
+    true = np.clip(true_slip(truth, wheels), -1.0, 1.0)
+    slips = low_passed_slip(true, float(np.median(np.diff(truth.time_s))))
+    slips[speed < PEAK_ABOVE_MPS] = np.nan
+    seen, ticks = (
+        slice(None, None, max(1, math.ceil(len(each) / MAX_POINTS)))
+        for each in (truth.time_s, control.time_s)
+    )
+    channels = {name: control.channel(name)[ticks] for name in control.channels}
+    aimed, control_s, codes = channels["aimed_ratio"], control.time_s[ticks], channels["terrain_code"]
+    if not np.isfinite(channels["balance_ratio"]).any():  # the thesis reports the magnitude of its target
+        aimed = np.where(channels["drive_state_code"] == DriveState.BRAKING, -aimed, aimed)
+    terrains = {}
+    if len(run.terrains) > 1:
+        terrains["true"] = [(label.start_s, label.end_s, label.terrain) for label in run.labels]
+        if (codes >= 0).any():
+            terrains["classified"] = spans(control_s, codes, dict(enumerate(table.targets)))
+    slips = slips[seen]
+    return DriveCurves(
+        truth.time_s[seen],
+        speed[seen],
+        slips.mean(axis=1),
+        slips.min(axis=1),
+        slips.max(axis=1),
+        control_s,
+        channels,
+        aimed,
+        not np.isfinite(channels["slip_ratio"]).any(),
+        terrains,
+    )
 
 
 def run_figures(examples: Mapping[str, DriveCurves]) -> list[Figure]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from pipelines.live.classifying import WindowOutput
 from pipelines.live.model import TerrainModel
 from terrain.control.live_state import Bias, LiveState
-from terrain.control.pilot_settings import check_table
+from terrain.control.robot_control import check_table
 from terrain.control.slip_table import SlipTable
 from terrain.control.switching import (
     NO_BELIEF,

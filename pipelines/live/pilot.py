@@ -19,8 +19,13 @@ from pipelines.live.chain import Chain, CommandStatus, Step
 from pipelines.live.classifying import PILOT_FILTER
 from pipelines.live.model import TerrainModel
 from terrain.control.live_state import LiveState
-from terrain.control.pilot_settings import DEFAULT_SETTINGS, OPEN_LOOP, PilotSettings, check_pilot
-from terrain.control.robot_control import RobotControl
+from terrain.control.robot_control import (
+    DEFAULT_SETTINGS,
+    OPEN_LOOP,
+    PilotSettings,
+    RobotControl,
+    check_pilot,
+)
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainSource
 from terrain.control.traction import TractionStatus
@@ -158,7 +163,7 @@ class LivePilot(Chain):
         Returns
         -------
         Command
-            its ``status`` has the fields of :class:`~terrain.control.pilot_settings.PilotStatus`
+            its ``status`` has the fields of :class:`~terrain.control.robot_control.PilotStatus`
         """
         time_s, readings = self._clocks.step(
             getattr(sample, "time_s", None), getattr(sample, "readings", None)

@@ -24,7 +24,7 @@ from pipelines.live.observer import Observer
 from pipelines.live.pilot import LivePilot
 from pipelines.live.recording import RecordingThread, SessionRecorder
 from terrain.control.live_state import LiveState
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.arrivals import Inbox, StreamHealth, as_numbers

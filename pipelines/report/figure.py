@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+Span = tuple[float, float, str]
+"""Start, end and name of an interval."""
 
 
 class Mark(NamedTuple):
@@ -47,9 +52,27 @@ def Bars(
     return Mark("bars", label, categories, values, low, high, colour)
 
 
-def Strip(spans: Sequence[tuple[float, float, str]]) -> Mark:
-    """Return coloured intervals ``(start, end, name)`` along x; one name has one colour."""
-    return Mark("strip", "", spans)
+def Strip(intervals: Sequence[Span]) -> Mark:
+    """Return coloured intervals along x; one name has one colour."""
+    return Mark("strip", "", intervals)
+
+
+def spans(time_s: Any, codes: Any, names: Mapping[int, str]) -> list[Span]:
+    """Return the intervals in which a code (n,) has a name, from its first sample to that of the next code.
+
+    Examples
+    --------
+    >>> spans(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0, 1, 1, 0]), {1: "braking"})
+    [(1.0, 3.0, 'braking')]
+    """
+    codes = np.nan_to_num(codes, nan=-99.0)  # no status
+    first = np.flatnonzero(np.diff(codes, prepend=codes[0] - 1))
+    ends = [*time_s[first[1:]].tolist(), float(time_s[-1])]
+    return [
+        (float(time_s[i]), end, names[int(codes[i])])
+        for i, end in zip(first, ends, strict=True)
+        if int(codes[i]) in names
+    ]
 
 
 @dataclass(frozen=True)

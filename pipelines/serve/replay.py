@@ -25,7 +25,7 @@ from pipelines.report.numbers import format_counts, format_value, plural
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Report, Table, Text, sections
 from pipelines.serve.serve import Settings, loaded, stopping
-from terrain.control.pilot_settings import PilotSettings, check_table
+from terrain.control.robot_control import PilotSettings, check_table
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.live import CHANNELS

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points, Strip
+from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points, Strip, spans
 from pipelines.report.numbers import format_value, plural
 from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Part, Report, Text
@@ -23,7 +23,6 @@ from pipelines.slip.tracks import (
     estimated,
     tracks_report,
 )
-from terrain.control.drive_curves import spans
 from terrain.errors import ConfigError
 from terrain.estimation.enriched import enriched
 from terrain.estimation.estimate import Estimate, estimate_run, tuning_of

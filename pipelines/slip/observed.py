@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipelines.report.figure import Figure, Line, Mark, Panel, Points, Strip
+from pipelines.report.figure import Figure, Line, Mark, Panel, Points, Strip, spans
 from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Report
@@ -24,7 +24,6 @@ from pipelines.slip.tracks import (
     estimated,
     tracks_report,
 )
-from terrain.control.drive_curves import spans
 from terrain.errors import ConfigError
 from terrain.estimation.observers.choice import BY_MODEL
 from terrain.estimation.observers.estimate import ObserverEstimate, observe_run, with_estimates

@@ -49,7 +49,7 @@ def learn_steady(
     if others:
         raise DataError(f"runs are of the robot {others[0]!r}: a table is learned for one, {robot.name!r}")
     window_s, found = measure_steady(labelled, robot, seed, progress)
-    learned = learn_surfaces(found, robot, name, seed)
+    table, surfaces, points, transfers = learn_surfaces(found, robot, name, seed)
     not_labelled = [
         f"run {run.run_id}: is on {len(run.terrains)} terrains: {', '.join(run.terrains)}"
         if run.terrains
@@ -58,15 +58,15 @@ def learn_steady(
         if len(run.terrains) != 1
     ]
     return SteadyTargets(
-        **fields_of(learned.table),
+        **fields_of(table),
         seed=seed,
         data_digest=data_digest(found.runs),
         n_runs=len(found.runs),
         skipped=(*not_labelled, *found.failed),
-        pictures={"operating_points": operating_figure(robot.name, learned.surfaces, learned.points)},
+        pictures={"operating_points": operating_figure(robot.name, surfaces, points)},
         window_s=window_s,
-        surfaces=learned.surfaces,
-        transfers=learned.transfers,
+        surfaces=surfaces,
+        transfers=transfers,
     )
 
 

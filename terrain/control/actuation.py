@@ -34,16 +34,10 @@ SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 
 
 class Follower:
-    """A wheel's speed, or a steering angle, against its command.
+    """A wheel's speed, or a steering angle, against its command: whether it ``is_off``.
 
-    Parameters
-    ----------
-    tolerance, ratio : a constant, and a part of the command
-    still_s : time within which a value that repeats itself has to change as the command does
-
-    Attributes
-    ----------
-    is_off : whether it does not do what it was commanded
+    The tolerance is a constant and a ratio of the command; a value that repeats itself has to change as the
+    command does within ``still_s``.
     """
 
     def __init__(self, tolerance: float, ratio: float = 0.0, still_s: float = math.inf) -> None:
@@ -92,15 +86,9 @@ def _low_passed(before: float, value: float, step_ratio: float) -> float:
 
 
 class Actuation:
-    """Wheels and steering of a robot against their commands, step by step.
+    """Wheels and steering of a robot against their commands, step by step: which (6,) are ``off``.
 
-    Parameters
-    ----------
-    mps_per_radps : speed of a wheel by the rate of its motor
-
-    Attributes
-    ----------
-    off : (6,) wheels and steering angles that are off their commands
+    ``mps_per_radps`` is the speed of a wheel by the rate of its motor.
     """
 
     def __init__(self, mps_per_radps: float) -> None:

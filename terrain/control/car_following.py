@@ -1,9 +1,28 @@
-"""A car-like robot that follows a path: observer, steering law and preview as a controller in the loop.
+"""A car-like robot that follows a path: steering law, observer of sideslip, and preview as a controller in the loop.
 
-At a tick the observer takes what was measured, the path gives the deviations of the estimated pose, and
-:mod:`terrain.control.steering_law` the steering.  Without an observer of sideslip the slip is 0, and the pose
-is that of the extended kinematic model without slip.  The robot stops where it does not know where it is: no
-fix for three seconds, or further from the path than its search reaches; at the end the drive is finished.
+At a tick the observer takes what was measured, the path gives the deviations of the estimated pose, and the
+law the steering.  With the deviations y and theta~ from a path of curvature c, slip angles b of the axles, and a
+desired lateral offset y_d::
+
+    g = theta~ + b_R      a = 1 - c y      A = -K_p (y - y_d) - K_d a tan g + c a tan^2 g
+    d = atan(tan b_R + L / cos b_R (c cos g / a + A cos^3 g / a^2)) - b_F                     (17)
+    d = d_traj + d_dev,   d_traj = atan(L c cos g / a)                                        (18)
+
+The part d_dev comes from what is measured, and is passed on.  The part d_traj follows the path, whose future
+is known: it is commanded ahead, so that what the actuator makes of it (dead time T_d, then a lag tau) is
+where d_traj will be after the horizon H::
+
+    d_command = (d_traj(s + v (T_d + H)) - exp(-H / tau) m) / (1 - exp(-H / tau))
+
+with m the actuator's model driven by the commands of this part.  In steady cornering d_command = d_traj.
+
+Deremetz et al., ICRA 2017, (17), (18); Cariou et al. 2009.  K_p and K_d are per metre: (17) makes y converge
+over distance, y'' + K_d y' + K_p y = 0, alike at every speed up to the one from which the actuator's delays
+would matter.
+
+Without an observer of sideslip the slip is 0, and the pose is that of the extended kinematic model without slip.
+The robot stops where it does not know where it is: no fix for three seconds, or further from the path than its
+search reaches; at the end the drive is finished.
 
 The preview gives speed and steering ahead of bends, by the grip that the estimated cornering stiffness
 shows.  An axle under the load N carries |F| = f N.  With the cornering stiffness C_0 that the tyre has at small
@@ -27,15 +46,15 @@ prediction.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.paths import GRID_M, PathStatus, ReferencePath
-from terrain.control.steering_law import SteeringSettings, SteerState, SteerStatus, check_steering, steer
-from terrain.errors import ConfigError
+from terrain.control.paths import GRID_M, PathStatus, Place, ReferencePath
+from terrain.control.pid import LONGEST_STEP_S, checked
 from terrain.estimation.observers.family import Observer, ObserverOutput
 from terrain.estimation.observers.sideslip_dynamic import sideslip_dynamic_observer
 from terrain.estimation.observers.sideslip_kinematic import sideslip_kinematic_observer
@@ -48,9 +67,162 @@ from terrain.estimation.observers.sideslip_pose import (
     SPEED,
     PoseSettings,
 )
-from terrain.records import Array
+from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot
 from terrain.simulation.car import CarCommand, CarSample
+from terrain.status import StatusCode
+
+
+class SteerStatus(StatusCode):
+    """What a steering angle is worth."""
+
+    OK = 0
+    CLAMPED = 1
+    """At the limit of the steering."""
+    SINGULAR = 2
+    """1 - c y close to 0 or below, or across the path: bounded."""
+    HELD = 3
+    """Deviations are not known: the curvature of the path is steered, nothing is corrected."""
+    BAD_INPUT = 4
+    """Speed or time are not numbers that can be: the steering is as it was."""
+
+
+class SteeringSettings(NamedTuple):
+    """Gains and what is known of the actuator.
+
+    Parameters
+    ----------
+    position_pm2, angle_pm : K_p and K_d; the default is critically damped
+    fastest_ps : bandwidth above which both fall with the speed, as delays are in seconds
+    offset_m : desired distance to the left of the path
+    delay_s : dead time of the steering
+    slip_lag_s : time constant of a low-pass of the slip angles.  The front one has -d in it, at once: fed
+        back without a lag it closes a fast loop of gain 1 around actuator and tyres
+    horizon_time_constants : H over the actuator's time constant, 3 for its response time (95 %); 0 passes the
+        curvature on as it is
+    """
+
+    position_pm2: float = 0.16
+    angle_pm: float = 0.8
+    fastest_ps: float = 1.5
+    offset_m: float = 0.0
+    delay_s: float = 0.05
+    horizon_time_constants: float = 3.0
+    slip_lag_s: float = 0.05
+
+
+_LEAST_BESIDE, _ACROSS_RAD = 0.2, 1.3
+
+
+class SteerState(NamedTuple):
+    """The actuator's model m, the last command, and slip angles behind their low-pass."""
+
+    model_rad: float = 0.0
+    command_rad: float = 0.0
+    front_rad: float = 0.0
+    rear_rad: float = 0.0
+
+
+def check_steering(settings: SteeringSettings) -> SteeringSettings:
+    """Return settings that :func:`steer` accepts: gains above zero, bounded delays; else ``ConfigError``."""
+    gains = "position_pm2", "angle_pm", "fastest_ps"
+    most = {"delay_s": 2.0, "slip_lag_s": 10.0, "horizon_time_constants": 20.0}
+    checked("steering: ", settings._replace(offset_m=abs(settings.offset_m)), gains, most=most)
+    return settings
+
+
+def law_17(
+    settings: SteeringSettings,
+    base_m: float,
+    lateral: float,
+    angle: float,
+    curvature: float,
+    front: float,
+    rear: float,
+) -> float:
+    """Return the steering angle of (17), not limited.
+
+    Examples
+    --------
+    >>> round(law_17(SteeringSettings(), 1.2, 0.0, 0.0, 0.1, 0.0, 0.0), 4)  # atan(L c)
+    0.1194
+    """
+    gamma = min(max(angle + rear, -_ACROSS_RAD), _ACROSS_RAD)
+    beside = max(1.0 - curvature * lateral, _LEAST_BESIDE)
+    tangent, cos = math.tan(gamma), math.cos(gamma)
+    pull = -settings.position_pm2 * (lateral - settings.offset_m) - settings.angle_pm * beside * tangent
+    pull += curvature * beside * tangent * tangent
+    bend = curvature * cos / beside + pull * (cos * cos * cos) / (beside * beside)
+    return math.atan(math.tan(rear) + base_m / math.cos(rear) * bend) - front
+
+
+def _curvature_at(path: ReferencePath, distance_m: float) -> float:
+    at = min(max(distance_m / GRID_M, 0.0), len(path.curvature_pm) - 1.001)
+    before, after = path.curvature_pm[int(at) : int(at) + 2].tolist()
+    return float(before + (at - int(at)) * (after - before))
+
+
+def steer(
+    robot: BicycleRobot,
+    settings: SteeringSettings,
+    state: SteerState,
+    path: ReferencePath,
+    place: Place,
+    slips: Array,
+    speed_mps: float,
+    dt_s: float,
+) -> tuple[float, SteerState, SteerStatus]:
+    """Return the steering to command, the next state and the status.
+
+    Parameters
+    ----------
+    robot, settings : that steers; accepted ones
+    state : ``SteerState()`` at first, then what the step before returned
+    path, place : that is followed, and where the robot is on it
+    slips : (2,) of front and rear; NaN is taken as no slip
+    speed_mps : of the robot
+    dt_s : since the step before
+    """
+    if not (0.0 <= dt_s <= LONGEST_STEP_S and abs(speed_mps) < 100.0 and abs(place.distance_m) < 1e9):
+        return state.command_rad, state, SteerStatus.BAD_INPUT
+    part = 1.0 - math.exp(-dt_s / max(settings.slip_lag_s, 1e-9))
+    front, rear = (
+        before + part * ((slip if abs(slip) < 1.0 else 0.0) - before)
+        for before, slip in zip(state[2:], slips.tolist(), strict=True)
+    )
+    status, lateral, angle = SteerStatus.OK, place.lateral_m, place.angle_rad
+    curvature = place.curvature_pm if abs(place.curvature_pm) < 1e3 else 0.0
+    if not (abs(lateral) < 1e6 and abs(angle) < 1e6):
+        status, lateral, angle = SteerStatus.HELD, settings.offset_m, -rear
+    elif 1.0 - curvature * lateral < _LEAST_BESIDE or abs(angle + rear) > _ACROSS_RAD:
+        status = SteerStatus.SINGULAR
+    gamma = min(max(angle + rear, -_ACROSS_RAD), _ACROSS_RAD)
+    beside = max(1.0 - curvature * lateral, _LEAST_BESIDE)
+    along = robot.wheelbase_m * math.cos(gamma) / beside
+    followed = math.atan(along * curvature)
+    slower = min(1.0, settings.fastest_ps / max(abs(speed_mps) * math.sqrt(settings.position_pm2), 1e-9))
+    gains = settings._replace(
+        position_pm2=settings.position_pm2 * (slower * slower), angle_pm=settings.angle_pm * slower
+    )
+    deviation = law_17(gains, robot.wheelbase_m, lateral, angle, curvature, front, rear) - followed
+    ahead, tau_s, most = followed, robot.steering_time_constant_s, robot.steering_max_rad
+    horizon_s = settings.horizon_time_constants * tau_s
+    if horizon_s > 0.0:
+        reach = abs(speed_mps) * (settings.delay_s + horizon_s)
+        target = math.atan(along * _curvature_at(path, place.distance_m + reach))
+        keep = math.exp(-horizon_s / tau_s)
+        ahead = (target - keep * state.model_rad) / (1.0 - keep)
+    ahead = min(max(ahead, -most), most)
+    lag = -math.expm1(-dt_s / tau_s) if tau_s > 0.0 else 1.0
+    command = ahead + deviation
+    if abs(command) > most:
+        command, status = math.copysign(most, command), max(status, SteerStatus.CLAMPED)
+    return (
+        command,
+        SteerState(state.model_rad + lag * (ahead - state.model_rad), command, front, rear),
+        status,
+    )
+
 
 REACH_TIME_CONSTANTS = 1.0
 """Of the steering, by which the sideslip expected ahead is steered before it comes, beside the dead time."""
@@ -87,28 +259,11 @@ def sideslip_observer(robot: BicycleRobot, source: SlipSource) -> Observer:
     )
 
 
-class GripSettings(NamedTuple):
-    """What is assumed of grip, and how much of it is used.
-
-    Parameters
-    ----------
-    grip_ratio, grip_std : at first
-    grip_walk : change within a second, one standard deviation
-    used_part : of the grip that the side force ahead may take
-    braking_mps2 : below the drive's acceleration
-    stiffness_std_ratio : of C_0, the nominal stiffness
-    correlation_s : for which errors of an estimated slip last
-    """
-
-    grip_ratio: float = 0.6
-    grip_std: float = 0.15
-    grip_walk: float = 0.02
-    used_part: float = 0.75
-    braking_mps2: float = 1.0
-    stiffness_std_ratio: float = 0.2
-    correlation_s: float = 0.3
-
-
+USED_PART, BRAKING_MPS2 = 0.75, 1.0
+"""Of the grip, what the side force ahead may take; and the braking before a bend, below the drive's acceleration."""
+GRIP_WALK, STIFFNESS_STD_RATIO, CORRELATION_S = 0.02, 0.2, 0.3
+"""Standard deviations of the grip's change within a second and of the nominal stiffness C_0, and the time for
+which errors of an estimated slip last; all assumed."""
 _LEAST_GRIP, _MOST_GRIP = 0.05, 1.5
 _SHOWS = 0.1
 """Part of the load below which a side force shows nothing of the grip."""
@@ -116,29 +271,14 @@ _LOOK_M = 0.5
 
 
 class Grip(NamedTuple):
-    """Largest side force over load, and its variance."""
+    """Largest side force over load, and its variance; as assumed at first."""
 
-    ratio: float
-    variance: float
-
-
-def first_grip(settings: GripSettings) -> Grip:
-    """Return the grip before anything is known.
-
-    Raises
-    ------
-    ConfigError
-        if a setting is not above zero, or the part used above 1.
-    """
-    bad = [f"{name} is {value:g}" for name, value in settings._asdict().items() if not 0 < value < math.inf]
-    if bad or settings.used_part > 1.0:
-        raise ConfigError(f"{', '.join(bad) or 'used_part is above 1'}; see GripSettings")
-    return Grip(settings.grip_ratio, settings.grip_std**2)
+    ratio: float = 0.6
+    variance: float = 0.15**2
 
 
 def grip_step(
     robot: BicycleRobot,
-    settings: GripSettings,
     grip: Grip,
     force_mps2: float,
     slips: Array,
@@ -149,7 +289,7 @@ def grip_step(
 
     Parameters
     ----------
-    robot, settings, grip : whose tyres; what is assumed; as it was
+    robot, grip : whose tyres; as it was
     force_mps2 : lateral specific force, u r + g sin a
     slips, slip_std : (2,) as estimated; NaN shows nothing
     dt_s : since the step before
@@ -157,16 +297,16 @@ def grip_step(
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> robot, grip = load_robot("adap2e"), first_grip(GripSettings())
+    >>> robot, grip = load_robot("adap2e"), Grip()
     >>> slips, std = np.array([-0.3, -0.3]), np.full(2, 0.01)
     >>> for _ in range(200):  # half of g although the slip is large: that is all the grip there is
-    ...     grip = grip_step(robot, GripSettings(), grip, 4.9, slips, std, 0.02)
+    ...     grip = grip_step(robot, grip, 4.9, slips, std, 0.02)
     >>> round(grip.ratio, 2)
     0.51
     """
     if not (0.0 < dt_s < 1.0 and abs(force_mps2) < 50.0):
         return grip
-    mu, variance = grip.ratio, min(grip.variance + settings.grip_walk * settings.grip_walk * dt_s, 0.25)
+    mu, variance = grip.ratio, min(grip.variance + GRIP_WALK * GRIP_WALK * dt_s, 0.25)
     used = abs(force_mps2) / GRAVITY_MPS2
     if used < _SHOWS:
         return Grip(mu, variance)
@@ -181,9 +321,9 @@ def grip_step(
         q = slope * abs(slip)
         left = math.exp(-q / mu)
         shown = 1.0 - left * (1.0 + q / mu)
-        by_slip, by_stiffness = slope * std, settings.stiffness_std_ratio * q
+        by_slip, by_stiffness = slope * std, STIFFNESS_STD_RATIO * q
         noise = 0.02 * 0.02 + left * left * (by_slip * by_slip + by_stiffness * by_stiffness)
-        noise *= max(1.0, 2.0 * settings.correlation_s / dt_s)
+        noise *= max(1.0, 2.0 * CORRELATION_S / dt_s)
         gain = variance * shown / (shown * shown * variance + noise)
         mu = min(max(mu + gain * (used - mu * (1.0 - left)), _LEAST_GRIP), _MOST_GRIP)
         variance *= 1.0 - gain * shown
@@ -197,29 +337,27 @@ def _roll_at(path: ReferencePath, row: int, roll_rad: float) -> float:
     return roll_rad if math.isnan(known) else known
 
 
-def preview_speed(
-    settings: GripSettings, grip: Grip, path: ReferencePath, distance_m: float, roll_rad: float
-) -> float:
+def preview_speed(grip: Grip, path: ReferencePath, distance_m: float, roll_rad: float) -> float:
     """Return the fastest speed at a distance along a path; infinite where nothing limits it.
 
     Examples
     --------
     >>> from terrain.control.paths import path_from_curvature
     >>> bend = path_from_curvature(np.array([0.0, 20.0, 20.1, 40.0]), np.array([0.0, 0.0, 0.1, 0.1]))
-    >>> [round(preview_speed(GripSettings(), Grip(0.5, 0.0), bend, s, 0.0), 2) for s in (10.0, 20.0, 25.0)]
+    >>> [round(preview_speed(Grip(0.5, 0.0), bend, s, 0.0), 2) for s in (10.0, 20.0, 25.0)]
     [7.6, 6.15, 6.06]
     """
     known = max(grip.ratio - math.sqrt(grip.variance), _LEAST_GRIP)
     first, least = path.row_at(distance_m), math.inf
     for i in range(first, len(path.x_m), int(_LOOK_M / GRID_M)):
         ahead = (i - first) * GRID_M
-        if 2.0 * settings.braking_mps2 * ahead > least:
+        if 2.0 * BRAKING_MPS2 * ahead > least:
             break
         curvature, roll = float(path.curvature_pm[i]), _roll_at(path, i, roll_rad)
         pull = GRAVITY_MPS2 * math.sin(roll) * (1.0 if curvature > 0.0 else -1.0)
-        room = settings.used_part * known * GRAVITY_MPS2 * math.cos(roll) - max(pull, 0.0)
+        room = USED_PART * known * GRAVITY_MPS2 * math.cos(roll) - max(pull, 0.0)
         square = max(room, 0.25) / max(abs(curvature), 1e-6)
-        least = min(least, square + 2.0 * settings.braking_mps2 * ahead)
+        least = min(least, square + 2.0 * BRAKING_MPS2 * ahead)
     return math.sqrt(least)
 
 
@@ -241,29 +379,16 @@ def expected_slips(
 
 
 class FollowedTick(NamedTuple):
-    """What a controller knew and did at a tick.
-
-    Parameters
-    ----------
-    time_s : of the tick
-    distance_m, lateral_m : on the path, by the estimated pose
-    path_status, steer_status, observer_status : whether each could do its part
-    estimate : of the observer
-    steer_rad, speed_mps : commanded
-    grip_ratio, grip_std : as estimated; NaN without the preview
-    """
+    """What a controller knew and did at a tick."""
 
     time_s: float
-    distance_m: float
-    lateral_m: float
-    path_status: PathStatus
-    steer_status: SteerStatus
-    observer_status: int
+    place: Place  # on the path, by the estimated pose
     estimate: ObserverOutput
-    steer_rad: float
-    speed_mps: float
-    grip_ratio: float
-    grip_std: float
+    steer_status: SteerStatus
+    grip: Grip  # as estimated; NaN without the preview
+
+
+_NO_GRIP = Grip(math.nan, math.nan)
 
 
 class CarFollower:
@@ -275,8 +400,11 @@ class CarFollower:
     path : to follow
     source : of the sideslip
     steering : gains of the law
-    grip : settings of the preview, which only ``multi-grip`` has
     observer : another observer than :func:`sideslip_observer` gives
+
+    Attributes
+    ----------
+    ticks : what was known and done, in the order of time
     """
 
     def __init__(
@@ -285,17 +413,15 @@ class CarFollower:
         path: ReferencePath,
         source: SlipSource = SlipSource.MULTI,
         steering: SteeringSettings = SteeringSettings(),  # noqa: B008
-        grip: GripSettings = GripSettings(),  # noqa: B008
         observer: Observer | None = None,
     ) -> None:
         self._robot, self._path, self._source = robot, path, SlipSource(source)
         self._observer = sideslip_observer(robot, self._source) if observer is None else observer
         self._memory, self._steered = np.array(self._observer.start), SteerState()
-        self._steering, self._grip_settings, self._grip = check_steering(steering), grip, first_grip(grip)
+        self._steering, self._grip = check_steering(steering), Grip()
         self._reach_s = steering.delay_s + REACH_TIME_CONSTANTS * robot.steering_time_constant_s
         self._before_m, self._time_s = math.nan, math.nan
         self.ticks: list[FollowedTick] = []
-        """What was known and done, in the order of time."""
 
     def __call__(self, sample: CarSample) -> CarCommand:
         """Return the command of a tick."""
@@ -306,47 +432,120 @@ class CarFollower:
         speed = float(self._memory[SPEED])
         x_m, y_m, yaw_rad = known.mean[:3].tolist()
         place = self._path.locate(x_m, y_m, yaw_rad, self._before_m)
-        if place.status not in (PathStatus.NO_POSE, PathStatus.FAR) or math.isnan(self._before_m):
-            self._before_m = place.distance_m if place.status is not PathStatus.NO_POSE else math.nan
+        is_first = math.isnan(self._before_m)
+        if place.status not in (PathStatus.NO_POSE, PathStatus.FAR) or (
+            is_first and place.status is PathStatus.FAR
+        ):
+            self._before_m = place.distance_m
         slips = np.zeros(2) if self._source is SlipSource.NONE else known.slip
-        desired, previews = sample.speed_desired_mps, self._source is SlipSource.GRIP
-        if previews:
+        desired, grip = sample.speed_desired_mps, _NO_GRIP
+        if self._source is SlipSource.GRIP:
             slips, desired = self._preview(known, sample, place.distance_m, dt_s, desired)
+            grip = self._grip
         steer_rad, self._steered, status = steer(
             self._robot, self._steering, self._steered, self._path, place, slips, speed, dt_s
         )
-        lost = self._memory[SINCE_FIX] > LOST_STOP_S or place.status is PathStatus.FAR
+        stops = self._memory[SINCE_FIX] > LOST_STOP_S or place.status is PathStatus.FAR
         finished = place.status is PathStatus.END
-        command = CarCommand(steer_rad, 0.0 if lost or finished else desired, finished)
-        grip = self._grip if previews else Grip(math.nan, math.nan)
-        self.ticks.append(
-            FollowedTick(
-                time_s=sample.time_s,
-                distance_m=place.distance_m,
-                lateral_m=place.lateral_m,
-                path_status=place.status,
-                steer_status=status,
-                observer_status=known.status,
-                estimate=known,
-                steer_rad=steer_rad,
-                speed_mps=command.speed_mps,
-                grip_ratio=grip.ratio,
-                grip_std=math.sqrt(grip.variance),
-            )
-        )
-        return command
+        self.ticks.append(FollowedTick(sample.time_s, place, known, status, grip))
+        return CarCommand(steer_rad, 0.0 if stops or finished else desired, finished)
 
     def _preview(
         self, known: ObserverOutput, sample: CarSample, distance_m: float, dt_s: float, desired_mps: float
     ) -> tuple[Array, float]:
         """Return slips with what is expected of the path ahead, and the speed that the grip allows."""
-        robot, path, settings = self._robot, self._path, self._grip_settings
         speed, roll = float(self._memory[SPEED]), float(self._memory[ROLL])
         force = float(sample.measured[IN_SPEED] * sample.measured[IN_RATE]) + GRAVITY_MPS2 * math.sin(roll)
-        self._grip = grip_step(robot, settings, self._grip, force, known.slip, known.slip_std, dt_s)
-        fastest = preview_speed(settings, self._grip, path, distance_m, roll)
+        self._grip = grip_step(self._robot, self._grip, force, known.slip, known.slip_std, dt_s)
+        fastest = preview_speed(self._grip, self._path, distance_m, roll)
         here, ahead = (
-            expected_slips(robot, path, s, roll, speed, known.mean[5:7])
+            expected_slips(self._robot, self._path, s, roll, speed, known.mean[5:7])
             for s in (distance_m, distance_m + abs(speed) * self._reach_s)
         )
         return known.slip + ahead - here, min(desired_mps, fastest)
+
+
+EXCITED_MPS2, EXCITED_RAD = 1.5, 0.02
+"""Lateral specific force and slip angles from which a cornering stiffness can be compared with its secant."""
+
+
+class FollowedDrive(NamedTuple):
+    """Truth and estimates at the ticks of a drive: rows (n,) or, front and rear, (n, 2)."""
+
+    time_s: Array
+    distance_m: Array  # of the true pose beside the path
+    lateral_m: Array
+    position_m: Array  # (n, 2) true
+    speed_mps: Array  # true
+    slip_rad: Array  # (n, 2) as estimated; NaN where unknown, or at rest
+    slip_true_rad: Array
+    slip_std_rad: Array
+    stiffness_npr: Array  # (n, 2) as estimated
+    secant_npr: Array  # (n, 2) -F/b of the truth where it is excited; else NaN
+    steer_rad: Array  # true
+    grip_ratio: Array  # as estimated; NaN without the preview
+    grip_std: Array
+    reached_end: bool  # the drive came to the end of the path
+
+    def between(self, start_m: float, end_m: float) -> Array:
+        """Return which ticks (n,) lie between two distances."""
+        return (self.distance_m >= start_m) & (self.distance_m < end_m)
+
+    def lateral_max_m(self, start_m: float = 0.0, end_m: float = math.inf) -> float:
+        """Return the largest lateral error between two distances; NaN where the robot never was."""
+        part = np.abs(self.lateral_m[self.between(start_m, end_m)])
+        return float(part.max()) if part.size else math.nan
+
+    @property
+    def stiffness_error_ratio(self) -> Array:
+        """Errors (k,) of the estimated stiffness over its secant, of both axles, where it is excited."""
+        error = (self.stiffness_npr / self.secant_npr - 1.0).ravel()
+        return error[np.isfinite(error)]
+
+    @property
+    def slip_error_rad(self) -> Array:
+        """Errors (n, 2) of the slip angles; NaN where one is not known."""
+        return self.slip_rad - self.slip_true_rad
+
+
+def followed_drive(run: RunLog, path: ReferencePath, ticks: Sequence[FollowedTick]) -> FollowedDrive:
+    """Return the drive of a simulated car and what its controller knew.
+
+    Parameters
+    ----------
+    run : as simulated, with its truth
+    path : that was followed
+    ticks : of the controller, one for each tick of the wheels
+    """
+    truth, n = run.streams["truth"], len(ticks)
+    step = round(len(truth) / n)
+    columns = {name: truth.channel(name)[::step][:n] for name in truth.channels}
+    before, places = math.nan, np.empty((n, 2))
+    for k in range(n):
+        x_m, y_m, yaw_rad = (float(columns[name][k]) for name in ("position_x_m", "position_y_m", "yaw_rad"))
+        place = path.locate(x_m, y_m, yaw_rad, before)
+        before, places[k] = place.distance_m, place[:2]
+    true_slips = np.column_stack([columns["slip_front_rad"], columns["slip_rear_rad"]])
+    forces = np.column_stack([columns["side_front_n"], columns["side_rear_n"]])
+    shown = (np.abs(true_slips) > EXCITED_RAD) & (np.abs(columns["accel_y_mps2"]) > EXCITED_MPS2)[:, None]
+    shown &= forces * true_slips < 0.0
+    secant = np.full((n, 2), math.nan)
+    np.divide(-forces, true_slips, out=secant, where=shown)
+    means = [tick.estimate.mean for tick in ticks]
+    stiffness = [mean[5:7] if len(mean) == 7 else np.full(2, math.nan) for mean in means]
+    return FollowedDrive(
+        time_s=truth.time_s[::step][:n],
+        distance_m=places[:, 0],
+        lateral_m=places[:, 1],
+        position_m=np.column_stack([columns["position_x_m"], columns["position_y_m"]]),
+        speed_mps=columns["speed_x_mps"],
+        slip_rad=np.array([tick.estimate.slip for tick in ticks]),
+        slip_true_rad=true_slips,
+        slip_std_rad=np.array([tick.estimate.slip_std for tick in ticks]),
+        stiffness_npr=np.array(stiffness),
+        secant_npr=secant,
+        steer_rad=columns["steer_front_rad"],
+        grip_ratio=np.array([tick.grip.ratio for tick in ticks]),
+        grip_std=np.sqrt([tick.grip.variance for tick in ticks]),
+        reached_end=ticks[-1].place.status == PathStatus.END,
+    )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from terrain.errors import ConfigError
 
 if TYPE_CHECKING:
-    from terrain.control.pilot_settings import PilotSettings
+    from terrain.control.robot_control import PilotSettings
     from terrain.control.slip_table import SlipTable
 
 TRACK = "+track"
@@ -39,6 +39,7 @@ class Kind(NamedTuple):
 
 
 _THESIS, _TRACTION = "The thesis' PID of slip on each wheel, with the target", "Traction control"
+_CLASSIFIED = "of the terrain that a classifier recognises while driving"
 
 KINDS = {
     "plain": Kind("plain", Source.NONE, "The wheel speeds of the kinematics; slip is not used."),
@@ -50,20 +51,14 @@ KINDS = {
         f"{_TRACTION}: one speed for all wheels, limited while it rises; the target is that of the table's "
         "fallback.",
     ),
-    "classified": Kind(
-        "traction",
-        Source.CLASSIFIER,
-        f"{_TRACTION} with the target of the terrain that a classifier recognises while driving.",
-    ),
+    "classified": Kind("traction", Source.CLASSIFIER, f"{_TRACTION} with the target {_CLASSIFIED}."),
     "true_terrain": Kind(
         "traction",
         Source.TRUTH,
         f"{_TRACTION} with the target of the true terrain: the limit for a classifier without error.",
     ),
     "thesis:classified": Kind(
-        "thesis",
-        Source.CLASSIFIER,
-        f"{_THESIS}s of the terrain that a classifier recognises while driving: the chain of the thesis.",
+        "thesis", Source.CLASSIFIER, f"{_THESIS}s {_CLASSIFIED}: the chain of the thesis."
     ),
     "thesis:true_terrain": Kind("thesis", Source.TRUTH, f"{_THESIS}s of the true terrain."),
 }
@@ -160,7 +155,8 @@ def make_controller(
     ConfigError
         if there is none of that name, or its terrain or target is none.
     """
-    from terrain.control.pilot_settings import PilotSettings
+    from terrain.control.robot_control import PilotSettings
+    from terrain.records import SlipTarget, TargetStatus
 
     kind, (bare, track, rest) = kind_of(name), name.partition(TRACK)
     if kind is None or rest:
@@ -174,21 +170,13 @@ def make_controller(
     if kind.source is Source.KNOWN and given not in table.targets:
         raise ConfigError(f"controller {name!r}: the table {table.name} has no entry {given!r}")
     if bare.startswith("target:"):
-        table = _single_target(table, name, given)
+        try:
+            ratio = float(given)
+        except ValueError:
+            ratio = math.nan
+        if not 0.0 <= ratio < 1.0:
+            raise ConfigError(f"controller {name!r}: a slip from 0 to below 1 is required")
+        target = SlipTarget(table.fallback, "traction", ratio, math.nan, 0, TargetStatus.UNESTIMATED, "given")
+        only = {table.fallback: {**table.targets[table.fallback], "traction": target}}
+        table = replace(table, targets=only, curves={}, reasons={})
     return Controller(name, pilot, table, kind.source, given if kind.source is Source.KNOWN else "")
-
-
-def _single_target(table: SlipTable, name: str, slip: str) -> SlipTable:
-    """Return a table whose only entry is its fallback, with one target."""
-    from terrain.records import SlipTarget, TargetStatus
-
-    try:
-        ratio = float(slip)
-    except ValueError:
-        ratio = math.nan
-    if not 0.0 <= ratio < 1.0:
-        raise ConfigError(f"controller {name!r}: a slip from 0 to below 1 is required")
-    entry = dict(table.targets[table.fallback])
-    assumed = TargetStatus.UNESTIMATED
-    entry["traction"] = SlipTarget(table.fallback, "traction", ratio, math.nan, 0, assumed, "given")
-    return replace(table, targets={table.fallback: entry}, curves={}, reasons={})

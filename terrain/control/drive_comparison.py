@@ -9,35 +9,19 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
 
-from terrain.control.controllers import TRACK, Controller, adapts, uses_classifier
-from terrain.control.drive_curves import DriveCurves, drive_curves
-from terrain.control.drive_metrics import (
-    START_TIME_S,
-    EnergyCurve,
-    drive_history,
-    energy_at_equal_distance,
-    energy_curve,
-    evaluate_drive,
-)
-from terrain.control.situations import STARTS, Situation
+from terrain.control.controllers import TRACK, adapts, uses_classifier
+from terrain.control.drive_metrics import START_TIME_S, EnergyCurve, energy_at_equal_distance
+from terrain.control.situations import STARTS
 from terrain.records import Array, RunLog
-from terrain.robots import Robot
 
 
 class MeanInterval(NamedTuple):
-    """A mean and its 95 % interval; None where it is not known.
-
-    Parameters
-    ----------
-    mean : None without a known value
-    ci : lower and upper end; None with fewer than two values
-    n : number of known values
-    """
+    """A mean and its 95 % interval, of the known values: None without one, and the interval of a single one."""
 
     mean: float | None
     ci: tuple[float, float] | None
@@ -79,27 +63,18 @@ def paired_difference(
 ) -> Difference | None:
     """Return the mean of ``values - base``, pair by pair; None without a pair of which both are known.
 
-    Parameters
-    ----------
-    values, base : of the same runs; None or NaN where a value is not known
-    relative : divide by the mean of ``base``, which then has to be above zero
+    Relative to the mean of ``base``, which then has to be above zero.
     """
-    pairs = np.array(
-        [(a, b) for a, b in zip(values, base, strict=True) if _is_known(a) and _is_known(b)], dtype=float
-    ).reshape(-1, 2)
+    pairs = np.array([values, base], dtype=float).T
+    pairs = pairs[np.isfinite(pairs).all(axis=1)]
     if not len(pairs):
         return None
     each = pairs[:, 0] - pairs[:, 1]
-    mean, half, scale = float(each.mean()), _half_interval(each), float(pairs[:, 1].mean())
-    if relative:
-        if scale <= 0.0:
-            return None
-        mean, half = mean / scale, half / scale
+    scale = float(pairs[:, 1].mean()) if relative else 1.0
+    if scale <= 0.0:
+        return None
+    mean, half = float(each.mean()) / scale, _half_interval(each) / scale
     return Difference(mean, mean - half, mean + half)
-
-
-def _is_known(value: float | None) -> bool:
-    return value is not None and math.isfinite(value)
 
 
 def _half_interval(values: Array) -> float:
@@ -158,16 +133,7 @@ class Drive(NamedTuple):
 
     metrics: dict[str, float]
     energy: EnergyCurve
-    curves: DriveCurves | None
-
-
-def evaluated(run: RunLog, robot: Robot, situation: Situation, controller: Controller, shown: bool) -> Drive:
-    """Return the evaluation of a drive, with its curves where they are shown."""
-    history = drive_history(run, robot, situation.conditions.radius_factors)
-    adapting_to = controller.table if adapts(controller.name) else None
-    metrics = evaluate_drive(run, history, robot, situation, adapting_to)
-    curves = drive_curves(run, controller.table) if shown else None
-    return Drive(metrics, energy_curve(history, situation.scenario), curves)
+    curves: Any = None
 
 
 def add_energies(drives: Mapping[str, Sequence[Drive]]) -> None:
@@ -196,19 +162,15 @@ def matching_ramp(
     scenario: str,
     accel_mps2: float,
 ) -> float | None:
-    """Return the ramp that travels as far as the first reference among the controllers, at the same seeds.
+    """Return the rise of speed in m/s^2 by which the ramp travels as far as the first reference among controllers.
+
+    None where no controller is a reference.
 
     Parameters
     ----------
-    drives : by controller
+    drives : by controller, at the same seeds
     of_ramp : drives of the controller ``ramp`` with a rise of speed in m/s^2
-    scenario : that is driven
-    accel_mps2 : desired rise of speed
-
-    Returns
-    -------
-    float or None
-        rise of speed in m/s^2; None where no controller is a reference
+    scenario, accel_mps2 : that is driven, and the desired rise of speed
     """
     references = [name for kind in REFERENCES for name in drives if name in (kind, f"{kind}{TRACK}")]
     references += [name for name in drives if name.startswith(("known:", "target:"))]

@@ -51,224 +51,8 @@ desired."""
 FINAL_S = 20.0
 """The final speed is the mean over this time, or over the last third of a shorter run."""
 
-
-class DriveHistory(NamedTuple):
-    """The truth of a drive, evenly spaced.
-
-    Parameters
-    ----------
-    time_s, speed_mps, velocity_mps : (n,), (n,), (n, 2); magnitude of the velocity over ground, and the
-        velocity in body axes
-    progress_mps : (n,) speed along the desired direction; negative where the robot slides back
-    distance_m, energy_j, scrub_j, scrub_along_j : (n,) cumulated; scrub is the energy dissipated in the
-        contacts, and the part of it along the wheels
-    wheel_speed_mps, ground_mps, slip_ratio : (n, wheels) circumferential speed, speed over ground along each
-        wheel, and slip, low-pass filtered, positive in traction in both directions; NaN at rest
-    sinkage_m : (n,) of the deepest wheel
-    yaw_rad : (n,)
-    """
-
-    time_s: Array
-    speed_mps: Array
-    velocity_mps: Array
-    progress_mps: Array
-    distance_m: Array
-    energy_j: Array
-    scrub_j: Array
-    scrub_along_j: Array
-    wheel_speed_mps: Array
-    ground_mps: Array
-    slip_ratio: Array
-    sinkage_m: Array
-    yaw_rad: Array
-
-
-def drive_history(
-    run: RunLog, robot: Robot, radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
-) -> DriveHistory:
-    """Return the history of a simulated run.
-
-    Parameters
-    ----------
-    run : with its truth
-    robot : the one that was simulated
-    radius_factors : true radius of each wheel over the nominal one (``Conditions``); without them, wheels
-        of different radii appear to gain energy from the ground
-    """
-    truth = run.streams["truth"]
-    wheels = robot.wheels
-    step_s = float(np.median(np.diff(truth.time_s)))
-    twist = np.column_stack([truth.channel(name) for name in TWIST])
-    rate = np.column_stack([truth.channel(f"wheel_{wheel}_radps") for wheel in wheels])
-    steer = np.column_stack([truth.channel(f"steer_{wheel}_rad") for wheel in wheels])
-    ground, sideways = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
-    torque = np.column_stack([truth.channel(f"torque_{wheel}_nm") for wheel in wheels])
-    power_w = np.maximum(torque * rate, 0.0).sum(axis=1)
-    wheel_speed = rate * robot.wheel_radius_m * np.asarray(radius_factors)
-    traction = np.column_stack([truth.channel(f"traction_{wheel}_n") for wheel in wheels])
-    side = np.column_stack([truth.channel(f"side_{wheel}_n") for wheel in wheels])
-    along_w = (traction * (wheel_speed - ground)).sum(axis=1)
-    lost_w = along_w - (side * sideways).sum(axis=1)
-    velocity = twist[:, :2]
-    speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    progress = _progress(truth.time_s, velocity, run.streams.get("commands"))
-    true = true_slip(truth, wheels)
-    slip = low_passed_slip(true, step_s)
-    slip[np.isnan(true)] = np.nan
-    sinkage = np.column_stack([truth.channel(f"sinkage_{wheel}_m") for wheel in wheels])
-    return DriveHistory(
-        truth.time_s,
-        speed,
-        velocity,
-        progress,
-        np.cumsum(progress) * step_s,
-        np.cumsum(power_w) * step_s,
-        np.cumsum(lost_w) * step_s,
-        np.cumsum(along_w) * step_s,
-        wheel_speed,
-        ground,
-        slip,
-        sinkage.max(axis=1),
-        truth.channel("yaw_rad"),
-    )
-
-
-def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
-    """Return the speed (n,) along the last desired direction: sliding down a slope backwards is negative.
-
-    Before any translation is desired, as in a turn on the spot, or without commands, it is the speed over
-    ground.
-    """
-    if commands is None:
-        return np.asarray(np.linalg.norm(velocity, axis=1))
-    desired = np.column_stack([commands.channel("speed_x_mps"), commands.channel("speed_y_mps")])
-    size = np.linalg.norm(desired, axis=1)
-    last = np.maximum.accumulate(np.where(size > 0.0, np.arange(size.size), -1))
-    at = last[np.clip(np.searchsorted(commands.time_s, time_s, side="right") - 1, 0, size.size - 1)]
-    direction = desired[at] / np.maximum(size[at], 1e-9)[:, None]
-    along = np.where(at < 0, np.linalg.norm(velocity, axis=1), np.einsum("ij,ij->i", velocity, direction))
-    return np.asarray(along)
-
-
-def low_passed_slip(slip_ratio: Array, step_s: float) -> Array:
-    """Return slip (n, wheels) behind the low-pass of its estimate; NaN counts as 0."""
-    return low_pass(np.nan_to_num(slip_ratio), step_s, SMOOTH_S)
-
-
-def slip_peak(history: DriveHistory, within: Array | None = None) -> float:
-    """Return the largest slip of the robot, the mean over its wheels, above :data:`PEAK_ABOVE_MPS`; or NaN.
-
-    Parameters
-    ----------
-    history : of the drive
-    within : (n,) samples to evaluate; all by default
-    """
-    used = history.speed_mps > PEAK_ABOVE_MPS
-    used &= np.isfinite(history.slip_ratio).any(axis=1)
-    if within is not None:
-        used &= within
-    return float(np.nanmean(history.slip_ratio[used], axis=1).max()) if used.any() else math.nan
-
-
-def energy_over(history: DriveHistory, distance_m: float, start_s: float = 0.0) -> float:
-    """Return the energy in J over a distance from a time on; NaN where the robot did not travel so far."""
-    first = int(np.searchsorted(history.time_s, start_s))
-    travelled = history.distance_m - history.distance_m[first]
-    if travelled[-1] < distance_m:
-        return math.nan
-    return float(np.interp(distance_m, travelled[first:], history.energy_j[first:]) - history.energy_j[first])
-
-
-def distance_within(history: DriveHistory, start_s: float, length_s: float) -> float:
-    """Return the distance in m travelled within ``length_s`` from a time on."""
-    first, last = np.searchsorted(history.time_s, [start_s, start_s + length_s])
-    return float(history.distance_m[min(last, len(history.distance_m) - 1)] - history.distance_m[first])
-
-
-def lock_s(history: DriveHistory, start_s: float = 0.0, end_s: float = math.inf) -> float:
-    """Return the time in s, between two times, for which the wheel that was locked longest was locked."""
-    within = (history.time_s >= start_s) & (history.time_s <= end_s)
-    step_s = history.time_s[1] - history.time_s[0]
-    moving = np.abs(history.ground_mps) > LOCKED_ABOVE_MPS
-    locked = moving & (
-        history.wheel_speed_mps * np.sign(history.ground_mps) < LOCKED_RATIO * np.abs(history.ground_mps)
-    )
-    return float(locked[within].sum(axis=0).max() * step_s)
-
-
-def immobilised(history: DriveHistory, control: Stream) -> int:
-    """Return how often the robot was stuck: no motion for :data:`STUCK_S` although one is desired.
-
-    The desired speed is the pilot's ``desired_mps`` and not the wheels' command: a robot that its controller
-    stops counts as stuck.  It moves where a wheel moves over ground in the direction of its rotation: a robot
-    that turns on the spot is not stuck, one that slides back down a slope is.
-    """
-    desired = np.interp(history.time_s, control.time_s, control.channel("desired_mps"))
-    moving_mps = (history.ground_mps * np.sign(history.wheel_speed_mps)).max(axis=1)
-    stuck = (desired > STUCK_COMMAND_MPS) & (moving_mps < STUCK_MPS)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], stuck, [False]]).astype(int)))
-    step_s = history.time_s[1] - history.time_s[0]
-    return int(((edges[1::2] - edges[::2]) * step_s >= STUCK_S).sum())
-
-
-def final_speed(history: DriveHistory) -> float:
-    """Return the mean speed in m/s at the end of a drive."""
-    length_s = min(FINAL_S, history.time_s[-1] / 3)
-    return float(history.progress_mps[history.time_s > history.time_s[-1] - length_s].mean())
-
-
-def standstill_time(history: DriveHistory, start_s: float) -> float:
-    """Return the first time in s, from one on, at which the robot stood or reversed; NaN if never.
-
-    A robot that is braked hard may roll back: the first standstill counts.
-    """
-    first = int(np.searchsorted(history.time_s, start_s - 1e-9))
-    direction = history.velocity_mps[first] / max(history.speed_mps[first], 1e-9)
-    stood = np.flatnonzero(history.velocity_mps[first:] @ direction < STANDING_MPS)
-    return float(history.time_s[first + stood[0]]) if stood.size else math.nan
-
-
-def stopping_distance(history: DriveHistory, start_s: float) -> float:
-    """Return the distance in m from a time on until the robot stood; NaN where it did not."""
-    end_s = standstill_time(history, start_s)
-    return distance_within(history, start_s, end_s - start_s) if math.isfinite(end_s) else math.nan
-
-
-def adaptation_times(
-    control: Stream, changes: Sequence[tuple[float, float]], close: float = 0.02
-) -> list[float]:
-    """Return the time from each change of terrain until the target was close to the new terrain's.
-
-    Parameters
-    ----------
-    control : the pilot's status
-    changes : time of each change, and the target of the new terrain
-    close : largest difference that counts as close
-
-    Returns
-    -------
-    list of float
-        in s; NaN where it did not before the next change
-    """
-    target, found = control.channel("target_ratio"), []
-    for i, (change_s, desired) in enumerate(changes):
-        end_s = changes[i + 1][0] if i + 1 < len(changes) else math.inf
-        near = (control.time_s >= change_s) & (control.time_s < end_s) & (np.abs(target - desired) <= close)
-        found.append(float(control.time_s[near.argmax()] - change_s) if near.any() else math.nan)
-    return found
-
-
-def command_change(commands: Stream) -> float:
-    """Return the rms rate of change of the wheels' commands in rad/s^2."""
-    wheels = np.column_stack([commands.channel(f"wheel_{i}_radps") for i in (1, 2, 3)])
-    return float(np.sqrt(np.mean((np.diff(wheels, axis=0) / np.diff(commands.time_s)[:, None]) ** 2)))
-
-
-START_DISTANCE_M = 4.0
-"""Distance of a start over which energy is compared."""
-
-START_TIME_S, START_WINDOW_S = 5.0, 7.0
-"""Time of a start within which distance is compared, and in which its slip is."""
+START_DISTANCE_M, START_TIME_S, START_WINDOW_S = 4.0, 5.0, 7.0
+"""Of a start: the distance over which energy is compared, the times within which distance is, and its slip."""
 
 TARGET_CHANGE = 0.02
 """Targets that differ by less count as one."""
@@ -305,39 +89,193 @@ LABELS = METRICS | {
 """The same with those of some scenarios."""
 
 BELIEF = ("believed_ratio", "n_accepted", "n_below_threshold", "n_refused")
-"""Metrics of a controller that uses the terrain: ratio of the driving time with a known terrain, and outputs
-of its source by :class:`terrain.control.switching.OutputStatus`."""
+"""Metrics of a controller that uses the terrain."""
 
 
-class Label(NamedTuple):
-    """Name of a metric, and its unit or nothing."""
+class DriveHistory(NamedTuple):
+    """The truth of a drive, evenly spaced: rows (n,) or, of wheels, (n, wheels)."""
 
-    text: str
-    unit: str
-
-    @property
-    def with_unit(self) -> str:
-        """The name with its unit in brackets."""
-        return f"{self.text} [{self.unit}]" if self.unit else self.text
-
-
-def metric_label(key: str) -> Label:
-    """Return the label of a metric.
-
-    Examples
-    --------
-    >>> tuple(metric_label("first_distance_5s_m")), metric_label("energy_4m_j").with_unit
-    (('distance within 5 s of a start, first start', 'm'), 'energy of the first 4 m [J]')
-    """
-    text, unit = LABELS[key.removeprefix("first_")]
-    return Label(f"{text}, first start" if key.startswith("first_") else text, unit)
-
-
-class EnergyCurve(NamedTuple):
-    """Energy over distance of a drive: distance (n,), which never falls, and energy (n,)."""
-
-    distance_m: Array
+    time_s: Array
+    speed_mps: Array  # magnitude of the velocity over ground
+    velocity_mps: Array  # (n, 2) in body axes
+    progress_mps: Array  # along the desired direction; negative where the robot slides back
+    distance_m: Array  # this and the next three cumulated
     energy_j: Array
+    scrub_j: Array  # dissipated in the contacts
+    scrub_along_j: Array  # of it along the wheels
+    wheel_speed_mps: Array  # circumferential
+    ground_mps: Array  # of each wheel along it
+    slip_ratio: Array  # low-pass filtered, positive in traction in both directions; NaN at rest
+    sinkage_m: Array  # of the deepest wheel
+    yaw_rad: Array
+
+
+def drive_history(
+    run: RunLog, robot: Robot, radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
+) -> DriveHistory:
+    """Return the history of a simulated run.
+
+    Parameters
+    ----------
+    run : with its truth
+    robot : the one that was simulated
+    radius_factors : true radius of each wheel over the nominal one (``Conditions``); without them, wheels
+        of different radii appear to gain energy from the ground
+    """
+    truth, wheels = run.streams["truth"], robot.wheels
+    step_s = float(np.median(np.diff(truth.time_s)))
+    twist = np.column_stack([truth.channel(name) for name in TWIST])
+    rate, steer, torque, traction, side, sinkage = (
+        np.column_stack([truth.channel(name.format(wheel)) for wheel in wheels])
+        for name in (
+            *("wheel_{}_radps", "steer_{}_rad", "torque_{}_nm"),
+            *("traction_{}_n", "side_{}_n", "sinkage_{}_m"),
+        )
+    )
+    ground, sideways = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
+    wheel_speed = rate * robot.wheel_radius_m * np.asarray(radius_factors)
+    along_w = (traction * (wheel_speed - ground)).sum(axis=1)
+    velocity = twist[:, :2]
+    progress = _progress(truth.time_s, velocity, run.streams.get("commands"))
+    true = true_slip(truth, wheels)
+    slip = low_passed_slip(true, step_s)
+    slip[np.isnan(true)] = np.nan
+    return DriveHistory(
+        truth.time_s,
+        np.hypot(velocity[:, 0], velocity[:, 1]),
+        velocity,
+        progress,
+        np.cumsum(progress) * step_s,
+        np.cumsum(np.maximum(torque * rate, 0.0).sum(axis=1)) * step_s,
+        np.cumsum(along_w - (side * sideways).sum(axis=1)) * step_s,
+        np.cumsum(along_w) * step_s,
+        wheel_speed,
+        ground,
+        slip,
+        sinkage.max(axis=1),
+        truth.channel("yaw_rad"),
+    )
+
+
+def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
+    """Return the speed (n,) along the last desired direction: sliding down a slope backwards is negative.
+
+    Before any translation is desired, as in a turn on the spot, or without commands, it is the speed over
+    ground.
+    """
+    if commands is None:
+        return np.asarray(np.linalg.norm(velocity, axis=1))
+    desired = np.column_stack([commands.channel("speed_x_mps"), commands.channel("speed_y_mps")])
+    size = np.linalg.norm(desired, axis=1)
+    last = np.maximum.accumulate(np.where(size > 0.0, np.arange(size.size), -1))
+    at = last[np.clip(np.searchsorted(commands.time_s, time_s, side="right") - 1, 0, size.size - 1)]
+    direction = desired[at] / np.maximum(size[at], 1e-9)[:, None]
+    along = np.where(at < 0, np.linalg.norm(velocity, axis=1), np.einsum("ij,ij->i", velocity, direction))
+    return np.asarray(along)
+
+
+def low_passed_slip(slip_ratio: Array, step_s: float) -> Array:
+    """Return slip (n, wheels) behind the low-pass of its estimate; NaN counts as 0."""
+    return low_pass(np.nan_to_num(slip_ratio), step_s, SMOOTH_S)
+
+
+def stretches(mask: Array) -> Array:
+    """Return the lengths (k,) of the stretches of a mask (n,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
+    return np.asarray(edges[1::2] - edges[::2])
+
+
+def slip_peak(history: DriveHistory, within: Array | None = None) -> float:
+    """Return the largest slip of the robot, the mean over its wheels, above :data:`PEAK_ABOVE_MPS`; or NaN.
+
+    Within some samples, a mask (n,), or in all.
+    """
+    used = history.speed_mps > PEAK_ABOVE_MPS
+    used &= np.isfinite(history.slip_ratio).any(axis=1)
+    if within is not None:
+        used &= within
+    return float(np.nanmean(history.slip_ratio[used], axis=1).max()) if used.any() else math.nan
+
+
+def energy_over(history: DriveHistory, distance_m: float, start_s: float = 0.0) -> float:
+    """Return the energy in J over a distance from a time on; NaN where the robot did not travel so far."""
+    first = int(np.searchsorted(history.time_s, start_s))
+    travelled = history.distance_m - history.distance_m[first]
+    if travelled[-1] < distance_m:
+        return math.nan
+    return float(np.interp(distance_m, travelled[first:], history.energy_j[first:]) - history.energy_j[first])
+
+
+def distance_within(history: DriveHistory, start_s: float, length_s: float) -> float:
+    """Return the distance in m travelled within ``length_s`` from a time on."""
+    first, last = np.searchsorted(history.time_s, [start_s, start_s + length_s])
+    return float(history.distance_m[min(last, len(history.distance_m) - 1)] - history.distance_m[first])
+
+
+def lock_s(history: DriveHistory, start_s: float = 0.0, end_s: float = math.inf) -> float:
+    """Return the time in s, between two times, for which the wheel that was locked longest was locked."""
+    within = (history.time_s >= start_s) & (history.time_s <= end_s)
+    rolling = history.wheel_speed_mps * np.sign(history.ground_mps)
+    locked = rolling < LOCKED_RATIO * np.abs(history.ground_mps)
+    locked &= np.abs(history.ground_mps) > LOCKED_ABOVE_MPS
+    return float(locked[within].sum(axis=0).max() * (history.time_s[1] - history.time_s[0]))
+
+
+def immobilised(history: DriveHistory, control: Stream) -> int:
+    """Return how often the robot was stuck: no motion for :data:`STUCK_S` although one is desired.
+
+    The desired speed is the pilot's ``desired_mps`` and not the wheels' command: a robot that its controller
+    stops counts as stuck.  It moves where a wheel moves over ground in the direction of its rotation: a robot
+    that turns on the spot is not stuck, one that slides back down a slope is.
+    """
+    desired = np.interp(history.time_s, control.time_s, control.channel("desired_mps"))
+    moving_mps = (history.ground_mps * np.sign(history.wheel_speed_mps)).max(axis=1)
+    stuck = stretches((desired > STUCK_COMMAND_MPS) & (moving_mps < STUCK_MPS))
+    return int((stuck * (history.time_s[1] - history.time_s[0]) >= STUCK_S).sum())
+
+
+def final_speed(history: DriveHistory) -> float:
+    """Return the mean speed in m/s at the end of a drive."""
+    length_s = min(FINAL_S, history.time_s[-1] / 3)
+    return float(history.progress_mps[history.time_s > history.time_s[-1] - length_s].mean())
+
+
+def standstill_time(history: DriveHistory, start_s: float) -> float:
+    """Return the first time in s, from one on, at which the robot stood or reversed; NaN if never.
+
+    A robot that is braked hard may roll back: the first standstill counts.
+    """
+    first = int(np.searchsorted(history.time_s, start_s - 1e-9))
+    direction = history.velocity_mps[first] / max(history.speed_mps[first], 1e-9)
+    stood = np.flatnonzero(history.velocity_mps[first:] @ direction < STANDING_MPS)
+    return float(history.time_s[first + stood[0]]) if stood.size else math.nan
+
+
+def stopping_distance(history: DriveHistory, start_s: float) -> float:
+    """Return the distance in m from a time on until the robot stood; NaN where it did not."""
+    end_s = standstill_time(history, start_s)
+    return distance_within(history, start_s, end_s - start_s) if math.isfinite(end_s) else math.nan
+
+
+def adaptation_times(
+    control: Stream, changes: Sequence[tuple[float, float]], close: float = 0.02
+) -> list[float]:
+    """Return the time in s from each change of terrain until the pilot's target was as close to the new one.
+
+    A change is its time and the target of the new terrain; NaN where it was not close before the next change.
+    """
+    target, found = control.channel("target_ratio"), []
+    ends_s = [*(change_s for change_s, _ in changes[1:]), math.inf]
+    for (change_s, desired), end_s in zip(changes, ends_s, strict=False):
+        near = (control.time_s >= change_s) & (control.time_s < end_s) & (np.abs(target - desired) <= close)
+        found.append(float(control.time_s[near.argmax()] - change_s) if near.any() else math.nan)
+    return found
+
+
+def command_change(commands: Stream) -> float:
+    """Return the rms rate of change of the wheels' commands in rad/s^2."""
+    wheels = np.column_stack([commands.channel(f"wheel_{i}_radps") for i in (1, 2, 3)])
+    return float(np.sqrt(np.mean((np.diff(wheels, axis=0) / np.diff(commands.time_s)[:, None]) ** 2)))
 
 
 def evaluate_drive(
@@ -357,8 +295,9 @@ def evaluate_drive(
     adapting_to : targets of a controller that uses the terrain; without, neither adaptation nor belief is
         evaluated
     """
-    commands, control = run.streams["commands"], run.streams["control"]
-    scenario = situation.scenario
+    control, scenario = run.streams["control"], situation.scenario
+    limited = control.channel("driven_mps") < control.channel("desired_mps") - 1e-6
+    error = np.abs(control.channel("slip_ratio") - control.channel("aimed_ratio"))[limited]
     row = {
         "distance_m": float(history.distance_m[-1]),
         "mean_speed_mps": float(history.progress_mps.mean()),
@@ -370,17 +309,17 @@ def evaluate_drive(
         "immobilised": float(immobilised(history, control)),
         "adapt_s": math.nan,
         "adapted_ratio": math.nan,
-        "slip_error_ratio": _slip_error(run),
+        "slip_error_ratio": float(np.nanmean(error)) if np.isfinite(error).any() else math.nan,
         "sinkage_m": float(history.sinkage_m.mean()),
-        "command_mps2": command_change(commands) * robot.wheel_radius_m,
+        "command_mps2": command_change(run.streams["commands"]) * robot.wheel_radius_m,
         "yaw_drift_rad": float(abs(history.yaw_rad[-1] - history.yaw_rad[0])),
-    }
-    row |= _belief(control) if adapting_to is not None else dict.fromkeys(BELIEF, math.nan)
-    changes = [] if adapting_to is None else _target_changes(run, adapting_to)
-    if changes:
-        times = np.array(adaptation_times(control, changes))
-        row["adapted_ratio"] = float(np.isfinite(times).mean())
-        row["adapt_s"] = float(np.nanmean(times)) if np.isfinite(times).any() else math.nan
+    } | dict.fromkeys(BELIEF, math.nan)
+    if adapting_to is not None:
+        row |= _belief(control)
+        if changes := _target_changes(run, adapting_to):
+            times = np.array(adaptation_times(control, changes))
+            row["adapted_ratio"] = float(np.isfinite(times).mean())
+            row["adapt_s"] = float(np.nanmean(times)) if np.isfinite(times).any() else math.nan
     if scenario.name == STARTS:
         row |= _evaluate_starts(history, start_times(scenario))
     if scenario.name == BRAKE:
@@ -411,33 +350,27 @@ def _target_changes(run: RunLog, table: SlipTable) -> list[tuple[float, float]]:
     return found
 
 
-def _slip_error(run: RunLog) -> float:
-    """Return the mean error of slip while the speed was limited; NaN without a target."""
-    control = run.streams["control"]
-    if "aimed_ratio" not in control.channels or "slip_ratio" not in control.channels:
-        return math.nan
-    limited = control.channel("driven_mps") < control.channel("desired_mps") - 1e-6
-    error = np.abs(control.channel("slip_ratio") - control.channel("aimed_ratio"))[limited]
-    return float(np.nanmean(error)) if np.isfinite(error).any() else math.nan
-
-
 def _evaluate_starts(history: DriveHistory, starts: Sequence[float]) -> dict[str, float]:
     """Return metrics of the first start, before which no balance is known, and means of those after it."""
-    rows = []
-    for start_s in starts:
-        within = (history.time_s >= start_s) & (history.time_s < start_s + START_WINDOW_S)
-        rows.append(
-            {
-                "slip_peak": slip_peak(history, within),
-                f"distance_{START_TIME_S:g}s_m": distance_within(history, start_s, START_TIME_S),
-                f"energy_{START_DISTANCE_M:g}m_j": energy_over(history, START_DISTANCE_M, start_s),
-            }
-        )
-    first, later = rows[0], rows[1:]
-    return {
-        **{f"first_{key}": value for key, value in first.items()},
-        **{key: float(np.mean([row[key] for row in later])) for key in first},
-    }
+    first, *later = (
+        {
+            "slip_peak": slip_peak(
+                history, (history.time_s >= start_s) & (history.time_s < start_s + START_WINDOW_S)
+            ),
+            f"distance_{START_TIME_S:g}s_m": distance_within(history, start_s, START_TIME_S),
+            f"energy_{START_DISTANCE_M:g}m_j": energy_over(history, START_DISTANCE_M, start_s),
+        }
+        for start_s in starts
+    )
+    means = {key: float(np.mean([row[key] for row in later])) for key in first}
+    return {f"first_{key}": value for key, value in first.items()} | means
+
+
+class EnergyCurve(NamedTuple):
+    """Energy over distance of a drive: distance (n,), which never falls, and energy (n,)."""
+
+    distance_m: Array
+    energy_j: Array
 
 
 def energy_curve(history: DriveHistory, scenario: Scenario) -> EnergyCurve:

@@ -11,8 +11,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from terrain.control.drive_metrics import (
     DriveHistory,
     drive_history,
     stopping_distance,
+    stretches,
 )
 from terrain.control.situations import (
     BRAKE,
@@ -38,62 +39,46 @@ from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
 from terrain.signals import low_pass
 from terrain.simulation.conditions import Faults
-from terrain.simulation.faults import FaultyBus, Nature, SensorFault, fault_catalogue
+from terrain.simulation.faults import FaultyBus, Nature, fault_catalogue
 from terrain.simulation.scenario import Scenario
 
 START, STOP, STEADY = "start", "stop", "steady"
 
-FAULT_SITUATIONS: dict[str, str] = {
+FAULT_SITUATIONS = {
     START: "from rest at 1 m/s^2 to 1 m/s; the fault begins as the start does",
     STOP: "a command to stop at once from 1 m/s; the fault begins with the command",
     STEADY: "at 1 m/s; the fault begins 3 s after the speed was reached",
 }
-"""Situations by name."""
 
-START_LENGTH_S, STEADY_LENGTH_S = 7.0, 10.0
+LENGTHS_S = {START: 7.0, STEADY: 10.0}
 """Long enough for a fault of 3 s and 2 s after it."""
 
 STEADY_FAULT_S = 5.0
 """By then the slip of steady motion is known to the controller, after 1 s of rest and 1 s of start."""
 
 
-class FaultSituation(NamedTuple):
-    """A situation, and the time at which a fault begins in it."""
-
-    situation: Situation
-    start_s: float
-
-
-def make_fault_situation(name: str, robot: Robot, terrain: str, seed: int) -> FaultSituation:
-    """Return a situation without any fault by chance.
-
-    Parameters
-    ----------
-    name : one of :data:`FAULT_SITUATIONS`
-    robot : swerve robot
-    terrain : soil
-    seed : of all that is drawn: load, soil, tyres, noise
+def make_fault_situation(name: str, robot: Robot, terrain: str, seed: int) -> tuple[Situation, float]:
+    """Return a situation without any fault by chance, and the time at which a fault begins in it.
 
     Raises
     ------
     ConfigError
-        if the situation or the terrain is unknown.
+        if the name is none of :data:`FAULT_SITUATIONS`, or the terrain is unknown.
 
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> make_fault_situation("start", load_robot("agrimaro"), "grass", 0).start_s
+    >>> make_fault_situation("start", load_robot("agrimaro"), "grass", 0)[1]
     1.0
     """
     if name not in FAULT_SITUATIONS:
         raise ConfigError(f"situation {name!r} is unknown: use {', '.join(FAULT_SITUATIONS)}")
-    length_s = {START: START_LENGTH_S, STEADY: STEADY_LENGTH_S}.get(name)
-    scenario = BRAKE if name == STOP else "straight"
-    made = make_situation(scenario, robot, terrain, seed, SituationOptions(duration_s=length_s))
+    options = SituationOptions(duration_s=LENGTHS_S.get(name))
+    made = make_situation(BRAKE if name == STOP else "straight", robot, terrain, seed, options)
     made = made._replace(faults=Faults(by_chance=False))
-    if name == START:
-        return FaultSituation(made, start_times(made.scenario)[0])
-    return FaultSituation(made, brake_time(made.scenario) if name == STOP else STEADY_FAULT_S)
+    if name == STEADY:
+        return made, STEADY_FAULT_S
+    return made, brake_time(made.scenario) if name == STOP else start_times(made.scenario)[0]
 
 
 _SLACK_S = 1e-9  # figures and instants that differ by less are the same
@@ -107,101 +92,56 @@ OVERSPEED_MPS = 0.05
 wheels of different radii is corrected by less."""
 
 
+class FaultDrive(NamedTuple):
+    """What is evaluated of a drive, at the instants of its control: rows (n,)."""
+
+    time_s: Array
+    ok: Array  # whether the status is OK
+    slip_ratio: Array  # largest of the wheels, as the controller estimates it; NaN where unknown
+    true_slip_ratio: Array  # the true one behind the estimate's low-pass; NaN where a wheel is slow
+    body_slip_ratio: Array  # true slip of the robot, the mean over its wheels; NaN where it is slow
+    moving: Array  # whether the robot moves or motion is desired
+    commanded_mps: Array  # mean of the wheels
+    desired_mps: Array
+    speed_mps: Array  # true, over ground
+    stop_s: float = math.inf  # time of the command to stop; infinite without one
+    stop_m: float = math.nan  # travelled from then to standstill; NaN where there was none
+
+
+class FaultFigures(NamedTuple):
+    """Figures of a drive with a fault; NaN where one is not defined.  Slip counts from the fault's start on."""
+
+    ok_total_s: float  # with status OK while the fault acts and the robot is to move
+    ok_longest_s: float  # of it, the longest in one piece
+    not_ok_s: float  # without OK meanwhile, beyond the clean drive's
+    slip_error_ratio: float  # largest error of slip while the status is OK
+    clean_slip_error_ratio: float  # that of the clean drive
+    slip_peak_ratio: float  # largest magnitude of the robot's true slip
+    plain_slip_peak_ratio: float  # that of the plain drive
+    stop_m: float  # stopping distance; infinite without a standstill
+    stop_ratio: float  # over that of the plain drive
+    recovery_s: float  # from the fault's end until the status is OK for good; infinite where it is not
+    overspeed_s: float  # longest time for which the commanded speed is above the desired one
+    n_exceptions: int  # steps at which the controller raised
+    n_not_finite: int  # steps at which a command was not finite
+
+
 class Limits(NamedTuple):
-    """Limits of the figures.
+    """Limits of the figures."""
 
-    Parameters
-    ----------
-    ok_s : time for which a stream may be dead or lying before the status is another than OK
-    held_back_s : time without OK beyond the clean drive's while a fault is tolerable
-    slip_error_ratio : of the slip while the status is OK
-    slip_error_chance_ratio : the limit is at least the clean drive's own error and this
-    slip_peak_ratio : true slip above the plain drive's: what differs by chance between two drives whose
-        commands differ little
-    stop_ratio : stopping distance over the plain drive's
-    recovery_s : from the end of the fault to OK
-    overspeed_s : time for which the commanded speed is above the desired one: a controlled braking from
-        1 m/s on a slick floor takes 0.5 s
-    """
-
-    ok_s: float = 0.3
-    held_back_s: float = 0.3
+    ok_s: float = 0.3  # for which a stream may be dead or lying before the status is another than OK
+    held_back_s: float = 0.3  # without OK beyond the clean drive's while a fault is tolerable
     slip_error_ratio: float = 0.05
-    slip_error_chance_ratio: float = 0.03
-    slip_peak_ratio: float = 0.03
-    stop_ratio: float = 1.1
+    slip_error_chance_ratio: float = 0.03  # the limit is at least the clean drive's own error and this
+    slip_peak_ratio: float = 0.03  # above the plain drive's: by chance between drives that differ little
+    stop_ratio: float = 1.1  # over the plain drive's
     recovery_s: float = 1.0
-    overspeed_s: float = 1.0
+    overspeed_s: float = 1.0  # a controlled braking from 1 m/s on a slick floor takes 0.5 s
 
 
 LIMITS = Limits()
 
-
-class FaultDrive(NamedTuple):
-    """What is evaluated of a drive, at the instants of its control.
-
-    Parameters
-    ----------
-    time_s : (n,)
-    ok : (n,) whether the status is OK
-    slip_ratio, true_slip_ratio : (n,) largest of the wheels, estimated by the controller, and the true one
-        behind the estimate's low-pass; NaN where unknown, and the true one where a wheel is slow
-    body_slip_ratio : (n,) true slip of the robot, the mean over its wheels; NaN where it is slow
-    moving : (n,) whether the robot moves or motion is desired
-    commanded_mps, desired_mps, speed_mps : (n,) mean of the wheels' commands, what is desired, and the true
-        speed over ground
-    stop_s : time of the command to stop; infinite without one
-    stop_m : distance travelled from then to standstill; NaN where there was none
-    """
-
-    time_s: Array
-    ok: Array
-    slip_ratio: Array
-    true_slip_ratio: Array
-    body_slip_ratio: Array
-    moving: Array
-    commanded_mps: Array
-    desired_mps: Array
-    speed_mps: Array
-    stop_s: float = math.inf
-    stop_m: float = math.nan
-
-
-class FaultFigures(NamedTuple):
-    """Figures of a drive with a fault; NaN where one is not defined.
-
-    Parameters
-    ----------
-    ok_total_s, ok_longest_s : time with status OK while the fault acts and the robot is to move: all, and the
-        longest in one piece
-    not_ok_s : time without OK meanwhile, beyond the clean drive's
-    slip_error_ratio, clean_slip_error_ratio : largest error of slip while the status is OK, from the fault's
-        start on; of the clean drive
-    slip_peak_ratio, plain_slip_peak_ratio : largest magnitude of the robot's true slip, from the fault's
-        start on; of the plain drive
-    stop_m, stop_ratio : stopping distance, and over that of the plain drive; infinite without a standstill
-    recovery_s : from the end of the fault until the status is OK and remains so while the robot is to move;
-        infinite where it does not; NaN of a fault for good, and where the robot stands by then
-    overspeed_s : longest time for which the commanded speed is above the desired one
-    n_exceptions, n_not_finite : steps at which the controller raised, or gave a command that is not finite
-    """
-
-    ok_total_s: float
-    ok_longest_s: float
-    not_ok_s: float
-    slip_error_ratio: float
-    clean_slip_error_ratio: float
-    slip_peak_ratio: float
-    plain_slip_peak_ratio: float
-    stop_m: float
-    stop_ratio: float
-    recovery_s: float
-    overspeed_s: float
-    n_exceptions: int
-    n_not_finite: int
-
-
-BARS: Mapping[str, str] = {
+BARS = {
     "ok_ends": "status OK while a dead or lying stream acts: at most {ok_s:g} s in all",
     "goes_on": "status not OK while a tolerable fault acts: at most {held_back_s:g} s more than without it",
     "slip_error": "error of slip while the status is OK: at most {slip_error_ratio:g}, or the clean drive's "
@@ -212,22 +152,13 @@ BARS: Mapping[str, str] = {
     "overspeed": "commanded speed above the desired one: for at most {overspeed_s:g} s",
     "finite": "commands that are not finite, and exceptions: none",
 }
-"""The bars by name; the limits are those of :class:`Limits`."""
+"""The bars by name, with the limits of :class:`Limits`."""
 
 
-def fault_drive(
-    run: RunLog,
-    history: DriveHistory,
-    robot: Robot,
-    scenario: Scenario,
-) -> FaultDrive:
-    """Return what is evaluated of a drive straight ahead.
+def fault_drive(run: RunLog, history: DriveHistory, robot: Robot, scenario: Scenario) -> FaultDrive:
+    """Return what is evaluated of a simulated drive straight ahead, whose truth has that history.
 
-    Parameters
-    ----------
-    run, history : its log with the streams ``control`` and ``commands``, and the history of its truth
-    robot : the one that was simulated; its encoders' low-pass is the lag of every estimate
-    scenario : straight ahead; a command to stop is one of :func:`terrain.control.situations.brake_time`
+    The robot's encoders' low-pass is the lag of every estimate.
     """
     control, commands, time_s = run.streams["control"], run.streams["commands"], run.streams["control"].time_s
     step_s = float(history.time_s[1] - history.time_s[0])
@@ -241,7 +172,9 @@ def fault_drive(
     slip[fastest.min(axis=1) < RATIO_ABOVE_MPS] = np.nan
     body = history.slip_ratio.mean(axis=1)
     body[history.speed_mps <= PEAK_ABOVE_MPS] = np.nan
-    speed = np.interp(time_s, history.time_s, history.speed_mps)
+    speed, true_slip, body_slip = (
+        np.interp(time_s, history.time_s, each) for each in (history.speed_mps, slip, body)
+    )
     wheels = np.column_stack([commands.channel(f"wheel_{i}_radps") for i in robot.wheels])
     desired = np.hypot(scenario.twist[:, 0], scenario.twist[:, 1])
     stop_s = brake_time(scenario) if scenario.name == BRAKE else math.inf
@@ -249,8 +182,8 @@ def fault_drive(
         time_s=time_s,
         ok=control.channel("status_code") == TractionStatus.OK,
         slip_ratio=control.channel("slip_ratio"),
-        true_slip_ratio=np.interp(time_s, history.time_s, slip),
-        body_slip_ratio=np.interp(time_s, history.time_s, body),
+        true_slip_ratio=true_slip,
+        body_slip_ratio=body_slip,
         moving=(speed > STANDING_MPS) | (desired > 0.0),
         commanded_mps=np.abs(wheels).mean(axis=1) * robot.wheel_radius_m,
         desired_mps=desired,
@@ -269,13 +202,10 @@ def fault_figures(
     n_exceptions: int = 0,
     n_not_finite: int = 0,
 ) -> FaultFigures:
-    """Return the figures of a drive with a fault.
+    """Return the figures of a drive with a fault that acts between two times; an infinite end is for good.
 
-    Parameters
-    ----------
-    drive, clean, plain : with the fault, without it, and by plain commands, at the same instants
-    start_s, end_s : between which the fault acts; an infinite end is for good
-    n_exceptions, n_not_finite : as counted in the drive
+    The drives with the fault, without it, and by plain commands are at the same instants; exceptions and
+    commands that are not finite are those counted in the drive.
     """
     time_s = drive.time_s
     step_s = float(np.median(np.diff(time_s)))
@@ -284,59 +214,67 @@ def fault_figures(
     ok, not_ok = (acts & drive.moving & each for each in (drive.ok, ~drive.ok))
     clean_not_ok = acts & clean.moving & ~clean.ok
     too_fast = drive.commanded_mps > drive.desired_mps + OVERSPEED_MPS
+
+    def lasts_s(n_steps: float) -> float:  # to a microsecond
+        return round(float(n_steps) * step_s, 6)
+
+    def slip_error(one: FaultDrive) -> float:
+        return _largest((one.slip_ratio - one.true_slip_ratio)[since & one.ok])
+
+    recovery_s = math.nan
+    if (after := drive.moving & (time_s >= end_s - _SLACK_S)).any():
+        left_s, lost = time_s[after], np.flatnonzero(~drive.ok[after])
+        resumes = int(lost[-1]) + 1 if lost.size else 0
+        recovery_s = math.inf if resumes == left_s.size else round(float(left_s[resumes] - end_s), 6)
+        recovery_s = recovery_s if lost.size else 0.0
     is_stop = math.isfinite(plain.stop_m)
     stop_m = drive.stop_m if math.isfinite(drive.stop_m) else math.inf
     return FaultFigures(
-        ok_total_s=_time_s(ok.sum(), step_s),
-        ok_longest_s=_time_s(_longest(ok), step_s),
-        not_ok_s=_time_s(max(not_ok.sum() - clean_not_ok.sum(), 0), step_s),
-        slip_error_ratio=_slip_error(drive, since),
-        clean_slip_error_ratio=_slip_error(clean, since),
-        slip_peak_ratio=_largest(np.abs(drive.body_slip_ratio[since])),
-        plain_slip_peak_ratio=_largest(np.abs(plain.body_slip_ratio[since])),
+        ok_total_s=lasts_s(ok.sum()),
+        ok_longest_s=lasts_s(stretches(ok).max(initial=0)),
+        not_ok_s=lasts_s(max(not_ok.sum() - clean_not_ok.sum(), 0)),
+        slip_error_ratio=slip_error(drive),
+        clean_slip_error_ratio=slip_error(clean),
+        slip_peak_ratio=_largest(drive.body_slip_ratio[since]),
+        plain_slip_peak_ratio=_largest(plain.body_slip_ratio[since]),
         stop_m=stop_m if is_stop else math.nan,
         stop_ratio=stop_m / plain.stop_m if is_stop else math.nan,
-        recovery_s=_recovery_s(drive, end_s),
-        overspeed_s=_time_s(_longest(since & too_fast), step_s),
+        recovery_s=recovery_s,
+        overspeed_s=lasts_s(stretches(since & too_fast).max(initial=0)),
         n_exceptions=n_exceptions,
         n_not_finite=n_not_finite,
     )
 
 
-def judge(figures: FaultFigures, nature: Nature, limits: Limits = LIMITS) -> dict[str, bool | None]:
-    """Return which of :data:`BARS` are met; None for one that does not apply, or whose figure is undefined.
+def _largest(values: Array) -> float:
+    """Return the largest magnitude that is known; NaN of none."""
+    known = np.abs(values[np.isfinite(values)])
+    return float(known.max()) if known.size else math.nan
 
-    Parameters
-    ----------
-    figures : of the drive
-    nature : of the fault, which decides on ``ok_ends`` and ``goes_on``
-    limits : of the figures
-    """
+
+def judge(figures: FaultFigures, nature: Nature, limits: Limits = LIMITS) -> dict[str, bool | None]:
+    """Return which of :data:`BARS` are met; None where a figure is undefined, or a fault of that nature may miss it."""
     one = figures
     error_limit = max(
         limits.slip_error_ratio, one.clean_slip_error_ratio + limits.slip_error_chance_ratio
     )  # the clean drive's error is NaN where it has none: the first then
-    return {
-        "ok_ends": _at_most(one.ok_total_s, limits.ok_s) if nature in (Nature.DEAD, Nature.LYING) else None,
-        "goes_on": _at_most(one.not_ok_s, limits.held_back_s) if nature is Nature.TOLERABLE else None,
-        "slip_error": _at_most(one.slip_error_ratio, error_limit),
-        "slip_peak": _at_most(one.slip_peak_ratio, one.plain_slip_peak_ratio + limits.slip_peak_ratio),
-        "stop": _at_most(one.stop_ratio, limits.stop_ratio),
-        "recovery": _at_most(one.recovery_s, limits.recovery_s),
-        "overspeed": _at_most(one.overspeed_s, limits.overspeed_s),
-        "finite": one.n_exceptions + one.n_not_finite == 0,
+    at_most = {
+        "ok_ends": (one.ok_total_s, limits.ok_s),
+        "goes_on": (one.not_ok_s, limits.held_back_s),
+        "slip_error": (one.slip_error_ratio, error_limit),
+        "slip_peak": (one.slip_peak_ratio, one.plain_slip_peak_ratio + limits.slip_peak_ratio),
+        "stop": (one.stop_ratio, limits.stop_ratio),
+        "recovery": (one.recovery_s, limits.recovery_s),
+        "overspeed": (one.overspeed_s, limits.overspeed_s),
+        "finite": (float(one.n_exceptions + one.n_not_finite), 0.0),
     }
-
-
-def bar_texts(limits: Limits = LIMITS) -> dict[str, str]:
-    """Return what each bar asks for.
-
-    Examples
-    --------
-    >>> bar_texts()["recovery"]
-    'status OK again after the fault: within 1 s'
-    """
-    return {name: text.format(**limits._asdict()) for name, text in BARS.items()}
+    applies = {"ok_ends": (Nature.DEAD, Nature.LYING), "goes_on": (Nature.TOLERABLE,)}
+    return {
+        name: None
+        if nature not in applies.get(name, (nature,)) or math.isnan(value + limit)
+        else value <= limit + _SLACK_S
+        for name, (value, limit) in at_most.items()
+    }
 
 
 class BarCount(NamedTuple):
@@ -351,45 +289,11 @@ class BarCount(NamedTuple):
 def count_bars(judged: Sequence[Mapping[str, bool | None]], limits: Limits = LIMITS) -> dict[str, BarCount]:
     """Return each bar by name, over the drives that were judged."""
     counted = {}
-    for name, text in bar_texts(limits).items():
+    for name, text in BARS.items():
         met = [bars[name] for bars in judged]
-        counted[name] = BarCount(text, met.count(True), met.count(False), met.count(None))
+        counts = met.count(True), met.count(False), met.count(None)
+        counted[name] = BarCount(text.format(**limits._asdict()), *counts)
     return counted
-
-
-def _at_most(value: float, limit: float) -> bool | None:
-    return None if math.isnan(value) or math.isnan(limit) else value <= limit + _SLACK_S
-
-
-def _slip_error(drive: FaultDrive, since: Array) -> float:
-    return _largest(np.abs(drive.slip_ratio - drive.true_slip_ratio)[since & drive.ok])
-
-
-def _recovery_s(drive: FaultDrive, end_s: float) -> float:
-    after = drive.moving & (drive.time_s >= end_s - _SLACK_S)
-    if not after.any():
-        return math.nan
-    time_s, not_ok = drive.time_s[after], np.flatnonzero(~drive.ok[after])
-    if not not_ok.size:
-        return 0.0
-    last = int(not_ok[-1])
-    return round(float(time_s[last + 1] - end_s), 6) if last + 1 < time_s.size else math.inf
-
-
-def _time_s(n_steps: float, step_s: float) -> float:
-    """Return the time of so many steps, to a microsecond."""
-    return round(float(n_steps) * step_s, 6)
-
-
-def _longest(mask: Array) -> int:
-    """Return the length of the longest stretch of a mask (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return int((edges[1::2] - edges[::2]).max()) if edges.size else 0
-
-
-def _largest(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(known.max()) if known.size else math.nan
 
 
 FRESH = "fresh"
@@ -399,15 +303,16 @@ NAMED_S = 0.1
 """A sensor counts as named where it has been for this time."""
 
 
-class FaultCase(NamedTuple):
-    """A drive with a fault.
+class Place(NamedTuple):
+    """Situation, terrain and seed, which one clean and one plain drive are made for."""
 
-    Parameters
-    ----------
-    fault : its name in the catalogue
-    duration_s : for which it acts; infinite for good, None in JSON
-    situation, terrain, seed : of the drive
-    """
+    situation: str
+    terrain: str
+    seed: int
+
+
+class FaultCase(NamedTuple):
+    """A drive with a fault of the catalogue, which acts for a time, infinite for good, in a :class:`Place`."""
 
     fault: str
     duration_s: float
@@ -418,17 +323,7 @@ class FaultCase(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class FaultRow:
-    """A drive with a fault, and what it shows.
-
-    Parameters
-    ----------
-    case : what was driven
-    kind, streams, nature : of the fault
-    figures : of the drive
-    bars : by name, whether it is met; None where it does not apply
-    sensors_named : by the name of a sensor, what the controller's ``health`` named it; None without a ``health``
-    exception : the first one that the controller raised, or empty
-    """
+    """A drive with a fault, and what it shows."""
 
     case: FaultCase
     kind: str
@@ -436,8 +331,8 @@ class FaultRow:
     nature: str
     figures: FaultFigures
     bars: Mapping[str, bool | None]
-    sensors_named: Mapping[str, str] | None
-    exception: str
+    sensors_named: Mapping[str, str] | None  # by sensor, what the controller's health named it; None without
+    exception: str  # the first one that the controller raised, or empty
 
     @property
     def unmet(self) -> tuple[str, ...]:
@@ -446,25 +341,14 @@ class FaultRow:
 
     def as_json(self) -> dict[str, Any]:
         """Return the fields in one object, with the verdict; what is infinite is None."""
-        given = {each.name: getattr(self, each.name) for each in fields(self)}
-        case, figures = given.pop("case"), given.pop("figures")
-        return {**case._asdict(), **given, **figures._asdict(), "is_met": not self.unmet}
+        own = ("kind", "streams", "nature", "bars", "sensors_named", "exception")
+        given = {name: getattr(self, name) for name in own}
+        return {**self.case._asdict(), **given, **self.figures._asdict(), "is_met": not self.unmet}
 
 
 @dataclass(frozen=True, slots=True)
 class CleanDrive:
-    """What the controller does without a fault, and plain commands do, where a situation's rows are compared.
-
-    Parameters
-    ----------
-    situation, terrain, seed : of the drives
-    start_s : when faults begin
-    slip_error_ratio : largest error of slip of the controller, from then on
-    not_ok_s : time without the status OK from then on while the robot is to move
-    slip_peak_ratio, plain_slip_peak_ratio : largest true slip
-    stop_m, plain_stop_m : stopping distance; NaN where no stop is commanded
-    overspeed_s : longest time for which the commanded speed is above the desired one
-    """
+    """What the controller does without a fault, and plain commands do, from when faults begin in a place."""
 
     situation: str
     terrain: str
@@ -479,39 +363,12 @@ class CleanDrive:
     overspeed_s: float
 
 
-class Pilot(Protocol):
-    """What drives: a step from a sample to a command, and the estimate behind it; ``health`` is optional."""
-
-    @property
-    def estimate(self) -> Any:
-        """Last estimate, with ``speed_x_mps``; None where there is none."""
-
-    def step(self, sample: Sample) -> Command:
-        """Return the command."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FaultLoop:
-    """The closed loop of all drives.
-
-    Parameters
-    ----------
-    robot : swerve robot
-    new_pilot : returns a pilot of a controller, ``traction`` or ``plain``; to be sent to other processes
-    delay_s : from a sample to the wheel
-    """
+class FaultLoop(NamedTuple):
+    """The closed loop of all drives: a swerve robot, its pilots by controller, and the delay to the wheel."""
 
     robot: Robot
-    new_pilot: Callable[[str], Pilot]
+    new_pilot: Callable[[str], Any]  # of ``traction`` or ``plain``; is sent to other processes
     delay_s: float
-
-
-class Place(NamedTuple):
-    """Situation, terrain and seed, which one clean and one plain drive are made for."""
-
-    situation: str
-    terrain: str
-    seed: int
 
 
 class References(NamedTuple):
@@ -532,71 +389,65 @@ class Driven(NamedTuple):
 
 def drive_references(loop: FaultLoop, place: Place) -> References:
     """Return the clean and the plain drive of a place."""
-    made = make_fault_situation(place.situation, loop.robot, place.terrain, place.seed)
-    clean, plain = (_drive(loop, made, place.seed, controller=name).drive for name in ("traction", "plain"))
-    return References(clean, plain, made.start_s)
+    made, start_s = make_fault_situation(place.situation, loop.robot, place.terrain, place.seed)
+    clean, plain = (
+        _drive(loop, made, GuardedPilot(loop.new_pilot(name))).drive for name in ("traction", "plain")
+    )
+    return References(clean, plain, start_s)
 
 
 def drive_case(loop: FaultLoop, case: FaultCase) -> Driven:
     """Return the drive with a fault."""
-    made = make_fault_situation(case.situation, loop.robot, case.terrain, case.seed)
-    fault = fault_catalogue(loop.robot)[case.fault]
-    return _drive(loop, made, case.seed, fault, case.duration_s)
+    made, start_s = make_fault_situation(case.situation, loop.robot, case.terrain, case.seed)
+    pilot, fault = GuardedPilot(loop.new_pilot("traction")), fault_catalogue(loop.robot)[case.fault]
+    bus = FaultyBus(pilot.step, fault, start_s, start_s + case.duration_s, case.seed)
+    return _drive(loop, made, pilot, bus.__call__)
+
+
+def _drive(
+    loop: FaultLoop,
+    made: Situation,
+    pilot: GuardedPilot,
+    step: Callable[[Sample], Command] | None = None,
+) -> Driven:
+    with np.errstate(all="ignore"):  # values of a fault are squared
+        log = simulate_situation(loop.robot, made, step or pilot.step, loop.delay_s)
+    history = drive_history(log, loop.robot, made.conditions.radius_factors)
+    return Driven(fault_drive(log, history, loop.robot, made.scenario), pilot, np.array(pilot.speed_mps))
 
 
 def evaluate_case(loop: FaultLoop, case: FaultCase, references: References) -> FaultRow:
-    """Return the row of a drive with a fault.
-
-    Parameters
-    ----------
-    loop : of all drives
-    case : what is driven
-    references : of the same place
-    """
+    """Return the row of a drive with a fault, compared with the references of the same place."""
     fault = fault_catalogue(loop.robot)[case.fault]
-    driven = drive_case(loop, case)
-    pilot, start_s = driven.pilot, references.start_s
-    figures = fault_figures(
-        driven.drive,
-        references.clean,
-        references.plain,
-        start_s,
-        start_s + case.duration_s,
-        pilot.n_exceptions,
-        pilot.n_not_finite,
-    )
-    time_s = driven.drive.time_s
-    acts = (time_s >= start_s) & (time_s < start_s + case.duration_s)
+    drive, pilot, _ = drive_case(loop, case)
+    clean, plain, start_s = references
+    end_s, time_s = start_s + case.duration_s, drive.time_s
+    counts = pilot.n_exceptions, pilot.n_not_finite
+    figures = fault_figures(drive, clean, plain, start_s, end_s, *counts)
+    acts = ((time_s >= start_s) & (time_s < end_s)).tolist()
     return FaultRow(
-        case=case,
-        kind=fault.kind,
-        streams=fault.streams,
-        nature=fault.nature.value,
-        figures=figures,
-        bars=judge(figures, fault.nature),
-        sensors_named=named_sensors(pilot.health, acts.tolist(), float(time_s[1] - time_s[0])),
-        exception=pilot.exception,
+        case,
+        fault.kind,
+        fault.streams,
+        fault.nature.value,
+        figures,
+        judge(figures, fault.nature),
+        named_sensors(pilot.health, acts, float(time_s[1] - time_s[0])),
+        pilot.exception,
     )
 
 
 def drawn_cases(rows: Sequence[FaultRow], draw: Sequence[str] = ()) -> list[FaultCase]:
-    """Return the drives that are drawn, of the first seed.
+    """Return the drives that are drawn, of the first seed: of each kind that with the most unmet bars.
 
-    Parameters
-    ----------
-    rows : all drives
-    draw : faults or kinds of them whose drives are drawn, for the longest time that was driven; without, of
-        each kind the drive with the most unmet bars
+    With faults or kinds of them to draw: theirs, for the longest time that was driven.
     """
     longest_s = max(row.case.duration_s for row in rows)
     first_seed = min(row.case.seed for row in rows)
     first = [row for row in rows if row.case.seed == first_seed]
     if draw:
-        return [
-            row.case
-            for row in first
-            if {row.case.fault, row.kind} & set(draw) and row.case.duration_s == longest_s
-        ]
+        drawn = [row.case for row in first if {row.case.fault, row.kind} & set(draw)]
+        return [case for case in drawn if case.duration_s == longest_s]
     worst: dict[str, FaultRow] = {}
     for row in first:
         if row.unmet and len(row.unmet) > len(worst[row.kind].unmet if row.kind in worst else ()):
@@ -608,13 +459,12 @@ def clean_drive(place: Place, references: References) -> CleanDrive:
     """Return what the clean and the plain drive of a place show."""
     clean, plain, start_s = references
     one = fault_figures(clean, clean, plain, start_s, math.inf)
-    since = clean.time_s >= start_s
-    step_s = float(clean.time_s[1] - clean.time_s[0])
+    not_ok = ~clean.ok & clean.moving & (clean.time_s >= start_s)
     return CleanDrive(
         *place,
         start_s=start_s,
         slip_error_ratio=one.slip_error_ratio,
-        not_ok_s=float((~clean.ok & clean.moving & since).sum()) * step_s,
+        not_ok_s=float(not_ok.sum()) * float(clean.time_s[1] - clean.time_s[0]),
         slip_peak_ratio=one.slip_peak_ratio,
         plain_slip_peak_ratio=one.plain_slip_peak_ratio,
         stop_m=clean.stop_m,
@@ -623,33 +473,13 @@ def clean_drive(place: Place, references: References) -> CleanDrive:
     )
 
 
-def _drive(
-    loop: FaultLoop,
-    made: FaultSituation,
-    seed: int,
-    fault: SensorFault | None = None,
-    duration_s: float = math.inf,
-    controller: str = "traction",
-) -> Driven:
-    pilot = GuardedPilot(loop.new_pilot(controller))
-    step = pilot.step
-    if fault is not None:
-        step = FaultyBus(step, fault, made.start_s, made.start_s + duration_s, seed).__call__
-    situation = made.situation
-    with np.errstate(all="ignore"):  # values of a fault are squared
-        log = simulate_situation(loop.robot, situation, step, loop.delay_s)
-    history = drive_history(log, loop.robot, situation.conditions.radius_factors)
-    drive = fault_drive(log, history, loop.robot, situation.scenario)
-    return Driven(drive, pilot, np.array(pilot.speed_mps))
-
-
 class GuardedPilot:
     """Passes samples to a pilot; where it fails, the wheels keep their last command.
 
     Parameters
     ----------
-    pilot : gets the samples.  Its ``health``, a mapping from a sensor to the name of its status or a method
-        that returns one, is recorded where it has one
+    pilot : gets the samples.  Its ``health``, a mapping from a sensor to the name of its status, is recorded
+        where it has one
 
     Attributes
     ----------
@@ -659,7 +489,7 @@ class GuardedPilot:
     health : after each step; None where the pilot has none
     """
 
-    def __init__(self, pilot: Pilot) -> None:
+    def __init__(self, pilot: Any) -> None:
         self._pilot = pilot
         self._last: Command | None = None
         self.n_exceptions = self.n_not_finite = 0
@@ -670,28 +500,29 @@ class GuardedPilot:
     def step(self, sample: Sample) -> Command:
         """Return the pilot's command, or its last one that was finite with the status ``NO_SLIP``.
 
-        Raises
-        ------
-        Exception
-            that of the pilot, if it is in the first step.
+        An exception in the first step is raised.
         """
         try:
-            command = self._pilot.step(sample)
+            command: Command | None = self._pilot.step(sample)
         except Exception as error:
             if self._last is None:
                 raise
             self.n_exceptions += 1
             self.exception = self.exception or f"{type(error).__name__}: {error}"
-            command = _without_correction(self._last)
+            command = None
+        if command is not None and not is_finite(command) and self._last is not None:
+            self.n_not_finite += 1
+            command = None
+        if command is None:
+            assert self._last is not None
+            changed = {"status_code": float(TractionStatus.NO_SLIP), "slip_ratio": math.nan}
+            command = self._last._replace(status={**self._last.status, **changed})
         else:
-            if is_finite(command) or self._last is None:
-                self._last = command
-            else:
-                self.n_not_finite += 1
-                command = _without_correction(self._last)
+            self._last = command
         estimate = self._pilot.estimate
         self.speed_mps.append(math.nan if estimate is None else estimate.speed_x_mps)
-        self.health.append(_health(self._pilot))
+        health = getattr(self._pilot, "health", None)
+        self.health.append(None if health is None else dict(health))
         return command
 
 
@@ -705,15 +536,11 @@ def is_finite(command: Command) -> bool:
 
 
 def named_sensors(
-    health: list[dict[str, str] | None], acts: list[bool], step_s: float
+    health: Sequence[Mapping[str, str] | None], acts: Sequence[bool], step_s: float
 ) -> dict[str, str] | None:
     """Return the sensors that were named as other than fresh, with how, for :data:`NAMED_S` at least.
 
-    Parameters
-    ----------
-    health : after each step
-    acts : whether the fault acted at it
-    step_s : from step to step
+    ``health`` is that after each step, ``acts`` whether the fault acted at it.
 
     Examples
     --------
@@ -729,16 +556,3 @@ def named_sensors(
         if status != FRESH and n * step_s >= NAMED_S - 1e-9:
             found[sensor] = f"{found[sensor]}, {status}" if sensor in found else status
     return found
-
-
-def _health(pilot: Any) -> dict[str, str] | None:
-    health = getattr(pilot, "health", None)
-    health = health() if callable(health) else health
-    if not isinstance(health, Mapping):
-        return None
-    return {str(sensor): str(getattr(status, "name", status)).lower() for sensor, status in health.items()}
-
-
-def _without_correction(command: Command) -> Command:
-    changed = {"status_code": float(TractionStatus.NO_SLIP), "slip_ratio": math.nan}
-    return command._replace(status={**command.status, **changed})

@@ -17,7 +17,7 @@ import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.control.slip_table import DRIVE_STATES, SIGN, CurveEntry, SlipTable, load_slip_table
-from terrain.records import Array, RunLog, SlipTarget, TargetStatus
+from terrain.records import Array, SlipTarget, TargetStatus
 from terrain.robots import Robot
 from terrain.simulation.run import learning_runs
 from terrain.slip_learning.curve import (
@@ -43,19 +43,24 @@ FALLBACK = "unknown"
 DIGITS = 4
 """Of slips and ratios of forces in the table: a hundredth of their standard deviation."""
 
+MIN_RUNS = 3
+"""From fewer, how a median differs from run to run is not known."""
+
+N_DRAWS = 1000
+
+NO_PEAK = (
+    "steady motion alone is used: the slip where thrust balances resistance, which shows no peak of thrust"
+)
+FEW_RUNS = f"fewer than {MIN_RUNS} runs with a slip in steady motion"
+BRAKES = "the median slip is negative: the robot is faster than its wheels, downhill or by a wrong radius"
+
+_Z95 = 1.959964
+
 
 def simulated_table(
     robot: Robot, terrains: Sequence[str], seed: int, progress: Callable[[int, int], None]
 ) -> SlipTable:
-    """Return target slips learned from simulated runs on terrains, as ``terrain learn-slip`` learns them.
-
-    Parameters
-    ----------
-    robot : swerve robot
-    terrains : soils
-    seed : of the runs, and of what is learned from them
-    progress : gets the number of terrains that are done, and of all
-    """
+    """Return target slips learned from simulated runs on soils, as ``terrain learn-slip`` learns them."""
     learned = []
     for done, terrain in enumerate(terrains, start=1):
         measured = [one for log in learning_runs(robot, terrain, seed) for one in terrain_runs(log, robot)]
@@ -70,73 +75,70 @@ def learned_table(learned: Sequence[LearnedTerrain], robot: Robot, name: str) ->
     The fallback is for a terrain without an entry: of each drive state the lower median of the estimated
     terrains' numbers, and the packaged table's own without any.  The least of them would not do: on soft
     terrain the slip for tiles would not overcome the resistance.
-
-    Parameters
-    ----------
-    learned : of each terrain
-    robot : that drove
-    name : of the table
     """
-    default = load_slip_table()
     targets: dict[str, Mapping[str, SlipTarget]] = {}
-    curves, reasons = {}, {}
+    curves, reasons, estimated = {}, {}, []
     for entry in learned:
-        if entry.curve is not None and entry.targets is not None:
-            targets[entry.terrain] = _estimated(entry.terrain, entry.targets, entry.curve.n_runs)
-            curves[entry.terrain] = curve_entry(entry.curve, entry.targets, robot)
-        else:
-            targets[entry.terrain] = _assumed(entry.terrain, default, entry.status)
-            reasons[entry.terrain] = entry.reason
+        terrain = entry.terrain
+        if (curve := entry.curve) is None or entry.targets is None:
+            targets[terrain] = _assumed(terrain, entry.status)
+            reasons[terrain] = entry.reason
+            continue
+        curves[terrain] = curve_entry(curve, entry.targets, robot)
+        targets[terrain] = {
+            state: SlipTarget(
+                terrain,
+                state,
+                round(slip, DIGITS),
+                round(std, DIGITS),
+                curve.n_runs,
+                TargetStatus.ESTIMATED,
+                source,
+            )
+            for state in DRIVE_STATES
+            for slip, std, source in [entry.targets.of(state)]
+        }
+        estimated.append(targets[terrain])
+    if FALLBACK not in targets:
+        own = load_slip_table()
+        slips = {state: target.slip_ratio for state, target in own.targets[own.fallback].items()}
+        source = f"table {own.name}, its fallback"
+        if estimated:
+            source = "lower median of the terrains estimated here"
+            slips = {
+                state: SIGN[state] * median_low(abs(entry[state].slip_ratio) for entry in estimated)
+                for state in DRIVE_STATES
+            }
+        targets[FALLBACK] = {
+            state: SlipTarget(FALLBACK, state, slip, math.nan, 0, TargetStatus.UNESTIMATED, source)
+            for state, slip in slips.items()
+        }
     reasons.setdefault(FALLBACK, "used for a terrain without an entry")
-    targets.setdefault(FALLBACK, _fallback(targets, default))
     return SlipTable(name, FALLBACK, targets, robot.name, curves, reasons)
 
 
-def _estimated(terrain: str, targets: Targets, n_runs: int) -> dict[str, SlipTarget]:
-    found = {}
-    for state in DRIVE_STATES:
-        slip, std, source = targets.of(state)
-        numbers = round(slip, DIGITS), round(std, DIGITS), n_runs
-        found[state] = SlipTarget(terrain, state, *numbers, TargetStatus.ESTIMATED, source)
-    return found
-
-
-def _assumed(
-    terrain: str, default: SlipTable, status: TargetStatus = TargetStatus.UNESTIMATED
-) -> dict[str, SlipTarget]:
+def _assumed(terrain: str, status: TargetStatus = TargetStatus.UNESTIMATED) -> dict[str, SlipTarget]:
     """Return the numbers of the packaged table for a terrain."""
+    table = load_slip_table()
     return {
-        state: target._replace(
-            terrain=terrain,
-            slip_std=math.nan,
-            n_runs=0,
-            status=status,
-            source=f"table {default.name}, {target.terrain}: {target.source}",
+        state: SlipTarget(
+            terrain,
+            state,
+            target.slip_ratio,
+            math.nan,
+            0,
+            status,
+            f"table {table.name}, {target.terrain}: {target.source}",
         )
-        for state, target in default.lookup(terrain).items()
+        for state, target in table.lookup(terrain).items()
     }
-
-
-def _fallback(targets: Mapping[str, Mapping[str, SlipTarget]], default: SlipTable) -> dict[str, SlipTarget]:
-    estimated = [
-        by_state for by_state in targets.values() if by_state["traction"].status is TargetStatus.ESTIMATED
-    ]
-    chosen = {}
-    for state in DRIVE_STATES:
-        if estimated:
-            slip = SIGN[state] * median_low(abs(by_state[state].slip_ratio) for by_state in estimated)
-            source = "lower median of the terrains estimated here"
-        else:
-            slip = default.targets[default.fallback][state].slip_ratio
-            source = f"table {default.name}, its fallback"
-        chosen[state] = SlipTarget(FALLBACK, state, slip, math.nan, 0, TargetStatus.UNESTIMATED, source)
-    return chosen
 
 
 def curve_entry(curve: SlipCurve, targets: Targets, robot: Robot) -> CurveEntry:
     """Return what the table holds of a curve, rounded."""
     energy = {
-        state: round(energy_jpm(curve, targets.of(state).slip_ratio, robot), 1) for state in DRIVE_STATES
+        f"{state}_energy_jpm": round(energy_jpm(curve, targets.of(state).slip_ratio, robot), 1)
+        for state in DRIVE_STATES
     }
     named = zip(LAW_PARAMETERS[curve.law], curve.parameters, strict=True)
     working = targets.working_slip_ratio
@@ -153,9 +155,7 @@ def curve_entry(curve: SlipCurve, targets: Targets, robot: Robot) -> CurveEntry:
         peak_based_slip_ratio=round(targets.peak_based_slip_ratio, DIGITS),
         working_slip_ratio=None if math.isnan(working) else round(working, DIGITS),
         traction_efficiency_ratio=round(tractive_efficiency(curve, targets.traction.slip_ratio), 3),
-        traction_energy_jpm=energy["traction"],
-        braking_energy_jpm=energy["braking"],
-        steady_energy_jpm=energy["steady"],
+        **energy,
         n_runs=curve.n_runs,
     )
 
@@ -212,12 +212,6 @@ def _rounded(pair: tuple[float, float]) -> tuple[float, float]:
     return round(pair[0], DIGITS), round(pair[1], DIGITS)
 
 
-MIN_RUNS = 3
-"""From fewer, how a median differs from run to run is not known."""
-
-N_DRAWS = 1000
-
-
 class Transfer(NamedTuple):
     """The slip of one session taken for another of the same surface: what it costs.
 
@@ -242,86 +236,36 @@ class Transfer(NamedTuple):
     interval: tuple[float, float]
 
 
-def transfers(
-    runs: Sequence[RunLog], slips: Sequence[MeasuredSlip], rng: np.random.Generator
-) -> list[Transfer]:
-    """Return what each session shows beside each other one of the same surface.
-
-    Parameters
-    ----------
-    runs : labelled with one terrain each
-    slips : of each run
-    rng : draws runs
-    """
+def transfers(measured: Measured, rng: np.random.Generator) -> list[Transfer]:
+    """Return what each session of runs, labelled with one terrain each, shows beside each other of the same surface."""
     medians: dict[tuple[str, str], list[float]] = {}
-    for run, slip in zip(runs, slips, strict=True):
+    for run, slip in zip(measured.runs, measured.slips, strict=True):
         known = slip.body_slip[slip.steady & np.isfinite(slip.body_slip)]
         if known.size:
             medians.setdefault((run.terrains[0], run.session), []).append(float(np.median(known)))
-    return [
-        _transfer(terrain, learned, driven, medians, rng)
-        for terrain, learned in sorted(medians)
-        for other, driven in sorted(medians)
-        if other == terrain and driven != learned
-    ]
 
+    def drawn(values: Array) -> Array:
+        return np.asarray(np.median(values[bootstrap_rows(values.size, N_DRAWS, rng)], axis=1))
 
-def _transfer(
-    terrain: str,
-    learned: str,
-    driven: str,
-    medians: dict[tuple[str, str], list[float]],
-    rng: np.random.Generator,
-) -> Transfer:
-    one, two = np.array(medians[terrain, learned]), np.array(medians[terrain, driven])
-    interval = (np.nan, np.nan)
-    if min(one.size, two.size) >= MIN_RUNS:
-        interval = percentile_interval(_drawn_medians(two, rng) - _drawn_medians(one, rng))
-    slip_learned, slip_driven = float(np.median(one)), float(np.median(two))
-    return Transfer(
-        terrain,
-        learned,
-        driven,
-        slip_learned,
-        slip_driven,
-        one.size,
-        two.size,
-        slip_driven - slip_learned,
-        interval,
-    )
-
-
-def _drawn_medians(values: Array, rng: np.random.Generator) -> Array:
-    return np.asarray(np.median(values[bootstrap_rows(values.size, N_DRAWS, rng)], axis=1))
-
-
-NO_PEAK = (
-    "steady motion alone is used: the slip where thrust balances resistance, which shows no peak of thrust"
-)
-FEW_RUNS = f"fewer than {MIN_RUNS} runs with a slip in steady motion"
-BRAKES = "the median slip is negative: the robot is faster than its wheels, downhill or by a wrong radius"
-
-_Z95 = 1.959964
+    shown = []
+    for terrain, learned in sorted(medians):
+        for driven in sorted(other for place, other in medians if place == terrain and other != learned):
+            one, two = np.array(medians[terrain, learned]), np.array(medians[terrain, driven])
+            interval = math.nan, math.nan
+            if min(one.size, two.size) >= MIN_RUNS:
+                interval = percentile_interval(drawn(two) - drawn(one))
+            slips = float(np.median(one)), float(np.median(two))
+            difference = slips[1] - slips[0]
+            shown.append(Transfer(terrain, learned, driven, *slips, one.size, two.size, difference, interval))
+    return shown
 
 
 def measured_table(surfaces: Sequence[SurfaceSlip], robot: Robot, name: str) -> SlipTable:
-    """Return the table of a robot: steady slip where it was measured, assumed numbers elsewhere.
-
-    Parameters
-    ----------
-    surfaces : labelled ones
-    robot : that drove
-    name : of the table
-    """
-    default = load_slip_table()
-    targets: dict[str, Mapping[str, SlipTarget]] = {}
-    reasons: dict[str, str] = {}
-    for surface in surfaces:
-        reasons[surface.terrain] = reason_of(surface)
-        targets[surface.terrain] = _targets(surface, default)
+    """Return the table of a robot: steady slip of surfaces where it was measured, assumed numbers elsewhere."""
+    targets = {surface.terrain: _measured_targets(surface) for surface in surfaces}
+    reasons = {surface.terrain: reason_of(surface) for surface in surfaces}
     reasons.setdefault(FALLBACK, "used for a terrain without an entry")
-    if FALLBACK not in targets:
-        targets[FALLBACK] = _assumed(FALLBACK, default)
+    targets.setdefault(FALLBACK, _assumed(FALLBACK))
     return SlipTable(name, FALLBACK, targets, robot.name, {}, reasons)
 
 
@@ -332,8 +276,8 @@ def reason_of(surface: SurfaceSlip) -> str:
     return BRAKES if surface.slip_ratio < 0.0 else NO_PEAK
 
 
-def _targets(surface: SurfaceSlip, default: SlipTable) -> dict[str, SlipTarget]:
-    assumed = _assumed(surface.terrain, default)
+def _measured_targets(surface: SurfaceSlip) -> dict[str, SlipTarget]:
+    assumed = _assumed(surface.terrain)
     if reason_of(surface) is not NO_PEAK:
         return assumed
     low, high = surface.interval
@@ -354,49 +298,34 @@ def _targets(surface: SurfaceSlip, default: SlipTable) -> dict[str, SlipTarget]:
     return {**assumed, "steady": steady, "traction": traction}
 
 
-class LearnedSurfaces(NamedTuple):
-    """What was learned of surfaces.
+def learn_surfaces(
+    measured: Measured, robot: Robot, name: str, seed: int
+) -> tuple[SlipTable, dict[str, dict[str, Any]], dict[str, OperatingPoints], tuple[Transfer, ...]]:
+    """Return what runs on one terrain each show.
 
-    Parameters
-    ----------
+    Returns
+    -------
     table : of target slips
     surfaces : by name: the slip as measured, medians over runs of current and thrust over load with their
         quartiles, targets, and why there are no more
     points : operating points of the runs on each
     transfers : of targets from session to session
     """
-
-    table: SlipTable
-    surfaces: dict[str, dict[str, Any]]
-    points: dict[str, OperatingPoints]
-    transfers: tuple[Transfer, ...]
-
-
-def learn_surfaces(found: Measured, robot: Robot, name: str, seed: int) -> LearnedSurfaces:
-    """Return what runs on one terrain each show.
-
-    Parameters
-    ----------
-    found : runs with their slip
-    robot : that drove
-    name : of the table
-    seed : of the bootstrap
-    """
-    rng, by_terrain = np.random.default_rng(seed), found.by_terrain()
-    slips = {each: surface_slip(each, own.slips, rng) for each, own in by_terrain.items()}
+    rng, by_terrain = np.random.default_rng(seed), measured.by_terrain()
+    slips = {terrain: surface_slip(terrain, own.slips, rng) for terrain, own in by_terrain.items()}
     table = measured_table(list(slips.values()), robot, name)
-    points = {each: operating_points(own.runs, own.slips, robot) for each, own in by_terrain.items()}
+    points = {terrain: operating_points(own.runs, own.slips, robot) for terrain, own in by_terrain.items()}
     surfaces = {
-        each: {
+        terrain: {
             "slip": slip,
-            "current_a": _quartiles(points[each].current_a),
-            "thrust_ratio": _quartiles(points[each].thrust_ratio),
-            "targets": table.target_rows(each),
+            "current_a": _quartiles(points[terrain].current_a),
+            "thrust_ratio": _quartiles(points[terrain].thrust_ratio),
+            "targets": table.target_rows(terrain),
             "reason": reason_of(slip),
         }
-        for each, slip in slips.items()
+        for terrain, slip in slips.items()
     }
-    return LearnedSurfaces(table, surfaces, points, tuple(transfers(found.runs, found.slips, rng)))
+    return table, surfaces, points, tuple(transfers(measured, rng))
 
 
 def _quartiles(values: Array) -> tuple[float, float, float]:

@@ -42,32 +42,18 @@ class Bias(NamedTuple):
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class LiveState:
-    """What a live chain knew at a time.
-
-    Parameters
-    ----------
-    robot, filter : whose and which filter's biases, by name
-    saved_s : seconds since 1970
-    biases : by name of the state
-    terrain, probability : believed; empty and NaN where it was unknown
-    target_ratio : target slip that was aimed for; NaN where there was none
-    """
+    """What a live chain knew at a time."""
 
     robot: str
-    filter: str
-    saved_s: Number
-    biases: dict[str, Bias]
-    terrain: str = UNKNOWN
+    filter: str  # whose biases these are
+    saved_s: Number  # since 1970
+    biases: dict[str, Bias]  # by name of the state
+    terrain: str = UNKNOWN  # believed; empty where it was unknown
     probability: Number = math.nan
-    target_ratio: Number = math.nan
+    target_ratio: Number = math.nan  # target slip that was aimed for; NaN where there was none
 
     def usable(self, robot: str, filter_name: str, now_s: float) -> LiveState:
         """Return it without what may not be used now: what is too old, or another robot's or filter's.
-
-        Parameters
-        ----------
-        robot, filter_name : that it is to be used for
-        now_s : seconds since 1970
 
         Examples
         --------
@@ -106,10 +92,7 @@ def to_text(state: LiveState) -> str:
 def from_text(text: str | bytes, place: str = "saved state") -> LiveState:
     """Return the state that a text holds; messages begin with its place.
 
-    Raises
-    ------
-    DataError
-        if it is damaged, of another version, or its checksum is another.
+    ``DataError`` where it is damaged, of another version, or its checksum is another.
 
     Examples
     --------
@@ -125,8 +108,6 @@ def from_text(text: str | bytes, place: str = "saved state") -> LiveState:
 
 def load_state(path: Path) -> LiveState | None:
     """Return the state of a file; None where there is none, ``DataError`` for one that cannot be read."""
-    return (
-        from_text(read_regular(path, str(path), DataError, LARGEST_FILE), str(path))
-        if path.exists()
-        else None
-    )
+    if not path.exists():
+        return None
+    return from_text(read_regular(path, str(path), DataError, LARGEST_FILE), str(path))

@@ -39,7 +39,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from terrain.angles import wrapped
-from terrain.control.pid import LONGEST_STEP_S, Gains, PidState, PidStatus, pid_step
+from terrain.control.pid import LONGEST_STEP_S, Gains, PidState, PidStatus, checked, pid_step
 from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, closed_loop, spectral_radius
 from terrain.errors import ConfigError
 from terrain.records import Array
@@ -86,6 +86,11 @@ class TrackSettings(NamedTuple):
 SETTINGS = TrackSettings()
 
 
+_ABOVE_ZERO = frozenset(
+    f"{loop}_{end}" for loop in ("heading", "cross") for end in ("max_rad", "fastest_ps")
+) | {"arm_m", "yaw_std_max_rad", "stale_max_s"}
+
+
 def check_tracking(
     robot: Robot, settings: TrackSettings = SETTINGS, delay_s: float = DELAY_S, *, dt_s: float = SAMPLE_TIME_S
 ) -> TrackSettings:
@@ -125,12 +130,7 @@ def check_tracking(
     terrain.errors.ConfigError: path tracking: heading_pm 12 and heading_integral_pm2 0.7 with a delay of
     0.05 s are unstable from 1.02 to 2 m/s
     """
-    for name, value in settings._asdict().items():
-        zero = name in ("lag_s",) or "integral" in name or name.endswith("_pm")
-        valid = not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value)
-        if not valid or not (value >= 0.0 if zero else value > 0.0):
-            accepted = "a number from zero up" if zero else "a number above zero"
-            raise ConfigError(f"path tracking: {name} is {value!r}, {accepted} is required")
+    settings = checked("path tracking: ", settings, _ABOVE_ZERO)
     for name, value, least in (("delay_s", delay_s, 0.0), ("dt_s", dt_s, 1e-3)):
         if not least <= value <= LONGEST_STEP_S:
             raise ConfigError(
@@ -138,18 +138,27 @@ def check_tracking(
             )
     fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
     speeds_mps = np.geomspace(MOVING_MPS, fastest_mps, N_SPEEDS).tolist()
-    for loop in ("heading", "cross"):
-        k, k_i = getattr(settings, f"{loop}_pm"), getattr(settings, f"{loop}_integral_pm2")
-        fastest_ps = getattr(settings, f"{loop}_fastest_ps")
-        gains = (k, k_i, fastest_ps)
-        radii = [spectral_radius(_loop_matrix(robot, gains, delay_s, dt_s, speed)) for speed in speeds_mps]
-        bad = [speed for speed, radius in zip(speeds_mps, radii, strict=True) if radius >= 1.0 + 1e-9]
+    for loop, (k, k_i, _, fastest_ps) in _loops(settings).items():
+        gains = k, k_i, fastest_ps
+        bad = [
+            speed
+            for speed in speeds_mps
+            if spectral_radius(_loop_matrix(robot, gains, delay_s, dt_s, speed)) >= 1.0 + 1e-9
+        ]
         if bad:
             raise ConfigError(
                 f"path tracking: {loop}_pm {k:g} and {loop}_integral_pm2 {k_i:g} with a delay of "
                 f"{delay_s:g} s are unstable from {bad[0]:.3g} to {bad[-1]:.3g} m/s"
             )
-    return TrackSettings(*(float(value) for value in settings))
+    return settings
+
+
+def _loops(settings: TrackSettings) -> dict[str, tuple[float, float, float, float]]:
+    """Return gain, integral gain, clamp and bandwidth of heading and cross-track error."""
+    values = settings._asdict()
+    ends = ("pm", "integral_pm2", "max_rad", "fastest_ps")
+    cross, heading = ([values[f"{loop}_{end}"] for end in ends] for loop in ("cross", "heading"))
+    return {"heading": (*heading,), "cross": (*cross,)}
 
 
 def _loop_matrix(
@@ -172,10 +181,6 @@ def _loop_matrix(
     return closed_loop(over[:4, :4], over[:4, 4], integral[None], integral - slower * k * seen, n_delayed)
 
 
-Twist = tuple[float, float, float]
-"""Forward, left and turn; or a pose."""
-
-
 class TrackStatus(StatusCode):
     """Whether the twist is corrected: yes, up to a clamp, or not, and why."""
 
@@ -188,61 +193,31 @@ class TrackStatus(StatusCode):
     BAD_TIME = 6
 
 
-class PoseEstimate(NamedTuple):
-    """Estimated pose of the body's origin in the world.
-
-    Parameters
-    ----------
-    x_m, y_m, yaw_rad : pose; whole turns of the heading do not matter
-    yaw_std_rad : standard deviation of the heading
-    stale_s : time since the speed over ground was measured last
-    """
-
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    yaw_std_rad: float
-    stale_s: float
-
-
 class TrackReport(NamedTuple):
-    """Errors, NaN where nothing is corrected, and the correction.
-
-    Parameters
-    ----------
-    heading_error_rad : of the robot
-    cross_track_m : distance from the path, positive to its left
-    correction_rad : magnitude, as a steering angle
-    status : whether the twist was corrected
-    """
+    """Errors, NaN where nothing is corrected, and the correction."""
 
     heading_error_rad: float
-    cross_track_m: float
-    correction_rad: float
+    cross_track_m: float  # distance from the path, positive to its left
+    correction_rad: float  # magnitude, as a steering angle
     status: TrackStatus
 
 
+_ZEROS = np.zeros(3)
+
+
 class TrackState(NamedTuple):
-    """What a step leaves to the next.
+    """What a step leaves to the next."""
 
-    Parameters
-    ----------
-    reference : x, y and heading p* of the path; None where there is none, as at first
-    desired_once, desired : desired twist behind one and two low-passes
-    integral : of the errors along x, along y and of the heading, as corrections
-    last : x, y and heading of the robot
-    blind_s : time without a pose
-    """
-
-    reference: Twist | None = None
-    desired_once: Twist = (0.0, 0.0, 0.0)
-    desired: Twist = (0.0, 0.0, 0.0)
-    integral: Twist = (0.0, 0.0, 0.0)
-    last: Twist = (0.0, 0.0, 0.0)
-    blind_s: float = 0.0
+    reference: Array | None = (
+        None  # (3,) x, y and heading p* of the path; None where there is none, as at first
+    )
+    desired_once: Array = _ZEROS  # (3,) desired twist behind a low-pass
+    desired: Array = _ZEROS  # (3,) behind two
+    integral: tuple[float, ...] = (0.0, 0.0, 0.0)  # of the errors along x, along y and of the heading
+    last: Array = _ZEROS  # (3,) pose of the robot
+    blind_s: float = 0.0  # without a pose
 
 
-_NO_ERRORS = (0.0, 0.0, 0.0)
 _STAND_MPS = 0.02  # slower is standing: a tenth of the speed that counts as a drive
 _TURNED = 0.5  # cosine of 60 degrees
 _JUMP_M, _JUMP_RAD = 0.02, 0.02  # a filter moves its pose by less than a tenth of it beside the motion
@@ -250,189 +225,130 @@ _BLIND_S = 0.5  # longer without a pose, and the reference is lost
 _BACK, _AHEAD = 1.0, 3.0  # limits of the reference's speed, in multiples of the desired one
 
 
-def _rotated(angle_rad: float, x: float, y: float) -> tuple[float, float]:
-    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-    return cos * x - sin * y, sin * x + cos * y
-
-
-def _seen_along(yaw_rad: float, x: float, y: float) -> tuple[float, float]:
-    """Return a vector of the world in axes of this heading."""
-    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
-    return cos * x + sin * y, cos * y - sin * x
-
-
-def _pose_status(settings: TrackSettings, pose: PoseEstimate, ground: Twist) -> TrackStatus:
-    """Return whether a pose can be used."""
-    if not all(map(math.isfinite, (*pose[:3], *ground))):
-        return TrackStatus.NO_POSE
-    if not pose.yaw_std_rad <= settings.yaw_std_max_rad:
-        return TrackStatus.UNCERTAIN
-    return TrackStatus.OK if pose.stale_s <= settings.stale_max_s else TrackStatus.STALE
-
-
-def _after_jump(reference: Twist, last: Twist, pose: PoseEstimate, ground: Twist, dt_s: float) -> Twist:
-    """Return the reference, which jumps with a pose that jumps away from the motion."""
-    forward, left, turn = ground
-    step_x, step_y = _rotated(last[2] + 0.5 * dt_s * turn, forward, left)
-    due_x, due_y = last[0] + dt_s * step_x, last[1] + dt_s * step_y
-    jump = float(wrapped(pose.yaw_rad - last[2] - dt_s * turn))
-    if not (abs(jump) > _JUMP_RAD or math.hypot(pose.x_m - due_x, pose.y_m - due_y) > _JUMP_M):
-        return reference
-    off_x, off_y = _rotated(jump, reference[0] - due_x, reference[1] - due_y)
-    return pose.x_m + off_x, pose.y_m + off_y, reference[2] + jump
-
-
-def _delayed(settings: TrackSettings, state: TrackState, twist: Twist, dt_s: float) -> TrackState:
-    """Delay the desired twist as the estimated motion is."""
-    part = 1.0 - (math.exp(-2.0 * dt_s / settings.lag_s) if settings.lag_s > 0.0 else 0.0)
-
-    def low_passed(before: Twist, new: Twist) -> Twist:
-        x, y, turn = (late + part * (value - late) for late, value in zip(before, new, strict=True))
-        return x, y, turn
-
-    once = low_passed(state.desired_once, twist)
-    return state._replace(desired_once=once, desired=low_passed(state.desired, once))
-
-
-def _advanced(
-    settings: TrackSettings, state: TrackState, pose: PoseEstimate, late2: float, dt_s: float
-) -> Twist:
-    """Return the reference, moved along the delayed twist to where it is nearest to the robot."""
-    assert state.reference is not None
-    (x, y, yaw), (forward, left, turn), arm = state.reference, state.desired, settings.arm_m
-    ahead, beside = _seen_along(yaw, pose.x_m - x, pose.y_m - y)
-    turned = arm * arm * float(wrapped(pose.yaw_rad - yaw)) * turn
-    ahead_s = (ahead * forward + beside * left + turned) / late2
-    ahead_s = min(max(ahead_s, -_BACK * dt_s), _AHEAD * dt_s)
-    step_x, step_y = _rotated(yaw + 0.5 * ahead_s * turn, forward, left)
-    return x + ahead_s * step_x, y + ahead_s * step_y, yaw + ahead_s * turn
-
-
-def _corrected(
-    settings: TrackSettings, state: TrackState, twist: Twist, size: float, pose: PoseEstimate, dt_s: float
-) -> tuple[Twist, Twist, TrackReport]:
-    """Return the twist corrected by the errors across the desired motion, and the integrals.
-
-    Errors are along x, along y and L times heading, in metres.
-    """
-    assert state.reference is not None
-    (x, y, yaw), arm, status = state.reference, settings.arm_m, TrackStatus.OK
-    ahead, beside = _seen_along(pose.yaw_rad, pose.x_m - x, pose.y_m - y)
-    along = twist[0] / size, twist[1] / size, arm * twist[2] / size
-    error = _across((ahead, beside, arm * float(wrapped(pose.yaw_rad - yaw))), along)
-    cross = (
-        settings.cross_pm,
-        settings.cross_integral_pm2,
-        settings.cross_max_rad,
-        settings.cross_fastest_ps,
-    )
-    heading = (
-        *(settings.heading_pm, settings.heading_integral_pm2),
-        *(settings.heading_max_rad, settings.heading_fastest_ps),
-    )
-    added, integrals = [], []
-    for value, integral, (k, k_i, limit, fastest) in zip(
-        error, state.integral, (cross, cross, heading), strict=True
-    ):
-        slower = min(1.0, fastest / max(k * size, 1e-9))
-        gains = Gains(slower * k, slower * k_i, 0.0, limit, limit, 0.0)
-        one, pid, found = pid_step(gains, PidState(integral), -value, min(size * dt_s, LONGEST_STEP_S))
-        added.append(one)
-        integrals.append(pid.integral)
-        if found is not PidStatus.OK:
-            status = TrackStatus.CLAMPED
-    to_x, to_y, to_turn = _across((added[0], added[1], added[2]), along)
-    command = twist[0] + size * to_x, twist[1] + size * to_y, twist[2] + size * to_turn / arm
-    cross_m = math.copysign(math.hypot(error[0], error[1]), along[0] * error[1] - along[1] * error[0])
-    angle = math.sqrt(to_x * to_x + to_y * to_y + to_turn * to_turn)
-    return (
-        command,
-        (integrals[0], integrals[1], integrals[2]),
-        TrackReport(error[2] / arm, cross_m, angle, status),
-    )
-
-
-def _across(vector: Twist, along: Twist) -> Twist:
-    """Return a vector without its part along a unit vector."""
-    part = vector[0] * along[0] + vector[1] * along[1] + vector[2] * along[2]
-    return vector[0] - along[0] * part, vector[1] - along[1] * part, vector[2] - along[2] * part
-
-
 def track_step(
     settings: TrackSettings,
     state: TrackState,
-    desired_twist: Array,
-    pose: PoseEstimate,
+    twist: Array,
+    pose: Array,
     ground_twist: Array,
+    yaw_std_rad: float,
+    stale_s: float,
     dt_s: float,
 ) -> tuple[Array, TrackState, TrackReport]:
-    """Return the twist to drive, the next state, and why.
+    """Return the twist to drive (3,), the next state, and why.
 
     Parameters
     ----------
     settings : as :func:`check_tracking` gives them
     state : ``TrackState()`` at first, then what the step before returned
-    desired_twist : (3,) finite
-    pose, ground_twist : as estimated; (3,)
+    twist : (3,) desired, finite
+    pose : (3,) estimated x, y and heading of the body's origin; whole turns of the heading do not matter
+    ground_twist : (3,) estimated
+    yaw_std_rad : standard deviation of the heading
+    stale_s : time since the speed over ground was measured last
     dt_s : since the step before
-
-    Returns
-    -------
-    twist : (3,)
-    state : the next
-    report : errors, correction and status
 
     Examples
     --------
-    >>> ahead = np.array([1.0, 0.0, 0.0])
-    >>> at = PoseEstimate(0.0, 0.0, 0.0, yaw_std_rad=0.001, stale_s=0.0)
-    >>> _, state, _ = track_step(SETTINGS, TrackState(), ahead, at, ahead, 0.02)
-    >>> at = at._replace(x_m=0.02, yaw_rad=0.01)  # turned to the left
-    >>> twist, state, report = track_step(SETTINGS, state, ahead, at, ahead, 0.02)
+    >>> ahead, at = np.array([1.0, 0.0, 0.0]), np.zeros(3)
+    >>> _, state, _ = track_step(SETTINGS, TrackState(), ahead, at, ahead, 0.001, 0.0, 0.02)
+    >>> at = np.array([0.02, 0.0, 0.01])  # turned to the left
+    >>> twist, state, report = track_step(SETTINGS, state, ahead, at, ahead, 0.001, 0.0, 0.02)
     >>> twist.round(3), round(report.heading_error_rad, 3), report.status.name
     (array([ 1.  ,  0.  , -0.03]), 0.01, 'OK')
     """
-    twist, ground = tuple(desired_twist.tolist()), tuple(ground_twist.tolist())
 
     def uncorrected(status: TrackStatus) -> TrackReport:
         return TrackReport(math.nan, math.nan, 0.0, status)
 
     if not 0.0 < dt_s <= LONGEST_STEP_S:
-        return np.array(twist), state, uncorrected(TrackStatus.BAD_TIME)
-    status = _pose_status(settings, pose, ground)
+        return twist, state, uncorrected(TrackStatus.BAD_TIME)
+    status = TrackStatus.OK if stale_s <= settings.stale_max_s else TrackStatus.STALE
+    if not all(map(math.isfinite, (*pose.tolist(), *ground_twist.tolist()))):
+        status = TrackStatus.NO_POSE
+    elif not yaw_std_rad <= settings.yaw_std_max_rad:
+        status = TrackStatus.UNCERTAIN
     if status is not TrackStatus.OK:
         blind_s = state.blind_s + dt_s
         reference = None if blind_s > _BLIND_S else state.reference
-        return np.array(twist), state._replace(blind_s=blind_s, reference=reference), uncorrected(status)
-    arm, at = settings.arm_m, pose[:3]
-    size = math.sqrt(twist[0] * twist[0] + twist[1] * twist[1] + (arm * twist[2]) * (arm * twist[2]))
+        return twist, state._replace(blind_s=blind_s, reference=reference), uncorrected(status)
+    metres = np.array([1.0, 1.0, settings.arm_m])  # what makes a twist or an error metres in all three
+    along = metres * twist
+    size = math.sqrt(along @ along)
     if state.reference is None or size < _STAND_MPS:
-        state = TrackState(reference=at)
+        state = TrackState(reference=pose)
     elif state.blind_s == 0.0:
-        state = state._replace(reference=_after_jump(state.reference, state.last, pose, ground, dt_s))
-    state = state._replace(last=at, blind_s=0.0)
+        jumped = _after_jump(state.reference, state.last, pose, ground_twist, dt_s)
+        state = state._replace(reference=jumped)
+    state = state._replace(last=pose, blind_s=0.0)
     if size < _STAND_MPS:
-        return np.array(twist), state, uncorrected(TrackStatus.STANDING)
-    state = _delayed(settings, state, twist, dt_s)
-    late2, same = _products(arm, state.desired, twist)
-    ground2, moves = _products(arm, ground, twist)
-    turned = same < _TURNED * size * math.sqrt(late2)
-    if turned or (ground2 > MOVING_MPS * MOVING_MPS and moves < _TURNED * size * math.sqrt(ground2)):
-        assert state.reference is not None
-        state = state._replace(reference=(*at[:2], state.reference[2]), integral=_NO_ERRORS)
+        return twist, state, uncorrected(TrackStatus.STANDING)
+    along, reference = along / size, state.reference
+    assert reference is not None
+
+    # the desired twist, delayed as the estimated motion is
+    part = 1.0 - (math.exp(-2.0 * dt_s / settings.lag_s) if settings.lag_s > 0.0 else 0.0)
+    once = state.desired_once + part * (twist - state.desired_once)
+    desired, integral = state.desired + part * (once - state.desired), state.integral
+    late, ground = metres * desired, metres * ground_twist
+    turned = late @ along < _TURNED * math.sqrt(late @ late)
+    ground_mps = math.sqrt(ground @ ground)
+    if turned or (ground_mps > MOVING_MPS and ground @ along < _TURNED * ground_mps):
+        reference, integral = np.array([pose[0], pose[1], reference[2]]), (0.0, 0.0, 0.0)
     if turned:
-        state, late2 = state._replace(desired_once=twist, desired=twist), size * size
-    if late2 > 0.0:
-        state = state._replace(reference=_advanced(settings, state, pose, late2, dt_s))
-    command, integral, report = _corrected(settings, state, twist, size, pose, dt_s)
-    return np.array(command), state._replace(integral=integral), report
+        once = desired = twist
+        late = metres * twist
+
+    # the reference moves along it to where it is nearest to the robot
+    if (late2 := float(late @ late)) > 0.0:
+        ahead_s = float(metres * _seen_from(reference, pose, reference[2]) @ late) / late2
+        ahead_s = min(max(ahead_s, -_BACK * dt_s), _AHEAD * dt_s)
+        reference = reference + ahead_s * _rotated(reference[2] + 0.5 * ahead_s * desired[2], desired)
+
+    # errors across the desired motion, along x, along y and L times heading
+    error = _across(metres * _seen_from(reference, pose, pose[2]), along)
+    loops, added, integrals, status = _loops(settings), [], [], TrackStatus.OK
+    for value, before, loop in zip(error.tolist(), integral, ("cross", "cross", "heading"), strict=True):
+        k, k_i, limit, fastest = loops[loop]
+        slower = min(1.0, fastest / max(k * size, 1e-9))
+        gains = Gains(slower * k, slower * k_i, 0.0, limit, limit, 0.0)
+        one, pid, computed = pid_step(gains, PidState(before), -value, min(size * dt_s, LONGEST_STEP_S))
+        added.append(one)
+        integrals.append(pid.integral)
+        if computed is not PidStatus.OK:
+            status = TrackStatus.CLAMPED
+    correction = _across(np.array(added), along)
+    cross_m = math.copysign(math.hypot(error[0], error[1]), along[0] * error[1] - along[1] * error[0])
+    angle = math.sqrt(correction @ correction)
+    report = TrackReport(float(error[2]) / settings.arm_m, cross_m, angle, status)
+    state = TrackState(reference, once, desired, tuple(integrals), pose)
+    return twist + size * correction / metres, state, report
 
 
-def _products(arm_m: float, one: Twist, other: Twist) -> tuple[float, float]:
-    """Return the square of a twist, and its product with another, in metres."""
-    square = product = 0.0
-    for j in range(3):
-        unit = arm_m if j == 2 else 1.0
-        square += (unit * one[j]) * (unit * one[j])
-        product += unit * unit * one[j] * other[j]
-    return square, product
+def _after_jump(reference: Array, last: Array, pose: Array, ground: Array, dt_s: float) -> Array:
+    """Return the reference, which jumps with a pose that jumps away from the motion."""
+    due = last + dt_s * _rotated(last[2] + 0.5 * dt_s * ground[2], ground)
+    jump = float(wrapped(pose[2] - due[2]))
+    if not (abs(jump) > _JUMP_RAD or math.hypot(pose[0] - due[0], pose[1] - due[1]) > _JUMP_M):
+        return reference
+    x, y, _ = pose + _rotated(jump, reference - due)
+    return np.array([x, y, reference[2] + jump])
+
+
+def _rotated(angle_rad: float, vector: Array) -> Array:
+    """Return a vector (3,) with x and y turned by an angle."""
+    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
+    x, y, third = vector.tolist()
+    return np.array([cos * x - sin * y, sin * x + cos * y, third])
+
+
+def _seen_from(reference: Array, pose: Array, heading_rad: float) -> Array:
+    """Return a pose (3,) less a reference, in axes of a heading."""
+    error = _rotated(-heading_rad, pose - reference)
+    error[2] = wrapped(error[2])
+    return error
+
+
+def _across(vector: Array, along: Array) -> Array:
+    """Return a vector (3,) without its part along a unit vector."""
+    return np.asarray(vector - along * (vector @ along))

@@ -11,6 +11,7 @@ Files of paths: CSV with a header, or two columns of numbers.
 from __future__ import annotations
 
 import csv
+import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,8 +22,8 @@ from scipy.interpolate import splev, splprep
 
 from terrain.angles import unwrapped, wrapped
 from terrain.errors import DataError, LogError
+from terrain.files.names import MEBIBYTE, read_regular
 from terrain.records import Array, read_only
-from terrain.robots import BicycleRobot
 from terrain.status import StatusCode
 
 GRID_M = 0.05
@@ -46,21 +47,12 @@ class PathStatus(StatusCode):
 
 
 class Place(NamedTuple):
-    """Where a robot is on a path.
+    """Where a robot is on a path."""
 
-    Parameters
-    ----------
-    distance_m : s of the closest point
-    lateral_m : y, of the robot to the left of the path
-    angle_rad : theta~, heading of the robot less that of the path
-    curvature_pm : c(s)
-    status : whether that is so
-    """
-
-    distance_m: float
-    lateral_m: float
-    angle_rad: float
-    curvature_pm: float
+    distance_m: float  # s of the closest point
+    lateral_m: float  # y, of the robot to the left of the path
+    angle_rad: float  # theta~, heading of the robot less that of the path
+    curvature_pm: float  # c(s)
     status: PathStatus
 
 
@@ -229,49 +221,23 @@ def path_from_points(points_m: Array, std_m: float = 0.0) -> ReferencePath:
         raise DataError(
             f"path: turns back by {np.degrees(turns[back - 1]):.0f} degrees at {kept[back].tolist()}"
         )
-    return replace(_spline_path(kept, steps, std_m), n_merged=len(points) - len(kept))
-
-
-def _spline_path(points: Array, steps: Array, std_m: float) -> ReferencePath:
     along = np.concatenate([[0.0], np.cumsum(steps)])
-    spline, _ = splprep(points.T, u=along, k=min(5, len(points) - 1), s=2 * len(points) * std_m**2)
+    spline, _ = splprep(kept.T, u=along, k=min(5, len(kept) - 1), s=2 * len(kept) * std_m**2)
     fine = np.linspace(0.0, along[-1], 1 + max(64, math.ceil(4 * along[-1] / GRID_M)))
     x, y = splev(fine, spline)
     length = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    s = np.arange(0.0, length[-1] + 1e-9, GRID_M)
-    at = np.interp(s, length, fine)
+    at = np.interp(np.arange(0.0, length[-1] + 1e-9, GRID_M), length, fine)
     x, y = splev(at, spline)
     (dx, dy), (ddx, ddy) = splev(at, spline, der=1), splev(at, spline, der=2)
     curvature = (dx * ddy - dy * ddx) / np.maximum(np.hypot(dx, dy), 1e-9) ** 3
-    return ReferencePath(x, y, unwrapped(np.arctan2(dy, dx)), curvature)
-
-
-def path_warnings(path: ReferencePath, robot: BicycleRobot) -> tuple[str, ...]:
-    """Return a sentence for what of a path the robot cannot drive, and for what was changed.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> tight = path_from_curvature(np.array([0.0, 2.0]), np.array([0.5, 0.5]))
-    >>> path_warnings(tight, load_robot("adap2e"))[0]
-    'curvature is 0.500 1/m at 0.0 m; steering to 20 degrees reaches 0.303 1/m'
-    """
-    found = []
-    reach = math.tan(robot.steering_max_rad) / robot.wheelbase_m
-    sharpest = int(np.abs(path.curvature_pm).argmax())
-    if abs(curvature := path.curvature_pm[sharpest]) > reach:
-        found.append(
-            f"curvature is {curvature:.3f} 1/m at {sharpest * GRID_M:.1f} m; "
-            f"steering to {np.degrees(robot.steering_max_rad):.0f} degrees reaches {reach:.3f} 1/m"
-        )
-    if path.n_merged:
-        found.append(f"{path.n_merged} points that repeat the one before were merged with it")
-    return tuple(found)
+    heading = unwrapped(np.arctan2(dy, dx))
+    return ReferencePath(x, y, heading, curvature, n_merged=len(points) - len(kept))
 
 
 _X = ("x_m", "position_x_m", "x")
 _Y = ("y_m", "position_y_m", "y")
-_MAX_BYTES = 50_000_000
+_MAX_BYTES = 48 * MEBIBYTE
+_STEEPEST_RAD = math.radians(45.0)
 
 
 def read_path(path: Path, std_m: float = 0.0) -> ReferencePath:
@@ -290,71 +256,49 @@ def read_path(path: Path, std_m: float = 0.0) -> ReferencePath:
     DataError
         if its points are no path.
     """
-    rows = _text_rows(path)
-    columns, first = _columns(path, [cell.strip() for cell in rows[0][1]]), 1
-    if columns is None:
-        columns, first = (0, 1, None), 0
-    points = _numbers(path, rows[first:], columns[:2])
     try:
-        found = path_from_points(points, std_m)
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from None
-    if columns[2] is None:
-        return found
-    roll = _numbers(path, rows[first:], (columns[2],))[:, 0]
-    if not (np.abs(roll) < np.deg2rad(45.0)).all():
-        raise DataError(f"{path}: roll_rad is beyond 45 degrees, or no number, at point {_first_bad(roll)}")
-    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-    return found.with_roll(along * found.length_m / along[-1], roll)
-
-
-def _first_bad(roll: Array) -> int:
-    return int(np.flatnonzero(~(np.abs(roll) < np.deg2rad(45.0)))[0]) + 1
-
-
-def _text_rows(path: Path) -> list[tuple[int, list[str]]]:
-    """Return the rows that are not empty, with their numbers in the file."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise LogError(f"{path}: {path.stat().st_size} bytes; a path of at most {_MAX_BYTES} is accepted")
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "is no text"
-        raise LogError(f"{path}: cannot be read: {reason}") from None
-    separator = ";" if ";" in text.partition("\n")[0] else ","
-    try:
-        listed = list(csv.reader(text.splitlines(), delimiter=separator))
-    except csv.Error as error:
+        text = read_regular(path, str(path), LogError, _MAX_BYTES).decode("utf-8-sig")
+        separator = ";" if ";" in text.partition("\n")[0] else ","
+        cells = list(csv.reader(io.StringIO(text, newline=""), delimiter=separator))
+    except (UnicodeDecodeError, csv.Error) as error:
         raise LogError(f"{path}: is no CSV file: {error}") from None
-    rows = [(number, row) for number, row in enumerate(listed, 1) if any(cell.strip() for cell in row)]
+    rows = [(number, row) for number, row in enumerate(cells, 1) if any(cell.strip() for cell in row)]
     if not rows:
         raise LogError(f"{path}: is empty")
-    return rows
-
-
-def _columns(path: Path, names: list[str]) -> tuple[int, int, int | None] | None:
-    """Return the places of x, y and roll; None where the first row is one of numbers."""
-    x = next((names.index(name) for name in _X if name in names), None)
-    y = next((names.index(name) for name in _Y if name in names), None)
-    if x is not None and y is not None:
-        return x, y, names.index("roll_rad") if "roll_rad" in names else None
-    try:
-        [float(name) for name in names[:2]]
-    except ValueError:
-        shown = ", ".join(names[:6])
-        raise LogError(f"{path}: columns x_m and y_m are needed, its first row has {shown}") from None
-    if len(names) < 2:
+    names, places = [cell.strip() for cell in rows[0][1]], [0, 1]
+    found = [next((names.index(name) for name in known if name in names), None) for known in (_X, _Y)]
+    if None not in found:
+        places = [place for place in found if place is not None]
+        places += [names.index("roll_rad")] if "roll_rad" in names else []
+        rows = rows[1:]
+    elif not all(map(_is_number, names[:2])):
+        raise LogError(f"{path}: columns x_m and y_m are needed, its first row has {', '.join(names[:6])}")
+    elif len(names) < 2:
         raise LogError(f"{path}: two columns of numbers are needed, its first row has one")
-    return None
-
-
-def _numbers(path: Path, rows: list[tuple[int, list[str]]], columns: tuple[int, ...]) -> Array:
-    found = np.empty((len(rows), len(columns)))
+    values = np.empty((len(rows), len(places)))
     for k, (number, row) in enumerate(rows):
-        for j, column in enumerate(columns):
-            try:
-                found[k, j] = float(row[column])
-            except (IndexError, ValueError):
-                cell = row[column] if column < len(row) else "nothing"
-                raise LogError(f"{path}: row {number} has {cell!r}, a number is needed") from None
-    return found
+        for j, place in enumerate(places):
+            cell = row[place] if place < len(row) else "nothing"
+            if not _is_number(cell):
+                raise LogError(f"{path}: row {number} has {cell!r}, a number is needed")
+            values[k, j] = float(cell)
+    try:
+        reference = path_from_points(values[:, :2], std_m)
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+    if len(places) < 3:
+        return reference
+    points, roll = values[:, :2], values[:, 2]
+    if not (np.abs(roll) < _STEEPEST_RAD).all():
+        first = int(np.flatnonzero(~(np.abs(roll) < _STEEPEST_RAD))[0]) + 1
+        raise DataError(f"{path}: roll_rad is beyond 45 degrees, or no number, at point {first}")
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    return reference.with_roll(along * reference.length_m / along[-1], roll)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

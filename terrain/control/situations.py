@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,39 +58,24 @@ class Situation(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SituationOptions:
-    """What is chosen of a situation.
-
-    Parameters
-    ----------
-    duration_s, speed_mps, accel_mps2 : of the scenario
-    grade_deg : uphill along the initial heading
-    radius_factors : true radius of each wheel over the nominal one; drawn by default
-    leg_backlash_rad : of the third leg
-    """
+    """What is chosen of a situation."""
 
     duration_s: float | None = None
     speed_mps: float = 1.0
     accel_mps2: float = 1.0
-    grade_deg: float = 0.0
-    radius_factors: tuple[float, float, float] | None = None
-    leg_backlash_rad: float = 0.0
+    grade_deg: float = 0.0  # uphill along the initial heading
+    radius_factors: tuple[float, float, float] | None = None  # true over nominal radius; drawn by default
+    leg_backlash_rad: float = 0.0  # of the third leg
 
 
 def make_situation(
     name: str, robot: Robot, terrain: str, seed: int, options: SituationOptions = SituationOptions()
 ) -> Situation:
-    """Return a situation; what is drawn depends on the seed and the terrain alone.
+    """Return a situation of :data:`SITUATIONS`, or of the scenarios of ``terrain simulate``, for a swerve robot.
 
-    Load, soil, tyres, roughness and noise are drawn.  ``course`` and ``mixed`` have slopes and undulations as
-    fields have (``data/spread``); all others have the chosen grade.
-
-    Parameters
-    ----------
-    name : one of :data:`SITUATIONS`, or of the scenarios of ``terrain simulate``
-    robot : swerve robot
-    terrain : soil, or ``course`` for all of them
-    seed : of all that is drawn
-    options : what is not drawn
+    Load, soil, tyres, roughness and noise are drawn, by seed and terrain alone: a soil, or ``course`` for all of
+    them.  ``course`` and ``mixed`` have slopes and undulations as fields have (``data/spread``); all others have
+    the chosen grade.
 
     Raises
     ------
@@ -123,15 +108,7 @@ def simulate_situation(
     controller: Callable[[Sample], Command],
     delay_s: float,
 ) -> RunLog:
-    """Return the log of a situation that a controller drives.
-
-    Parameters
-    ----------
-    robot : that is simulated
-    situation : in which it drives
-    controller : from a sample to a command
-    delay_s : from a sample to the wheel
-    """
+    """Return the log of a robot in a situation, driven by a controller with a delay from a sample to the wheel."""
     return simulate(
         robot,
         situation.scenario,
@@ -147,16 +124,14 @@ def simulate_situation(
 
 def _chosen(conditions: Conditions, options: SituationOptions, level: bool) -> Conditions:
     """Return the drawn conditions with those that are chosen."""
-    if level:
-        conditions = replace(conditions, grade_ratio=(0.0, 0.0), undulation_ratio=0.0)
+    chosen: dict[str, Any] = {"grade_ratio": (0.0, 0.0), "undulation_ratio": 0.0} if level else {}
     if options.leg_backlash_rad:
-        conditions = replace(conditions, leg_backlash_rad=options.leg_backlash_rad)
+        chosen["leg_backlash_rad"] = options.leg_backlash_rad
     if options.grade_deg:
-        grade_ratio = math.tan(math.radians(options.grade_deg))
-        conditions = replace(conditions, grade_ratio=(grade_ratio, 0.0))
+        chosen["grade_ratio"] = (math.tan(math.radians(options.grade_deg)), 0.0)
     if options.radius_factors is not None:
-        conditions = replace(conditions, radius_factors=options.radius_factors)
-    return conditions
+        chosen["radius_factors"] = options.radius_factors
+    return replace(conditions, **chosen)
 
 
 def _scenario(
@@ -182,16 +157,9 @@ def _starts(robot: Robot, terrain: str, speed_mps: float, accel_mps2: float) -> 
     enough_s = 60.0 + 4.0 * speed_mps / accel_mps2 if accel_mps2 > 0 else None
     checked = make_scenario(STARTS, robot, terrain, enough_s, speed_mps, accel_mps2=accel_mps2)
     ramp_s = speed_mps / accel_mps2
-    knots_s, speeds = [0.0, 1.0], [0.0, 0.0]
-    for _ in range(N_STARTS):
-        for length_s, speed in (
-            (ramp_s, speed_mps),
-            (STARTS_HOLD_S, speed_mps),
-            (ramp_s, 0.0),
-            (STARTS_REST_S, 0.0),
-        ):
-            knots_s.append(knots_s[-1] + length_s)
-            speeds.append(speed)
+    lengths_s = (ramp_s, STARTS_HOLD_S, ramp_s, STARTS_REST_S) * N_STARTS
+    knots_s = np.cumsum([0.0, 1.0, *lengths_s])
+    speeds = [0.0, 0.0, *(speed_mps, speed_mps, 0.0, 0.0) * N_STARTS]
     time_s = np.arange(round(knots_s[-1] * RATE_HZ) + 1) / RATE_HZ
     twist = np.zeros((time_s.size, 3))
     twist[:, 0] = np.interp(time_s, knots_s, speeds)

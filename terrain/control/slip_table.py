@@ -13,14 +13,16 @@ from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Annotated, Any
 
 import yaml
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic.dataclasses import dataclass as checked_dataclass
 
 from terrain.errors import ConfigError
 from terrain.files.atomic import atomic_write
-from terrain.files.documents import check_keys, read_yaml
-from terrain.files.names import data_folder
+from terrain.files.documents import accepted, check_keys, read_yaml
+from terrain.files.names import data_folder, shown
 from terrain.records import Array, SlipTarget, TargetStatus
 from terrain.slip_learning.curve import LAW_BOUNDS, LAW_PARAMETERS, PeakStatus, traction_ratio
 
@@ -32,17 +34,19 @@ SIGN = {"traction": 1, "braking": -1, "steady": 1}
 SCHEMA = 2
 """Newest form that is read, and the one that is written."""
 
-_Status = TypeVar("_Status", bound=StrEnum)
-
-_NUMBER_KEYS = {"slip_ratio", "source", "slip_std", "n_runs"}
 _HEADER = """\
 # Target slip on each terrain, positive in traction (s = (w r - v) / max(|w r|, |v|)).
 # Written by terrain learn-slip.  estimated: learned from n_runs runs; unestimated: the runs do not suffice,
 # the number is assumed; invalid: what was learned contradicts itself, the fallback is used instead.
 """
 
+Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Ratio = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1.0, le=1.0)]
+Words = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1)]
+_CLOSED = ConfigDict(extra="forbid")
 
-@dataclass(frozen=True, slots=True)
+
+@checked_dataclass(frozen=True, slots=True, config=_CLOSED)
 class CurveEntry:
     """What a table holds of a learned curve; numbers as in the file, None where not known.
 
@@ -61,21 +65,21 @@ class CurveEntry:
     """
 
     law: str
-    parameters: Mapping[str, float]
-    peak_slip_ratio: float
-    peak_interval_ratio: tuple[float, float]
+    parameters: Mapping[str, Finite]
+    peak_slip_ratio: Ratio
+    peak_interval_ratio: tuple[Ratio, Ratio]
     peak_status: PeakStatus
-    slip_range_ratio: tuple[float, float]
-    resistance_ratio: float
-    resistance_std: float
-    balance_slip_ratio: float
-    peak_based_slip_ratio: float
-    working_slip_ratio: float | None
-    traction_efficiency_ratio: float
-    traction_energy_jpm: float
-    braking_energy_jpm: float
-    steady_energy_jpm: float
-    n_runs: int
+    slip_range_ratio: tuple[Ratio, Ratio]
+    resistance_ratio: Finite
+    resistance_std: Finite
+    balance_slip_ratio: Ratio
+    peak_based_slip_ratio: Ratio
+    working_slip_ratio: Ratio | None = field(default=None, kw_only=True)
+    traction_efficiency_ratio: Finite
+    traction_energy_jpm: Finite
+    braking_energy_jpm: Finite
+    steady_energy_jpm: Finite
+    n_runs: Annotated[int, Field(strict=True, ge=1)]
 
     def thrust_ratio(self, slip_ratio: Array) -> Array:
         """Return the thrust over load (n,) at each slip (n,)."""
@@ -104,13 +108,10 @@ class SlipTable:
     robot: str = ""
     curves: Mapping[str, CurveEntry] = field(default_factory=dict)
     reasons: Mapping[str, str] = field(default_factory=dict)
-    _valid: Mapping[str, Mapping[str, SlipTarget]] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("targets", "curves", "reasons"):
             object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
-        valid = {terrain: entry for terrain, entry in self.targets.items() if _is_valid(entry)}
-        object.__setattr__(self, "_valid", valid)
 
     def lookup(self, terrain: str) -> Mapping[str, SlipTarget]:
         """Return the targets for a terrain, or those of the fallback; each names the entry that it is from.
@@ -123,8 +124,8 @@ class SlipTable:
         >>> table.lookup("ICE")["traction"].terrain, table.lookup("mud")["traction"].terrain
         ('ICE', 'unknown')
         """
-        entry = self._valid.get(terrain)
-        return self.targets[self.fallback] if entry is None else entry
+        entry = self.targets.get(terrain)
+        return self.targets[self.fallback] if entry is None or _is_invalid(entry) else entry
 
     def target_rows(self, terrain: str) -> dict[str, dict[str, Any]]:
         """Return the targets of an entry by drive state, as JSON has them."""
@@ -135,8 +136,28 @@ class SlipTable:
         }
 
 
-def _is_valid(entry: Mapping[str, SlipTarget]) -> bool:
-    return not any(target.status is TargetStatus.INVALID for target in entry.values())
+def _is_invalid(entry: Mapping[str, SlipTarget]) -> bool:
+    return any(target.status is TargetStatus.INVALID for target in entry.values())
+
+
+class _Number(BaseModel):
+    model_config = _CLOSED
+
+    slip_ratio: Ratio
+    source: Words
+    slip_std: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0)] | None = None
+    n_runs: Annotated[int, Field(strict=True, ge=0)] = 0
+    status: TargetStatus | None = None
+
+
+class _Entry(BaseModel):
+    model_config = _CLOSED
+
+    traction: _Number
+    braking: _Number
+    steady: _Number
+    curve: CurveEntry | None = None
+    reason: Annotated[str, Field(strict=True)] = ""
 
 
 def load_slip_table(
@@ -160,66 +181,69 @@ def load_slip_table(
     """
     file = data_folder("target_slip") / "default.yaml" if path is None else Path(path)
     content = read_yaml(file, text)
-    schema = _schema(file, content)
-    of_robot = _check_frame(file, content, schema)
-    if robot is not None and of_robot and of_robot != robot:
-        raise ConfigError(f"{file}: the table is for robot {of_robot!r}, not for {robot!r}")
-    fallback = content["fallback"]
-    targets, curves, reasons = {}, {}, {}
-    for key, entry in content["terrains"].items():
-        terrain = str(key)
-        targets[terrain] = _targets(file, terrain, entry, schema)
-        if "curve" in entry:
-            curves[terrain] = _curve(f"{file}: {terrain}, curve", entry["curve"])
-        if "reason" in entry:
-            if not isinstance(entry["reason"], str):
-                raise ConfigError(f"{file}: {terrain}: reason is {entry['reason']!r}, a text is required")
-            reasons[terrain] = entry["reason"]
-    if any(target.status is TargetStatus.INVALID for target in targets[fallback].values()):
+    schema = content.get("schema", 1) if isinstance(content, dict) else 1
+    if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
+        raise ConfigError(f"{file}: schema is {shown(schema)}, 1 or {SCHEMA} is required")
+    if schema > SCHEMA:
+        raise ConfigError(f"{file}: schema {schema} is newer than {SCHEMA}, the newest that is read here")
+    of_robot = ["schema", "robot"] if schema == SCHEMA else []
+    check_keys(str(file), content, [*of_robot, "name", "fallback", "terrains"], ("schema",))
+    terrains, fallback, owner = content["terrains"], content["fallback"], content.get("robot", "")
+    if not isinstance(terrains, dict) or not isinstance(fallback, str) or fallback not in terrains:
+        raise ConfigError(f"{file}: the fallback {shown(fallback)} is no entry of terrains")
+    if of_robot and not (isinstance(owner, str) and owner):
+        raise ConfigError(f"{file}: robot is {shown(owner)}, the name of one is required")
+    if robot is not None and owner not in ("", robot):
+        raise ConfigError(f"{file}: the table is for robot {owner!r}, not for {robot!r}")
+    entries = {
+        str(key): accepted(_Entry, entry, f"{file}: {key}", ConfigError) for key, entry in terrains.items()
+    }
+    targets = {terrain: _targets(f"{file}: {terrain}", terrain, entry) for terrain, entry in entries.items()}
+    if _is_invalid(targets[fallback]):
         raise ConfigError(
             f"{file}: the fallback {fallback!r} is invalid: it could not be used for any terrain"
         )
-    return SlipTable(str(content["name"]), fallback, targets, of_robot, curves, reasons)
+    curves = {terrain: entry.curve for terrain, entry in entries.items() if entry.curve is not None}
+    for terrain, curve in curves.items():
+        _check_curve(f"{file}: {terrain}, curve", curve)
+    reasons = {terrain: entry.reason for terrain, entry in entries.items() if entry.reason}
+    return SlipTable(str(content["name"]), fallback, targets, owner, curves, reasons)
 
 
-def _schema(file: Path, content: Any) -> int:
-    schema = content.get("schema", 1) if isinstance(content, dict) else 1
-    if isinstance(schema, bool) or not isinstance(schema, int) or schema < 1:
-        raise ConfigError(f"{file}: schema is {schema!r}, 1 or {SCHEMA} is required")
-    if schema > SCHEMA:
-        raise ConfigError(f"{file}: schema {schema} is newer than {SCHEMA}, the newest that is read here")
-    return schema
-
-
-def _check_frame(file: Path, content: Any, schema: int) -> str:
-    """Check all of a file but its terrains; return the robot that it is for, or an empty name."""
-    keys = ["name", "fallback", "terrains"]
-    if schema == 1 and not (isinstance(content, dict) and set(content) - {"schema"} == set(keys)):
-        raise ConfigError(f"{file}: a slip table holds just the keys name, fallback and terrains")
-    if schema > 1:
-        check_keys(str(file), content, ["schema", "name", "robot", "fallback", "terrains"])
-    terrains, fallback = content["terrains"], content["fallback"]
-    if not isinstance(terrains, dict) or not isinstance(fallback, str) or fallback not in terrains:
-        raise ConfigError(f"{file}: the fallback {fallback!r} is no entry of terrains")
-    robot = content.get("robot", "")
-    if schema > 1 and not (isinstance(robot, str) and robot):
-        raise ConfigError(f"{file}: robot is {robot!r}, the name of one is required")
-    return str(robot)
-
-
-def _targets(file: Path, terrain: str, entry: Any, schema: int) -> dict[str, SlipTarget]:
-    """Return the targets of a terrain by drive state."""
-    extra = {"curve", "reason"} if schema > 1 else set()
-    if not isinstance(entry, dict) or not set(DRIVE_STATES) <= set(entry) <= set(DRIVE_STATES) | extra:
-        raise ConfigError(f"{file}: {terrain} needs just the drive states {', '.join(DRIVE_STATES)}")
-    targets = {state: _target(file, terrain, state, entry[state], schema) for state in DRIVE_STATES}
+def _targets(place: str, terrain: str, entry: _Entry) -> dict[str, SlipTarget]:
+    targets = {}
+    for state in DRIVE_STATES:
+        number: _Number = getattr(entry, state)
+        where, slip, n_runs = f"{place}, {state}", number.slip_ratio, number.n_runs
+        if slip * SIGN[state] < 0:
+            sign = "negative" if SIGN[state] > 0 else "positive"
+            raise ConfigError(f"{where}: slip_ratio is {slip:g}; {state} slip cannot be {sign}")
+        if (number.slip_std is None) != (n_runs == 0):
+            raise ConfigError(f"{where}: slip_std and n_runs go together")
+        status = number.status or (TargetStatus.ESTIMATED if n_runs else TargetStatus.UNESTIMATED)
+        if status is TargetStatus.ESTIMATED and n_runs == 0:
+            raise ConfigError(f"{where}: status is 'estimated', and no runs are behind it")
+        std = math.nan if number.slip_std is None else number.slip_std
+        targets[state] = SlipTarget(terrain, state, slip, std, n_runs, status, number.source)
     steady, traction = targets["steady"].slip_ratio, targets["traction"].slip_ratio
     if steady > traction:
         raise ConfigError(
-            f"{file}: {terrain}: steady slip {steady:g} is over that of traction, {traction:g}; "
-            "targets must rise"
+            f"{place}: steady slip {steady:g} is over that of traction, {traction:g}; targets must rise"
         )
     return targets
+
+
+def _check_curve(where: str, curve: CurveEntry) -> None:
+    if curve.law not in LAW_PARAMETERS:
+        raise ConfigError(f"{where}: law is {curve.law!r}; it must be one of {', '.join(LAW_PARAMETERS)}")
+    check_keys(f"{where}: parameters", dict(curve.parameters), list(LAW_PARAMETERS[curve.law]))
+    for name, least, most in zip(LAW_PARAMETERS[curve.law], *LAW_BOUNDS[curve.law], strict=True):
+        if not least <= (value := curve.parameters[name]) <= most:
+            raise ConfigError(f"{where}: {name} is {value:g}; {least:g} to {most:g} are accepted")
+    for name in ("peak_interval_ratio", "slip_range_ratio"):
+        low, high = getattr(curve, name)
+        if low > high:
+            raise ConfigError(f"{where}: {name} is {low:g} to {high:g}; two rising numbers are required")
 
 
 def write_slip_table(table: SlipTable, path: str | Path) -> None:
@@ -234,9 +258,8 @@ def write_slip_table(table: SlipTable, path: str | Path) -> None:
     """
     if not table.robot:
         raise ConfigError(f"table {table.name!r} is no robot's: a learned table names the one it is for")
-    body = yaml.safe_dump(
-        table_content(table), sort_keys=False, default_flow_style=None, width=200, allow_unicode=True
-    )
+    content = table_content(table)
+    body = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=200, allow_unicode=True)
     atomic_write(path, _HEADER + body)
 
 
@@ -244,35 +267,20 @@ def table_content(table: SlipTable) -> dict[str, Any]:
     """Return what the file of a table holds."""
     terrains: dict[str, Any] = {}
     for terrain, by_state in table.targets.items():
-        entry: dict[str, Any] = {state: _number(by_state[state]) for state in DRIVE_STATES}
+        entry = terrains[terrain] = {state: _number(by_state[state]) for state in DRIVE_STATES}
         if terrain in table.reasons:
             entry["reason"] = table.reasons[terrain]
         if (curve := table.curves.get(terrain)) is not None:
-            entry["curve"] = {
-                item.name: _plain(getattr(curve, item.name))
-                for item in fields(CurveEntry)
-                if getattr(curve, item.name) is not None
-            }
-        terrains[terrain] = entry
-    return {
-        "schema": SCHEMA,
-        "name": table.name,
-        "robot": table.robot,
-        "fallback": table.fallback,
-        "terrains": terrains,
-    }
+            known = {item.name: _plain(getattr(curve, item.name)) for item in fields(CurveEntry)}
+            entry["curve"] = {name: value for name, value in known.items() if value is not None}
+    head = {"schema": SCHEMA, "name": table.name, "robot": table.robot, "fallback": table.fallback}
+    return {**head, "terrains": terrains}
 
 
-def _number(target: SlipTarget) -> dict[str, Any]:
-    known = {} if math.isnan(target.slip_std) else {"slip_std": float(target.slip_std)}
-    runs = {"n_runs": int(target.n_runs)} if target.n_runs else {}
-    return {
-        "slip_ratio": float(target.slip_ratio),
-        **known,
-        **runs,
-        "status": TargetStatus(target.status).value,
-        "source": target.source,
-    }
+def _number(target: SlipTarget) -> Any:
+    learned = {"slip_std": float(target.slip_std), "n_runs": int(target.n_runs)} if target.n_runs else {}
+    status = TargetStatus(target.status).value
+    return {"slip_ratio": float(target.slip_ratio), **learned, "status": status, "source": target.source}
 
 
 def _plain(value: Any) -> Any:
@@ -281,93 +289,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, StrEnum):
         return value.value
     return [float(number) for number in value] if isinstance(value, tuple) else value
-
-
-def _target(file: Path, terrain: str, state: str, number: Any, schema: int) -> SlipTarget:
-    where = f"{file}: {terrain}, {state}"
-    accepted = _NUMBER_KEYS | ({"status"} if schema > 1 else set())
-    needed = accepted - {"slip_std", "n_runs"}
-    if not isinstance(number, dict) or not needed <= set(number) <= accepted:
-        words = "slip_ratio and source" if schema == 1 else "slip_ratio, status and source"
-        raise ConfigError(f"{where}: needs {words}, and accepts slip_std and n_runs besides")
-    slip, std, n_runs = number["slip_ratio"], number.get("slip_std"), number.get("n_runs", 0)
-    if not _is_number(slip) or abs(slip) > 1:
-        raise ConfigError(f"{where}: slip_ratio is {slip!r}; it must be a number within [-1, 1]")
-    if slip * SIGN[state] < 0:
-        sign = "negative" if SIGN[state] > 0 else "positive"
-        raise ConfigError(f"{where}: slip_ratio is {slip:g}; {state} slip cannot be {sign}")
-    if not isinstance(number["source"], str) or not number["source"].strip():
-        raise ConfigError(f"{where}: source must be a text, or 'assumed'")
-    if std is not None and not (_is_number(std) and std >= 0):
-        raise ConfigError(f"{where}: slip_std is {std!r}; it must be a number of at least 0")
-    if isinstance(n_runs, bool) or not isinstance(n_runs, int) or n_runs < 0:
-        raise ConfigError(f"{where}: n_runs is {n_runs!r}; it must be a whole number of at least 0")
-    status = _one_of(
-        TargetStatus, where, "status", number.get("status", "estimated" if n_runs else "unestimated")
-    )
-    if (schema == 1 or status is TargetStatus.ESTIMATED) and (std is None) != (n_runs == 0):
-        raise ConfigError(f"{where}: slip_std and n_runs go together")
-    if status is TargetStatus.ESTIMATED and n_runs == 0:
-        raise ConfigError(f"{where}: status is 'estimated', and no runs are behind it")
-    slip_std = math.nan if std is None else float(std)
-    return SlipTarget(terrain, state, float(slip), slip_std, n_runs, status, number["source"])
-
-
-def _curve(where: str, content: Any) -> CurveEntry:
-    names = [item.name for item in fields(CurveEntry)]
-    check_keys(where, content, [n for n in names if n != "working_slip_ratio"], ("working_slip_ratio",))
-    law, n_runs = content["law"], content["n_runs"]
-    if not isinstance(law, str) or law not in LAW_PARAMETERS:
-        raise ConfigError(f"{where}: law is {law!r}; it must be one of {', '.join(LAW_PARAMETERS)}")
-    status = _one_of(PeakStatus, where, "peak_status", content["peak_status"])
-    if isinstance(n_runs, bool) or not isinstance(n_runs, int) or n_runs < 1:
-        raise ConfigError(f"{where}: n_runs is {n_runs!r}; it must be a whole number of at least 1")
-    values: dict[str, Any] = {"working_slip_ratio": None, "law": law, "peak_status": status, "n_runs": n_runs}
-    values["parameters"] = _parameters(where, law, content["parameters"])
-    for name in names:
-        if name in content and name not in ("law", "peak_status", "n_runs", "parameters"):
-            read = _interval if name in ("peak_interval_ratio", "slip_range_ratio") else _ratio
-            values[name] = read(where, name, content[name])
-    return CurveEntry(**values)
-
-
-def _parameters(where: str, law: str, content: Any) -> dict[str, float]:
-    check_keys(f"{where}: parameters", content, list(LAW_PARAMETERS[law]))
-    values = {name: _finite(f"{where}: {name}", value) for name, value in content.items()}
-    for name, least, most in zip(LAW_PARAMETERS[law], *LAW_BOUNDS[law], strict=True):
-        if not least <= values[name] <= most:
-            raise ConfigError(f"{where}: {name} is {values[name]:g}; {least:g} to {most:g} are accepted")
-    return values
-
-
-def _interval(where: str, name: str, value: Any) -> tuple[float, float]:
-    if not isinstance(value, list) or len(value) != 2:
-        raise ConfigError(f"{where}: {name} is {value!r}; two numbers are required")
-    low, high = (_finite(f"{where}: {name}", edge) for edge in value)
-    if not -1 <= low <= high <= 1:
-        raise ConfigError(f"{where}: {name} is {value!r}; two rising numbers within [-1, 1] are required")
-    return low, high
-
-
-def _ratio(where: str, name: str, value: Any) -> float:
-    """Return a number, of a slip one within [-1, 1]."""
-    number = _finite(f"{where}: {name}", value)
-    if "slip_ratio" in name and abs(number) > 1:
-        raise ConfigError(f"{where}: {name} is {value!r}; it must be within [-1, 1]")
-    return number
-
-
-def _one_of(kind: type[_Status], where: str, name: str, value: Any) -> _Status:
-    if value not in list(kind):
-        raise ConfigError(f"{where}: {name} is {value!r}; it must be one of {', '.join(kind)}")
-    return kind(value)
-
-
-def _finite(where: str, value: Any) -> float:
-    if not _is_number(value):
-        raise ConfigError(f"{where} is {value!r}; it must be a finite number")
-    return float(value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -31,15 +31,13 @@ as the slip ratio requires (thesis 7.2.2).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.danzi_pid import LOW_SPEED_MPS
-from terrain.control.pid import Gains, check_gains
+from terrain.control.pid import LOW_SPEED_MPS, Gains, check_gains
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -68,33 +66,6 @@ _HALVINGS, _TAYLOR_ORDER = 12, 8
 # All at once by a series, and squared: scipy's expm, matrix by matrix, takes seconds where cores are busy.
 
 
-class Stability(NamedTuple):
-    """Largest eigenvalue of a loop, and where it occurs.
-
-    Parameters
-    ----------
-    radius_ratio : largest magnitude of an eigenvalue; stable below 1
-    speed_mps, slip_ratio, slope_ratio : where it occurs
-    gain_margin_ratio : factor on all gains at which the loop becomes unstable somewhere; infinite for none
-    """
-
-    radius_ratio: float
-    speed_mps: float
-    slip_ratio: float
-    slope_ratio: float
-    gain_margin_ratio: float
-
-
-class _Point(NamedTuple):
-    """The plant from sample to sample at one speed, slip and ground."""
-
-    speed_mps: float
-    slip_ratio: float
-    slope_ratio: float
-    keep: Array
-    drive: Array
-
-
 def check_stable(
     robot: Robot,
     gains: Gains,
@@ -102,16 +73,21 @@ def check_stable(
     *,
     dt_s: float = SAMPLE_TIME_S,
     low_speed_mps: float = LOW_SPEED_MPS,
-) -> Stability:
-    """Return the stability of the loop over the robot's range of operation.
+) -> float:
+    """Return the factor on all gains at which the loop becomes unstable somewhere in the robot's range of operation.
 
     Parameters
     ----------
     robot : with its sections
-    gains : of :class:`terrain.control.pid.Gains`; the limits are not used
+    gains : whose limits are not used
     delay_s : from measurement to command, beside the encoders' low-pass
     dt_s : sample time
     low_speed_mps : below which the controller is inactive
+
+    Returns
+    -------
+    float
+        above 1; infinite for none
 
     Raises
     ------
@@ -122,73 +98,88 @@ def check_stable(
     --------
     >>> from terrain.robots import load_robot
     >>> robot = load_robot("agrimaro")
-    >>> found = check_stable(robot, Gains(0.5, 0.5, 0.0, limit=5.0))
-    >>> found.radius_ratio < 1, round(found.gain_margin_ratio, 1)
-    (True, 3.0)
+    >>> round(check_stable(robot, Gains(0.5, 0.5, 0.0, limit=5.0)), 1)
+    3.0
     >>> check_stable(robot, Gains(2.0, 0.0, 0.0, limit=5.0))
     Traceback (most recent call last):
     terrain.errors.ConfigError: robot agrimaro: slip control (kp 2, ki 0, kd 0) with a delay of 0.05 s is
     unstable from 0.05 to 2 m/s; it is stable up to 0.76 times these gains
     """
     gains = check_gains(gains)
-    points = _points(robot, delay_s, dt_s, low_speed_mps)
-
-    n_delayed = _n_delayed(delay_s, dt_s)
+    _samples_of(delay_s, dt_s)
+    fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
+    if not 0 < low_speed_mps < fastest_mps:
+        raise ConfigError(
+            f"low_speed_mps is {low_speed_mps!r}, above 0 and below {fastest_mps:g} is required"
+        )
+    speeds_mps = np.geomspace(low_speed_mps, fastest_mps, N_SPEEDS).tolist()
+    places = list(product(speeds_mps, SLIPS, SLOPES))
     without, loops = (
-        np.array([_closed(robot, given, n_delayed, dt_s, point) for point in points])
-        for given in (gains._replace(kp=0.0, ki=0.0, kd=0.0), gains)
+        loop_matrices(robot, one, delay_s, places, dt_s=dt_s)
+        for one in (gains._replace(kp=0.0, ki=0.0, kd=0.0), gains)
     )
 
     def radii(factor: float) -> Array:  # with all gains scaled: the matrix is linear in them
         return np.asarray(np.abs(np.linalg.eigvals(without + factor * (loops - without))).max(axis=1))
 
-    found = radii(1.0)
-    margin = _gain_margin(radii)
-    if found.max() >= 1.0:
-        speeds = [point.speed_mps for point, radius in zip(points, found, strict=True) if radius >= 1.0]
+    margin, high = 1 / LARGEST_FACTOR, LARGEST_FACTOR
+    if radii(high).max() < 1.0:
+        margin = math.inf
+    while high / margin > 1.003:
+        middle = math.sqrt(margin * high)
+        margin, high = (middle, high) if radii(middle).max() < 1.0 else (margin, middle)
+    unstable = [place[0] for place, radius in zip(places, radii(1.0), strict=True) if radius >= 1.0]
+    if unstable:
         raise ConfigError(
             f"robot {robot.name}: slip control (kp {gains.kp:g}, ki {gains.ki:g}, kd {gains.kd:g}) "
-            f"with a delay of {delay_s:g} s is unstable from {min(speeds):.3g} to {max(speeds):.3g} m/s; "
+            f"with a delay of {delay_s:g} s is unstable from {min(unstable):.3g} to {max(unstable):.3g} m/s; "
             f"it is stable up to {margin:.2g} times these gains"
         )
-    worst = points[int(found.argmax())]
-    return Stability(float(found.max()), *worst[:3], margin)
+    return margin
 
 
-def loop_matrix(
+def loop_matrices(
     robot: Robot,
     gains: Gains,
     delay_s: float,
-    speed_mps: float,
-    slip_ratio: float,
-    slope_ratio: float,
+    places: Sequence[tuple[float, float, float]],
     *,
     dt_s: float = SAMPLE_TIME_S,
 ) -> Array:
-    """Return the closed loop from one sample to the next at one speed, slip and ground; without the drift.
+    """Return the closed loops (k, n, n) of ``pid_step`` and the plant from one sample to the next; without the drift.
 
     Parameters
     ----------
     robot, gains, delay_s, dt_s : as :func:`check_stable` takes them
-    speed_mps : V, the larger of wheel circumferential speed and ground speed
-    slip_ratio : s_0
-    slope_ratio : c in loads
-
-    Raises
-    ------
-    ConfigError
-        if a gain or a time is not accepted.
+    places : (k) of V in m/s, the larger of wheel circumferential speed and ground speed; slip s_0; slope c in
+        loads
     """
-    n_delayed = _n_delayed(delay_s, dt_s)
-    (point,) = _sampled(robot, [(speed_mps, slip_ratio, slope_ratio)], dt_s)
-    return _closed(robot, check_gains(gains), n_delayed, dt_s, point)
+    n_delayed, radius_m = _samples_of(delay_s, dt_s), robot.wheel_radius_m
+    short = np.array([plant_matrix(robot, *place) for place in places]) * (dt_s / 2**_HALVINGS)
+    plants = one = np.eye(len(short[0]))
+    for order in range(_TAYLOR_ORDER, 0, -1):
+        plants = one + short @ plants / order
+    for _ in range(_HALVINGS):
+        plants = plants @ plants
+    *_, measured_slip, integral, filtered = np.eye(9)
+    tau_s, loops = gains.derivative_time_constant_s, []
+    for (speed_mps, slip, _), plant in zip(places, plants, strict=True):
+        error = -measured_slip * (speed_mps / radius_m)
+        change = (error - filtered) * (-math.expm1(-dt_s / tau_s) if tau_s > 0 else 1.0)
+        controller = np.array([integral + gains.ki * dt_s * error, filtered + change])
+        output = gains.kp * error + controller[0] + gains.kd / dt_s * change
+        loop = closed_loop(plant[:-1, :-1], plant[:-1, -1], controller, output, n_delayed)
+        rolls = radius_m * (1 - slip) if slip > 0 else radius_m / (1 + slip)
+        # The speeds of wheel and robot, the estimate and commands shift together.
+        together = np.array([1.0, rolls, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, *np.ones(n_delayed)])
+        # The loop on the complement of the direction that it maps to itself: its other eigenvalues.
+        across = np.linalg.svd(together[None])[2][1:]
+        loops.append(across @ loop @ across.T)
+    return np.array(loops)
 
 
 def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio: float) -> Array:
-    """Return the system matrix (8, 8) of the plant's states and the command; the last row is 0.
-
-    In the order of ``w, v, k, T, q, e, y, u`` of the module's equations.
-    """
+    """Return the system matrix (8, 8) of ``w, v, k, T, q, e, y`` and the command u; the last row is 0."""
     body, motors, _, _, sensors = robot.equipment
     radius_m, third_kg = robot.wheel_radius_m, robot.mass_kg / 3
     rate, speed, contact, torque, integral, estimate, measured_slip, command = np.eye(8)
@@ -201,15 +192,12 @@ def plant_matrix(robot: Robot, speed_mps: float, slip_ratio: float, slope_ratio:
     thrust = slope_ratio * third_kg * GRAVITY_MPS2 * (contact + DEFLECTION_DAMPING_S * build_up)
     speed_error = command - estimate
     desired = motors.speed_gain_nmspr * speed_error + integral
-    # no lag is shorter than the simulator's step, as there
-    torque_s, estimate_s, encoder_s = (
-        max(lag_s, STEP_S)
-        for lag_s in (
-            motors.torque_time_constant_s,
-            motors.speed_estimate_time_constant_s,
-            sensors.encoder_time_constant_s,
-        )
+    lags_s = (
+        motors.torque_time_constant_s,
+        motors.speed_estimate_time_constant_s,
+        sensors.encoder_time_constant_s,
     )
+    torque_s, estimate_s, encoder_s = (max(lag_s, STEP_S) for lag_s in lags_s)  # as in the simulator
     return np.array(
         [
             (torque - radius_m * thrust) / body.wheel_inertia_kgm2,
@@ -249,71 +237,14 @@ def closed_loop(keep: Array, drive: Array, controller: Array, output: Array, n_d
 
 
 def spectral_radius(matrix: Array) -> float:
-    """Return the largest magnitude of an eigenvalue.
-
-    Examples
-    --------
-    >>> round(spectral_radius(np.array([[0.0, -0.5], [0.5, 0.0]])), 3)
-    0.5
-    """
+    """Return the largest magnitude of an eigenvalue."""
     return float(np.abs(np.linalg.eigvals(matrix)).max())
 
 
-def _points(robot: Robot, delay_s: float, dt_s: float, low_speed_mps: float) -> list[_Point]:
-    """Return the plant over the range of operation; ``ConfigError`` where the range is empty."""
-    _n_delayed(delay_s, dt_s)
-    fastest_mps = robot.wheel_radius_m * robot.equipment.motors.speed_max_radps
-    if not 0 < low_speed_mps < fastest_mps:
-        raise ConfigError(
-            f"low_speed_mps is {low_speed_mps!r}, above 0 and below {fastest_mps:g} is required"
-        )
-    speeds_mps = np.geomspace(low_speed_mps, fastest_mps, N_SPEEDS).tolist()
-    return _sampled(robot, list(product(speeds_mps, SLIPS, SLOPES)), dt_s)
-
-
-def _sampled(robot: Robot, places: Sequence[tuple[float, float, float]], dt_s: float) -> list[_Point]:
-    """Return the plant over one sample at each place (speed, slip, slope): the exponential of its matrix."""
-    short = np.array([plant_matrix(robot, *place) for place in places]) * (dt_s / 2**_HALVINGS)
-    moved = one = np.eye(len(short[0]))
-    for order in range(_TAYLOR_ORDER, 0, -1):
-        moved = one + short @ moved / order
-    for _ in range(_HALVINGS):
-        moved = moved @ moved
-    return [_Point(*place, over[:-1, :-1], over[:-1, -1]) for place, over in zip(places, moved, strict=True)]
-
-
-def _n_delayed(delay_s: float, dt_s: float) -> int:
+def _samples_of(delay_s: float, dt_s: float) -> int:
+    """Return a delay in samples, rounded up; ``ConfigError`` where it or the sample time is not accepted."""
     if not 0 < dt_s <= LONGEST_DELAY_S:
         raise ConfigError(f"dt_s is {dt_s!r}, above 0 and up to {LONGEST_DELAY_S:g} s is required")
     if not 0 <= delay_s <= LONGEST_DELAY_S:
         raise ConfigError(f"delay_s is {delay_s!r}, 0 to {LONGEST_DELAY_S:g} s is required")
     return math.ceil(delay_s / dt_s - 1e-9)
-
-
-def _closed(robot: Robot, gains: Gains, n_delayed: int, dt_s: float, point: _Point) -> Array:
-    """Return the loop of ``pid_step`` and the plant, with a delay of some samples."""
-    radius_m, slip = robot.wheel_radius_m, point.slip_ratio
-    *_, measured_slip, integral, filtered = np.eye(9)
-    error = -measured_slip * (point.speed_mps / radius_m)
-    tau_s = gains.derivative_time_constant_s
-    change = (error - filtered) * (-math.expm1(-dt_s / tau_s) if tau_s > 0 else 1.0)
-    controller = np.array([integral + gains.ki * dt_s * error, filtered + change])
-    output = gains.kp * error + controller[0] + gains.kd / dt_s * change
-    loop = closed_loop(point.keep, point.drive, controller, output, n_delayed)
-    rolls = radius_m * (1 - slip) if slip > 0 else radius_m / (1 + slip)
-    # The speeds of wheel and robot, the estimate and commands shift together, in the order of plant and controller.
-    together = np.array([1.0, rolls, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, *np.ones(n_delayed)])
-    # The loop on the complement of the direction that it maps to itself: its other eigenvalues.
-    across = np.linalg.svd(together[None])[2][1:]
-    return np.asarray(across @ loop @ across.T)
-
-
-def _gain_margin(radii: Callable[[float], Array]) -> float:
-    """Return the factor on all gains at which the loop becomes unstable; it is stable without gain."""
-    if radii(LARGEST_FACTOR).max() < 1.0:
-        return math.inf
-    low, high = 1 / LARGEST_FACTOR, LARGEST_FACTOR
-    while high / low > 1.003:
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if radii(middle).max() < 1.0 else (low, middle)
-    return low

@@ -14,9 +14,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from terrain.errors import ConfigError
+from terrain.control.pid import checked
 from terrain.records import Sample
 from terrain.status import StatusCode
+
+if TYPE_CHECKING:
+    from terrain.estimation.choice import Estimate
 
 DRIVING_MPS = 0.03
 """A robot whose fastest wheel is to turn at least so fast drives: windows are cut from this speed on
@@ -52,23 +55,14 @@ SWITCHING = SwitchSettings()
 
 
 class TerrainBelief(NamedTuple):
-    """The accepted terrain, and the candidate that may replace it.
-
-    Parameters
-    ----------
-    terrain : accepted; :data:`UNKNOWN` at first
-    probability : with which it was classified last; NaN before
-    candidate, since_s, received_s : class of the last output, since when without interruption, and the time
-        of the last output
-    unconfirmed_s : time of driving since an output of the accepted class
-    """
+    """The accepted terrain, and the candidate that may replace it."""
 
     terrain: str = UNKNOWN
-    probability: float = math.nan
-    candidate: str = UNKNOWN
-    since_s: float = math.nan
-    received_s: float = math.nan
-    unconfirmed_s: float = 0.0
+    probability: float = math.nan  # with which it was classified last; NaN before
+    candidate: str = UNKNOWN  # class of the last output
+    since_s: float = math.nan  # since when it is without interruption
+    received_s: float = math.nan  # time of the last output
+    unconfirmed_s: float = 0.0  # time of driving since an output of the accepted class
 
 
 NO_BELIEF = TerrainBelief()
@@ -88,24 +82,8 @@ class OutputStatus(StatusCode):
 
 
 def check_switching(settings: SwitchSettings) -> None:
-    """Refuse invalid settings.
-
-    Raises
-    ------
-    ConfigError
-        if the probability is not within 0 and 1, or another number is not finite or below zero.
-
-    Examples
-    --------
-    >>> check_switching(SWITCHING._replace(probability_least=1.5))
-    Traceback (most recent call last):
-    terrain.errors.ConfigError: switching: probability_least is 1.5, a number from 0 to 1 is required
-    """
-    for name, value in settings._asdict().items():
-        most, accepted = (1.0, "from 0 to 1") if name == "probability_least" else (math.inf, "from zero up")
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (number and math.isfinite(value) and 0.0 <= value <= most):
-            raise ConfigError(f"switching: {name} is {value!r}, a number {accepted} is required")
+    """Raise ``ConfigError`` if the probability is not within 0 and 1, or another number not finite or below zero."""
+    checked("switching: ", settings, most={"probability_least": 1.0})
 
 
 def update(
@@ -132,11 +110,8 @@ def update(
     candidate = terrain if counts else UNKNOWN
     continues = candidate == belief.candidate and time_s - belief.received_s <= settings.silent_s
     since_s = belief.since_s if continues else time_s
-    known_probability = probability if candidate else math.nan
-    if candidate == belief.terrain:
-        return TerrainBelief(belief.terrain, known_probability, candidate, since_s, time_s)
-    if time_s - since_s >= settings.dwell_s - 1e-9:
-        return TerrainBelief(candidate, known_probability, candidate, since_s, time_s)
+    if candidate == belief.terrain or time_s - since_s >= settings.dwell_s - 1e-9:
+        return TerrainBelief(candidate, probability if candidate else math.nan, candidate, since_s, time_s)
     return belief._replace(candidate=candidate, since_s=since_s, received_s=time_s)
 
 
@@ -157,21 +132,14 @@ def drive_on(
 ) -> TerrainBelief:
     """Return the belief after a time without an output; unknown where it was not confirmed for too long.
 
-    Parameters
-    ----------
-    belief : before
-    speed_mps : desired circumferential speed of the fastest wheel; below :data:`DRIVING_MPS` no time counts,
-        as no windows come
-    dt_s : time; nothing counts where it is not above zero
-    settings : of ``unconfirmed_max_s``
+    The speed is the desired circumferential one of the fastest wheel: below :data:`DRIVING_MPS` no time counts,
+    as no windows come.
 
     Examples
     --------
     >>> grass = TerrainBelief("grass", 0.9, "grass", 0.0, 2.0)
-    >>> drive_on(grass, 1.0, 9.0).terrain, drive_on(grass, 1.0, 11.0).terrain
-    ('grass', '')
-    >>> drive_on(grass, 0.0, 11.0).terrain
-    'grass'
+    >>> [drive_on(grass, *driven).terrain for driven in ((1.0, 9.0), (1.0, 11.0), (0.0, 11.0))]
+    ['grass', '', 'grass']
     """
     if belief.terrain == UNKNOWN or not (speed_mps >= DRIVING_MPS and dt_s > 0.0):
         return belief
@@ -193,10 +161,6 @@ def approach(now: float, desired: float, rate: float, dt_s: float) -> float:
         return desired
     step = rate * max(dt_s, 0.0)
     return now + min(max(desired - now, -step), step)
-
-
-if TYPE_CHECKING:
-    from terrain.estimation.choice import Estimate
 
 
 class TerrainEstimate(NamedTuple):
@@ -240,12 +204,7 @@ class TerrainSource:
 
 
 class KnownTerrain(TerrainSource):
-    """The true terrain of the samples, at every change of it.
-
-    Parameters
-    ----------
-    name_of : from the true terrain to the one that is given, to be wrong on purpose
-    """
+    """The true terrain of the samples, at every change of it; or another for it, to be wrong on purpose."""
 
     certain = settled = True
 

@@ -2,7 +2,7 @@
 
 In steady motion the slip of a wheel is given by what resists it, ``F(s) = R``, and not by its speed command:
 a controller that integrates the error of slip towards a target below that balance slows the robot to a
-standstill, one above it runs away (``tests/terrain/control/test_danzi_pid.py`` shows both).  What a speed
+standstill, one above it runs away (``tests/terrain/control/test_pid.py`` shows both).  What a speed
 command does decide is how much *more* slip a start takes, and that is what is limited here.
 
 With w the desired speed of the fastest wheel, d the commanded speed, u_i the desired speed of wheel i, g_i
@@ -16,7 +16,7 @@ its speed over ground along it, and s* the target slip::
 - The cap limits the rise of d and nothing else.  A cap that may fall stalls: less speed, less pull, less
   ground speed, less cap.
 - It is the normalised P controller of slip, ``d + K (s* - s) d`` with ``s = 1 - q / d`` and ``K = 1 / (1 -
-  s*)`` (as :mod:`terrain.control.danzi_pid` normalises it), acting on the chassis instead of each wheel.
+  s*)`` (as :mod:`terrain.control.pid` normalises it), acting on the chassis instead of each wheel.
 - Below v_l the slip ratio carries little information on the terrain: v_l replaces the robot's speed.
 - q is delayed by the filter's lag and the command by its transport; t compensates both with the measured
   acceleration a, limited to that of a start on soft soil, as the acceleration of the first tenths of a second
@@ -41,8 +41,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.control.danzi_pid import DriveState
-from terrain.errors import ConfigError
+from terrain.control.pid import LONGEST_STEP_S, DriveState, checked
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.status import StatusCode
@@ -91,47 +90,33 @@ SETTINGS = TractionSettings()
 
 
 class TractionTarget(NamedTuple):
-    """Slip to aim for on the current terrain.
+    """Slip to aim for on the current terrain."""
 
-    Parameters
-    ----------
-    traction_ratio : s*, from 0 to below 1
-    braking_ratio : magnitude of the slip of a controlled braking
-    braking_mps2 : deceleration at that slip; 0 leaves braking to the motor drivers
-    margin_ratio : slip above the balance that gives the working pull; at least the settings' own is used
-    """
-
-    traction_ratio: float
-    braking_ratio: float = 0.0
-    braking_mps2: float = 0.0
-    margin_ratio: float = 0.0
+    traction_ratio: float  # s*, from 0 to below 1
+    braking_ratio: float = 0.0  # magnitude of the slip of a controlled braking
+    braking_mps2: float = 0.0  # deceleration at that slip; 0 leaves braking to the motor drivers
+    margin_ratio: float = 0.0  # above the balance, gives the working pull; at least the settings' own is used
 
 
 class WheelMotion(NamedTuple):
-    """Estimated motion at the wheels; arrays (wheels,), signed along each wheel as it is steered.
+    """Estimated motion at the wheels; arrays (wheels,), signed along each wheel as it is steered."""
 
-    Parameters
-    ----------
-    speed_mps, accel_mps2 : speed and acceleration over ground, of the filter
-    slip_ratio, slip_std : slip and its standard deviation
-    torque_nm : of the motors, at the wheels; NaN where it is not known
-    wheel_radps : rates
-    chassis_mps : magnitude of the robot's velocity
-    stale_s : time since the speed over ground was measured last; infinite before the first time
-    """
-
-    speed_mps: Array
+    speed_mps: Array  # over ground, of the filter
     accel_mps2: Array
     slip_ratio: Array
     slip_std: Array
-    torque_nm: Array
+    torque_nm: Array  # of the motors, at the wheels; NaN where it is not known
     wheel_radps: Array
-    chassis_mps: float
-    stale_s: float
+    chassis_mps: float  # magnitude of the robot's velocity
+    stale_s: float  # since the speed over ground was measured last; infinite before the first time
 
 
-def check_settings(settings: TractionSettings) -> TractionSettings:
-    """Return settings that can be used, as floats.
+def check_settings(settings: TractionSettings, robot: Robot | None = None) -> TractionSettings:
+    """Return settings that can be used, with what a robot's motor drivers need to change their torque.
+
+    A PI speed loop carries a change of torque T by its error until its integral has taken it over: an error
+    of ``T / K_P`` with the time constant ``K_P / K_I``.  At a deceleration a, each of n wheels carries
+    ``T = a m r / n``.
 
     Raises
     ------
@@ -140,34 +125,13 @@ def check_settings(settings: TractionSettings) -> TractionSettings:
 
     Examples
     --------
-    >>> check_settings(SETTINGS._replace(lead_s=-0.1))
-    Traceback (most recent call last):
-    terrain.errors.ConfigError: traction: lead_s is -0.1, a number from zero up is required
-    """
-    for name, value in settings._asdict().items():
-        least, accepted = (
-            (1e-6, "above zero")
-            if name in ("launch_mps", "droop_time_s", "charge_time_s")
-            else (0.0, "from zero up")
-        )
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value < math.inf:
-            raise ConfigError(f"traction: {name} is {value!r}, a number {accepted} is required")
-    return TractionSettings(*(float(value) for value in settings))
-
-
-def with_motor_driver(settings: TractionSettings, robot: Robot) -> TractionSettings:
-    """Return the settings with what a robot's motor drivers need to change their torque.
-
-    A PI speed loop carries a change of torque T by its error until its integral has taken it over: an error
-    of ``T / K_P`` with the time constant ``K_P / K_I``.  At a deceleration a, each of n wheels carries
-    ``T = a m r / n``.
-
-    Examples
-    --------
     >>> from terrain.robots import load_robot
-    >>> round(with_motor_driver(SETTINGS, load_robot("agrimaro")).charge_mps_per_mps2, 3)
+    >>> round(check_settings(SETTINGS, load_robot("agrimaro")).charge_mps_per_mps2, 3)
     0.1
     """
+    settings = checked("traction: ", settings, ("launch_mps", "droop_time_s", "charge_time_s"))
+    if robot is None:
+        return settings
     motors = robot.equipment.motors
     torque = robot.mass_kg * robot.wheel_radius_m / len(robot.wheels)
     integral = motors.speed_integral_nmpr
@@ -175,10 +139,6 @@ def with_motor_driver(settings: TractionSettings, robot: Robot) -> TractionSetti
         charge_mps_per_mps2=torque / motors.speed_gain_nmspr * robot.wheel_radius_m,
         charge_time_s=motors.speed_gain_nmspr / integral if integral > 0 else 1e6,
     )
-
-
-MAX_STEP_S = 0.5
-"""A longer step between two calls is no step of a control loop."""
 
 
 class TractionStatus(StatusCode):
@@ -196,68 +156,35 @@ class TractionStatus(StatusCode):
 
 
 class WheelReport(NamedTuple):
-    """What a step of a controller of the wheels decided, and by what; NaN where it does not have the figure.
+    """What a step of a controller of the wheels decided, and by what; NaN where it does not have the figure."""
 
-    Parameters
-    ----------
-    driven_mps : commanded speed of the fastest wheel
-    aimed_ratio : s* with its floor
-    balance_ratio : slip of steady motion; NaN until it was measured
-    slip_ratio : largest of the wheels, positive in traction; NaN where it is not known
-    drive_state : by what is commanded, as the measured acceleration would latch into braking; of the thesis'
-        controller that of the first wheel
-    status : whether a correction was made
-    """
-
-    driven_mps: float
-    aimed_ratio: float
-    balance_ratio: float
-    slip_ratio: float
-    drive_state: DriveState
+    driven_mps: float  # commanded speed of the fastest wheel
+    aimed_ratio: float  # s* with its floor
+    balance_ratio: float  # slip of steady motion; NaN until it was measured
+    slip_ratio: float  # largest of the wheels, positive in traction
+    drive_state: DriveState  # by what is commanded, as the measured acceleration would latch into braking
     status: TractionStatus
 
 
 class TractionState(NamedTuple):
-    """What a step leaves to the next; as it is at first, of a robot at rest on unknown terrain.
+    """What a step leaves to the next; as it is at first, of a robot at rest on unknown terrain."""
 
-    Parameters
-    ----------
-    driven_mps, desired_mps : d and w
-    reference_mps, constant_s : speed that is commanded without a change, and for how long it has been
-    slow_mps : q behind a low-pass
-    balance_ratio, floor_ratio : slip of steady motion, NaN until it was measured, and least s*
-    held_s : for how long d has been limited
-    braking_s, braked_from_mps : of a controlled braking: for how long, and the largest d in it
-    droop_nm : torque of each wheel behind its low-pass
-    rate_radpm : rate of each wheel at a w of 1 m/s, of the last command that was none to stop
-    """
-
-    driven_mps: float = 0.0
-    desired_mps: float = 0.0
-    reference_mps: float = 0.0
-    constant_s: float = 0.0
-    slow_mps: float = 0.0
-    balance_ratio: float = math.nan
-    floor_ratio: float = 0.0
-    held_s: float = 0.0
-    braking_s: float = 0.0
-    braked_from_mps: float = 0.0
-    droop_nm: tuple[float, ...] = (0.0, 0.0, 0.0)
-    rate_radpm: tuple[float, ...] = (0.0, 0.0, 0.0)
+    driven_mps: float = 0.0  # d
+    desired_mps: float = 0.0  # w
+    reference_mps: float = 0.0  # speed that is commanded without a change
+    constant_s: float = 0.0  # for how long it has been
+    slow_mps: float = 0.0  # q behind a low-pass
+    balance_ratio: float = math.nan  # slip of steady motion, NaN until it was measured
+    floor_ratio: float = 0.0  # least s*
+    held_s: float = 0.0  # for how long d has been limited
+    braking_s: float = 0.0  # for how long braking has been controlled
+    braked_from_mps: float = 0.0  # largest d in it
+    droop_nm: tuple[float, ...] = (0.0, 0.0, 0.0)  # torque of each wheel behind its low-pass
+    rate_radpm: tuple[float, ...] = (0.0, 0.0, 0.0)  # of each wheel at w = 1 m/s, of the last command to move
 
     def on_other_terrain(self) -> TractionState:
         """Return the state without what was learned of the terrain: for a change of the classified terrain."""
         return self._replace(balance_ratio=math.nan, floor_ratio=0.0)
-
-
-class _Seen(NamedTuple):
-    """Speed and acceleration over ground seen from the fastest wheel, slips, and whether they can be used."""
-
-    ground_mps: float
-    accel_mps2: float
-    largest_slip: float
-    mean_slip: float
-    status: TractionStatus
 
 
 _SLOW_S = 0.5  # window of the speed gain: shorter is noise, longer comes late
@@ -276,108 +203,128 @@ _BRAKE_LONGEST, _BRAKE_SPARE_S = 1.3, 0.3  # of the time that the planned decele
 _BRAKE_MPS2 = 0.5  # a command that falls faster than the resistances slow the robot is a braking
 
 
-def _observe(
+def traction_step(
     settings: TractionSettings,
     state: TractionState,
+    target: TractionTarget,
     radius_m: float,
+    wheel_radps: Array,
     wheels: WheelMotion,
-) -> _Seen:
-    """Return the motion over ground seen from the fastest wheel: the least that a wheel shows."""
+    dt_s: float,
+) -> tuple[Array, TractionState, WheelReport]:
+    """Return the wheels' commands (wheels,), the next state, and why.
+
+    Parameters
+    ----------
+    settings, state : as :data:`SETTINGS`; ``TractionState()`` at first, then what the step before returned
+    target : slips to aim for
+    radius_m : nominal radius of the wheels
+    wheel_radps : (wheels,) desired
+    wheels : as estimated
+    dt_s : since the step before
+    """
+    rates = wheel_radps.tolist()
+    desired, along = 0.0, 0.0
+    for rate, before in zip(rates, state.rate_radpm, strict=True):
+        desired = max(desired, abs(rate) * radius_m)
+        along += rate * before
+    was = state.driven_mps if along >= 0.0 else 0.0  # a reversal is a start from rest
+    if desired > 0.0:  # a command to stop keeps the directions of the last motion
+        state = state._replace(rate_radpm=tuple(rate / desired for rate in rates))
+    if not 0.0 < dt_s <= LONGEST_STEP_S:
+        driven = min(desired, was + settings.fade_mps2 * _USUAL_STEP_S)
+        figures = driven, target.traction_ratio, state.balance_ratio, math.nan
+        command = np.array([rate * driven for rate in state.rate_radpm])
+        report = WheelReport(*figures, DriveState.STEADY, TractionStatus.BAD_TIME)
+        return command, state._replace(driven_mps=driven), report
+    q, accel, largest_slip, mean_slip, status = _observe(settings, state, radius_m, wheels)
+    margin = max(settings.balance_margin_ratio, target.margin_ratio)
+    aimed = target.traction_ratio  # s*: no more than the balance and its margin, no less than the floor
+    if math.isfinite(state.balance_ratio):
+        aimed = min(aimed, max(state.balance_ratio, 0.0) + margin)
+    aimed = max(aimed, state.floor_ratio)
+
+    # d, by what is commanded
+    driven, held_s, braking_s, drive_state = desired, 0.0, 0.0, DriveState.STEADY
+    if desired > was + 1e-9:
+        drive_state = DriveState.TRACTION
+    elif state.desired_mps - desired > _BRAKE_MPS2 * dt_s or (state.braking_s > 0.0 and was > desired):
+        drive_state = DriveState.BRAKING
+    if status is not TractionStatus.OK:
+        driven = min(desired, was + settings.fade_mps2 * dt_s)
+    elif drive_state is DriveState.TRACTION:
+        ahead = q + settings.lead_s * min(max(accel, 0.0), settings.lead_max_mps2)
+        cap = max(ahead, settings.launch_mps) / (1.0 - min(aimed, _FLOOR_MAX))
+        driven = min(desired, max(was, cap))
+        held_s = state.held_s + dt_s if driven < desired else 0.0
+    elif drive_state is DriveState.BRAKING and target.braking_mps2 > 0.0:
+        stops_in_s = state.braked_from_mps / max(target.braking_mps2, 1e-6)
+        time_s = state.braking_s + dt_s
+        ahead = q - target.braking_mps2 * min(time_s, settings.brake_lead_s)
+        ahead *= 1.0 - target.braking_ratio
+        overdue = state.braking_s > _BRAKE_LONGEST * stops_in_s + _BRAKE_SPARE_S
+        if not overdue and not ahead <= max(desired, _BRAKE_END_MPS):
+            charge = settings.charge_mps_per_mps2 * math.exp(-time_s / settings.charge_time_s)
+            driven, braking_s = max(desired, min(was, ahead - charge * target.braking_mps2)), time_s
+    state = state._replace(
+        driven_mps=driven,
+        desired_mps=desired,
+        held_s=held_s,
+        braking_s=braking_s,
+        braked_from_mps=0.0 if braking_s == 0.0 else max(state.braked_from_mps, was),
+    )
+    if status is TractionStatus.OK:
+        state = _learn_balance(settings, state, q, mean_slip, aimed, margin, dt_s)
+    command, torques = _share_torque(settings, state, wheels.torque_nm, mean_slip, status, dt_s)
+    slip = math.nan if status is TractionStatus.NO_SLIP else largest_slip
+    report = WheelReport(driven, aimed, state.balance_ratio, slip, drive_state, status)
+    return command, state._replace(droop_nm=torques), report
+
+
+def _observe(
+    settings: TractionSettings, state: TractionState, radius_m: float, wheels: WheelMotion
+) -> tuple[float, float, float, float, TractionStatus]:
+    """Return speed and acceleration over ground seen from the fastest wheel, largest and mean slip, and their status.
+
+    Of all wheels the one counts that shows the least speed.
+    """
     status = TractionStatus.OK
-    q, gain, largest, shared, uncertain = math.inf, 0.0, -math.inf, 0.0, 0.0
+    q, gain, largest, mean, uncertain = math.inf, 0.0, -math.inf, 0.0, 0.0
     rows = (row.tolist() for row in wheels[:4])
-    for rate, speed, accel, slip, std in zip(state.rate_radpm, *rows, strict=True):
-        sign = 1.0 if rate >= 0.0 else -1.0
-        ratio = abs(rate) * radius_m  # of the fastest wheel's speed
-        if (
-            not math.isfinite(slip)
-            or not math.isfinite(std)
-            or not math.isfinite(speed)
-            or not math.isfinite(accel)
-        ):
+    for rate, *motion in zip(state.rate_radpm, *rows, strict=True):
+        if not all(map(math.isfinite, motion)):
             status = TractionStatus.NO_SLIP
             continue
+        speed, accel, slip, std = motion
+        sign = 1.0 if rate >= 0.0 else -1.0
+        ratio = abs(rate) * radius_m  # of the fastest wheel's speed
         largest = max(largest, sign * slip)
-        shared += sign * slip / len(state.rate_radpm)
+        mean += sign * slip / len(state.rate_radpm)
         fastest = abs(speed) / max(1.0 - max(sign * slip, 0.0), 0.05)
         judged = max(fastest, _JUDGED * settings.launch_mps, state.braked_from_mps)
         uncertain = max(uncertain, std * fastest / judged)
         if ratio >= _SLOWEST_WHEEL_RATIO and sign * speed / ratio < q:
             q, gain = sign * speed / ratio, sign * accel / ratio
-    if math.isinf(q):
-        q, gain = 0.0, 0.0
     if status is TractionStatus.OK and not wheels.stale_s <= settings.stale_max_s:
         status = TractionStatus.STALE
     if status is TractionStatus.OK and not uncertain <= settings.std_max_ratio:
         status = TractionStatus.UNCERTAIN
-    return _Seen(q, gain, largest, shared, status)
-
-
-def _aimed_slip(state: TractionState, target_ratio: float, margin_ratio: float) -> float:
-    """Return s*: no more than the balance and its margin, no less than the floor."""
-    if math.isfinite(state.balance_ratio):
-        target_ratio = min(target_ratio, max(state.balance_ratio, 0.0) + margin_ratio)
-    return max(target_ratio, state.floor_ratio)
-
-
-def _commanded_state(before: TractionState, desired_mps: float, was_mps: float, dt_s: float) -> DriveState:
-    if desired_mps > was_mps + 1e-9:
-        return DriveState.TRACTION
-    falling = before.desired_mps - desired_mps > _BRAKE_MPS2 * dt_s
-    if falling or (before.braking_s > 0.0 and was_mps > desired_mps):
-        return DriveState.BRAKING
-    return DriveState.STEADY
-
-
-def _drive(
-    settings: TractionSettings,
-    state: TractionState,
-    target: TractionTarget,
-    aimed_ratio: float,
-    seen: _Seen,
-    drive_state: DriveState,
-    was_mps: float,
-    dt_s: float,
-) -> TractionState:
-    """Return the state with the next d, which was ``was_mps``."""
-    desired = driven = state.desired_mps
-    held_s = braking_s = 0.0
-    if seen.status is not TractionStatus.OK:
-        driven = min(desired, was_mps + settings.fade_mps2 * dt_s)
-    elif drive_state is DriveState.TRACTION:
-        ahead = seen.ground_mps + settings.lead_s * min(max(seen.accel_mps2, 0.0), settings.lead_max_mps2)
-        cap = max(ahead, settings.launch_mps) / (1.0 - min(aimed_ratio, _FLOOR_MAX))
-        driven = min(desired, max(was_mps, cap))
-        held_s = state.held_s + dt_s if driven < desired else 0.0
-    elif drive_state is DriveState.BRAKING and target.braking_mps2 > 0.0:
-        stops_in_s = state.braked_from_mps / max(target.braking_mps2, 1e-6)
-        time_s = state.braking_s + dt_s
-        ahead = seen.ground_mps - target.braking_mps2 * min(time_s, settings.brake_lead_s)
-        ahead *= 1.0 - target.braking_ratio
-        overdue = state.braking_s > _BRAKE_LONGEST * stops_in_s + _BRAKE_SPARE_S
-        if not overdue and not ahead <= max(desired, _BRAKE_END_MPS):
-            charge = settings.charge_mps_per_mps2 * math.exp(-time_s / settings.charge_time_s)
-            driven, braking_s = max(desired, min(was_mps, ahead - charge * target.braking_mps2)), time_s
-    return state._replace(
-        driven_mps=driven,
-        held_s=held_s,
-        braking_s=braking_s,
-        braked_from_mps=0.0 if braking_s == 0.0 else max(state.braked_from_mps, was_mps),
-    )
+    return (0.0 if math.isinf(q) else q), gain, largest, mean, status
 
 
 def _learn_balance(
     settings: TractionSettings,
     state: TractionState,
-    seen: _Seen,
+    ground_mps: float,
+    mean_slip: float,
     aimed_ratio: float,
     margin_ratio: float,
     dt_s: float,
 ) -> TractionState:
     """Update the slip of steady motion, and raise the floor of s* where the robot gains no speed."""
-    driven, q = state.driven_mps, seen.ground_mps
-    slow = state.slow_mps + (q - state.slow_mps) * min(dt_s / _SLOW_S, 1.0)
-    gained = (q - slow) / _SLOW_S
+    driven = state.driven_mps
+    slow = state.slow_mps + (ground_mps - state.slow_mps) * min(dt_s / _SLOW_S, 1.0)
+    gained = (ground_mps - slow) / _SLOW_S
     balance, floor = state.balance_ratio, state.floor_ratio
     if state.held_s > _HELD_S and gained < settings.gain_least_mps2:
         floor = min(aimed_ratio + settings.floor_rate_ratio * dt_s, _FLOOR_MAX)
@@ -385,9 +332,9 @@ def _learn_balance(
     if abs(driven - reference) > _CONSTANT_MPS:
         reference, constant_s = driven, 0.0
     constant_s += dt_s
-    if constant_s > _CONSTANT_S and abs(gained) < _STEADY_MPS2 and q > _STEADY_MPS:
-        before = balance if math.isfinite(balance) else seen.mean_slip
-        balance = before + (seen.mean_slip - before) * min(dt_s / _BALANCE_S, 1.0)
+    if constant_s > _CONSTANT_S and abs(gained) < _STEADY_MPS2 and ground_mps > _STEADY_MPS:
+        before = balance if math.isfinite(balance) else mean_slip
+        balance = before + (mean_slip - before) * min(dt_s / _BALANCE_S, 1.0)
         steady = min(max(balance, 0.0) + margin_ratio, _FLOOR_MAX)
         floor = steady if driven >= state.desired_mps else max(floor, steady)
     return state._replace(
@@ -400,7 +347,12 @@ def _learn_balance(
 
 
 def _share_torque(
-    settings: TractionSettings, state: TractionState, torque_nm: Array, seen: _Seen, dt_s: float
+    settings: TractionSettings,
+    state: TractionState,
+    torque_nm: Array,
+    mean_slip: float,
+    status: TractionStatus,
+    dt_s: float,
 ) -> tuple[Array, tuple[float, ...]]:
     """Return the wheels' commands, one speed for all less the droop by torque above the mean, and the torques."""
     signs = [1.0 if rate >= 0.0 else -1.0 for rate in state.rate_radpm]
@@ -415,71 +367,11 @@ def _share_torque(
     mean = 0.0
     for torque in filtered:
         mean += torque / len(filtered)
-    grip = min(max(2.0 - abs(seen.mean_slip) / _GRIP, 0.0), 1.0)
+    grip = min(max(2.0 - abs(mean_slip) / _GRIP, 0.0), 1.0)
     command = [rate * state.driven_mps for rate in state.rate_radpm]
-    if seen.status is TractionStatus.OK:
+    if status is TractionStatus.OK:
         for i, sign in enumerate(signs):
             limit = grip * settings.droop_max_ratio * abs(command[i])
             droop = settings.droop_radps_per_nm * (filtered[i] - mean)
             command[i] -= sign * min(max(droop, -limit), limit)
     return np.array(command), filtered
-
-
-def traction_step(
-    settings: TractionSettings,
-    state: TractionState,
-    target: TractionTarget,
-    radius_m: float,
-    wheel_radps: Array,
-    wheels: WheelMotion,
-    dt_s: float,
-) -> tuple[Array, TractionState, WheelReport]:
-    """Return the wheels' commands, the next state, and why.
-
-    Parameters
-    ----------
-    settings, state : as :data:`SETTINGS`; ``TractionState()`` at first, then what the step before returned
-    target : slips to aim for
-    radius_m : nominal radius of the wheels
-    wheel_radps : (wheels,) desired
-    wheels : as estimated
-    dt_s : since the step before
-
-    Returns
-    -------
-    wheel_radps : (wheels,) commanded
-    state : the next
-    report : what was decided
-    """
-    rates = wheel_radps.tolist()
-    desired, along = 0.0, 0.0
-    for rate, before in zip(rates, state.rate_radpm, strict=True):
-        desired = max(desired, abs(rate) * radius_m)
-        along += rate * before
-    was = state.driven_mps if along >= 0.0 else 0.0  # a reversal is a start from rest
-    if desired > 0.0:  # a command to stop keeps the directions of the last motion
-        state = state._replace(rate_radpm=tuple(rate / desired for rate in rates))
-    if not 0.0 < dt_s <= MAX_STEP_S:
-        driven = min(desired, was + settings.fade_mps2 * _USUAL_STEP_S)
-        report = WheelReport(
-            driven,
-            target.traction_ratio,
-            state.balance_ratio,
-            math.nan,
-            DriveState.STEADY,
-            TractionStatus.BAD_TIME,
-        )
-        command = np.array([rate * driven for rate in state.rate_radpm])
-        return command, state._replace(driven_mps=driven), report
-    seen = _observe(settings, state, radius_m, wheels)
-    margin = max(settings.balance_margin_ratio, target.margin_ratio)
-    aimed = _aimed_slip(state, target.traction_ratio, margin)
-    drive_state = _commanded_state(state, desired, was, dt_s)
-    state = state._replace(desired_mps=desired)
-    state = _drive(settings, state, target, aimed, seen, drive_state, was, dt_s)
-    if seen.status is TractionStatus.OK:
-        state = _learn_balance(settings, state, seen, aimed, margin, dt_s)
-    command, torques = _share_torque(settings, state, wheels.torque_nm, seen, dt_s)
-    slip = math.nan if seen.status is TractionStatus.NO_SLIP else seen.largest_slip
-    report = WheelReport(state.driven_mps, aimed, state.balance_ratio, slip, drive_state, seen.status)
-    return command, state._replace(droop_nm=torques), report

@@ -42,12 +42,9 @@ class BridgeState(StatusCode):
 
 
 class LowLevelKinematics:
-    """The theoretical rates of the wheels of a swerve robot, as its low-level kinematics evaluates them.
+    """The theoretical rates of a swerve robot's wheels, as its low-level kinematics evaluates them.
 
-    Parameters
-    ----------
-    robot : whose wheels
-    steer_rad : (3,) last command of the steering; at first where it is measured
+    ``steer_rad`` (3,) is the last command of the steering; at first where it is measured.
     """
 
     def __init__(self, robot: SwerveRobot, steer_rad: Array) -> None:
@@ -73,15 +70,11 @@ def corrections(
     measured angle is the other one, the correction changes its sign.  Where it is neither, the low-level
     kinematics is at another command than the one that was computed here, and nothing may be added to it.
 
-    Parameters
-    ----------
-    command : of the controller
-    wheel_radps, steer_rad : (3,) theoretical, of the desired twist
-    measured_rad : (3,) steering angles, zeros removed; NaN where unknown
+    Rates and angles (3,) are those of the desired twist; measured angles have their zeros removed, and are NaN
+    where unknown.
 
     Examples
     --------
-    >>> import numpy as np
     >>> command = Command(np.array([4.0, 4.0, 4.0]), np.zeros(3), np.zeros(3), {})
     >>> added, state = corrections(command, np.full(3, 5.0), np.zeros(3), np.array([0.01, -0.01, np.pi]))
     >>> added.tolist(), state.name
@@ -101,13 +94,9 @@ def corrections(
 
 
 class LastSample:
-    """Newest sample of a stream that measured anything.
+    """Newest sample of a stream that measured anything: all of its values, or any where it need not be ``whole``.
 
-    Parameters
-    ----------
-    stale_s : when it is too old
-    whole : whether all of its values have to be there, or any
-    missing, stale : states while there is none, and while it is too old
+    It is too old after ``stale_s``; ``missing`` and ``stale`` are the states while there is none, and while it is.
     """
 
     def __init__(

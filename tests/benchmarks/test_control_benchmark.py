@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from pipelines.live.pilot import LivePilot
-from terrain.control.danzi_pid import ThesisSettings, WheelPid, thesis_step
-from terrain.control.pid import Gains
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.pid import Gains, WheelPid, wheel_step
+from terrain.control.robot_control import PilotSettings
 from terrain.control.traction import SETTINGS, TractionState, TractionTarget, WheelMotion, traction_step
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
@@ -47,10 +46,14 @@ def with_traction(desired, rate, ground, accel, slip, torque):
 
 
 def with_thesis(desired, rate, ground, accel, slip, torque):
-    settings, states, targets = ThesisSettings(0.2, GAINS), [WheelPid()] * 3, (0.1, -0.15, 0.05)
+    states, targets = [WheelPid()] * 3, (0.1, -0.15, 0.05)
     for u, w, v, a in zip(desired, rate, ground, accel, strict=True):
-        wheels, states = thesis_step(settings, states, u, w, v, a, float(v[0]), targets, DT_S)
-    return u + np.array([wheel.correction_radps for wheel in wheels])
+        steps = [
+            wheel_step(GAINS, 0.2, state, *row, float(v[0]), targets, DT_S)
+            for state, *row in zip(states, u.tolist(), w.tolist(), v.tolist(), a.tolist(), strict=True)
+        ]
+        states = [state for _, state in steps]
+    return u + np.array([wheel.correction_radps for wheel, _ in steps])
 
 
 def with_python(desired, rate, ground, accel, slip, torque):

@@ -16,21 +16,18 @@ from car_scenarios import STOP, Course, slope_course, stop_course
 from terrain.control.car_following import (
     LOST_STOP_S,
     CarFollower,
-    GripSettings,
+    Grip,
     SlipSource,
-    first_grip,
+    SteeringSettings,
     grip_step,
     preview_speed,
 )
 from terrain.control.paths import path_from_curvature
-from terrain.control.steering_law import SteeringSettings
-from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.simulation.car import Ground, level_ground, side_force, simulate_car
 
 ROBOT = load_robot("adap2e")
 SEEDS = (0, 1, 2)
-SETTINGS = GripSettings()
 
 
 def lateral_errors(run, path):
@@ -92,41 +89,41 @@ def test_preview_slows_down_before_the_bend_and_knows_the_grip():
     assert 3.0 < speed[bend].min() < 5.5
     assert speed[distance > 110.0].max() == 6.0
     last = follower.ticks[-1]
-    assert abs(last.grip_ratio - 0.7) < 3 * last.grip_std
+    assert abs(last.grip.ratio - 0.7) < 3 * np.sqrt(last.grip.variance)
 
 
 @pytest.mark.parametrize("true_grip", [0.35, 0.6, 0.8])
 def test_grip_comes_back_within_its_error(true_grip):
     """Forces of the tyre over a sweep of slip that reaches nine tenths of the grip, b with noise."""
     rng = np.random.default_rng(4)
-    grip = first_grip(SETTINGS)
+    grip = Grip()
     load = ROBOT.mass_kg * 9.80665 / 2
     for k in range(1500):
         slip = -0.16 * abs(np.sin(k / 100))
         force = 2.0 * side_force(slip, ROBOT.front_cornering_npr, true_grip * load) / ROBOT.mass_kg
         seen = slip + rng.normal(0.0, 0.01, 2)
-        grip = grip_step(ROBOT, SETTINGS, grip, force, seen, np.full(2, 0.01), 0.02)
+        grip = grip_step(ROBOT, grip, force, seen, np.full(2, 0.01), 0.02)
     assert abs(grip.ratio - true_grip) < 3 * np.sqrt(grip.variance)
     assert np.sqrt(grip.variance) < 0.1
 
 
 def test_grip_stays_as_assumed_while_little_of_it_is_used_or_nothing_is_known():
-    grip = first_grip(SETTINGS)
+    grip = Grip()
     for force, slip in ((0.5, -0.01), (np.nan, -0.1), (4.0, np.nan), (4.0, 0.1)):
-        after = grip_step(ROBOT, SETTINGS, grip, force, np.full(2, slip), np.full(2, 0.01), 0.02)
+        after = grip_step(ROBOT, grip, force, np.full(2, slip), np.full(2, 0.01), 0.02)
         assert after.ratio == grip.ratio
         assert after.variance >= grip.variance
     for dt_s in (0.0, np.nan, -1.0, 1e9):
-        assert grip_step(ROBOT, SETTINGS, grip, 4.0, np.full(2, -0.1), np.full(2, 0.01), dt_s) == grip
+        assert grip_step(ROBOT, grip, 4.0, np.full(2, -0.1), np.full(2, 0.01), dt_s) == grip
 
 
 def test_allowed_speed_falls_with_slope_uphill_and_is_free_on_the_straight():
-    grip = first_grip(SETTINGS)
+    grip = Grip()
     bend = path_from_curvature(np.array([0.0, 40.0]), np.array([0.1, 0.1]))
-    level, uphill, downhill = (preview_speed(SETTINGS, grip, bend, 5.0, roll) for roll in (0.0, 0.2, -0.2))
+    level, uphill, downhill = (preview_speed(grip, bend, 5.0, roll) for roll in (0.0, 0.2, -0.2))
     assert uphill < downhill <= level
     straight = path_from_curvature(np.array([0.0, 40.0]), np.zeros(2))
-    assert preview_speed(SETTINGS, grip, straight, 5.0, 0.2) > 100.0
+    assert preview_speed(grip, straight, 5.0, 0.2) > 100.0
 
 
 def test_robot_stops_when_fixes_are_lost():
@@ -151,8 +148,3 @@ def test_an_offset_is_kept_to_the_left():
     ground = Ground(np.zeros(1), np.array([0.7]), np.array([0.15]))
     run = simulate_car(ROBOT, Course(path, ground).drive(3.0), follower, np.random.default_rng(0))
     assert lateral_errors(run, path)[-100:, 1] == pytest.approx(1.0, abs=0.05)
-
-
-def test_settings_of_the_preview_that_cannot_be_are_refused():
-    with pytest.raises(ConfigError, match="used_part"):
-        first_grip(GripSettings(used_part=1.5))

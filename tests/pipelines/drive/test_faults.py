@@ -25,7 +25,7 @@ from terrain.control.fault_drives import (
     fault_figures,
     make_fault_situation,
 )
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.robot_control import PilotSettings
 from terrain.control.situations import simulate_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.robots import load_robot

@@ -9,10 +9,9 @@ import pytest
 
 from pipelines.drive.faults import fault_loop
 from pipelines.live.pilot import LivePilot
-from terrain.control.aims import braking_by_slip
 from terrain.control.fault_drives import LIMITS, FaultCase, Place, drive_case, drive_references, evaluate_case
 from terrain.control.pid import Gains
-from terrain.control.pilot_settings import CONTROLLERS, PilotSettings, PilotStatus
+from terrain.control.robot_control import CONTROLLERS, PilotSettings, PilotStatus, braking_by_slip
 from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainEstimate, TerrainSource
 from terrain.control.traction import SETTINGS, TractionStatus
@@ -123,7 +122,7 @@ def test_a_classifier_whose_probability_never_suffices_is_reported_and_one_that_
 def slick_table():
     """A table with the curve that is learned on ``wet_floor``, whose thrust falls beyond its peak."""
     named = dict(zip(LAW_PARAMETERS["magic"], (16.50, 1.431, 0.262, -0.903), strict=True))
-    numbers = (0.09, (0.078, 0.102), "peak", (0.0, 0.6), 0.012, 0.004, 0.002, 0.08, None, 0.9, 168.0, -203.0)
+    numbers = (0.09, (0.078, 0.102), "peak", (0.0, 0.6), 0.012, 0.004, 0.002, 0.08, 0.9, 168.0, -203.0)
     curves = {"wet_floor": CurveEntry("magic", named, *numbers, 17.9, 8)}
     targets = {state: target._replace(terrain="wet_floor") for state, target in TABLE.lookup("").items()}
     return replace(TABLE, targets={**TABLE.targets, "wet_floor": targets}, curves=curves)

@@ -16,7 +16,7 @@ from terrain.control.live_state import (
     load_state,
     to_text,
 )
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import KnownTerrain
 from terrain.errors import DataError

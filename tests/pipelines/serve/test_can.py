@@ -20,7 +20,7 @@ from pipelines.live.chain import CommandStatus
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bus import Bridge, Link, open_bus
 from pipelines.serve.serve import Settings, run
-from terrain.control.pilot_settings import PilotSettings
+from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import load_slip_table
 from terrain.control.wheel_controllers import PERIOD_S
 from terrain.control.wheel_corrections import BridgeState

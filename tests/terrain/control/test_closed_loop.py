@@ -1,6 +1,7 @@
 """A robot's control in the closed loop with its estimator and a simulated robot: what it gains, and that it stays."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,15 +10,8 @@ import pytest
 from terrain.control.controllers import make_controller
 from terrain.control.drive_metrics import distance_within, drive_history, final_speed, slip_peak
 from terrain.control.path_tracking import SETTINGS as TRACKING
-from terrain.control.path_tracking import (
-    PoseEstimate,
-    TrackState,
-    TrackStatus,
-    check_tracking,
-    track_step,
-)
-from terrain.control.pilot_settings import OPEN_LOOP
-from terrain.control.robot_control import RobotControl
+from terrain.control.path_tracking import TrackState, TrackStatus, check_tracking, track_step
+from terrain.control.robot_control import OPEN_LOOP, RobotControl
 from terrain.control.situations import SituationOptions, make_situation, simulate_situation, start_times
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import OutputStatus, TerrainBelief
@@ -25,6 +19,7 @@ from terrain.control.traction import TractionStatus
 from terrain.estimation.live import LiveFilter
 from terrain.logs.replay import TWIST
 from terrain.robots import load_robot
+from terrain.simulation.conditions import Faults
 
 ROBOT, TABLE, DELAY_S = load_robot("agrimaro"), load_slip_table(), 0.05
 
@@ -147,12 +142,24 @@ def off_the_path(scenario, terrain, seed, duration_s):
     desired = at(situation.scenario.time_s, situation.scenario.twist.T)
     settings, state, off_m = check_tracking(ROBOT, TRACKING, DELAY_S), TrackState(), []
     for place, twist, motion in zip(pose, desired, ground, strict=True):
-        seen = PoseEstimate(*map(float, place), yaw_std_rad=0.0, stale_s=0.0)
-        _, state, report = track_step(settings, state, twist.copy(), seen, motion.copy(), 0.02)
+        _, state, report = track_step(settings, state, twist, place, motion, 0.0, 0.0, 0.02)
         off_m.append(abs(report.cross_track_m))
     tracked = np.isin(control.channel("track_status_code"), (TrackStatus.OK, TrackStatus.CLAMPED))
     good = tracked & (control.channel("status_code") == TractionStatus.OK)
     return np.array(off_m)[good], good
+
+
+def test_tracking_holds_on_a_side_slope_with_backlash_and_without_a_camera():
+    ends, options = {}, SituationOptions(duration_s=23.0, leg_backlash_rad=0.02)
+    where = make_situation("straight", ROBOT, "grass", 200, options)
+    slope = replace(where.conditions, grade_ratio=(0.0, math.tan(math.radians(5.0))))
+    where = where._replace(conditions=slope, faults=Faults(camera_lost_s=((10.0, 13.0),)))
+    for name in ("plain", "fallback+track"):
+        truth = simulate_situation(ROBOT, where, Loop(name).step, DELAY_S).streams["truth"]
+        moved = [abs(np.ptp(truth.channel(each)[[0, -1]])) for each in ("position_y_m", "yaw_rad")]
+        ends[name] = np.array(moved)
+    assert ends["plain"][0] > 1.0
+    assert (ends["fallback+track"] < [0.1 * ends["plain"][0], 0.3 * ends["plain"][1]]).all()
 
 
 def test_a_minute_on_the_path():

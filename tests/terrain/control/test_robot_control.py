@@ -1,17 +1,25 @@
-"""What a robot's control aims for on a slope, and which of its sensors it names."""
+"""What a robot's control aims for on slick terrain and on a slope, and which of its sensors it names."""
 
 import math
 
 import numpy as np
 import pytest
 
-from terrain.control.pilot_settings import DEFAULT_SETTINGS
-from terrain.control.robot_control import RobotControl, uphill_mps2
+from terrain.constants import GRAVITY_MPS2
+from terrain.control.robot_control import (
+    DECELERATION_RATIO,
+    DEFAULT_SETTINGS,
+    SLICK_RATIO,
+    RobotControl,
+    braking_by_slip,
+    uphill_mps2,
+)
 from terrain.control.slip_table import load_slip_table
 from terrain.estimation.health import SENSORS, Health
 from terrain.estimation.live import LiveFilter
 from terrain.records import Reading
 from terrain.robots import load_robot
+from terrain.slip_learning.curve import traction_ratio
 
 ROBOT = load_robot("agrimaro")
 
@@ -49,3 +57,33 @@ def test_the_sensor_is_named_that_takes_others_with_it(standing, statuses, named
     judged = np.array([statuses.get(name, Health.FRESH) for name in SENSORS], dtype=np.int8)
     place, status = control._judge(seen._replace(health=judged))
     assert (SENSORS[place] if place >= 0 else None, status) == (named, health)
+
+
+class Curve:
+    """The law of a table's curve, with its resistance."""
+
+    resistance_ratio = 0.02
+
+    def __init__(self, law, *parameters):
+        self.thrust_ratio = lambda slip: traction_ratio(law, parameters, slip)
+
+
+def test_slick_terrain_with_falling_thrust_is_braked_at_its_peak():
+    """D sin(C atan(B s)) without curvature has its peak D where C atan(B s) is a right angle."""
+    b, c, d = 25.0, 1.5, 0.3
+    slip_ratio, mps2 = braking_by_slip(Curve("magic", b, c, d, 0.0))
+    assert slip_ratio == pytest.approx(np.tan(np.pi / 2 / c) / b, abs=0.002)
+    assert mps2 == pytest.approx(DECELERATION_RATIO * (d + 0.02) * GRAVITY_MPS2, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("law", "parameters"),
+    [
+        ("janosi", (0.3, 0.05)),  # rises up to the locked wheel
+        ("magic", (25.0, 1.0, 0.3, 0.0)),
+        ("magic", (25.0, 1.5, SLICK_RATIO + 0.01, 0.0)),  # grips
+        ("magic", (25.0, 1.2, 0.3, 0.0)),  # hardly falls
+    ],
+)
+def test_where_locked_wheels_stop_as_soon_there_is_no_braking_by_slip(law, parameters):
+    assert braking_by_slip(Curve(law, *parameters)) is None

@@ -42,17 +42,10 @@ def test_all_that_is_drawn_depends_on_the_seed(name):
     assert dict(one.soils) == dict(again.soils) != dict(other.soils)
     assert one.seed.generate_state(4).tolist() == again.seed.generate_state(4).tolist()
     assert (one.scenario.twist[0] == 0).all()
-    assert one.scenario.name == {"slope": "climb"}.get(name, name)
-
-
-def test_conditions_of_a_seed_are_the_same_in_all_scenarios_and_not_nominal():
-    drawn = [situation(name, ROBOT, "grass", 5) for name in SITUATIONS if terrain_of(name) == "grass"]
-    assert len({one.conditions for one in drawn}) == 1
-    assert len({tuple(one.soils.items()) for one in drawn}) == 1
-    assert drawn[0].soils["grass"] != load_soil("grass")
-    assert drawn[0].conditions.grade_ratio == (0.0, 0.0)
-    assert drawn[0].conditions.undulation_ratio == 0.0
-    assert situation(COURSE, ROBOT, COURSE, 5).conditions.grade_ratio != (0.0, 0.0)
+    if name not in (COURSE, MIXED):  # the same in all scenarios, level, and not nominal
+        assert one.conditions == situation("starts", ROBOT, "grass", 3).conditions
+        assert (one.conditions.grade_ratio, one.conditions.undulation_ratio) == ((0.0, 0.0), 0.0)
+        assert one.soils["grass"] != load_soil("grass")
 
 
 def test_slopes_and_radii_are_the_chosen_ones():
@@ -63,7 +56,7 @@ def test_slopes_and_radii_are_the_chosen_ones():
     assert asked.payload_kg == drawn.payload_kg
 
 
-@pytest.mark.parametrize(("speed_mps", "accel_mps2"), [(1.0, 1.0), (2.0, 0.05), (1.5, math.inf)])
+@pytest.mark.parametrize(("speed_mps", "accel_mps2"), [(1.0, 1.0), (1.5, math.inf)])
 def test_starts_begin_at_rest_and_last_as_long_as_is_evaluated(speed_mps, accel_mps2):
     scenario = situation("starts", ROBOT, "grass", 0, speed_mps=speed_mps, accel_mps2=accel_mps2).scenario
     time_s, speed = scenario.time_s, scenario.twist[:, 0]
@@ -114,8 +107,8 @@ def test_changes_are_where_another_terrain_begins():
         (MIXED, "grass", {}, "scenario 'mixed' does not go with terrain 'grass'"),
         ("starts", "cheese", {}, "soil 'cheese' is unknown"),
         ("starts", "grass", {"duration_s": 20.0}, "scenario 'starts' is as long as its 3 starts"),
-        *[("starts", "grass", {"speed_mps": value}, "speed_mps is") for value in (0.0, -1.0, 5.0, math.nan)],
-        *[("starts", "grass", {"accel_mps2": value}, "accel_mps2 is") for value in (0.0, -1.0, math.nan)],
+        *[("starts", "grass", {"speed_mps": value}, "speed_mps is") for value in (0.0, 5.0)],
+        *[("starts", "grass", {"accel_mps2": value}, "accel_mps2 is") for value in (0.0, math.nan)],
         ("brake", "grass", {"accel_mps2": 2.0}, "accel_mps2 is 2: scenario 'brake' has ramps of its own"),
         (MIXED, COURSE, {"accel_mps2": 2.0}, "accel_mps2 is 2: scenario 'complex' has ramps of its own"),
         (MIXED, COURSE, {"duration_s": 0.0}, "duration_s is 0.0"),

@@ -6,8 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.control import traction
-from terrain.control.danzi_pid import DriveState
-from terrain.control.slip_table import DRIVE_STATES
+from terrain.control.pid import DriveState
 from terrain.control.traction import (
     SETTINGS,
     TractionState,
@@ -16,7 +15,6 @@ from terrain.control.traction import (
     WheelMotion,
     check_settings,
     traction_step,
-    with_motor_driver,
 )
 from terrain.errors import ConfigError
 from terrain.kinematics.commands import inverse
@@ -166,9 +164,7 @@ def numbers_of(state):
 def test_any_drive_with_faults_equals_the_reference_implementation(seed):
     rng = np.random.default_rng(seed)
     changes = {"launch_mps": float(rng.choice([0.01, 0.22])), "droop_time_s": 0.2, "fade_mps2": 1.07}
-    using = with_motor_driver(
-        SETTINGS._replace(**changes), ROBOT
-    )  # no step of a fade is a threshold's, to the digit
+    using = check_settings(SETTINGS._replace(**changes), ROBOT)  # no step of a fade is a threshold's
     aim = TractionTarget(rng.uniform(0, 0.6), *(rng.choice([[0.0, 0.0, 0.0], [0.15, 3.0, 0.05]])))
     memory, state = remembered(), TractionState()
     desired, v, bits = rng.choice([-1, 1], 3) * rng.uniform(0.2, 5, 3), 0.0, rng.uniform(0, 0.1)
@@ -197,23 +193,6 @@ def test_any_drive_with_faults_equals_the_reference_implementation(seed):
         assert decided == pytest.approx([driven, target, status], abs=1e-12), k
         assert numbers_of(state) == pytest.approx(in_order(memory), nan_ok=True, abs=1e-12), k
         assert np.isfinite(command).all()
-
-
-@given(
-    driven=st.floats(0.1, 2.0),
-    slip=st.floats(-0.2, 0.9),
-    target=st.floats(0.0, 0.9),
-    more=st.floats(0.01, 1.0),
-)
-def test_the_cap_is_the_normalised_p_controller_of_slip_on_the_chassis(driven, slip, target, more):
-    state = TractionState(driven_mps=driven, desired_mps=driven)
-    using = SETTINGS._replace(launch_mps=1e-6)
-    wheel = (driven + more) / RADIUS_M
-    ground_mps = driven * (1 - slip)
-    command, _, report = steps(state, wheel, ground_mps=ground_mps, slip=slip, aim=(target,), using=using)
-    corrected = driven + (target - slip) * driven / (1 - target)
-    assert report.driven_mps == pytest.approx(min(driven + more, max(driven, corrected)), rel=1e-9)
-    assert command == pytest.approx(np.full(3, report.driven_mps / RADIUS_M))
 
 
 twists = st.tuples(*[st.floats(-1.0, 1.0)] * 3).filter(lambda twist: max(map(abs, twist)) > 0.05)
@@ -251,100 +230,6 @@ def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
         assert np.array_equal(back, -command)
         assert np.array_equal(report_back, report, equal_nan=True)
         assert np.array_equal(numbers_of(after_back)[:-3], numbers_of(after)[:-3], equal_nan=True)
-
-
-def rolling(torque, n=2000, wheel=5.0, **changes):
-    """Steady at what is required, for long; (command, state)."""
-    state = TractionState()
-    for _ in range(n):
-        command, state, report = steps(state, wheel, ground_mps=0.99, slip=0.01, torque=torque, **changes)
-    assert report.driven_mps == 1.0
-    return command, state
-
-
-def test_wheel_speed_droops_with_torque_above_the_mean_only():
-    assert np.array_equal(rolling(7.0)[0], np.full(3, 5.0))
-    torque = np.array([12.0, 3.0, -6.0])
-    command, _ = rolling(torque)
-    assert command - 5.0 == pytest.approx(SETTINGS.droop_radps_per_nm * (torque.mean() - torque), rel=1e-6)
-    assert command.sum() == pytest.approx(15.0)
-    command, _ = rolling(10 * torque)  # 10 % of its speed at most
-    assert command == pytest.approx([4.5, 5.0 + 0.0, 5.5])
-    command, _ = rolling(torque, wheel=5.0, std=1.0)
-    assert np.array_equal(command, np.full(3, 5.0))
-
-
-def test_an_unknown_torque_does_not_count_as_zero():
-    steady, state = rolling(np.array([10.0, 10.0, 10.0]))
-    for _ in range(100):
-        command, state, _ = steps(state, 5.0, ground_mps=0.99, slip=0.01, torque=[NAN, 10.0, 10.0])
-    assert np.array_equal(command, steady)
-
-
-FAULTS = [
-    *[
-        ({name: value}, TractionStatus.NO_SLIP)
-        for name in ("ground_mps", "accel", "slip", "std")
-        for value in (NAN, INF)
-    ],
-    ({"ground_mps": [0.9, NAN, 0.9]}, TractionStatus.NO_SLIP),
-    ({"std": 0.03}, TractionStatus.UNCERTAIN),
-    *[({"stale_s": value}, TractionStatus.STALE) for value in (3.01, INF, NAN)],
-    *[({"dt_s": value}, TractionStatus.BAD_TIME) for value in BAD_TIMES],
-]
-
-
-@pytest.mark.parametrize(("fault", "status"), FAULTS)
-def test_without_valid_inputs_it_fades_to_the_desired_speed_and_learns_nothing(fault, status):
-    _, state = rolling(torque=0.0)
-    state = state._replace(driven_mps=0.3, floor_ratio=0.2, balance_ratio=0.1)
-    sound = {"ground_mps": 0.25, "slip": 0.1, "torque": NAN}
-    _, _, report = steps(state, 5.0, **sound)
-    assert (report.driven_mps, report.status) == (pytest.approx(0.25 / 0.8), TractionStatus.OK)
-    rise = SETTINGS.fade_mps2 * DT_S
-    for k in range(100):
-        command, state, report = steps(state, 5.0, **sound | fault)
-        assert TractionStatus(report.status) is status
-        assert report.driven_mps == pytest.approx(min(1.0, 0.3 + (k + 1) * rise))
-        assert command == pytest.approx(np.full(3, report.driven_mps / RADIUS_M))
-        assert (state.balance_ratio, state.floor_ratio) == (0.1, 0.2)
-    command, _, report = steps(state, 0.0, **sound | fault)  # and stops at once
-    assert not command.any()
-    assert report.driven_mps == 0.0
-
-
-def test_balance_is_measured_in_steady_motion_and_sets_the_floor_of_the_target():
-    state = TractionState()
-    speeds = np.concatenate([np.arange(0, 1, 0.02), np.full(150, 1.0)])
-    seen = []
-    for k, speed in enumerate(speeds):
-        slip = 0.4 if speed < 1 else 0.15 + 0.05 * math.exp(-(k - 50) / 10)
-        gone = speed * (1 - slip)
-        _, state, report = steps(state, speed / RADIUS_M, ground_mps=gone, slip=slip, aim=(0.9,))
-        seen.append(report.balance_ratio)
-    assert np.isnan(seen[:80]).all()
-    assert seen[-1] == pytest.approx(0.15, abs=1e-3)
-    assert state.floor_ratio == pytest.approx(0.15 + SETTINGS.balance_margin_ratio, abs=1e-3)
-    assert steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=(0.05,))[2].aimed_ratio == state.floor_ratio
-    aim = TractionTarget(0.9, margin_ratio=0.05)
-    working = steps(state, 5.0, ground_mps=0.85, slip=0.15, aim=aim)[2].aimed_ratio
-    assert working == pytest.approx(0.2, abs=1e-3)  # no more than the balance and what the work takes
-    other = state.on_other_terrain()
-    assert (math.isnan(other.balance_ratio), other.floor_ratio) == (True, 0.0)
-    assert other._replace(balance_ratio=state.balance_ratio, floor_ratio=state.floor_ratio) == state
-
-
-def test_the_floor_rises_only_where_a_limited_robot_gains_no_speed():
-    floors = {}
-    for name, gain_mps2 in {"stuck": 0.0, "gaining": 0.6}.items():
-        state, v = TractionState(), 0.3
-        for _ in range(100):
-            v += gain_mps2 * DT_S
-            _, state, report = steps(state, 20.0, ground_mps=v, slip=0.1, aim=(0.1,))
-        floors[name] = state.floor_ratio
-        assert report.driven_mps < 4.0
-    assert floors["gaining"] == 0.0
-    assert floors["stuck"] == pytest.approx(0.1 + SETTINGS.floor_rate_ratio * 1.6, abs=0.02)
 
 
 def driven_along(target, duration_s=30.0, desired_mps=1.0, shear=0.1, limit=0.4, resistance=0.2):
@@ -393,7 +278,7 @@ def test_braking_on_slick_terrain_keeps_the_directions_and_its_slip_and_ends():
     wheel = np.array([5.0, -5.0, 4.0])
     loose, _ = braked(TractionTarget(0.1), wheel, 1.0)
     assert not loose[:, :4].any()
-    using = with_motor_driver(SETTINGS, ROBOT)
+    using = check_settings(SETTINGS, ROBOT)
     held, state = braked(SLICK, wheel, 1.0, using=using)
     command, driven, drive_state, v = held[:, :3], held[:, 3], held[:, 4], held[:, 5]
     busy = driven > 0
@@ -409,19 +294,6 @@ def test_braking_on_slick_terrain_keeps_the_directions_and_its_slip_and_ends():
     assert (expected + charge)[busy].min() > 0.1  # slower, the wheels are commanded to stop
     assert not held[~busy][:, :4].any()
     assert state.driven_mps == 0.0
-
-
-def test_gentle_deceleration_and_acceleration_are_not_braking():
-    state = TractionState()
-    states = []
-    for speed in [*np.full(5, 1.0), *np.arange(1.0, 0.9, -0.008), *np.full(5, 1.1)]:
-        _, state, row = steps(state, speed / RADIUS_M, ground_mps=0.95, aim=SLICK)
-        states.append(row.drive_state)
-    assert states[0] == DriveState.TRACTION
-    assert DriveState.BRAKING not in states
-    assert states[6] == DriveState.STEADY
-    names = {DriveState.TRACTION: "traction", DriveState.BRAKING: "braking", DriveState.STEADY: "steady"}
-    assert tuple(names[code] for code in range(3)) == DRIVE_STATES
 
 
 @pytest.mark.parametrize(
@@ -441,8 +313,3 @@ def test_invalid_settings_are_refused_in_one_sentence(name, value, accepted):
     with pytest.raises(ConfigError) as refused:
         check_settings(SETTINGS._replace(**{name: value}))
     assert str(refused.value) == f"traction: {name} is {value!r}, a number {accepted} is required"
-
-
-def test_integers_are_accepted_as_settings():
-    using = check_settings(SETTINGS._replace(lead_s=0, stale_max_s=3))
-    assert steps(TractionState(), 5.0, using=using)[2].status == TractionStatus.OK

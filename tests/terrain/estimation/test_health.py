@@ -35,7 +35,7 @@ def samples(terrain="grass"):
 @cache
 def situation(name, terrain):
     """A start or a brake with plain commands."""
-    where = make_fault_situation(name, ROBOT, terrain, 7).situation
+    where = make_fault_situation(name, ROBOT, terrain, 7)[0]
     run = drive_once(
         DriveInputs(ROBOT, load_slip_table()), make_controller("plain", load_slip_table(), 0.05), where
     )
