@@ -31,7 +31,6 @@ from terrain.slip_learning.curve import (
 from terrain.slip_learning.learn import LearnedTerrain, TerrainRun, learn_terrain, terrain_runs
 from terrain.slip_learning.measured import (
     Measured,
-    MeasuredSlip,
     OperatingPoints,
     SurfaceSlip,
     operating_points,

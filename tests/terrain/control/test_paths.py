@@ -137,7 +137,7 @@ def test_a_file_that_is_no_path_is_one_sentence(tmp_path, text, message):
 def test_bytes_and_folders_are_no_path(tmp_path):
     (tmp_path / "noise.csv").write_bytes(b"\xff\xfe\x00\x9f")
     for place in (tmp_path, tmp_path / "noise.csv", tmp_path / "none.csv"):
-        with pytest.raises(TerrainError, match="is a folder|is no CSV file|cannot be opened"):
+        with pytest.raises(TerrainError, match=r"is a folder|is no CSV file|cannot be opened"):
             read_path(place)
 
 
