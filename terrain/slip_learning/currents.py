@@ -208,10 +208,8 @@ class Cases(NamedTuple):
 
     def at(self, rows: Array) -> Cases:
         """Return some of the windows."""
-        return Cases(
-            self.matrix[rows],
-            self.columns,
-            *(getattr(self, name)[rows] for name in ("slip", "run_id", "terrain", "session", "regime")),
+        return self._replace(
+            **{name: getattr(self, name)[rows] for name in self._fields if name != "columns"}
         )
 
 
@@ -241,7 +239,11 @@ def predictions(
             continue
         predicted = np.full((4, len(usual.slip)), np.nan)
         rng = np.random.default_rng((seed, number))
-        for done, (train, test) in enumerate(_folds(usual.terrain, group, rng), start=1):
+        if len(np.unique(usual.terrain)) > 1:
+            parts = split_runs(usual.terrain, group, N_FOLDS, rng)
+        else:
+            parts = folds(deal(group, N_FOLDS, rng))
+        for done, (train, test) in enumerate(parts, start=1):
             predicted[:, test] = _fitted(usual.at(train)).predict_slip(usual.matrix[test])
             progress(f"predict by {name}", done, N_FOLDS)
         found.append(_figures(name, usual, PredictedSlip(*predicted), rng))
@@ -255,12 +257,6 @@ def predictions(
                 _figures(session or "runs without a label", part, fitted.predict_slip(part.matrix), rng)
             )
     return found
-
-
-def _folds(terrain: Array, group: Array, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-    if len(np.unique(terrain)) > 1:
-        return list(split_runs(terrain, group, N_FOLDS, rng))
-    return list(folds(deal(group, N_FOLDS, rng)))
 
 
 def _fitted(cases: Cases) -> SlipRegressor:

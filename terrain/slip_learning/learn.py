@@ -39,15 +39,10 @@ FILTER = "vio15"
 
 
 class TerrainRun(NamedTuple):
-    """Measurements of one run on one terrain.
+    """Bins of slip, mass and resistance of one run on one terrain.
 
-    Parameters
-    ----------
-    run_id, terrain : of the run
-    bins : mean slip and thrust over load
-    balance : mass and resistance
-    left_out : number of samples that do not meet each condition of :class:`WheelForces`
-    n_samples : behind the bins
+    ``left_out`` is the number of samples that do not meet each condition of :class:`WheelForces`, ``n_samples`` that
+    of those behind the bins.
     """
 
     run_id: str
@@ -139,15 +134,7 @@ def learn_terrain(
 
 
 class LearnedRuns(NamedTuple):
-    """What was learned of runs.
-
-    Parameters
-    ----------
-    used : runs that were measured
-    measured : each on each of its terrains
-    terrains : what was learned, by name
-    faulty : a sentence for each run that was left out
-    """
+    """Runs that were measured, each on each of its terrains, what was learned, and a sentence for each run left out."""
 
     used: list[RunLog]
     measured: list[TerrainRun]
