@@ -103,6 +103,30 @@ class Fit(NamedTuple):
         """Standard deviations (k,)."""
         return np.asarray(np.sqrt(np.diag(self.cov)))
 
+    def derived(self, function: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Return what follows from the parameters (m,), and its 95 % interval (2, m), to first order.
+
+        Parameters
+        ----------
+        function : of values (k,)
+
+        Examples
+        --------
+        >>> x = np.arange(12.0)
+        >>> fit = identify(lambda p: p[0] * x - 2.0 * x - np.sin(9 * x), [Parameter("slope_ratio", 1.0)])
+        >>> value, (low, high) = fit.derived(lambda p: 10.0 * p)
+        >>> bool(np.allclose(value, 10.0 * fit.value)), bool(np.allclose([low, high], 10.0 * fit.interval))
+        (True, True)
+        """
+        value, h = np.asarray(function(self.value)), 1e-5
+        steps = h * np.diag([p.unit for p in self.parameters])
+        slopes = [
+            (function(self.value + step) - function(self.value - step)) / (2 * step.sum()) for step in steps
+        ]
+        variance = np.einsum("im,ij,jm->m", slopes, self.cov, slopes)
+        half = half_width(np.sqrt(variance), len(self.influence) - 1 if len(self.influence) else math.inf)
+        return value, np.stack([value - half, value + half])
+
 
 def identify(
     residual: Callable[[Array], Array],

@@ -96,7 +96,7 @@ def estimate_all(
     if options.predict:
         cases = slip_cases(found.runs, found.slips, options.window_s)
         predicted = predictions(cases, options.hold_out, seed, progress)
-    findings = rollers_of(found, robot, seed) if options.rollers else None
+    findings = rollers_of(found, robot) if options.rollers else None
     if keep is not None:
         for done, run in enumerate(found.runs, start=1):
             late_s = found.delays[run.session].applied_s

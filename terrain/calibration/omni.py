@@ -161,7 +161,7 @@ def _driven(runs: Sequence[RunLog], robot: OmniRobot, seed: int) -> list[Finding
         reason = f"no surface on which {MIN_RUNS} runs in steady motion were measured from outside"
         return undetermined([*names, DISTANCE], reason)
     kept = [(slip, of) for slip, of in slips if of in fitted]
-    found = roller_findings([slip for slip, _ in kept], [of for _, of in kept], robot, fitted, seed)
+    found = roller_findings([slip for slip, _ in kept], [of for _, of in kept], robot, fitted)
     ids = tuple(slip.run_id for slip, _ in kept)
     return [
         *_load(found, robot, ids),

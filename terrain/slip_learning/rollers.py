@@ -2,16 +2,16 @@ r"""What makes an omni robot slip, from runs whose motion was measured from outs
 
 The steady law of :mod:`terrain.simulation.planar.omni` is fitted to the median motion of each run,
 slip along the direction that the wheels roll and speed across it: the sharing of the load and the scale are
-those of the robot, the friction of the rollers over traction is that of each surface.  Intervals are of draws
-of runs; what the law leaves is judged on every fifth run in turn, held out.  A group of runs that is not
+those of the robot, the friction of the rollers over traction is that of each surface.  Intervals are those of runs
+left out in turn; what the law leaves is judged on every fifth run in turn, held out.  A group of runs that is not
 fitted (with weights, say) is asked which sharing of the load would explain it, all else equal.
 
 Wheels at the distance d from the robot's middle that roll :math:`\varphi_i` without slip turn the body by
 :math:`\psi = \sum_i r \varphi_i / (3 d)`.  Over runs on one surface the slope of the turn measured from
 outside over that of the described distance is :math:`(1 - s)\,d_0 / d`, with the slip s of turning, which a
 robot that is commanded not to turn hardly shows.  Where s is not known, :math:`d_0` over the slope is the
-distance of wheels that turn the body without slip: an upper bound, but for what else turns it.  Intervals are
-those of draws of runs; how far surfaces differ says what else there is.
+distance of wheels that turn the body without slip: an upper bound, but for what else turns it.  Its interval is
+that of draws of runs; how far surfaces differ says what else there is.
 """
 
 from __future__ import annotations
@@ -26,14 +26,13 @@ import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.errors import DataError
-from terrain.identify import Parameter, folds, identify
+from terrain.identify import Fit, Parameter, folds, identify
 from terrain.records import Array
 from terrain.robots import OmniRobot, Robot, as_drive
 from terrain.simulation.planar.omni import steady_twist
 from terrain.slip_learning.measured import Measured, MeasuredSlip, single_terrain
 
 N_FOLDS = 5
-N_DRAWS = 100
 
 MIN_RUNS = 10
 """Of a surface: two unknowns of the load, the scale and its own friction over several directions."""
@@ -107,7 +106,7 @@ class _Cases:
 
 
 def roller_findings(
-    runs: Sequence[MeasuredSlip], groups: Sequence[str], robot: Robot, surfaces: Sequence[str], seed: int = 0
+    runs: Sequence[MeasuredSlip], groups: Sequence[str], robot: Robot, surfaces: Sequence[str]
 ) -> RollerFindings:
     """Return what makes a robot on three omni wheels slip.
 
@@ -117,7 +116,6 @@ def roller_findings(
     groups : name of the surface of each run, or of another group
     robot : whose runs they are
     surfaces : names of the groups that are fitted; the others are asked for their load
-    seed : of the draws
 
     Raises
     ------
@@ -133,35 +131,35 @@ def roller_findings(
         raise DataError("no surface is named whose runs could be fitted")
     fitted = cases.at(np.flatnonzero(np.isin(cases.group, names)))
     law = _Law(robot, names)
-    best = law.fit(fitted)
-    rng = np.random.default_rng(seed)
-    places = [np.flatnonzero(fitted.group == name) for name in names]
-    draws = np.array([law.fit(fitted.at(_drawn(places, rng)), best) for _ in range(N_DRAWS)])
+    fit = law.fit(fitted, np.arange(len(fitted.slip)))
     fold, left = np.empty(len(fitted.slip), int), np.empty(len(fitted.slip))
+    places = [np.flatnonzero(fitted.group == name) for name in names]
     for rows in places:
         fold[rows] = np.arange(len(rows)) % N_FOLDS
     for train, test in folds(fold):
-        part = law.fit(fitted.at(train), best)
+        part = law.fit(fitted.at(train)).value
         left[test] = law.motion(fitted.at(test), part)[0] - fitted.slip[test]
-    loads = np.array([law.loads(draw) for draw in draws])
+    loads, load_interval = fit.derived(law.loads)
+    ratios, ratio_interval = fit.derived(lambda values: np.exp(values[3:]))
+    intervals = [(max(low, 0.0), high) for low, high in ratio_interval.T.tolist()]
     others = [name for name in dict.fromkeys(cases.group.tolist()) if name not in names]
     found = {
-        name: each
-        for name in others
-        if (each := _other_load(law, cases.at(np.flatnonzero(cases.group == name)), best)) is not None
+        name: law.other_load(cases.at(np.flatnonzero(cases.group == name)), fit.value) for name in others
     }
+    named = {name: each for name, each in found.items() if each is not None}
+    low, high = fit.interval[:, 2].tolist()
     return RollerFindings(
-        load_ratio=tuple(law.loads(best).tolist()),
-        load_interval=tuple(percentile_interval(column) for column in loads.T),
-        scale_error=float(best[2]),
-        scale_interval=percentile_interval(draws[:, 2]),
-        roller_ratio={name: float(np.exp(best[3 + i])) for i, name in enumerate(names)},
-        roller_interval={name: percentile_interval(np.exp(draws[:, 3 + i])) for i, name in enumerate(names)},
+        load_ratio=tuple(loads.tolist()),
+        load_interval=tuple((low, high) for low, high in load_interval.T.tolist()),
+        scale_error=float(fit.value[2]),
+        scale_interval=(low, high),
+        roller_ratio=dict(zip(names, ratios.tolist(), strict=True)),
+        roller_interval=dict(zip(names, intervals, strict=True)),
         held_out_rms={name: _rms(left[rows]) for name, rows in zip(names, places, strict=True)},
         plain_rms={name: float(fitted.slip[rows].std()) for name, rows in zip(names, places, strict=True)},
-        other_surface={name: surface for name, (surface, _, _) in found.items()},
-        other_loads={name: loads for name, (_, loads, _) in found.items()},
-        other_rms={name: rms for name, (_, _, rms) in found.items()},
+        other_surface={name: surface for name, (surface, _, _) in named.items()},
+        other_loads={name: loads for name, (_, loads, _) in named.items()},
+        other_rms={name: rms for name, (_, _, rms) in named.items()},
     )
 
 
@@ -183,11 +181,6 @@ def surface_of_windows(slip: MeasuredSlip, found: RollerFindings, robot: Robot) 
     for row, best in zip(rows.tolist(), off.argmin(axis=0).tolist(), strict=True):
         named[row] = names[best]
     return named
-
-
-def _drawn(places: Sequence[Array], rng: np.random.Generator) -> Array:
-    """Return rows of runs drawn with replacement, as many of each surface as it has."""
-    return np.concatenate([rows[bootstrap_rows(len(rows), 1, rng)[0]] for rows in places])
 
 
 class _Law:
@@ -221,29 +214,28 @@ class _Law:
             side[rows] = (ahead[:, 0] * twist[:, 1] - ahead[:, 1] * twist[:, 0]) / speed
         return slip, side
 
-    def misfit(self, cases: _Cases, parameters: Array, group: str = "") -> Array:
+    def misfit(self, cases: _Cases, group: str, parameters: Array) -> Array:
+        """Return what the law leaves (n, 2) of slip and sideways speed."""
         slip, side = self.motion(cases, parameters, group)
-        return np.concatenate([slip - cases.slip, side - cases.side])
+        return np.column_stack([slip - cases.slip, side - cases.side])
 
-    def fit(self, cases: _Cases, start: Array | None = None) -> Array:
-        starts = [] if start is None else [start]
-        return identify(partial(self.misfit, cases), self.parameters, starts=starts).value
+    def fit(self, cases: _Cases, clusters: Array | None = None) -> Fit:
+        return identify(partial(self.misfit, cases, ""), self.parameters, clusters)
 
-
-def _other_load(
-    law: _Law, cases: _Cases, best: Array
-) -> tuple[str, tuple[float, ...], tuple[float, float]] | None:
-    """Return the surface that explains runs best, the load that does so on it, and what is left."""
-    if len(cases.slip) < MIN_RUNS:
-        return None
-
-    def misfit(loads: Array, surface: str) -> Array:
-        return law.misfit(cases, np.concatenate([loads, best[2:]]), surface)
-
-    surface = min(law.surfaces, key=lambda name: _rms(misfit(best[:2], name)))
-    found = identify(partial(misfit, surface=surface), law.parameters[:2], starts=[best[:2]])
-    rms = _rms(misfit(best[:2], surface)), _rms(found.residual)
-    return surface, tuple(law.loads(found.value).tolist()), rms
+    def other_load(
+        self, cases: _Cases, best: Array
+    ) -> tuple[str, tuple[float, ...], tuple[float, float]] | None:
+        """Return the surface that explains runs best, the load that does so on it, and what is left."""
+        if len(cases.slip) < MIN_RUNS:
+            return None
+        before = {name: _rms(self.misfit(cases, name, best)) for name in self.surfaces}
+        surface = min(before, key=before.__getitem__)
+        found = identify(
+            lambda loads: self.misfit(cases, surface, np.concatenate([loads, best[2:]])),
+            self.parameters[:2],
+            starts=[best[:2]],
+        )
+        return surface, tuple(self.loads(found.value).tolist()), (before[surface], _rms(found.residual))
 
 
 def _cases(runs: Sequence[MeasuredSlip], groups: Sequence[str]) -> _Cases:
@@ -312,12 +304,12 @@ def distance_bound(
 NO_ROLLERS = "robot {name}: drive {drive!r} has no rollers, only 'omni' has"
 
 
-def rollers_of(found: Measured, robot: Robot, seed: int) -> RollerFindings:
+def rollers_of(found: Measured, robot: Robot) -> RollerFindings:
     """Return what makes an omni robot slip; sessions are groups that are asked for their load."""
     known = [i for i, run in enumerate(found.runs) if single_terrain(run)]
     groups = [found.runs[i].session or single_terrain(found.runs[i]) for i in known]
     surfaces = sorted({single_terrain(found.runs[i]) for i in known if not found.runs[i].session})
-    return roller_findings([found.slips[i] for i in known], groups, robot, surfaces, seed)
+    return roller_findings([found.slips[i] for i in known], groups, robot, surfaces)
 
 
 def named_surfaces(found: Measured, robot: Robot, rollers: RollerFindings) -> tuple[NamedSurface, ...]:

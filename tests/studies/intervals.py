@@ -274,7 +274,7 @@ def _rollers(seed: int) -> Iterator[Interval]:
                 wheel_speed_mps=wheels,
             )
             runs.append((slip, surface))
-    found = roller_findings([slip for slip, _ in runs], [name for _, name in runs], robot, list(ratio), seed)
+    found = roller_findings([slip for slip, _ in runs], [name for _, name in runs], robot, list(ratio))
     for k, (interval, truth) in enumerate(zip(found.load_interval, load.tolist(), strict=True), start=1):
         yield Interval(f"load_{k}_ratio", *interval, truth)
     yield Interval("scale_ratio", *found.scale_interval, 0.06)
