@@ -1,7 +1,7 @@
 """The value of an effect in quantities that the builder of a robot knows: a track in m, a lag of the wheels.
 
 A value is added to what the description has already, and the description's number stands beside the sum:
-where that number is assumed, only the sum was measured.  What an effect makes of the robot is said by its entry
+where that number is assumed, only the sum was measured.  What an effect makes of the robot stands in its entry
 (:mod:`terrain.effects`), or by the number of the description that it changes.
 """
 

@@ -58,7 +58,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "pipelines/reporting/json_file.py": ('"ours"', '"taught_runs"', '"felt_ratio"'),
     "README.md": ("told:NAME",),
     "CHANGELOG.md": ("told:NAME", "`steering_play`", "`ours`", "`taught_runs`", "`felt_ratio`"),
-    "tests/terrain/extension/test_writing.py": ('"steering_play"', "steering_play_rad"),
+    "tests/terrain/extension/test_description.py": ('"steering_play"', "steering_play_rad"),
 }
 """By file, texts in which such a word is a name that earlier releases accepted, or a title."""
 
