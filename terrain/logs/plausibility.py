@@ -567,7 +567,7 @@ def _overlap(run: RunLog) -> Check:
     )
 
 
-# -- What of it is said of many runs --------------------------------------------------------------------------
+# -- Sentences on many runs -----------------------------------------------------------------------------------
 
 MAX_NAMED = 3
 """A sentence that concerns many runs is written for so many, and counted for the others."""
