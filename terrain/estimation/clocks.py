@@ -1,17 +1,17 @@
-"""One time for all that arrives: the caller's, without its steps, and each stream's stamps on it.
+"""What arrives from a robot: numbers, rows in a queue, and one time for all of them.
 
-Stamps that agree with the time, up to a quarter of a second late, are left as they are. How stamps follow
-each other distinguishes a clock that was set from samples that are late: its stamps jump back, or ahead of
-the time that has passed. After a jump of a stream the difference to the time is taken anew, once three
-readings agree on it; until then they are left out. What is later without a jump is late, however long, and
-left out.
+The time is the caller's, without its steps, and each stream's stamps are brought onto it.  Stamps that agree with
+the time, up to a quarter of a second late, are left as they are.  How stamps follow each other distinguishes a clock
+that was set from samples that are late: its stamps jump back, or ahead of the time that has passed.  After a jump of
+a stream the difference to the time is taken anew, once three readings agree on it; until then they are left out.
+What is later without a jump is late, however long, and left out.
 """
 
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Mapping
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,14 @@ BEHIND_S, N_BEHIND = 1.0, 5
 """A reading that is so far behind the newest stamp of its stream is late, or its clock was set where so many
 follow each other: late ones are fewer."""
 
-_FLOATS = np.dtype(np.float64)
+MAX_QUEUED = 20_000
+"""Rows of a stream that wait for a step: some seconds at a kilohertz; of more, the oldest are left out."""
+
+LOST_AFTER_S, PERIODS = 0.5, 3.0
+"""A stream that gives nothing for so long is lost; of one that is slower, so many of its periods."""
+
+NEVER = -math.inf, math.nan
+"""When samples came last that were too late to be taken, and by how much, of what never had any."""
 
 
 def number(value: Any) -> float:
@@ -63,22 +70,25 @@ def number(value: Any) -> float:
 
 
 def numbers(value: Any) -> Array | None:
-    """Return a value as an array of numbers; None where it is none.
+    """Return numbers as an array of floats, NaN for None; None where anything else is among them.
 
     Examples
     --------
-    >>> numbers([[1.0], [2.0, 3.0]]) is None, numbers(["a"]) is None, numbers([1, 2])
-    (True, True, array([1., 2.]))
+    >>> numbers([1, None]), numbers([[1.0], [2.0, 3.0]]), numbers(["1"]), numbers([True])
+    (array([ 1., nan]), None, None, None)
     """
-    if type(value) is np.ndarray and value.dtype == _FLOATS:
+    if type(value) is np.ndarray and value.dtype == np.float64:
         return value
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in "fiub":
-            return None
-        return array.astype(np.float64, copy=False)
+        is_mixed = array.dtype.kind == "O" and all(map(_is_number, array.ravel().tolist()))
+        return array.astype(np.float64, copy=False) if is_mixed or array.dtype.kind in "fiu" else None
     except Exception:
         return None
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or type(value) is float or (type(value) is int and abs(value) < 2**63)
 
 
 def finite_twist(given: object) -> Array:
@@ -89,20 +99,37 @@ def finite_twist(given: object) -> Array:
     return twist
 
 
-class _StreamClock:
-    """The clock of one stream.
+def readable(given: Any) -> Reading | None:
+    """Return a reading as arrays (k,) and (k, c); None where it is not that."""
+    try:
+        time_s, values = given
+    except Exception:
+        return None
+    stamps, array = numbers(time_s), numbers(values)
+    if stamps is None or array is None or stamps.ndim != 1 or array.ndim != 2 or len(array) != stamps.size:
+        return None
+    if type(given) is Reading and stamps is time_s and array is values:
+        return given
+    return Reading(stamps, array)
 
-    Parameters
-    ----------
-    counts : what was left out, by kind
-    too_late : when a reading came last that was too late, and by how much
-    """
+
+def last_stamp_s(samples: Mapping[str, Reading], stream: str) -> float:
+    """Return the last stamp of a stream; NaN where it has none that can be read."""
+    try:
+        return float(samples[stream][0][-1])
+    except (TypeError, ValueError, LookupError, OverflowError):
+        return math.nan
+
+
+class _StreamClock:
+    """The clock of one stream; counts what was left out, by kind."""
 
     def __init__(self) -> None:
-        self.too_late = -math.inf, math.nan
+        self.too_late = NEVER
         self.offset_s, self.lateness_s = 0.0, 0.0
-        self._stamp_s = self._now_s = math.nan
-        self._due_s, self._n_due, self._jumped = math.nan, 0, True  # a first stamp may be of any time
+        self.jumped = True  # a first stamp may be of any time
+        self._stamp_s = self._now_s = self._due_s = math.nan
+        self._n_due = 0
         self.counts = {"off the clock": 0, "too late": 0, "clock set": 0}
 
     def take(self, now_s: float, reading: Reading) -> Reading | None:
@@ -119,18 +146,16 @@ class _StreamClock:
         newest_s = stamps[0] if len(stamps) == 1 else max(stamps)
         advanced_s = newest_s - self._stamp_s  # since the reading before
         if advanced_s < -REWIND_S or advanced_s > now_s - self._now_s + JUMP_S:
-            self._jumped, self._n_due = True, 0
+            self.jumped, self._n_due = True, 0
         self._stamp_s, self._now_s = newest_s, now_s
         late_s = now_s - (newest_s - self.offset_s)
         if -AHEAD_S <= late_s <= REWIND_S:
-            self.lateness_s, self._jumped, self._n_due = late_s, False, 0
-        elif not self._jumped:
-            self.counts["too late" if late_s > 0.0 else "off the clock"] += time_s.size
-            if late_s > 0.0:
+            self.lateness_s, self.jumped, self._n_due = late_s, False, 0
+        elif not self.jumped or not self._agrees(now_s - newest_s):
+            is_late = not self.jumped and late_s > 0.0
+            self.counts["too late" if is_late else "off the clock"] += time_s.size
+            if is_late:
                 self.too_late = now_s, late_s
-            return None
-        elif not self._agrees(now_s - newest_s):
-            self.counts["off the clock"] += time_s.size
             return None
         if self.offset_s == 0.0:
             return Reading(time_s, values) if left_out else reading
@@ -145,7 +170,7 @@ class _StreamClock:
         if self._n_due < N_AGREED:
             return False
         self.offset_s = -self._due_s + min(max(self.lateness_s, 0.0), REWIND_S)
-        self._jumped, self._n_due = False, 0
+        self.jumped, self._n_due = False, 0
         self.counts["clock set"] += 1
         return True
 
@@ -165,29 +190,25 @@ class Clocks:
     def __init__(self) -> None:
         self._given_s, self._offset_s, self._now_s = math.nan, 0.0, 0.0
         self._streams: dict[str, _StreamClock] = {}
-        self._unreadable: dict[str, int] = {}
-        self.set = 0
+        self._unreadable: Counter[str] = Counter()
+        self.times_set = 0
 
     @property
     def counts(self) -> dict[str, int]:
         """What was not taken, and how often a clock was set, by stream and kind."""
-        found = {
-            f"{name}: {kind}": n for name, one in self._streams.items() for kind, n in one.counts.items()
-        }
-        found |= {f"{name}: unreadable": n for name, n in self._unreadable.items()} | {
-            "time: clock set": self.set
-        }
-        return {kind: n for kind, n in found.items() if n}
+        counts = {f"{name}: {kind}": n for name, clock in self._streams.items() for kind, n in clock.counts.items()}
+        counts |= {f"{name}: unreadable": n for name, n in self._unreadable.items()}
+        return {kind: n for kind, n in (counts | {"time: clock set": self.times_set}).items() if n}
 
     @property
     def too_late(self) -> tuple[float, float]:
         """When a reading came last that was too late to be taken, and by how much; minus infinity and NaN."""
-        return max((one.too_late for one in self._streams.values()), default=(-math.inf, math.nan))
+        return max((clock.too_late for clock in self._streams.values()), default=NEVER)
 
     @property
     def lateness_s(self) -> dict[str, float]:
         """How late the last reading of each stream came that was taken."""
-        return {name: one.lateness_s for name, one in self._streams.items()}
+        return {name: clock.lateness_s for name, clock in self._streams.items()}
 
     def step(self, time_s: Any, readings: Any) -> tuple[float, dict[str, Reading]]:
         """Return the time of a step, which never goes back, and what can be read of its readings.
@@ -198,21 +219,21 @@ class Clocks:
         readings : by stream, each a pair of stamps (k,) and values (k, c); or anything
         """
         now_s = self._advance(number(time_s))
-        found: dict[str, Reading] = {}
+        taken: dict[str, Reading] = {}
         if type(readings) is not dict and not isinstance(readings, Mapping):
-            return now_s, found
+            return now_s, taken
         for name, given in readings.items():
             reading = readable(given)
             if reading is None:
-                self._unreadable[str(name)] = self._unreadable.get(str(name), 0) + 1
+                self._unreadable[str(name)] += 1
                 continue
             clock = self._streams.get(name)
             if clock is None:
                 clock = self._streams[name] = _StreamClock()
-            taken = clock.take(now_s, reading)
-            if taken is not None:
-                found[name] = taken
-        return now_s, found
+            believed = clock.take(now_s, reading)
+            if believed is not None:
+                taken[name] = believed
+        return now_s, taken
 
     def _advance(self, given_s: float) -> float:
         """Return the time of a step: what was given, less all steps of its clock."""
@@ -223,26 +244,12 @@ class Clocks:
         step_s = given_s - self._given_s
         if not math.isnan(step_s) and not 0.0 <= step_s <= LONGEST_STEP_S:
             self._offset_s = given_s - (self._now_s + PERIOD_S)
-            self.set += 1
+            self.times_set += 1
             for clock in self._streams.values():
-                clock._jumped = True
+                clock.jumped = True
         self._given_s = given_s
         self._now_s = given_s - self._offset_s
         return self._now_s
-
-
-def readable(given: Any) -> Reading | None:
-    """Return a reading as arrays (k,) and (k, c); None where it is not that."""
-    try:
-        time_s, values = given
-    except Exception:
-        return None
-    stamps, array = numbers(time_s), numbers(values)
-    if stamps is None or array is None or stamps.ndim != 1 or array.ndim != 2 or len(array) != stamps.size:
-        return None
-    if type(given) is Reading and stamps is time_s and array is values:
-        return given
-    return Reading(stamps, array)
 
 
 class SessionClock:
@@ -297,13 +304,12 @@ class ClockWatch:
     [False, False, False, False, False, False, True, False]
     """
 
+    too_late = NEVER  # by their stamps alone samples are never late
+
     def __init__(self) -> None:
         self._newest_s: dict[str, float] = {}
         self._n_behind: dict[str, int] = {}
         self.times_set = 0
-
-    too_late = -math.inf, math.nan
-    """As of :attr:`Clocks.too_late`: by their stamps alone samples are never late."""
 
     @property
     def counts(self) -> dict[str, int]:
@@ -329,9 +335,112 @@ class ClockWatch:
         return False
 
 
-def last_stamp_s(samples: Mapping[str, Reading], stream: str) -> float:
-    """Return the last stamp of a stream; NaN where it has none that can be read."""
-    try:
-        return float(samples[stream][0][-1])
-    except (TypeError, ValueError, LookupError, OverflowError):
-        return math.nan
+class Inbox:
+    """Queue rows of streams, in the order in which they come.
+
+    Parameters
+    ----------
+    channels : number of columns by stream
+
+    Attributes
+    ----------
+    received : rows taken, by stream
+    refused : rows or readings that were not taken, by reason
+
+    Examples
+    --------
+    >>> inbox = Inbox({"imu": 2})
+    >>> inbox.put("imu", [0.0, 0.01], [[1.0, 2.0], [3.0, None]])
+    0.01
+    >>> inbox.take()["imu"].values.tolist()
+    [[1.0, 2.0], [3.0, nan]]
+    >>> inbox.put("imu", [0.0], [[1.0]]), dict(inbox.refused)
+    (None, {'imu: not rows of 2 numbers': 1})
+    """
+
+    def __init__(self, channels: Mapping[str, int]) -> None:
+        self._n_columns = dict(channels)
+        self._queued: dict[str, list[Reading]] = {name: [] for name in channels}
+        self._n_queued = dict.fromkeys(channels, 0)
+        self.received: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+
+    def put(self, stream: str, time_s: Any, values: Any) -> float | None:
+        """Queue rows; return their newest stamp, or None where they were refused and counted."""
+        n_columns = self._n_columns.get(stream)
+        if n_columns is None:
+            self.refused["stream that was not announced"] += 1
+            return None
+        stamps, rows = numbers(time_s), numbers(values)
+        if stamps is None or rows is None or rows.shape != (stamps.size, n_columns) or stamps.ndim != 1:
+            self.refused[f"{stream}: not rows of {n_columns} numbers"] += 1
+            return None
+        if not stamps.size:
+            return None
+        queued = self._queued[stream]
+        queued.append(Reading(stamps, rows))
+        self.received[stream] += stamps.size
+        self._n_queued[stream] += stamps.size
+        while self._n_queued[stream] > MAX_QUEUED and len(queued) > 1:
+            n = queued.pop(0).time_s.size
+            self._n_queued[stream] -= n
+            self.refused[f"{stream}: too many wait"] += n
+        finite = stamps[np.isfinite(stamps)]
+        return float(finite.max()) if finite.size else None
+
+    def take(self) -> dict[str, Reading]:
+        """Return what is queued, as one reading a stream, and empty the queue."""
+        taken = {}
+        for stream, queued in self._queued.items():
+            if queued:
+                joined = Reading(*map(np.concatenate, zip(*queued, strict=True))) if queued[1:] else queued[0]
+                taken[stream], self._queued[stream], self._n_queued[stream] = joined, [], 0
+        return taken
+
+
+class StreamHealth:
+    """Judge whether each stream comes, and keep its last values.
+
+    Parameters
+    ----------
+    channels : by stream
+
+    Examples
+    --------
+    >>> health = StreamHealth({"imu": ("gyro_z_radps",)})
+    >>> health.take({"imu": Reading(np.array([1.0]), np.array([[0.1]]))}, 1.0)
+    >>> health.health(1.2), health.health(2.0)
+    ({'imu': 'fresh'}, {'imu': 'lost'})
+    """
+
+    def __init__(self, channels: Mapping[str, Sequence[str]]) -> None:
+        self._channels = {stream: tuple(names) for stream, names in channels.items()}
+        self._last_s = dict.fromkeys(channels, math.nan)
+        self._period_s = dict.fromkeys(channels, 0.0)
+        self._values: dict[str, Array] = {}
+
+    def take(self, readings: Mapping[str, Reading], time_s: float) -> None:
+        """Note what came by a time of the robot's clock."""
+        for stream, reading in readings.items():
+            if len(reading.values):
+                step_s = (time_s - self._last_s[stream]) / len(reading.values)
+                if 0.0 < step_s < 10.0:
+                    self._period_s[stream] = step_s
+                self._last_s[stream], self._values[stream] = time_s, reading.values[-1]
+
+    def health(self, time_s: float) -> dict[str, str]:
+        """Return ``fresh``, ``not finite`` or ``lost`` by stream."""
+        health = {}
+        for stream, last_s in self._last_s.items():
+            allowed_s = max(LOST_AFTER_S, PERIODS * self._period_s[stream])
+            if not abs(time_s - last_s) <= allowed_s:  # True for NaN, and a clock that was set back
+                health[stream] = "lost"
+            else:
+                health[stream] = "fresh" if np.isfinite(self._values[stream]).all() else "not finite"
+        return health
+
+    def last(self, stream: str, channels: Sequence[str]) -> Array:
+        """Return the last values of some channels; NaN where there is none."""
+        values = self._values.get(stream)
+        known = {} if values is None else dict(zip(self._channels[stream], values, strict=True))
+        return np.array([known.get(name, math.nan) for name in channels])

@@ -3,29 +3,40 @@
 NIS nu' S^-1 nu and NEES e' P^-1 e follow a chi-square law with as many degrees of freedom as nu and e have
 entries (Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, 5.4):
 on average one a degree.  Over that, the filter is overconfident; under it, conservative.
+
+A filter's inputs come behind one low-pass (:mod:`terrain.estimation.feed`), so what it estimates is the motion behind
+that low-pass, and it is judged against the truth behind the same one: else every ramp of 1 m/s^2 would count 5 cm/s
+of known delay as an error.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.special import chdtri
 
 from terrain.angles import wrapped
 from terrain.errors import DataError
 from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise
-from terrain.records import GATED, USED, Array, StateTrack
+from terrain.kinematics.logged_wheels import true_slip, wheel_and_ground_speed
+from terrain.records import GATED, USED, Array, RunLog, StateTrack, Stream
+from terrain.robots import Robot
+from terrain.signals import low_passed
+from terrain.slip import slip_ratio
 
 OUTSIDE = 0.05
 """Probability outside the bounds, half on each side."""
 
 MOST_GATED = 0.01
 """A sensor of which a larger fraction is gated does not have the noise of the model: 0.01 % is expected."""
+
+LONGEST_STEP_S = 0.1
+"""A longer step in the truth is a gap."""
 
 
 class ConsistencyVerdict(StrEnum):
@@ -49,7 +60,6 @@ class Consistency(NamedTuple):
     mean_per_dof: float
     low: float
     high: float
-    share_outside: float
     gated_fraction: float
     verdict: ConsistencyVerdict
 
@@ -81,19 +91,18 @@ def consistency_report(track: StateTrack, truth: Array | None = None) -> Consist
     DataError
         where the shape of the truth does not fit.
     """
-    sensors = []
+    sensors, states = [], []
     for k, name in enumerate(track.sensors):
         used, gated = track.use[:, k] == USED, track.use[:, k] == GATED
         came = int(used.sum() + gated.sum())
         gated_fraction = float(gated.sum() / came) if came else 0.0
         sensors.append(_judge(name, track.nis[used, k], track.nis_dof[used, k], gated_fraction))
-    states = []
     if truth is not None:
         values = _fitting(truth, track, track.states)
         known = [state for j, state in enumerate(track.states) if np.isfinite(values[:, j]).any()]
         groups: dict[str, list[str]] = {}
-        for state in known:
-            groups.setdefault(_group_of(state), []).append(state)
+        for state in known:  # without axis, number and unit
+            groups.setdefault(re.sub(r"(_[xyz\d])?_[a-z0-9]+$", "", state), []).append(state)
         if len(groups) > 1:
             groups["all"] = known
         for name, members in groups.items():
@@ -137,6 +146,78 @@ def _fitting(truth: Array, track: StateTrack, states: Sequence[str]) -> Array:
     return values
 
 
+def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Consistency:
+    """Compare squares (n,), each of so many degrees of freedom, with chi-square."""
+    verdict = ConsistencyVerdict.OVERCONFIDENT if gated_fraction else ConsistencyVerdict.UNKNOWN
+    if not squares.size:
+        return Consistency(name, 0, 0.0, np.nan, np.nan, np.nan, gated_fraction, verdict)
+    dof = dof.astype(np.float64)
+    n_independent = _independent(squares / dof)
+    total = n_independent * dof.mean()
+    low, high = (float(chdtri(total, p)) / total for p in (1 - OUTSIDE / 2, OUTSIDE / 2))
+    mean = float(squares.sum() / dof.sum())
+    verdict = ConsistencyVerdict.CONSERVATIVE if mean < low else ConsistencyVerdict.CONSISTENT
+    if mean > high or gated_fraction > MOST_GATED:
+        verdict = ConsistencyVerdict.OVERCONFIDENT
+    return Consistency(name, squares.size, n_independent, mean, low, high, gated_fraction, verdict)
+
+
+def _independent(values: Array) -> float:
+    """Return how many independent values say as much on the mean: n over the autocorrelation time."""
+    n = values.size
+    spectrum = np.fft.rfft(values - values.mean(), 2 * n)
+    correlation = np.fft.irfft(spectrum * spectrum.conj())[:n]
+    if correlation[0] <= 0:
+        return float(n)
+    rho = correlation / correlation[0]
+    negative = np.flatnonzero(rho <= 0)
+    end = int(negative[0]) if negative.size else n
+    return float(n / max(1.0, 1 + 2 * rho[1:end].sum()))
+
+
+def innovations(
+    model: FilterModel,
+    noise: Noise,
+    track: StateTrack,
+    z: Array,
+    max_gap_s: float = FilterSettings.max_gap_s,
+    inputs: Array | None = None,
+) -> dict[str, tuple[Array, Array]]:
+    """Return by row the innovation (n,) at each instant, and the standard deviation (n,) that the filter expected of it.
+
+    That is ``z - h(x)`` and ``sqrt(diag(H P H' + R))`` with what is predicted from the instant before; NaN where
+    nothing was measured, at the first instant and after a gap.
+
+    Parameters
+    ----------
+    model, noise : the filter, and what it was run with, at the instants of the track
+    track : what it gave
+    z : (n, m) measurements at these instants
+    max_gap_s : over a longer step there is no prediction
+    inputs : (n, k) of the step up to each
+    """
+    n, d, m = len(track.time_s), len(model.states), len(model.rows)
+    value, std = np.full((2, n, m), np.nan)
+    variance = np.broadcast_to(noise.measurement_variance, (n, m))
+    known = np.zeros((n, len(model.inputs))) if inputs is None else inputs
+    walk = np.zeros((n, d)) if noise.walk_variance is None else noise.walk_variance
+    x_next, z_hat = np.zeros(d), np.zeros(m)
+    for k in range(1, n):
+        dt_s = track.time_s[k] - track.time_s[k - 1]
+        if dt_s > max_gap_s:
+            continue
+        f, h, params = np.zeros((d, d)), np.zeros((m, d)), np.append(model.params, known[k])
+        model.propagate(np.array(track.mean[k - 1]), dt_s, params, x_next, f)
+        model.observe(x_next, params, z_hat, h)
+        predicted = f @ track.cov[k - 1] @ f.T + (noise.process_variance + np.diag(walk[k])) * dt_s
+        value[k] = z[k] - z_hat
+        std[k] = np.sqrt(np.einsum("ij,jk,ik->i", h, predicted, h) + variance[k])
+    is_angle = [row in model.angle_rows for row in model.rows]
+    value[:, is_angle] = wrapped(value[:, is_angle])
+    std[np.isnan(value)] = np.nan
+    return {row: (value[:, i], std[:, i]) for i, row in enumerate(model.rows)}
+
+
 def sample_from_model(
     model: FilterModel, noise: Noise, n: int, dt_s: float, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
@@ -145,8 +226,7 @@ def sample_from_model(
     Parameters
     ----------
     model, noise : the filter; the truth starts from its initial mean and variance
-    n : number of samples
-    dt_s : their spacing
+    n, dt_s : number of samples, and their spacing
     rng : source of the noise
 
     Returns
@@ -175,120 +255,81 @@ def sample_from_model(
     return np.arange(n) * dt_s, truth, z
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Innovations:
-    """Measurement minus prediction at each instant of a track; NaN where there is none, as after a gap.
+def true_states(
+    run: RunLog, track: StateTrack, robot: Robot, time_constant_s: float, initial_yaw_rad: float = 0.0
+) -> Array | None:
+    """Return the truth (n, d) at each instant of a track, or None where the log has none.
+
+    States that the truth does not know (an effective track) are NaN, and so is what lies outside its time.
 
     Parameters
     ----------
-    time_s : (n,)
-    rows : name of each of the m measurements
-    value : (n, m)
-    std : (n, m) what the filter expected of it, ``sqrt(diag(H P H' + R))`` with the predicted P
+    run : log with the stream ``truth`` as ``terrain.simulation`` writes it
+    track : of a filter on that log
+    robot : as the filter was given it: slip speeds are those against its nominal radius
+    time_constant_s : of the low-pass on the filter's inputs
+    initial_yaw_rad : what the filter calls the heading of the start
     """
+    truth = run.streams.get("truth")
+    if truth is None:
+        return None
+    true = np.full(track.mean.shape, np.nan)
+    for j, state in enumerate(track.states):
+        values = _true_state(truth, state, robot, initial_yaw_rad)
+        if values is not None and (known := np.isfinite(values)).any():
+            time_s = truth.time_s[known]
+            smooth = low_passed(time_s, values[known], time_constant_s, LONGEST_STEP_S)
+            true[:, j] = np.interp(track.time_s, time_s, smooth, left=np.nan, right=np.nan)
+    return true
 
-    time_s: Array
-    rows: tuple[str, ...]
-    value: Array
-    std: Array
 
-    def row(self, name: str) -> tuple[Array, Array]:
-        """Return value (n,) and std (n,) of one measurement."""
-        i = self.rows.index(name)
-        return self.value[:, i], self.std[:, i]
+def _true_state(truth: Stream, state: str, robot: Robot, initial_yaw_rad: float) -> Array | None:
+    if state == "yaw_rad":
+        yaw = np.unwrap(truth.channel("yaw_rad"))
+        return np.asarray(yaw - yaw[0] + initial_yaw_rad)
+    if state in truth.channels:
+        return truth.channel(state)
+    if state in ("gyro_bias_radps", "imu_yaw_offset_rad") and "gyro_bias_z_radps" in truth.channels:
+        bias = truth.channel("gyro_bias_z_radps") - robot.completed.sensors.gyro_bias_z_radps
+        return np.asarray(bias if "bias" in state else cumulative_trapezoid(bias, truth.time_s, initial=0.0))
+    if state.startswith("slip_speed_"):
+        wheel_speed, along = wheel_and_ground_speed(truth, robot)
+        wheel = state.split("_")[2]
+        if wheel not in robot.wheels:
+            raise DataError(f"state {state!r} is of a wheel that robot {robot.name} does not have")
+        return np.asarray((wheel_speed - along)[:, robot.wheels.index(wheel)])
+    return None
 
 
-def innovations(
-    model: FilterModel,
-    noise: Noise,
-    track: StateTrack,
-    z: Array,
-    max_gap_s: float = FilterSettings.max_gap_s,
-    inputs: Array | None = None,
-) -> Innovations:
-    """Return the innovations of a track, from one step to the next.
+def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Array, Array]:
+    """Return the true slip ratio and speed over ground of each wheel, both (n, wheels), behind a low-pass.
+
+    Of slip between speeds that come behind it, this is the best that can be estimated.
 
     Parameters
     ----------
-    model, noise : of the filter that made the track
-    track : its states
-    z : (n, m) the measurements at the track's times
-    max_gap_s : of the filter: over more than that nothing was predicted
-    inputs : (n, k) of the step up to each time; zeros without
+    truth : stream as ``terrain.simulation`` writes it
+    robot : gives the nominal radius and the wheels' places
+    time_constant_s : of the low-pass on the filter's inputs
     """
-    n, d, m = len(track.time_s), len(model.states), len(model.rows)
-    value, std = np.full((2, n, m), np.nan)
-    variance = np.broadcast_to(noise.measurement_variance, (n, m))
-    known = np.zeros((n, len(model.inputs))) if inputs is None else inputs
-    walk = np.zeros((n, d)) if noise.walk_variance is None else noise.walk_variance
-    x_next, z_hat = np.zeros(d), np.zeros(m)
-    is_angle = np.array([row in model.angle_rows for row in model.rows])
-    for k in range(1, n):
-        dt_s = track.time_s[k] - track.time_s[k - 1]
-        if dt_s > max_gap_s:
-            continue
-        f, h, params = np.zeros((d, d)), np.zeros((m, d)), np.append(model.params, known[k])
-        model.propagate(np.array(track.mean[k - 1]), dt_s, params, x_next, f)
-        model.observe(x_next, params, z_hat, h)
-        predicted = f @ track.cov[k - 1] @ f.T + (noise.process_variance + np.diag(walk[k])) * dt_s
-        value[k] = z[k] - z_hat
-        std[k] = np.sqrt(np.einsum("ij,jk,ik->i", h, predicted, h) + variance[k])
-    value[:, is_angle] = wrapped(value[:, is_angle])
-    std[np.isnan(value)] = np.nan
-    return Innovations(track.time_s, model.rows, value, std)
-
-
-def _judge(name: str, squares: Array, dof: Array, gated_fraction: float) -> Consistency:
-    """Compare squares (n,), each of so many degrees of freedom, with chi-square."""
-    if not squares.size:
-        nan = float("nan")
-        return Consistency(
-            name,
-            0,
-            0.0,
-            nan,
-            nan,
-            nan,
-            nan,
-            gated_fraction,
-            ConsistencyVerdict.OVERCONFIDENT if gated_fraction else ConsistencyVerdict.UNKNOWN,
-        )
-    dof = dof.astype(np.float64)
-    n_independent = _independent(squares / dof)
-    total = n_independent * dof.mean()
-    low, high = (float(chdtri(total, p)) / total for p in (1 - OUTSIDE / 2, OUTSIDE / 2))
-    mean = float(squares.sum() / dof.sum())
-    outside = (squares < chdtri(dof, 1 - OUTSIDE / 2)) | (squares > chdtri(dof, OUTSIDE / 2))
-    verdict = ConsistencyVerdict.CONSISTENT
-    if mean > high or gated_fraction > MOST_GATED:
-        verdict = ConsistencyVerdict.OVERCONFIDENT
-    elif mean < low:
-        verdict = ConsistencyVerdict.CONSERVATIVE
-    return Consistency(
-        name, squares.size, n_independent, mean, low, high, float(outside.mean()), gated_fraction, verdict
+    wheel_speed, ground = (
+        np.column_stack([low_passed(truth.time_s, wheel, time_constant_s, LONGEST_STEP_S) for wheel in speeds.T])
+        for speeds in wheel_and_ground_speed(truth, robot)
     )
+    return slip_ratio(wheel_speed, ground), ground
 
 
-def _independent(values: Array) -> float:
-    """Return how many independent values say as much on the mean: n over the autocorrelation time."""
-    n = values.size
-    centred = values - values.mean()
-    spectrum = np.fft.rfft(centred, 2 * n)
-    correlation = np.fft.irfft(spectrum * spectrum.conj())[:n]
-    if correlation[0] <= 0:
-        return float(n)
-    rho = correlation / correlation[0]
-    negative = np.flatnonzero(rho <= 0)
-    end = int(negative[0]) if negative.size else n
-    return float(n / max(1.0, 1 + 2 * rho[1:end].sum()))
+def lagged_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:
+    """Return :func:`lagged_slip` (n, wheels) of a run behind its encoders' low-pass, at some instants."""
+    truth = run.streams["truth"]
+    slip, _ = lagged_slip(truth, robot, robot.encoder_lag_s)
+    return np.column_stack([np.interp(time_s, truth.time_s, wheel) for wheel in slip.T])
 
 
-def _group_of(state: str) -> str:
-    """Return a state's name without axis, number and unit.
-
-    Examples
-    --------
-    >>> _group_of("slip_speed_2_mps"), _group_of("yaw_rad")
-    ('slip_speed', 'yaw')
-    """
-    return re.sub(r"(_[xyz\d])?_[a-z0-9]+$", "", state)
+def true_slip_at(run: RunLog, robot: Robot, time_s: Array) -> Array:
+    """Return the true slip (n, wheels), positive in traction, from some instants on; NaN without a truth."""
+    truth = run.streams.get("truth")
+    if truth is None:
+        return np.full((len(time_s), len(robot.wheels)), np.nan)
+    at = np.clip(np.searchsorted(truth.time_s, time_s), 0, len(truth) - 1)
+    return true_slip(truth, robot.wheels)[at]

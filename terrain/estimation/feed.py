@@ -6,24 +6,16 @@ signal goes through a low-pass too, and its own lag and the filter's together ar
 
 1. calibration, gravity and the camera's axes are removed, angles are unwrapped;
 2. channels that repeat themselves to the last bit on a robot that moves are left out, and jumps;
-3. a low-pass, at each sensor's own rate;
+3. a low-pass, at each sensor's own rate (:func:`terrain.signals.low_pass_step`);
 4. at each tick the last sample at or before it, unless it is too old; the low-pass runs on to the tick with
    that sample as its input, which leaves no delay of the holding;
 5. rows that follow from others: vibration, changes of the wheels' speeds, rest; of a robot that skids the
    gyro's mean since the last tick.
 
-A whole log (:mod:`terrain.estimation.table`) and the live chain (:mod:`terrain.estimation.live`) take
-the same steps: :func:`take_sample` for each sample, :func:`take_tick` for each tick.
-
-The low-pass
-------------
-With x the samples and m the slope between two of them, dt apart, it is ``tau y' + y = x``, exact for an input
-that is straight from sample to sample: with ``a = exp(-dt/tau)``::
-
-    y_1 = x_1 - tau m + a (y_0 - x_0 + tau m)
-
-so that a ramp is delayed by tau at any rate.  (The usual ``y_1 = a y_0 + (1 - a) x_1`` falls short of it by
-half a step: 10 ms at 50 Hz.)
+A whole log (:func:`measurement_table`) is :func:`take_sample` and :func:`take_tick`, looped over what is left of it
+after samples that cannot be true are left out and counted; the live chain (:mod:`terrain.estimation.live`) takes the
+same steps.  What looks ahead in a log is the cleaning, the median periods and, unless ``causal``, latencies, the yaw
+at the start and the origin of positions.
 
 Rows that follow from others
 ----------------------------
@@ -51,20 +43,28 @@ it.
 
 from __future__ import annotations
 
+import cmath
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.kernels import filled, njit, record
+from terrain.errors import ConfigError, DataError
+from terrain.kernels import filled, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE
+from terrain.kinematics.wheels import no_slip_twist, point_velocity
+from terrain.logs.samples import longest_rise
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS
-from terrain.records import Array
+from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
+from terrain.signals import low_pass_step
 
 TICK_S = 1e-9
 """Stamps that differ by less are the same instant, rounded differently by two clocks."""
@@ -119,7 +119,7 @@ STANDING_SPEED_MPS = 0.05
 GNSS_LATENCY_S = 0.1
 """Age of a position when it arrives; assumed, as in the simulated receiver."""
 
-GNSS_STD_M = {True: 0.02, False: 0.5}
+FIX_STD_M, FLOAT_STD_M = 0.02, 0.5
 """Position's standard deviation with a fix (RTK, thesis 5.1.1) and with a float solution (assumed)."""
 
 GNSS_SPEED_STD_MPS = 0.03
@@ -208,163 +208,114 @@ N_CHANNELS = max(map(len, STREAMS.values()))
 NOISY = {"imu": slice(0, 6), "odometry": slice(3, 13)}
 """Channels that never repeat themselves all at once, of streams that are left out where they do."""
 
+FROZEN_S = 0.25
+"""Noise of a log that repeats exactly for so long is none: 50 samples of the camera, 25 of the IMU."""
+
+OFF_CLOCK_S = 1.0
+"""A sample that is further from every tick is of no use to anyone: its clock jumped."""
+
+HEADING_SPEED_MPS = 0.2
+"""Slower, a course is noise."""
+
+MAX_HEADING_STD_RAD = 0.05
+"""A heading that is known no better is not known: at 1 m/s it would be 5 cm/s of sideways speed."""
+
 CAMERA_ROWS = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
 GNSS_ROWS = ("gnss_position_x_m", "gnss_position_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps")
-DERIVED_ROWS = (
-    "vibration_mps2",
-    *(f"wheel_{i}_growth_per_s" for i in (1, 2, 3)),
-    *(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)),
-    "camera_age_s",
-    *("rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
-)
 SIDE_ROWS = ("wheel_left_mps", "wheel_right_mps")
 REST_ROW = "rest_gyro_radps"
-ROWS = (
-    *(f"wheel_{i}_radps" for i in (1, 2, 3)),
-    "accel_x_mps2",
-    "accel_y_mps2",
-    "gyro_z_radps",
-    "imu_yaw_rad",
-    *(f"steer_{i}_rad" for i in (1, 2, 3)),
-    *CAMERA_ROWS,
-    *GNSS_ROWS,
-    *DERIVED_ROWS,
-    *SIDE_ROWS,
-    REST_ROW,
-)
+_ROWS = {
+    "wheel_radps": tuple(f"wheel_{i}_radps" for i in (1, 2, 3)),
+    "accel_mps2": ("accel_x_mps2", "accel_y_mps2"),
+    "gyro_z_radps": ("gyro_z_radps",),
+    "imu_yaw_rad": ("imu_yaw_rad",),
+    "steer_rad": tuple(f"steer_{i}_rad" for i in (1, 2, 3)),
+    "camera_speed_mps": CAMERA_ROWS[:2],
+    "camera_yaw_rate_radps": CAMERA_ROWS[2:3],
+    "camera_yaw_rad": CAMERA_ROWS[3:],
+    "gnss_position_m": GNSS_ROWS[:2],
+    "gnss_speed_mps": GNSS_ROWS[2:],
+    "vibration_mps2": ("vibration_mps2",),
+    "growth_per_s": tuple(f"wheel_{i}_growth_per_s" for i in (1, 2, 3)),
+    "change_m2ps3": tuple(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)),
+    "camera_age_s": ("camera_age_s",),
+    "rest_twist": ("rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
+    "side_mps": SIDE_ROWS,
+    "rest_gyro_radps": (REST_ROW,),
+}
+ROWS = tuple(name for names in _ROWS.values() for name in names)
 """Names of all numbers of a :data:`ROW`, in its order."""
 
+DERIVED_ROWS = ROWS[ROWS.index("vibration_mps2") : ROWS.index(SIDE_ROWS[0])]
 _SIDES = (*SIDE_ROWS, "gyro_z_radps", *GNSS_ROWS, REST_ROW)
-ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {
-    "swerve": ROWS[:-3],
-    "skid_steer": _SIDES,
-    "tracked": _SIDES,
-}
+ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {"swerve": ROWS[:-3], "skid_steer": _SIDES, "tracked": _SIDES}
 """Rows that a drive measures, of a swerve robot in the order of (6.3).
 
 Positions and GNSS speeds are in the world frame, east and north from where the antenna first was; yaw counts
 from east once the heading at the start is given; all else is in body axes."""
 
-_SIGNALS = {
-    "steer_rad": "steering",
-    "accel_mps2": "imu",
-    "gyro_z_radps": "imu",
-    "imu_yaw_rad": "imu",
-    "tilt_rad": "imu",
-    "camera_speed_mps": "odometry",
-    "camera_yaw_rate_radps": "odometry",
-    "camera_yaw_rad": "odometry",
-    "gnss_position_m": "gnss",
-    "gnss_speed_mps": "gnss",
-}
-"""What is behind a low-pass and held, by the stream that measures it."""
 
-_SIZES = {
-    "steer_rad": 3,
-    **dict.fromkeys(("accel_mps2", "tilt_rad", "camera_speed_mps", "gnss_position_m", "gnss_speed_mps"), 2),
-}
+def _sized(kind: Any, n: int) -> Any:
+    return kind if n == 1 else (kind, n)
 
-ROW = record(
-    {
-        "wheel_radps": (float, 3),
-        "accel_mps2": (float, 2),
-        "gyro_z_radps": float,
-        "imu_yaw_rad": float,
-        "steer_rad": (float, 3),
-        "camera_speed_mps": (float, 2),
-        "camera_yaw_rate_radps": float,
-        "camera_yaw_rad": float,
-        "gnss_position_m": (float, 2),
-        "gnss_speed_mps": (float, 2),
-        "vibration_mps2": float,
-        "growth_per_s": (float, 3),
-        "change_m2ps3": (float, 3),
-        "camera_age_s": float,
-        "rest_twist": (float, 3),
-        "side_mps": (float, 2),
-        "rest_gyro_radps": float,
-        "gnss_variance": (float, 4),
-    }
-)
+
+ROW = record({name: _sized(float, len(names)) for name, names in _ROWS.items()} | {"gnss_variance": (float, 4)})
 """What is measured at a tick, NaN where nothing is: the numbers of :data:`ROWS`, and the variances of
 :data:`GNSS_ROWS`."""
 
-LIMIT = record(
-    {
-        **dict.fromkeys(("time_constant_s", "gap_s", "age_s", "jump", "jump_per_s"), float),
-        "once": bool,
-        "policy": int,
-    }
-)
+_SIGNALS = {
+    "steer_rad": "steering",
+    **dict.fromkeys(("accel_mps2", "gyro_z_radps", "imu_yaw_rad", "tilt_rad"), "imu"),
+    **dict.fromkeys(("camera_speed_mps", "camera_yaw_rate_radps", "camera_yaw_rad"), "odometry"),
+    **dict.fromkeys(("gnss_position_m", "gnss_speed_mps"), "gnss"),
+}
+"""What is behind a low-pass and held, by the stream that measures it; of the tilt jumps are seen only."""
+
+LIMIT = record(numbers("time_constant_s gap_s age_s jump jump_per_s") | {"once": bool, "policy": int})
 """What is constant of a signal: low-pass, longest step, oldest value, the largest change between two samples
 (a constant, and a part per second), whether a sample is given at one tick only, and what becomes of a jump."""
 
 LINE = record(
-    {
-        **dict.fromkeys(("value", "instant_s", "came_s", "low_passed"), float),
-        "was_given": bool,
-        **dict.fromkeys(("judged", "judged_s", "jumping_s"), float),
-        **dict.fromkeys(("raw", "raw_s", "jumped_by", "jumped_s"), float),
-        "is_followed": bool,
-    }
+    numbers("value instant_s came_s low_passed judged judged_s jumping_s raw raw_s jumped_by jumped_s")
+    | {"was_given": bool, "is_followed": bool}
 )
 """Memory of a signal: value, instant, arrival and low-pass output of the last sample, whether it was given at a
 tick; value and instant that jumps are judged against, since when values have been jumping; and of a signal
 that is not passing the last sample, taken or not, its instant, the sum of its jumps, since when that is not 0,
 and whether a sample before it is known to be right."""
 
-CHANNEL = record({**dict.fromkeys(("last", "repeated", "longest"), float), "began_in_motion": bool})
+CHANNEL = record(numbers("last repeated longest") | {"began_in_motion": bool})
 """Of a channel that may freeze: last value, number of repetitions, longest run, and whether this one began in
 motion."""
 
-TURN = record({"last_rad": float, "turned_rad": float})
-"""Of an unwrapped angle the last one, and the turns so far."""
-
-AVERAGE = record({"sum": float, "n": int, "mean": float})
+_TURN = record(numbers("last_rad turned_rad"))  # of an unwrapped angle the last one, and the turns so far
+_AVERAGE = record({"sum": float, "n": int, "mean": float})
+_SIZES = {name: len(_ROWS.get(name, "xy")) for name in _SIGNALS}
 
 SETTINGS = record(
-    {
-        **{name: (LIMIT, _SIZES.get(name, ())) for name in _SIGNALS},
-        "latency_s": (float, len(STREAMS)),
-        "is_steered": bool,
-        **dict.fromkeys(("reduction_ratio", "fastest_radps", "wheel_radius_m", "initial_yaw_rad"), float),
-        "steering_zeros_rad": (float, 3),
-        "gyro_bias_radps": float,
-        **dict.fromkeys(("accel_bias_mps2", "accel_scale_ratio"), (float, 3)),
-    }
+    {name: _sized(LIMIT, n) for name, n in _SIZES.items()}
+    | {"latency_s": (float, len(STREAMS)), "is_steered": bool}
+    | numbers("reduction_ratio fastest_radps wheel_radius_m initial_yaw_rad gyro_bias_radps")
+    | dict.fromkeys(("steering_zeros_rad", "accel_bias_mps2", "accel_scale_ratio"), (float, 3))
 )
 """What is constant of a robot's feed."""
 
+_CHANNELS = {"imu_channels": 9, "camera_channels": 14, "speed_channels": 2, "wheel_channels": 3}
+COUNTS = ("not_finite", "frozen", "low_confidence", "no_rotation", "jump")
 FEED = record(
-    {
-        **{name: (LINE, _SIZES.get(name, ())) for name in _SIGNALS},
-        "steer_turns": (TURN, 3),
-        **dict.fromkeys(("imu_turns", "camera_turns"), TURN),
-        "camera_yaw_0_rad": float,
-        "imu_channels": (CHANNEL, 9),
-        "camera_channels": (CHANNEL, 14),
-        "speed_channels": (CHANNEL, 2),
-        "wheel_channels": (CHANNEL, 3),
-        "before": (float, (2, N_CHANNELS)),
-        "last_s": (float, len(STREAMS)),
-        "gnss_origin_m": (float, 2),
-        "gnss_variance": float,
-        **dict.fromkeys(("vibration_square", "vibration_s", "tick_s", "rest_since_s", "camera_s"), float),
-        **dict.fromkeys(("wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3"), (float, 3)),
-        **dict.fromkeys(("rate_received_s", "steer_received_s"), (float, 3)),
-        "start_s": float,
-        "has_moved": bool,
-        "camera_has_started": bool,
-        "camera_offset_rad": float,
-        **dict.fromkeys(("imu_yaw_start", "camera_yaw_start"), AVERAGE),
-        **dict.fromkeys(("gyro_angle_rad", "gyro_time_s"), float),
-        **dict.fromkeys(("standing_s", "gyro_low_radps", "gyro_high_radps", "gyro_sum_radps"), float),
-        "n_gyro": int,
-        **dict.fromkeys(
-            ("not_finite", "frozen", "low_confidence", "no_rotation", "jump"), (int, len(STREAMS))
-        ),
-        **dict.fromkeys(("wheels_not_finite", "wheels_beyond"), int),
-    }
+    {name: _sized(LINE, n) for name, n in _SIZES.items()}
+    | {"steer_turns": (_TURN, 3), "imu_turns": _TURN, "camera_turns": _TURN, "camera_yaw_0_rad": float}
+    | {name: (CHANNEL, n) for name, n in _CHANNELS.items()}
+    | {"before": (float, (2, N_CHANNELS)), "last_s": (float, len(STREAMS))}
+    | {"gnss_origin_m": (float, 2), "gnss_variance": float}
+    | numbers("vibration_square vibration_s tick_s rest_since_s camera_s")
+    | dict.fromkeys(("wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3"), (float, 3))
+    | dict.fromkeys(("rate_received_s", "steer_received_s"), (float, 3))
+    | {"start_s": float, "has_moved": bool, "camera_has_started": bool, "camera_offset_rad": float}
+    | {"imu_yaw_start": _AVERAGE, "camera_yaw_start": _AVERAGE}
+    | numbers("gyro_angle_rad gyro_time_s standing_s gyro_low_radps gyro_high_radps gyro_sum_radps")
+    | {"n_gyro": int, "wheels_not_finite": int, "wheels_beyond": int}
+    | dict.fromkeys(COUNTS, (int, len(STREAMS)))
 )
 """All that is remembered of the samples: a copy is a snapshot.
 
@@ -373,32 +324,39 @@ stream the last stamp taken; positions' origin and variance; what the derived ro
 measured by last; the yaw at the start; the gyro since the last tick, and at rest; and counts of what was left
 out."""
 
-_kernel = njit(error_model="numpy")
+_kernel = njit(cache=True, error_model="numpy")
 
 
 def feed_settings(
     robot: Robot,
-    initial_yaw_rad: float,
-    latency_s: Sequence[float],
-    lag_s: Mapping[str, float],
     period_s: Mapping[str, float],
-    tick_s: float,
+    initial_yaw_rad: float,
+    gnss_latency_s: float,
+    time_constant_s: float | None = None,
 ) -> Array:
-    """Return what is constant of a robot's feed.
+    """Return what is constant of a robot's feed, with neutral values for what it does not have.
 
     Parameters
     ----------
-    robot : neutral values stand for what it does not have
+    robot : gives calibration, latencies and lags
+    period_s : of the wheels, and of each stream that comes
     initial_yaw_rad : heading of the start
-    latency_s : of each of :data:`STREAMS`
-    lag_s, period_s : time constant of the low-pass on each stream, and its period; NaN without one
-    tick_s : period of the wheels
+    gnss_latency_s : age of a position when it arrives
+    time_constant_s : of the low-pass on all but the wheels; by default what each sensor lacks to the encoders'
+
+    Raises
+    ------
+    ConfigError
+        if a time constant or a latency is out of range.
     """
-    motors, sensors = robot.completed.motors, robot.completed.sensors
+    for name, value in (("time_constant_s", time_constant_s), ("gnss_latency_s", gnss_latency_s)):
+        if value is not None and not 0 <= value < np.inf:
+            raise ConfigError(f"{name} is {value:g}, a time from zero up is required")
+    motors, sensors, camera = robot.completed.motors, robot.completed.sensors, robot.completed.camera
     zeros = robot.steering_zeros_rad.tolist()
     settings = filled(
         SETTINGS,
-        latency_s=latency_s,
+        latency_s=[0.0, sensors.imu_latency_s, camera.latency_s, gnss_latency_s],
         is_steered=robot.steered,
         reduction_ratio=motors.reduction_ratio,
         fastest_radps=MAX_RATE_FACTOR * motors.speed_max_radps,
@@ -409,14 +367,14 @@ def feed_settings(
         accel_bias_mps2=[getattr(sensors, f"accel_bias_{axis}_mps2") for axis in "xyz"],
         accel_scale_ratio=[getattr(sensors, f"accel_scale_{axis}_ratio") for axis in "xyz"],
     )
+    lag_s = dict.fromkeys(STREAMS, robot.encoder_lag_s if time_constant_s is None else time_constant_s)
+    if robot.describes("camera") and time_constant_s is None:
+        lag_s["odometry"] = max(robot.encoder_lag_s - camera.time_constant_s, 0.0)
     for name, stream in _SIGNALS.items():
         judged = robot.steered or name in ("gyro_z_radps", "tilt_rad")
         jump = JUMPS.get(name, NO_JUMP) if judged else NO_JUMP
-        period = period_s.get(stream, math.nan)
-        if name == "tilt_rad":
-            settings[name] = signal_limits(0.0, 0.02, 0.0, jump)
-        else:
-            settings[name] = signal_limits(lag_s.get(stream, 0.0), period, tick_s, jump)
+        limits = lag_s[stream], period_s.get(stream, math.nan), period_s["wheels"]
+        settings[name] = signal_limits(*((0.0, 0.02, 0.0) if name == "tilt_rad" else limits), jump)
     return settings
 
 
@@ -449,7 +407,7 @@ def new_feed() -> Array:
         FEED, np.nan, last_s=-np.inf, rate_received_s=-np.inf, steer_received_s=-np.inf, camera_offset_rad=0.0
     )
     feed["gyro_angle_rad"] = feed["gyro_time_s"] = 0.0
-    for name in ("imu_channels", "camera_channels", "speed_channels", "wheel_channels"):
+    for name in _CHANNELS:
         feed[name]["repeated"] = feed[name]["longest"] = 0.0
     for name in ("imu_yaw_start", "camera_yaw_start"):
         feed[name] = 0
@@ -457,18 +415,10 @@ def new_feed() -> Array:
 
 
 @_kernel
-def low_pass_step(value: float, before: float, smooth: float, step_s: float, time_constant_s: float) -> float:
-    """Return y_1 of the equation above: from x_0 = ``before`` and y_0 = ``smooth`` to x_1 = ``value``."""
-    lead = time_constant_s * (value - before) / step_s
-    return value - lead + math.exp(-step_s / time_constant_s) * (smooth - before + lead)
-
-
-@_kernel
 def sum_of_jumps(value: float, instant_s: float, line: Any, limit: Any) -> float:
     """Return the sum of a signal's jumps: 0 after one that jumped back, and for a latched one after a gap."""
-    step_s, change = instant_s - line.raw_s, value - line.raw
+    step_s, change, before = instant_s - line.raw_s, value - line.raw, line.jumped_by
     line.raw, line.raw_s = value, instant_s
-    before = line.jumped_by
     if math.isnan(step_s) or (limit.policy == LATCHED and step_s > limit.gap_s):
         line.jumped_by, line.is_followed = 0.0, False
     else:
@@ -532,7 +482,7 @@ def repeats(channel: Any, most: float) -> bool:
 
 
 @_kernel
-def mask_frozen(sample: Array, most: Array, moving: bool, channels: Any) -> Array:
+def _mask_frozen(sample: Array, most: Array, moving: bool, channels: Any) -> Array:
     """Return a sample (c,) with NaN where a channel is frozen, and count its repetitions."""
     masked = sample.copy()
     for c in range(most.size):
@@ -569,9 +519,7 @@ def _unwrap(angle_rad: float, turn: Any) -> float:
         turn.turned_rad = 0.0
     elif abs(step) >= np.pi:
         short = (step + np.pi) % (2 * np.pi) - np.pi
-        if short == -np.pi and step > 0:
-            short = np.pi
-        turn.turned_rad += short - step
+        turn.turned_rad += (np.pi if short == -np.pi and step > 0 else short) - step
     turn.last_rad = angle_rad
     return float(angle_rad + turn.turned_rad)
 
@@ -587,58 +535,42 @@ def _take_steering(sample: Array, came_s: float, settings: Any, feed: Any) -> bo
 
 
 @_kernel
-def _take_gyro(gyro_radps: float, instant_s: float, came_s: float, settings: Any, feed: Any) -> bool:
-    """Take the yaw rate, and add it to the angle since the last tick."""
-    before_s, before_radps = feed.gyro_z_radps.instant_s, feed.gyro_z_radps.low_passed
-    if take(gyro_radps, instant_s, came_s, feed.gyro_z_radps, settings.gyro_z_radps):
-        return True
-    step_s = feed.gyro_z_radps.instant_s - before_s
-    if 0.0 < step_s <= settings.gyro_z_radps.gap_s:
-        feed.gyro_angle_rad += 0.5 * (before_radps + feed.gyro_z_radps.low_passed) * step_s
-        feed.gyro_time_s += step_s
-    return False
-
-
-@_kernel
-def _take_vibration(accel_z_mps2: float, instant_s: float, feed: Any) -> None:
-    """Take the vertical acceleration of an IMU sample, without gravity, into the mean square."""
-    if math.isnan(accel_z_mps2):
-        return
-    step_s = instant_s - feed.vibration_s
-    feed.vibration_s = instant_s
-    square = accel_z_mps2 * accel_z_mps2
-    if not step_s > 0.0 or math.isnan(feed.vibration_square):
-        feed.vibration_square = square
-        return
-    feed.vibration_square += (square - feed.vibration_square) * -math.expm1(-step_s / VIBRATION_S)
-
-
-@_kernel
 def _take_imu(sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any) -> bool:
-    """Calibrated yaw rate, acceleration of the body without gravity, and yaw.
+    """Calibrated yaw rate, acceleration of the body without gravity, yaw, and mean square of the vibration.
 
     A sample is ``scale * truth + bias``.  The specific force at rest is g times the world's vertical in body
     axes, ``g (-sin pitch, sin roll cos pitch, cos roll cos pitch)``: with the nose up (pitch negative) it
     points forward too, with the left side up (roll positive) to the left.
     """
-    gyro_z = sample[2]
-    roll, pitch, yaw = sample[6], sample[7], sample[8]
+    roll, pitch = sample[6], sample[7]
     for i in range(2):
         if not math.isnan(sample[6 + i]):
-            line, limit = feed.tilt_rad[i], settings.tilt_rad[i]
-            if sum_of_jumps(sample[6 + i], instant_s, line, limit) != 0.0:
+            if sum_of_jumps(sample[6 + i], instant_s, feed.tilt_rad[i], settings.tilt_rad[i]) != 0.0:
                 roll = pitch = np.nan
-    bias, scale = settings.accel_bias_mps2, settings.accel_scale_ratio
-    accel_x = (sample[3] - bias[0]) / scale[0] + GRAVITY_MPS2 * math.sin(pitch)
-    level_y = GRAVITY_MPS2 * math.sin(roll) * math.cos(pitch)
-    accel_y = (sample[4] - bias[1]) / scale[1] - level_y
-    jumped = take(accel_x, instant_s, came_s, feed.accel_mps2[0], settings.accel_mps2[0])
-    jumped |= take(accel_y, instant_s, came_s, feed.accel_mps2[1], settings.accel_mps2[1])
-    jumped |= _take_gyro(gyro_z - settings.gyro_bias_radps, instant_s, came_s, settings, feed)
-    yaw = _unwrap(yaw, feed.imu_turns)
+    level_x, level_y = -GRAVITY_MPS2 * math.sin(pitch), GRAVITY_MPS2 * math.sin(roll) * math.cos(pitch)
+    bias, scale, jumped = settings.accel_bias_mps2, settings.accel_scale_ratio, False
+    for i, level in ((0, level_x), (1, level_y)):
+        accel = (sample[3 + i] - bias[i]) / scale[i] - level
+        jumped |= take(accel, instant_s, came_s, feed.accel_mps2[i], settings.accel_mps2[i])
+    gyro, limit = feed.gyro_z_radps, settings.gyro_z_radps
+    before_s, before_radps = gyro.instant_s, gyro.low_passed
+    if take(sample[2] - settings.gyro_bias_radps, instant_s, came_s, gyro, limit):
+        jumped = True
+    else:  # the angle since the last tick
+        step_s = gyro.instant_s - before_s
+        if 0.0 < step_s <= limit.gap_s:
+            feed.gyro_angle_rad += 0.5 * (before_radps + gyro.low_passed) * step_s
+            feed.gyro_time_s += step_s
+    yaw = _unwrap(sample[8], feed.imu_turns)
     jumped |= take(yaw, instant_s, came_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
-    level_z = GRAVITY_MPS2 * math.cos(roll) * math.cos(pitch)
-    _take_vibration((sample[5] - bias[2]) / scale[2] - level_z, instant_s, feed)
+    accel = (sample[5] - bias[2]) / scale[2] - GRAVITY_MPS2 * math.cos(roll) * math.cos(pitch)
+    if not math.isnan(accel):
+        step_s, square = instant_s - feed.vibration_s, accel * accel
+        feed.vibration_s = instant_s
+        if not step_s > 0.0 or math.isnan(feed.vibration_square):
+            feed.vibration_square = square
+        else:
+            feed.vibration_square += (square - feed.vibration_square) * -math.expm1(-step_s / VIBRATION_S)
     return bool(jumped)
 
 
@@ -661,22 +593,17 @@ def _take_odometry(
     yaw = _unwrap(math.atan2(r_10, r_00), feed.camera_turns)
     if math.isnan(feed.camera_yaw_0_rad):
         feed.camera_yaw_0_rad = yaw
-    speed_x = r_00 * v_x + r_10 * v_y + r_20 * v_z
-    speed_y = r_01 * v_x + r_11 * v_y + r_21 * v_z
-    speed = mask_frozen(np.array([speed_x, speed_y]), REPEATED_SPEED, moving, feed.speed_channels)
-    turned_by = feed.camera_yaw_rad.jumped_by
-    yaw -= feed.camera_yaw_0_rad
-    jumped = take(yaw, instant_s, came_s, feed.camera_yaw_rad, settings.camera_yaw_rad)
-    turned = (
-        feed.camera_yaw_rad.jumped_by != turned_by
-    )  # that turns the speeds: they have not jumped themselves
+    along, left = r_00 * v_x + r_10 * v_y + r_20 * v_z, r_01 * v_x + r_11 * v_y + r_21 * v_z
+    speed = _mask_frozen(np.array([along, left]), REPEATED_SPEED, moving, feed.speed_channels)
+    line, turned_by = feed.camera_yaw_rad, feed.camera_yaw_rad.jumped_by
+    jumped = take(yaw - feed.camera_yaw_0_rad, instant_s, came_s, line, settings.camera_yaw_rad)
+    turned = line.jumped_by != turned_by  # that turns the speeds: they have not jumped themselves
     for i in range(2):
-        line = feed.camera_speed_mps[i]
         if turned:
-            line.raw = speed[i]
-        jumped |= take(speed[i], instant_s, came_s, line, settings.camera_speed_mps[i])
-    line, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
-    jumped |= take(sample[11], instant_s, came_s, line, limit)
+            feed.camera_speed_mps[i].raw = speed[i]
+        jumped |= take(speed[i], instant_s, came_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
+    rate, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
+    jumped |= take(sample[11], instant_s, came_s, rate, limit)
     return bool(jumped)
 
 
@@ -685,19 +612,16 @@ def _take_gnss(sample: Array, instant_s: float, came_s: float, settings: Any, fe
     """Position from the origin, by default the first one, and speed; the position's variance is kept."""
     std = sample[4]
     if not std > 0.0:
-        std = _FIX_STD_M if sample[5] >= 0.5 else _FLOAT_STD_M
-    if not (math.isnan(sample[0]) or math.isnan(sample[1])):
-        if math.isnan(feed.gnss_origin_m[0]):
-            feed.gnss_origin_m[0], feed.gnss_origin_m[1] = sample[0], sample[1]
+        std = FIX_STD_M if sample[5] >= 0.5 else FLOAT_STD_M
+    known = not (math.isnan(sample[0]) or math.isnan(sample[1]))
+    if known and math.isnan(feed.gnss_origin_m[0]):
+        feed.gnss_origin_m[0], feed.gnss_origin_m[1] = sample[0], sample[1]
+    if known:
         feed.gnss_variance = std * std
-        for i in range(2):
-            value = sample[i] - feed.gnss_origin_m[i]
-            take(value, instant_s, came_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
     for i in range(2):
+        place = sample[i] - feed.gnss_origin_m[i] if known else np.nan
+        take(place, instant_s, came_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
         take(sample[2 + i], instant_s, came_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
-
-
-_FIX_STD_M, _FLOAT_STD_M = GNSS_STD_M[True], GNSS_STD_M[False]
 
 
 @_kernel
@@ -709,10 +633,10 @@ def take_sample(
     if stream == STEERING:
         jumped = _take_steering(sample, came_s, settings, feed)
     elif stream == IMU:
-        sample = mask_frozen(sample, REPEATED_IMU, moving, feed.imu_channels)
+        sample = _mask_frozen(sample, REPEATED_IMU, moving, feed.imu_channels)
         jumped = _take_imu(sample, instant_s, came_s, settings, feed)
     elif stream == ODOMETRY:
-        sample = mask_frozen(sample, REPEATED_CAMERA, moving, feed.camera_channels)
+        sample = _mask_frozen(sample, REPEATED_CAMERA, moving, feed.camera_channels)
         jumped = _take_odometry(sample, instant_s, came_s, settings, feed, moving)
     else:
         _take_gnss(sample, instant_s, came_s, settings, feed)
@@ -728,7 +652,7 @@ def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
         row.side_mps[0], row.side_mps[1] = wheels[0], wheels[1]
         return
     moving, lively, finite, beyond = is_moving(feed), False, True, False
-    mask_frozen(wheels, REPEATED_WHEELS, moving, feed.wheel_channels)
+    _mask_frozen(wheels, REPEATED_WHEELS, moving, feed.wheel_channels)
     for i in range(3):
         lively |= feed.wheel_channels[i].repeated <= LIVELY
     for i in range(3):
@@ -753,7 +677,7 @@ def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     keep = math.exp(-step_s / CHANGE_S) if step_s > 0.0 else 0.0
     if not math.isnan(row.camera_speed_mps[0]):
         feed.camera_s = time_s
-    unseen = not time_s - feed.camera_s <= UNSEEN_AFTER_S
+    row.camera_age_s = time_s - feed.camera_s
     for i in range(3):
         speed = row.wheel_radps[i] * settings.wheel_radius_m
         once, twice = feed.wheel_once_mps[i], feed.wheel_twice_mps[i]
@@ -761,10 +685,10 @@ def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
         rise = once - twice
         change = twice * math.copysign(max(abs(rise) - WAVERING_MPS, 0.0), rise) / CHANGE_S
         row.growth_per_s[i] = change / (twice * twice + CRAWL_MPS * CRAWL_MPS)
-        ahead = max(abs(speed - once) - RIPPLE_MPS, 0.0)
-        change = (abs(speed) + CRAWL_MPS) * ahead / CHANGE_S
+        change = (abs(speed) + CRAWL_MPS) * max(abs(speed - once) - RIPPLE_MPS, 0.0) / CHANGE_S
         held = feed.wheel_change_m2ps3[i] * math.exp(-step_s / HELD_S) if step_s > 0.0 else np.nan
         feed.wheel_change_m2ps3[i] = change if math.isnan(held) or change > held else held
+        unseen = not row.camera_age_s <= UNSEEN_AFTER_S
         row.change_m2ps3[i] = feed.wheel_change_m2ps3[i] if unseen else change
         if math.isnan(once) or not step_s > 0.0:
             feed.wheel_once_mps[i] = feed.wheel_twice_mps[i] = speed
@@ -779,7 +703,6 @@ def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
         feed.rest_since_s = np.nan
     elif math.isnan(feed.rest_since_s):
         feed.rest_since_s = time_s
-    row.camera_age_s = time_s - feed.camera_s
     rests = time_s - feed.rest_since_s >= REST_AFTER_S
     for i in range(3):
         row.rest_twist[i] = 0.0 if rests else np.nan
@@ -794,11 +717,7 @@ def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
 def rest_at(time_s: float, left_mps: float, right_mps: float, gyro_radps: float, feed: Any) -> float:
     """Return the mean of the gyro over the last :data:`REST_S` at rest, once for each such time; else NaN.
 
-    Parameters
-    ----------
-    time_s : increasing; a stamp that was set back starts anew
-    left_mps, right_mps, gyro_radps : measurements, NaN where there is none
-    feed : memory, which is moved
+    A stamp that was set back starts anew; measurements are NaN where there is none.
     """
     stands = abs(left_mps) < STANDING_MPS and abs(right_mps) < STANDING_MPS
     if not (stands and abs(gyro_radps) < MAX_READING_RADPS):
@@ -825,40 +744,36 @@ def take_tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) 
 
     ``wheels`` are the rates (3,) of the motors, or the speeds (2,) of the sides.
     """
+    row.side_mps[0] = row.side_mps[1] = row.rest_gyro_radps = np.nan
     _take_wheels(wheels, settings, feed, row)
+    for i in range(3):
+        row.steer_rad[i] = at_tick(time_s, feed.steer_rad[i], settings.steer_rad[i])
+        if not math.isnan(row.wheel_radps[i]):
+            feed.rate_received_s[i] = time_s
+        if not math.isnan(row.steer_rad[i]):
+            feed.steer_received_s[i] = time_s
     for i in range(2):
         row.accel_mps2[i] = at_tick(time_s, feed.accel_mps2[i], settings.accel_mps2[i])
         row.camera_speed_mps[i] = at_tick(time_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
         row.gnss_position_m[i] = at_tick(time_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
         row.gnss_speed_mps[i] = at_tick(time_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
-        unknown = math.isnan(row.gnss_position_m[i])
-        row.gnss_variance[i] = np.nan if unknown else feed.gnss_variance
+        row.gnss_variance[i] = np.nan if math.isnan(row.gnss_position_m[i]) else feed.gnss_variance
         row.gnss_variance[2 + i] = np.nan if math.isnan(row.gnss_speed_mps[i]) else GNSS_SPEED_STD_MPS**2
-    for i in range(3):
-        row.steer_rad[i] = at_tick(time_s, feed.steer_rad[i], settings.steer_rad[i])
     row.gyro_z_radps = at_tick(time_s, feed.gyro_z_radps, settings.gyro_z_radps)
     row.imu_yaw_rad = at_tick(time_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
     line, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
     row.camera_yaw_rate_radps = at_tick(time_s, line, limit)
     row.camera_yaw_rad = at_tick(time_s, feed.camera_yaw_rad, settings.camera_yaw_rad)
-    row.rest_gyro_radps = np.nan
-    if settings.is_steered:
-        row.side_mps[0] = row.side_mps[1] = np.nan
-    elif not math.isnan(row.gyro_z_radps) and feed.gyro_time_s > 0.0:
+    if not settings.is_steered and not math.isnan(row.gyro_z_radps) and feed.gyro_time_s > 0.0:
         row.gyro_z_radps = feed.gyro_angle_rad / feed.gyro_time_s
     feed.gyro_angle_rad = feed.gyro_time_s = 0.0
     _derive(time_s, settings, feed, row)
     if not settings.is_steered:
         row.rest_gyro_radps = rest_at(time_s, row.side_mps[0], row.side_mps[1], row.gyro_z_radps, feed)
-    for i in range(3):
-        if not math.isnan(row.wheel_radps[i]):
-            feed.rate_received_s[i] = time_s
-        if not math.isnan(row.steer_rad[i]):
-            feed.steer_received_s[i] = time_s
 
 
 @_kernel
-def average_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
+def _average_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     """Take a tick into the averages of the yaw rows at the start."""
     if math.isnan(feed.start_s):
         feed.start_s = time_s
@@ -867,20 +782,18 @@ def average_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     for i in range(3):
         if abs(row.wheel_radps[i] * settings.wheel_radius_m) > STANDING_SPEED_MPS:
             feed.has_moved = True
-    _average(row.imu_yaw_rad, feed.has_moved, feed.imu_yaw_start)
-    _average(row.camera_yaw_rad, feed.has_moved, feed.camera_yaw_start)
+    for yaw_rad, average in (
+        (row.imu_yaw_rad, feed.imu_yaw_start),
+        (row.camera_yaw_rad, feed.camera_yaw_start),
+    ):
+        if not math.isnan(yaw_rad) and (not feed.has_moved or average.n == 0):
+            average.sum += yaw_rad
+            average.n += 1
+            average.mean = average.sum / average.n
 
 
 @_kernel
-def _average(yaw_rad: float, has_moved: bool, average: Any) -> None:
-    if not math.isnan(yaw_rad) and (not has_moved or average.n == 0):
-        average.sum += yaw_rad
-        average.n += 1
-        average.mean = average.sum / average.n
-
-
-@_kernel
-def refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
+def _refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     """Count the yaw rows of a tick from the averages."""
     initial = settings.initial_yaw_rad
     row.imu_yaw_rad = imu = row.imu_yaw_rad - feed.imu_yaw_start.mean + initial
@@ -898,44 +811,29 @@ def refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
 
 
 @_kernel
-def _repeats_all(sample: Array, first: int, last: int, before: Array) -> bool:
-    """Say whether channels are those of the sample before to the last bit, and keep them."""
-    same, n_known = True, 0
-    for c in range(first, last):
-        if not math.isnan(sample[c]):
-            n_known += 1
-            same &= sample[c] == before[c]
-        before[c] = sample[c]
-    return same and n_known > 0
-
-
-@_kernel
 def take_live(stream: int, sample: Array, complete: bool, came_s: float, settings: Any, feed: Any) -> None:
     """Take a sample as it came, without a look ahead: unless it repeats the one before, or is not confident."""
     settings, feed = settings[0], feed[0]
     feed.last_s[stream] = came_s
     feed.not_finite[stream] += not complete
     first, last = (0, 6) if stream == IMU else (3, 13)
-    noisy = stream in (IMU, ODOMETRY) and complete
-    if noisy and _repeats_all(sample, first, last, feed.before[stream - IMU]):
-        feed.frozen[stream] += 1
-        _count_frozen(stream, feed)
-        return
+    if complete and stream in (IMU, ODOMETRY):
+        before, same, n_known = feed.before[stream - IMU], True, 0
+        for c in range(first, last):
+            if not math.isnan(sample[c]):
+                n_known += 1
+                same &= sample[c] == before[c]
+            before[c] = sample[c]
+        if same and n_known > 0:
+            feed.frozen[stream] += 1
+            for c in range(9 if stream == IMU else 14):
+                channel = feed.imu_channels[c] if stream == IMU else feed.camera_channels[c]
+                channel.repeated += 1.0
+            return
     if stream == ODOMETRY and sample[13] < MIN_CONFIDENCE_RATIO:
         feed.low_confidence[stream] += 1
         return
     take_sample(stream, sample, came_s - settings.latency_s[stream], came_s, settings, feed)
-
-
-@_kernel
-def _count_frozen(stream: int, feed: Any) -> None:
-    """Count a repetition of every channel of a stream."""
-    if stream == IMU:
-        for c in range(9):
-            feed.imu_channels[c].repeated += 1.0
-    else:
-        for c in range(14):
-            feed.camera_channels[c].repeated += 1.0
 
 
 @_kernel
@@ -944,12 +842,12 @@ def tick_live(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) 
     settings, feed, row = settings[0], feed[0], row[0]
     take_tick(time_s, wheels, settings, feed, row)
     if settings.is_steered:
-        average_yaw(time_s, settings, feed, row)
-        refer_yaw(time_s, settings, feed, row)
+        _average_yaw(time_s, settings, feed, row)
+        _refer_yaw(time_s, settings, feed, row)
 
 
 @_kernel
-def run_feed(
+def _run(
     clock: Array,
     wheels: Array,
     came_s: tuple[Array, ...],
@@ -967,9 +865,8 @@ def run_feed(
         for stream in range(len(came_s)):
             k = due[stream]
             while k < came_s[stream].size and came_s[stream][k] <= time_s:
-                take_sample(
-                    stream, samples[stream][k], instant_s[stream][k], came_s[stream][k], settings, feed
-                )
+                instant = instant_s[stream][k]
+                take_sample(stream, samples[stream][k], instant, came_s[stream][k], settings, feed)
                 k += 1
             due[stream] = k
         if n < clock.size:
@@ -977,16 +874,15 @@ def run_feed(
 
 
 @_kernel
-def refer_all(clock: Array, causal: bool, settings: Any, feed: Any, rows: Any) -> None:
+def _refer_all(clock: Array, causal: bool, settings: Any, feed: Any, rows: Any) -> None:
     """Count the yaw rows from the start: from the averages of all ticks, or ``causal`` of those so far."""
     settings, feed = settings[0], feed[0]
-    if not causal:
+    for refers in (False, True):
         for n in range(clock.size):
-            average_yaw(clock[n], settings, feed, rows[n])
-    for n in range(clock.size):
-        if causal:
-            average_yaw(clock[n], settings, feed, rows[n])
-        refer_yaw(clock[n], settings, feed, rows[n])
+            if refers == causal:
+                _average_yaw(clock[n], settings, feed, rows[n])
+            if refers:
+                _refer_yaw(clock[n], settings, feed, rows[n])
 
 
 def forget_times(feed: Any) -> None:
@@ -997,11 +893,309 @@ def forget_times(feed: Any) -> None:
     names |= {"wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3", "gyro_angle_rad", "gyro_time_s"}
     for name in names:
         feed[name] = fresh[name]
-    for name in ("imu_channels", "camera_channels", "speed_channels", "wheel_channels"):
+    for name in _CHANNELS:
         feed[name]["repeated"] = 0.0
 
 
 def measurements(rows: Any) -> Array:
     """Return rows (n,) as numbers (n, m) in the order of :data:`ROWS`; a view."""
-    numbers: Array = rows.view(np.float64).reshape(len(rows), -1)[:, : len(ROWS)]
-    return numbers
+    values: Array = rows.view(np.float64).reshape(len(rows), -1)[:, : len(ROWS)]
+    return values
+
+
+def on_clock(
+    clock: Array, time_s: Array, signals: Mapping[str, Array], time_constant_s: float
+) -> dict[str, Array]:
+    """Return each signal behind the low-pass, at the ticks of the clock.
+
+    Parameters
+    ----------
+    clock : (n_ticks,) increasing
+    time_s : (n,) increasing instants of the samples
+    signals : each (n,), NaN where a sample is missing
+    time_constant_s : of the low-pass; 0 for none
+    """
+    limits = signal_limits(time_constant_s, median_step_s(time_s), median_step_s(clock))
+    return {
+        row: _on_clock(clock, time_s, np.where(np.isfinite(signal), signal, np.nan), filled(LINE, np.nan), limits)
+        for row, signal in signals.items()
+    }
+
+
+@_kernel
+def _on_clock(clock: Array, time_s: Array, signal: Array, line: Array, limit: Array) -> Array:
+    out, line, limit, k = np.empty(clock.size), line[0], limit[0], 0
+    for n in range(clock.size):
+        while k < time_s.size and time_s[k] <= clock[n] + TICK_S:
+            take(signal[k], time_s[k], time_s[k], line, limit)
+            k += 1
+        out[n] = at_tick(clock[n], line, limit)
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasurementTable:
+    """What a filter measures at each tick of its clock; NaN where a sensor gave nothing.
+
+    Parameters
+    ----------
+    time_s : (n,) stamps of the wheels stream
+    rows : name of each of the m measurements
+    z : (n, m)
+    gnss_variance : (n, 4) of :data:`GNSS_ROWS`, in their units squared; NaN where they are
+    dropped : samples left out, as counts by stream and kind (``"imu: frozen"``)
+    """
+
+    time_s: Array
+    rows: tuple[str, ...]
+    z: Array
+    gnss_variance: Array
+    dropped: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name, n_columns in (("time_s", None), ("z", len(self.rows)), ("gnss_variance", len(GNSS_ROWS))):
+            array = read_only(getattr(self, name))
+            object.__setattr__(self, name, array)
+            shape = (self.time_s.size,) if n_columns is None else (self.time_s.size, n_columns)
+            if array.shape != shape:
+                raise ValueError(f"{name} has shape {array.shape}, {shape} is needed")
+        object.__setattr__(self, "rows", tuple(self.rows))
+        object.__setattr__(self, "dropped", MappingProxyType(dict(self.dropped)))
+
+    def at(self, time_s: Array) -> MeasurementTable:
+        """Return the table of some of its own instants, as a filter's track has them that left rows out."""
+        if np.array_equal(time_s, self.time_s):
+            return self
+        n = np.searchsorted(self.time_s, time_s)
+        return MeasurementTable(self.time_s[n], self.rows, self.z[n], self.gnss_variance[n], self.dropped)
+
+    def columns(self, names: Iterable[str]) -> Array:
+        """Return the measurements (n, len(names)) in the order of a model's rows.
+
+        Raises
+        ------
+        DataError
+            if the table has no such row.
+        """
+        names = list(names)
+        for lacking in (name for name in names if name not in self.rows):
+            known = ", ".join(self.rows)
+            raise DataError(f"there is no measurement {lacking!r}; this robot gives {known}")
+        return self.z[:, [self.rows.index(name) for name in names]]
+
+
+def measurement_table(
+    run: RunLog,
+    robot: Robot,
+    *,
+    time_constant_s: float | None = None,
+    ema_alpha: float | None = None,
+    initial_yaw_rad: float = 0.0,
+    gnss_latency_s: float = GNSS_LATENCY_S,
+    causal: bool = False,
+) -> MeasurementTable:
+    """Return the measurements of a run, ready for a filter.
+
+    Parameters
+    ----------
+    run : with the stream ``wheels``; ``steering``, ``imu``, ``odometry`` and ``gnss`` are optional, whole or
+        in parts, and give NaN where they are missing
+    robot : a swerve robot needs its motors, steering and sensors described, and its camera with odometry
+    time_constant_s : of the low-pass on all but the wheels; 0 for none.  By default what each sensor lacks to
+        the encoders' ``encoder_time_constant_s`` ((6.12) and (7.8) with a time constant for their alpha)
+    ema_alpha : for the thesis' own smoothing in place of the low-pass: ``z = a z_prev + (1 - a) z_raw`` a
+        tick on the camera's rows (7.8), at 0.2 a delay of a quarter of a tick; the other rows stay raw
+    initial_yaw_rad : heading of the start in the world frame, to which all yaw rows are referred
+    gnss_latency_s : age of a position when it arrives
+    causal : whether a tick takes only what had arrived by then, as a live filter has to; cleaning looks ahead
+        all the same
+
+    Raises
+    ------
+    DataError
+        if there are no wheels to give the clock.
+    ConfigError
+        if a time constant or an alpha is out of range, or a section of the description is missing.
+
+    Notes
+    -----
+    With latencies subtracted, a row holds what the sensor measured at that instant, which arrives only later.
+    ``causal``, it holds the last that had arrived, at most a latency and a period old: the low-pass runs on
+    from the sample's own instant to the tick, and the average of the yaw at the start is that of the ticks so far.
+    The origin of positions is the first with a fix, or the first of all where no fix ever comes, or if ``causal``.
+    A sensor slower than the clock gives each of its samples once, so that no filter counts it several times.
+
+    A simulated camera or IMU without noise looks frozen where nothing changes: give it noise.
+    """
+    if ema_alpha is not None:
+        if not 0 <= ema_alpha < 1:
+            raise ConfigError(f"ema_alpha is {ema_alpha:g}, a number from 0 to below 1 is required")
+        if time_constant_s is not None:
+            raise ConfigError("give time_constant_s or ema_alpha, not both: one of them smooths the camera")
+        time_constant_s = 0.0
+    if robot.steered:
+        robot.require("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
+    dropped: Counter[str] = Counter()
+    wheels, streams = _clean_streams(run, robot, dropped)
+    clock, period_s = np.array(wheels.time_s), {"wheels": median_step_s(wheels.time_s)}
+    period_s |= {name: median_step_s(stream.time_s) for name, stream in streams.items()}
+    settings = feed_settings(robot, period_s, initial_yaw_rad, gnss_latency_s, time_constant_s)
+    memory = new_feed()
+    if "gnss" in streams and not causal:
+        memory["gnss_origin_m"] = _gnss_origin(streams["gnss"])
+    came_s, instant_s, values = [], [], []
+    for (name, channels), age_s in zip(STREAMS.items(), settings["latency_s"][0].tolist(), strict=True):
+        nothing = Stream(np.empty(0), np.empty((0, len(channels))), channels)
+        stream = streams.get(name, nothing)
+        instant_s.append(np.array(stream.time_s) - age_s)
+        came_s.append(np.array(stream.time_s) if causal else instant_s[-1])
+        values.append(np.array(stream.values))
+    rows = np.zeros(clock.size, ROW)
+    samples = tuple(came_s), tuple(instant_s), tuple(values)
+    _run(clock, np.array(wheels.values), *samples, settings, memory, rows)
+    counts = {"wheels: beyond the motors": int(memory["wheels_beyond"][0])}
+    for number, name in enumerate(STREAMS):
+        counts[f"{name}: jump"] = int(memory["jump"][0, number])
+        counts[f"{name}: no rotation"] = int(memory["no_rotation"][0, number])
+    dropped += Counter(counts)  # a Counter, so that zeros fall out
+    z = measurements(rows)
+    if ema_alpha is not None:
+        for row in CAMERA_ROWS:
+            z[:, ROWS.index(row)] = _ema(z[:, ROWS.index(row)], ema_alpha)
+    if robot.steered:
+        _refer_all(clock, causal, settings, memory, rows)
+    names = ROWS_OF_DRIVE[robot.drive]
+    return MeasurementTable(
+        clock, names, z[:, [ROWS.index(name) for name in names]], rows["gnss_variance"], dropped
+    )
+
+
+def _clean_streams(run: RunLog, robot: Robot, dropped: Counter[str]) -> tuple[Stream, dict[str, Stream]]:
+    """Return the wheels, and the streams that the robot's other rows are measured by, cleaned."""
+    place = f"run {run.run_id}: "
+    if "wheels" not in run.streams:
+        raise DataError(f"{place}there is no stream 'wheels', which gives the clock")
+    for lacking in (name for name in robot.rate_channels if name not in run.streams["wheels"].channels):
+        raise DataError(
+            f"{place}the stream 'wheels' has no channel {lacking!r}, which the robot {robot.name} should have"
+        )
+    wheels = clean_stream(run, "wheels", list(robot.rate_channels), dropped)
+    if wheels is None:
+        raise DataError(f"{place}the stream 'wheels', which gives the clock, is empty")
+    has = {"steering": robot.describes("steering"), "odometry": robot.describes("camera")}
+    streams = {}
+    for name, channels in STREAMS.items():
+        names = [f"angle_{wheel}_rad" for wheel in robot.wheels] if name == "steering" else channels
+        stream = clean_stream(run, name, names, dropped, channels[NOISY[name]] if name in NOISY else ())
+        if stream is not None and has.get(name, True):
+            streams[name] = stream
+    return wheels, streams
+
+
+def _gnss_origin(gnss: Stream) -> Array:
+    """Return the first position with a fix, or the first where there is none; NaN without any."""
+    position = gnss.values[:, :2]
+    known = np.isfinite(position).all(axis=1)
+    fixed = known & (gnss.channel("fix_ratio") >= 0.5)
+    first = fixed if fixed.any() else known
+    return np.asarray(position[first.argmax()]) if first.any() else np.full(2, np.nan)
+
+
+def clean_stream(
+    run: RunLog, name: str, channels: Sequence[str], dropped: Counter[str], frozen: Sequence[str] = ()
+) -> Stream | None:
+    """Return the channels named of a stream without what cannot be true, or None where nothing is left.
+
+    Stamps increase strictly (one far ahead costs itself only), numbers are finite or NaN, channels that the log
+    lacks are NaN.  A camera or IMU all of whose noisy channels (``frozen``) repeat is left out from the first
+    repetition on.
+    """
+    stream = run.streams.get(name)
+    if stream is None:
+        return None
+    clock_s = run.streams["wheels"].time_s if "wheels" in run.streams else stream.time_s
+    known_s = clock_s[np.isfinite(clock_s)]
+    there = [k for k, channel in enumerate(channels) if channel in stream.channels]
+    values = np.full((len(stream), len(channels)), np.nan)
+    for k in there:
+        values[:, k] = stream.channel(channels[k])
+    increasing = np.flatnonzero(np.isfinite(stream.time_s))
+    if not (np.diff(stream.time_s[increasing]) > 0).all():
+        increasing = increasing[longest_rise(stream.time_s[increasing])]
+    dropped[f"{name}: stamp does not increase"] += len(stream) - len(increasing)
+    time_s, values = stream.time_s[increasing], values[increasing]
+    if known_s.size:
+        off = (time_s < known_s.min() - OFF_CLOCK_S) | (time_s > known_s.max() + OFF_CLOCK_S)
+        dropped[f"{name}: off the clock"] += int(off.sum())
+    finite = np.isfinite(values[:, there]).all(axis=1)
+    dropped[f"{name}: not finite"] += int((~finite).sum())
+    values[~np.isfinite(values)] = np.nan
+    kept = np.ones(len(time_s), dtype=bool)
+    noisy = [k for k in there if channels[k] in frozen]
+    if noisy and finite.any():
+        kept[finite] = ~_frozen(time_s[finite], values[finite][:, noisy])
+        dropped[f"{name}: frozen"] += int((~kept).sum())
+    if "confidence_ratio" in stream.channels and "confidence_ratio" in channels:
+        confidence = values[:, list(channels).index("confidence_ratio")]
+        low_confidence = kept & (confidence < MIN_CONFIDENCE_RATIO)
+        dropped[f"{name}: low confidence"] += int(low_confidence.sum())
+        kept &= ~low_confidence
+    return Stream(time_s[kept], values[kept], tuple(channels)) if kept.any() else None
+
+
+def _frozen(time_s: Array, values: Array) -> Array:
+    """Return which rows (n,) repeat the one before, in stretches of at least :data:`FROZEN_S`."""
+    same = np.zeros(len(time_s), dtype=bool)
+    same[1:] = (values[1:] == values[:-1]).all(axis=1)
+    first = np.flatnonzero(~same)
+    last = np.append(first[1:], len(time_s)) - 1
+    lasting = np.repeat(time_s[last] - time_s[first] >= FROZEN_S - TICK_S, last - first + 1)
+    return np.asarray(same & lasting)
+
+
+def median_step_s(time_s: Array) -> float:
+    """Return the median step of a clock; NaN of fewer than two stamps."""
+    return float(np.median(np.diff(time_s))) if time_s.size > 1 else math.nan
+
+
+def _ema(value: Array, alpha: float) -> Array:
+    """Smooth the finite values (n,) one after the other, whatever the time between them (7.8)."""
+    from scipy.signal import lfilter  # half a second of import, which only the thesis' smoothing needs
+
+    out, known = np.array(value), np.isfinite(value)
+    if known.any():
+        out[known] = lfilter([1.0 - alpha], [1.0, -alpha], value[known], zi=[alpha * value[known][0]])[0]
+    return out
+
+
+def gnss_heading(table: MeasurementTable, robot: Robot) -> float:
+    """Return the world's heading in rad of what the yaw rows call 0; NaN where the drive does not tell.
+
+    Parameters
+    ----------
+    table : measurements with yaw rows that are 0 at the start
+    robot : a swerve robot
+
+    Notes
+    -----
+    The rotation that brings the speeds over ground v, by the camera or else by the wheels, onto those of
+    the receiver u with the least squared error, both as complex numbers: the angle of
+    ``sum u conj(v e^(i yaw))``.  Its standard deviation is ``speed_std / sqrt(sum |v|^2)``.
+    """
+    rates, steer = table.columns(robot.wheel_rows), table.columns(robot.steer_rows)
+    twist, _ = no_slip_twist(robot.wheel_positions_m, steer, robot.wheel_radius_m * rates)
+    speed = twist[:, 0] + 1j * twist[:, 1]
+    if robot.describes("camera"):
+        camera = robot.camera
+        x, y, turn = table.columns(["camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps"]).T
+        origin_x, origin_y = point_velocity(x, y, turn, -camera.lever_x_m, -camera.lever_y_m)
+        by_camera = origin_x + 1j * origin_y
+        speed = np.where(np.isfinite(by_camera), by_camera, speed)
+    yaw = table.columns(["camera_yaw_rad", "imu_yaw_rad"])
+    speed = speed * np.exp(1j * np.where(np.isfinite(yaw[:, 0]), yaw[:, 0], yaw[:, 1]))
+    received = table.columns(GNSS_ROWS[2:]) @ np.array([1.0, 1.0j])
+    good = np.isfinite(received) & np.isfinite(speed) & (np.abs(speed) > HEADING_SPEED_MPS)
+    weight = float(np.sum(np.abs(speed[good]) ** 2))
+    if weight == 0.0 or GNSS_SPEED_STD_MPS / math.sqrt(weight) > MAX_HEADING_STD_RAD:
+        return math.nan
+    return cmath.phase(complex(np.sum(received[good] * np.conj(speed[good]))))

@@ -7,16 +7,15 @@ State x (d,) with covariance P, measurement z (m,) with independent rows of vari
                   x <- x + K nu              P <- P - K H P - P H' K' + K s K'  (Joseph form)
 
 h and H are evaluated once a step, at the predicted state, and the rows conditioned on one by one: the same
-answer as all at once, in O(m d^2) and without inverting a matrix.  A robot, a sensor or a soil is a
-:class:`FilterModel` given to this step; there is no second one.
+answer as all at once, in O(m d^2) and without inverting a matrix.
 
 What arrives is not trusted.  Missing values (NaN) are skipped; so are infinite ones, and counted.  What
 disagrees with the prediction beyond the gate of its sensor is left out, and believed once after a while, so
 that a filter that went wrong finds back.  A jump of the clock is believed when the next stamp follows it, and
 is not integrated over.  Nothing that comes in makes what comes out infinite or NaN.
 
-Loops are written out and divisions unchecked: at these sizes the assignment of a slice costs as much as a
-measurement.  The plain form is in the tests.
+Loops are written out: at these sizes the assignment of a slice costs as much as a measurement.  The plain form
+is in the tests.
 
 Source: the form of the step follows the textbook of Sarkka, Bayesian Filtering and Smoothing (2013), 5.2.
 """
@@ -30,6 +29,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import float64, void
+from numba.core.errors import NumbaError
 from numba.core.types.function_type import CompileResultWAP
 from scipy.special import chdtri
 
@@ -56,18 +56,16 @@ WIDEST = LARGEST**4
 LONGEST_GAP_S = 3600.0
 """After a longer gap a position is no less certain than after this one: that is nowhere already."""
 
-MAX_STATES = MAX_ROWS = MAX_SENSORS = 32
-"""Room in the records: every filter is one type for the compiled step, whatever its size."""
+MOST = 32
+"""Room in the records for states, rows and sensors: every filter is one type for the compiled step."""
 
 _SLACK_S = 1e-9  # what sums of steps may be off by
 
 _VECTOR, _MATRIX = float64[::1], float64[:, ::1]
-
-PROPAGATE = void(_VECTOR, float64, _VECTOR, _VECTOR, _MATRIX)
-"""Signature of ``propagate(x, dt, params, x_next, F)``."""
-
-OBSERVE = void(_VECTOR, _VECTOR, _VECTOR, _MATRIX)
-"""Signature of ``observe(x, params, z_hat, H)``."""
+_SIGNATURES = {
+    "propagate": void(_VECTOR, float64, _VECTOR, _VECTOR, _MATRIX),
+    "observe": void(_VECTOR, _VECTOR, _VECTOR, _MATRIX),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,30 +75,28 @@ class FilterModel:
     Parameters
     ----------
     name : what reports call it
-    states : d names, each ending in its unit
-    rows : m names of measurements, each ending in its unit
+    states, rows : d states and m measurements, each name ending in its unit
     sensors : name and rows of each sensor, in the order in which they are judged, each after those before; a
         sensor is believed or left out as a whole, and every row belongs to one
     propagate : ``propagate(x, dt, params, x_next, F)`` writes the next state (d,), and the entries of the
-        Jacobian that are not zero: F (d, at least d) comes as zeros, and rows that stay short cost less
+        Jacobian that are not zero: F (d, d) comes as zeros, and rows that stay short cost less
     observe : ``observe(x, params, z_hat, H)`` writes the measurement expected (m,), and the entries of H
-        (m, at least d) that are not zero.  Both are compiled, as ``@njit(PROPAGATE)``
+        (m, d) that are not zero.  Both are functions of numba, ``@njit``
     params : what the two functions need of the robot; the inputs of a sample stand behind them
-    inputs : names of what is known of each step beside the state; 0 where it is not given
     initial_std : (d,) how little is known of each state where nothing is known
     initial_mean : (d,) zeros without
+    inputs : names of what is known of each step beside the state; 0 where it is not given
     references : sensors of the speed over ground
     held : sensors that are not reopened before two seconds: those that fail, rather than show the ground's
         doing
     positions : states that a gap in the data leaves where they were, with a covariance that grew
-    angle_states : states that are wrapped to (-pi, pi]
-    angle_rows : rows whose innovation is
+    angle_states, angle_rows : states that are wrapped to (-pi, pi], and rows whose innovation is
 
     Raises
     ------
     ConfigError
         where a name has no unit, is given twice or refers to nothing, a length does not fit, or a function is
-        not compiled as it should be.
+        none of numba.
     """
 
     name: str
@@ -120,56 +116,43 @@ class FilterModel:
     angle_rows: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        place, shape = f"filter {self.name}", (len(self.states),)
         if not len(self.initial_mean):
-            object.__setattr__(self, "initial_mean", np.zeros(len(self.states)))
+            object.__setattr__(self, "initial_mean", np.zeros(shape))
         for name in ("params", "initial_std", "initial_mean"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
-        self._check_initial()
-        self._check_names()
-        for what, signature in (("propagate", PROPAGATE), ("observe", OBSERVE)):
-            if tuple(signature.args) not in getattr(getattr(self, what), "signatures", ()):
-                raise ConfigError(f"filter {self.name}: {what} must be compiled as @njit({what.upper()})")
-
-    def _check_initial(self) -> None:
-        place = f"filter {self.name}"
-        for name in ("initial_std", "initial_mean"):
-            shape = getattr(self, name).shape
-            if shape != (len(self.states),):
-                raise ConfigError(f"{place}: {name} has shape {shape}, {(len(self.states),)} is needed")
+            if name != "params" and getattr(self, name).shape != shape:
+                raise ConfigError(f"{place}: {name} has shape {getattr(self, name).shape}, {shape} is needed")
         if not (np.isfinite(self.initial_std).all() and (self.initial_std > 0).all()):
-            raise ConfigError(
-                f"{place}: initial_std {self.initial_std.tolist()} must be above zero and finite"
-            )
+            raise ConfigError(f"{place}: initial_std {self.initial_std.tolist()} must be above zero and finite")
+        self._check_names(place)
+        for name, signature in _SIGNATURES.items():
+            function = getattr(self, name)
+            if tuple(signature.args) not in getattr(function, "signatures", ()):
+                try:
+                    function.compile(signature)
+                except (AttributeError, RuntimeError, NumbaError):
+                    raise ConfigError(f"{place}: {name} must be @njit, and take {signature}") from None
 
-    def _check_names(self) -> None:
-        """Refuse a name without a unit, one that is given twice, one that refers to nothing, and too many."""
-        place = f"filter {self.name}"
+    def _check_names(self, place: str) -> None:
         for name in (*self.states, *self.rows):
             try:
                 unit_of(name)
             except LogError as error:
                 raise ConfigError(f"{place}: {str(error).replace('channel', 'state or row')}") from None
-        grouped = [row for _, rows in self.sensors for row in rows]
-        for what, names, most in (
-            ("states", self.states, MAX_STATES),
-            ("rows", self.rows, MAX_ROWS),
-            ("sensors", self.sensor_names, MAX_SENSORS),
-            ("inputs", self.inputs, MAX_ROWS),
-        ):
+        sensors, grouped = self.sensor_names, [row for _, rows in self.sensors for row in rows]
+        given = {"states": self.states, "rows": self.rows, "sensors": sensors, "inputs": self.inputs}
+        for what, names in given.items():
             if len(set(names)) < len(names):
                 raise ConfigError(f"{place}: {what} {list(names)} name one of them twice")
-            if len(names) > most:
-                raise ConfigError(f"{place}: there are {len(names)} {what}, at most {most} are possible")
+            if len(names) > MOST:
+                raise ConfigError(f"{place}: there are {len(names)} {what}, at most {MOST} are possible")
         if sorted(grouped) != sorted(self.rows):
             raise ConfigError(f"{place}: its sensors must hold every row once; they hold {grouped}")
-        for what, names, known in (
-            ("references", self.references, self.sensor_names),
-            ("held", self.held, self.sensor_names),
-            ("positions", self.positions, self.states),
-            ("angle_states", self.angle_states, self.states),
-            ("angle_rows", self.angle_rows, self.rows),
-        ):
-            for unknown in (name for name in names if name not in known):
+        referring = {"references": sensors, "held": sensors, "positions": self.states}
+        referring |= {"angle_states": self.states, "angle_rows": self.rows}
+        for what, known in referring.items():
+            for unknown in (name for name in getattr(self, what) if name not in known):
                 raise ConfigError(f"{place}: {what} name {unknown!r}, which is none of {', '.join(known)}")
 
     @property
@@ -209,11 +192,9 @@ class Noise:
     walk_variance: Array | None = None
 
     def __post_init__(self) -> None:
-        process = _covariance("process_variance", self.process_variance)
-        object.__setattr__(self, "process_variance", process)
-        if self.initial_variance is not None:
-            initial = _covariance("initial_variance", self.initial_variance, definite=True)
-            object.__setattr__(self, "initial_variance", initial)
+        for name in ("process_variance", "initial_variance"):
+            if (given := getattr(self, name)) is not None:
+                object.__setattr__(self, name, _covariance(name, given, definite=name == "initial_variance"))
         if self.walk_variance is not None:
             walk = read_only(self.walk_variance)
             object.__setattr__(self, "walk_variance", walk)
@@ -231,15 +212,11 @@ class Noise:
     def at(self, samples: Array) -> Noise:
         """Return the noise of some samples (k,) by number, where it changes from sample to sample."""
         r, walk = self.measurement_variance, self.walk_variance
-        return Noise(
-            self.process_variance,
-            r[samples] if r.ndim == 2 else r,
-            self.initial_variance,
-            None if walk is None else walk[samples],
-        )
+        r, walk = r[samples] if r.ndim == 2 else r, None if walk is None else walk[samples]
+        return Noise(self.process_variance, r, self.initial_variance, walk)
 
 
-def _covariance(what: str, given: Any, *, definite: bool = False) -> Array:
+def _covariance(what: str, given: Any, *, definite: bool) -> Array:
     """Return a covariance (d, d) or the variances (d,) as a checked matrix."""
     array = np.asarray(given, dtype=np.float64)
     if array.ndim not in (1, 2) or array.shape[0] != array.shape[-1] or not array.size:
@@ -259,7 +236,7 @@ def _covariance(what: str, given: Any, *, definite: bool = False) -> Array:
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """When a measurement or a stamp is not believed.
+    """When a measurement or a stamp is not believed; ``ConfigError`` where a value is out of its range.
 
     Parameters
     ----------
@@ -271,11 +248,6 @@ class FilterSettings:
         before it in the row observes; else all that it does.  A sensor that the model holds takes two seconds
         at least
     max_gap_s : over a longer step nothing is integrated; a log sampled slower than that needs another value
-
-    Raises
-    ------
-    ConfigError
-        where a value is out of its range.
 
     Examples
     --------
@@ -300,20 +272,16 @@ class FilterSettings:
 
 DEFAULT_SETTINGS = FilterSettings()
 
-UNGATED = FilterSettings(gate_probability=1.0)
-"""Every measurement is used."""
-
 MODEL = record(
     {
         **dict.fromkeys(("n_states", "n_rows", "n_sensors", "n_inputs"), int),
-        "order": (int, MAX_ROWS),
-        "starts": (int, MAX_SENSORS + 1),
-        **dict.fromkeys(("is_reference", "is_held"), (bool, MAX_SENSORS)),
-        "is_angle_row": (bool, MAX_ROWS),
-        **dict.fromkeys(("is_angle_state", "is_position"), (bool, MAX_STATES)),
-        "x0": (float, MAX_STATES),
-        **dict.fromkeys(("p0", "q"), (float, (MAX_STATES, MAX_STATES))),
-        "thresholds": (float, MAX_ROWS + 1),
+        **dict.fromkeys(("order", "starts"), (int, MOST + 1)),
+        **dict.fromkeys(
+            ("is_reference", "is_held", "is_angle_row", "is_angle_state", "is_position"), (bool, MOST)
+        ),
+        "x0": (float, MOST),
+        **dict.fromkeys(("p0", "q"), (float, (MOST, MOST))),
+        "thresholds": (float, MOST + 1),
         **dict.fromkeys(("reopen_after_s", "max_gap_s"), float),
     }
 )
@@ -324,12 +292,12 @@ innovation that is believed, by its number of rows."""
 STATE = record(
     {
         **dict.fromkeys(("time_s", "pending_time_s", "reference_age_s", "log_likelihood"), float),
-        "x": (float, MAX_STATES),
-        "p": (float, (MAX_STATES, MAX_STATES)),
-        **dict.fromkeys(("use", "nis_dof"), (np.int8, MAX_SENSORS)),
-        **dict.fromkeys(("nis", "rejected_s"), (float, MAX_SENSORS)),
+        "x": (float, MOST),
+        "p": (float, (MOST, MOST)),
+        **dict.fromkeys(("use", "nis_dof"), (np.int8, MOST)),
+        **dict.fromkeys(("nis", "rejected_s"), (float, MOST)),
         **dict.fromkeys(("not_advanced", "jumps", "lost"), int),
-        **dict.fromkeys(("gated", "not_finite", "numerical"), (int, MAX_SENSORS)),
+        **dict.fromkeys(("gated", "not_finite", "numerical"), (int, MOST)),
     }
 )
 """All that a filter carries from one sample to the next: a copy is a snapshot.
@@ -338,17 +306,15 @@ Stamp of the last sample, that of a jump that is not believed yet, time since th
 measured; what became of the sensors of the last sample, for how long each was rejected (-1 for
 one that was not), and counts of what was left out."""
 
-_MATRICES = ("f", "fp", "h", "p_before")
 _WORK = record(
     {
-        **dict.fromkeys(_MATRICES, (float, (MAX_STATES, MAX_STATES))),
-        **dict.fromkeys(("f_columns", "h_columns"), (int, (MAX_STATES, MAX_STATES))),
-        **dict.fromkeys(("n_f_columns", "n_h_columns", "rows"), (int, MAX_STATES)),
+        **dict.fromkeys(("f", "fp", "h", "p_before"), (float, (MOST, MOST))),
+        "rows": (int, MOST),
         **dict.fromkeys(
             ("x_next", "x_before", "z_hat", "nu", "dx", "dx_before", "g", "gain", "rounding", "moved"),
-            (float, MAX_STATES),
+            (float, MOST),
         ),
-        "chosen": (bool, MAX_STATES),
+        "chosen": (bool, MOST),
     }
 )
 """Room to compute in."""
@@ -356,7 +322,7 @@ _WORK = record(
 _SKIP, _START, _STEP, _JUMP = range(4)  # what the clock says of a row
 _UNSOUND = -1  # a use that is never reported
 
-_kernel = njit(error_model="numpy")
+_kernel = njit(cache=True, error_model="numpy")
 
 
 @_kernel
@@ -402,38 +368,23 @@ def _copy(d: int, p: Array, x: Array, p_to: Array, x_to: Array) -> None:
 
 
 @_kernel
-def _find_columns(d: int, m: Array, i: int, columns: Array) -> int:
-    """Write the columns in which row i of m is not zero; return how many."""
-    n = 0
-    for j in range(d):
-        if m[i, j] != 0.0:
-            columns[i, n] = j
-            n += 1
-    return n
-
-
-@_kernel
 def _predict(model: Any, state: Any, work: Any, dt: float, params: Array, propagate: Any) -> None:
     """x_next = f(x, dt), and P <- F P F' + Q dt, symmetric to the last bit."""
-    d = model.n_states
-    p, q, f, fp, columns, n_columns = state.p, model.q, work.f, work.fp, work.f_columns, work.n_f_columns
+    d, p, f, fp = model.n_states, state.p, work.f, work.fp
     f[:d, :d] = 0.0
+    fp[:d, :d] = 0.0
     propagate(state.x[:d], dt, params, work.x_next[:d], f[:d])
     for i in range(d):
-        n_columns[i] = _find_columns(d, f, i, columns)
-        for k in range(d):
-            fp[i, k] = 0.0
-        for c in range(n_columns[i]):
-            j = columns[i, c]
-            weight = f[i, j]
-            for k in range(d):
-                fp[i, k] += weight * p[j, k]
+        for j in range(d):
+            if f[i, j] != 0.0:
+                for k in range(d):
+                    fp[i, k] += f[i, j] * p[j, k]
     for i in range(d):
         for k in range(i + 1):
-            total = q[i, k] * dt
-            for c in range(n_columns[k]):
-                j = columns[k, c]
-                total += fp[i, j] * f[k, j]
+            total = model.q[i, k] * dt
+            for j in range(d):
+                if f[k, j] != 0.0:
+                    total += fp[i, j] * f[k, j]
             p[i, k] = total
             p[k, i] = total
 
@@ -527,18 +478,16 @@ def _choose_states(model: Any, state: Any, work: Any, k: int) -> None:
 @_kernel
 def _innovation(model: Any, state: Any, work: Any, i: int) -> tuple[float, float]:
     """Write g = P h' of row i; return its innovation after what was conditioned on before, and h P h'."""
-    d, h, columns, g = model.n_states, work.h, work.h_columns, work.g
-    nu, spread = work.nu[i], 0.0
-    for j in range(d):
-        g[j] = 0.0
-    for c in range(work.n_h_columns[i]):
-        column = columns[i, c]
-        weight = h[i, column]
-        nu -= weight * work.dx[column]
-        for j in range(d):
-            g[j] += weight * state.p[column, j]
-    for c in range(work.n_h_columns[i]):
-        spread += h[i, columns[i, c]] * g[columns[i, c]]
+    d, h, g, nu, spread = model.n_states, work.h[i], work.g, work.nu[i], 0.0
+    g[:d] = 0.0
+    for column in range(d):
+        if h[column] != 0.0:
+            nu -= h[column] * work.dx[column]
+            for j in range(d):
+                g[j] += h[column] * state.p[column, j]
+    for column in range(d):
+        if h[column] != 0.0:
+            spread += h[column] * g[column]
     return nu, spread
 
 
@@ -583,7 +532,6 @@ def _take_rows(model: Any, state: Any, work: Any, z: Array, variance: Array, k: 
             continue
         nu = z[i] - work.z_hat[i]
         work.nu[i] = wrapped(nu) if model.is_angle_row[i] else nu
-        work.n_h_columns[i] = _find_columns(model.n_states, work.h, i, work.h_columns)
         work.rows[n_rows] = i
         n_rows += 1
     return n_rows
@@ -654,7 +602,7 @@ def _condition_on_sensor(model: Any, state: Any, work: Any, z: Array, variance: 
 
 
 class _Samples(NamedTuple):
-    """Stamps and measurements, variances, walks and inputs; the last three for each sample or in one row."""
+    """Stamps and measurements, variances, walks and inputs of each sample."""
 
     time_s: Array
     z: Array
@@ -664,7 +612,7 @@ class _Samples(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """What is written of each sample: all but ``taken`` only where they have rows."""
+    """What is written of each sample: all but the last two only where they have rows."""
 
     mean: Array
     cov: Array
@@ -673,6 +621,7 @@ class _Columns(NamedTuple):
     use: Array
     reference_age_s: Array
     taken: Array
+    log_likelihood: Array
 
 
 @_kernel
@@ -696,24 +645,22 @@ def _take(
         for k in range(n_sensors):
             state.use[k], state.nis[k], state.nis_dof[k] = ABSENT, np.nan, 0
         if kind == _STEP:
-            walk = samples.walk[n if samples.walk.shape[0] > 1 else 0]
-            inputs = samples.inputs[n if samples.inputs.shape[0] > 1 else 0]
-            _step(model, state, work, dt, walk, inputs, params, propagate)
+            _step(model, state, work, dt, samples.walk[n], samples.inputs[n], params, propagate)
         elif kind == _JUMP:
             _predict_over_gap(model, state, work, dt, params, propagate)
         if columns.taken[n]:
-            variance = samples.variance[n if samples.variance.shape[0] > 1 else 0]
             work.h[:m, :d] = 0.0
             observe(x[:d], params, work.z_hat[:m], work.h[:m])
             work.dx[:] = 0.0
             for k in range(n_sensors):
-                _condition_on_sensor(model, state, work, samples.z[n], variance, k)
+                _condition_on_sensor(model, state, work, samples.z[n], samples.variance[n], k)
             for i in range(d):
                 x[i] += work.dx[i]
                 if model.is_angle_state[i]:
                     x[i] = wrapped(x[i])
                 for j in range(i):
                     p[j, i] = p[i, j]
+        columns.log_likelihood[n] = state.log_likelihood
         if keep:
             columns.reference_age_s[n] = state.reference_age_s
             for k in range(n_sensors):
@@ -746,7 +693,7 @@ class Filter:
 
     Examples
     --------
-    >>> from terrain.estimation.filters.skid import make_skid_filter, skid_noise
+    >>> from terrain.estimation.models.skid import make_skid_filter, skid_noise
     >>> from terrain.robots import load_robot
     >>> robot = load_robot("husky")
     >>> filter = Filter(make_skid_filter(robot), skid_noise(robot))
@@ -769,8 +716,8 @@ class Filter:
         self.state["nis"] = np.nan
         params = np.append(model.params, np.zeros(len(model.inputs)))
         functions = (  # compiled with their signature: finding them costs more than a step
-            CompileResultWAP(f.overloads[tuple(signature.args)])
-            for f, signature in ((model.propagate, PROPAGATE), (model.observe, OBSERVE))
+            CompileResultWAP(getattr(model, name).overloads[tuple(signature.args)])
+            for name, signature in _SIGNATURES.items()
         )
         self._kernel = (self._fixed, self.state, filled(_WORK), params, *functions)
         sizes = (m, m, d, len(model.inputs))
@@ -812,22 +759,18 @@ class Filter:
     def run(self, time_s: Array, z: Array, inputs: Array | None = None, *, keep: bool = True) -> _Columns:
         """Take in all samples of a log; return what is known at each, empty columns unless kept."""
         d, m, stamps = len(self.model.states), len(self.model.rows), np.array(time_s, dtype=np.float64)
-        n = stamps.size
-        samples = [stamps, np.array(z, dtype=np.float64, order="C")]
-        shapes: list[tuple[str, list[tuple[int, ...]]]] = [("time_s", [(n,)]), ("z", [(n, m)])]
+        n, samples = stamps.size, [stamps]
         for name, array, size in (
+            ("z", z, m),
             ("measurement_variance", self.noise.measurement_variance, m),
             ("walk_variance", self.noise.walk_variance, d),
             ("inputs", inputs, len(self.model.inputs)),
         ):
             given = np.zeros((1, size)) if array is None else np.atleast_2d(array)
-            samples.append(np.array(given, dtype=np.float64, order="C"))
-            shapes.append((name, [(n, size), (1, size)]))
-        for (name, possible), array in zip(shapes, samples, strict=True):
-            if array.shape not in possible:
-                raise DataError(
-                    f"filter {self.model.name}: {name} has shape {array.shape}, {possible[0]} is needed"
-                )
+            if given.shape != (n, size) and (name == "z" or given.shape != (1, size)):
+                shape = np.shape(z) if name == "z" else given.shape
+                raise DataError(f"filter {self.model.name}: {name} has shape {shape}, {(n, size)} is needed")
+            samples.append(np.array(np.broadcast_to(given, (n, size)), dtype=np.float64, order="C"))
         columns = self._columns(n, keep=keep)
         _take(*self._kernel, _Samples(*samples), columns)
         return columns
@@ -842,15 +785,13 @@ class Filter:
             np.empty((n_kept, k), np.int8),
             np.empty(n_kept),
             np.zeros(n, np.bool_),
+            np.empty(n),
         )
 
     def follows(self, time_s: float) -> int:
         """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken."""
-        state = self.state[0]
-        limit_s = float(self._fixed["max_gap_s"][0])
-        follows: int = _follows.py_func(
-            time_s, float(state["time_s"]), float(state["pending_time_s"]), limit_s
-        )
+        last_s, pending_s = (float(self.state[name][0]) for name in ("time_s", "pending_time_s"))
+        follows: int = _follows.py_func(time_s, last_s, pending_s, float(self._fixed["max_gap_s"][0]))
         return follows
 
     def known(self, states: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -858,12 +799,12 @@ class Filter:
         places = {name: self.model.states.index(name) for name in states if name in self.model.states}
         return {name: (float(self.mean[i]), math.sqrt(float(self.cov[i, i]))) for name, i in places.items()}
 
-    def begin_from(self, known: Mapping[str, tuple[float, float]], age_s: float) -> tuple[str, ...]:
-        """Start from what was known of some states; return the names of those that are used.
+    def begin_from(self, known: Mapping[str, tuple[float, float]], age_s: float) -> None:
+        """Start from what was known of some states.
 
         Parameters
         ----------
-        known : mean and standard deviation by name of the state
+        known : mean and standard deviation by name of the state; what the filter does not have is left out
         age_s : time since then, for which each walks; none is believed less than without it
 
         Raises
@@ -873,28 +814,17 @@ class Filter:
         """
         if not math.isnan(self.state["time_s"][0]):
             raise DataError("a filter that runs cannot start from another state")
-        used = [name for name in known if name in self.model.states]
-        for name in used:
-            i = self.model.states.index(name)
-            mean, std = known[name]
-            variance = std**2 + float(self.noise.process_variance[i, i]) * age_s
-            if variance < self.cov[i, i]:
-                self.mean[i], self.cov[i, i] = mean, variance
-        return tuple(used)
+        for name, (mean, std) in known.items():
+            if name in self.model.states:
+                i = self.model.states.index(name)
+                variance = std**2 + float(self.noise.process_variance[i, i]) * age_s
+                if variance < self.cov[i, i]:
+                    self.mean[i], self.cov[i, i] = mean, variance
 
     @property
     def reference_age_s(self) -> float:
         """Time since the speed over ground was last measured; infinite before the first."""
         return float(self.state["reference_age_s"][0])
-
-    @property
-    def nis(self) -> dict[str, float]:
-        """NIS of each sensor at the last step, a row; NaN where it measured nothing or is not a number."""
-        squares, rows = self.state["nis"][0].tolist(), self.state["nis_dof"][0].tolist()
-        names = self.model.sensor_names
-        return {
-            name: square / n if n else math.nan for name, square, n in zip(names, squares, rows, strict=False)
-        }
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -913,26 +843,26 @@ class Filter:
 
 def _fixed(model: FilterModel, noise: Noise, settings: FilterSettings) -> Array:
     """Return the record of a model, its noise and the settings, which are checked against it."""
-    d, m, k = len(model.states), len(model.rows), len(model.sensors)
+    d, m = len(model.states), len(model.rows)
     for name in ("process_variance", "initial_variance"):
         matrix = getattr(noise, name)
         if matrix is not None and len(matrix) != d:
             raise DataError(f"filter {model.name}: {name} is for {len(matrix)} states, it has {d}")
-    if noise.measurement_variance.shape[-1] != m:
-        n_rows = noise.measurement_variance.shape[-1]
+    if (n_rows := noise.measurement_variance.shape[-1]) != m:
         raise DataError(f"filter {model.name}: measurement_variance is for {n_rows} rows, it has {m}")
     fixed = filled(
         MODEL,
         n_states=d,
         n_rows=m,
-        n_sensors=k,
+        n_sensors=len(model.sensors),
         n_inputs=len(model.inputs),
         reopen_after_s=settings.reopen_after_s - _SLACK_S,
         max_gap_s=settings.max_gap_s + _SLACK_S,
+        thresholds=np.inf,
     )
     one = fixed[0]
     one["order"][:m] = [model.rows.index(row) for _, rows in model.sensors for row in rows]
-    one["starts"][: k + 1] = np.cumsum([0, *(len(rows) for _, rows in model.sensors)])
+    one["starts"][: len(model.sensors) + 1] = np.cumsum([0, *(len(rows) for _, rows in model.sensors)])
     for name, names, chosen in (
         ("is_reference", model.sensor_names, model.references),
         ("is_held", model.sensor_names, model.held),
@@ -944,9 +874,8 @@ def _fixed(model: FilterModel, noise: Noise, settings: FilterSettings) -> Array:
     initial = np.diag(model.initial_std**2) if noise.initial_variance is None else noise.initial_variance
     one["x0"][:d] = model.initial_mean
     one["p0"][:d, :d], one["q"][:d, :d] = initial, noise.process_variance
-    one["thresholds"] = np.inf
-    widest = max(len(rows) for _, rows in model.sensors)
-    one["thresholds"][1 : widest + 1] = chdtri(np.arange(1.0, widest + 1), 1 - settings.gate_probability)
+    dof = np.arange(1.0, 1 + max(len(rows) for _, rows in model.sensors))
+    one["thresholds"][1 : 1 + dof.size] = chdtri(dof, 1 - settings.gate_probability)
     return fixed
 
 
@@ -1014,12 +943,3 @@ def run_filter(
         float(session.state["log_likelihood"][0]),
         dropped,
     )
-
-
-def log_likelihood(
-    model: FilterModel, noise: Noise, time_s: Array, z: Array, settings: FilterSettings = UNGATED
-) -> float:
-    """Return the log likelihood of a log without keeping its track; everything is believed by default."""
-    session = Filter(model, noise, settings)
-    session.run(time_s, z, keep=False)
-    return float(session.state["log_likelihood"][0])

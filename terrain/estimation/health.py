@@ -82,13 +82,7 @@ N_COLUMNS = 16
 
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 _BIASES = ("accel_bias_x_mps2", "accel_bias_y_mps2", "gyro_bias_radps")
-_WHEEL, _STEER, _GYRO, _ACCEL, _TILT, _YAW, _SEEN, _SEEN_TURN, _SEEN_YAW = (
-    SENSORS.index(name)
-    for name in (
-        *("wheel_1", "steer_1", "gyro", "accel", "tilt", "imu_yaw"),
-        *("camera_speed", "camera_yaw_rate", "camera_yaw"),
-    )
-)
+_WHEEL, _STEER, _GYRO, _ACCEL, _TILT, _YAW, _SEEN, _SEEN_TURN, _SEEN_YAW = (0, 3, *range(6, 13))  # among SENSORS
 
 MONITOR = record(
     {
@@ -120,12 +114,7 @@ _kernel = njit(error_model="numpy")
 
 
 class HealthMonitor:
-    """Judges the sensors at each tick of a live estimator.
-
-    Parameters
-    ----------
-    robot : gives the periods of the sensors
-    model : the filter
+    """Judges the sensors at each tick of a live estimator by a filter of a robot, which gives their periods.
 
     Attributes
     ----------
@@ -149,14 +138,11 @@ class HealthMonitor:
             period_s=1.0 / np.array(rates_hz),
             tick_s=1.0 / sensors.wheels_rate_hz,
         )
-        self.memory = filled(MEMORY, np.nan, health=Health.LOST.value)
-        self.memory["gated_s"] = 0.0
+        self.memory = filled(MEMORY, np.nan, health=Health.LOST.value, gated_s=0.0)
         self.health = self.memory["health"][0]
         self._wheels = np.zeros(N_COLUMNS)
 
-    def judge(
-        self, time_s: float, wheels: Array, rates: Array, row: Array, feed: Array, state: Array
-    ) -> None:
+    def judge(self, time_s: float, wheels: Array, rates: Array, row: Array, feed: Array, state: Array) -> None:
         """Judge the sensors at a tick.
 
         Parameters
@@ -172,10 +158,8 @@ class HealthMonitor:
     @property
     def names(self) -> dict[str, str]:
         """Health of each sensor by name, in small letters."""
-        return {
-            name: Health(status).name.lower()
-            for name, status in zip(SENSORS, self.health.tolist(), strict=True)
-        }
+        health = (Health(status).name.lower() for status in self.health.tolist())
+        return dict(zip(SENSORS, health, strict=True))
 
 
 @_kernel
@@ -204,52 +188,49 @@ def _or_infinite(since_s: float) -> float:
 
 
 @_kernel
-def _jumped_since(line: Any) -> float:
-    """Return since when a signal has jumped and not jumped back; infinite where it has not."""
-    return float(min(_or_infinite(line.jumping_s), _or_infinite(line.jumped_s)))
+def _received(line: Any, sensor: int, received_s: Array, jumped_s: Array) -> None:
+    """Write when a signal of a sensor was taken last, and since when it has jumped and not jumped back."""
+    received_s[sensor] = line.came_s
+    jumped_s[sensor] = min(_or_infinite(line.jumping_s), _or_infinite(line.jumped_s))
 
 
 @_kernel
 def _when_received(feed: Any, received_s: Array, jumped_s: Array) -> None:
-    """Write when each sensor (13,) was taken last, and since when its value has jumped."""
+    """Write when each sensor (13,) was taken last, and since when its value has jumped, infinite where it has not."""
     jumped_s[:] = np.inf
     for i in range(3):
         received_s[_WHEEL + i], received_s[_STEER + i] = feed.rate_received_s[i], feed.steer_received_s[i]
-    received_s[_GYRO], jumped_s[_GYRO] = feed.gyro_z_radps.came_s, _jumped_since(feed.gyro_z_radps)
-    received_s[_ACCEL], jumped_s[_ACCEL] = feed.accel_mps2[0].came_s, _jumped_since(feed.accel_mps2[0])
+    _received(feed.gyro_z_radps, _GYRO, received_s, jumped_s)
+    _received(feed.accel_mps2[0], _ACCEL, received_s, jumped_s)
+    _received(feed.imu_yaw_rad, _YAW, received_s, jumped_s)
+    _received(feed.camera_speed_mps[0], _SEEN, received_s, jumped_s)
+    _received(feed.camera_yaw_rate_radps, _SEEN_TURN, received_s, jumped_s)
+    _received(feed.camera_yaw_rad, _SEEN_YAW, received_s, jumped_s)
     received_s[_TILT] = feed.accel_mps2[0].came_s
-    tilt = feed.tilt_rad
-    jumped_s[_TILT] = min(_or_infinite(tilt[0].jumped_s), _or_infinite(tilt[1].jumped_s))
-    received_s[_YAW], jumped_s[_YAW] = feed.imu_yaw_rad.came_s, _jumped_since(feed.imu_yaw_rad)
-    seen = feed.camera_speed_mps
-    received_s[_SEEN] = seen[0].came_s
-    jumped_s[_SEEN] = min(_jumped_since(seen[0]), _or_infinite(seen[1].jumped_s))
-    turn = feed.camera_yaw_rate_radps
-    received_s[_SEEN_TURN], jumped_s[_SEEN_TURN] = turn.came_s, _jumped_since(turn)
-    yaw = feed.camera_yaw_rad
-    received_s[_SEEN_YAW], jumped_s[_SEEN_YAW] = yaw.came_s, _jumped_since(yaw)
+    jumped_s[_TILT] = min(_or_infinite(feed.tilt_rad[0].jumped_s), _or_infinite(feed.tilt_rad[1].jumped_s))
+    jumped_s[_SEEN] = min(jumped_s[_SEEN], _or_infinite(feed.camera_speed_mps[1].jumped_s))
 
 
 @_kernel
-def _own(i: int, age_s: float, jumping_s: float, period_s: float) -> int:
-    """Return the health of a sensor by what came of it alone."""
+def _status(i: int, age_s: float, jumping_s: float, use: int, settings: Any, memory: Any) -> int:
+    """Return the health of a sensor by what came of it, and by what the filter made of it.
+
+    What was gated or worse has to be used first: only then is it sound again.
+    """
+    status = Health.FRESH.value
     if jumping_s > JUMPING_S:
-        return Health.STEPPED.value
-    if not age_s <= (WHEELS_LOST_S if i < _STEER else LOST_AFTER_S):
-        return Health.LOST.value
-    return Health.LATE.value if age_s > LATE_PERIODS * period_s else Health.FRESH.value
-
-
-@_kernel
-def _by_filter(use: int, before: int, step_s: float, gated_s: Array, i: int) -> int:
-    """Return the health of a sensor by what the filter made of it; what was lost has to be used first."""
+        status = Health.STEPPED.value
+    elif not age_s <= (WHEELS_LOST_S if i < _STEER else LOST_AFTER_S):
+        status = Health.LOST.value
+    elif age_s > LATE_PERIODS * settings.period_s[i]:
+        status = Health.LATE.value
     if use == GATED:
-        gated_s[i] += step_s
-        if gated_s[i] > GATED_AFTER_S or before >= Health.GATED.value:
-            return Health.GATED.value
+        memory.gated_s[i] += settings.tick_s
+        if memory.gated_s[i] > GATED_AFTER_S or memory.health[i] >= Health.GATED.value:
+            return max(status, Health.GATED.value)
     elif use != ABSENT:
-        gated_s[i] = 0.0
-    return Health.REOPENED.value if use == REOPENED else Health.FRESH.value
+        memory.gated_s[i] = 0.0
+    return max(status, Health.REOPENED.value) if use == REOPENED else status
 
 
 @_kernel
@@ -284,14 +265,7 @@ def _mark_stuck(rates: Array, speed_mps: float, row: Any, feed: Any, memory: Any
 
 @_kernel
 def _judge(
-    time_s: float,
-    wheels: Array,
-    rates: Array,
-    row: Any,
-    feed: Any,
-    state: Any,
-    settings: Any,
-    memory: Any,
+    time_s: float, wheels: Array, rates: Array, row: Any, feed: Any, state: Any, settings: Any, memory: Any
 ) -> None:
     """Write the health of the sensors at a tick."""
     row, feed, state, settings, memory = row[0], feed[0], state[0], settings[0], memory[0]
@@ -309,11 +283,9 @@ def _judge(
     received_s, jumped_s = np.empty(health.size), np.empty(health.size)
     _when_received(feed, received_s, jumped_s)
     for i in range(health.size):
-        status = _own(i, time_s - received_s[i], time_s - jumped_s[i], settings.period_s[i])
-        if settings.places[i] >= 0:
-            use = state.use[settings.places[i]]
-            status = max(status, _by_filter(use, health[i], settings.tick_s, memory.gated_s, i))
-        health[i] = status
+        use = state.use[settings.places[i]] if settings.places[i] >= 0 else ABSENT
+        age_s, jumping_s = time_s - received_s[i], time_s - jumped_s[i]
+        health[i] = _status(i, age_s, jumping_s, use, settings, memory)
     if disagrees:
         health[_ACCEL] = max(health[_ACCEL], Health.DISAGREES.value)
         health[_SEEN] = max(health[_SEEN], Health.DISAGREES.value)

@@ -1,6 +1,6 @@
 """Live estimation of a robot's motion and slip, sample by sample.
 
-The chain of :func:`~terrain.estimation.table.measurement_table` with ``causal=True``,
+The chain of :func:`~terrain.estimation.feed.measurement_table` with ``causal=True``,
 :func:`~terrain.estimation.filter.run_filter` and :func:`~terrain.estimation.wheel_slip.wheel_slip`, with
 the same numbers, on memory of a fixed size.  Each sample of the wheels is a tick, whose estimate is known
 at once (:attr:`LiveFilter.latest`).  For what comes up to a quarter of a second late the estimator goes back to
@@ -11,14 +11,11 @@ An estimate **settles** when every stream that comes has reached its tick, or wh
 any more: from then on it does not change.  :meth:`LiveFilter.step` returns those that have settled, so that
 windows are made of the same numbers over a bad link as over a good one.
 
-What differs from the batch is what has to look ahead there:
-
-- a camera or IMU that repeats itself is left out from the first repetition on; the batch leaves repetitions
-  shorter than ``FROZEN_S`` in;
-- of stamps out of order the one goes that the next sample shows to be wrong; the batch keeps the longest
-  rise.  A stamp of the wheels that is ahead by less than ``max_gap_s`` is taken, and those up to it are not;
-- periods are those of the robot's description; the batch takes the log's medians;
-- positions count from the first of all, also where a better one comes later.
+What differs from the batch is what has to look ahead there: a camera or IMU that repeats itself is left out from the
+first repetition on (the batch leaves repetitions shorter than ``FROZEN_S`` in); of stamps out of order the one goes
+that the next sample shows to be wrong (the batch keeps the longest rise), and a stamp of the wheels that is ahead by
+less than ``max_gap_s`` is taken, and those up to it are not; periods are those of the robot's description (the batch
+takes the log's medians); positions count from the first of all, also where a better one comes later.
 """
 
 from __future__ import annotations
@@ -33,20 +30,18 @@ import numpy as np
 from terrain.errors import ConfigError
 from terrain.estimation import feed as rows
 from terrain.estimation.clocks import REWIND_S, numbers
-from terrain.estimation.feed import GNSS_LATENCY_S, GNSS_PERIOD_S, GNSS_ROWS, ROWS, STREAMS, TICK_S
-from terrain.estimation.filter import (
-    GATE_PROBABILITY,
-    REOPEN_AFTER_S,
-    Filter,
-    FilterSettings,
-    Noise,
-)
-from terrain.estimation.filters.skid import make_skid_filter, skid_noise, within_bounds
-from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import Schedule, default_noise
+from terrain.estimation.feed import GNSS_LATENCY_S, GNSS_PERIOD_S, GNSS_ROWS, OFF_CLOCK_S, ROWS, STREAMS, TICK_S
+from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings, Noise
 from terrain.estimation.health import HealthMonitor
-from terrain.estimation.stuck import STUCK_AFTER_S, Motion, motion_at, motion_memory
-from terrain.estimation.table import OFF_CLOCK_S, latencies_s
+from terrain.estimation.models.skid import (
+    Motion,
+    make_skid_filter,
+    motion_at,
+    motion_memory,
+    skid_noise,
+    within_bounds,
+)
+from terrain.estimation.models.swerve import Schedule, default_noise, make_filter
 from terrain.estimation.wheel_slip import STALE_AFTER_S, SlipOfInstant
 from terrain.extension import Correction, RegionMonitor, check_corrected
 from terrain.logs.schema import WHEELS_CHANNELS
@@ -70,6 +65,9 @@ N_STEPS = 1024
 
 QUEUE = 1024
 """Samples of a stream that wait for the wheels; five seconds of a camera."""
+
+LATE_PERIODS = 1.5
+"""So many periods without wheels make a tick without them."""
 
 _JUST_BEFORE_S = 1e-6
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
@@ -127,21 +125,18 @@ class Tick(NamedTuple):
     wheels: Array | None
 
 
-class History:
+class _History:
     """The last ticks with all that was remembered after each, and the last samples of each stream.
 
-    The first is none: what was remembered before any.
-
-    Parameters
-    ----------
-    memories : arrays that are all an estimator remembers
+    The first tick is none: what was remembered before any.  ``memories`` are arrays that are all an estimator
+    remembers.
     """
 
     def __init__(self, memories: Sequence[Array]) -> None:
         self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
-        before = Tick(-math.inf, None), [memory.copy() for memory in self._memories]
-        self._ticks: deque[tuple[Tick, list[Array]]] = deque([before], maxlen=N_TICKS)
+        self._ticks: deque[tuple[Tick, list[Array]]] = deque(maxlen=N_TICKS)
         self._samples: deque[tuple[float, dict[str, Samples]]] = deque(maxlen=N_STEPS)
+        self.add_tick(Tick(-math.inf, None))
 
     def add_samples(self, came: dict[str, Samples], now_s: float) -> None:
         """Remember what came of each stream at a step, and drop what is old."""
@@ -156,29 +151,26 @@ class History:
 
     def stamps(self, stream: str) -> set[float]:
         """Return the stamps of a stream that came."""
-        steps = (came[stream][0] for _, came in self._samples if stream in came)
-        return {stamp_s for stamps in steps for stamp_s in stamps}
+        return {stamp_s for _, came in self._samples if stream in came for stamp_s in came[stream][0]}
 
     @property
     def last_s(self) -> float:
         """Stamp of the last tick; minus infinity before the first."""
-        return self._ticks[-1][0].time_s if self._ticks else -np.inf
+        return self._ticks[-1][0].time_s if self._ticks else -math.inf
 
     @property
     def last_measured_s(self) -> float:
         """Stamp of the last tick at which the wheels gave a sample."""
-        return next((tick.time_s for tick, _ in reversed(self._ticks) if tick.wheels is not None), -np.inf)
+        return next((tick.time_s for tick, _ in reversed(self._ticks) if tick.wheels is not None), -math.inf)
 
     def reaches(self, time_s: float) -> bool:
         """Say whether it is possible to go back before an instant."""
-        if not self._ticks:
-            return False
-        return bool(time_s - TICK_S > max(self._ticks[0][0].time_s, self.last_s - REWIND_S))
+        return bool(self._ticks) and time_s - TICK_S > max(self._ticks[0][0].time_s, self.last_s - REWIND_S)
 
     def go_back(self, time_s: float) -> list[Tick]:
         """Put the memories back to the last tick before an instant; return the ticks after it."""
         later: list[Tick] = []
-        while self._ticks[-1][0].time_s >= time_s - TICK_S:
+        while self.last_s >= time_s - TICK_S:
             later.append(self._ticks.pop()[0])
         for memory, snapshot in zip(self._memories, self._ticks[-1][1], strict=True):
             memory[:] = snapshot
@@ -204,14 +196,12 @@ class History:
 class _Queue:
     """Samples of a stream that are not due, by stamp; of two that are not in order one goes.
 
-    Parameters
-    ----------
-    columns : where each channel of the schema stands in the readings, -1 where it does not
+    ``columns`` say where each channel of the schema stands in the readings, -1 where it does not.
     """
 
     def __init__(self, columns: Array) -> None:
         self._columns, self._is_lacking = columns, columns < 0
-        self._waiting: list[tuple[float, bool, Array]] = []
+        self.waiting: list[tuple[float, bool, Array]] = []
         self.counts: Counter[str] = Counter()
 
     def push(self, time_s: Array, values: Array, last_s: float) -> None:
@@ -221,8 +211,8 @@ class _Queue:
         finite = np.isfinite(samples)
         samples[~finite] = np.nan
         finite[:, self._is_lacking] = True
-        waiting, stamps, complete = self._waiting, time_s.tolist(), np.all(finite, axis=1).tolist()
-        for stamp_s, whole, sample in zip(stamps, complete, samples, strict=True):
+        waiting, complete = self.waiting, np.all(finite, axis=1).tolist()
+        for stamp_s, whole, sample in zip(time_s.tolist(), complete, samples, strict=True):
             before_s = waiting[-1][0] if waiting else last_s
             if not (math.isfinite(stamp_s) and stamp_s > before_s):
                 self.counts["stamp does not increase"] += 1
@@ -237,7 +227,7 @@ class _Queue:
 
     def take(self, time_s: float) -> list[tuple[float, bool, Array]]:
         """Take out what came by a tick; what is stamped far ahead of it goes."""
-        waiting = self._waiting
+        waiting = self.waiting
         n = next((k for k, (stamp_s, _, _) in enumerate(waiting) if stamp_s > time_s + TICK_S), len(waiting))
         due = waiting[:n]
         del waiting[:n]
@@ -245,10 +235,6 @@ class _Queue:
             self.counts["off the clock"] += 1
             waiting.pop()
         return due
-
-    def clear(self) -> None:
-        """Drop all."""
-        self._waiting.clear()
 
 
 class LiveFilter:
@@ -266,6 +252,11 @@ class LiveFilter:
     gnss_latency_s : age of a position when it arrives
     rate_hz : of ``wheels`` and ``imu``, where they are not those of the robot's description
     correction : of :func:`terrain.extension.correct_live`
+
+    Attributes
+    ----------
+    latest : the last estimate; None before the first tick
+    too_late : tick at which samples came last that were too late to be taken, and by how much
 
     Raises
     ------
@@ -302,9 +293,15 @@ class LiveFilter:
         correction: Correction | None = None,
     ) -> None:
         check_corrected(robot)
+        yaw_rad = initial_yaw_rad or 0.0
+        if not math.isfinite(yaw_rad):
+            raise ConfigError(f"initial_yaw_rad is {initial_yaw_rad}, a finite number is required")
+        for stream, rate in (rate_hz or {}).items():
+            if not 0.0 < rate < math.inf:
+                raise ConfigError(f"rate of {stream!r} is {rate} Hz, a number above zero is required")
         skids = filter_name == "skid"
-        own = {**CHANNELS, "wheels": robot.rate_channels} if skids else CHANNELS
-        channels = own if channels is None else channels
+        if channels is None:
+            channels = {**CHANNELS, "wheels": robot.rate_channels} if skids else CHANNELS
         has_gnss = not skids and initial_yaw_rad is not None and "gnss" in channels
         if skids:
             self.model, usual = make_skid_filter(robot), skid_noise(robot)
@@ -312,62 +309,57 @@ class LiveFilter:
             self.model = make_filter(filter_name, robot, with_gnss=has_gnss)
             robot.require("motors", "steering", "sensors")
             usual = default_noise(filter_name, robot, has_gnss)
-        _check_numbers(initial_yaw_rad or 0.0, gnss_latency_s, rate_hz or {})
+        states, model_rows = self.model.states, self.model.rows
         is_scheduled = noise is None and bool(self.model.inputs)
         self._schedule = Schedule(self.model, ROWS) if is_scheduled else None
-        self._robot, self._channels, self._correction = robot, channels, correction
+        self._robot, self._channels, self._correction, self._skids = robot, channels, correction, skids
         self.filter = Filter(self.model, usual if noise is None else noise, settings)
         self._connect(channels, has_gnss)
         sensors = robot.completed.sensors
-        rates = {"wheels": sensors.wheels_rate_hz, "imu": sensors.imu_rate_hz} | dict(rate_hz or {})
-        self._settings = _feed_settings(robot, initial_yaw_rad or 0.0, gnss_latency_s, rates)
-        self._period_s = 1.0 / rates["wheels"]
+        rates = {"wheels": sensors.wheels_rate_hz, "imu": sensors.imu_rate_hz, "gnss": 1.0 / GNSS_PERIOD_S}
+        rates["steering"] = sensors.steering_rate_hz
+        if robot.describes("camera"):
+            rates["odometry"] = robot.camera.rate_hz
+        period_s = {stream: 1.0 / rate for stream, rate in (rates | dict(rate_hz or {})).items()}
+        self._period_s = period_s["wheels"]
+        self._settings = rows.feed_settings(robot, period_s, yaw_rad, gnss_latency_s)
         self._feed, self._row = rows.new_feed(), np.zeros(1, rows.ROW)
         self._numbers = rows.measurements(self._row)
         self._monitor = None if skids else HealthMonitor(robot, self.model)
-        self._slip = SlipOfInstant(robot, self.model.states)
-        self._motion, self._stuck_since_s = motion_memory(), np.full(1, np.nan)
-        memories = [self.filter.state, self._feed, self._motion, self._stuck_since_s]
-        self._history = History(memories if self._monitor is None else [*memories, self._monitor.memory])
+        self._slip = SlipOfInstant(robot, states)
+        self._motion = motion_memory()
+        memories = [self.filter.state, self._feed, self._motion]
+        self._history = _History(memories if self._monitor is None else [*memories, self._monitor.memory])
         self._region = RegionMonitor(robot)
-        self._row_places = [ROWS.index(row) for row in self.model.rows]
-        self._gnss_places = [k for k, row in enumerate(self.model.rows) if row in GNSS_ROWS]
-        self._motion_places = [
-            self.model.states.index(name) if name in self.model.states else -1
-            for name in (("speed_mps", "", "yaw_rate_radps", "", "") if skids else _MOTION)
-        ]
-        self._skids = skids
+        self._row_places = [ROWS.index(row) for row in model_rows]
+        self._gnss_places = [k for k, row in enumerate(model_rows) if row in GNSS_ROWS]
+        motion = ("speed_mps", "", "yaw_rate_radps", "", "") if skids else _MOTION
+        self._motion_places = places_among(motion, states).tolist()
         self.latest: LiveEstimate | None = None
         self._unsettled: deque[LiveEstimate] = deque()
         self._settled_s = -math.inf
         self._newest_s: dict[str, float] = {}
         self._counted: Counter[str] = Counter()
         self.too_late = -math.inf, math.nan
-        """Tick at which samples came last that were too late to be taken, and by how much."""
 
     def _connect(self, channels: Mapping[str, tuple[str, ...]], has_gnss: bool) -> None:
         """Find each channel's column, and lay out the queues."""
-        known = list(channels.get("wheels", ()))
-        needed = {
-            "wheels": self._robot.rate_channels,
-            "imu": ("gyro_z_radps",) if self.name == "skid" else (),
-        }
+        needed = {"wheels": self._robot.rate_channels}
+        if self._skids and channels.get("imu"):
+            needed["imu"] = ("gyro_z_radps",)
         for stream, names in needed.items():
-            if stream == "imu" and not channels.get("imu"):
-                continue
-            if lacking := [name for name in names if name not in channels.get(stream, ())]:
-                raise ConfigError(
-                    f"channels of {stream!r} are {list(channels.get(stream, ()))}: {lacking[0]!r} must be among them"
-                )
-        used = ("imu",) if self.name == "skid" else tuple(STREAMS)
-        read = [name for name in used if channels.get(name) and (name != "gnss" or has_gnss)]
-        if "odometry" in read and not self._robot.describes("camera"):
-            read.remove("odometry")
+            known = channels.get(stream, ())
+            for lacking in (name for name in names if name not in known):
+                raise ConfigError(f"channels of {stream!r} are {list(known)}: {lacking!r} must be among them")
+        has = {"gnss": has_gnss, "odometry": self._robot.describes("camera")}
+        used = ("imu",) if self._skids else tuple(STREAMS)
+        read = [name for name in used if channels.get(name) and has.get(name, True)]
+        wheels = list(channels["wheels"])
         self._n_columns = {name: len(channels[name]) for name in ("wheels", *read)}
-        self._rate_columns = [known.index(channel) for channel in self._robot.rate_channels]
-        self._current_columns = places_among([f"current_{wheel}_a" for wheel in self._robot.wheels], known)
+        self._rate_columns = [wheels.index(channel) for channel in self._robot.rate_channels]
+        self._current_columns = places_among([f"current_{wheel}_a" for wheel in self._robot.wheels], wheels)
         self._queues = {name: _Queue(places_among(STREAMS[name], list(channels[name]))) for name in read}
-        self._no_wheels = np.full(len(known), np.nan)
+        self._no_wheels = np.full(len(wheels), np.nan)
 
     @property
     def name(self) -> str:
@@ -380,11 +372,6 @@ class LiveFilter:
         return self.model.states
 
     @property
-    def lag_s(self) -> float:
-        """Delay of every estimate: each row follows the low-pass of the encoders' rates."""
-        return self._robot.encoder_lag_s
-
-    @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
         counts = dict(self._counted)
@@ -393,9 +380,14 @@ class LiveFilter:
         for stream, name in enumerate(STREAMS):
             if name in self._queues:
                 counts |= {f"{name}: {kind}": n for kind, n in self._queues[name].counts.items()}
-                for kind in ("not_finite", "frozen", "low_confidence", "no_rotation", "jump"):
+                for kind in rows.COUNTS:
                     counts[f"{name}: {kind.replace('_', ' ')}"] = int(self._feed[kind][0, stream])
         return {kind: n for kind, n in (counts | self.filter.dropped).items() if n}
+
+    @property
+    def health(self) -> dict[str, str]:
+        """Health of each sensor at the last tick, by name; empty where none is judged."""
+        return {} if self._monitor is None else self._monitor.names
 
     def at(self, now_s: float) -> LiveEstimate | None:
         """Return the last estimate, its means predicted to a later time; None before the first tick."""
@@ -405,24 +397,11 @@ class LiveFilter:
         d = len(self.states)
         mean, params = np.empty(d), np.append(self.model.params, np.zeros(len(self.model.inputs)))
         self.model.propagate(seen.mean, now_s - seen.time_s, params, mean, np.zeros((d, d)))
-        v_x, v_y, turn, a_x, a_y = self._motion_of(mean)
-        return seen._replace(
-            mean=mean,
-            speed_x_mps=v_x,
-            speed_y_mps=v_y,
-            yaw_rate_radps=turn,
-            accel_x_mps2=a_x,
-            accel_y_mps2=a_y,
-        )
+        return seen._replace(mean=mean, **dict(zip(_MOTION, self._motion_of(mean), strict=True)))
 
     def _motion_of(self, mean: Array) -> list[float]:
         """Return speeds, yaw rate and accelerations of a state; NaN of what it does not have."""
         return [math.nan if place < 0 else float(mean[place]) for place in self._motion_places]
-
-    @property
-    def health(self) -> dict[str, str]:
-        """Health of each sensor at the last tick, by name; empty where none is judged."""
-        return {} if self._monitor is None else self._monitor.names
 
     def step(self, readings: Mapping[str, Reading], now_s: float | None = None) -> list[LiveEstimate]:
         """Take in what arrived, and return the estimates at samples of the wheels that have settled.
@@ -441,14 +420,20 @@ class LiveFilter:
         """
         if not isinstance(readings, Mapping):
             readings = {}
-        history = self._history
-        last_s = history.last_s
+        history, last_s, late_s = self._history, self._history.last_s, math.inf
         came: dict[str, Samples] = {}
-        late_s = self._queue_up(readings, came, last_s)
-        taken = self._taken("wheels", readings, came)
         ticks = []
-        if taken is not None:
-            stamps, _, values = taken
+        for name in (*self._queues, "wheels"):
+            taken = self._taken(name, readings, came)
+            if taken is None:
+                continue
+            stamps, time_s, values = taken
+            if name != "wheels":
+                late = self._late(name, stamps, last_s) if stamps and min(stamps) <= last_s else math.inf
+                late_s = min(late_s, late)
+                if late == math.inf:
+                    self._queues[name].push(time_s, values, self._last_taken_s(name))
+                continue
             ticks = [Tick(*tick) for tick in zip(stamps, values, strict=True)]
             if ticks and stamps[0] <= last_s and history.last_measured_s < stamps[0]:
                 late_s = min(late_s, self._late("wheels", stamps, last_s))
@@ -461,7 +446,7 @@ class LiveFilter:
             ticks = self._go_back(late_s, ticks)
         if now_s is not None and history.last_s > -math.inf:
             reached_s = ticks[-1].time_s if ticks else history.last_s
-            if 1.5 * self._period_s < now_s - reached_s < SETTINGS.max_gap_s:
+            if LATE_PERIODS * self._period_s < now_s - reached_s < SETTINGS.max_gap_s:
                 ticks.append(Tick(now_s, None))
                 self._counted["ticks without wheels"] += 1
         settled: list[LiveEstimate] = []
@@ -478,11 +463,9 @@ class LiveFilter:
         if not self._unsettled:
             return []
         last_s, first_s, reached_s = self._history.last_s, self._unsettled[0].time_s, math.inf
-        for (
-            name
-        ) in self._n_columns:  # a stream that stopped, or does not begin, is waited for no longer than that
+        for name in self._n_columns:
             newest_s = self._newest_s.setdefault(name, first_s - _JUST_BEFORE_S)
-            if newest_s > last_s - REWIND_S:
+            if newest_s > last_s - REWIND_S:  # one that stopped, or does not begin, is waited for no longer
                 reached_s = min(reached_s, newest_s)
         reached_s = math.inf if all_of_them else max(reached_s, last_s - REWIND_S)
         settled = []
@@ -491,65 +474,17 @@ class LiveFilter:
             self._settled_s = settled[-1].time_s
         return settled
 
-    def _queue_up(self, readings: Mapping[str, Reading], came: dict[str, Samples], last_s: float) -> float:
-        """Queue the samples of all streams but the wheels; return the instant to go back to, or infinity."""
-        late_s = math.inf
-        for name, queue in self._queues.items():
-            taken = self._taken(name, readings, came)
-            if taken is None:
-                continue
-            stamps, time_s, values = taken
-            if stamps and min(stamps) <= last_s and (late := self._late(name, stamps, last_s)) < math.inf:
-                late_s = min(late_s, late)
-            else:
-                queue.push(time_s, values, self._last_taken_s(name))
-        return late_s
-
     def _last_taken_s(self, name: str) -> float:
         return float(self._feed["last_s"][0, list(STREAMS).index(name)])
 
     def _taken(self, name: str, readings: Mapping[str, Reading], came: dict[str, Samples]) -> Samples | None:
-        """Return what came of a stream, noted where it has stamps to go back to; None where nothing did."""
+        """Return what came of a stream, noted where it has stamps to go back to; None where nothing did.
+
+        Values that do not fit are unknown, stamps that do not are nothing.
+        """
         reading = readings.get(name)
-        arrays = None if reading is None or name not in self._n_columns else self._arrays(name, reading)
-        if arrays is None:
+        if reading is None or name not in self._n_columns:
             return None
-        stamps: list[float] = arrays[0].tolist()
-        taken = stamps, *arrays
-        if stamps and math.isfinite(sum(stamps)):
-            came[name] = taken
-        return taken
-
-    def _late(self, name: str, stamps: list[float], last_s: float) -> float:
-        """Return the instant to go back to for late samples, infinite where there is none that is new."""
-        known = self._history.stamps(name)
-        late = [stamp_s for stamp_s in stamps if stamp_s <= last_s and stamp_s not in known]
-        if late and not self._history.reaches(min(late)):
-            self.too_late = last_s, last_s - min(late)
-            return math.inf
-        if not late:
-            return math.inf
-        self._counted["came late"] += 1
-        return min(late)
-
-    def _go_back(self, late_s: float, ticks: list[Tick]) -> list[Tick]:
-        """Put the memory back before an instant; return the ticks to be done again, with new ones."""
-        done = self._history.go_back(late_s)
-        for name, queue in self._queues.items():
-            queue.clear()
-            later = self._history.since(name, self._last_taken_s(name))
-            if later is not None:
-                queue.push(*later, self._last_taken_s(name))
-        first_s = done[0].time_s if done else math.inf
-        while self._unsettled and self._unsettled[-1].time_s >= first_s:
-            self._unsettled.pop()
-        measured = {tick.time_s: tick for tick in (*ticks, *done) if tick.wheels is not None}
-        reached_s = max(measured, default=-math.inf) + 1.5 * self._period_s  # none was due before
-        spare = [tick for tick in done if tick.wheels is None and tick.time_s > reached_s]
-        return sorted([*measured.values(), *spare], key=lambda tick: tick.time_s)
-
-    def _arrays(self, name: str, reading: Reading) -> tuple[Array, Array] | None:
-        """Return stamps and values; values that do not fit are unknown, stamps that do not are nothing."""
         try:
             time_s, values = numbers(reading[0]), numbers(reading[1])
         except (TypeError, ValueError, LookupError):
@@ -557,14 +492,46 @@ class LiveFilter:
         if time_s is None or values is None:
             self._counted[f"{name}: unreadable"] += 1
             return None
-        if time_s.ndim == 1 and values.shape == (time_s.size, self._n_columns[name]):
-            if self._correction is not None:
-                return self._correction(name, self._channels[name], time_s, values)
-            return time_s, values
-        self._counted[f"{name}: unreadable"] += max(time_s.size, 1)
-        if name == "wheels" and time_s.ndim == 1:
-            return time_s, np.full((time_s.size, self._n_columns[name]), np.nan)
-        return None
+        if time_s.ndim != 1 or values.shape != (time_s.size, self._n_columns[name]):
+            self._counted[f"{name}: unreadable"] += max(time_s.size, 1)
+            if name != "wheels" or time_s.ndim != 1:
+                return None
+            values = np.full((time_s.size, self._n_columns[name]), np.nan)
+        elif self._correction is not None:
+            time_s, values = self._correction(name, self._channels[name], time_s, values)
+        stamps: list[float] = time_s.tolist()
+        taken = stamps, time_s, values
+        if stamps and math.isfinite(sum(stamps)):
+            came[name] = taken
+        return taken
+
+    def _late(self, name: str, stamps: list[float], last_s: float) -> float:
+        """Return the instant to go back to for late samples, infinite where there is none that is new."""
+        known = self._history.stamps(name)
+        late_s = min((at_s for at_s in stamps if at_s <= last_s and at_s not in known), default=math.inf)
+        if late_s == math.inf:
+            return math.inf
+        if not self._history.reaches(late_s):
+            self.too_late = last_s, last_s - late_s
+            return math.inf
+        self._counted["came late"] += 1
+        return late_s
+
+    def _go_back(self, late_s: float, ticks: list[Tick]) -> list[Tick]:
+        """Put the memory back before an instant; return the ticks to be done again, with new ones."""
+        done = self._history.go_back(late_s)
+        for name, queue in self._queues.items():
+            queue.waiting.clear()
+            later = self._history.since(name, self._last_taken_s(name))
+            if later is not None:
+                queue.push(*later, self._last_taken_s(name))
+        first_s = done[0].time_s if done else math.inf
+        while self._unsettled and self._unsettled[-1].time_s >= first_s:
+            self._unsettled.pop()
+        measured = {tick.time_s: tick for tick in (*ticks, *done) if tick.wheels is not None}
+        reached_s = max(measured, default=-math.inf) + LATE_PERIODS * self._period_s  # none was due before
+        spare = [tick for tick in done if tick.wheels is None and tick.time_s > reached_s]
+        return sorted([*measured.values(), *spare], key=lambda tick: tick.time_s)
 
     def _tick(self, tick: Tick, settled: list[LiveEstimate]) -> LiveEstimate | None:
         """Do a tick; what was not settled before a clock was set back has settled."""
@@ -581,16 +548,23 @@ class LiveFilter:
             self._settled_s = -math.inf
             rows.forget_times(self._feed)
             for queue in self._queues.values():
-                queue.clear()
+                queue.waiting.clear()
         for stream, name in enumerate(STREAMS):
             if name in self._queues:
                 for came_s, complete, sample in self._queues[name].take(time_s):
                     rows.take_live(stream, sample, complete, came_s, self._settings, self._feed)
         rates = wheels[self._rate_columns]
         if self._skids:
-            rates = np.where(np.isfinite(rates), rates, np.nan)
+            rates[~np.isfinite(rates)] = np.nan
         rows.tick_live(time_s, rates, self._settings, self._feed, self._row)
-        self._filter_row(time_s)
+        z = self._numbers[:, self._row_places][0]
+        variance, walk, inputs = filter_.noise.measurement_variance, None, None
+        if self._schedule is not None:
+            (variance,), (walk,), (inputs,) = self._schedule(self._numbers, variance)
+        if self._gnss_places:
+            variance = np.array(variance)
+            variance[self._gnss_places] = self._row["gnss_variance"][0]
+        filter_.step(time_s, z, variance, walk, inputs)
         if self._monitor is not None:
             self._monitor.judge(time_s, wheels, rates, self._row, self._feed, filter_.state)
         estimate = self._estimate(time_s, wheels, rates)
@@ -601,36 +575,23 @@ class LiveFilter:
             self._region.step(time_s, float(estimate.wheel_speed_mps.mean()), estimate.yaw_rate_radps)
         return estimate
 
-    def _filter_row(self, time_s: float) -> None:
-        """Take the row into the filter, with the noise and the inputs of this tick."""
-        z = self._numbers[:, self._row_places][0]
-        variance, walk, inputs = self.filter.noise.measurement_variance, None, None
-        if self._schedule is not None:
-            (variance,), (walk,), (inputs,) = self._schedule(self._numbers, variance)
-        if self._gnss_places:
-            variance = np.array(variance)
-            variance[self._gnss_places] = self._row["gnss_variance"][0]
-        self.filter.step(time_s, z, variance, walk, inputs)
-
     def _estimate(self, time_s: float, wheels: Array, rates: Array) -> LiveEstimate:
         """Return what is known after a tick."""
         filter_, robot = self.filter, self._robot
         mean, std = filter_.mean.copy(), np.sqrt(filter_.cov.diagonal())
-        motion, nothing = Motion.UNKNOWN, np.full(len(robot.wheels), np.nan)
-        age_s = filter_.reference_age_s
-        slip_ratio = slip_std = nothing
-        motor_radps, wheel_speed_mps = nothing, rates
+        motion, age_s = Motion.UNKNOWN, filter_.reference_age_s
+        slip_ratio = slip_std = motor_radps = np.full(len(robot.wheels), np.nan)
+        wheel_speed_mps = rates
         if self._skids:  # nothing sees the ground go by: slip is not known
             mean = within_bounds(mean, robot.track_m)
-            motion = self._motion_at(time_s, mean, std)
+            sides_mps, has_gyro = self._row["side_mps"][0].tolist(), not math.isnan(self._row["gyro_z_radps"][0])
+            turn, bias = (self.states.index(name) for name in ("yaw_rate_radps", "gyro_bias_radps"))
+            known = float(mean[turn]), float(std[bias])
+            motion = motion_at(time_s, *sides_mps, has_gyro, *known, robot.track_m, self._motion)
         else:
-            motor_radps, wheel_speed_mps = (
-                rates.copy(),
-                robot.wheel_speeds_mps(rates / robot.motors.reduction_ratio),
-            )
+            motor_radps = rates.copy()
+            wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.motors.reduction_ratio)
             slip_ratio, slip_std = self._slip.at(time_s, filter_, self._row, self._feed)
-        current_a = np.append(wheels, np.nan)[self._current_columns]
-        v_x, v_y, turn, a_x, a_y = self._motion_of(mean)
         return LiveEstimate(
             time_s,
             mean,
@@ -640,62 +601,14 @@ class LiveFilter:
             age_s > STALE_AFTER_S,
             age_s,
             self._numbers[0].copy(),
-            v_x,
-            v_y,
-            turn,
-            a_x,
-            a_y,
+            *self._motion_of(mean),
             motor_radps,
-            current_a,
+            np.append(wheels, np.nan)[self._current_columns],
             wheel_speed_mps,
             np.empty(0, np.int8) if self._monitor is None else self._monitor.health.copy(),
             motion,
-            float(self._stuck_since_s[0]),
+            float(self._motion["stuck_since_s"][0]),
         )
-
-    def _motion_at(self, time_s: float, mean: Array, std: Array) -> Motion:
-        """Return what is known of the motion, and note since when the robot is stuck."""
-        left_mps, right_mps = self._row["side_mps"][0].tolist()
-        bias, turn = (self.states.index(name) for name in ("gyro_bias_radps", "yaw_rate_radps"))
-        has_gyro = not math.isnan(self._row["gyro_z_radps"][0])
-        status = motion_at(
-            time_s, left_mps, right_mps, has_gyro, mean[turn], std[bias], self._robot.track_m, self._motion
-        )
-        if status != Motion.STUCK:
-            self._stuck_since_s[0] = math.nan
-        elif math.isnan(self._stuck_since_s[0]):
-            self._stuck_since_s[0] = time_s - STUCK_AFTER_S
-        return Motion(status)
-
-
-def _feed_settings(
-    robot: Robot, initial_yaw_rad: float, gnss_latency_s: float, rate_hz: Mapping[str, float]
-) -> Array:
-    """Return the settings of the feed by the periods of the description."""
-    sensors = robot.completed.sensors
-    lag_s = dict.fromkeys(STREAMS, robot.encoder_lag_s)
-    period_s = {
-        "imu": 1.0 / rate_hz["imu"],
-        "steering": 1.0 / sensors.steering_rate_hz,
-        "gnss": GNSS_PERIOD_S,
-    }
-    if robot.describes("camera"):
-        lag_s["odometry"] = max(robot.encoder_lag_s - robot.camera.time_constant_s, 0.0)
-        period_s["odometry"] = 1.0 / robot.camera.rate_hz
-    latency_s = latencies_s(robot, gnss_latency_s)
-    return rows.feed_settings(robot, initial_yaw_rad, latency_s, lag_s, period_s, 1.0 / rate_hz["wheels"])
-
-
-def _check_numbers(initial_yaw_rad: float, gnss_latency_s: float, rate_hz: Mapping[str, float]) -> None:
-    """Refuse a heading, a latency or a rate that is none; ``ConfigError``."""
-    for name, value in (("initial_yaw_rad", initial_yaw_rad), ("gnss_latency_s", gnss_latency_s)):
-        if not math.isfinite(value):
-            raise ConfigError(f"{name} is {value}, a finite number is required")
-    if gnss_latency_s < 0:
-        raise ConfigError(f"gnss_latency_s is {gnss_latency_s:g}, a time from zero up is required")
-    for stream, rate in rate_hz.items():
-        if not 0.0 < rate < math.inf:
-            raise ConfigError(f"rate of {stream!r} is {rate} Hz, a number above zero is required")
 
 
 def places_among(names: Sequence[str], among: Sequence[str]) -> Array:

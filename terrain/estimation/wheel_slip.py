@@ -1,4 +1,4 @@
-"""Slip of each wheel from what a filter estimates, with its standard deviation.
+"""Slip of each wheel from what a filter estimates, with its standard deviation, and a run's in a few figures.
 
 The definition of the slip ratio is :func:`terrain.slip.slip_ratio`.
 """
@@ -6,18 +6,30 @@ The definition of the slip ratio is :func:`terrain.slip.slip_ratio`.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.estimation.feed import UNMEASURED_AFTER_S
+from terrain.estimation.feed import UNMEASURED_AFTER_S, MeasurementTable
 from terrain.estimation.filter import Filter
-from terrain.estimation.table import MeasurementTable
 from terrain.kernels import njit
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
-from terrain.records import Array, SlipTrack, StateTrack
+from terrain.records import Array, SlipTrack, StateTrack, read_only
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS
+
+STEADY_SPEED_MPS = 0.2
+"""Slower, 1 cm/s of error in the speed is over 5 % of slip."""
+
+STEADY_CHANGE_MPS = 0.1
+"""Largest change of speed over :data:`STEADY_BEFORE_S` that counts as none: 0.1 m/s^2 asks for a hundredth of
+the weight in traction, little beside what rolling on soft ground does."""
+
+STEADY_BEFORE_S, STEADY_AFTER_S = 1.0, 0.25
+"""How long the speed has to have been steady, for transients to have died out, and how long it has to remain
+so, for the start of a braking not to count before it shows."""
 
 STALE_AFTER_S = 0.15
 """Age of the last speed over ground beyond which slip counts as stale: one and a half periods of GNSS, at 10
@@ -58,20 +70,13 @@ def wheel_slip(
     unseen = np.isinf(track.reference_age_s)
     if f"slip_speed_{robot.wheels[0]}_mps" not in track.states:
         unseen = unseen | slip.stale
-    unknown = unseen[:, None] | _unmeasured(table, robot)
+    unknown = np.repeat(unseen[:, None], len(robot.wheels), axis=1)
+    for i, row in enumerate(robot.wheel_rows):  # a wheel whose rate or angle was not measured for long
+        measured = np.isfinite(table.columns([row, *robot.steer_rows[i : i + 1]]))
+        last_s = np.maximum.accumulate(np.where(measured, table.time_s[:, None], -np.inf), axis=0)
+        unknown[:, i] |= (table.time_s[:, None] - last_s > UNMEASURED_AFTER_S).any(axis=1)
     ratio, std = (np.where(unknown, np.nan, v) for v in (slip.slip_ratio, slip.slip_std))
     return SlipTrack(slip.time_s, ratio, std, slip.wheels, slip.stale)
-
-
-def _unmeasured(table: MeasurementTable, robot: Robot) -> Array:
-    """Return where (n, wheels) a wheel's rate or angle was not measured for :data:`UNMEASURED_AFTER_S`."""
-    columns = []
-    for i, row in enumerate(robot.wheel_rows):
-        names = [row, *robot.steer_rows[i : i + 1]]
-        measured = np.isfinite(table.columns(names))
-        last_s = np.maximum.accumulate(np.where(measured, table.time_s[:, None], -np.inf), axis=0)
-        columns.append((table.time_s[:, None] - last_s > UNMEASURED_AFTER_S).any(axis=1))
-    return np.column_stack(columns)
 
 
 def blind_slip(track: StateTrack, table: MeasurementTable, robot: Robot) -> SlipTrack:
@@ -104,13 +109,7 @@ def _slip(
 
 
 class SlipOfInstant:
-    """The slip of each wheel at the last step of a filter: :func:`wheel_slip`, live.
-
-    Parameters
-    ----------
-    robot : with its wheels
-    states : of the filter
-    """
+    """The slip of each wheel of a robot at the last step of a filter with some states: :func:`wheel_slip`, live."""
 
     def __init__(self, robot: Robot, states: tuple[str, ...]) -> None:
         self._robot, self._positions_m = robot, np.array(robot.wheel_positions_m)
@@ -120,14 +119,14 @@ class SlipOfInstant:
 
     def at(self, time_s: float, session: Filter, row: Array, feed: Array) -> tuple[Array, Array]:
         """Return slip and standard deviation (wheels,) at a tick, of a row of a feed and its memory."""
-        slip, age_s = np.full((2, len(self._robot.wheels)), np.nan), session.reference_age_s
+        slip, age_s = np.full((1, 2, len(self._robot.wheels)), np.nan), session.reference_age_s
         if not math.isinf(age_s) and (age_s <= STALE_AFTER_S or self._has_slip_speed):
-            speeds = self._robot.wheel_speeds_mps(row["wheel_radps"][0])
-            cov = np.ascontiguousarray(session.cov)
-            _instant_slip(session.mean, cov, self._positions_m, self._places, speeds, self._variance, slip)
+            speeds = self._robot.wheel_speeds_mps(row["wheel_radps"])
+            mean, cov = session.mean[None], np.ascontiguousarray(session.cov)[None]
+            _slips(mean, cov, self._positions_m, self._places, speeds, self._variance, slip)
             received_s = np.minimum(feed["rate_received_s"][0], feed["steer_received_s"][0])
-            slip[:, time_s - received_s > UNMEASURED_AFTER_S] = np.nan
-        return slip[0], slip[1]
+            slip[0, :, time_s - received_s > UNMEASURED_AFTER_S] = np.nan
+        return slip[0, 0], slip[0, 1]
 
 
 def _places(robot: Robot, states: tuple[str, ...], from_encoders: bool = False) -> Array:
@@ -143,8 +142,8 @@ def _places(robot: Robot, states: tuple[str, ...], from_encoders: bool = False) 
     return np.array([states.index(name) if name in states else -1 for name in names])
 
 
-@njit(error_model="numpy")
-def _instant_slip(
+@njit(cache=True, error_model="numpy")
+def _slips(
     mean: Array,
     cov: Array,
     positions_m: Array,
@@ -153,27 +152,29 @@ def _instant_slip(
     wheel_speed_variance: float,
     slip: Array,
 ) -> None:
-    """Write ratio and standard deviation (2, wheels) of the slip of one instant.
+    """Write ratio and standard deviation (n, 2, wheels) of the slip of n instants.
 
     ``places`` say where the state has what :func:`_places` names; where it has no slip speeds,
-    ``wheel_speed_mps`` (wheels,) holds.
+    ``wheel_speed_mps`` (n, wheels) holds.
     """
-    n = positions_m.shape[0]
+    n_wheels = positions_m.shape[0]
     states, slopes = np.empty(5, np.int64), np.empty(5)
     states[:3] = places[:3]
-    for i in range(n):
-        states[3], states[4] = places[3 + i], places[3 + n + i]
+    for k in range(mean.shape[0] * n_wheels):
+        n, i = k // n_wheels, k % n_wheels
+        state = mean[n]
+        states[3], states[4] = places[3 + i], places[3 + n_wheels + i]
         x, y = positions_m[i, 0], positions_m[i, 1]
-        across = mean[states[1]] if states[1] >= 0 else 0.0
-        steer = mean[states[3]] if states[3] >= 0 else 0.0
-        ahead, left = point_velocity(mean[states[0]], across, mean[states[2]], x, y)
+        across = state[states[1]] if states[1] >= 0 else 0.0
+        steer = state[states[3]] if states[3] >= 0 else 0.0
+        ahead, left = point_velocity(state[states[0]], across, state[states[2]], x, y)
         cos, sin = np.cos(steer), np.sin(steer)
         ground, sideways = in_wheel_frame(ahead, left, cos, sin)
         in_state = states[4] >= 0
-        wheel_speed = ground + mean[states[4]] if in_state else wheel_speed_mps[i]
+        wheel_speed = ground + state[states[4]] if in_state else wheel_speed_mps[n, i]
         traction = abs(wheel_speed) >= abs(ground)
         fastest = wheel_speed if traction else ground
-        slip[:, i] = np.nan
+        slip[n, :, i] = np.nan
         if not (abs(fastest) >= MIN_SPEED_MPS and np.isfinite(wheel_speed)):
             continue
         size, sign = abs(fastest), np.sign(fastest)
@@ -185,27 +186,11 @@ def _instant_slip(
         slopes[3], slopes[4] = along * sideways, by_wheel_speed
         variance = 0.0 if in_state else by_wheel_speed**2 * wheel_speed_variance
         for j in range(5):
-            for k in range(5):
-                if states[j] >= 0 and states[k] >= 0:
-                    variance += slopes[j] * cov[states[j], states[k]] * slopes[k]
-        slip[0, i] = min(max((wheel_speed - ground) / size, -1.0), 1.0)
-        slip[1, i] = np.sqrt(max(variance, 0.0))
-
-
-@njit(error_model="numpy")
-def _slips(
-    mean: Array,
-    cov: Array,
-    positions_m: Array,
-    places: Array,
-    wheel_speed_mps: Array,
-    wheel_speed_variance: float,
-    slip: Array,
-) -> None:
-    """Write the slip (n, 2, wheels) of each instant."""
-    for n in range(mean.shape[0]):
-        speeds = wheel_speed_mps[n]
-        _instant_slip(mean[n], cov[n], positions_m, places, speeds, wheel_speed_variance, slip[n])
+            for m in range(5):
+                if states[j] >= 0 and states[m] >= 0:
+                    variance += slopes[j] * cov[n, states[j], states[m]] * slopes[m]
+        slip[n, 0, i] = min(max((wheel_speed - ground) / size, -1.0), 1.0)
+        slip[n, 1, i] = np.sqrt(max(variance, 0.0))
 
 
 def wheel_speed_scatter_mps(robot: Robot) -> float:
@@ -222,3 +207,55 @@ def wheel_speed_scatter_mps(robot: Robot) -> float:
     lag_s = sensors.encoder_time_constant_s
     ripple = step_rad / lag_s / np.sqrt(12.0) if lag_s > 0 else 0.0
     return float(np.hypot(noise, ripple) * robot.wheel_radius_m)
+
+
+class SlipFigures(NamedTuple):
+    """Slip of a run in a few figures, ratios; NaN where there was nothing to take them from.
+
+    Parameters
+    ----------
+    steady : (n,) where the robot drove steadily
+    steady_mean : over all wheels then
+    peak : largest absolute slip of any wheel while the robot moved and not steadily
+    """
+
+    steady: Array
+    steady_mean: float
+    peak: float
+
+
+def slip_figures(
+    slip: SlipTrack, speed_mps: Array, time_s: Array, rolling: Array | None = None
+) -> SlipFigures:
+    """Return the figures of a run: steady slip, and the peak of its transients.
+
+    Parameters
+    ----------
+    slip : of a filter; stale samples count as long as they are no NaN
+    speed_mps, time_s : (k,) speed of the robot, on any clock
+    rolling : (n, wheels) -1 where a wheel rolls backward, else 1: means are of slip positive in traction
+        then, so that driving forward and backward does not cancel; without, slip counts as it is
+
+    Notes
+    -----
+    Steady is faster than :data:`STEADY_SPEED_MPS`, with a speed that stays within :data:`STEADY_CHANGE_MPS`
+    from :data:`STEADY_BEFORE_S` before to :data:`STEADY_AFTER_S` after.
+    """
+    known = np.isfinite(speed_mps)
+    speed = np.full(slip.time_s.size, np.nan)
+    if known.any():
+        speed = np.abs(np.interp(slip.time_s, time_s[known], speed_mps[known], left=np.nan, right=np.nan))
+    first = np.searchsorted(slip.time_s, slip.time_s - STEADY_BEFORE_S - 1e-9)
+    last = np.searchsorted(slip.time_s, slip.time_s + STEADY_AFTER_S + 1e-9)
+    change = np.array([np.ptp(speed[a:b]) for a, b in zip(first, last, strict=True)])
+    started = slip.time_s - slip.time_s[:1] >= STEADY_BEFORE_S - 1e-9
+    moving = speed > STEADY_SPEED_MPS
+    steady = moving & started & (change < STEADY_CHANGE_MPS)
+    ratio = slip.slip_ratio if rolling is None else slip.slip_ratio * rolling
+    peak = _of_known(np.max, np.abs(ratio[moving & ~steady]))
+    return SlipFigures(read_only(steady, np.bool_), _of_known(np.mean, ratio[steady]), peak)
+
+
+def _of_known(statistic: Callable[[Array], Any], slip: Array) -> float:
+    known = slip[np.isfinite(slip)]
+    return float(statistic(known)) if known.size else math.nan

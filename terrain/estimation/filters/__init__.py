@@ -1,1 +1,0 @@
-"""What the filters estimate, from what, and with what noise."""

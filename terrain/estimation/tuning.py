@@ -1,0 +1,156 @@
+"""Process noise of a filter from runs: the variances under which these are most likely.
+
+The log likelihood of a filter is the sum of log N(nu; 0, S) over its innovations (Sarkka, Bayesian Filtering
+and Smoothing, 2013, 12.3), so that noise can be fitted to runs without a truth.  Gates are off meanwhile:
+otherwise it would pay to leave out what does not fit.  As s = h P h' + R is at least R, a sample's is at most that of
+no innovation and a variance of R: half the square of a residual is what it lacks to that, and
+:func:`terrain.identify.identify` finds the scales.
+
+Measurement noise stays: behind the common low-pass an error lasts longer than a sample, and a likelihood that
+takes each for independent would drive the variances of the sensors to zero.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from terrain.errors import DataError
+from terrain.estimation.estimate import model_and_noise
+from terrain.estimation.feed import measurement_table
+from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise
+from terrain.extension import corrected, corrected_log
+from terrain.identify import Parameter, identify
+from terrain.records import Array, RunLog
+from terrain.robots import Robot, packaged_robot
+
+MAX_RUNS = 3
+"""Number of runs to tune on unless they are named: the likelihood of each is evaluated a hundred times."""
+
+MAX_STEPS = 25
+"""Of the search, each of which evaluates the likelihood once, and once a group."""
+
+WIDEST_SCALE = 1e4
+"""No variance is scaled up or down by more than this."""
+
+CLEAR_DROP = 2.0
+"""A scale twice or half as large has to cost this much log likelihood, as an error of two standard deviations
+does; otherwise the runs say nothing on it."""
+
+GROUPS = ("speed", "yaw_rate", "accel", "steer", "slip", "effective_track", "gyro_bias")
+"""States are tuned together whose names begin alike."""
+
+
+class TuningStatus(StrEnum):
+    """What the runs say of a scale: determined, at the end of its range, or not determined."""
+
+    FOUND = "found"
+    AT_BOUND = "at bound"
+    NOT_EXCITED = "not excited"
+
+
+@dataclass(frozen=True, slots=True)
+class TunedNoise:
+    """Result of a tuning.
+
+    Parameters
+    ----------
+    runs : ids of the runs tuned on
+    log_likelihood_before, log_likelihood_after : summed over them
+    scales : of the variances, by group
+    status : of each scale, by group
+    """
+
+    runs: tuple[str, ...]
+    log_likelihood_before: float
+    log_likelihood_after: float
+    scales: Mapping[str, float]
+    status: Mapping[str, TuningStatus]
+
+
+def tuned_noise(
+    runs: Sequence[RunLog], robot: Robot | None, name: str, names: Sequence[str] | None = None
+) -> tuple[Noise, TunedNoise]:
+    """Return noise under which the runs are most likely, and what became of each group.
+
+    Parameters
+    ----------
+    runs : logs, as measured
+    robot : whose they are; by default the one that the first names
+    name : of the filter
+    names : of the runs to tune on; the first few by default
+
+    Raises
+    ------
+    DataError
+        if no run is named, or there is none of a name.
+    """
+    by_id = {run.run_id: run for run in runs}
+    names = list(by_id)[:MAX_RUNS] if names is None else names
+    if not names:
+        raise DataError("no run to tune on is named")
+    for unknown in (each for each in names if each not in by_id):
+        raise DataError(f"there is no run {unknown!r} to tune on; there are {', '.join(by_id)}")
+    robot = robot or packaged_robot(by_id[names[0]].robot)
+    logs, robot = [corrected_log(by_id[each], robot) for each in names], corrected(robot)
+    model, noise = model_and_noise(logs[0], robot, name)
+    tables = [measurement_table(run, robot) for run in logs]
+    samples = [(table.time_s, table.columns(model.rows)) for table in tables]
+    return tune_noise(model, samples, noise, tuple(names))
+
+
+def tune_noise(
+    model: FilterModel, samples: Sequence[tuple[Array, Array]], noise: Noise, runs: tuple[str, ...] = ()
+) -> tuple[Noise, TunedNoise]:
+    """Scale the process variances of each of :data:`GROUPS` so that samples become as likely as they can.
+
+    Parameters
+    ----------
+    model : the filter
+    samples : ``time_s (n,), z (n, m)`` of each run
+    noise : where to start, with variances of measurements that do not change from sample to sample
+    runs : their ids, to be reported
+    """
+    members = {name: [state.startswith(name) for state in model.states] for name in GROUPS}
+    members = {name: states for name, states in members.items() if any(states)}
+
+    def scaled(log_scales: Array) -> Noise:
+        std = np.ones(len(model.states))
+        for states, log_scale in zip(members.values(), log_scales.tolist(), strict=True):
+            std[states] = math.exp(0.5 * log_scale)
+        return replace(noise, process_variance=noise.process_variance * np.outer(std, std))
+
+    def likelihoods(log_scales: Array) -> list[Array]:
+        tried = scaled(log_scales)
+        sessions = (Filter(model, tried, FilterSettings(gate_probability=1.0)) for _ in samples)
+        return [
+            np.diff(session.run(*sample, keep=False).log_likelihood, prepend=0.0)
+            for session, sample in zip(sessions, samples, strict=True)
+        ]
+
+    def likelihood(log_scales: Array) -> float:
+        return math.fsum(float(each.sum()) for each in likelihoods(log_scales))
+
+    most = [-0.5 * (np.isfinite(z) @ np.log(2 * np.pi * noise.measurement_variance)) for _, z in samples]
+
+    def residual(log_scales: Array) -> Array:
+        lacking = np.concatenate(most) - np.concatenate(likelihoods(log_scales))
+        return np.sqrt(2.0 * np.maximum(lacking, 0.0))
+
+    widest = math.log(WIDEST_SCALE)
+    parameters = [Parameter(name, 0.0, -widest, widest) for name in members]
+    fit = identify(residual, parameters, max_nfev=MAX_STEPS)
+    after, status = likelihood(fit.value), {}
+    for i, name in enumerate(members):
+        shift = math.log(2) * np.eye(len(members))[i]
+        drop = after - max(likelihood(fit.value + shift), likelihood(fit.value - shift))
+        status[name] = TuningStatus.FOUND if drop > CLEAR_DROP else TuningStatus.NOT_EXCITED
+        if fit.at_bound[i]:
+            status[name] = TuningStatus.AT_BOUND
+    scales = dict(zip(members, np.exp(fit.value).tolist(), strict=True))
+    before = likelihood(np.zeros(len(members)))
+    return scaled(fit.value), TunedNoise(runs, before, after, scales, status)
