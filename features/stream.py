@@ -309,7 +309,7 @@ class WindowFeed:
 
     The windows are those that :func:`~features.windows.cut_windows` cuts from the log with wheel speeds
     (:func:`terrain.kinematics.logged_wheels.with_wheel_speeds`) and estimates
-    (:func:`terrain.estimation.enriched.enriched`).
+    (:func:`terrain.estimation.estimate.enriched`).
 
     Parameters
     ----------

@@ -140,7 +140,7 @@ def low_pass(values: Array, step_s: float, time_constant_s: float, at_first: boo
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], values, axis=0, zi=start)[0])
 
 
-@njit(cache=True)
+@njit
 def low_pass_step(value: float, before: float, smooth: float, step_s: float, time_constant_s: float) -> float:
     """Return what is behind a low-pass after a step: from x_0 = ``before`` and y_0 = ``smooth`` to x_1 = ``value``.
 
@@ -173,7 +173,7 @@ def low_passed(time_s: Array, value: Array, time_constant_s: float, gap_s: float
     return _low_passed(time_s, value, time_constant_s, gap_s) if time_constant_s > 0 else value
 
 
-@njit(cache=True)
+@njit
 def _low_passed(time_s: Array, value: Array, time_constant_s: float, gap_s: float) -> Array:
     out = np.empty_like(value)
     for k in range(value.size):

@@ -31,16 +31,19 @@ from terrain.control.pid import (
     power_state,
     wheel_step,
 )
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import THESIS_EMA_ALPHA, THESIS_SAMPLE_TIME_S, Estimate, estimate_run
-from terrain.estimation.filter import FilterSettings, run_filter
-from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import adaptive_noise, thesis_noise
-from terrain.estimation.reference import lagged_slip, lagged_slip_at
-from terrain.estimation.slip_figures import STEADY_SPEED_MPS, slip_figures
-from terrain.estimation.summary import summarize
-from terrain.estimation.table import measurement_table
-from terrain.estimation.wheel_slip import wheel_slip
+from terrain.estimation.consistency import lagged_slip, lagged_slip_at
+from terrain.estimation.estimate import (
+    THESIS_EMA_ALPHA,
+    THESIS_SAMPLE_TIME_S,
+    Estimate,
+    enriched,
+    estimate_run,
+    summarize,
+)
+from terrain.estimation.feed import measurement_table
+from terrain.estimation.filter import FilterSettings, Noise, run_filter
+from terrain.estimation.models.swerve import default_noise, make_filter, thesis_noise
+from terrain.estimation.wheel_slip import STEADY_SPEED_MPS, slip_figures, wheel_slip
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
 from terrain.kinematics.commands import admissible_scale, admissible_yaw_rate
 from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
@@ -285,6 +288,22 @@ FACTORS = (1.0, 1e2, 1e4, 1e6)
 """Factors by which the noise of the wheels is raised and that of the IMU lowered."""
 WHEEL_SPEED_MPS = 1.0
 """Commanded wheel speed of the scenario ``straight``."""
+
+
+def adaptive_noise(robot: Robot, factor: float) -> Noise:
+    """Return noise for encoder12 that trusts the wheels less and the IMU more, as thesis 4.6.1 tried in vain.
+
+    The variance of the wheels is multiplied by the factor, that of accelerometer and gyro divided by it, and
+    the walk of the yaw rate multiplied.  No factor will do: as long as the wheels hold the speed, it is
+    theirs and slip reads zero; where they do not, it includes the integral of the accelerometer's
+    bias.  The speed over ground has to be measured.
+    """
+    model, plain = make_filter("encoder12", robot), default_noise("encoder12", robot)
+    scale = {"wheel": factor, "accel": 1 / factor, "gyro": 1 / factor}
+    walk = plain.process_variance.diagonal().copy()
+    walk[model.states.index("yaw_rate_radps")] *= factor
+    scales = [scale.get(row.split("_")[0], 1.0) for row in model.rows]
+    return Noise(walk, plain.measurement_variance * np.array(scales), plain.initial_variance)
 
 
 def adaptive_tuning(trial: Trial) -> Finding:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.predict import Predictions
     from pipelines.learn.train import TrainResult
-    from terrain.estimation.labelled import TerrainSlip
+    from pipelines.slip.labelled import TerrainSlip
     from terrain.records import RunLog
 
 EXAMPLE = "terrain quickstart --data logs/"
@@ -104,7 +104,7 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
         if data is None:
             # kernels are compiled when they are imported: meanwhile, not before
             from pipelines.slip.filtered import motion_figure, slip_figure
-            from terrain.estimation.labelled import labelled_runs
+            from pipelines.slip.labelled import labelled_runs
 
             given, slip, example = labelled_runs(settings.seed, settings.runs_a_terrain, progress)
             figures = slip_figure(example), motion_figure(example)
@@ -156,7 +156,7 @@ def _commands(settings: Settings, model_uri: str, held_out: Sequence[RunLog]) ->
     names = shlex.quote(",".join(run.run_id for run in held_out))
     without, only = (f" --without {names}", f" --only {names}") if held_out else ("", "")
     if data is None:
-        from terrain.estimation.labelled import FILTER, ROBOT, SCENARIO
+        from pipelines.slip.labelled import FILTER, ROBOT, SCENARIO
 
         data = settings.out / "runs"
         steps = [

@@ -76,7 +76,7 @@ def train_classifier(robot: Robot, seed: int, progress: Progress = silent) -> Te
     """
     from pipelines.learn.settings import RecipeSettings
     from pipelines.learn.training_data import fitted_model
-    from terrain.estimation.labelled import RUNS_A_TERRAIN, labelled_runs
+    from pipelines.slip.labelled import RUNS_A_TERRAIN, labelled_runs
 
     runs, _, _ = labelled_runs(seed, RUNS_A_TERRAIN, progress, robot)
     progress("train", 0, 1)

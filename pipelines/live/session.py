@@ -27,8 +27,7 @@ from terrain.control.live_state import LiveState
 from terrain.control.robot_control import PilotSettings
 from terrain.control.slip_table import SlipTable
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.arrivals import Inbox, StreamHealth, as_numbers
-from terrain.estimation.clocks import SessionClock
+from terrain.estimation.clocks import Inbox, SessionClock, StreamHealth, numbers
 from terrain.estimation.live import LiveEstimate
 from terrain.records import Sample
 from terrain.robots import Robot
@@ -275,7 +274,7 @@ class RobotSession:
         elif streams is not None:
             self.inbox.refused["samples that are not given by stream"] += 1
         if twist is not None:
-            desired = as_numbers(twist)
+            desired = numbers(twist)
             if desired is None or desired.shape != (3,) or not np.isfinite(desired).all():
                 self.inbox.refused["twist that is not three numbers"] += 1
             else:

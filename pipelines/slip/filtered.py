@@ -24,12 +24,17 @@ from pipelines.slip.tracks import (
     tracks_report,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import Estimate, estimate_run, tuning_of
-from terrain.estimation.reference import lagged_slip_at
-from terrain.estimation.stuck import stuck_intervals
-from terrain.estimation.summary import EstimateSummary, summarize
-from terrain.estimation.tuned_noise import TunedNoise, tuned_noise
+from terrain.estimation.consistency import lagged_slip_at
+from terrain.estimation.estimate import (
+    Estimate,
+    EstimateSummary,
+    enriched,
+    estimate_run,
+    summarize,
+    tuning_of,
+)
+from terrain.estimation.models.skid import stuck_intervals
+from terrain.estimation.tuning import TunedNoise, tuned_noise
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.logs.clock import offsets_apart_s
 from terrain.records import GATED, Array, RunLog
@@ -123,8 +128,17 @@ def report(result: FilterResult) -> Report:
         f"Motion and slip by {result.filter}",
         _answer(result),
         (result.runs, columns, f"filter {result.filter}, {result.tuning} noise"),
-        ("At rest, moving, stuck", [row.motion_text for row in result.runs if row.motion is not None]),
+        ("At rest, moving, stuck", [_motion_text(row) for row in result.runs if row.motion is not None]),
         parts,
+    )
+
+
+def _motion_text(row: EstimateSummary) -> str:
+    motion = row.motion or {}
+    times = ", ".join(f"{each.start_s:.1f} to {each.end_s:.1f} s" for each in row.stuck or ())
+    return (
+        f"{row.run_id}: {f'stuck from {times}' if times else 'not seen to be stuck'}; moving for "
+        f"{motion['moving']:.1f} s, at rest for {motion['at_rest']:.1f} s, unknown for {motion['unknown']:.1f} s"
     )
 
 
@@ -178,7 +192,8 @@ def motion_figure(estimate: Estimate) -> Figure:
     rows = ["gyro_z_radps"] if name != "skid" else []
     if name in SEEING:
         rows = [f"camera_{state}" for state in LABELS if state in track.states]
-    panels += [_innovation_panel(estimate, row, *estimate.innovations.row(row)) for row in rows]
+    innovations = estimate.innovations if rows else {}
+    panels += [_innovation_panel(estimate, row, *innovations[row]) for row in rows]
     return Figure(
         f"{estimate.run.run_id}: motion by {name}",
         panels,

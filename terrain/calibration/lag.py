@@ -27,12 +27,11 @@ from scipy.optimize import minimize_scalar
 
 from terrain.calibration.finding import Finding, undetermined
 from terrain.calibration.sensors import MAX_GAP_S, Stretch, origin_twist
-from terrain.estimation.resampling import low_pass
 from terrain.identify import half_width
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.signals import at_times
+from terrain.signals import at_times, low_passed
 
 REFERENCE_LAG_S = 1 / (2 * math.pi * 62.5)
 """Of the accelerometer itself: 62.5 Hz of bandwidth in the fusion modes (Bosch, BNO055 data sheet)."""
@@ -203,7 +202,7 @@ def _ramps(time_s: Array, speed_mps: Array) -> list[tuple[float, float]]:
 
 def _signal(event: Event, speed: tuple[Array, Array]) -> _Signal:
     time_s, speed_mps = speed
-    behind_mps = low_pass(time_s, speed_mps, REFERENCE_LAG_S, LEVEL_S)
+    behind_mps = low_passed(time_s, speed_mps, REFERENCE_LAG_S, LEVEL_S)
     gained = cumulative_trapezoid(event.accel_mps2, event.time_s, initial=0.0)
     n = max(len(time_s) // 8, 1)
     first, last = speed_mps[:n].mean(), speed_mps[-n:].mean()
@@ -234,7 +233,7 @@ def _lag(signals: Sequence[_Signal], slips: bool) -> tuple[float, Array]:
 def _left(signal: _Signal, lag_s: float) -> tuple[Array, Array]:
     """Return slip's part and the speed without what level, gain and offset of the event explain of either."""
     gained, slip, ramp = (
-        np.interp(signal.time_s, signal.grid_s, low_pass(signal.grid_s, column, lag_s, LEVEL_S))
+        np.interp(signal.time_s, signal.grid_s, low_passed(signal.grid_s, column, lag_s, LEVEL_S))
         for column in (signal.gained_mps, signal.slip_mps, signal.grid_s - signal.grid_s[0])
     )
     own = np.column_stack([np.ones(len(ramp)), gained, ramp])

@@ -175,7 +175,7 @@ class DriveState(StatusCode):
 
 POWER_THRESHOLD_WPKG = 0.1
 """Assumed, as the thesis specifies none: 0.1 m/s^2 at 1 m/s, the threshold of a steady speed elsewhere
-(``terrain.estimation.slip_figures.STEADY_CHANGE_MPS``), and more than five times the effect of an
+(``terrain.estimation.wheel_slip.STEADY_CHANGE_MPS``), and more than five times the effect of an
 accelerometer's bias."""
 
 LOW_SPEED_MPS = 0.05

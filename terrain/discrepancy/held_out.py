@@ -22,8 +22,7 @@ from terrain.discrepancy.unfit import unfit_runs
 from terrain.discrepancy.verdict import Excluded
 from terrain.effects import CHANNELS
 from terrain.errors import ConfigError, DataError, TerrainError
-from terrain.estimation.estimate import Estimate, estimate_run
-from terrain.estimation.summary import summarize
+from terrain.estimation.estimate import Estimate, estimate_run, summarize
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 

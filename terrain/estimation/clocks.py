@@ -196,7 +196,9 @@ class Clocks:
     @property
     def counts(self) -> dict[str, int]:
         """What was not taken, and how often a clock was set, by stream and kind."""
-        counts = {f"{name}: {kind}": n for name, clock in self._streams.items() for kind, n in clock.counts.items()}
+        counts = {
+            f"{name}: {kind}": n for name, clock in self._streams.items() for kind, n in clock.counts.items()
+        }
         counts |= {f"{name}: unreadable": n for name, n in self._unreadable.items()}
         return {kind: n for kind, n in (counts | {"time: clock set": self.times_set}).items() if n}
 

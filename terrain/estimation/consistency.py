@@ -183,7 +183,7 @@ def innovations(
     max_gap_s: float = FilterSettings.max_gap_s,
     inputs: Array | None = None,
 ) -> dict[str, tuple[Array, Array]]:
-    """Return by row the innovation (n,) at each instant, and the standard deviation (n,) that the filter expected of it.
+    """Return by row the innovation (n,) at each instant, and the standard deviation that was expected of it.
 
     That is ``z - h(x)`` and ``sqrt(diag(H P H' + R))`` with what is predicted from the instant before; NaN where
     nothing was measured, at the first instant and after a gap.
@@ -313,7 +313,9 @@ def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Ar
     time_constant_s : of the low-pass on the filter's inputs
     """
     wheel_speed, ground = (
-        np.column_stack([low_passed(truth.time_s, wheel, time_constant_s, LONGEST_STEP_S) for wheel in speeds.T])
+        np.column_stack(
+            [low_passed(truth.time_s, wheel, time_constant_s, LONGEST_STEP_S) for wheel in speeds.T]
+        )
         for speeds in wheel_and_ground_speed(truth, robot)
     )
     return slip_ratio(wheel_speed, ground), ground

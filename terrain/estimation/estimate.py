@@ -1,4 +1,4 @@
-"""A filter run over a whole log: measurements, states, slip, and the truth where a log has one; and all that in figures."""
+"""A filter run over a whole log: measurements, states, slip, and the truth where a log has one; and its figures."""
 
 from __future__ import annotations
 
@@ -357,7 +357,9 @@ def summarize(estimate: Estimate) -> EstimateSummary:
             if (dof := int(track.nis_dof[used[:, k], k].sum()))
         },
         nees=mean_nees,
-        consistency={kind: {entry.name: entry.verdict for entry in entries} for kind, entries in report.items()},
+        consistency={
+            kind: {entry.name: entry.verdict for entry in entries} for kind, entries in report.items()
+        },
         speed_rmse_mps=speed_rmse_mps,
         n_dropped=sum(estimate.table.dropped.values()) + n_refused,
         n_gated=int((track.use == GATED).sum()),

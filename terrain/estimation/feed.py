@@ -259,7 +259,9 @@ def _sized(kind: Any, n: int) -> Any:
     return kind if n == 1 else (kind, n)
 
 
-ROW = record({name: _sized(float, len(names)) for name, names in _ROWS.items()} | {"gnss_variance": (float, 4)})
+ROW = record(
+    {name: _sized(float, len(names)) for name, names in _ROWS.items()} | {"gnss_variance": (float, 4)}
+)
 """What is measured at a tick, NaN where nothing is: the numbers of :data:`ROWS`, and the variances of
 :data:`GNSS_ROWS`."""
 
@@ -324,7 +326,7 @@ stream the last stamp taken; positions' origin and variance; what the derived ro
 measured by last; the yaw at the start; the gyro since the last tick, and at rest; and counts of what was left
 out."""
 
-_kernel = njit(cache=True, error_model="numpy")
+_kernel = njit(error_model="numpy")
 
 
 def feed_settings(
@@ -544,9 +546,9 @@ def _take_imu(sample: Array, instant_s: float, came_s: float, settings: Any, fee
     """
     roll, pitch = sample[6], sample[7]
     for i in range(2):
-        if not math.isnan(sample[6 + i]):
-            if sum_of_jumps(sample[6 + i], instant_s, feed.tilt_rad[i], settings.tilt_rad[i]) != 0.0:
-                roll = pitch = np.nan
+        line, limit, angle = feed.tilt_rad[i], settings.tilt_rad[i], sample[6 + i]
+        if not math.isnan(angle) and sum_of_jumps(angle, instant_s, line, limit) != 0.0:
+            roll = pitch = np.nan
     level_x, level_y = -GRAVITY_MPS2 * math.sin(pitch), GRAVITY_MPS2 * math.sin(roll) * math.cos(pitch)
     bias, scale, jumped = settings.accel_bias_mps2, settings.accel_scale_ratio, False
     for i, level in ((0, level_x), (1, level_y)):
@@ -917,7 +919,9 @@ def on_clock(
     """
     limits = signal_limits(time_constant_s, median_step_s(time_s), median_step_s(clock))
     return {
-        row: _on_clock(clock, time_s, np.where(np.isfinite(signal), signal, np.nan), filled(LINE, np.nan), limits)
+        row: _on_clock(
+            clock, time_s, np.where(np.isfinite(signal), signal, np.nan), filled(LINE, np.nan), limits
+        )
         for row, signal in signals.items()
     }
 

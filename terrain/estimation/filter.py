@@ -124,7 +124,9 @@ class FilterModel:
             if name != "params" and getattr(self, name).shape != shape:
                 raise ConfigError(f"{place}: {name} has shape {getattr(self, name).shape}, {shape} is needed")
         if not (np.isfinite(self.initial_std).all() and (self.initial_std > 0).all()):
-            raise ConfigError(f"{place}: initial_std {self.initial_std.tolist()} must be above zero and finite")
+            raise ConfigError(
+                f"{place}: initial_std {self.initial_std.tolist()} must be above zero and finite"
+            )
         self._check_names(place)
         for name, signature in _SIGNATURES.items():
             function = getattr(self, name)
@@ -295,7 +297,7 @@ STATE = record(
         "x": (float, MOST),
         "p": (float, (MOST, MOST)),
         **dict.fromkeys(("use", "nis_dof"), (np.int8, MOST)),
-        **dict.fromkeys(("nis", "rejected_s"), (float, MOST)),
+        **dict.fromkeys(("nis", "likelihood", "rejected_s"), (float, MOST)),
         **dict.fromkeys(("not_advanced", "jumps", "lost"), int),
         **dict.fromkeys(("gated", "not_finite", "numerical"), (int, MOST)),
     }
@@ -303,7 +305,7 @@ STATE = record(
 """All that a filter carries from one sample to the next: a copy is a snapshot.
 
 Stamp of the last sample, that of a jump that is not believed yet, time since the speed over ground was
-measured; what became of the sensors of the last sample, for how long each was rejected (-1 for
+measured; what became of the sensors of the last sample and how likely it was, for how long each was rejected (-1 for
 one that was not), and counts of what was left out."""
 
 _WORK = record(
@@ -322,7 +324,7 @@ _WORK = record(
 _SKIP, _START, _STEP, _JUMP = range(4)  # what the clock says of a row
 _UNSOUND = -1  # a use that is never reported
 
-_kernel = njit(cache=True, error_model="numpy")
+_kernel = njit(error_model="numpy")
 
 
 @_kernel
@@ -596,6 +598,7 @@ def _condition_on_sensor(model: Any, state: Any, work: Any, z: Array, variance: 
         state.gated[k] += 1
         return
     state.rejected_s[k] = 0.0 if use == REOPENED else -1.0
+    state.likelihood[k] = likelihood
     state.log_likelihood += likelihood
     if model.is_reference[k]:
         state.reference_age_s = 0.0
@@ -612,16 +615,16 @@ class _Samples(NamedTuple):
 
 
 class _Columns(NamedTuple):
-    """What is written of each sample: all but the last two only where they have rows."""
+    """What is written of each sample: the first five only where they have rows."""
 
     mean: Array
     cov: Array
-    nis: Array
     nis_dof: Array
     use: Array
     reference_age_s: Array
+    nis: Array
+    likelihood: Array
     taken: Array
-    log_likelihood: Array
 
 
 @_kernel
@@ -643,7 +646,7 @@ def _take(
         kind, dt = _read_stamp(model, state, samples.time_s[n])
         columns.taken[n] = kind != _SKIP
         for k in range(n_sensors):
-            state.use[k], state.nis[k], state.nis_dof[k] = ABSENT, np.nan, 0
+            state.use[k], state.nis[k], state.nis_dof[k], state.likelihood[k] = ABSENT, np.nan, 0, 0.0
         if kind == _STEP:
             _step(model, state, work, dt, samples.walk[n], samples.inputs[n], params, propagate)
         elif kind == _JUMP:
@@ -660,12 +663,12 @@ def _take(
                     x[i] = wrapped(x[i])
                 for j in range(i):
                     p[j, i] = p[i, j]
-        columns.log_likelihood[n] = state.log_likelihood
+        for k in range(n_sensors):
+            columns.nis[n, k], columns.likelihood[n, k] = state.nis[k], state.likelihood[k]
         if keep:
             columns.reference_age_s[n] = state.reference_age_s
             for k in range(n_sensors):
-                columns.nis[n, k], columns.nis_dof[n, k] = state.nis[k], state.nis_dof[k]
-                columns.use[n, k] = state.use[k]
+                columns.use[n, k], columns.nis_dof[n, k] = state.use[k], state.nis_dof[k]
             for i in range(d):
                 columns.mean[n, i] = x[i]
                 for j in range(d):
@@ -780,12 +783,12 @@ class Filter:
         return _Columns(
             np.empty((n_kept, d)),
             np.empty((n_kept, d, d)),
-            np.empty((n_kept, k)),
             np.empty((n_kept, k), np.int8),
             np.empty((n_kept, k), np.int8),
             np.empty(n_kept),
+            np.empty((n, k)),
+            np.empty((n, k)),
             np.zeros(n, np.bool_),
-            np.empty(n),
         )
 
     def follows(self, time_s: float) -> int:

@@ -82,7 +82,11 @@ N_COLUMNS = 16
 
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 _BIASES = ("accel_bias_x_mps2", "accel_bias_y_mps2", "gyro_bias_radps")
-_WHEEL, _STEER, _GYRO, _ACCEL, _TILT, _YAW, _SEEN, _SEEN_TURN, _SEEN_YAW = (0, 3, *range(6, 13))  # among SENSORS
+_WHEEL, _STEER, _GYRO, _ACCEL, _TILT, _YAW, _SEEN, _SEEN_TURN, _SEEN_YAW = (
+    0,
+    3,
+    *range(6, 13),
+)  # among SENSORS
 
 MONITOR = record(
     {
@@ -142,7 +146,9 @@ class HealthMonitor:
         self.health = self.memory["health"][0]
         self._wheels = np.zeros(N_COLUMNS)
 
-    def judge(self, time_s: float, wheels: Array, rates: Array, row: Array, feed: Array, state: Array) -> None:
+    def judge(
+        self, time_s: float, wheels: Array, rates: Array, row: Array, feed: Array, state: Array
+    ) -> None:
         """Judge the sensors at a tick.
 
         Parameters

@@ -23,14 +23,22 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.estimation import feed as rows
 from terrain.estimation.clocks import REWIND_S, numbers
-from terrain.estimation.feed import GNSS_LATENCY_S, GNSS_PERIOD_S, GNSS_ROWS, OFF_CLOCK_S, ROWS, STREAMS, TICK_S
+from terrain.estimation.feed import (
+    GNSS_LATENCY_S,
+    GNSS_PERIOD_S,
+    GNSS_ROWS,
+    OFF_CLOCK_S,
+    ROWS,
+    STREAMS,
+    TICK_S,
+)
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings, Noise
 from terrain.estimation.health import HealthMonitor
 from terrain.estimation.models.skid import (
@@ -397,7 +405,8 @@ class LiveFilter:
         d = len(self.states)
         mean, params = np.empty(d), np.append(self.model.params, np.zeros(len(self.model.inputs)))
         self.model.propagate(seen.mean, now_s - seen.time_s, params, mean, np.zeros((d, d)))
-        return seen._replace(mean=mean, **dict(zip(_MOTION, self._motion_of(mean), strict=True)))
+        motion: dict[str, Any] = dict(zip(_MOTION, self._motion_of(mean), strict=True))
+        return seen._replace(mean=mean, **motion)
 
     def _motion_of(self, mean: Array) -> list[float]:
         """Return speeds, yaw rate and accelerations of a state; NaN of what it does not have."""
@@ -584,14 +593,16 @@ class LiveFilter:
         wheel_speed_mps = rates
         if self._skids:  # nothing sees the ground go by: slip is not known
             mean = within_bounds(mean, robot.track_m)
-            sides_mps, has_gyro = self._row["side_mps"][0].tolist(), not math.isnan(self._row["gyro_z_radps"][0])
-            turn, bias = (self.states.index(name) for name in ("yaw_rate_radps", "gyro_bias_radps"))
-            known = float(mean[turn]), float(std[bias])
-            motion = motion_at(time_s, *sides_mps, has_gyro, *known, robot.track_m, self._motion)
+            left_mps, right_mps = self._row["side_mps"][0].tolist()
+            has_gyro = not math.isnan(self._row["gyro_z_radps"][0])
+            yaw_rate, bias = (self.states.index(name) for name in ("yaw_rate_radps", "gyro_bias_radps"))
+            known = float(mean[yaw_rate]), float(std[bias]), robot.track_m
+            motion = motion_at(time_s, left_mps, right_mps, has_gyro, *known, self._motion)
         else:
             motor_radps = rates.copy()
             wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.motors.reduction_ratio)
             slip_ratio, slip_std = self._slip.at(time_s, filter_, self._row, self._feed)
+        v_x, v_y, turn, a_x, a_y = self._motion_of(mean)
         return LiveEstimate(
             time_s,
             mean,
@@ -601,7 +612,11 @@ class LiveFilter:
             age_s > STALE_AFTER_S,
             age_s,
             self._numbers[0].copy(),
-            *self._motion_of(mean),
+            v_x,
+            v_y,
+            turn,
+            a_x,
+            a_y,
             motor_radps,
             np.append(wheels, np.nan)[self._current_columns],
             wheel_speed_mps,

@@ -2,8 +2,8 @@
 
 The log likelihood of a filter is the sum of log N(nu; 0, S) over its innovations (Sarkka, Bayesian Filtering
 and Smoothing, 2013, 12.3), so that noise can be fitted to runs without a truth.  Gates are off meanwhile:
-otherwise it would pay to leave out what does not fit.  As s = h P h' + R is at least R, a sample's is at most that of
-no innovation and a variance of R: half the square of a residual is what it lacks to that, and
+otherwise it would pay to leave out what does not fit.  As s = h P h' + R is at least R, a constant less the sum of
+squares of ``nu / sqrt(s)`` and of ``sqrt(log(s / R))`` is twice that likelihood, and
 :func:`terrain.identify.identify` finds the scales.
 
 Measurement noise stays: behind the common low-pass an error lasts longer than a sample, and a likelihood that
@@ -124,22 +124,27 @@ def tune_noise(
             std[states] = math.exp(0.5 * log_scale)
         return replace(noise, process_variance=noise.process_variance * np.outer(std, std))
 
-    def likelihoods(log_scales: Array) -> list[Array]:
-        tried = scaled(log_scales)
-        sessions = (Filter(model, tried, FilterSettings(gate_probability=1.0)) for _ in samples)
-        return [
-            np.diff(session.run(*sample, keep=False).log_likelihood, prepend=0.0)
-            for session, sample in zip(sessions, samples, strict=True)
-        ]
+    def run(log_scales: Array) -> tuple[Array, Array]:
+        """Return of each sensor at each sample its squared innovation, 0 where there is none, and its likelihood."""
+        tried, nis, likelihoods = scaled(log_scales), [], []
+        for sample in samples:
+            columns = Filter(model, tried, FilterSettings(gate_probability=1.0)).run(*sample, keep=False)
+            nis.append(np.nan_to_num(columns.nis))
+            likelihoods.append(columns.likelihood)
+        return np.concatenate(nis), np.concatenate(likelihoods)
 
     def likelihood(log_scales: Array) -> float:
-        return math.fsum(float(each.sum()) for each in likelihoods(log_scales))
+        return float(run(log_scales)[1].sum())
 
-    most = [-0.5 * (np.isfinite(z) @ np.log(2 * np.pi * noise.measurement_variance)) for _, z in samples]
+    log_r = np.log(2 * np.pi * noise.measurement_variance)
+    known = np.isfinite(np.concatenate([z for _, z in samples])) * log_r
+    by_sensor = [known[:, [model.rows.index(row) for row in rows]].sum(axis=1) for _, rows in model.sensors]
+    least = np.column_stack(by_sensor)
 
     def residual(log_scales: Array) -> Array:
-        lacking = np.concatenate(most) - np.concatenate(likelihoods(log_scales))
-        return np.sqrt(2.0 * np.maximum(lacking, 0.0))
+        nis, likelihoods = run(log_scales)
+        wider = np.where(likelihoods == 0.0, 0.0, -2.0 * likelihoods - nis - least)
+        return np.asarray(np.sqrt(np.concatenate([nis.ravel(), np.maximum(wider, 0.0).ravel()])))
 
     widest = math.log(WIDEST_SCALE)
     parameters = [Parameter(name, 0.0, -widest, widest) for name in members]

@@ -142,7 +142,7 @@ def _places(robot: Robot, states: tuple[str, ...], from_encoders: bool = False) 
     return np.array([states.index(name) if name in states else -1 for name in names])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(error_model="numpy")
 def _slips(
     mean: Array,
     cov: Array,

@@ -131,7 +131,7 @@ ESTIMATOR_CHANNELS = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_m
 """States of a filter that go into windows."""
 
 ESTIMATED = ("estimator", "slip")
-"""Streams that a filter adds to what is measured (:func:`terrain.estimation.enriched.enriched`)."""
+"""Streams that a filter adds to what is measured (:func:`terrain.estimation.estimate.enriched`)."""
 
 SIGNAL_SETS: tuple[str, ...] = ("imu", "wheels", "currents", "slip", "estimator")
 """Groups of signals that can be switched off by name."""

@@ -37,8 +37,7 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
-from terrain.estimation.resampling import on_clock
-from terrain.estimation.table import MeasurementTable
+from terrain.estimation.feed import MeasurementTable, on_clock
 from terrain.kernels import njit
 from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack

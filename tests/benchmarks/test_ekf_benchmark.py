@@ -12,8 +12,7 @@ from filterpy.kalman import ExtendedKalmanFilter
 from threadpoolctl import threadpool_limits
 
 from terrain.estimation.filter import Filter, FilterSettings, run_filter
-from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise
+from terrain.estimation.models.swerve import default_noise, make_filter
 from terrain.robots import load_robot
 
 N_STEPS = 2000

@@ -16,8 +16,7 @@ from pipelines.learn.model_file import read_model
 from pipelines.learn.training_data import data_of_runs, fitted_model
 from pipelines.live.model import TerrainModel
 from terrain.angles import wrapped
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
+from terrain.estimation.estimate import enriched, estimate_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

@@ -6,13 +6,16 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+from scipy.special import ndtri
+
 from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
 from pipelines.report.tree import Report, Table
 from terrain.control.drive_comparison import MeanInterval, mean_interval
-from terrain.estimation.coverage import nees_by_group, slip_coverage
-from terrain.estimation.estimate import estimate_run
+from terrain.estimation.consistency import consistency_report, lagged_slip_at
+from terrain.estimation.estimate import Estimate, estimate_run
 from terrain.robots import Robot, load_robot
 from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
@@ -55,6 +58,27 @@ class TerrainConsistency(NamedTuple):
     n_runs: int
     nees: dict[str, MeanInterval]
     slip_coverage: MeanInterval
+
+
+def nees_by_group(estimate: Estimate) -> dict[str, float]:
+    """Return the mean NEES of a simulated run, a state, of each group of states; empty without a truth."""
+    states = consistency_report(estimate.track, estimate.truth).states
+    return {group.name: group.mean_per_dof for group in states if group.name != "all"}
+
+
+def slip_coverage(estimate: Estimate, between_s: tuple[float, float] = (-math.inf, math.inf)) -> float:
+    """Return the ratio of slips between two times whose 95 % interval contains the true slip; NaN without any.
+
+    The truth comes behind the low-pass of the encoders, as the filter's inputs do.
+    """
+    if "truth" not in estimate.run.streams:
+        return math.nan
+    slip = estimate.slip
+    error = np.abs(slip.slip_ratio - lagged_slip_at(estimate.run, estimate.robot, slip.time_s))
+    known = np.isfinite(error) & np.isfinite(slip.slip_std)
+    known &= ((slip.time_s >= between_s[0]) & (slip.time_s <= between_s[1]))[:, None]
+    inside = error[known] <= ndtri(0.975) * slip.slip_std[known]
+    return float(inside.mean()) if inside.size else math.nan
 
 
 def consistency_by_terrain(

@@ -36,8 +36,7 @@ from studies.service import (
     spread,
     study_drive,
 )
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
+from terrain.estimation.estimate import enriched, estimate_run
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Windows
 from terrain.robots import Robot, load_robot

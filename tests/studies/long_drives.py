@@ -9,10 +9,9 @@ import numpy as np
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, setting
 from pipelines.report.tree import Column, Pairs, Report, Table
-from studies.consistency import GROUPS
+from studies.consistency import GROUPS, nees_by_group, slip_coverage
 from terrain.angles import wrapped
 from terrain.errors import ConfigError
-from terrain.estimation.coverage import nees_by_group, slip_coverage
 from terrain.estimation.estimate import estimate_run
 from terrain.robots import Robot, load_robot
 from terrain.simulation.conditions import Faults

@@ -17,8 +17,7 @@ import numpy as np
 from websockets.asyncio.client import connect
 
 from terrain.errors import TerrainError
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
+from terrain.estimation.estimate import enriched, estimate_run
 from terrain.estimation.live import CHANNELS
 from terrain.logs.replay import replay
 from terrain.records import Array, RunLog

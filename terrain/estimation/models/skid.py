@@ -92,7 +92,7 @@ _ROWS = (*WHEELS_AND_GYRO, REST_ROW)
 _X, _Y, _YAW, _V, _W, _TRACK, _BIAS, _DIFFERENCE = range(8)
 
 
-@njit(cache=True)
+@njit
 def wheel_weight(yaw_rate_radps: float, difference_mps: float, track_m: float) -> float:
     """Return a, from 0 to 1: how much a difference D of the sides is believed beside a yaw rate w, of the track B_0.
 
@@ -108,7 +108,7 @@ def wheel_weight(yaw_rate_radps: float, difference_mps: float, track_m: float) -
     return 1.0 / (1.0 + (apart / DISAGREEMENT_RADPS) ** 2) / slip
 
 
-@njit(cache=True)
+@njit
 def _propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
     cos, sin = math.cos(x[_YAW]), math.sin(x[_YAW])
     for i in range(x.size):
@@ -132,7 +132,7 @@ def _propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> N
         f[_W, _TRACK] = -near * x[_DIFFERENCE] / track**2
 
 
-@njit(cache=True)
+@njit
 def _observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
     for row, side in ((0, -0.5), (1, 0.5)):
         z_hat[row] = x[_V] + side * x[_DIFFERENCE]
@@ -172,7 +172,9 @@ def make_skid_filter(robot: Robot) -> FilterModel:
         name="skid",
         states=_STATES,
         rows=_ROWS,
-        sensors=tuple(zip(("wheel_left", "wheel_right", "gyro", "rest"), ((row,) for row in _ROWS), strict=True)),
+        sensors=tuple(
+            zip(("wheel_left", "wheel_right", "gyro", "rest"), ((row,) for row in _ROWS), strict=True)
+        ),
         propagate=_propagate,
         observe=_observe,
         params=np.array([robot.track_m]),
@@ -340,7 +342,7 @@ def motion_track(
 
 
 def stuck_intervals(time_s: Array, motion: Array) -> tuple[StuckInterval, ...]:
-    """Return the times in which a robot was stuck, from when it became so, :data:`STUCK_AFTER_S` before it is said.
+    """Return the times in which a robot was stuck, from when it became so, :data:`STUCK_AFTER_S` before it is known.
 
     Parameters
     ----------

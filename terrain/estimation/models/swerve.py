@@ -193,7 +193,7 @@ _X, _Y, _YAW, _VX, _VY, _W, _AX, _AY = range(8)
 _STEER, _BIAS, _SLIP, _OFFSET, _ACCEL_BIAS = 8, 11, 12, 15, 16
 
 
-@njit(cache=True)
+@njit
 def propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
     """(4.30)-(4.35): the motion, accelerations that fade; and what vio15 has beside random walks."""
     cos, sin = math.cos(x[_YAW]), math.sin(x[_YAW])
@@ -223,13 +223,13 @@ def propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> No
         f[_OFFSET, _BIAS] = dt
 
 
-@njit(cache=True)
+@njit
 def _scale(state: int, ratio: float, x: Array, x_next: Array, f: Array) -> None:
     x_next[state] = ratio * x[state]
     f[state, state] = ratio
 
 
-@njit(cache=True)
+@njit
 def observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
     """(4.20), (4.28), (4.48) and (6.6): what all sensors measure."""
     slip, radius = params[_SLIP_KIND], params[_RADIUS]
@@ -276,13 +276,13 @@ def observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
         _observe_gnss(x, params[_ANTENNA_X], params[_ANTENNA_Y], row, z_hat, h)
 
 
-@njit(cache=True)
+@njit
 def _add(row: int, state: int, x: Array, z_hat: Array, h: Array) -> None:
     z_hat[row] += x[state]
     h[row, state] = 1.0
 
 
-@njit(cache=True)
+@njit
 def _observe_gnss(x: Array, antenna_x: float, antenna_y: float, row: int, z_hat: Array, h: Array) -> None:
     """Position and velocity of the antenna in the world."""
     cos, sin = math.cos(x[_YAW]), math.sin(x[_YAW])

@@ -2,8 +2,7 @@
 
 import pytest
 
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
+from terrain.estimation.estimate import enriched, estimate_run
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 

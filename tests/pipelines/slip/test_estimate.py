@@ -11,7 +11,7 @@ from pipelines.report.results import silent
 from pipelines.slip.estimate import Settings, estimate_runs, run
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.estimate import estimate_run
-from terrain.estimation.filters.tuning import TuningStatus
+from terrain.estimation.tuning import TuningStatus
 from terrain.logs.read import read_run
 from terrain.logs.schema import signal_set_of
 from terrain.logs.write import write_run

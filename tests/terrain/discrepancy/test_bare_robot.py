@@ -6,8 +6,7 @@ import pytest
 from terrain.discrepancy.diagnosed_runs import diagnose_runs
 from terrain.discrepancy.signals import signals_of
 from terrain.effects import CHANNELS, effect_named, vector_of
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run
+from terrain.estimation.estimate import enriched, estimate_run
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground, make_planar
 from terrain.simulation.planar.replay import replay

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from terrain.estimation.arrivals import StreamHealth
+from terrain.estimation.clocks import StreamHealth
 from terrain.records import Reading
 
 

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import FILTERS, estimate_run
-from terrain.estimation.summary import summarize
+from terrain.estimation.estimate import FILTERS, enriched, estimate_run, summarize
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults

@@ -4,8 +4,7 @@ import numpy as np
 
 from terrain.estimation.consistency import innovations, sample_from_model
 from terrain.estimation.filter import FilterSettings, run_filter
-from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise
+from terrain.estimation.models.swerve import default_noise, make_filter
 from terrain.robots import load_robot
 
 ROBOT = load_robot("agrimaro")
@@ -23,8 +22,8 @@ def filtered(seed=0):
 
 def test_scaled_innovations_have_unit_variance_and_no_memory():
     _, _, found = filtered()
-    scaled = (found.value / found.std)[50:]
-    assert np.isnan(found.value[0]).all()
+    scaled = np.column_stack([value / std for value, std in found.values()])[50:]
+    assert np.isnan([value[0] for value, _ in found.values()]).all()
     for column in scaled.T:
         column = column[np.isfinite(column)]
         assert abs(column.var() - 1.0) < 5 * np.sqrt(2 / column.size)
@@ -35,13 +34,13 @@ def test_the_first_sensor_of_a_step_has_the_square_that_the_filter_kept():
     model, track, found = filtered()
     _, rows = model.sensors[0]  # conditioned on first: its prediction is that of the step
     assert len(rows) == 1
-    value, std = found.row(rows[0])
+    value, std = found[rows[0]]
     np.testing.assert_allclose((value / std)[1:] ** 2, track.nis[1:, 0], rtol=1e-6, atol=1e-9)
 
 
 def test_missing_measurements_have_no_innovation():
     _, _, found = filtered()
-    value, std = found.row("camera_speed_x_mps")
+    value, std = found["camera_speed_x_mps"]
     assert np.isnan(value[200:250]).all()
     assert np.isnan(std[200:250]).all()
     assert np.isfinite(value[251:]).all()
@@ -54,6 +53,6 @@ def test_the_first_row_after_a_gap_has_no_innovation():
     track = run_filter(model, noise, time_s, z)
     found = innovations(model, noise, track, z[np.searchsorted(time_s, track.time_s)])
     after = int(np.flatnonzero(np.diff(track.time_s) > 1.0)[0]) + 1
-    assert np.isnan(found.value[after]).all()
-    assert np.isnan(found.std[after]).all()
-    assert np.isfinite(found.value[after + 1 :]).all()
+    for value, std in found.values():
+        assert np.isnan([value[after], std[after]]).all()
+        assert np.isfinite(value[after + 1 :]).all()

@@ -9,12 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.errors import ConfigError
-from terrain.estimation.feed import GNSS_ROWS, ROWS_OF_DRIVE
+from terrain.estimation.feed import GNSS_ROWS, ROWS_OF_DRIVE, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
-from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import default_noise, scheduled
 from terrain.estimation.live import CHANNELS, QUEUE, LiveFilter
-from terrain.estimation.table import measurement_table
+from terrain.estimation.models.swerve import default_noise, make_filter, scheduled
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.logged_wheels import with_wheel_speeds
@@ -258,7 +256,6 @@ def test_wheels_alone_give_wheel_speeds_and_no_slip():
     assert column(estimates, "slip_stale").all()
     assert np.isinf(column(estimates, "reference_age_s")).all()
     assert np.isfinite(column(estimates, "mean")).all()
-    assert estimator.lag_s == ROBOT.sensors.encoder_time_constant_s
 
 
 def test_a_given_noise_stays_as_it_is():

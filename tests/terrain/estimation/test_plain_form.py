@@ -16,11 +16,12 @@ from terrain.estimation.feed import (
     CHANGE_S,
     CRAWL_MPS,
     DERIVED_ROWS,
+    FIX_STD_M,
+    FLOAT_STD_M,
     GAP_PERIODS,
     GNSS_LATENCY_S,
     GNSS_ROWS,
     GNSS_SPEED_STD_MPS,
-    GNSS_STD_M,
     HELD_S,
     JUMPS,
     LATCHED,
@@ -47,8 +48,9 @@ from terrain.estimation.feed import (
     UNSEEN_AFTER_S,
     VIBRATION_S,
     WAVERING_MPS,
+    clean_stream,
+    measurement_table,
 )
-from terrain.estimation.table import clean_stream, measurement_table
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
@@ -253,7 +255,7 @@ def plain_gnss(gnss, causal):
     fixed, known = gnss.channel("fix_ratio") >= 0.5, np.isfinite(values[:, 0])
     values[:, :2] -= values[(known & fixed if (known & fixed).any() and not causal else known).argmax(), :2]
     std = gnss.channel("std_position_m")
-    std = np.where(std > 0, std, np.where(fixed, GNSS_STD_M[True], GNSS_STD_M[False]))
+    std = np.where(std > 0, std, np.where(fixed, FIX_STD_M, FLOAT_STD_M))
     variance = np.column_stack([std, std, *[np.full(std.size, GNSS_SPEED_STD_MPS)] * 2]) ** 2
     variance[np.isnan(values)] = np.nan
     return dict(zip(GNSS_ROWS, values.T, strict=True)), dict(zip(GNSS_ROWS, variance.T, strict=True))

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from terrain.errors import DataError
-from terrain.estimation.reference import lagged_slip, true_states
-from terrain.estimation.resampling import low_pass
+from terrain.estimation.consistency import lagged_slip, true_states
 from terrain.kinematics.logged_wheels import wheel_and_ground_speed
 from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot
+from terrain.signals import low_passed
 from terrain.simulation.run import simulate_run
 
 ROBOT = load_robot("agrimaro")
@@ -41,7 +41,7 @@ def test_truth_passes_the_low_pass_of_the_filter_inputs(run):
     time_s = np.arange(0.5, 9.0, 0.02)
     truth = run.streams["truth"]
     found = true_states(run, empty_track(STATES, time_s), ROBOT, 0.05)
-    speed = low_pass(truth.time_s, truth.channel("speed_x_mps"), 0.05, 1.0)
+    speed = low_passed(truth.time_s, truth.channel("speed_x_mps"), 0.05, 1.0)
     np.testing.assert_allclose(found[:, 1], np.interp(time_s, truth.time_s, speed), atol=1e-9)
     plain = true_states(run, empty_track(STATES, time_s), ROBOT, 0.0)
     rising = (time_s > 1.3) & (time_s < 1.7)

@@ -12,7 +12,7 @@ from terrain.errors import ConfigError
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.feed import ROWS
 from terrain.estimation.live import N_STEPS, QUEUE, LiveFilter
-from terrain.estimation.stuck import Motion, stuck_intervals
+from terrain.estimation.models.skid import Motion, stuck_intervals
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
@@ -178,7 +178,7 @@ def test_memory_does_not_grow_while_the_wheels_are_silent():
     estimator = LiveFilter(HUSKY, "skid")
     for k in range(3000):
         assert estimator.step({"imu": Reading(np.array([0.01 * k]), IMU[None])}) == []
-    assert len(estimator._queues["imu"]._waiting) <= QUEUE
+    assert len(estimator._queues["imu"].waiting) <= QUEUE
     assert len(estimator._history._samples) <= N_STEPS
     assert estimator.dropped["imu: waited too long"] > 0
 

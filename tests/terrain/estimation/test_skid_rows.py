@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from terrain.estimation.feed import REST_ROW, REST_S, STEADY_RADPS, new_feed, rest_at
-from terrain.estimation.table import measurement_table
+from terrain.estimation.feed import REST_ROW, REST_S, STEADY_RADPS, measurement_table, new_feed, rest_at
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 

@@ -9,12 +9,17 @@ from scipy.spatial.transform import Rotation
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.feed import CAMERA_ROWS, GNSS_ROWS, REST_ROW, ROWS_OF_DRIVE
-from terrain.estimation.resampling import low_pass
-from terrain.estimation.table import measurement_table
+from terrain.estimation.feed import (
+    CAMERA_ROWS,
+    GNSS_ROWS,
+    REST_ROW,
+    ROWS_OF_DRIVE,
+    measurement_table,
+)
 from terrain.kinematics.camera import odometry_stream
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
+from terrain.signals import low_passed
 
 ROBOT = load_robot("agrimaro")
 HUSKY = load_robot("husky")
@@ -224,7 +229,7 @@ def test_low_pass_solves_its_equation_on_any_stamps(tau):
     time_s = np.cumsum(rng.exponential(0.02, 40))
     value = rng.standard_normal(40)
     np.testing.assert_allclose(
-        low_pass(time_s, value, tau, 0.05), plain_low_pass(time_s, value, tau, 0.05), atol=1e-6
+        low_passed(time_s, value, tau, 0.05), plain_low_pass(time_s, value, tau, 0.05), atol=1e-6
     )
 
 
@@ -241,7 +246,7 @@ def test_laws_of_the_low_pass(seed, tau, gain, split):
     far = np.inf
 
     def smooth(value, time=time_s):
-        return low_pass(time, value, tau, far)
+        return low_passed(time, value, tau, far)
 
     np.testing.assert_allclose(smooth(a + gain * b), smooth(a) + gain * smooth(b), atol=1e-9)  # linear
     np.testing.assert_allclose(smooth(np.full(50, gain)), gain, atol=1e-12)  # keeps what stands

@@ -10,11 +10,9 @@ import pytest
 import terrain
 from terrain.effects import parameters_of
 from terrain.errors import ConfigError
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import estimate_run, filter_run
+from terrain.estimation.estimate import enriched, estimate_run, filter_run, summarize
+from terrain.estimation.feed import measurement_table
 from terrain.estimation.live import LiveFilter
-from terrain.estimation.summary import summarize
-from terrain.estimation.table import measurement_table
 from terrain.extension import (
     Correction,
     apply_homes,

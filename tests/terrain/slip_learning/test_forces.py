@@ -4,7 +4,7 @@ import pytest
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import DataError
 from terrain.estimation.estimate import estimate_run
-from terrain.estimation.resampling import on_clock
+from terrain.estimation.feed import on_clock
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions

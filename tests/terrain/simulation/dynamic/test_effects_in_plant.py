@@ -11,7 +11,7 @@ from scipy.optimize import minimize_scalar
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import library_of
 from terrain.errors import ConfigError
-from terrain.estimation.resampling import low_pass
+from terrain.estimation.feed import low_pass
 from terrain.extension import corrected, corrected_log
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.wheels import no_slip_twist

@@ -19,12 +19,12 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.resampling import low_pass
 from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.logged_wheels import wheel_and_ground_speed
 from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.robots import load_robot
+from terrain.signals import low_passed
 from terrain.simulation.planar.model import Ground, make_planar, planar_ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.replay import replay
@@ -288,7 +288,7 @@ def test_encoders_lag_as_described_and_read_zero_at_rest():
     slow, at_once = (
         simulate_planar(robot, twist, 0).streams["wheels"] for robot in (AGRIMARO, quick(AGRIMARO))
     )
-    expected = low_pass(at_once.time_s, at_once.values[:, 0], lag_s, 0.1)
+    expected = low_passed(at_once.time_s, at_once.values[:, 0], lag_s, 0.1)
     np.testing.assert_allclose(slow.values[:, 0], expected, atol=0.02 * np.abs(expected).max())
     still = simulate_planar(AGRIMARO, np.zeros((101, 3)), 0, noise=NOISE, scatter=SCATTER)
     assert (still.streams["wheels"].values[:, :3] == 0).all()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrain.estimation.labelled import labelled_runs
+from pipelines.slip.labelled import labelled_runs
 from terrain.terramechanics.soil import soil_names
 
 

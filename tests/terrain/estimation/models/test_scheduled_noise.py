@@ -6,12 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S
+from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, HELD_S, REOPEN_AFTER_S, Filter, FilterSettings
-from terrain.estimation.filters.swerve import make_filter
-from terrain.estimation.filters.swerve_noise import Schedule, default_noise, scheduled
 from terrain.estimation.live import LiveFilter
-from terrain.estimation.table import measurement_table
+from terrain.estimation.models.swerve import Schedule, default_noise, make_filter, scheduled
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.replay import replay
 from terrain.logs.schema import IMU_CHANNELS

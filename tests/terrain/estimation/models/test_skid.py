@@ -5,17 +5,17 @@ from terrain.angles import wrapped
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.filter import run_filter
-from terrain.estimation.filters.skid import (
+from terrain.estimation.models.skid import (
     FOLLOWS_S,
     MAX_BIAS_RADPS,
     MAX_TRACK_RATIO,
     MIN_TURN_RADPS,
+    Motion,
     make_skid_filter,
     skid_noise,
     wheel_weight,
     within_bounds,
 )
-from terrain.estimation.stuck import Motion
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 

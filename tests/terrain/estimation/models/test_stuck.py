@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 
-from terrain.estimation.stuck import STUCK_AFTER_S, Motion, motion_seconds, motion_track, stuck_intervals
+from terrain.estimation.models.skid import (
+    STUCK_AFTER_S,
+    Motion,
+    motion_seconds,
+    motion_track,
+    stuck_intervals,
+)
 from terrain.robots import load_robot
 
 TRACK_M = load_robot("husky").track_m

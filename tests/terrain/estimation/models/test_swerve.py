@@ -6,14 +6,15 @@ from scipy.stats import chi2
 
 from terrain.errors import ConfigError
 from terrain.estimation.consistency import nees, sample_from_model
-from terrain.estimation.filter import OBSERVE, PROPAGATE, FilterSettings, Noise, run_filter
-from terrain.estimation.filters.swerve import FILTERS, make_filter
-from terrain.estimation.filters.swerve_model import (
-    observe_slip_ratio,
-    observe_without_slip,
-    propagate_slip_speed,
+from terrain.estimation.filter import FilterSettings, Noise, run_filter
+from terrain.estimation.models.swerve import (
+    FILTERS,
+    default_noise,
+    make_filter,
+    observe,
+    propagate,
+    thesis_noise,
 )
-from terrain.estimation.filters.swerve_noise import adaptive_noise, default_noise, thesis_noise
 from terrain.kernels import njit
 from terrain.robots import load_robot
 
@@ -192,28 +193,22 @@ def _print_accelerations(x, z_hat, h):
     h[3, 4], h[3, 5], h[4, 3], h[4, 5] = -x[5], -x[4], x[5], x[3]
 
 
-@njit(OBSERVE)
-def observe_as_printed_4_28(x, params, z_hat, h):
-    observe_slip_ratio(x, params, z_hat, h)
+@njit
+def observe_as_printed(x, params, z_hat, h):
+    """(4.28), (4.48)."""
+    observe(x, params, z_hat, h)
     _print_accelerations(x, z_hat, h)
 
 
-@njit(OBSERVE)
-def observe_as_printed_4_48(x, params, z_hat, h):
-    observe_without_slip(x, params, z_hat, h)
-    _print_accelerations(x, z_hat, h)
-
-
-@njit(PROPAGATE)
+@njit
 def propagate_as_printed_6_2(x, dt, params, x_next, f):
-    propagate_slip_speed(x, dt, params, x_next, f)
+    propagate(x, dt, params, x_next, f)
     x_next[3], x_next[4] = x[3] + dt * (x[6] - x[5] * x[4]), x[4] + dt * (x[7] + x[5] * x[3])
     f[3, 4], f[3, 5], f[4, 3], f[4, 5] = -dt * x[5], -dt * x[4], dt * x[5], dt * x[3]
 
 
 def as_printed(name):
-    printed = {"encoder12": observe_as_printed_4_48, "slip14": observe_as_printed_4_28}
-    return dataclasses.replace(make_filter(name, ROBOT), observe=printed[name])
+    return dataclasses.replace(make_filter(name, ROBOT), observe=observe_as_printed)
 
 
 def test_observable_rank_in_straight_driving():
@@ -273,20 +268,6 @@ def test_coriolis_signs_as_printed_cost_the_speed_when_the_camera_is_lost_in_a_c
     assert worst[0] < 0.05
     assert worst[1] > 0.15
     assert worst[1] > 5 * worst[0]
-
-
-def test_adaptive_tuning_has_two_horns():
-    """Thesis 4.6.1: mild factors leave slip at zero, strong ones the speed to the accelerometer's bias."""
-    model = make_filter("encoder12", ROBOT)
-    time_s, z, _ = drive(model, duration_s=62.0)
-    z[:, model.rows.index("accel_x_mps2")] += 0.02
-    for factor in (1.0, 10.0, 100.0):
-        track = run_filter(model, adaptive_noise(ROBOT, factor), time_s, z)
-        assert np.abs(raw_slip(model, track, z)[time_s > 5].mean(axis=0)).max() < 0.02
-    track = run_filter(model, adaptive_noise(ROBOT, 1e8), time_s, z)
-    speed = track.state("speed_x_mps")
-    assert speed[-1] - speed[time_s > 2][0] > 0.5
-    assert raw_slip(model, track, z)[-1].max() < -0.2  # for + 0.125: no better than zero
 
 
 # Standard deviations of a robot's size: the walks of default_noise let a filter follow anything, and a truth
@@ -500,7 +481,6 @@ def test_wheels_at_right_angles_at_the_start_are_found():
         (lambda: default_noise("vio15", load_robot("husky")), "robot husky has the drive 'skid_steer'"),
         (lambda: make_filter("vio15", ROBOT.without("camera")), "has no section 'camera'"),
         (lambda: thesis_noise("vio12", ROBOT, 0.0), "sample_time_s is 0.0, seconds above zero are required"),
-        (lambda: adaptive_noise(ROBOT, -1.0), "factor is -1.0, a number above zero is required"),
     ],
 )
 def test_invalid_filters_are_refused(call, message):

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from terrain.estimation.enriched import enriched
-from terrain.estimation.estimate import Estimate, estimate_run
-from terrain.estimation.summary import EstimateSummary, summarize
+from pipelines.report.results import Progress, silent
+from terrain.estimation.estimate import Estimate, EstimateSummary, enriched, estimate_run, summarize
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
 
-ROBOT = "agrimaro"
-SCENARIO = "survey"
-FILTER = "vio15"
-RUNS_A_TERRAIN = 6
+ROBOT, SCENARIO, FILTER, RUNS_A_TERRAIN = "agrimaro", "survey", "vio15", 6
 
 
 class TerrainSlip(NamedTuple):
@@ -37,10 +33,7 @@ class TerrainSlip(NamedTuple):
 
 
 def labelled_runs(
-    seed: int,
-    runs_a_terrain: int = RUNS_A_TERRAIN,
-    progress: Callable[[str, int, int], None] = lambda task, done, total: None,
-    robot: Robot | None = None,
+    seed: int, runs_a_terrain: int = RUNS_A_TERRAIN, progress: Progress = silent, robot: Robot | None = None
 ) -> tuple[list[RunLog], tuple[TerrainSlip, ...], Estimate]:
     """Simulate and filter runs on every terrain, with varied speed, slope, load, tyres and soil.
 
@@ -48,43 +41,39 @@ def labelled_runs(
     ----------
     seed : of everything that is drawn
     runs_a_terrain : how many
-    progress : gets the task, how many of its steps are done, and how many there are
+    progress : of the runs
     robot : whose; :data:`ROBOT` by default
 
     Returns
     -------
-    runs
-        with the streams ``estimator`` and ``slip``, sorted by id
-    slips
-        steady slip of the runs of each terrain
-    example
-        the estimate of one run, to be drawn
+    the runs with the streams ``estimator`` and ``slip``, sorted by id; steady slip of the runs of each terrain; and
+    the estimate of one run, to be drawn
     """
     robot = load_robot(ROBOT) if robot is None else robot
     terrains = soil_names()
     runs, rows = [], []
     for terrain in terrains:
-        found = []
+        summaries = []
         for number in range(1, runs_a_terrain + 1):
             run = simulate_run(robot, terrain, SCENARIO, seed, number, vary=True)
             estimate = estimate_run(run, robot, FILTER)
             runs.append(enriched(estimate))
-            found.append(summarize(estimate))
+            summaries.append(summarize(estimate))
             progress("simulate and filter", len(runs), runs_a_terrain * len(terrains))
             if terrain == "grass" and number == 1:
                 example = estimate
-        rows.append(_row(terrain, found))
+        rows.append(_row(terrain, summaries))
     return sorted(runs, key=lambda run: run.run_id), tuple(rows), example
 
 
-def _row(terrain: str, found: Sequence[EstimateSummary]) -> TerrainSlip:
-    pairs = [(row.slip_mean, row.slip_true_mean) for row in found if math.isfinite(row.slip_true_mean)]
+def _row(terrain: str, summaries: Sequence[EstimateSummary]) -> TerrainSlip:
+    pairs = [(row.slip_mean, row.slip_true_mean) for row in summaries if math.isfinite(row.slip_true_mean)]
     estimated, true = np.array(pairs).T if pairs else (np.array([math.nan]), np.array([math.nan]))
     values = {
         "slip_mean": float(estimated.mean()),
         "slip_true_mean": float(true.mean()),
         "slip_rmse": float(np.sqrt(np.mean((estimated - true) ** 2))),
-        "nees": float(np.mean([row.nees for row in found])),
+        "nees": float(np.mean([row.nees for row in summaries])),
     }
     known = {key: value if math.isfinite(value) else None for key, value in values.items()}
-    return TerrainSlip(terrain, len(found), **known)
+    return TerrainSlip(terrain, len(summaries), **known)

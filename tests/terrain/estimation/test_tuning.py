@@ -1,0 +1,71 @@
+"""Process noise comes back from what a filter's own equations draw, and what runs do not show has that status."""
+
+import numpy as np
+import pytest
+
+from terrain.estimation.consistency import consistency_report, sample_from_model
+from terrain.estimation.filter import Noise, run_filter
+from terrain.estimation.models.swerve import default_noise, make_filter
+from terrain.estimation.tuning import GROUPS, TuningStatus, tune_noise
+from terrain.robots import load_robot
+
+ROBOT = load_robot("agrimaro")
+MODEL = make_filter("vio15", ROBOT)
+STD = {"accel": 0.05, "yaw_rate": 0.2, "steer": 0.1, "slip_speed": 0.05, "speed": 0.02}
+"""Of the walks: slow enough for the linearisation to hold over the run, fast enough to be seen."""
+
+OFF_BY = {"yaw_rate": 1 / 10, "slip": 8.0, "steer": 10.0}
+"""What the process noise to start with is wrong by."""
+
+
+def group(name, names):
+    return [each.startswith(name) for each in names]
+
+
+def true_noise():
+    plain = default_noise("vio15", ROBOT)
+    walk = plain.process_variance.diagonal().copy()
+    for state, std in STD.items():
+        walk[group(state, MODEL.states)] = std**2
+    sample = (
+        plain.measurement_variance.copy()
+    )  # the camera's scatter stands out beside the walk within a tick
+    sample[group("camera_speed", MODEL.rows)] = 0.0012**2
+    return Noise(walk, sample, np.minimum(plain.initial_variance.diagonal(), 0.1**2))
+
+
+def drawn(n_runs=3, n=500):
+    draws = (
+        sample_from_model(MODEL, true_noise(), n, 0.02, np.random.default_rng(seed)) for seed in range(n_runs)
+    )
+    return [(time_s, z) for time_s, _, z in draws]
+
+
+def test_variances_that_are_off_by_eight_to_ten_come_back():
+    truth, samples = true_noise(), drawn()
+    walk = truth.process_variance.diagonal().copy()
+    for name, factor in OFF_BY.items():
+        walk[group(name, MODEL.states)] *= factor
+    tuned, report = tune_noise(
+        MODEL, samples, Noise(walk, truth.measurement_variance, truth.initial_variance)
+    )
+    for name, factor in OFF_BY.items():
+        assert report.status[name] is TuningStatus.FOUND
+        assert 1 / 1.5 < report.scales[name] * factor < 1.5, name
+        states = group(name, MODEL.states)
+        scaled = walk[states] * report.scales[name]
+        np.testing.assert_allclose(tuned.process_variance.diagonal()[states], scaled)
+    assert report.log_likelihood_after > report.log_likelihood_before + 100
+    track = run_filter(MODEL, tuned, *samples[0])
+    assert [entry.verdict for entry in consistency_report(track).sensors].count("consistent") >= 10
+
+
+@pytest.mark.parametrize("name", ["steer"])
+def test_a_group_without_measurements_is_reported_as_not_excited(name):
+    samples = drawn(n_runs=1, n=200)
+    for _, z in samples:
+        z[:, [row.startswith((name, "wheel")) for row in MODEL.rows]] = np.nan
+    _, report = tune_noise(MODEL, samples, true_noise())
+    assert report.status[name] is TuningStatus.NOT_EXCITED
+    assert report.scales[name] == pytest.approx(1.0)
+    assert set(report.scales) == {each for each in GROUPS if any(group(each, MODEL.states))}
