@@ -9,8 +9,7 @@ import numpy as np
 
 from terrain.records import Array
 
-LEVEL = 0.95
-"""Probability of an interval unless another is given."""
+LEVEL = 0.95  #: Probability of an interval unless another is given
 
 
 def bootstrap_counts(n: int, n_draws: int, seed: int) -> Array:

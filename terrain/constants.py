@@ -1,4 +1,3 @@
 """Physical constants, each with its source."""
 
-GRAVITY_MPS2 = 9.80665
-"""Standard gravity (3rd CGPM, 1901)."""
+GRAVITY_MPS2 = 9.80665  #: Standard gravity (3rd CGPM, 1901)

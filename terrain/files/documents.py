@@ -60,20 +60,17 @@ def check_keys(place: str, entry: Any, desired: list[str], optional: tuple[str, 
         raise ConfigError(f"{place}: key {missing[0]!r} is missing")
 
 
-MAX_JSON_BYTES = 16 * MEBIBYTE
-"""A run with a label each second of 24 hours has 7 MiB of them."""
+MAX_JSON_BYTES = 16 * MEBIBYTE  #: A run with a label each second of 24 hours has 7 MiB of them
 
 MAX_YAML_BYTES = MEBIBYTE
 """Descriptions are written and read by people: the longest of the package has 20 KiB."""
 
-MAX_DEPTH = 32
-"""Levels of lists and mappings; those of this package have 6 at most."""
+MAX_DEPTH = 32  #: Levels of lists and mappings; those of this package have 6 at most
 
 MAX_NODES = 100_000
 """Values of a YAML file, those of an alias counted each time: reading as many takes some seconds."""
 
-MAX_PLACE_CHARACTERS = 200
-"""Keys down to a fault, as a message names them."""
+MAX_PLACE_CHARACTERS = 200  #: Keys down to a fault, as a message names them
 
 _MAX_WHOLE = 2**63
 _DEEP = f"is nested deeper than {MAX_DEPTH} levels"

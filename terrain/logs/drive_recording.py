@@ -72,22 +72,14 @@ from terrain.logs.schema import POSE_CHANNELS
 from terrain.logs.tables import read_table, row_number, text_rows
 from terrain.records import Array, Label, RunLog
 
-MIN_RUN_S = 2.0
-"""Shorter stretches hold no window and no steady speed."""
-
-STANDING_S = 2.0
-"""So long without motion ends what an operator drove."""
-
-MARGIN_S = 0.5
-"""What is kept of the standing before and after it: starts and stops are whole."""
-
-BREAK_PERIODS = 2.5
-"""A longer wait between two rows ends a run: samples are lost."""
+MIN_RUN_S = 2.0  #: Shorter stretches hold no window and no steady speed
+STANDING_S = 2.0  #: So long without motion ends what an operator drove
+MARGIN_S = 0.5  #: What is kept of the standing before and after it: starts and stops are whole
+BREAK_PERIODS = 2.5  #: A longer wait between two rows ends a run: samples are lost
 
 SUFFIX = ".csv.gz"
 
-COMMANDED = "calib"
-"""State in which the logged command drives."""
+COMMANDED = "calib"  #: State in which the logged command drives
 
 WHEELS: dict[str, str] = {
     "speed_left_mps": "meas_left_vel",

@@ -41,8 +41,7 @@ MAX_GAIN_PER_S = 4.0
 """Largest standard deviation of a speed for each unit of the pose's; 2.3 in the middle of a window of 40
 samples with a pose in every second one."""
 
-N_FRAME = 5
-"""Samples whose mean heading the authors of DRIVE turned the positions of a window by."""
+N_FRAME = 5  #: Samples whose mean heading the authors of DRIVE turned the positions of a window by
 
 MAX_STD = (0.2, 0.2, 0.2)
 """Standard deviations, in m/s and rad/s, beyond which a recording's lidar has lost the robot: poses scatter
@@ -52,17 +51,10 @@ recordings of a Warthog that takes 1 % of the twists, of a Husky on wet grass a 
 MIN_JUDGED_SCANS = 5.0
 """So few poses at least show their scatter about a parabola, which takes three of them."""
 
-MIN_DISTANCE_M = 0.15
-"""Windows with a shorter path have no direction: poses scatter by a centimetre."""
-
-MIN_WINDOWS = 20
-"""So few windows show nothing of a session."""
-
-STEADY_RAD = 0.1
-"""Deviation from which a window counts less: wheels that spin, registrations that jump."""
-
-ITERATIONS = 30
-"""Of the reweighted least squares."""
+MIN_DISTANCE_M = 0.15  #: Windows with a shorter path have no direction: poses scatter by a centimetre
+MIN_WINDOWS = 20  #: So few windows show nothing of a session
+STEADY_RAD = 0.1  #: Deviation from which a window counts less: wheels that spin, registrations that jump
+ITERATIONS = 30  #: Of the reweighted least squares
 
 
 def undo_hold(values: Array, time_s: Array, holds: Sequence[int]) -> Array:

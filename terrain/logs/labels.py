@@ -25,13 +25,11 @@ from terrain.logs.samples import short_name
 from terrain.logs.schema import TIME_TOLERANCE_S
 from terrain.records import Label, Stream
 
-SLACK_S = 0.01
-"""An interval may be that far outside of a run: times are typed with two digits."""
+SLACK_S = 0.01  #: An interval may be that far outside of a run: times are typed with two digits
 
 WINDOWS_FILE = "windows.json"
 
-MAX_BYTES = 64 * MEBIBYTE
-"""Windows each second of a week with ten classes."""
+MAX_BYTES = 64 * MEBIBYTE  #: Windows each second of a week with ten classes
 
 Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """A number that is null in JSON where it is not finite."""

@@ -40,8 +40,7 @@ from terrain.logs.schema import UNIT_SCALES, canonical_unit, check_unit, unit_of
 from terrain.logs.tables import TextLayout, read_table, row_number
 from terrain.records import Array, RunLog, Stream
 
-MAX_HEADER_ROWS = 1000
-"""No instrument writes a longer head."""
+MAX_HEADER_ROWS = 1000  #: No instrument writes a longer head
 
 POSITION_CHANNELS = ("position_x_m", "position_y_m", "position_z_m")
 """What latitude, longitude and height become: east, north and up of an origin."""

@@ -18,8 +18,7 @@ import numpy as np
 
 from terrain.records import Reading
 
-LONGEST = 1.02
-"""Square of the length of a quaternion's vector part that rounding can explain."""
+LONGEST = 1.02  #: Square of the length of a quaternion's vector part that rounding can explain
 
 
 class Part(NamedTuple):

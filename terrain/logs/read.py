@@ -54,8 +54,7 @@ from terrain.logs.schema import SCHEMA_VERSION, unit_of
 from terrain.logs.tables import read_parquet
 from terrain.records import Label, RunLog, Stream
 
-MAX_STREAMS = 64
-"""Streams of a run; each is held in memory, and several may name one file."""
+MAX_STREAMS = 64  #: Streams of a run; each is held in memory, and several may name one file
 
 MAY_BE_UNKNOWN = ("slip", "truth", "control", "testbed")
 """Streams of which a channel may hold nothing but NaN."""

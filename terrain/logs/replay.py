@@ -16,8 +16,7 @@ SENSORS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry", "gnss", "co
 TWIST: tuple[str, ...] = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 """Channels of the desired motion in the stream ``commands``."""
 
-MAX_STEPS = 20_000_000
-"""Of a replay: 111 hours at 50 Hz."""
+MAX_STEPS = 20_000_000  #: Of a replay: 111 hours at 50 Hz
 
 _SLACK_S = 1e-9  # stamps that differ by less are the same instant, written by two clocks' arithmetic
 

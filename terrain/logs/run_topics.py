@@ -48,15 +48,13 @@ uint32 nanosec
 
 TIME_FIELD = "time_s"
 
-LATEST_S = 2**31 - 1
-"""Latest stamp of a header in s: its seconds have 32 bits."""
+LATEST_S = 2**31 - 1  #: Latest stamp of a header in s: its seconds have 32 bits
 
 SHORT_STREAM = "streams with fewer than 2 samples"
 DEAD_STREAM = "streams with nothing finite"
 APART = "streams apart in time"
 
-DECIDED = ("commands", "control")
-"""Streams that a controller writes; sensors have precedence over them."""
+DECIDED = ("commands", "control")  #: Streams that a controller writes; sensors have precedence over them
 
 
 class StreamTopic(BaseModel):

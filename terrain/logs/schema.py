@@ -108,8 +108,7 @@ def check_unit(place: str, unit: str, desired: str) -> None:
 WHEELS_CHANNELS = (*(f"motor_{i}_radps" for i in (1, 2, 3)), *(f"current_{i}_a" for i in (1, 2, 3)))
 """Channels of the motor drivers of a swerve robot: motor rates and motor currents."""
 
-STEERING_CHANNELS = tuple(f"angle_{i}_rad" for i in (1, 2, 3))
-"""Channels of its steering encoders."""
+STEERING_CHANNELS = tuple(f"angle_{i}_rad" for i in (1, 2, 3))  #: Channels of its steering encoders
 
 IMU_CHANNELS = (
     *(f"gyro_{axis}_radps" for axis in "xyz"),

@@ -32,8 +32,7 @@ from terrain.files.names import MEBIBYTE, check_regular, listed, normal_name, pr
 from terrain.logs.samples import BAD_CELL, SHORT_ROW, short_name
 from terrain.records import Array
 
-MISSING = ("", "nan", "NaN", "NAN", "NA")
-"""Cells that stand for a missing value."""
+MISSING = ("", "nan", "NaN", "NAN", "NA")  #: Cells that stand for a missing value
 
 MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 """Of a packed file: 48 hours of DRIVE, and gigabytes of zeros pack to megabytes."""
@@ -41,8 +40,7 @@ MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 MAX_FOOTER_BYTES = 16 * MEBIBYTE
 """Of the description at the end of a Parquet file, which takes many times its size when read; streams have 10 KiB."""
 
-MAX_COLUMNS = 4096
-"""Columns of a Parquet file; streams have 20."""
+MAX_COLUMNS = 4096  #: Columns of a Parquet file; streams have 20
 
 MAX_VALUES = 200_000_000
 """Rows times columns that are read, 1.6 GB as numbers: ten hours at 500 Hz of eleven channels.
@@ -71,8 +69,7 @@ class TextLayout(NamedTuple):
         return self.skip_rows + self.header_rows
 
 
-PLAIN = TextLayout()
-"""Commas, points, and names in the first line."""
+PLAIN = TextLayout()  #: Commas, points, and names in the first line
 
 
 def read_table(

@@ -51,8 +51,7 @@ STREAM = "testbed"
 HELD_S = 1.0
 """Time from the first of the two equal samples of a trial to the other; it stands for no duration."""
 
-TRAVEL_SPEED_MPS = 0.010
-"""Commanded speed of every trial."""
+TRAVEL_SPEED_MPS = 0.010  #: Commanded speed of every trial
 
 _DEG, _MM = math.pi / 180.0, 1e-3
 MEANS: dict[str, tuple[str, float]] = {

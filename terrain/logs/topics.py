@@ -62,19 +62,15 @@ LABELS_TYPE = "std_msgs/String"
 DISTRO = "ROS2_HUMBLE"
 """Release whose definitions are written, and taken for a bag that holds none and does not name its own."""
 
-MAX_LABELS = 1_000_000
-"""Messages with terrains; ten a second are 28 hours."""
-
-LATEST_NS = 2**62
-"""Latest stamp that a message may have."""
+MAX_LABELS = 1_000_000  #: Messages with terrains; ten a second are 28 hours
+LATEST_NS = 2**62  #: Latest stamp that a message may have
 
 _JOINT_UNITS: Mapping[str, str] = {"velocity": "rad/s", "position": "rad", "effort": "Nm"}
 _PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
 
 Kind = Literal["fields", "gnss", "imu", "joints", "odometry", "pose", "twist"]
 Number = Callable[[Any], float]
-Converted = tuple[tuple[str, ...], Array]
-"""Channels, and their values (n, c)."""
+Converted = tuple[tuple[str, ...], Array]  #: Channels, and their values (n, c)
 
 
 class Topic(NamedTuple):
