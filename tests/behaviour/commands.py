@@ -27,20 +27,13 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """Command lines that belong together.
+    """Command lines that belong together."""
 
-    Parameters
-    ----------
-    name : of the case, and of the file with its result
-    steps : in order
-    make : returns files that lie there before, by path
-    helps : commands whose options are listed; an empty name is ``terrain --help``
-    """
-
-    name: str
-    steps: tuple[Step, ...] = ()
+    name: str  #: of the case, and of the file with its result
+    steps: tuple[Step, ...] = ()  #: in order
+    #: returns files that lie there before, by path
     make: Callable[[], Mapping[str, bytes]] = field(default=dict)
-    helps: tuple[str, ...] = ()
+    helps: tuple[str, ...] = ()  #: commands whose options are listed; an empty name is ``terrain --help``
 
 
 def steps(*lines: str | Step) -> tuple[Step, ...]:
@@ -73,8 +66,7 @@ def foreign_logs() -> dict[str, bytes]:
     return files
 
 
-PATH_POINTS = "x_m,y_m\n0,0\n5,0\n10,0.5\n15,2\n20,4\n25,5\n30,5\n"
-"""Of a gentle S-bend."""
+PATH_POINTS = "x_m,y_m\n0,0\n5,0\n10,0.5\n15,2\n20,4\n25,5\n30,5\n"  #: Of a gentle S-bend
 
 TRIAL_COLUMNS = (
     "trial_num,beta,slip,Vry,avg_Vx,std_Vx,avg_Vry,std_Vry,avg_Fx,std_Fx,avg_Fy,std_Fy,avg_Fz,std_Fz,"

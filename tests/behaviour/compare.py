@@ -1,7 +1,6 @@
 """Compares two results of :mod:`behaviour.record`: what was computed, and not how it is worded.
 
-Numbers and the strings that are data must be the same; sentences may change.  A key or a name that was
-changed on purpose is entered in one of the two tables below; the old one is then still accepted.
+Numbers and the strings that are data must be the same; sentences may change.
 """
 
 from __future__ import annotations
@@ -10,54 +9,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
-
-ALIASES: dict[str, str] = {
-    "ours": "simulated",
-    "taught_runs": "training_runs",
-    "grounds": "terrain_matches",
-    "share": "residual_ratio",
-    "felt_ratio": "effective_ratio",
-    "why_ratio": "status_code",
-    "leg_play_rad": "leg_backlash_rad",
-    "fixed": "fallback",
-    "learned": "classified",
-    "oracle": "true_terrain",
-    "oracle+track": "true_terrain+track",
-    "told:grass": "known:grass",
-    "told:clay": "known:clay",
-    **{
-        f"run_{old}.{kind}": f"run_{new}.{kind}"
-        for old, new in {
-            "fixed": "fallback",
-            "learned": "classified",
-            "oracle": "true_terrain",
-            "oracle_track": "true_terrain_track",
-            "told_grass": "known_grass",
-        }.items()
-        for kind in ("png", "svg")
-    },
-}
-"""Old key of JSON, old name of a file, stream or channel: the new one.  At any depth."""
-
-ALIASES_OF_VALUES: dict[str, str] = {
-    "--leg-play": "--leg-backlash",
-    "The first day, run by run": "The first seed, run by run",
-    "fixed": "fallback",
-    "learned": "classified",
-    "oracle": "true_terrain",
-    "oracle+track": "true_terrain+track",
-    "told:grass": "known:grass",
-    "told:clay": "known:clay",
-    "What it follows": "What it depends on",
-    "Gain, on runs that had no say in it": "Gain on held-out runs",
-    "What would not have been seen": "What would not have been detected",
-    "Not told apart": "Not distinguished",
-    "Without a name": "Unexplained",
-    "The paper's figure beside ours": "The paper's figure beside the simulation's",
-    "steering_play": "steering_backlash",
-    "steering_play_rad": "steering_backlash_rad",
-}
-"""Old string that is data, or old heading of a page: the new one."""
 
 IGNORED: dict[str, str] = {
     "seconds": "time that computing took",
@@ -92,11 +43,8 @@ KEYED: dict[str, str] = {"importance": "feature"}
 STATISTICS = frozenset({"n", "nan", "sum", "sum_sq", "first", "last"})
 """Keys of what is kept of a long list of numbers."""
 
-TOLERANCE = 1e-9
-"""Relative."""
-
-TINY = 1e-12
-"""Absolute: what should be 0 and is rounding."""
+TOLERANCE = 1e-9  #: Relative
+TINY = 1e-12  #: Absolute: what should be 0 and is rounding
 
 LOOSE: dict[str, dict[str, float]] = {
     "estimate_swerve": {"/steps/05/json": 2e-3},
@@ -114,14 +62,7 @@ _RANDOM_ID = re.compile(r"[0-9a-f]{32}|[0-9a-f]{40}|[0-9a-f]{64}")
 
 
 def differences(expected: Any, actual: Any, path: str = "", key: str = "") -> list[str]:
-    """Return a line for each difference; none where the results agree.
-
-    Parameters
-    ----------
-    expected, actual : what JSON can hold
-    path : where in the whole, for the lines
-    key : the last key of that path, which decides what a string is
-    """
+    """Return a line for each difference of what JSON can hold; the last key of a path decides what a string is."""
     if key in IGNORED:
         return []
     if isinstance(expected, Mapping) and isinstance(actual, Mapping):
@@ -179,48 +120,33 @@ def _same_text(expected: str, actual: str, key: str) -> bool:
         return _RANDOM_ID.fullmatch(actual) is not None
     if is_prose(expected, key):
         return bool(expected) == bool(actual)  # a reason must not be lost, nor come from nowhere
-    return _today(expected) == _today(actual)
-
-
-def _today(text: str) -> str:
-    """Return a string of data by its new name; names by commas one by one."""
-    if text in ALIASES_OF_VALUES:
-        return ALIASES_OF_VALUES[text]
-    return ",".join(ALIASES_OF_VALUES.get(part, part) for part in text.split(","))
+    return expected == actual
 
 
 def _of_mappings(expected: Mapping[str, Any], actual: Mapping[str, Any], path: str, key: str) -> list[str]:
-    found = []
-    for old, new in ALIASES.items():
-        if old in actual and new in actual:  # both are written for a release
-            found += differences(actual[old], actual[new], f"{path}/{new} beside {old}")
-    required, there = _renamed(expected), _renamed(actual)
-    for name in required:
-        if name in there:
+    lines = []
+    for name in expected:
+        if name in actual:
             # the values of a table that goes by names of its own belong to the table
-            of = name if not isinstance(required[name], str) or key not in PROSE_KEYS else key
-            found += differences(required[name], there[name], f"{path}/{name}", of)
-    missing = [name for name in required if name not in there]
-    added = [name for name in there if name not in required]
+            of = name if not isinstance(expected[name], str) or key not in PROSE_KEYS else key
+            lines += differences(expected[name], actual[name], f"{path}/{name}", of)
+    missing = [name for name in expected if name not in actual]
+    added = [name for name in actual if name not in expected]
     for name in list(missing):
         if " " in name:  # a key that is prose: its value has to be there, under whatever words
-            same = [other for other in added if not differences(required[name], there[other])]
+            same = [other for other in added if not differences(expected[name], actual[other])]
             if same:
                 missing.remove(name)
                 added.remove(same[0])
-    found += [f"{path}/{name}: is missing; {_short(required[name])} was expected" for name in missing]
-    found += [f"{path}/{name}: was not expected; it is {_short(there[name])}" for name in added]
-    return found
-
-
-def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    return {ALIASES.get(name, name): value for name, value in mapping.items()}
+    lines += [f"{path}/{name}: is missing; {_short(expected[name])} was expected" for name in missing]
+    lines += [f"{path}/{name}: was not expected; it is {_short(actual[name])}" for name in added]
+    return lines
 
 
 def _of_lists(expected: Sequence[Any], actual: Sequence[Any], path: str, key: str) -> list[str]:
     name = KEYED.get(key)
     if name is not None:
-        one, other = ({_today(str(row.get(name))): row for row in rows} for rows in (expected, actual))
+        one, other = ({str(row.get(name)): row for row in rows} for rows in (expected, actual))
         return _of_mappings(one, other, path, key)
     if len(expected) != len(actual):
         return [f"{path}: {len(expected)} entries were expected, there are {len(actual)}: {_short(actual)}"]

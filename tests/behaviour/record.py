@@ -40,14 +40,9 @@ EXPECTED = Path(__file__).with_name("expected")
 
 TIMEOUT_S = 900.0
 
-LONG = 40
-"""So many numbers in a list are kept as statistics."""
-
-BIG_BYTES = 100_000
-"""A bigger result is kept compressed."""
-
-PARTS = ("section", "h2", "h3", "table", "svg", "img", "figure")
-"""Elements of a page that are counted."""
+LONG = 40  #: So many numbers in a list are kept as statistics
+BIG_BYTES = 100_000  #: A bigger result is kept compressed
+PARTS = ("section", "h2", "h3", "table", "svg", "img", "figure")  #: Elements of a page that are counted
 
 ALIASES_QUERY = "select name, alias, version from registered_model_aliases order by name"
 
@@ -55,14 +50,7 @@ _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA
 
 
 def run_case(case: Case, terrain: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Return the result of a case.
-
-    Parameters
-    ----------
-    case : what to run
-    terrain : the command's first words
-    folder : an empty one, to work in
-    """
+    """Return the result of a case that is run in an empty folder, by the command's first words."""
     given = case.make()
     for name, content in given.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -80,26 +68,14 @@ def run_case(case: Case, terrain: Sequence[str], folder: Path) -> dict[str, Any]
 
 
 def outline(page: str) -> dict[str, Any]:
-    """Return how many there are of the parts of an HTML page, and its headings.
-
-    Examples
-    --------
-    >>> outline("<section><h2>All <i>of</i> it</h2><table></table></section>")["h2"]
-    ['All of it']
-    """
+    """Return how many there are of the parts of an HTML page, and its headings."""
     counts = {part: len(re.findall(rf"<{part}\b", page)) for part in PARTS if part != "h2"}
     headings = re.findall(r"<h2\b[^>]*>(.*?)</h2>", page, flags=re.DOTALL)
     return {**counts, "h2": [html.unescape(re.sub(r"<[^>]*>", "", heading)).strip() for heading in headings]}
 
 
 def statistics(values: Any) -> dict[str, Any]:
-    """Return what is kept of many numbers, or of many texts.
-
-    Examples
-    --------
-    >>> statistics([1.0, float("nan"), 3.0])
-    {'n': 3, 'nan': 1, 'sum': 4.0, 'sum_sq': 10.0, 'first': 1.0, 'last': 3.0}
-    """
+    """Return what is kept of many numbers, or of many texts."""
     if any(isinstance(value, str) for value in values):
         texts = [str(value) for value in values]
         return {"n": len(texts), "distinct": len(set(texts)), "first": texts[0], "last": texts[-1]}

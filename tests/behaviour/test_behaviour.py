@@ -115,20 +115,6 @@ def test_a_sum_that_cancels_is_as_accurate_as_its_summands():
     assert differences(one, {**one, "sum": 1.0}) == ["/sum: 0.0 was expected, it is 1.0"]
 
 
-def test_a_new_name_is_accepted_and_so_is_the_old_one(monkeypatch):
-    def rename(result):
-        result["model"] = result.pop("robot")
-        result["run_ids"] = ["meadow_01", "grass_02"]
-
-    assert len(changed(rename)) == 3
-    monkeypatch.setitem(compare.ALIASES, "robot", "model")
-    monkeypatch.setitem(compare.ALIASES_OF_VALUES, "grass_01", "meadow_01")
-    assert changed(rename) == []
-    assert changed(lambda result: None) == []
-    assert changed(lambda result: result.update(model=result["robot"])) == []
-    assert changed(lambda result: result.update(model="another"))
-
-
 def test_a_result_is_kept_and_read_back(tmp_path):
     assert keep_result("small", RESULT, tmp_path).suffix == ".json"
     assert load_result("small", tmp_path) == RESULT

@@ -25,8 +25,7 @@ from terrain.classify.novelty import learn_novelty
 from terrain.classify.support import learn_support
 from terrain.records import RunLog, Stream
 
-N_COMPARED = 8
-"""tsfel takes about a tenth of a second a window."""
+N_COMPARED = 8  #: tsfel takes about a tenth of a second a window
 
 
 def synthetic_run(duration_s=60.0):

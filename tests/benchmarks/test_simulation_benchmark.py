@@ -7,8 +7,7 @@ from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 
-TIMES_REAL_TIME = 100.0
-"""The bar: a minute in 0.6 s."""
+TIMES_REAL_TIME = 100.0  #: The bar: a minute in 0.6 s
 
 
 @pytest.mark.benchmark(group="simulate a minute on grass, bar 0.6 s")

@@ -45,19 +45,13 @@ COVERAGE_HEADING = "coverage of slip"
 
 
 class TerrainConsistency(NamedTuple):
-    """Consistency of a filter on a terrain, means over runs with their 95 % intervals.
+    """Consistency of a filter on a terrain, means over runs with their 95 % intervals."""
 
-    Parameters
-    ----------
-    terrain, n_runs : of how many runs
-    nees : a state, by group of states (:data:`GROUPS`); 1 is consistent
-    slip_coverage : ratio of slips within their stated 95 % interval
-    """
-
+    #: terrain, n_runs: of how many runs
     terrain: str
     n_runs: int
-    nees: dict[str, MeanInterval]
-    slip_coverage: MeanInterval
+    nees: dict[str, MeanInterval]  #: a state, by group of states (:data:`GROUPS`); 1 is consistent
+    slip_coverage: MeanInterval  #: ratio of slips within their stated 95 % interval
 
 
 def nees_by_group(estimate: Estimate) -> dict[str, float]:
@@ -94,22 +88,8 @@ def consistency_by_terrain(
 ) -> tuple[TerrainConsistency, ...]:
     """Simulate and filter runs of some scenarios on each terrain, and compare errors with their variance.
 
-    Parameters
-    ----------
-    robot : swerve robot
-    seed : of everything that is drawn: soil, slope, load, tyres, driving and noise of each run
-    runs : of each scenario on each terrain
-    filter_name : one of :data:`terrain.estimation.estimate.FILTERS`
-    progress : of the runs
-    n_jobs : processes at once
-    terrains : names of soils
-    scenarios : names of scenarios
-    lost_s : for so long from the middle of each run there is no camera, and coverage is that of this time
-
-    Raises
-    ------
-    ConfigError
-        if the filter does not fit the robot, or there is no such terrain.
+    Of each run soil, slope, load, tyres, driving and noise are drawn; for ``lost_s`` from its middle there is no
+    camera, and coverage is that of this time.
     """
     from joblib import Parallel, delayed
 
@@ -203,13 +183,7 @@ def report(result: Consistency) -> Report:
 
 
 def shown(value: MeanInterval) -> str:
-    """Return a mean and half of its 95 % interval.
-
-    Examples
-    --------
-    >>> shown(MeanInterval(0.912, (0.862, 0.962), 9)), shown(MeanInterval(4.86, (2.3, 7.42), 9))
-    ('0.91 ± 0.05', '4.9 ± 2.6')
-    """
+    """Return a mean and half of its 95 % interval."""
     if value.mean is None:
         return format_value(None)
     digits = 1 if value.mean >= 1.0 else 2

@@ -46,13 +46,7 @@ class Figures(Result):
 
 
 def read_tables(folder: Path) -> list[dict[str, Any]]:
-    """Return the tables in order of their files.
-
-    Raises
-    ------
-    DataError
-        if a record lacks a key, or a value of a column.
-    """
+    """Return the tables in order of their files."""
     tables = []
     for file in sorted(folder.glob("*.json")):
         table = json.loads(file.read_text(encoding="utf-8"))
@@ -108,13 +102,7 @@ def readme_table(tables: Sequence[Mapping[str, Any]]) -> str:
 
 
 def with_table(page: str, table: str, title: str = "") -> str:
-    """Return a page with a table between its marks.
-
-    Raises
-    ------
-    DataError
-        if the marks are not there.
-    """
+    """Return a page with a table between its marks."""
     mark = f"<!-- measured: {title} -->" if title else "<!-- measured -->"
     before, begin, rest = page.partition(mark)
     _, end, after = rest.partition(END)

@@ -54,8 +54,7 @@ from terrain.terramechanics.soil import load_soil
 EXAMPLE = "python tests/studies intervals --repeats 200 --seed 0"
 WHEEL = WHEELS["testbed_smooth"]
 SPEEDS_MMPS = (0.0, 3.0, 5.0, 8.0, 10.0, 12.0, 20.0, 40.0, 100.0)
-NOMINAL_M = 0.3
-"""Wheel radius by which logs of a skid-steer robot are made."""
+NOMINAL_M = 0.3  #: Wheel radius by which logs of a skid-steer robot are made
 
 
 class Interval(NamedTuple):

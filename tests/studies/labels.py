@@ -69,13 +69,7 @@ class _FoldLabels(NamedTuple):
 
 
 def run(settings: Settings, progress: Progress = silent) -> LabelStudy:
-    """Compare strategies on a folder of labelled runs.
-
-    Raises
-    ------
-    DataError
-        if a terrain has too few runs.
-    """
+    """Compare strategies on a folder of labelled runs."""
     data, repeats = settings.data, settings.repeats
     evaluation = LearnSettings(repeats=repeats, seed=settings.seed, n_jobs=settings.n_jobs)
     samples = samples_of(load_runs(data), evaluation.rule)

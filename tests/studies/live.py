@@ -42,8 +42,7 @@ from terrain.records import RunLog, Windows
 from terrain.robots import Robot, load_robot
 
 EXAMPLE = "python tests/studies live --robots 25 --seconds 20"
-SHARES = (1, 0.4, 1.6)
-"""Of the robots that were asked for, in this order."""
+SHARES = (1, 0.4, 1.6)  #: Of the robots that were asked for, in this order
 REPEATS = 5
 STEP_RATE_HZ = 50.0
 N_WINDOWS = 400
@@ -169,13 +168,7 @@ def window_times_ms(windows: Windows, model: Any) -> Spread:
 
 
 def run(settings: Settings, progress: Progress = silent) -> LiveLatencies:
-    """Measure the live chain and the service on this machine.
-
-    Raises
-    ------
-    TerrainError
-        if the model cannot be loaded, or the service does not start.
-    """
+    """Measure the live chain and the service on this machine."""
     robot, log = load_robot(ROBOT), study_drive(settings.seed)
     n_stages = 5 + len(SHARES)
     with TemporaryDirectory() as folder:

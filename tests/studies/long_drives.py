@@ -20,8 +20,7 @@ from terrain.terramechanics.soil import soil_names
 
 EXAMPLE = "python tests/studies long-drives --runs 12 --minutes 30 --seed 0"
 SCENARIO, FILTER = "complex", "vio15"
-LOST_S = 60.0
-"""For so long at the end of a drive there is no camera."""
+LOST_S = 60.0  #: For so long at the end of a drive there is no camera
 
 
 class Settings(JobsSettings):
@@ -34,22 +33,13 @@ class Settings(JobsSettings):
 
 
 class LongDrive(NamedTuple):
-    """A drive's errors and consistency.
+    """A drive's errors and consistency."""
 
-    Parameters
-    ----------
-    terrain : soil
-    yaw_error_rad : largest, while there is a camera
-    blind_yaw_error_rad : at the end, after :data:`LOST_S` without one
-    nees : a state, by group of states; 1 is consistent
-    slip_coverage : ratio of slips within their stated 95 % interval
-    """
-
-    terrain: str
-    yaw_error_rad: float
-    blind_yaw_error_rad: float
-    nees: dict[str, float]
-    slip_coverage: float
+    terrain: str  #: soil
+    yaw_error_rad: float  #: largest, while there is a camera
+    blind_yaw_error_rad: float  #: at the end, after :data:`LOST_S` without one
+    nees: dict[str, float]  #: a state, by group of states; 1 is consistent
+    slip_coverage: float  #: ratio of slips within their stated 95 % interval
 
 
 class LongDrives(Result):
@@ -61,13 +51,7 @@ class LongDrives(Result):
 
 
 def drive_long(robot: Robot, terrain: str, seed: int, number: int, duration_s: float) -> LongDrive:
-    """Simulate and filter a drive whose camera is lost for its last minute.
-
-    Raises
-    ------
-    ConfigError
-        if the drive is not longer than two minutes, or the filter does not fit the robot.
-    """
+    """Simulate and filter a drive whose camera is lost for its last minute."""
     if not duration_s > 2 * LOST_S:
         raise ConfigError(f"a drive of {duration_s:g} s is too short: more than {2 * LOST_S:g} s are needed")
     seen_s = duration_s - LOST_S

@@ -33,24 +33,16 @@ TIMEOUT_S = 600
 
 
 class Mutant(NamedTuple):
-    """A fault, and what has to notice it.
+    """A fault, and what has to notice it."""
 
-    Parameters
-    ----------
-    name : of the fault
-    what : the fault in a sentence, by which it is put in again where its text has moved
-    file : that it is in, from the repository
-    old, new : the text that occurs once in the file, and what replaces it
-    tests : files or nodes of tests
-    kind : numerical (a sign, a factor, an index) or logical (a missing check, a status); empty where not stated
-    """
-
-    name: str
-    what: str
-    file: str
+    name: str  #: of the fault
+    what: str  #: the fault in a sentence, by which it is put in again where its text has moved
+    file: str  #: that it is in, from the repository
+    #: old, new: the text that occurs once in the file, and what replaces it
     old: str
     new: str
-    tests: tuple[str, ...]
+    tests: tuple[str, ...]  #: files or nodes of tests
+    #: numerical (a sign, a factor, an index) or logical (a missing check, a status); empty where not stated
     kind: str = ""
 
 
@@ -125,13 +117,7 @@ def is_caught(mutant: Mutant, tree: Path) -> tuple[bool, str]:
 
 
 def run(settings: Settings, progress: Progress = silent) -> Mutants:
-    """Put in each mutant and run its tests.
-
-    Raises
-    ------
-    ConfigError
-        if there is no mutant of a name.
-    """
+    """Put in each mutant and run its tests."""
     mutants = read_mutants(settings.file)
     unknown = sorted(set(settings.only) - {each.name for each in mutants})
     if unknown:

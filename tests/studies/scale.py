@@ -30,10 +30,8 @@ from terrain.records import Label, RunLog, Stream
 EXAMPLE = "python tests/studies scale --runs 10000 --workers 1,2"
 FRACTIONS = (0.1, 0.3, 1.0)
 """Of the runs that were asked for: three sizes show whether time and memory follow their number."""
-WARM_RUNS = 24
-"""Before a measurement: processes are started, kernels are compiled and loaded."""
-N_GENERATED = 50
-"""Runs by which the time to generate one is measured."""
+WARM_RUNS = 24  #: Before a measurement: processes are started, kernels are compiled and loaded
+N_GENERATED = 50  #: Runs by which the time to generate one is measured
 RUN_S = 20.0
 IMU_RATE_HZ, WHEEL_RATE_HZ = 50.0, 10.0
 IMU = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps", "accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
@@ -101,14 +99,7 @@ class ScaleResult(Result):
 
 
 def generated_run(seed: int, number: int) -> RunLog:
-    """Return a run; it depends on the seed and its number only.
-
-    Examples
-    --------
-    >>> run = generated_run(0, 2)
-    >>> run.run_id, run.labels[0].terrain, len(run.streams["imu"])
-    ('run_000002', 'GRAVEL', 1000)
-    """
+    """Return a run; it depends on the seed and its number only."""
     rng = np.random.default_rng((seed, number))
     terrain = list(TERRAINS)[number % len(TERRAINS)]
     level_mps2, colour = TERRAINS[terrain]
@@ -207,13 +198,7 @@ def peak_memory() -> Iterator[Peak]:
 
 
 def run(settings: Settings, progress: Progress = silent) -> ScaleResult:
-    """Measure making features of generated runs on this machine.
-
-    Raises
-    ------
-    TerrainError
-        if the folder cannot be written.
-    """
+    """Measure making features of generated runs on this machine."""
     from joblib.externals.loky import get_reusable_executor
 
     from pipelines.learn.parallel import parallel
@@ -273,14 +258,7 @@ def _by_workers(points: Sequence[Point]) -> list[list[Point]]:
 def nonlinearity(times: Sequence[tuple[int, int, float]]) -> float:
     """Return the largest deviation of the time a run from that of the largest size with as many processes.
 
-    Parameters
-    ----------
-    times : (processes, runs, time in s) of each measurement
-
-    Examples
-    --------
-    >>> round(nonlinearity([(1, 10, 1.1), (1, 100, 10.0)]), 3)
-    0.1
+    The times are (processes, runs, time in s) of each measurement.
     """
     deviations = []
     for n_workers in {each[0] for each in times}:

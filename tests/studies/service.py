@@ -28,8 +28,7 @@ ROBOT = "agrimaro"
 STEP_RATE_HZ, IMU_RATE_HZ = 20.0, 100.0
 DRIVE_S, TRAINING_S = 40.0, 25.0
 ANSWER_S = 5.0
-APART_S = 2.0
-"""Robots do not start at one instant, and their windows do not end at one."""
+APART_S = 2.0  #: Robots do not start at one instant, and their windows do not end at one
 COMMAND = (sys.executable, "-c", "from pipelines.cli.main import main; main()", "serve")
 
 
@@ -42,13 +41,7 @@ class Spread(NamedTuple):
 
 
 def spread(values: Array | list[float]) -> Spread:
-    """Return the spread of some figures.
-
-    Examples
-    --------
-    >>> spread([1.0, 2.0, 3.0]).median
-    2.0
-    """
+    """Return the spread of some figures."""
     if not len(values):
         return Spread(np.nan, np.nan, np.nan)
     median, p99 = np.percentile(values, [50, 99])
@@ -88,14 +81,7 @@ def sent_channels(run: RunLog) -> dict[str, list[str]]:
 def messages_of(
     run: RunLog, rate_hz: float = IMU_RATE_HZ, step_rate_hz: float = STEP_RATE_HZ
 ) -> Iterator[dict[str, Any]]:
-    """Yield the messages of a robot: samples at one rate, of which some ask for a step.
-
-    Parameters
-    ----------
-    run : drive
-    rate_hz : of the messages
-    step_rate_hz : of those that ask for a step
-    """
+    """Yield the messages of a robot: samples at one rate, of which some ask for a step."""
     every = round(rate_hz / step_rate_hz)
     for k, sample in enumerate(replay(run, rate_hz)):
         streams = {
@@ -150,13 +136,7 @@ class Driven(NamedTuple):
 
 
 async def drive(url: str, first: bytes, messages: Sequence[Packed], delay_s: float = 0.0) -> Driven:
-    """Drive one robot in real time; return the round trips of its steps.
-
-    Raises
-    ------
-    TerrainError
-        if the service refuses the robot.
-    """
+    """Drive one robot in real time; return the round trips of its steps."""
     times_ms: list[float] = []
     rows = unanswered = 0
     async with connect(f"{url}/robots", compression=None, max_size=None) as socket:

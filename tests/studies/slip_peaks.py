@@ -66,29 +66,20 @@ class Case(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """Coverage and error over cases.
+    """Coverage and error over cases."""
 
-    Parameters
-    ----------
-    n : cases
-    coverage, coverage_ci : ratio of intervals that contain the true peak, and its exact 95 % interval
-    error_mean, error_median_abs, error_max_abs : of the peak slip
-    within_003 : ratio of cases with an error of at most 0.03
-    width_median : of the intervals
-    well_covered : cases with slips up to :data:`WELL_COVERED_SLIP` and beyond
-    status_right : cases with the true status of the peak
-    """
-
-    n: int
+    n: int  #: cases
+    #: coverage, coverage_ci: ratio of intervals that contain the true peak, and its exact 95 % interval
     coverage: float
     coverage_ci: tuple[float, float] | None
+    #: error_mean, error_median_abs, error_max_abs: of the peak slip
     error_mean: float
     error_median_abs: float
     error_max_abs: float
-    within_003: float
-    width_median: float
-    well_covered: int
-    status_right: int
+    within_003: float  #: ratio of cases with an error of at most 0.03
+    width_median: float  #: of the intervals
+    well_covered: int  #: cases with slips up to :data:`WELL_COVERED_SLIP` and beyond
+    status_right: int  #: cases with the true status of the peak
 
 
 class PeaksResult(Result):
@@ -110,13 +101,7 @@ class PeaksResult(Result):
 
 
 def true_peak(robot: Robot, terrain: str, slip_range: tuple[float, float]) -> Peak:
-    """Return the peak of a described soil's net traction within a range of slips, under a third of the robot.
-
-    Examples
-    --------
-    >>> true_peak(load_robot("agrimaro"), "snow", (0.0, 0.6))
-    Peak(slip_ratio=0.3115, status=<PeakStatus.PEAK: 'peak'>)
-    """
+    """Return the peak of a described soil's net traction within a range of slips, under a third of the robot."""
     soil, body = load_soil(terrain), robot.body
     geometry = robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
     load_n = robot.mass_kg * GRAVITY_MPS2 / len(robot.wheels)
@@ -146,14 +131,7 @@ def run_case(
 
 
 def clopper_pearson(hits: int, n: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the exact interval of a probability by ``hits`` of ``n``.
-
-    Examples
-    --------
-    >>> low, high = clopper_pearson(90, 100)
-    >>> round(low, 3), round(high, 3)
-    (0.824, 0.951)
-    """
+    """Return the exact interval of a probability by ``hits`` of ``n``."""
     tail = (1 - level) / 2
     low = float(betaincinv(hits, n - hits + 1, tail)) if hits else 0.0
     high = float(betaincinv(hits + 1, n - hits, 1 - tail)) if hits < n else 1.0

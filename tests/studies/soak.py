@@ -35,8 +35,7 @@ from studies.service import (
 )
 
 EXAMPLE = "python tests/studies soak --robots 8 --minutes 30"
-ANSWER_S, DROPPED_S = 5.0, 1.0
-"""For an answer; for that of a request that was dropped, if it was not."""
+ANSWER_S, DROPPED_S = 5.0, 1.0  #: For an answer; for that of a request that was dropped, if it was not
 
 MEMORY_GROWTH_MOST = 0.05
 FAULTS = (
@@ -109,13 +108,7 @@ class _Seen:
 class _Robot:
     """One robot that drives again and again, and meets the faults that are due.
 
-    Parameters
-    ----------
-    number : of the robot; its clock is as many times :data:`CLOCKS_APART_S` ahead
-    channels : of each stream
-    messages : of a drive; no clock is far from them
-    seen : of all robots
-    seed : of the faults
+    Its clock is ``number`` times :data:`CLOCKS_APART_S` ahead.
     """
 
     def __init__(
@@ -304,13 +297,7 @@ def _swap(service: ServiceProcess, uri: str, seen: _Seen) -> None:
 
 
 def run(settings: Settings, progress: Progress = silent) -> Soak:
-    """Load a service of its own process with robots and faults, and judge what it did.
-
-    Raises
-    ------
-    TerrainError
-        if the model cannot be loaded, or the service does not start.
-    """
+    """Load a service of its own process with robots and faults, and judge what it did."""
     log, seen = study_drive(settings.seed), _Seen()
     channels, messages = sent_channels(log), list(messages_of(log))
     with TemporaryDirectory() as folder:

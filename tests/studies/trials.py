@@ -85,11 +85,6 @@ def run(settings: Settings, progress: Progress = silent) -> TrialsResult:
     """Run blind trials and return their scores, with every single trial.
 
     A trial depends on the seed, its row, its number and the number of runs only.
-
-    Raises
-    ------
-    ConfigError
-        for too few runs.
     """
     if settings.runs < MIN_RUNS:
         raise ConfigError(f"--runs is {settings.runs}; at least {MIN_RUNS} are required, to hold some out")
