@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from features.windows import WindowRule, cut_windows, wheel_speeds
-from terrain.classify.change_points import change_points
+from terrain.classify.changes import change_points
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import signal_set_of
 from terrain.records import Array, RunLog, Windows
@@ -46,13 +46,13 @@ def odd_stretches(run: RunLog) -> tuple[OddStretch, ...]:
     start_s = windows.start_s
     return tuple(
         OddStretch(
-            float(start_s[each.first]),
-            float(start_s[each.end - 1] + windows.length_s),
-            each.shift,
-            float(np.median(speed_mps[each.first : each.end])),
+            float(start_s[first]),
+            float(start_s[end - 1] + windows.length_s),
+            shift,
+            float(np.median(speed_mps[first:end])),
             float(np.median(speed_mps)),
         )
-        for each in change_points(values)
+        for first, end, shift in change_points(values)
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from features.cross_channel import left_right
 from features.windows import wheel_speeds
-from terrain.classify.regimes import Motion
+from terrain.classify.coverage import Motion
 from terrain.logs.schema import signal_set_of
 from terrain.records import Array, Windows
 

@@ -19,7 +19,7 @@ from features.labelled import cut_labelled, cut_partitions, deal_partitions
 from features.motion import fastest_wheel
 from features.windows import WindowRule
 from terrain.classify.folds import Fold, block_groups, fold_numbers, numbered_folds, single_run_classes
-from terrain.classify.slow_fast import (
+from terrain.classify.held_out import (
     MIN_CLASSES,
     MIN_RUNS_A_SIDE,
     MIN_TIME_A_SIDE_S,

@@ -13,7 +13,7 @@ from features.extractor import FeatureExtractor
 from features.matrix import FeatureMatrix
 from features.response import ResponseExtractor
 from features.sample_extractor import SampleExtractor
-from terrain.classify.grouped_network import GroupedNetwork
+from terrain.classify.network import GroupedNetwork
 from terrain.classify.response import GroupedResponse
 from terrain.classify.stack import GroupedStack
 from terrain.classify.svm import CANDIDATES, GroupedSVC
@@ -114,7 +114,7 @@ def make_recipe(
         features = SampleExtractor(*sets, with_features=True)
         classifier = GroupedStack(choose=recipe == "best", candidates=candidates, gap=gap, seed=seed)
     else:
-        from terrain.classify.own import OwnClassifier
+        from terrain.classify.grouped import OwnClassifier
 
         made = recipe if hasattr(recipe, "fit") and not isinstance(recipe, type) else recipe()
         if isinstance(made, WindowPipeline):

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from features.matrix import FeatureMatrix, left_out_of
-from terrain.classify.network_input import SampleColumns
+from terrain.classify.network import SampleColumns
 from terrain.logs.schema import signal_set_of
 from terrain.records import Array, Windows
 

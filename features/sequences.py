@@ -10,7 +10,8 @@ import numpy as np
 
 from features.windows import Layout, WindowRule, cut_windows, regular_starts, span_of
 from terrain.classify.folds import Fold
-from terrain.classify.sequence_figures import STRIDE_S, Track, track_of
+from terrain.classify.metrics import STRIDE_S, Track, last_class, track_of
+from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
 from terrain.logs.splicing import SplicedRun, parts_under, sequences_of
 from terrain.records import Array, RunLog, Windows
 
@@ -48,8 +49,12 @@ class Following(NamedTuple):
                 probability[rows] = 0.0
                 features = np.asarray(self.features.fit_transform(windows))
                 probability[np.ix_(rows, columns)] = classifier.predict_proba(features)
-            at = starts_s, rule.length_s, probability, self.classes, self.prior
-            tracks.append(track_of(log.labels, runs, *at, spliced))
+            settings = check_filter(TerrainFilter(tuple(self.prior.tolist())))
+            belief = filter_run(probability, starts_s + rule.length_s, settings)
+            reports = reported(belief, settings.threshold), last_class(probability)
+            tracks.append(
+                track_of(log.labels, runs, starts_s, rule.length_s, *reports, self.classes, spliced)
+            )
         return tracks
 
 

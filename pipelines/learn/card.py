@@ -32,8 +32,7 @@ from pipelines.live.model import ModelInfo, assess
 from pipelines.report.numbers import NOT_KNOWN, enumerated, format_value, sentence
 from pipelines.report.results import Result, described
 from pipelines.report.tree import Column, Pairs, Report, Section, Table, Text
-from terrain.classify.importance import ChannelImportance
-from terrain.classify.slow_fast import run_speeds
+from terrain.classify.held_out import ChannelImportance, run_speeds
 from terrain.errors import ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import parse_document
@@ -131,7 +130,7 @@ def read_training(folder: Path) -> tuple[ModelInfo, TrainingRecord | None]:
 def write_training(folder: Path, name: str, record: TrainingRecord) -> ModelResult:
     """Write how a model was trained, and its card, beside the model; the time of one window is measured here."""
     from pipelines.report.pages import markdown_text
-    from terrain.classify.network_onnx import time_of_onnx
+    from terrain.classify.network import time_of_onnx
 
     model = read_model(folder)
     window = drawn_window(model.info)

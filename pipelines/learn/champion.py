@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from pipelines.live.model import ModelInfo, TerrainModel
-from terrain.classify.metrics import runs_by_terrain
-from terrain.classify.paired import MIN_RUNS, Difference, paired_accuracy
+from terrain.classify.metrics import MIN_RUNS, Difference, paired_accuracy, runs_by_terrain
 from terrain.logs.digest import joint_digest
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from features.protocols import Samples
     from features.recipes import WindowPipeline
     from pipelines.live.model import TerrainModel
-    from terrain.classify.paired import Comparison, Difference
+    from terrain.classify.metrics import Comparison, Difference
     from terrain.records import RunLog
 
 POINTS = "+.1f"
@@ -70,9 +70,9 @@ def side_by_side(
 
     from features.motion import window_motion
     from pipelines.learn.evaluate import evaluate_recipe
-    from terrain.classify.next_drives import held_out_support
-    from terrain.classify.paired import Outcome, compare_with_first
-    from terrain.classify.support import support_levels
+    from terrain.classify.coverage import held_out_support
+    from terrain.classify.limits import support_levels
+    from terrain.classify.metrics import Outcome, compare_with_first
 
     first, _, samples = contenders[0]
     for name, _, other in contenders[1:]:
@@ -109,7 +109,7 @@ def compare_models(
     from features.windows import cut_windows
     from pipelines.learn.evaluate import evaluation_of
     from terrain.classify.held_out import HeldOut
-    from terrain.classify.paired import Outcome, compare_with_first
+    from terrain.classify.metrics import Outcome, compare_with_first
     from terrain.logs.digest import data_digest
 
     trained = {digest for model in models for digest in model.info.run_digests}

@@ -19,17 +19,30 @@ from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, EvaluationSettings, RecipeSettings
 from pipelines.report.numbers import format_counts
 from pipelines.report.results import Progress, silent
-from terrain.classify.breakaway import breakaways
+from terrain.classify.changes import breakaways
+from terrain.classify.coverage import coverage_of
 from terrain.classify.folds import Fold, single_run_classes
-from terrain.classify.held_out import Examples, HeldOut, fit_fold, held_out_figures, itself, set_figures
-from terrain.classify.importance import ChannelDrops
-from terrain.classify.learning_curve import drawn_folds, learning_curve
-from terrain.classify.next_drives import coverage_of
-from terrain.classify.sequence_figures import sequence_figures
-from terrain.classify.slow_fast import Applicability, run_speeds
+from terrain.classify.held_out import (
+    Applicability,
+    ChannelDrops,
+    Examples,
+    HeldOut,
+    drawn_folds,
+    fit_fold,
+    itself,
+    left_out_folds,
+    run_speeds,
+    score_fold,
+)
+from terrain.classify.metrics import (
+    held_out_figures,
+    learning_curve,
+    sequence_figures,
+    set_figures,
+    unknown_figures,
+)
 from terrain.classify.stiffness import stiffness_figures
 from terrain.classify.svm import GroupedSVC
-from terrain.classify.unknown_figures import left_out_folds, score_fold, unknown_figures
 from terrain.records import Array
 from terrain.terramechanics.stiffness import known_levels
 
@@ -137,13 +150,13 @@ def evaluate_recipe(
         left_out = left_out_folds(terrain, run_id, N_FOLDS, gap, seed)
         shared = checked, terrain, run_id, gap, seed
         scores = [*parallel(score_fold, shared, left_out, settings.jobs, protocol, progress)]
-        found |= unknown_figures(scores, terrain, run_id, windows.start_s, seed)._asdict()
+        found |= unknown_figures(scores, terrain, run_id, windows.start_s, seed)
     if not published:
         found["conformal"] = set_figures(held_out, windows, seed)
         if motion is None:
             notes.append(f"support: {NO_MOTION}")
         else:
-            found |= coverage_of(held_out, samples.run_id, motion, windows.length_s, seed)._asdict()
+            found |= coverage_of(held_out, samples.run_id, motion, windows.length_s, seed)
     result = evaluation_of(
         held_out,
         samples,

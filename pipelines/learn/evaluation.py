@@ -14,15 +14,22 @@ from pipelines.report.figure import Bars, Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_value, plural
 from pipelines.report.results import Result, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text, value_at
-from terrain.classify.breakaway import Breakaway
-from terrain.classify.held_out import ConformalFigures, FoldFigures
-from terrain.classify.learning_curve import LearningCurve
-from terrain.classify.metrics import ClassFigures, CoverageFigures, ReliabilityBin, RunFigures
-from terrain.classify.next_drives import NextDrive, PartFigures, SupportRow
-from terrain.classify.sequence_figures import DelayFigures, SequenceFigures
-from terrain.classify.slow_fast import SlowFast
+from terrain.classify.changes import Breakaway
+from terrain.classify.coverage import NextDrive, PartFigures, SupportRow
+from terrain.classify.held_out import SlowFast
+from terrain.classify.metrics import (
+    ClassFigures,
+    ConformalFigures,
+    CoverageFigures,
+    DelayFigures,
+    FoldFigures,
+    LearningCurve,
+    LeftOutTerrain,
+    ReliabilityBin,
+    RunFigures,
+    SequenceFigures,
+)
 from terrain.classify.stiffness import StiffnessFigures
-from terrain.classify.unknown_figures import LeftOutTerrain
 
 MAX_ROWS = 10
 PERCENT = ".1%"

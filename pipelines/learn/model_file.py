@@ -27,9 +27,8 @@ from features.samples import is_centred
 from features.windows import Layout, WindowRule
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain import __version__
-from terrain.classify.network_onnx import check_network, with_centred
-from terrain.classify.novelty import Novelty, check_novelty
-from terrain.classify.support import SupportTable, check_support
+from terrain.classify.limits import Novelty, SupportTable, check_novelty, check_support
+from terrain.classify.network import check_network, with_centred
 from terrain.errors import ConfigError, DataError, ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import MAX_JSON_BYTES, parse_document, parse_json
@@ -44,7 +43,7 @@ CARD_FILE, TRAINING_FILE = "model_card.md", "training.json"
 FILES = (MODEL_FILE, ONNX_FILE, CARD_FILE, TRAINING_FILE)
 """Files that a manifest may list; what else lies beside them is not read."""
 
-VERSION = 5
+VERSION = 6
 
 FETCH_TIMEOUT_S = 120.0
 
@@ -63,24 +62,24 @@ TRUSTED_TYPES: tuple[str, ...] = (
     "features.windows.Layout",
     "numpy.dtype",
     "features.recipes.WindowPipeline",
-    "terrain.classify.augment.Augmentation",
-    "terrain.classify.grouped_network.GroupedNetwork",
-    "terrain.classify.grouped_network.NetworkChoice",
-    "terrain.classify.grouped_network.Trial",
-    "terrain.classify.ground_response.GroundResponse",
-    "terrain.classify.network_input.SampleColumns",
-    "terrain.classify.novelty.Novelty",
-    "terrain.classify.own.OwnClassifier",
-    "terrain.classify.ground_response.Process",
+    "terrain.classify.network.Augmentation",
+    "terrain.classify.network.GroupedNetwork",
+    "terrain.classify.network.NetworkChoice",
+    "terrain.classify.network.Trial",
+    "terrain.classify.response.GroundResponse",
+    "terrain.classify.network.SampleColumns",
+    "terrain.classify.limits.Novelty",
+    "terrain.classify.grouped.OwnClassifier",
+    "terrain.classify.response.Process",
     "terrain.classify.response.GroupedResponse",
     "terrain.classify.response.ResponseChoice",
     "terrain.classify.response.ResponseColumns",
     "terrain.classify.stack.GroupedStack",
     "terrain.classify.stack.StackChoice",
-    "terrain.classify.support.SupportTable",
+    "terrain.classify.limits.SupportTable",
     "terrain.classify.svm.Candidate",
     "terrain.classify.svm.GroupedSVC",
-    "terrain.classify.svm.Preparation",
+    "terrain.classify.grouped.Preparation",
 )
 """Types beyond those that skops trusts itself which a model of this package may hold."""
 

@@ -25,8 +25,7 @@ from pipelines.report.results import Progress, as_json
 from terrain.bootstrap import percentile_interval
 from terrain.classify.folds import Fold, inner_splits
 from terrain.classify.held_out import Examples
-from terrain.classify.metrics import run_weights
-from terrain.classify.paired import Difference, Outcome, compare_outcomes
+from terrain.classify.metrics import Difference, Outcome, compare_outcomes, drawn_runs
 from terrain.classify.svm import CANDIDATES, Candidate, GroupedSVC
 from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
@@ -179,8 +178,10 @@ def _tried(examples: Examples, gap: int, seed: int, params: Candidate) -> Trial:
     held_out = evaluate(GroupedSVC((params,), gap=gap, seed=seed), examples, folds)
     known = held_out.tested
     correct = held_out.correct[0, known]
-    weights = run_weights(group[known].astype(str), terrain[known], N_DRAWS, np.random.default_rng(seed))
-    draws = weights @ correct / weights.sum(axis=1)
+    runs = group[known].astype(str), terrain[known]
+    weights, place = drawn_runs(*runs, N_DRAWS, np.random.default_rng(seed))
+    hits, sizes = np.bincount(place, weights=correct), np.bincount(place)
+    draws = (weights @ hits / (weights @ sizes))[1:]
     return Trial(params, float(correct.mean()), percentile_interval(draws))
 
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pipelines.learn.evaluation import CrossvalResult
     from pipelines.learn.search import SearchResult
     from pipelines.learn.training_data import TrainingData
-    from terrain.classify.importance import ChannelImportance
+    from terrain.classify.held_out import ChannelImportance
 
 EXAMPLE = "terrain train --data runs/ --name field"
 
@@ -165,7 +165,7 @@ def train(
     from pipelines.report.drawing import figure_png
     from pipelines.report.tree import figures_of
     from pipelines.report.versions import versions
-    from terrain.classify.importance import channel_importance, channel_of
+    from terrain.classify.held_out import channel_importance, channel_of
 
     _check_storable(data)
     searched, notes = None, []
@@ -248,9 +248,8 @@ def _check_storable(data: TrainingData) -> None:
 
     from features.own import FunctionExtractor
     from pipelines.learn.model_file import packed
-    from terrain.classify.grouped_network import GroupedNetwork
-    from terrain.classify.network_onnx import require_onnx
-    from terrain.classify.own import OwnClassifier
+    from terrain.classify.grouped import OwnClassifier
+    from terrain.classify.network import GroupedNetwork, require_onnx
     from terrain.classify.stack import GroupedStack
     from terrain.errors import ModelError
 

@@ -18,9 +18,7 @@ from pipelines.learn.model_file import model_info
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
-from terrain.classify.conformal import conformal_threshold, held_out_scores
-from terrain.classify.novelty import learn_novelty
-from terrain.classify.support import learn_support
+from terrain.classify.limits import conformal_threshold, held_out_scores, learn_novelty, learn_support
 from terrain.errors import DataError
 from terrain.logs.digest import data_digest
 from terrain.logs.schema import ESTIMATED

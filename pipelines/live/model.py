@@ -1,8 +1,8 @@
 """A trained model, and what it says of windows.
 
 A window is *unknown* where it is less like all learned terrains than nearly all known windows are
-(:mod:`terrain.classify.novelty`), and *unsupported* where few training runs drove the predicted
-terrain like this (:mod:`terrain.classify.support`).  Of windows of known terrains,
+(:mod:`terrain.classify.limits`), and *unsupported* where few training runs drove the predicted
+terrain like this (:mod:`terrain.classify.limits`).  Of windows of known terrains,
 5 % are unknown by definition.
 """
 
@@ -17,9 +17,7 @@ import numpy as np
 from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.report.results import described
-from terrain.classify.conformal import conformal_sets
-from terrain.classify.novelty import Novelty
-from terrain.classify.support import SupportTable, support_of
+from terrain.classify.limits import Novelty, SupportTable, conformal_sets, support_of
 from terrain.classify.terrain_filter import TerrainFilter
 from terrain.records import Array, Windows
 

@@ -5,8 +5,6 @@ and, among those, the fewest windows.  (scikit-learn's ``StratifiedGroupKFold`` 
 dealing; with runs of unequal length nearly every seed gives the same folds, and a spread over seeds is
 meaningless.)  A class that has a single run cannot be both held out whole and trained on: its run is
 cut into contiguous blocks, and training windows beside a test block are left out.
-
-Inner folds of a training part give out-of-fold probabilities, which a threshold or a calibration may be fitted to.
 """
 
 from __future__ import annotations
@@ -15,7 +13,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from sklearn.base import BaseEstimator, clone
 
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
@@ -27,6 +24,8 @@ FEWEST_RUNS = 3
 """Where no terrain has enough, the one with the most runs gives one away if two are left."""
 
 N_FOLDS = 5
+
+TOO_FEW = "the windows are too few to hold some of them out; add runs"
 
 
 class Fold(NamedTuple):
@@ -47,13 +46,7 @@ def two_classes(y: Array) -> Array:
 
 
 def single_run_classes(y: Array, groups: Array) -> list[Any]:
-    """Return the classes that have one run only.
-
-    Examples
-    --------
-    >>> single_run_classes(np.array(["ice", "ice", "sand"]), np.array(["a", "b", "c"]))
-    ['sand']
-    """
+    """Return the classes that have one run only."""
     return [c for c in np.unique(y).tolist() if len(np.unique(groups[y == c])) == 1]
 
 
@@ -68,24 +61,10 @@ def block_groups(y: Array, groups: Array, n_blocks: int) -> Array:
 
 
 def fold_numbers(y: Array, groups: Array, n_folds: int, rng: np.random.Generator) -> Array:
-    """Deal whole groups into folds at random, evenly within each class.
+    """Return the fold (n,) that tests each window: whole groups are dealt at random, evenly within each class.
 
-    Parameters
-    ----------
-    y : (n,) class of each window
-    groups : (n,) group of each window; a group with several classes counts for its most frequent one
-    n_folds : at least 2
-    rng : source of the deal
-
-    Returns
-    -------
-    (n,) int
-        the fold that tests each window.
-
-    Raises
-    ------
-    DataError
-        if there is one class only, or fewer groups than folds.
+    A group with several classes counts for its most frequent one.  ``DataError`` where there is one class only,
+    or there are fewer groups than folds.
     """
     two_classes(y)
     names, group_of = np.unique(np.asarray(groups, dtype=str), return_inverse=True)
@@ -110,14 +89,10 @@ def fold_numbers(y: Array, groups: Array, n_folds: int, rng: np.random.Generator
 def split_runs(
     y: Array, groups: Array, n_folds: int, rng: np.random.Generator, gap: int = 1
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield training and test rows of folds that keep runs whole.
+    """Yield training and test rows of folds that keep runs whole; errors as :func:`fold_numbers`.
 
-    Parameters
-    ----------
-    y, groups : (n,) class and run of each window; windows of a run are in order of time
-    n_folds : at least 2
-    rng : source of the deal
-    gap : training windows left out on each side of a test block, where a single run had to be cut
+    ``gap`` training windows are left out on each side of a test block, where a single run had to be cut; windows
+    of a run are in order of time.
 
     Examples
     --------
@@ -135,19 +110,10 @@ def split_runs(
 def numbered_folds(
     number: Array, cut_runs: Sequence[Array] = (), gap: int = 0
 ) -> Iterator[tuple[Array, Array]]:
-    """Yield training and test rows of each fold.
+    """Yield training and test rows of each fold, from the fold (n,) that tests each window, -1 for none.
 
-    Parameters
-    ----------
-    number : (n,) the fold that tests each window; -1 of one that no fold tests
-    cut_runs : rows, in order of time, of each run that lies in several folds
-    gap : windows of such a run beside a test window that do not train
-
-    Examples
-    --------
-    >>> number = np.array([0, 0, 1, 1, 1, 2])
-    >>> [train.tolist() for train, _ in numbered_folds(number, [np.arange(6)], gap=1)]
-    [[3, 4, 5], [0], [0, 1, 2, 3]]
+    Of each run that lies in several folds, ``cut_runs`` has the rows in order of time; ``gap`` of its windows on
+    each side of a test window do not train.
     """
     for each in range(int(number.max()) + 1):
         testing = number == each
@@ -158,20 +124,30 @@ def numbered_folds(
         yield np.flatnonzero(training), np.flatnonzero(testing)
 
 
+def inner_splits(
+    y: Array, groups: Array, n_folds: int, seed: int, gap: int = 1, *, lacking: bool = False
+) -> Iterator[tuple[Array, Array]]:
+    """Yield training and test rows of inner folds of whole runs, fewer folds where there are fewer runs.
+
+    A gap may leave out all rows of a class: such a fold is skipped, with ``lacking`` only where one class is left.
+    ``DataError`` where the rows are too few to hold some of them out.
+    """
+    classes, n_rows = np.unique(y, return_counts=True)
+    n_groups = len(np.unique(block_groups(y, groups, n_folds).astype(str)))
+    n_folds = min(n_folds, n_groups, *n_rows)
+    if n_folds < 2:
+        raise DataError(TOO_FEW)
+    for train, test in split_runs(y, groups, n_folds, np.random.default_rng(seed), gap):
+        present, counts = np.unique(y[train], return_counts=True)
+        if len(present) > 1 if lacking else len(present) == len(classes) and counts.min() > 1:
+            yield train, test
+
+
 def hold_out_runs(runs: Sequence[RunLog]) -> tuple[list[RunLog], list[RunLog]]:
     """Return runs to evaluate and train on, and the last one of each terrain that has enough runs, held out.
 
     The choice depends on names and numbers alone.  Nothing is held out where too little would be left, and no
     run with several terrains is.
-
-    Examples
-    --------
-    >>> from terrain.records import RunLog
-    >>> def run(terrain, number):
-    ...     return RunLog(f"{terrain}_{number}", "husky", {}, ((0.0, 9.0, terrain),))
-    >>> runs = [run("ice", i) for i in range(6)] + [run("mud", i) for i in range(2)]
-    >>> [each.run_id for each in hold_out_runs(runs)[1]]
-    ['ice_5']
     """
     by_terrain: dict[str, list[RunLog]] = {}
     for run in sorted(runs, key=lambda each: each.run_id):
@@ -183,61 +159,3 @@ def hold_out_runs(runs: Sequence[RunLog]) -> tuple[list[RunLog], list[RunLog]]:
         if len(most) >= FEWEST_RUNS and len(runs) > N_FOLDS:
             chosen = {most[-1].run_id}
     return [run for run in runs if run.run_id not in chosen], [run for run in runs if run.run_id in chosen]
-
-
-def inner_splits(
-    y: Array, groups: Array, n_folds: int, seed: int, gap: int = 1
-) -> Iterator[tuple[Array, Array]]:
-    """Yield training and test rows of inner folds of whole runs.
-
-    Parameters
-    ----------
-    y, groups : (n,) class and run of each row
-    n_folds : at least 2; fewer where there are fewer runs
-    seed : deals runs into folds
-    gap : rows left out beside a block, where the only run of a class is cut
-
-    Raises
-    ------
-    DataError
-        if the rows are too few to hold some of them out.
-    """
-    classes, n_rows = np.unique(y, return_counts=True)
-    n_groups = len(np.unique(block_groups(y, groups, n_folds).astype(str)))
-    n_folds = min(n_folds, n_groups, *n_rows)
-    if n_folds < 2:
-        raise DataError("the windows are too few to hold some of them out; add runs")
-    for train, test in split_runs(y, groups, n_folds, np.random.default_rng(seed), gap):
-        present, counts = np.unique(y[train], return_counts=True)
-        if len(present) == len(classes) and counts.min() > 1:  # a gap may leave out all rows of a class
-            yield train, test
-
-
-def inner_probabilities(
-    estimator: BaseEstimator, X: Array, y: Array, groups: Array, n_folds: int, seed: int, gap: int = 1
-) -> Array:
-    """Return out-of-fold probabilities (n, k) in the order of the sorted classes; NaN where none was found.
-
-    Parameters
-    ----------
-    estimator : with ``fit(X, y, groups)`` and ``predict_proba``; clones of it are fitted.  Of a fitted one
-        that chose hyper-parameters (``best_`` of ``candidates``) the clones take these
-    X : (n, f) features
-    y, groups, n_folds, seed, gap : as :func:`inner_splits`, with its errors
-    """
-    classes = np.unique(y)
-    probability = np.full((len(y), len(classes)), np.nan)
-    for train, test in inner_splits(y, groups, n_folds, seed, gap):
-        fitted = _as_chosen(estimator).fit(X[train], y[train], groups=groups[train])
-        probability[test] = fitted.predict_proba(X[test])
-    if np.isnan(probability).all():
-        raise DataError("the windows are too few to hold some of them out; add runs")
-    return probability
-
-
-def _as_chosen(estimator: Any) -> Any:
-    """Return an unfitted clone with the hyper-parameters that a fitted estimator chose."""
-    best, fresh = getattr(estimator, "best_", None), clone(estimator)
-    return (
-        fresh.set_params(candidates=(best,)) if best is not None and hasattr(fresh, "candidates") else fresh
-    )

@@ -1,16 +1,29 @@
-"""What classifiers share whose ``fit`` takes the run of each row: rows that are checked, and the best class."""
+"""Classifiers whose ``fit`` takes the run of each row: what they share, and one around a user's own."""
 
 from __future__ import annotations
 
-from typing import Any
+import warnings
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
-from sklearn.base import BaseEstimator, ClassifierMixin
+from sklearn.base import BaseEstimator, ClassifierMixin, clone
+from sklearn.feature_selection import SelectPercentile, VarianceThreshold, f_classif
+from sklearn.impute import SimpleImputer
+from sklearn.linear_model import LogisticRegression
+from sklearn.pipeline import Pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from terrain.classify.folds import two_classes
+from terrain.classify.folds import inner_splits, two_classes
+from terrain.errors import DataError
 from terrain.records import Array
+
+CLIP_STD = 5.0
+"""Scaled features are clipped here, so that one faulty sample cannot move a window far from all others."""
+
+N_INNER_FOLDS = 3
 
 
 class GroupedClassifier(ClassifierMixin, BaseEstimator):
@@ -19,7 +32,7 @@ class GroupedClassifier(ClassifierMixin, BaseEstimator):
     Subclasses have ``fit(X, y, groups)``, where X is (n, f), y (n,) classes and ``groups`` (n,) the run of each row,
     each row its own when missing, and ``predict_proba``; fitted ones have ``classes_`` (k,) and, for thresholds and
     calibration, ``inner_probability_`` (n, k) of the training rows when their run was held out, NaN where it never
-    was.
+    was.  All raise ``DataError`` where there is one class only.
     """
 
     def _training_rows(self, X: Array, y: Array, groups: Array | None) -> tuple[Array, Array, Array]:
@@ -43,3 +56,128 @@ class GroupedClassifier(ClassifierMixin, BaseEstimator):
         tags = super().__sklearn_tags__()
         tags.input_tags.allow_nan = True
         return tags
+
+
+class Preparation(NamedTuple):
+    """What features become first: ``columns`` (m,) of them, missing ones filled, then scaled and clipped.
+
+    ``fill``, ``mean`` and ``scale`` (m,) are median, mean and standard deviation of each in training.
+    """
+
+    columns: Array
+    fill: Array
+    mean: Array
+    scale: Array
+
+    def of(self, X: Array) -> Array:
+        """Return the prepared features (n, m) of rows (n, f)."""
+        used = X[:, self.columns]
+        used = np.where(np.isnan(used), self.fill, used)
+        return np.asarray(np.clip((used - self.mean) / self.scale, -CLIP_STD, CLIP_STD))
+
+
+def f_score(X: Array, y: Array) -> tuple[Array, Array]:
+    """Return the F test of each feature; a feature that is constant within every class divides by zero."""
+    with np.errstate(divide="ignore", invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        scores: tuple[Array, Array] = f_classif(X, y)
+    return scores
+
+
+def fit_preparation(X: Array, y: Array, percentile: float) -> Preparation:
+    """Return the preparation (of rows (n, f)) by a percentage of the features that vary: those an F test keeps."""
+    clip = FunctionTransformer(np.clip, kw_args={"a_min": -CLIP_STD, "a_max": CLIP_STD})
+    steps = Pipeline(
+        [
+            ("impute", SimpleImputer(strategy="median", keep_empty_features=True)),
+            ("constant", VarianceThreshold()),
+            ("scale", StandardScaler()),
+            ("clip", clip),
+            ("select", SelectPercentile(f_score, percentile=percentile)),
+        ]
+    ).fit(X, y)
+    selected = steps["select"].get_support()
+    columns = np.flatnonzero(steps["constant"].get_support())[selected]
+    fill = np.nan_to_num(steps["impute"].statistics_[columns])  # of a feature without any value
+    return Preparation(columns, fill, steps["scale"].mean_[selected], steps["scale"].scale_[selected])
+
+
+@dataclass(eq=False, repr=False)
+class OwnClassifier(GroupedClassifier):
+    """A user's own classifier behind imputation and scaling, with probabilities whatever it gives.
+
+    Held-out outputs of inner folds of whole runs give the thresholds of sets of classes, and, where the
+    classifier has margins only, a logistic regression of the classes on these margins (Platt, 1999, for more
+    than two classes).  A classifier that has neither gives its class the probability 1.
+
+    Parameters
+    ----------
+    estimator : with ``fit`` and ``predict``; a clone of it is fitted
+    gap : windows left out beside an inner test block, where the only run of a class is cut
+    seed : deals runs into inner folds
+
+    Examples
+    --------
+    >>> from sklearn.linear_model import RidgeClassifier
+    >>> rng = np.random.default_rng(0)
+    >>> y = np.repeat(["ice", "mud"], 40)
+    >>> X, runs = rng.normal(size=(80, 2)) + (y == "mud")[:, None], np.repeat(np.arange(8), 10)
+    >>> own = OwnClassifier(RidgeClassifier()).fit(X, y, groups=runs)
+    >>> own.outputs, own.predict_proba(X).shape
+    ('decision_function', (80, 2))
+    """
+
+    estimator: Any
+    gap: int = 1
+    seed: int = 0
+
+    @property
+    def outputs(self) -> str:
+        """The method that probabilities come from."""
+        names = ("predict_proba", "decision_function", "predict")
+        return next(name for name in names if hasattr(self.estimator, name))
+
+    def fit(self, X: Array, y: Array, groups: Array | None = None) -> OwnClassifier:
+        """Fit clones on inner folds and on all rows."""
+        X, y, groups = self._training_rows(X, y, groups)
+        held_out = []
+        try:
+            for train, test in inner_splits(y, groups, N_INNER_FOLDS, self.seed, self.gap):
+                if len(test):
+                    held_out.append((test, self._outputs(self._fitted(X[train], y[train]), X[test])))
+        except DataError:
+            pass  # rows too few to hold some of them out
+        self.calibration_ = None
+        if held_out and self.outputs == "decision_function":
+            margins = np.concatenate([each for _, each in held_out])
+            truth = y[np.concatenate([rows for rows, _ in held_out])]
+            self.calibration_ = LogisticRegression().fit(margins, truth)
+        self.inner_probability_ = np.full((len(y), len(self.classes_)), np.nan)
+        for rows, each in held_out:
+            self.inner_probability_[rows] = self._probability(each)
+        self.fitted_ = self._fitted(X, y)
+        return self
+
+    def predict_proba(self, X: Array) -> Array:
+        """Return probabilities (n, k) in the order of ``classes_``."""
+        return self._probability(self._outputs(self.fitted_, self._rows(X)))
+
+    def _fitted(self, X: Array, y: Array) -> tuple[Preparation, Any]:
+        preparation = fit_preparation(X, y, 100.0)
+        return preparation, clone(self.estimator).fit(preparation.of(X), y)
+
+    def _outputs(self, fitted: tuple[Preparation, Any], X: Array) -> Array:
+        preparation, classifier = fitted
+        found = getattr(classifier, self.outputs)(preparation.of(X))
+        if self.outputs == "predict":
+            return np.asarray(found[:, None] == self.classes_, dtype=float)
+        values = np.asarray(found, dtype=float)
+        return values[:, None] if values.ndim == 1 else values
+
+    def _probability(self, outputs: Array) -> Array:
+        if self.outputs != "decision_function":
+            return outputs
+        if self.calibration_ is not None:
+            return np.asarray(self.calibration_.predict_proba(outputs))
+        best = outputs.argmax(axis=1) if outputs.shape[1] > 1 else (outputs[:, 0] > 0).astype(int)
+        return np.asarray(best[:, None] == np.arange(len(self.classes_)), dtype=float)

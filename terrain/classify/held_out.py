@@ -1,95 +1,30 @@
-"""Windows that were held out: what a classifier that is fitted on every fold makes of them, and its figures."""
+"""Windows that were held out: by which folds, and what a classifier that is fitted on every fold makes of them.
+
+Beside the folds of a protocol there are those of a learning curve, which train on fewer runs; of terrains that are left
+out in turn, whose windows a novelty score is to find; and of slow runs against fast ones.  What a channel is worth to
+a classifier is how much balanced accuracy drops when all its features are shuffled together: a single one hardly lowers
+it, since the others carry much the same information.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from enum import StrEnum
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from sklearn.base import clone
+from sklearn.metrics import recall_score
 
-from terrain.classify.conformal import LEVEL, conformal_sets, conformal_threshold, held_out_scores
-from terrain.classify.folds import Fold
-from terrain.classify.metrics import (
-    class_figures,
-    confidence_figures,
-    macro_run_accuracy,
-    per_run_figures,
-    run_bootstrap,
-    runs_by_terrain,
-    vote,
-    vote_sizes,
-)
+from terrain.classify.folds import Fold, block_groups, split_runs
+from terrain.classify.limits import conformal_threshold, held_out_scores, learn_novelty
 from terrain.errors import DataError
-from terrain.records import Array, Windows
-
-
-class ConformalFigures(NamedTuple):
-    """What sets of classes hold, of windows whose runs were held out.
-
-    Parameters
-    ----------
-    level : that they were calibrated for
-    coverage, coverage_ci : fraction of windows whose set holds their class, with its 95 % interval over runs
-    coverage_per_run : mean over runs of the fraction of their windows, the level's own measure
-    coverage_worst_run : least of a run
-    set_size : mean number of classes in a set
-    single_ratio : fraction of the sets that name one class
-    """
-
-    level: float
-    coverage: float
-    coverage_ci: tuple[float, float]
-    coverage_per_run: float
-    coverage_worst_run: float
-    set_size: float
-    single_ratio: float
-
-
-def conformal_figures(
-    member: Array, class_index: Array, run_id: Array, terrain: Array, rng: np.random.Generator
-) -> ConformalFigures:
-    """Return the figures of sets of classes.
-
-    Parameters
-    ----------
-    member : (repeats, n, k) whether a class is in the set of a window
-    class_index, run_id, terrain : (n,) true class by number, run, and true class by name
-    rng : draws runs for the interval
-
-    Examples
-    --------
-    >>> member = np.array([[[True, False], [True, True], [True, False], [True, False]]])
-    >>> found = conformal_figures(member, np.array([0, 1, 1, 0]), np.array(list("aabb")),
-    ...                           np.array(["ice", "mud", "mud", "ice"]), np.random.default_rng(0))
-    >>> found.coverage, found.coverage_worst_run, found.set_size, found.single_ratio
-    (0.75, 0.5, 1.25, 0.75)
-    """
-    held = member[:, np.arange(len(class_index)), class_index].mean(axis=0)
-    _, run_of = np.unique(run_id, return_inverse=True)
-    per_run = np.bincount(run_of, weights=held) / np.bincount(run_of)
-    sizes = member.sum(axis=2)
-    return ConformalFigures(
-        LEVEL,
-        float(held.mean()),
-        run_bootstrap(held, run_id, terrain, rng),
-        float(per_run.mean()),
-        float(per_run.min()),
-        float(sizes.mean()),
-        float((sizes == 1).mean()),
-    )
+from terrain.records import Array
 
 
 class Examples(NamedTuple):
-    """What a classifier learns from.
-
-    Parameters
-    ----------
-    features : (n, f)
-    terrain : (n,) class of each row
-    group : (n,) what must not be split, the run of each row
-    """
+    """What a classifier learns from: features (n, f), class and run (n,); a run must not be split."""
 
     features: Array
     terrain: Array
@@ -97,7 +32,7 @@ class Examples(NamedTuple):
 
 
 class FoldResult(NamedTuple):
-    """Held-out class probabilities of one fold, and what else was asked of its classifier.
+    """Held-out class probabilities of one fold, what inner folds chose, and what else was asked of its classifier.
 
     ``conformal`` is the threshold of its sets of classes; NaN where its training part does not give one.
     """
@@ -107,12 +42,6 @@ class FoldResult(NamedTuple):
     chosen: Mapping[str, Any]
     found: Any = None
     conformal: float = math.nan
-
-
-def fit_on(classifier: Any, examples: Examples, rows: Array) -> Any:
-    """Return a clone of the classifier, fitted on some rows."""
-    features, terrain, group = examples
-    return clone(classifier).fit(features[rows], terrain[rows], groups=group[rows])
 
 
 def fit_fold(
@@ -127,23 +56,22 @@ def fit_fold(
     Parameters
     ----------
     classifier : estimator with ``fit(X, y, groups)`` and ``predict_proba``
-    examples : rows that the fold numbers
-    classes : (k,) of all rows, sorted
-    fold : train and test rows
+    examples, classes : rows that the fold numbers, and their classes (k,), sorted
     ask : what is called with the fitted classifier
     """
-    fitted = fit_on(classifier, examples, fold.train)
-    probability = np.zeros((len(fold.test), len(classes)))
-    columns = np.searchsorted(classes, fitted.classes_)
-    if len(fold.test):
-        probability[:, columns] = fitted.predict_proba(examples.features[fold.test])
+    features, terrain, group = examples
+    train, test = fold.train, fold.test
+    fitted = clone(classifier).fit(features[train], terrain[train], groups=group[train])
+    probability = np.zeros((len(test), len(classes)))
+    if len(test):
+        probability[:, np.searchsorted(classes, fitted.classes_)] = fitted.predict_proba(features[test])
     best = getattr(fitted, "best_", None)
-    chosen = dict(best._asdict()) if best is not None else {}
+    chosen = {} if best is None else dict(best._asdict())
     threshold = math.nan
     if hasattr(fitted, "inner_probability_"):
         try:
-            scores = held_out_scores(fitted, examples.terrain[fold.train])
-            threshold = conformal_threshold(scores, np.asarray(examples.group)[fold.train].astype(str))
+            scores = held_out_scores(fitted, terrain[train])
+            threshold = conformal_threshold(scores, np.asarray(group)[train].astype(str))
         except DataError:
             pass
     return FoldResult(fold, probability, chosen, None if ask is None else ask(fitted), threshold)
@@ -209,98 +137,249 @@ class HeldOut(NamedTuple):
         return [float(right[rows].mean()) for right, rows in zip(self.correct, held_out, strict=True)]
 
 
-class FoldFigures(NamedTuple):
-    """One fold: how many windows train and test, its accuracy, and what the inner folds chose."""
-
-    repeat: int
-    fold: int
-    n_train: int
-    n_test: int
-    accuracy: float
-    chosen: Mapping[str, Any]
+CURVE_RUNS = (1, 2, 3, 5, 8, 12)
+CURVE_DRAWS = 2
 
 
-def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: int) -> dict[str, Any]:
-    """Return the figures of merit of held-out windows, by name.
+def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> tuple[list[Fold], Array]:
+    """Draw at most m training runs of each class, for each m of :data:`CURVE_RUNS`; test rows stay the same.
 
-    Figures are means over the repeats, intervals of 95 % over runs within classes; ``per_class`` and
-    ``confusion`` are of all repeats together.
+    Returns
+    -------
+    folds : :data:`CURVE_DRAWS` repeats a size, of folds of one repeat
+    runs_per_class : of each size, and of all runs
+    """
+    available = [
+        np.array([len(set(group[train][y[train] == name])) for name in np.unique(y[train])])
+        for _, _, train, _ in folds
+    ]
+    sizes = [size for size in CURVE_RUNS if size < max(counts.max() for counts in available)]
+    rng = np.random.default_rng((seed, len(CURVE_RUNS)))
+    drawn = []
+    for repeat, size in enumerate(np.repeat(sizes, CURVE_DRAWS).tolist()):
+        for _, fold, train, test in folds:
+            kept = np.zeros(len(train), dtype=bool)
+            for terrain in np.unique(y[train]):
+                of_class = y[train] == terrain
+                chosen = rng.permutation(np.unique(group[train][of_class]))[:size]
+                kept |= np.isin(group[train], chosen) & of_class
+            drawn.append(Fold(repeat, fold, train[kept], test))
+    means = [[np.minimum(counts, size).mean() for counts in available] for size in (*sizes, len(y))]
+    return drawn, np.mean(means, axis=1)
+
+
+MIN_TERRAINS = 3
+"""Two are needed to train without the third."""
+
+
+def left_out_folds(
+    terrain: Array, run_id: Array, n_folds: int, gap: int, seed: int
+) -> list[tuple[Array, Array, Array]]:
+    """Return training rows, held-out rows and rows of the terrain that is left out, terrain by terrain.
+
+    ``DataError`` where there are fewer than three terrains, or too few runs.
+    """
+    y, terrains = terrain, np.unique(terrain)
+    if len(terrains) < MIN_TERRAINS:
+        raise DataError(
+            f"the runs are of {len(terrains)} terrains ({', '.join(terrains)}): "
+            f"at least {MIN_TERRAINS} are needed to leave one out"
+        )
+    folds = []
+    for name in terrains:
+        rows, unknown = np.flatnonzero(y != name), np.flatnonzero(y == name)
+        n_groups = len(np.unique(block_groups(y[rows], run_id[rows], n_folds).astype(str)))
+        if n_groups < n_folds:
+            raise DataError(f"{n_groups} runs without {name} are fewer than {n_folds} folds")
+        rng = np.random.default_rng((seed, 0))
+        for train, test in split_runs(y[rows], run_id[rows], n_folds, rng, gap):
+            if len(test):
+                folds.append((rows[train], rows[test], unknown))
+    return folds
+
+
+class Scored(NamedTuple):
+    """Held-out known rows and all unknown rows, their novelty by one fold, and the fold's threshold."""
+
+    known: Array
+    unknown: Array
+    known_scores: Array
+    unknown_scores: Array
+    threshold: float
+
+
+def score_fold(
+    X: Array, y: Array, group: Array, gap: int, seed: int, train: Array, test: Array, unknown: Array
+) -> Scored:
+    """Return the novelty of held-out and of unknown rows, by a score that is fitted on training rows."""
+    fitted = learn_novelty(X[train], y[train], group[train], gap=gap, seed=seed)
+    return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.threshold)
+
+
+MIN_RUNS_A_SIDE, MIN_TIME_A_SIDE_S = 2, 60.0
+"""Slow and fast runs of a class that are compared: at least so many, of so much time."""
+MIN_CLASSES = 3
+"""Slow and fast runs are compared where at least so many classes have enough of both."""
+MOVING_MPS = 0.03
+"""The faster wheel moves above this; it is the steady-motion rule's own threshold."""
+
+
+class Applicability(StrEnum):
+    """Whether the data allow a comparison."""
+
+    APPLICABLE = "applicable"
+    NOT_APPLICABLE = "not applicable"
+
+
+class ClassSpeeds(NamedTuple):
+    """Median speeds of the slow and of the fast runs of a class."""
+
+    slow_mps: float
+    fast_mps: float
+
+
+class SlowFast(NamedTuple):
+    """Accuracy when slow runs train and fast runs test, and the reverse; None where not applicable.
+
+    ``classes`` are those that are kept, ``left_out`` has the reason for each of the others.
+    """
+
+    status: Applicability
+    classes: Mapping[str, ClassSpeeds]
+    left_out: Mapping[str, str]
+    slow_to_fast: float | None = None
+    fast_to_slow: float | None = None
+
+
+def run_speeds(fastest_mps: Array, run_id: Array) -> dict[str, float]:
+    """Return the median speed (m/s) of each run's faster wheel where it moves; NaN if it never does."""
+    speeds = {}
+    for run in np.unique(run_id).tolist():
+        moving = fastest_mps[run_id == run].ravel()
+        moving = moving[moving > MOVING_MPS]
+        speeds[run] = float(np.median(moving)) if len(moving) else math.nan
+    return speeds
+
+
+def slow_fast_split(
+    fastest_mps: Array, run_id: Array, terrain: Array, start_s: Array, length_s: float
+) -> tuple[Array, SlowFast]:
+    """Split the runs of each class at their median speed, taken over the run's time on that class.
 
     Parameters
     ----------
-    held_out : probabilities of the windows
-    windows : of n windows
-    group : (n,) among whose windows votes are taken, as far as one fold tested them
-    seed : of the bootstrap over runs
+    fastest_mps : (n, samples) magnitude of the speed of the faster wheel in n windows; NaN where unknown
+    run_id, terrain, start_s : (n,) run, class and start of each window, of ``length_s``
+
+    Returns
+    -------
+    side : (n,) ``slow`` or ``fast``; empty of a class that is left out, and of a run that is slow on one class
+        and fast on another
+    split : of the classes, without accuracies
     """
-    rows, classes = np.flatnonzero(held_out.tested), held_out.classes
-    terrain, start_s = held_out.truth[rows], windows.start_s[rows]
-    run_id = runs_by_terrain(windows.run_id.astype(str)[rows], terrain)
-    probability, fold_number = held_out.probability[:, rows], held_out.fold_number[:, rows]
-    predicted = classes[probability.argmax(axis=2)]
-    correct = predicted == terrain
-    group_of = np.unique(group.astype(str)[rows], return_inverse=True)[1]
-    segments = group_of * (fold_number.max() + 1) + fold_number
-    voted = np.stack(
-        [
-            classes[vote(p, segment, start_s, windows.length_s)] == terrain
-            for p, segment in zip(probability, segments, strict=True)
-        ]
-    )
-    repeats = [class_figures(terrain, each, classes) for each in predicted]
-    pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
-    accuracies = np.array([repeat.accuracy for repeat in repeats])
-    stated = confidence_figures(
-        probability.max(axis=2), correct, run_id, terrain, np.random.default_rng(seed)
-    )
-    per_run = per_run_figures(correct, predicted[0], voted, run_id, terrain)
-    right = np.where(held_out.tested, held_out.correct, np.nan)
-    return {
-        "classes": tuple(str(name) for name in classes),
-        "n_windows": len(terrain),
-        "n_runs": len(np.unique(windows.run_id[rows])),
-        "repeats": len(repeats),
-        "accuracy": float(accuracies.mean()),
-        "accuracy_spread": float(accuracies.std(ddof=1)) if len(repeats) > 1 else None,
-        "accuracy_per_repeat": tuple(accuracies.tolist()),
-        "accuracy_ci": run_bootstrap(correct.mean(axis=0), run_id, terrain, np.random.default_rng(seed)),
-        "balanced_accuracy": float(np.mean([repeat.balanced_accuracy for repeat in repeats])),
-        "macro_f1": float(np.mean([repeat.macro_f1 for repeat in repeats])),
-        "macro_run_accuracy": macro_run_accuracy(per_run),
-        "per_class": pooled.per_class,
-        "confusion": pooled.confusion,
-        "vote_accuracy": float(np.mean(voted)),
-        "vote_windows": float(np.mean([vote_sizes(each, start_s, windows.length_s) for each in segments])),
-        "ece": stated.ece,
-        "ece_ci": stated.ece_ci,
-        "confidence_auc": stated.auc,
-        "confidence_auc_ci": stated.auc_ci,
-        "accuracy_at_coverage": stated.at_coverage,
-        "reliability": stated.reliability,
-        "per_run": per_run,
-        "folds": tuple(
-            FoldFigures(
-                fold.repeat,
-                fold.number,
-                len(fold.train),
-                len(fold.test),
-                float(np.nanmean(right[fold.repeat, fold.test])),
-                chosen,
-            )
-            for fold, _, chosen, *_ in held_out.results
-        ),
-    }
+    side = np.full(len(terrain), "", dtype=object)
+    kept: dict[str, ClassSpeeds] = {}
+    left_out: dict[str, str] = {}
+    for name in np.unique(terrain).tolist():
+        of_class = terrain == name
+        speeds = run_speeds(fastest_mps[of_class], run_id[of_class])
+        known = {run: speed for run, speed in speeds.items() if math.isfinite(speed)}
+        median = np.median(list(known.values())) if known else math.nan
+        parts = {
+            "slow": [run for run, speed in known.items() if speed <= median],
+            "fast": [run for run, speed in known.items() if speed > median],
+        }
+        for each, runs in parts.items():
+            time_s = sum(covered_s(start_s[of_class & (run_id == run)], length_s) for run in runs)
+            if len(runs) < MIN_RUNS_A_SIDE:
+                left_out.setdefault(name, f"{each} runs: {len(runs)}")
+            elif time_s < MIN_TIME_A_SIDE_S:
+                left_out.setdefault(name, f"{each} runs: {time_s:.0f} s")
+        if name not in left_out:
+            medians = (float(np.median([known[run] for run in runs])) for runs in parts.values())
+            kept[name] = ClassSpeeds(*medians)
+            for each, runs in parts.items():
+                side[of_class & np.isin(run_id, runs)] = each
+    both = set(run_id[side == "slow"]) & set(run_id[side == "fast"])
+    side[np.isin(run_id, list(both))] = ""
+    enough = len(kept) >= MIN_CLASSES
+    status = Applicability.APPLICABLE if enough else Applicability.NOT_APPLICABLE
+    return side, SlowFast(status, kept, left_out)
 
 
-def set_figures(held_out: HeldOut, windows: Windows, seed: int) -> ConformalFigures | None:
-    """Return the figures of the sets of classes; None where a fold has no threshold."""
-    if not held_out.results or any(math.isnan(result.conformal) for result in held_out.results):
-        return None
-    member = np.zeros(held_out.probability.shape, dtype=bool)
-    for result in held_out.results:
-        member[result.fold.repeat, result.fold.test] = conformal_sets(result.probability, result.conformal)
-    rows = np.flatnonzero(held_out.tested)
-    terrain = held_out.truth[rows]
-    run_id = runs_by_terrain(windows.run_id.astype(str)[rows], terrain)
-    truth = np.searchsorted(held_out.classes, terrain)
-    return conformal_figures(member[:, rows], truth, run_id, terrain, np.random.default_rng(seed))
+def covered_s(start_s: Array, length_s: float) -> float:
+    """Return the time that windows of one run cover; where they overlap it counts once."""
+    return float(np.minimum(np.diff(np.sort(start_s)), length_s).sum() + length_s)
+
+
+N_PERMUTATIONS = 3
+
+
+class ChannelImportance(NamedTuple):
+    """By how much balanced accuracy drops when a channel is shuffled; ``std`` over folds."""
+
+    feature: str
+    drop: float
+    std: float
+
+
+def channel_of(feature: str) -> str:
+    """Return the stream and channel that a feature is made of.
+
+    Examples
+    --------
+    >>> channel_of("imu.accel_z.std [m/s^2]"), channel_of("wheels.log_drive_effort [log10 A m/s]")
+    ('imu.accel_z', 'wheels.log_drive_effort')
+    >>> channel_of("imu.gyro_x~accel_y.correlation [1]"), channel_of("roughness")
+    ('imu.correlations', 'roughness')
+    """
+    name = feature.partition(" [")[0]
+    stream, separator, rest = name.partition(".")
+    channel = rest.split(".")[0]
+    return f"{stream}.correlations" if "~" in channel else f"{stream}{separator}{channel}"
+
+
+class ChannelDrops(NamedTuple):
+    """Called with the classifier of a fold, it returns a drop a channel, means over shuffles.
+
+    ``features`` (n, f) and ``truth`` (n,) are of the windows that the fold holds out, ``channels`` (f,) of the
+    features; ``seed`` and ``number``, of the fold, draw the permutations.
+    """
+
+    features: Array
+    truth: Array
+    channels: Sequence[str]
+    seed: int
+    number: int
+
+    def __call__(self, fitted: Any, /) -> list[float]:
+        """Return the drop of each channel, in the order of their names."""
+        present = np.isin(self.truth, fitted.classes_)
+        test, truth = self.features[present], self.truth[present]
+        labels, channels = np.unique(truth), np.array(self.channels)
+
+        def balanced_accuracy(features: Array) -> float:
+            return float(recall_score(truth, fitted.predict(features), labels=labels, average="macro"))
+
+        baseline = balanced_accuracy(test)
+        rng = np.random.default_rng((self.seed, self.number))
+        drops = []
+        for channel in np.unique(channels):
+            columns = np.flatnonzero(channels == channel)
+            scores = []
+            for _ in range(N_PERMUTATIONS):
+                shuffled = test.copy()
+                shuffled[:, columns] = test[rng.permutation(len(test))][:, columns]
+                scores.append(balanced_accuracy(shuffled))
+            drops.append(float(baseline - np.mean(scores)))
+        return drops
+
+
+def channel_importance(
+    channels: Sequence[str], drops: Sequence[Sequence[float]]
+) -> tuple[ChannelImportance, ...]:
+    """Return means and standard deviations over folds of their drops, the largest drop first."""
+    table, names = np.array(drops), np.unique(np.array(channels))
+    mean, std = table.mean(axis=0), table.std(axis=0, ddof=1)
+    order = np.argsort(-mean, kind="stable")
+    return tuple(ChannelImportance(str(names[i]), float(mean[i]), float(std[i])) for i in order)

@@ -1,26 +1,89 @@
-"""Figures of merit of held-out predictions: accuracy, calibration, votes, and an interval over runs.
+"""Figures of merit of held-out windows: accuracy, votes, confidence, sets of classes, terrain over time, differences.
 
 Windows of one run are not independent: intervals are those of a bootstrap that draws whole runs, within their
-classes, and computes each figure again from the windows of the runs drawn.
+classes, and computes each figure again from the windows of the runs drawn.  Two classifiers are judged on the same
+runs, and a run that is hard for one is mostly hard for the other: taking the figures of both from the same draw
+leaves this common part out of the interval of their difference.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from enum import StrEnum
 from functools import partial
 from itertools import pairwise
-from typing import NamedTuple
+from types import MappingProxyType
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from sklearn.metrics import confusion_matrix, precision_recall_fscore_support
+from scipy.optimize import least_squares
+from sklearn.metrics import confusion_matrix
 
-from terrain.bootstrap import bootstrap_rows, percentile_interval, stratified_counts
-from terrain.records import Array
+from terrain.bootstrap import bootstrap_counts, bootstrap_rows, percentile_interval, stratified_counts
+from terrain.classify.held_out import CURVE_DRAWS, HeldOut, Scored
+from terrain.classify.limits import KNOWN_KEPT, LEVEL, SupportLevel, conformal_sets
+from terrain.errors import DataError
+from terrain.records import Array, Label, Windows
 
 VOTE_SPAN_S = 5.0
-INTERVAL = 0.95
-N_BOOTSTRAP = 2000
 TIME_TOLERANCE_S = 1e-6
+N_BOOTSTRAP = 2000
+
+Interval = tuple[float, float]
+NO_INTERVAL: Interval = (math.nan, math.nan)
+
+
+def runs_of_classes(run_id: Array, terrain: Array) -> tuple[Array, Array]:
+    """Return the class (runs,) of each run, one of several classes once for each, and the run (n,) of each window."""
+    names = np.char.add(np.char.add(terrain.astype(str), "\n"), run_id.astype(str))
+    _, first, place = np.unique(names, return_index=True, return_inverse=True)
+    return terrain[first], place
+
+
+def drawn_runs(
+    run_id: Array,
+    terrain: Array,
+    n_draws: int,
+    rng: np.random.Generator,
+    counts_of: Callable[[Array, int, np.random.Generator], Array] = stratified_counts,
+) -> tuple[Array, Array]:
+    """Return how often each run counts: once (the first row), then as it is drawn within its class; and runs (n,).
+
+    A run of several classes counts for each.  The weights are (1 + n_draws, runs).
+    """
+    class_of, place = runs_of_classes(run_id, terrain)
+    return np.vstack([np.ones(len(class_of)), counts_of(class_of, n_draws, rng)]), place
+
+
+def row_counts(stratum: Array, n_draws: int, rng: np.random.Generator) -> Array:
+    """Return what :func:`~terrain.bootstrap.stratified_counts` does, one run drawn after the other."""
+    counts = np.zeros((n_draws, len(stratum)))
+    for name in np.unique(stratum):
+        members = np.flatnonzero(stratum == name)
+        drawn = members[bootstrap_rows(len(members), n_draws, rng)]
+        np.add.at(counts, (np.arange(n_draws)[:, None], drawn), 1.0)
+    return counts
+
+
+def ratio_over_runs(numerator: Array, denominator: Array) -> tuple[float | None, Interval | None]:
+    """Return the first ratio, and the interval of the others; None where the first has no denominator."""
+    if not denominator[0]:
+        return None, None
+    ratio: Array = np.full(len(numerator), np.nan)
+    np.divide(numerator, denominator, out=ratio, where=denominator > 0)
+    return float(ratio[0]), percentile_interval(ratio[1:]) if np.isfinite(ratio[1:]).any() else None
+
+
+def run_bootstrap(correct: Array, run_id: Array, terrain: Array, rng: np.random.Generator) -> Interval:
+    """Return a 95 % interval of the accuracy by resampling whole runs within their classes.
+
+    ``correct`` (n,) is the fraction of the repeats in which each window was classified correctly.  A class with one
+    run adds no spread, and with three or four a class the interval is still too narrow.
+    """
+    weights, place = drawn_runs(run_id, terrain, N_BOOTSTRAP, rng, row_counts)
+    hits, sizes = np.bincount(place, weights=correct), np.bincount(place)
+    return percentile_interval((weights[1:] @ hits) / (weights[1:] @ sizes))
 
 
 class ClassFigures(NamedTuple):
@@ -30,16 +93,6 @@ class ClassFigures(NamedTuple):
     recall: float
     f1: float
     n_windows: int
-
-
-class Classification(NamedTuple):
-    """Figures of one set of predictions; rows of ``confusion`` are true classes, columns predicted ones."""
-
-    accuracy: float
-    balanced_accuracy: float
-    macro_f1: float
-    per_class: dict[str, ClassFigures]
-    confusion: tuple[tuple[int, ...], ...]
 
 
 class RunFigures(NamedTuple):
@@ -53,84 +106,54 @@ class RunFigures(NamedTuple):
     mistaken_for: str | None
 
 
-def class_figures(y: Array, predicted: Array, classes: Array) -> Classification:
-    """Return accuracy, balanced accuracy, macro F1, per-class figures and the confusion matrix.
+class FoldFigures(NamedTuple):
+    """One fold: how many windows train and test, its accuracy, and what the inner folds chose."""
 
-    Parameters
-    ----------
-    y, predicted : (n,) classes
-    classes : (k,) order of rows and columns
+    repeat: int
+    fold: int
+    n_train: int
+    n_test: int
+    accuracy: float
+    chosen: Mapping[str, Any]
 
-    Examples
-    --------
-    >>> figures = class_figures(np.array(["a", "a", "b"]), np.array(["a", "b", "b"]), np.array(["a", "b"]))
-    >>> figures.confusion, round(figures.balanced_accuracy, 2)
-    (((1, 1), (0, 1)), 0.75)
+
+def class_figures(y: Array, predicted: Array, classes: Array) -> dict[str, Any]:
+    """Return accuracy, balanced accuracy, macro F1, figures of each class (k,), and the confusion matrix, by name.
+
+    Rows of ``confusion`` are true classes, columns predicted ones.
     """
-    precision, recall, f1, support = precision_recall_fscore_support(
-        y, predicted, labels=classes, zero_division=0.0
-    )
-    tested = support > 0
-    return Classification(
-        accuracy=float(np.mean(y == predicted)),
-        balanced_accuracy=float(recall[tested].mean()),
-        macro_f1=float(f1[tested].mean()),
-        per_class={
-            str(name): ClassFigures(float(precision[i]), float(recall[i]), float(f1[i]), int(support[i]))
-            for i, name in enumerate(classes)
-        },
-        confusion=tuple(map(tuple, confusion_matrix(y, predicted, labels=classes).tolist())),
-    )
+    confusion = confusion_matrix(y, predicted, labels=classes)
+    hits, n_true, n_predicted = confusion.diagonal(), confusion.sum(axis=1), confusion.sum(axis=0)
+    precision, recall = hits / np.maximum(n_predicted, 1), hits / np.maximum(n_true, 1)
+    f1 = 2 * hits / np.maximum(n_true + n_predicted, 1)
+    columns = precision.tolist(), recall.tolist(), f1.tolist(), n_true.tolist()
+    return {
+        "accuracy": float(np.mean(y == predicted)),
+        "balanced_accuracy": float(recall[n_true > 0].mean()),
+        "macro_f1": float(f1[n_true > 0].mean()),
+        "per_class": dict(zip(classes.astype(str).tolist(), map(ClassFigures, *columns), strict=True)),
+        "confusion": tuple(map(tuple, confusion.tolist())),
+    }
 
 
-def vote(
-    probability: Array, segment: Array, start_s: Array, length_s: float, span_s: float = VOTE_SPAN_S
-) -> Array:
-    """Return the class index voted by the windows that lie within the last ``span_s`` seconds.
+def vote(probability: Array, segment: Array, start_s: Array, length_s: float) -> tuple[Array, Array]:
+    """Return the class index voted by the windows of the last :data:`VOTE_SPAN_S`, and how many they are, (n,) each.
 
-    A window that ends at t votes together with the windows of its own segment that lie wholly in
-    ``[t - span_s, t]``; a tie goes to the class with the higher summed probability.
-
-    Parameters
-    ----------
-    probability : (n, k)
-    segment : (n,) stretch of a run that was tested in one piece; votes do not cross its ends
-    start_s : (n,) start of each window
-    length_s : length of a window
+    A window that ends at t votes together with the windows of its own segment (n,), a stretch of a run that was tested
+    in one piece, that lie wholly in ``[t - span, t]``; a tie goes to the class with the higher summed probability.
     """
     ballots = np.eye(probability.shape[1])[probability.argmax(axis=1)]
-    voted = np.empty(len(probability), dtype=int)
-    for row, voters in _voters(segment, start_s, length_s, span_s):
-        count, weight = ballots[voters].sum(axis=0), probability[voters].sum(axis=0)
-        voted[row] = np.lexsort((weight, count))[-1]
-    return voted
-
-
-def vote_sizes(segment: Array, start_s: Array, length_s: float, span_s: float = VOTE_SPAN_S) -> Array:
-    """Return how many windows (n,) take part in each vote; parameters as :func:`vote`.
-
-    Two windows of 2 s lie wholly in 5 s, and one window of 5 s does: such a vote is no vote.
-
-    Examples
-    --------
-    >>> vote_sizes(np.array(["a"] * 4), np.array([0.0, 2.0, 4.0, 6.0]), 2.0).tolist()
-    [1, 2, 2, 2]
-    """
-    sizes = np.empty(len(start_s), dtype=int)
-    for row, voters in _voters(segment, start_s, length_s, span_s):
-        sizes[row] = len(voters)
-    return sizes
-
-
-def _voters(segment: Array, start_s: Array, length_s: float, span_s: float) -> Iterator[tuple[int, Array]]:
-    """Yield each row with the rows that vote with it, its own among them."""
+    voted, sizes = np.empty((2, len(probability)), dtype=int)
     for name in np.unique(segment):
         rows = np.flatnonzero(segment == name)
         rows = rows[np.argsort(start_s[rows], kind="stable")]
         starts = start_s[rows]
-        first = np.searchsorted(starts, starts + length_s - span_s - TIME_TOLERANCE_S)
+        first = np.searchsorted(starts, starts + length_s - VOTE_SPAN_S - TIME_TOLERANCE_S)
         for position, row in enumerate(rows):
-            yield int(row), rows[min(first[position], position) : position + 1]
+            voters = rows[min(first[position], position) : position + 1]
+            count, weight = ballots[voters].sum(axis=0), probability[voters].sum(axis=0)
+            voted[row], sizes[row] = np.lexsort((weight, count))[-1], len(voters)
+    return voted, sizes
 
 
 def runs_by_terrain(run_id: Array, terrain: Array) -> Array:
@@ -146,45 +169,12 @@ def runs_by_terrain(run_id: Array, terrain: Array) -> Array:
     return np.array([f"{run} ({name})" if run in mixed else run for run, name in pairs])
 
 
-def run_bootstrap(
-    correct: Array, run_id: Array, terrain: Array, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Return a 95 % interval of the accuracy by resampling whole runs within their classes.
-
-    Windows of one run are not independent, so runs are drawn, with replacement, as many a class as the
-    class has.  A class with one run adds no spread, and with three or four a class the interval is still
-    too narrow.
-
-    Parameters
-    ----------
-    correct : (n,) fraction of the repeats in which each window was classified correctly
-    run_id, terrain : (n,) run and class of each window
-    rng : source of the draws
-    """
-    runs, run_of = np.unique(run_id, return_inverse=True)
-    hits = np.bincount(run_of, weights=correct)
-    sizes = np.bincount(run_of)
-    class_of = np.empty(len(runs), dtype=object)
-    class_of[run_of] = terrain
-    n_hits, n_windows = np.zeros(N_BOOTSTRAP), np.zeros(N_BOOTSTRAP)
-    for name in np.unique(terrain):
-        members = np.flatnonzero(class_of == name)
-        drawn = members[bootstrap_rows(len(members), N_BOOTSTRAP, rng)]
-        n_hits += hits[drawn].sum(axis=1)
-        n_windows += sizes[drawn].sum(axis=1)
-    return percentile_interval(n_hits / n_windows, INTERVAL)
-
-
 def per_run_figures(
     correct: Array, predicted: Array, voted_correct: Array, run_id: Array, terrain: Array
 ) -> tuple[RunFigures, ...]:
-    """Return the figures of each run, in the order of their ids.
+    """Return the figures of each run, in the order of their ids, from windows (n,) or (repeats, n).
 
-    Parameters
-    ----------
-    correct, voted_correct : (n,) or (repeats, n) whether the prediction and the vote are right
-    predicted : (n,) predictions of one repeat
-    run_id, terrain : (n,) run and class of each window
+    ``predicted`` (n,) are predictions of one repeat.
     """
     figures = []
     for name in np.unique(run_id):
@@ -204,15 +194,7 @@ def per_run_figures(
 
 
 def macro_run_accuracy(runs: Iterable[RunFigures]) -> float:
-    """Return the mean over classes of the mean accuracy of their runs, whatever their numbers of windows.
-
-    Examples
-    --------
-    >>> runs = [RunFigures("a", "ice", 90, 1.0, 1.0, None), RunFigures("b", "ice", 10, 0.5, 0.5, "snow"),
-    ...         RunFigures("c", "snow", 5, 0.25, 0.25, "ice")]
-    >>> macro_run_accuracy(runs)
-    0.5
-    """
+    """Return the mean over classes of the mean accuracy of their runs, whatever their numbers of windows."""
     of_class: dict[str, list[float]] = {}
     for run in runs:
         of_class.setdefault(run.terrain, []).append(run.accuracy)
@@ -227,18 +209,9 @@ CALIBRATION_BINS = 15
 DRAWS_AT_ONCE_VALUES = 4_000_000
 """Bootstrap draws are computed in blocks of at most so many weights: 32 MB."""
 
-Interval = tuple[float, float]
-
 
 class CoverageFigures(NamedTuple):
-    """Accuracy of the most confident windows.
-
-    Parameters
-    ----------
-    coverage : their fraction of all windows
-    accuracy, accuracy_ci : of them, with its 95 % interval over runs
-    confidence_least : of them, the least
-    """
+    """Accuracy of the most confident windows, a fraction of all, with its interval, and their least confidence."""
 
     coverage: float
     accuracy: float
@@ -255,62 +228,11 @@ class ReliabilityBin(NamedTuple):
     accuracy_ci: Interval
 
 
-class Confidence(NamedTuple):
-    """How confidence relates to correctness; intervals are of 95 % over runs.
-
-    Parameters
-    ----------
-    auc, auc_ci : probability that a window that is right has a higher confidence than one that is wrong; NaN
-        where all are right or all are wrong
-    at_coverage : accuracy of the most confident windows
-    ece, ece_ci : expected calibration error of the top label over bins of equal mass
-    reliability : the bins
-    """
-
-    auc: float
-    auc_ci: Interval
-    at_coverage: tuple[CoverageFigures, ...]
-    ece: float
-    ece_ci: Interval
-    reliability: tuple[ReliabilityBin, ...]
-
-
-def run_weights(run_id: Array, terrain: Array, n_draws: int, rng: np.random.Generator) -> Array:
-    """Return how often each window's run is drawn (n_draws, n), runs being drawn within their classes.
-
-    Parameters
-    ----------
-    run_id, terrain : (n,) run and class of each window; a run of several classes counts for each
-    n_draws : bootstrap samples
-    rng : source of the draws
-
-    Examples
-    --------
-    >>> run_weights(np.array(["a", "a", "b"]), np.array(["ice"] * 3), 1, np.random.default_rng(1))
-    array([[1., 1., 1.]])
-    """
-    class_of, place = runs_of_classes(run_id, terrain)
-    return np.asarray(stratified_counts(class_of, n_draws, rng)[:, place])
-
-
-def runs_of_classes(run_id: Array, terrain: Array) -> tuple[Array, Array]:
-    """Return the class (runs,) of each run, one of several classes once for each, and the run (n,) of each window."""
-    names = np.char.add(np.char.add(terrain.astype(str), "\n"), run_id.astype(str))
-    _, first, place = np.unique(names, return_index=True, return_inverse=True)
-    return terrain[first], place
-
-
 def confidence_auc(confidence: Array, correct: Array, weights: Array) -> Array:
-    """Return the area under the curve from confidence to correctness under each set of weights (d,).
+    """Return the area under the curve from confidence (n,) to correctness (n,) under each set of weights (d, n).
 
     ``P(c_right > c_wrong) + P(c_right = c_wrong) / 2`` over weighted pairs of a window that is right and one
     that is wrong (Mann and Whitney); NaN where there are no such pairs.
-
-    Parameters
-    ----------
-    confidence : (n,) probability of the predicted class
-    correct : (n,) whether, or in which fraction of repeats, the prediction is right
-    weights : (d, n)
 
     Examples
     --------
@@ -329,13 +251,7 @@ def confidence_auc(confidence: Array, correct: Array, weights: Array) -> Array:
 
 
 def accuracy_at_coverage(confidence: Array, correct: Array, weights: Array, coverage: float) -> Array:
-    """Return the accuracy of the most confident windows that hold a fraction of the weight (d,).
-
-    Examples
-    --------
-    >>> accuracy_at_coverage(np.array([0.9, 0.8, 0.6, 0.5]), np.array([1, 1, 0, 0]), np.ones((1, 4)), 0.75)
-    array([0.66666667])
-    """
+    """Return the accuracy of the most confident windows that hold a fraction of the weight (d,)."""
     order = np.argsort(-confidence, kind="stable")
     upto = np.cumsum(weights[:, order], axis=1)
     kept = np.diff(np.minimum(upto, coverage * upto[:, -1:]), axis=1, prepend=0.0)
@@ -350,109 +266,707 @@ def calibration_error(confidence: Array, correct: Array, weights: Array, n_bins:
 
     ``ece = sum_b w_b |accuracy_b - confidence_b|`` with the windows sorted by confidence and cut into
     ``n_bins`` bins of equal count (Guo et al. 2017, equation 3, equal mass instead of equal width).
-
-    Examples
-    --------
-    >>> calibration_error(np.full(100, 0.9), np.arange(100) < 60, np.ones((1, 100)), 1).round(9)
-    array([0.3])
     """
     order = np.argsort(confidence, kind="stable")
-    first = bin_starts(len(order), n_bins)
+    first = bin_edges(len(order), n_bins)[:-1]
     gaps = np.add.reduceat(weights[:, order] * (correct[order] - confidence[order]), first, axis=1)
     found: Array = np.abs(gaps).sum(axis=1) / weights.sum(axis=1)
     return found
 
 
-def bin_starts(n: int, n_bins: int) -> Array:
-    """Return where bins of equal count begin; fewer bins where there are fewer windows.
-
-    Examples
-    --------
-    >>> bin_starts(5, 2), bin_starts(2, 3)
-    (array([0, 3]), array([0, 1]))
-    """
+def bin_edges(n: int, n_bins: int) -> Array:
+    """Return where bins of equal count begin, and n; fewer bins where there are fewer windows."""
     sizes = [len(part) for part in np.array_split(np.arange(n), n_bins) if len(part)]
-    return np.cumsum([0, *sizes[:-1]])
+    return np.cumsum([0, *sizes])
 
 
 def reliability_bins(
     confidence: Array, correct: Array, weights: Array, n_bins: int
 ) -> tuple[ReliabilityBin, ...]:
-    """Return mean confidence and accuracy of bins of equal count over all repeats together.
-
-    Parameters
-    ----------
-    confidence, correct : (repeats, n)
-    weights : (d, n) of the windows in each bootstrap sample, for the intervals
-    n_bins : number of bins; fewer where there are fewer windows
-    """
+    """Return bins of equal count over all repeats (repeats, n) together; intervals are of the weights (d, n)."""
     n = confidence.shape[1]
     confidence, correct = confidence.ravel(), correct.ravel().astype(float)
     order = np.argsort(confidence, kind="stable")
-    edges = [*bin_starts(len(order), n_bins).tolist(), len(order)]
     found = []
-    for start, end in pairwise(edges):
+    for start, end in pairwise(bin_edges(len(order), n_bins).tolist()):
         rows = order[start:end]
-        drawn = weights[:, rows % n]
-        total = drawn.sum(axis=1)
-        accuracies = np.full(len(weights), np.nan)
-        np.divide(drawn @ correct[rows], total, out=accuracies, where=total > 0)
-        known = np.isfinite(accuracies).any()
-        interval = percentile_interval(accuracies) if known else (np.nan, np.nan)
-        accuracy = float(correct[rows].mean())
-        found.append(ReliabilityBin(float(confidence[rows].mean()), accuracy, len(rows), interval))
+        drawn = np.vstack([np.ones(len(rows)), weights[:, rows % n]])
+        accuracy, interval = ratio_over_runs(drawn @ correct[rows], drawn.sum(axis=1))
+        of_bin = float(confidence[rows].mean()), accuracy or 0.0, len(rows), interval or NO_INTERVAL
+        found.append(ReliabilityBin(*of_bin))
     return tuple(found)
 
 
 def confidence_figures(
-    confidence: Array,
-    correct: Array,
-    run_id: Array,
-    terrain: Array,
-    rng: np.random.Generator,
-    n_bins: int = CALIBRATION_BINS,
-) -> Confidence:
-    """Return how the confidence of held-out windows relates to their correctness.
+    confidence: Array, correct: Array, run_id: Array, terrain: Array, rng: np.random.Generator
+) -> dict[str, Any]:
+    """Return how the confidence of held-out windows (repeats, n) relates to their correctness, by name.
+
+    The area is the probability that a window that is right has a higher confidence than one that is wrong, ``ece`` the
+    expected calibration error of the top label.  Figures are means over the repeats, bins hold all repeats.
+    """
+    of_runs, place = drawn_runs(run_id, terrain, N_DRAWS, rng)
+    weights = of_runs[:, place]
+    at_once = max(1, DRAWS_AT_ONCE_VALUES // weights.shape[1])
+
+    def figure(of: Callable[[Array, Array, Array], Array]) -> tuple[float, Interval]:
+        draws = np.zeros(len(weights))
+        for c, right in zip(confidence, correct.astype(float), strict=True):
+            blocks = [of(c, right, weights[i : i + at_once]) for i in range(0, len(weights), at_once)]
+            draws += np.concatenate(blocks) / len(confidence)
+        known = np.isfinite(draws[1:]).any()
+        return float(draws[0]), percentile_interval(draws[1:]) if known else NO_INTERVAL
+
+    auc, auc_ci = figure(confidence_auc)
+    ece, ece_ci = figure(partial(calibration_error, n_bins=CALIBRATION_BINS))
+    at_coverage = []
+    for coverage in COVERAGES:
+        of_most = figure(partial(accuracy_at_coverage, coverage=coverage))
+        least = float(np.mean(np.quantile(confidence, 1.0 - coverage, axis=1)))
+        at_coverage.append(CoverageFigures(coverage, *of_most, least))
+    return {
+        "ece": round(ece, 12),
+        "ece_ci": ece_ci,
+        "confidence_auc": auc,
+        "confidence_auc_ci": auc_ci,
+        "accuracy_at_coverage": tuple(at_coverage),
+        "reliability": reliability_bins(confidence, correct, weights[1:], CALIBRATION_BINS),
+    }
+
+
+def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: int) -> dict[str, Any]:
+    """Return the figures of merit of held-out windows, by name.
+
+    Figures are means over the repeats, intervals of 95 % over runs within classes; ``per_class`` and
+    ``confusion`` are of all repeats together.  Votes are taken among the windows of a group (n,), as far as one fold
+    tested them.
+    """
+    rows, classes = np.flatnonzero(held_out.tested), held_out.classes
+    terrain, start_s = held_out.truth[rows], windows.start_s[rows]
+    run_id = runs_by_terrain(windows.run_id.astype(str)[rows], terrain)
+    probability, fold_number = held_out.probability[:, rows], held_out.fold_number[:, rows]
+    predicted = classes[probability.argmax(axis=2)]
+    correct = predicted == terrain
+    group_of = np.unique(group.astype(str)[rows], return_inverse=True)[1]
+    segments = group_of * (fold_number.max() + 1) + fold_number
+    votes = [
+        vote(p, segment, start_s, windows.length_s) for p, segment in zip(probability, segments, strict=True)
+    ]
+    voted = classes[np.stack([each for each, _ in votes])] == terrain
+    repeats = [class_figures(terrain, each, classes) for each in predicted]
+    pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
+    accuracies = np.array([repeat["accuracy"] for repeat in repeats])
+    per_run = per_run_figures(correct, predicted[0], voted, run_id, terrain)
+    right = np.where(held_out.tested, held_out.correct, np.nan)
+    of_confidence = probability.max(axis=2), correct, run_id, terrain, np.random.default_rng(seed)
+    folds = []
+    for fold, _, chosen, *_ in held_out.results:
+        accuracy = float(np.nanmean(right[fold.repeat, fold.test]))
+        sizes = len(fold.train), len(fold.test)
+        folds.append(FoldFigures(fold.repeat, fold.number, *sizes, accuracy, chosen))
+    return {
+        "classes": tuple(str(name) for name in classes),
+        "n_windows": len(terrain),
+        "n_runs": len(np.unique(windows.run_id[rows])),
+        "repeats": len(repeats),
+        "accuracy": float(accuracies.mean()),
+        "accuracy_spread": float(accuracies.std(ddof=1)) if len(repeats) > 1 else None,
+        "accuracy_per_repeat": tuple(accuracies.tolist()),
+        "accuracy_ci": run_bootstrap(correct.mean(axis=0), run_id, terrain, np.random.default_rng(seed)),
+        "balanced_accuracy": float(np.mean([repeat["balanced_accuracy"] for repeat in repeats])),
+        "macro_f1": float(np.mean([repeat["macro_f1"] for repeat in repeats])),
+        "macro_run_accuracy": macro_run_accuracy(per_run),
+        "per_class": pooled["per_class"],
+        "confusion": pooled["confusion"],
+        "vote_accuracy": float(np.mean(voted)),
+        "vote_windows": float(np.mean([sizes for _, sizes in votes])),
+        **confidence_figures(*of_confidence),
+        "per_run": per_run,
+        "folds": tuple(folds),
+    }
+
+
+class ConformalFigures(NamedTuple):
+    """What sets of classes hold, of windows whose runs were held out.
 
     Parameters
     ----------
-    confidence, correct : (repeats, n) probability of the predicted class, and whether it is right; figures
-        are means over the repeats, bins hold all repeats
-    run_id, terrain : (n,) run and class of each window
-    rng : source of the bootstrap
-    n_bins : of the calibration error
+    level : that they were calibrated for
+    coverage, coverage_ci : fraction of windows whose set holds their class, with its 95 % interval over runs
+    coverage_per_run : mean over runs of the fraction of their windows, the level's own measure
+    coverage_worst_run : least of a run
+    set_size, single_ratio : mean number of classes in a set, and fraction of the sets that name one class
+    """
+
+    level: float
+    coverage: float
+    coverage_ci: Interval
+    coverage_per_run: float
+    coverage_worst_run: float
+    set_size: float
+    single_ratio: float
+
+
+def set_figures(held_out: HeldOut, windows: Windows, seed: int) -> ConformalFigures | None:
+    """Return the figures of the sets of classes; None where a fold has no threshold."""
+    if not held_out.results or any(math.isnan(result.conformal) for result in held_out.results):
+        return None
+    member = np.zeros(held_out.probability.shape, dtype=bool)
+    for result in held_out.results:
+        member[result.fold.repeat, result.fold.test] = conformal_sets(result.probability, result.conformal)
+    rows = np.flatnonzero(held_out.tested)
+    terrain = held_out.truth[rows]
+    run_id = runs_by_terrain(windows.run_id.astype(str)[rows], terrain)
+    return conformal_figures(member[:, rows], held_out.classes, terrain, run_id, np.random.default_rng(seed))
+
+
+def conformal_figures(
+    member: Array, classes: Array, terrain: Array, run_id: Array, rng: np.random.Generator
+) -> ConformalFigures:
+    """Return the figures of sets: whether a class (k,) is in that of a window (repeats, n, k)."""
+    held = member[:, np.arange(len(terrain)), np.searchsorted(classes, terrain)].mean(axis=0)
+    _, run_of = np.unique(run_id, return_inverse=True)
+    per_run = np.bincount(run_of, weights=held) / np.bincount(run_of)
+    sizes = member.sum(axis=2)
+    return ConformalFigures(
+        LEVEL,
+        float(held.mean()),
+        run_bootstrap(held, run_id, terrain, rng),
+        float(per_run.mean()),
+        float(per_run.min()),
+        float(sizes.mean()),
+        float((sizes == 1).mean()),
+    )
+
+
+N_PAIRED_DRAWS = 2000
+MIN_RUNS = 3
+"""With fewer runs a bootstrap over runs gives no interval: that of one run would have no width."""
+
+
+class Verdict(StrEnum):
+    """Whether the interval of a difference leaves zero out."""
+
+    BETTER = "better"
+    WORSE = "worse"
+    NOT_DISTINGUISHED = "not distinguished"
+
+
+class Outcome(NamedTuple):
+    """What a classifier made of held-out windows: run and true class (n,), whether it is right, and confidence.
+
+    These two are (repeats, n).
+    """
+
+    run_id: Array
+    terrain: Array
+    correct: Array
+    confidence: Array
+
+    @classmethod
+    def of(cls, held_out: HeldOut, run_id: Array) -> Self:
+        """Return what was made of the windows that were held out."""
+        whole = cls(run_id, held_out.truth, held_out.correct, held_out.probability.max(axis=2))
+        return whole.at(np.flatnonzero(held_out.tested))
+
+    def at(self, rows: Array) -> Self:
+        """Return some of the windows."""
+        run_id, terrain, correct, confidence = self
+        return type(self)(run_id[rows], terrain[rows], correct[:, rows], confidence[:, rows])
+
+
+class Difference(NamedTuple):
+    """A figure of two classifiers; ``difference`` is b minus a, with its ``interval`` of 95 % over runs.
+
+    The interval is NaN where there are fewer runs than :data:`MIN_RUNS`.
+    """
+
+    a: float
+    b: float
+    difference: float
+    interval: Interval
+    verdict: Verdict
+    n_runs: int
+
+
+class RunDifference(NamedTuple):
+    """Accuracies of two classifiers on the windows of one run."""
+
+    run_id: str
+    terrain: str
+    a: float
+    b: float
+
+
+class Comparison(NamedTuple):
+    """Differences between two classifiers, b minus a.
+
+    Those of each class are of accuracy, as are those ``by_support``: by how many training runs drove the true
+    terrain with the motion of a window, where that is known.
+    """
+
+    accuracy: Difference
+    macro_run_accuracy: Difference
+    confidence_auc: Difference
+    by_class: dict[str, Difference]
+    by_run: tuple[RunDifference, ...]
+    by_support: Mapping[str, Difference] = MappingProxyType({})
+    a: str = ""
+    b: str = ""
+
+
+def compare_with_first(
+    names: Sequence[str], outcomes: Sequence[Outcome], seed: int, levels: Array | None = None
+) -> tuple[Comparison, ...]:
+    """Return how each of the other classifiers differs from the first.
+
+    ``levels`` (n,) has the :class:`~terrain.classify.limits.SupportLevel` of each window, the same of all outcomes.
+    """
+    first, found = outcomes[0], []
+    for name, other in zip(names[1:], outcomes[1:], strict=True):
+        by_support = {}
+        for level in SupportLevel if levels is not None else ():
+            rows = np.flatnonzero(levels == level.value)
+            if len(rows):
+                parts = compare_outcomes(first.at(rows), other.at(rows), np.random.default_rng(seed))
+                by_support[level.value] = parts.accuracy
+        compared = compare_outcomes(first, other, np.random.default_rng(seed))
+        found.append(compared._replace(by_support=by_support, a=names[0], b=name))
+    return tuple(found)
+
+
+def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Comparison:
+    """Return the differences between two classifiers, paired by run; their windows may differ.
+
+    ``DataError`` where they were not judged on the same runs and classes.
 
     Examples
     --------
-    >>> rng = np.random.default_rng(0)
-    >>> confidence = rng.uniform(0.5, 1.0, (1, 400))
-    >>> correct = rng.random((1, 400)) < confidence
-    >>> runs = np.repeat(np.arange(40), 10)
-    >>> found = confidence_figures(confidence, correct, runs, np.zeros(400), rng)
-    >>> found.auc_ci[0] < found.auc < found.auc_ci[1], found.ece < 0.1
-    (True, True)
+    >>> run, terrain = np.repeat(np.arange(8).astype(str), 10), np.repeat(["ice", "mud"], 40)
+    >>> half, all_right = np.tile([True, False], (1, 40)), np.ones((1, 80), dtype=bool)
+    >>> worse, better = (Outcome(run, terrain, right, np.full((1, 80), 0.9)) for right in (half, all_right))
+    >>> found = compare_outcomes(worse, better, np.random.default_rng(0))
+    >>> found.accuracy.difference, found.accuracy.verdict.value, found.by_class["ice"].n_runs
+    (0.5, 'better', 4)
     """
-    weights = run_weights(run_id, terrain, N_DRAWS, rng)
+    pairs = [list(zip(each.run_id.astype(str), each.terrain.astype(str), strict=True)) for each in (a, b)]
+    cells = sorted(set(pairs[0]))
+    if cells != sorted(set(pairs[1])):
+        other = sorted(set(pairs[0]) ^ set(pairs[1]))[0]
+        raise DataError(f"run {other[0]} ({other[1]}) was judged by one of the two only")
+    number, terrain = {cell: i for i, cell in enumerate(cells)}, np.array([name for _, name in cells])
+    names = np.unique(terrain)
+    weights = np.vstack([np.ones(len(cells)), stratified_counts(terrain, N_PAIRED_DRAWS, rng)])
+    places = [np.array([number[pair] for pair in each]) for each in pairs]
+    sizes = [np.bincount(place) for place in places]
+    rates = [
+        np.bincount(place, weights=each.correct.mean(axis=0)) / size
+        for each, place, size in zip((a, b), places, sizes, strict=True)
+    ]
 
-    def figure(of: Callable[[Array, Array, Array], Array]) -> tuple[float, Interval]:
-        value = float(np.mean([of(c, r, np.ones((1, len(c))))[0] for c, r in _pairs(confidence, correct)]))
-        at_once = max(1, DRAWS_AT_ONCE_VALUES // weights.shape[1])
-        draws = np.zeros(len(weights))
-        for c, r in _pairs(confidence, correct):
-            blocks = [of(c, r, weights[i : i + at_once]) for i in range(0, len(weights), at_once)]
-            draws += np.concatenate(blocks) / len(confidence)
-        return value, percentile_interval(draws) if np.isfinite(draws).any() else (np.nan, np.nan)
+    def accuracy(kept: Array) -> Difference:
+        of_a, of_b = (
+            weights @ (kept * r * n) / (weights @ (kept * n)) for r, n in zip(rates, sizes, strict=True)
+        )
+        return _difference(of_a, of_b, int(kept.sum()))
 
-    auc, auc_ci = figure(confidence_auc)
-    ece, ece_ci = figure(partial(calibration_error, n_bins=n_bins))
-    at_coverage = []
-    for coverage in COVERAGES:
-        accuracy, interval = figure(partial(accuracy_at_coverage, coverage=coverage))
-        least = float(np.mean(np.quantile(confidence, 1.0 - coverage, axis=1)))
-        at_coverage.append(CoverageFigures(coverage, accuracy, interval, least))
-    bins = reliability_bins(confidence, correct, weights, n_bins)
-    return Confidence(auc, auc_ci, tuple(at_coverage), round(ece, 12), ece_ci, bins)
+    def macro(rate: Array) -> Array:
+        of_class = [weights[:, terrain == name] for name in names]
+        means = [w @ rate[terrain == name] / w.sum(axis=1) for w, name in zip(of_class, names, strict=True)]
+        return np.asarray(np.mean(means, axis=0))
+
+    def area(each: Outcome, place: Array) -> Array:
+        repeats = zip(each.confidence, each.correct.astype(float), strict=True)
+        return np.asarray(
+            np.mean([confidence_auc(c, right, weights[:, place]) for c, right in repeats], axis=0)
+        )
+
+    areas = [area(each, place) for each, place in zip((a, b), places, strict=True)]
+    return Comparison(
+        accuracy(np.ones(len(cells))),
+        _difference(macro(rates[0]), macro(rates[1]), len(cells)),
+        _difference(areas[0], areas[1], len(cells)),
+        {str(name): accuracy((terrain == name).astype(float)) for name in names},
+        tuple(
+            RunDifference(run, name, float(of_a), float(of_b))
+            for (run, name), of_a, of_b in zip(cells, *rates, strict=True)
+        ),
+    )
 
 
-def _pairs(confidence: Array, correct: Array) -> list[tuple[Array, Array]]:
-    return list(zip(confidence, correct.astype(float), strict=True))
+def paired_accuracy(
+    terrain: Array, n_windows: Array, a: Array, b: Array, rng: np.random.Generator
+) -> Difference:
+    """Return the difference of two accuracies of runs (n,), which are drawn within their classes (n,)."""
+    weights = np.vstack([np.ones(len(terrain)), stratified_counts(terrain, N_PAIRED_DRAWS, rng)]) * n_windows
+    of_a, of_b = (weights @ each / weights.sum(axis=1) for each in (a, b))
+    return _difference(of_a, of_b, len(terrain))
+
+
+def _difference(of_a: Array, of_b: Array, n_runs: int) -> Difference:
+    """Return the difference of figures of which the first is of all runs, the others of bootstrap samples."""
+    draws = of_b[1:] - of_a[1:]
+    known = n_runs >= MIN_RUNS and np.isfinite(draws).any()
+    low, high = percentile_interval(draws) if known else NO_INTERVAL
+    verdict = Verdict.BETTER if low > 0 else Verdict.WORSE if high < 0 else Verdict.NOT_DISTINGUISHED
+    return Difference(float(of_a[0]), float(of_b[0]), float(of_b[0] - of_a[0]), (low, high), verdict, n_runs)
+
+
+MEAN_SPAN_S = 10.0
+"""Novelty scores are averaged over so long: a robot crosses a terrain for longer."""
+
+
+class LeftOutTerrain(NamedTuple):
+    """How well the windows of a terrain that was left out differ in score from held-out ones of others.
+
+    Parameters
+    ----------
+    auroc, auroc_10s : area under the ROC curve of single windows, and of means over 10 s
+    accepted : part of its windows that are taken for a known terrain
+    known_kept : part of the held-out windows of the other terrains that are not called unknown
+    """
+
+    auroc: float
+    auroc_10s: float
+    accepted: float
+    known_kept: float
+
+
+def unknown_figures(
+    scored: Sequence[Scored], terrain: Array, run_id: Array, start_s: Array, seed: int
+) -> dict[str, Any]:
+    """Return how well a terrain that was never learned is found to be unknown, by name.
+
+    Each terrain is left out in turn: figures are means over the terrains, intervals by bootstrap over runs.  The
+    threshold of the score keeps ``known_kept_target`` of the known windows of inner held-out runs.
+    """
+    terrains = np.unique(terrain)
+    of_terrain = {str(t): [each for each in scored if terrain[each.unknown[0]] == t] for t in terrains}
+    run_names, run_of = np.unique(np.char.add(np.char.add(run_id, " "), terrain), return_inverse=True)
+    weights = np.zeros((N_BOOTSTRAP, len(run_names)))
+    for number, name in enumerate(terrains):  # how often each run is drawn, terrain by terrain
+        runs = np.unique(run_of[terrain == name])
+        weights[:, runs] = bootstrap_counts(len(runs), N_BOOTSTRAP, seed + number)
+    windows = [_compare(parts, run_of) for parts in of_terrain.values()]
+    spans = [_compare([_span_means(s, run_of, start_s) for s in p], run_of) for p in of_terrain.values()]
+
+    def within(scores: Iterable[tuple[Array, float]]) -> float:
+        return float(np.concatenate([each <= threshold for each, threshold in scores]).mean())
+
+    rows = {
+        name: LeftOutTerrain(
+            float(window[0].sum() / window[1].sum()),
+            float(span[0].sum() / span[1].sum()),
+            within((part.unknown_scores, part.threshold) for part in parts),
+            within((part.known_scores, part.threshold) for part in parts),
+        )
+        for (name, parts), window, span in zip(of_terrain.items(), windows, spans, strict=True)
+    }
+    auroc, auroc_10s, accepted, known_kept = np.mean([*rows.values()], axis=0).tolist()
+    return {
+        "auroc_unknown": auroc,
+        "auroc_unknown_ci": _area_interval(windows, weights),
+        "auroc_unknown_10s": auroc_10s,
+        "auroc_unknown_10s_ci": _area_interval(spans, weights),
+        "unknown_accepted": accepted,
+        "known_kept": known_kept,
+        "known_kept_target": KNOWN_KEPT,
+        "unknown_by_terrain": rows,
+    }
+
+
+def _span_means(scored: Scored, run_of: Array, start_s: Array) -> Scored:
+    """Return mean scores of the windows that begin in the same 10 s of a run, at the first of their rows."""
+    means = []
+    for rows, scores in ((scored.known, scored.known_scores), (scored.unknown, scored.unknown_scores)):
+        span = np.stack([run_of[rows], np.floor(start_s[rows] / MEAN_SPAN_S)])
+        _, first, which = np.unique(span, axis=1, return_index=True, return_inverse=True)
+        means.append((rows[first], np.bincount(which.ravel(), scores) / np.bincount(which.ravel())))
+    (known, known_scores), (unknown, unknown_scores) = means
+    return Scored(known, unknown, known_scores, unknown_scores, scored.threshold)
+
+
+def _compare(parts: Sequence[Scored], run_of: Array) -> tuple[Array, Array]:
+    """Return, by run of known and unknown windows, how many pairs the unknown one wins, and how many pairs are.
+
+    Pairs are of one fold; ties count one half, NaN as unknown.
+    """
+    n_runs = int(run_of.max()) + 1
+    won, pairs = np.zeros((2, n_runs, n_runs))
+    for part in parts:
+        known_scores = np.nan_to_num(part.known_scores, nan=np.inf, posinf=np.inf)
+        unknown_scores = np.nan_to_num(part.unknown_scores, nan=np.inf, posinf=np.inf)
+        known_run, unknown_run = run_of[part.known], run_of[part.unknown]
+        for run in np.unique(known_run):
+            ordered = np.sort(known_scores[known_run == run])
+            below = np.searchsorted(ordered, unknown_scores, "left")
+            up_to = np.searchsorted(ordered, unknown_scores, "right")
+            won[run] += np.bincount(unknown_run, (below + up_to) / 2.0, n_runs)
+            pairs[run] += np.bincount(unknown_run, minlength=n_runs) * len(ordered)
+    return won, pairs
+
+
+def _area_interval(compared: Sequence[tuple[Array, Array]], weights: Array) -> Interval:
+    """Return the interval of the mean area over the terrains that were left out."""
+    draws = np.zeros(len(weights))
+    for won, pairs in compared:
+        area = np.einsum("dr,rs,ds->d", weights, won, weights, optimize=True)
+        draws += area / np.einsum("dr,rs,ds->d", weights, pairs, weights, optimize=True)
+    return percentile_interval(draws / len(compared))
+
+
+STRIDE_S = 0.25
+"""A window comes so often: four times as often as terrain has to be known at 1 Hz, an eighth of a window."""
+
+
+class DelayFigures(NamedTuple):
+    """Time from a change of terrain to where the new terrain is reported: quantiles in s over changes that were found.
+
+    A change is found before the next one; ``n_missed`` of ``n_changes`` were never found.  ``p90_of_all`` takes
+    these as infinite, and is None where it is.
+    """
+
+    p50: float
+    p50_ci: Interval
+    p90: float
+    p90_ci: Interval
+    n_changes: int
+    n_missed: int
+    p90_of_all: float | None
+
+
+class SequenceFigures(NamedTuple):
+    """How well single windows and the filter follow sequences; every ``_ci`` is 95 % by bootstrap over runs.
+
+    Parameters
+    ----------
+    filtered_accuracy : fraction of the time at which the right terrain was reported, where the window that
+        ends then lies wholly on one terrain; "unknown" counts as wrong
+    single_accuracy : the same of the last window's own class
+    gain : filtered minus single, paired
+    filtered_accuracy_at_end, single_accuracy_at_end : the same over all time, where windows across a change
+        are judged by the terrain at their end
+    filter_delay_s : from a change to its report
+    flips_per_minute, single_flips_per_minute : changes of the reported terrain, less the true ones
+    unknown_ratio : fraction of the time at which "unknown" was reported
+    n_courses, n_grounds, duration_s : sequences, stretches on one terrain, and time
+    """
+
+    filtered_accuracy: float
+    filtered_accuracy_ci: Interval
+    single_accuracy: float
+    single_accuracy_ci: Interval
+    gain: float
+    gain_ci: Interval
+    filtered_accuracy_at_end: float
+    filtered_accuracy_at_end_ci: Interval
+    single_accuracy_at_end: float
+    single_accuracy_at_end_ci: Interval
+    filter_delay_s: DelayFigures
+    flips_per_minute: float
+    flips_per_minute_ci: Interval
+    single_flips_per_minute: float
+    single_flips_per_minute_ci: Interval
+    unknown_ratio: float
+    n_courses: int
+    n_grounds: int
+    duration_s: float
+
+
+COUNTS = (
+    "whole",
+    "filtered",
+    "single",
+    "all",
+    "filtered_all",
+    "single_all",
+    "unknown",
+    "flips",
+    "single_flips",
+)
+"""Of a stretch on one terrain; flips are changes of the reported terrain less the true one."""
+
+
+class Track(NamedTuple):
+    """What was reported along a sequence: counts (m, 9) of every stretch on one terrain, its terrain and run (m,).
+
+    ``delay_s`` (m,) is of the change to it: NaN where the terrain did not change before, and infinite where that was
+    never found.
+    """
+
+    counts: Array
+    delay_s: Array
+    terrain: Array
+    run: tuple[str, ...]
+    spliced: bool
+
+
+def track_of(
+    labels: Sequence[Label],
+    runs: tuple[str, ...],
+    starts_s: Array,
+    length_s: float,
+    filtered: Array,
+    single: Array,
+    classes: Array,
+    spliced: bool,
+) -> Track:
+    """Return what the last window and the filter over time report along a sequence.
+
+    Parameters
+    ----------
+    labels, runs : terrain and run of each stretch of the sequence
+    starts_s, length_s : (n,) starts of windows on a regular grid, and their length
+    filtered, single : (n,) column of the class (k,), sorted, that the filter and the last window give; -1 for unknown
+    """
+    time_s, n = starts_s + length_s, len(labels)
+    terrain = np.searchsorted(classes, [label.terrain for label in labels])
+    counts, delay_s, flips = np.zeros((n, len(COUNTS))), np.full(n, np.nan), []
+    for reports in (filtered, single):  # "unknown" between two terrains is no change
+        flip, known = np.zeros(len(reports), dtype=bool), np.flatnonzero(reports >= 0)
+        flip[known[1:]] = np.diff(reports[known]) != 0
+        flips.append(flip)
+    for i, label in enumerate(labels):
+        here = (time_s > label.start_s + TIME_TOLERANCE_S) & (time_s <= label.end_s + TIME_TOLERANCE_S)
+        whole = here & (starts_s >= label.start_s - TIME_TOLERANCE_S)
+        right = [(reports == terrain[i]) & here for reports in (filtered, single)]
+        changed = i > 0 and bool(terrain[i - 1] != terrain[i])
+        parts = [whole, *(each & whole for each in right), here, *right, here & (filtered < 0)]
+        counts[i] = [*(np.sum(part) for part in parts), *(np.sum(flip & here) - changed for flip in flips)]
+        if changed:
+            at = np.flatnonzero(right[0])
+            delay_s[i] = max(time_s[at[0]] - label.start_s, 0.0) if len(at) else np.inf
+    return Track(counts, delay_s, terrain, runs, spliced)
+
+
+def last_class(probability: Array) -> Array:
+    """Return the class (n,) of the last window that had an output; -1 before the first."""
+    there = np.asarray(np.isfinite(probability).all(axis=1))
+    best = np.where(there, np.where(there[:, None], probability, 0.0).argmax(axis=1), -1)
+    latest = np.maximum.accumulate(np.where(there, np.arange(len(there)), -1))
+    return np.where(latest >= 0, best[latest], -1)
+
+
+def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | None:
+    """Return the figures of sequences by time; None where there is none.  The seed is of the bootstrap."""
+    if not tracks:
+        return None
+    counts, delay_s = (np.concatenate(parts) for parts in zip(*(each[:2] for each in tracks), strict=True))
+    run = np.array([name for track in tracks for name in track.run], dtype=str)
+    terrain = np.concatenate([track.terrain for track in tracks])
+    weights, place = drawn_runs(run, terrain, N_BOOTSTRAP, np.random.default_rng(seed), row_counts)
+    draws = weights[:, place]
+    drawn = dict(zip(COUNTS, (draws @ counts).T, strict=True))
+
+    def ratio(above: str, below: str, minus: str = "", per: float = 1.0) -> tuple[float, Interval]:
+        less = drawn[minus] if minus else 0.0
+        value, interval = ratio_over_runs((drawn[above] - less) * per, drawn[below])
+        return math.nan if value is None else value, interval or NO_INTERVAL
+
+    a_minute = 60.0 / STRIDE_S
+    return SequenceFigures(
+        *ratio("filtered", "whole"),
+        *ratio("single", "whole"),
+        *ratio("filtered", "whole", "single"),
+        *ratio("filtered_all", "all"),
+        *ratio("single_all", "all"),
+        _delays(delay_s, draws),
+        *ratio("flips", "all", per=a_minute),
+        *ratio("single_flips", "all", per=a_minute),
+        unknown_ratio=ratio("unknown", "all")[0],
+        n_courses=len(tracks),
+        n_grounds=len(run),
+        duration_s=float(drawn["all"][0] * STRIDE_S),
+    )
+
+
+def _delays(delay_s: Array, draws: Array) -> DelayFigures:
+    changes, found = delay_s[~np.isnan(delay_s)], np.flatnonzero(np.isfinite(delay_s))
+    n_missed = len(changes) - len(found)
+    if not len(found):
+        return DelayFigures(math.nan, NO_INTERVAL, math.nan, NO_INTERVAL, len(changes), n_missed, None)
+    order = found[np.argsort(delay_s[found], kind="stable")]
+    ordered_s, weights = delay_s[order], draws[1:, order].cumsum(axis=1)
+
+    def quantile(ratio: float) -> tuple[float, Interval]:
+        at = (weights < ratio * weights[:, -1:]).sum(axis=1)
+        drawn = np.where(weights[:, -1] > 0, ordered_s[np.minimum(at, len(ordered_s) - 1)], np.nan)
+        return float(np.quantile(ordered_s, ratio, method="inverted_cdf")), percentile_interval(drawn)
+
+    of_all = float(np.quantile(changes, 0.9, method="inverted_cdf"))
+    known = of_all if np.isfinite(of_all) else None
+    return DelayFigures(*quantile(0.5), *quantile(0.9), len(changes), n_missed, known)
+
+
+MIN_CURVE_POINTS = 4
+"""The law of the learning curve has three parameters."""
+ENOUGH_GAIN = 0.01
+"""Enough runs: doubling them would gain less than this accuracy."""
+
+
+class LearningCurve(NamedTuple):
+    """Accuracy against the number of training runs of each class.
+
+    Parameters
+    ----------
+    runs_per_class : mean over classes and folds, since a class may have fewer than were asked for
+    accuracy : with so many training runs
+    accuracy_spread : over draws of runs; None for all runs
+    enough_runs : the number of runs beyond which doubling brings next to nothing; None when not reached
+    statement : the same in a sentence
+    """
+
+    runs_per_class: tuple[float, ...]
+    accuracy: tuple[float, ...]
+    accuracy_spread: tuple[float | None, ...]
+    enough_runs: int | None
+    statement: str
+
+
+def learning_curve(runs_per_class: Array, drawn: Sequence[float], full: float) -> LearningCurve:
+    """Return the curve of accuracies of drawn folds, in their order, and that of all runs."""
+    by_size = np.reshape(drawn, (-1, CURVE_DRAWS))
+    accuracy = np.append(by_size.mean(axis=1), full)
+    spread = (*by_size.std(axis=1, ddof=1).tolist(), None)
+    enough = enough_runs(runs_per_class, accuracy)
+    return LearningCurve(tuple(runs_per_class.tolist()), tuple(accuracy.tolist()), spread, *enough)
+
+
+def enough_runs(runs_per_class: Array, accuracy: Array) -> tuple[int | None, str]:
+    """Return how many runs of each class would be enough by the law ``accuracy(m) = a - b m^-c``, and a sentence.
+
+    Enough is the smallest whole m for which doubling gains less than :data:`ENOUGH_GAIN` by that law; it
+    is not sought beyond ten times the largest m that was measured, and is None beyond, or with fewer than four points.
+
+    Examples
+    --------
+    >>> m = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
+    >>> enough_runs(m, 0.9 - 0.3 / m)[0]
+    16
+    """
+    if len(accuracy) < MIN_CURVE_POINTS:
+        return None, f"{len(accuracy)} sizes are too few to estimate how many runs are enough"
+    fit = least_squares(
+        lambda p: p[0] - p[1] * runs_per_class ** -p[2] - accuracy,
+        x0=[min(accuracy.max() + 0.02, 1.0), 0.3, 0.7],
+        bounds=([0.0, 0.0, 0.05], [1.0, 2.0, 3.0]),
+    )
+    _, scale, power = fit.x
+    largest = runs_per_class.max()
+    sizes = np.arange(1, int(10 * largest) + 1)
+    gain = scale * sizes**-power * (1 - 2.0**-power)
+    slack = _percent(float(np.interp(largest, sizes, gain)), 1)
+    found = sizes[gain < ENOUGH_GAIN]
+    if not len(found):
+        return None, f"not enough yet: doubling the {largest:.1f} runs per class would still gain {slack}"
+    enough = int(found[0])
+    return enough, (
+        f"{'enough' if enough <= largest else 'not enough yet'}: "
+        f"{enough} {'run' if enough == 1 else 'runs'} per class would be enough "
+        f"(doubling them gains under {_percent(ENOUGH_GAIN, 0)}); "
+        f"the data have {largest:.1f} on average, doubling which would gain {slack}"
+    )
+
+
+def _percent(ratio: float, decimals: int) -> str:
+    return f"{100 * ratio:.{decimals}f}\N{NO-BREAK SPACE}%"

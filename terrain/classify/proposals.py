@@ -20,26 +20,25 @@ from terrain.errors import ConfigError
 from terrain.files.names import plain_name, shown
 from terrain.records import Array
 
+MAX_GAP_WINDOWS = 2.0
+"""A stretch ends where windows are missing for longer."""
+
+ACCEPTED = 0.9
+"""Least mean probability of a proposal that is taken over without a question."""
+
+TOLERANCE_S = 0.5
+"""A stretch of a table may be that far outside of its run, and reach into the next one."""
+
+YES, NONE = "yes", "none"
+"""Answers beside the name of a terrain: the proposal is right; the stretch is of no terrain."""
+
 
 def smoothed_classes(probability: Array, time_s: Array, prior: Array, dwell_s: float = DWELL_S) -> Array:
-    """Return the class (n,) of each window along the most likely sequence.
+    """Return the class (n,) of each window along the most likely sequence, of windows that do not overlap, in order.
 
     Maximises ``sum_i log((1 - o) p_i(c_i) / prior(c_i) + o) + sum_i log P(c_i | c_i-1, dt_i)`` with the share
     o of windows that follow no class; a ground is kept with ``exp(-dt / dwell)``, and followed by any other
     alike.
-
-    Parameters
-    ----------
-    probability : (n, k) of windows that do not overlap, in order of time
-    time_s : (n,) of the windows
-    prior : (k,) shares of the classes among the training windows
-    dwell_s : mean time on one ground
-
-    Examples
-    --------
-    >>> probability = np.array([[0.9, 0.1]] * 4 + [[0.3, 0.7]] + [[0.9, 0.1]] * 4 + [[0.1, 0.9]] * 4)
-    >>> smoothed_classes(probability, 2.0 * np.arange(13), np.array([0.5, 0.5])).tolist()
-    [0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1]
     """
     n, k = probability.shape
     if n == 0:
@@ -60,26 +59,11 @@ def smoothed_classes(probability: Array, time_s: Array, prior: Array, dwell_s: f
     return path
 
 
-MAX_GAP_WINDOWS = 2.0
-"""A stretch ends where windows are missing for longer."""
-
-ACCEPTED = 0.9
-"""Least mean probability of a proposal that is taken over without a question."""
-
-TOLERANCE_S = 0.5
-"""A stretch of a table may be that far outside of its run, and reach into the next one."""
-
-YES, NONE = "yes", "none"
-"""Answers beside the name of a terrain: the proposal is right; the stretch is of no terrain."""
-
-
 class Proposal(NamedTuple):
-    """A stretch of a run, and the terrain that a model proposes for it.
+    """A stretch of a run, on its clock, and the terrain that a model proposes for it.
 
     Parameters
     ----------
-    run_id, start_s, end_s : of the stretch, on the clock of the run
-    terrain : proposed
     confidence : mean probability of that terrain over the windows
     supported_ratio : share of the windows whose prediction training runs support; 1 where not counted
     unknown_ratio : share of the windows that are like no terrain that was learned
@@ -121,7 +105,6 @@ def propose(
 
     Parameters
     ----------
-    run_id : of the run
     start_s, length_s : (n,) of its windows in order of time, which do not overlap, and their length
     probability : (n, k) in the order of the classes
     supported, unknown : (n,) whether training runs support it, NaN where not counted; whether it is unlike all
@@ -149,23 +132,17 @@ def questions(proposals: Sequence[Proposal], n: int) -> list[int]:
 
     The doubt of each is divided by the number of chosen ones of its run and of its terrain: ten questions on
     one run would bring one answer.
-
-    Examples
-    --------
-    >>> rows = [Proposal(run, 0, 9, "ice", p, 1, 0, 4) for run, p in (("a", .5), ("a", .52), ("b", .6))]
-    >>> questions(rows, 2)
-    [0, 2]
     """
     runs: Counter[str] = Counter()
     terrains: Counter[str] = Counter()
     left, chosen = list(range(len(proposals))), list[int]()
+
+    def worth(i: int) -> float:
+        one = proposals[i]
+        return one.doubt / ((1 + runs[one.run_id]) ** 2 * (1 + 0.5 * terrains[one.terrain]))
+
     while left and len(chosen) < n:
-        worth = {
-            i: proposals[i].doubt
-            / ((1 + runs[proposals[i].run_id]) ** 2 * (1 + 0.5 * terrains[proposals[i].terrain]))
-            for i in left
-        }
-        best = max(left, key=lambda i: (worth[i], -i))
+        best = max(left, key=lambda i: (worth(i), -i))
         chosen.append(best)
         left.remove(best)
         runs[proposals[best].run_id] += 1

@@ -1,8 +1,24 @@
-r"""Classifier of the ground by what wheels answer to how they are driven.
+r"""Terrain by what wheels answer to how they are driven: motor currents, or slip, of wheels or of the whole robot.
 
-For each terrain, the responses of a window (motor currents, say) are expected by a process over the regime of
-motion (:mod:`terrain.classify.ground_response`), and scatter about it with one covariance S.  The terrain is
-the more likely the better it expects them,
+A motor's current on a given ground depends on how its wheel is driven: how fast, and in which direction
+relative to the other wheels.  The *regime* of wheel i among W is what all wheels roll, in order from it,
+
+.. math:: z_i = \left(\frac{u_i}{|u|}, \frac{u_{i+1}}{|u|}, \ldots, \frac{|u|}{u_{max}}\right),
+          \qquad |u|^2 = \sum_j u_j^2 ,
+
+so that wheels that are placed alike answer alike.  On one ground each quantity is a Gaussian process over the regime,
+with the covariance of the responses of wheels i and j
+
+.. math:: k\big((i, z), (j, z')\big) = e(z, z') \left(a + b\,\delta_{ij}\right) + c\,\delta ,
+          \qquad e = \exp\left(-\tfrac12 \textstyle\sum_m (z_m - z_m')^2 / l_m^2\right) :
+
+a part that all wheels share, one of each wheel alone (its load, its motor), and the scatter of runs.  Units
+are means over a run and a regime, and runs are left out whole: windows of one run have its errors in common.
+What is left of all responses together has one covariance S: that of means of runs that were left out (in closed form
+from the inverse covariance, Rasmussen and Williams, Gaussian Processes for Machine Learning, 5.4.2, for blocks), and
+that of windows within a run.
+
+The terrain is the more likely the better it expects the responses of a window, which differ from that by d,
 
 .. math:: \log p = -\tfrac{\nu + r}{2} \log\left(1 + \tfrac1\nu d^T S^{-1} d\right) - \tfrac12\log|S| ,
 
@@ -17,22 +33,222 @@ each expected by the other runs alone.
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize_scalar
 
-from terrain.classify.ground_response import fit_ground, regimes
 from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import DataError
 from terrain.records import Array
 
-DEGREES_OF_FREEDOM = 5.0
+LENGTHS = (0.4, 0.5, 0.6, 0.8)
+"""Length scales of the direction among which the likelihood chooses: 0.4 is 23 degrees of an omni robot's
+direction of travel; shorter ones would follow single runs."""
 
+SPEED_LENGTH = 1.0
+"""Length scale of the speed, over the fastest: responses change little with it."""
+
+MIN_SPREAD = 1e-9
+
+SAME_REGIME, CELL = 0.1, 0.25
+"""Standard deviation of a run's regime below which it is one; a run that is driven in many is cut into cells."""
+
+MAX_POINTS = 1200
+"""Of a process: its cost grows with their cube.  Where there are more, units are thinned evenly."""
+
+APART, FAR = 10.0, 1e6
+"""Distance of two wheels as the kernel sees it: far for a wheel's own part, nothing for the shared one."""
+
+FLOOR = 1e-3
+"""Of a standard deviation, as a share of the response's spread over the ground: a response that repeats
+exactly (a counter that never moves) would outweigh all others."""
+
+DEGREES_OF_FREEDOM = 5.0
 LOG_TEMPERATURE_BOUNDS = (-3.0, 1.0)
 
 MIN_SPEED_RATIO = 0.05
 """Of the fastest window of training: slower, a robot stands."""
+
+
+def regimes(wheel_speed_mps: Array, fastest_mps: float) -> Array:
+    """Return the regime (n, wheels, wheels + 1) of each wheel from speeds (n, wheels); NaN where all stand.
+
+    ``fastest_mps`` is the norm of the speeds that counts as 1.
+
+    Examples
+    --------
+    >>> regimes(np.array([[3.0, 4.0]]), 10.0)
+    array([[[0.6, 0.8, 0.5],
+            [0.8, 0.6, 0.5]]])
+    """
+    norm = np.linalg.norm(wheel_speed_mps, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = np.where(norm[:, None] > 0.0, wheel_speed_mps / norm[:, None], np.nan)
+    n_wheels = unit.shape[1]
+    order = (np.arange(n_wheels)[:, None] + np.arange(n_wheels)) % n_wheels
+    speed = np.broadcast_to((norm / fastest_mps)[:, None, None], (len(unit), n_wheels, 1))
+    return np.concatenate([unit[:, order], speed], axis=2)
+
+
+def _units(regime: Array, run: Array) -> Array:
+    """Return the number (n,) of the unit of each row: its run by number, and its regime where a run has several."""
+    cell = np.floor(regime / CELL + 0.5).astype(np.int64)
+    for number in range(run.max() + 1):
+        rows = run == number
+        if regime[rows].std(axis=0).max() < SAME_REGIME:
+            cell[rows] = 0
+    return np.unique(np.column_stack([run, cell]), axis=0, return_inverse=True)[1].ravel()
+
+
+def _unit_means(values: Array, unit: Array) -> Array:
+    """Return the mean (units, ...) of rows (n, ...) of each unit."""
+    count = np.bincount(unit)
+    sums = np.zeros((len(count), *values.shape[1:]))
+    np.add.at(sums, unit, values)
+    return sums / count.reshape(-1, *[1] * (values.ndim - 1))
+
+
+class Process(NamedTuple):
+    """A fitted process of a response: its mean, points (m,) and their weights, and its covariance.
+
+    A prediction is the mean and the covariance with the points times the weights; ``common`` and ``own`` are a and b of
+    the covariance, ``length`` is the length scale of the direction.
+    """
+
+    mean: float
+    regime: Array
+    wheel: Array
+    weight: Array
+    common: float
+    own: float
+    length: float
+
+    def predict(self, regime: Array, wheel: int) -> Array:
+        """Return the expected response (n,) of a wheel at regimes (n, c)."""
+        scale = np.full(regime.shape[1], self.length)
+        scale[-1] = SPEED_LENGTH
+        a, b = regime / scale, self.regime / scale
+        squared = (a**2).sum(axis=1)[:, None] + (b**2).sum(axis=1) - 2.0 * a @ b.T
+        shared = self.common + self.own * (self.wheel == wheel)
+        return np.asarray(self.mean + np.exp(-0.5 * np.maximum(squared, 0.0)) @ (shared * self.weight))
+
+
+def fit_process(regime: Array, wheel: Array, response: Array, block: Array) -> tuple[Process, Array]:
+    """Return the most likely process of responses (m,) of wheels (m,) at regimes (m, c), and what other blocks leave.
+
+    That is, of each response, what it differs by from the process without its own block (m,), its run.
+    """
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+    mean, spread = float(response.mean()), float(response.std())
+    if len(response) < 3 or spread < MIN_SPREAD:
+        return Process(mean, regime, wheel, np.zeros(len(response)), 0.0, 0.0, 1.0), response - mean
+    n_wheels = len(np.unique(wheel))
+    apart = APART * np.eye(max(int(wheel.max()) + 1, 1))[wheel]
+    points = np.column_stack([regime, apart])
+    scaled = (response - mean) / spread
+
+    def fitted(length: float) -> Any:
+        scales = [length] * (regime.shape[1] - 1) + [SPEED_LENGTH]
+        shared = ConstantKernel(1.0, (1e-4, 1e3)) * RBF([*scales, *[FAR] * apart.shape[1]], "fixed")
+        own = ConstantKernel(0.1, (1e-4, 1e3)) * RBF([*scales, *[1.0] * apart.shape[1]], "fixed")
+        kernel = (shared + own if n_wheels > 1 else own) + WhiteKernel(0.05, (1e-4, 10.0))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            return GaussianProcessRegressor(kernel, alpha=1e-8).fit(points, scaled)
+
+    by_length = {length: fitted(length) for length in LENGTHS}
+    length = max(LENGTHS, key=lambda each: by_length[each].log_marginal_likelihood_value_)
+    best = by_length[length]
+    numbers = best.kernel_.get_params()
+    common = float(numbers["k1__k1__k1__constant_value"]) if n_wheels > 1 else 0.0
+    own = float(numbers["k1__k2__k1__constant_value" if n_wheels > 1 else "k1__k1__constant_value"])
+    covariance = best.kernel_(points) + 1e-8 * np.eye(len(points))
+    weight = cho_solve(cho_factor(covariance), scaled) * spread
+    return Process(mean, regime, wheel, weight, common, own, length), left_out(
+        covariance, scaled, block
+    ) * spread
+
+
+def left_out(covariance: Array, response: Array, block: Array) -> Array:
+    """Return each response (m,) less its expectation by the other blocks.
+
+    With the inverse Q of the covariance (m, m), that of block B is ``(Q_BB)^-1 (Q y)_B``.
+    """
+    inverse = np.linalg.inv(covariance)
+    whole = inverse @ response
+    out = np.empty_like(response)
+    for number in np.unique(block):
+        rows = np.flatnonzero(block == number)
+        out[rows] = np.linalg.solve(inverse[np.ix_(rows, rows)], whole[rows])
+    return out
+
+
+class GroundResponse(NamedTuple):
+    """What one ground answers: a process for each quantity of a wheel, then one for each of the body.
+
+    Responses are ordered by quantity, then wheel; then those of the body.  ``covariance`` (r, r) is of a window's
+    responses about the processes.
+    """
+
+    processes: tuple[Process, ...]
+    n_wheels: int
+    n_wheel_quantities: int
+    covariance: Array
+
+    def expected(self, regime: Array) -> Array:
+        """Return the expected responses (n, r) at regimes (n, wheels, c)."""
+        columns = []
+        for number, process in enumerate(self.processes):
+            wheels = range(self.n_wheels if number < self.n_wheel_quantities else 1)
+            columns += [process.predict(regime[:, i], i) for i in wheels]
+        return np.column_stack(columns)
+
+
+def fit_ground(
+    regime: Array, responses: Array, groups: Array, n_body: int = 0
+) -> tuple[GroundResponse, Array]:
+    """Return what a ground answers, and the responses (n, r) to expect of each row without its own run.
+
+    Parameters
+    ----------
+    regime : (n, wheels, c) of windows on this ground
+    responses : (n, r) finite, by quantity, then wheel, then ``n_body`` of the whole body
+    groups : (n,) run of each window
+    """
+    n_wheels = regime.shape[1]
+    run = np.unique(groups.astype(str), return_inverse=True)[1]
+    unit = _units(regime[:, 0], run)
+    n_units = unit.max() + 1
+    kept = np.zeros(n_units, dtype=bool)
+    n_kept = min(n_units, max(MAX_POINTS // n_wheels, 1))
+    kept[np.unique(np.linspace(0, n_units - 1, n_kept).round().astype(int))] = True
+    mean_regime, mean_response = _unit_means(regime, unit), _unit_means(responses, unit)
+    block = np.zeros(n_units, dtype=np.int64)
+    block[unit] = run
+    processes, left = [], np.zeros_like(mean_response)
+    n_quantities = (responses.shape[1] - n_body) // n_wheels
+    widths = [n_wheels] * n_quantities + [1] * n_body
+    for n, end in zip(widths, np.cumsum(widths), strict=True):
+        columns = np.arange(end - n, end)
+        points = np.concatenate([mean_regime[kept, i] for i in range(n)])
+        wheel, values = np.repeat(np.arange(n), kept.sum()), mean_response[kept][:, columns].T.ravel()
+        process, apart = fit_process(points, wheel, values, np.tile(block[kept], n))
+        processes.append(process)
+        left[np.ix_(np.flatnonzero(kept), columns)] = apart.reshape(n, -1).T
+        for i, column in enumerate(columns):
+            left[~kept, column] = mean_response[~kept, column] - process.predict(mean_regime[~kept, i], i)
+    within = responses - mean_response[unit]
+    floor = np.diag((FLOOR * np.maximum(responses.std(axis=0), 1e-12)) ** 2)
+    covariance = left.T @ left / len(left) + within.T @ within / max(len(within) - len(left), 1) + floor
+    ground = GroundResponse(tuple(processes), n_wheels, n_quantities, covariance)
+    return ground, (mean_response - left)[unit]
 
 
 class ResponseColumns(NamedTuple):
@@ -48,6 +264,7 @@ class ResponseChoice(NamedTuple):
     temperature: float
 
 
+@dataclass(eq=False, repr=False)
 class GroupedResponse(GroupedClassifier):
     """Terrain by the responses of wheels, with whole runs left out where it judges itself.
 
@@ -57,25 +274,17 @@ class GroupedResponse(GroupedClassifier):
 
     Attributes
     ----------
-    classes_ : (k,) class names
-    grounds_ : :class:`~terrain.classify.ground_response.GroundResponse` of each class
+    grounds_ : :class:`GroundResponse` of each class
     fastest_mps_ : norm of the wheel speeds that counts as 1
     temperature_, best_ : T, also as what was chosen
     inner_probability_ : (n, k) of each training row, its own terrain expected by other runs; NaN where the
         robot stands
     """
 
-    def __init__(self, columns: Any = ()) -> None:
-        self.columns = columns
+    columns: Any = ()
 
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedResponse:
-        """Fit the responses of each terrain.
-
-        Parameters
-        ----------
-        X : (n, n_wheels + n_responses) wheel speeds in m/s and responses, NaN where missing
-        y : (n,) classes
-        groups : (n,) run of each row; every row is its own run when missing
+        """Fit the responses of each terrain to wheel speeds in m/s and responses, NaN where missing.
 
         Raises
         ------
@@ -86,30 +295,34 @@ class GroupedResponse(GroupedClassifier):
         X, y, groups = self._training_rows(X, y, groups)
         if not self.columns or sum(self.columns) != X.shape[1]:
             raise DataError(f"the columns of wheels and responses do not describe rows of {X.shape[1]}")
-        n_wheels = self.columns[0]
-        norm = np.linalg.norm(X[:, :n_wheels], axis=1)
-        self.fastest_mps_ = float(np.nanmax(norm, initial=0.0))
+        responses = X[:, self.columns[0] :]
+        self.fastest_mps_ = float(np.nanmax(np.linalg.norm(X[:, : self.columns[0]], axis=1), initial=0.0))
         regime, moving = self._regimes(X)
         usable = moving & np.isfinite(X).all(axis=1)
-        grounds, left = [], np.full((len(X), X.shape[1] - n_wheels), np.nan)
+        grounds, expected = [], np.full(responses.shape, np.nan)
         for name in self.classes_:
             rows = np.flatnonzero(usable & (y == name))
             if not rows.size:
                 raise DataError(
                     f"no window of class {str(name)!r} has a robot that moves and all of its responses"
                 )
-            ground, expected = fit_ground(regime[rows], X[rows, n_wheels:], groups[rows])
+            ground, expected[rows] = fit_ground(regime[rows], responses[rows], groups[rows])
             grounds.append(ground)
-            left[rows] = expected
         self.grounds_ = tuple(grounds)
         likely = np.full((len(X), len(self.classes_)), np.nan)
-        rows = np.flatnonzero(usable)
-        likely[rows] = self._log_likelihood(regime[rows], X[rows, n_wheels:])
+        likely[usable] = self._log_likelihood(regime[usable], responses[usable])
         for j, name in enumerate(self.classes_):
-            own = np.flatnonzero(usable & (y == name))
-            likely[own, j] = log_density(X[own, n_wheels:] - left[own], grounds[j].covariance)
+            own = usable & (y == name)
+            likely[own, j] = log_density(responses[own] - expected[own], grounds[j].covariance)
+        rows = np.flatnonzero(usable)
         truth = np.searchsorted(self.classes_, y[rows])
-        self.temperature_ = _temperature(likely[rows], truth)
+
+        def loss(log_temperature: float) -> float:
+            stated = _softmax(np.exp(log_temperature) * likely[rows])[np.arange(len(rows)), truth]
+            return -float(np.log(np.maximum(stated, 1e-12)).mean())
+
+        found = minimize_scalar(loss, bounds=LOG_TEMPERATURE_BOUNDS, method="bounded")
+        self.temperature_ = float(np.exp(found.x))
         self.best_ = ResponseChoice(self.temperature_)
         self.inner_probability_ = _softmax(self.temperature_ * likely)
         return self
@@ -123,6 +336,7 @@ class GroupedResponse(GroupedClassifier):
         return _softmax(self.temperature_ * likely)
 
     def _regimes(self, X: Array) -> tuple[Array, Array]:
+        """Return the regimes of rows, and in which of them the robot moves."""
         speed = X[:, : self.columns[0]]
         norm = np.linalg.norm(speed, axis=1)
         moving = np.isfinite(norm) & (norm > MIN_SPEED_RATIO * self.fastest_mps_)
@@ -138,11 +352,6 @@ def log_density(apart: Array, covariance: Array) -> Array:
     """Return the logarithm (n,) of the Student density of differences (n, r); NaN does not count.
 
     Constants that do not depend on the covariance are left out.
-
-    Examples
-    --------
-    >>> log_density(np.array([[0.0, np.nan], [2.0, np.nan]]), np.eye(2)).round(3) + 0.0
-    array([ 0.   , -1.763])
     """
     out = np.zeros(len(apart))
     known = np.isfinite(apart)
@@ -159,16 +368,5 @@ def log_density(apart: Array, covariance: Array) -> Array:
 
 
 def _softmax(score: Array) -> Array:
-    score = score - score.max(axis=1, keepdims=True)
-    weight = np.exp(score)
+    weight = np.exp(score - score.max(axis=1, keepdims=True))
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))
-
-
-def _temperature(likely: Array, truth: Array) -> float:
-    """Return what makes the true classes most likely."""
-
-    def loss(log_temperature: float) -> float:
-        probability = _softmax(np.exp(log_temperature) * likely)
-        return -float(np.log(np.maximum(probability[np.arange(len(truth)), truth], 1e-12)).mean())
-
-    return float(np.exp(minimize_scalar(loss, bounds=LOG_TEMPERATURE_BOUNDS, method="bounded").x))

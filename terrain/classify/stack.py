@@ -8,15 +8,15 @@ draws them towards one half each, the mean of the two, which is where few runs l
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
 
 from terrain.classify.folds import fold_numbers
 from terrain.classify.grouped import GroupedClassifier
-from terrain.classify.grouped_network import GroupedNetwork
-from terrain.classify.network_input import SampleColumns, log_softmax
+from terrain.classify.network import GroupedNetwork, SampleColumns, log_softmax
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import DataError
 from terrain.records import Array
@@ -28,15 +28,13 @@ N_CROSS_FOLDS = 5
 MIN_STANDARD_ERRORS = 1.0
 """The SVM is left only for what has a lower loss by so many standard errors over runs."""
 
+TINY = np.finfo(float).tiny
+
 
 class StackChoice(NamedTuple):
-    """What held-out runs chose.
+    """What held-out runs chose: which is ``used`` (svm, cnn, stack), and the weights of the log probabilities.
 
-    Parameters
-    ----------
-    used : ``svm``, ``cnn`` or ``stack``
-    weight_svm, weight_cnn : of their log probabilities
-    loss_svm, loss_cnn, loss_stack : mean log loss of held-out runs, of the stack with weights of other runs
+    Losses are mean log losses of held-out runs, of the stack with weights of other runs.
     """
 
     used: str
@@ -47,6 +45,7 @@ class StackChoice(NamedTuple):
     loss_stack: float
 
 
+@dataclass(eq=False, repr=False)
 class GroupedStack(GroupedClassifier):
     """Stack of :class:`GroupedSVC` and :class:`GroupedNetwork` that keeps runs whole.
 
@@ -61,66 +60,46 @@ class GroupedStack(GroupedClassifier):
 
     Attributes
     ----------
-    classes_ : (k,) class names
     best_ : :class:`StackChoice`
-    inner_probability_ : (n, k) of held-out rows; NaN where one of the two has none
     svm_, network_ : the two, fitted; None where it is not used
     """
 
-    def __init__(
-        self,
-        columns: Sequence[SampleColumns] = (),
-        choose: bool = False,
-        candidates: Sequence[Sequence[float]] = CANDIDATES,
-        n_inner_folds: int = 3,
-        n_members: int = 3,
-        epochs: int = 30,
-        trial_epochs: int = 10,
-        gap: int = 1,
-        seed: int = 0,
-    ) -> None:
-        self.columns = columns
-        self.choose = choose
-        self.candidates = candidates
-        self.n_inner_folds = n_inner_folds
-        self.n_members = n_members
-        self.epochs = epochs
-        self.trial_epochs = trial_epochs
-        self.gap = gap
-        self.seed = seed
+    columns: Sequence[SampleColumns] = ()
+    choose: bool = False
+    candidates: Sequence[Sequence[float]] = CANDIDATES
+    n_inner_folds: int = 3
+    n_members: int = 3
+    epochs: int = 30
+    trial_epochs: int = 10
+    gap: int = 1
+    seed: int = 0
 
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedStack:
-        """Fit both and their weights; parameters and errors as of the two.
-
-        Raises
-        ------
-        DataError
-            also if the rows hold no features beside the samples.
-        """
+        """Fit both and their weights; errors as of the two, and where rows hold no features beside the samples."""
         X, y, groups = self._training_rows(X, y, groups)
         features, samples = self._parts(X)
-        of_both = {"n_inner_folds": self.n_inner_folds, "gap": self.gap, "seed": self.seed}
+        of_both: dict[str, Any] = {"n_inner_folds": self.n_inner_folds, "gap": self.gap, "seed": self.seed}
+        sizes: dict[str, Any] = {
+            "n_members": self.n_members,
+            "epochs": self.epochs,
+            "trial_epochs": self.trial_epochs,
+        }
         svm = GroupedSVC(self.candidates, **of_both).fit(features, y, groups)
-        network = GroupedNetwork(
-            self.columns,
-            n_members=self.n_members,
-            epochs=self.epochs,
-            trial_epochs=self.trial_epochs,
-            **of_both,
-        ).fit(samples, y, groups)
+        network = GroupedNetwork(self.columns, **sizes, **of_both).fit(samples, y, groups)
         both = np.stack([svm.inner_probability_, network.inner_probability_])
         rows = np.flatnonzero(np.isfinite(both).all(axis=(0, 2)))
         if not len(rows):
             raise DataError("no window was held out by both the SVM and the network; add runs")
-        truth, run = np.searchsorted(self.classes_, y[rows]), groups[rows].astype(str)
-        weights = fit_weights(both[:, rows], truth)
-        crossed = _cross_joined(both[:, rows], truth, run, self.seed)
-        losses = np.stack([-log_of_truth(each, truth) for each in (*both[:, rows], crossed)])
+        held_out, truth = both[:, rows], np.searchsorted(self.classes_, y[rows])
+        run = groups[rows].astype(str)
+        crossed = _cross_joined(held_out, truth, run, self.seed)
+        losses = np.stack([-log_of_truth(each, truth) for each in (*held_out, crossed)])
         used = chosen_of(losses, run) if self.choose else "stack"
-        weights = {"svm": np.array([1.0, 0.0]), "cnn": np.array([0.0, 1.0]), "stack": weights}[used]
+        alone = {"svm": np.array([1.0, 0.0]), "cnn": np.array([0.0, 1.0])}
+        weights = alone[used] if used in alone else fit_weights(held_out, truth)
         self.best_ = StackChoice(used, *weights.tolist(), *losses.mean(axis=1).tolist())
         self.inner_probability_ = np.full(both.shape[1:], np.nan)
-        self.inner_probability_[rows] = joined(both[:, rows], weights)
+        self.inner_probability_[rows] = joined(held_out, weights)
         self.svm_ = svm if weights[0] > 0 else None
         self.network_ = network if weights[1] > 0 else None
         return self
@@ -132,23 +111,15 @@ class GroupedStack(GroupedClassifier):
         return X[:, : X.shape[1] - width], X[:, X.shape[1] - width :]
 
     def predict_proba(self, X: Array) -> Array:
-        """Return calibrated probabilities (n, k) in the order of ``classes_``."""
-        features, samples = self._parts(self._rows(X))
-        svm = None if self.svm_ is None else self.svm_.predict_proba(features)
-        network = None if self.network_ is None else self.network_.predict_proba(samples)
-        return joined_of(svm, network, np.array([self.best_.weight_svm, self.best_.weight_cnn]))
+        """Return calibrated probabilities (n, k) in the order of ``classes_``, of one alone unchanged."""
+        parts = zip((self.svm_, self.network_), self._parts(self._rows(X)), strict=True)
+        found = [each.predict_proba(part) for each, part in parts if each is not None]
+        weights = np.array([self.best_.weight_svm, self.best_.weight_cnn])
+        return joined(np.stack(found), weights) if len(found) == 2 else found[0]
 
 
 def fit_weights(probability: Array, class_index: Array) -> Array:
-    """Return the weights (2,) of log probabilities (2, n, k) under which the true classes are most likely.
-
-    Examples
-    --------
-    >>> good = np.array([[0.9, 0.1], [0.2, 0.8]] * 50)
-    >>> useless = np.full((100, 2), 0.5)
-    >>> fit_weights(np.stack([good, useless]), np.array([0, 1] * 50)).round(1)
-    array([1.3, 0.5])
-    """
+    """Return the weights (2,) of log probabilities (2, n, k) under which the true classes are most likely."""
     half = np.full(2, 0.5)
 
     def loss(weights: Array) -> float:
@@ -159,37 +130,14 @@ def fit_weights(probability: Array, class_index: Array) -> Array:
 
 
 def joined(probability: Array, weights: Array) -> Array:
-    """Return probabilities (n, k) from those of both (2, n, k).
-
-    Examples
-    --------
-    >>> joined(np.array([[[0.8, 0.2]], [[0.5, 0.5]]]), np.array([1.0, 1.0]))
-    array([[0.8, 0.2]])
-    """
-    logits = np.tensordot(weights, np.log(np.maximum(probability, np.finfo(float).tiny)), axes=1)
+    """Return probabilities (n, k) from those of both (2, n, k)."""
+    logits = np.tensordot(weights, np.log(np.maximum(probability, TINY)), axes=1)
     return np.asarray(np.exp(log_softmax(logits)))
-
-
-def joined_of(svm: Array | None, network: Array | None, weights: Array) -> Array:
-    """Return the probabilities of the one that is there, unchanged, or those of both joined.
-
-    Raises
-    ------
-    ValueError
-        if neither is there.
-    """
-    if svm is not None and network is not None:
-        return joined(np.stack([svm, network]), weights)
-    alone = network if svm is None else svm
-    if alone is None:
-        raise ValueError("a stack of neither")
-    return alone
 
 
 def log_of_truth(probability: Array, class_index: Array) -> Array:
     """Return the log probability (n,) of the true class."""
-    tiny = np.finfo(float).tiny
-    return np.asarray(np.log(np.maximum(probability[np.arange(len(class_index)), class_index], tiny)))
+    return np.asarray(np.log(np.maximum(probability[np.arange(len(class_index)), class_index], TINY)))
 
 
 def _cross_joined(probability: Array, class_index: Array, run: Array, seed: int) -> Array:
@@ -211,13 +159,6 @@ def chosen_of(losses: Array, run: Array) -> str:
 
     The SVM, the cheapest, unless another has a lower loss by :data:`MIN_STANDARD_ERRORS`, by differences
     paired by run.
-
-    Examples
-    --------
-    >>> run = np.array(list("aabbccdd"))
-    >>> losses = np.stack([np.full(8, 0.5), np.linspace(0.2, 0.9, 8), np.linspace(0.38, 0.42, 8)])
-    >>> chosen_of(losses, run), chosen_of(losses[[0, 1, 0]], run)
-    ('stack', 'svm')
     """
     _, of_run = np.unique(run, return_inverse=True)
     count = np.bincount(of_run)

@@ -21,7 +21,7 @@ import numpy as np
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.held_out import HeldOut
-from terrain.classify.metrics import run_bootstrap, runs_by_terrain
+from terrain.classify.metrics import NO_INTERVAL, Interval, run_bootstrap, runs_by_terrain
 from terrain.errors import DataError
 from terrain.records import Array
 
@@ -35,11 +35,9 @@ MAX_CLUSTERS = 6
 MIN_RUNS = 8
 """Fewer runs are not clustered: two clusters and their covariance have more numbers than these."""
 
-N_COMPONENTS = 5
-"""Principal components in which runs are clustered, at most; at most one for each four runs."""
-
-EXPLAINED_RATIO = 0.8
-"""So much of the variance the components have to explain; what is left is mostly noise of single features."""
+N_COMPONENTS, EXPLAINED_RATIO = 5, 0.8
+"""Principal components in which runs are clustered, at most, one for each four runs; so much of the variance they
+have to explain: what is left is mostly noise of single features."""
 
 N_STARTS = 10
 """Starts of the mixture model, of which the most likely result is kept."""
@@ -51,9 +49,6 @@ CLIP_STD = 5.0
 """Scaled values are clipped here, so that one run is not a cluster because of one feature."""
 
 N_BOOTSTRAP = 1000
-
-
-Interval = tuple[float, float]
 
 
 class StiffnessLevel(IntEnum):
@@ -68,12 +63,7 @@ class StiffnessLevel(IntEnum):
 
 
 def cost_matrix(levels: Sequence[int], within: float = WITHIN_LEVEL_COST) -> Array:
-    """Return the cost (k, k) of predicting the class of a column where that of the row is true.
-
-    Parameters
-    ----------
-    levels : :class:`StiffnessLevel` of each class
-    within : cost of a wrong class of the right level, 0 to 1
+    """Return the cost (k, k) of predicting the class of a column where that of the row is true, from their levels.
 
     Examples
     --------
@@ -91,12 +81,7 @@ def cost_matrix(levels: Sequence[int], within: float = WITHIN_LEVEL_COST) -> Arr
 
 
 def least_cost_class(probability: Array, cost: Array) -> Array:
-    """Return the column (n,) of least expected cost; of equal ones that of the highest probability.
-
-    Parameters
-    ----------
-    probability : (n, k) of each class
-    cost : (k, k) as :func:`cost_matrix` gives it
+    """Return the column (n,) of least expected cost (k, k); of equal ones that of the highest probability (n, k).
 
     Examples
     --------
@@ -124,8 +109,7 @@ def cluster_runs(
     ----------
     values : (n_runs, f) features of each run, as medians over its windows; NaN where not defined
     speed_mps : (n_runs,) typical speed of each run; NaN where unknown
-    seed : of the starts
-    n_clusters : fixed number; by the criterion where None
+    seed, n_clusters : of the starts; a fixed number, by the criterion where None
 
     Returns
     -------
@@ -136,13 +120,6 @@ def cluster_runs(
     ------
     DataError
         if there are fewer than :data:`MIN_RUNS` runs, or no value differs between them.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(0)
-    >>> values = np.repeat([[0.0] * 6, [4.0] * 6], 10, axis=0) + 0.3 * rng.normal(size=(20, 6))
-    >>> int(cluster_runs(values, np.full(20, 0.5), 0)[1].argmin()) + 1
-    2
     """
     from sklearn.decomposition import PCA
     from sklearn.mixture import GaussianMixture
@@ -155,83 +132,54 @@ def cluster_runs(
     if not scaled.size:
         raise DataError("no feature differs between the runs: they cannot be clustered")
     scaled = np.clip((scaled - scaled.mean(axis=0)) / scaled.std(axis=0), -CLIP_STD, CLIP_STD)
-    n_components = min(N_COMPONENTS, max(n_runs // 4, 1), scaled.shape[1])
-    pca = PCA(n_components, svd_solver="full")
-    reduced = pca.fit_transform(_without_speed(scaled, speed_mps))
+    pca = PCA(min(N_COMPONENTS, max(n_runs // 4, 1), scaled.shape[1]), svd_solver="full")
+    if (np.isfinite(speed_mps) & (speed_mps > 0)).all() and np.ptp(speed_mps) > 0:
+        line = np.column_stack([np.ones(n_runs), np.log(speed_mps)])
+        scaled = scaled - line @ np.linalg.lstsq(line, scaled, rcond=None)[0]
+    reduced = pca.fit_transform(scaled)
     explained = np.cumsum(pca.explained_variance_ratio_)
     reduced = reduced[:, : 1 + int(np.sum(explained < EXPLAINED_RATIO))]
     numbers = range(1, min(MAX_CLUSTERS, n_runs - 1) + 1) if n_clusters is None else (n_clusters,)
-    found = []
-    for number in numbers:
-        mixture = GaussianMixture(
-            number, covariance_type="tied", n_init=N_STARTS, reg_covar=MIN_VARIANCE, random_state=seed
-        ).fit(reduced)
-        found.append((float(mixture.bic(reduced)), np.asarray(mixture.predict(reduced))))
-    bic = np.array([each[0] for each in found])
-    best = int(bic.argmin())
-    return found[best][1], bic
-
-
-def _without_speed(scaled: Array, speed_mps: Array) -> Array:
-    """Return what a least-squares line over the logarithm of the speed leaves of each column."""
-    known = np.isfinite(speed_mps) & (speed_mps > 0)
-    if not known.all() or np.ptp(speed_mps) == 0:
-        return scaled
-    line = np.column_stack([np.ones(len(scaled)), np.log(speed_mps)])
-    rest: Array = scaled - line @ np.linalg.lstsq(line, scaled, rcond=None)[0]
-    return rest
+    settings = {
+        "covariance_type": "tied",
+        "n_init": N_STARTS,
+        "reg_covar": MIN_VARIANCE,
+        "random_state": seed,
+    }
+    mixtures = [GaussianMixture(number, **settings).fit(reduced) for number in numbers]
+    bic = np.array([float(mixture.bic(reduced)) for mixture in mixtures])
+    return np.asarray(mixtures[int(bic.argmin())].predict(reduced)), bic
 
 
 def agreement(one: Array, other: Array, rng: np.random.Generator) -> tuple[float, Interval]:
     """Return the adjusted Rand index of two groupings, 1 the same, 0 as by chance, and its 95 % interval over runs.
 
-    Source: Hubert and Arabie (1985).
-
-    A bootstrap over runs repeats runs, which always agree with themselves, so its index is taken over pairs
-    of *different* runs only.
-
-    Parameters
-    ----------
-    one, other : (n_runs,) groups, by any names
-    rng : source of the draws
-
-    Examples
-    --------
-    >>> groups = np.repeat(["soft", "hard"], 6)
-    >>> agreement(groups, np.repeat([1, 0], 6), np.random.default_rng(0))[0]
-    1.0
+    Source: Hubert and Arabie (1985).  A bootstrap over runs repeats runs, which always agree with themselves, so its
+    index is taken over pairs of *different* runs only.
     """
     first, second = (np.unique(each, return_inverse=True)[1] for each in (one, other))
     n = len(first)
-    same = first[:, None] == first[None, :], second[:, None] == second[None, :]
-    draws = np.empty(N_BOOTSTRAP)
-    for i, rows in enumerate(bootstrap_rows(n, N_BOOTSTRAP, rng)):
-        draws[i] = _adjusted_rand(np.bincount(rows, minlength=n).astype(float), *same)
-    finite = draws[np.isfinite(draws)]
-    interval = percentile_interval(finite) if len(finite) else (np.nan, np.nan)
-    return _adjusted_rand(np.ones(n), *same), interval
+    same_one, same_other = first[:, None] == first[None, :], second[:, None] == second[None, :]
 
+    def index(weight: Array) -> float:
+        pairs = np.outer(weight, weight)
+        np.fill_diagonal(pairs, 0.0)
+        total = pairs.sum()
+        in_one, in_other = (pairs * same_one).sum(), (pairs * same_other).sum()
+        both = (pairs * (same_one & same_other)).sum()
+        by_chance = in_one * in_other / total if total else 0.0
+        most = (in_one + in_other) / 2
+        return float((both - by_chance) / (most - by_chance)) if most > by_chance else float("nan")
 
-def _adjusted_rand(weight: Array, same_one: Array, same_other: Array) -> float:
-    """Return the index over pairs of different runs, each pair with the product of its weights."""
-    pairs = np.outer(weight, weight)
-    np.fill_diagonal(pairs, 0.0)
-    total = pairs.sum()
-    one, other = (pairs * same_one).sum(), (pairs * same_other).sum()
-    both = (pairs * (same_one & same_other)).sum()
-    by_chance = one * other / total if total else 0.0
-    most = (one + other) / 2
-    return float((both - by_chance) / (most - by_chance)) if most > by_chance else float("nan")
+    rows = bootstrap_rows(n, N_BOOTSTRAP, rng)
+    draws = np.array([index(np.bincount(each, minlength=n).astype(float)) for each in rows])
+    return index(np.ones(n)), percentile_interval(draws) if np.isfinite(draws).any() else NO_INTERVAL
 
 
 class LevelClusters(NamedTuple):
-    """Clusters of runs without labels, and how far they agree with the stiffness levels.
+    """Clusters of runs without labels, and how far they agree with the stiffness levels, and with the terrains.
 
-    Parameters
-    ----------
-    n_clusters : by the Bayesian information criterion
-    adjusted_rand, interval : agreement with the levels, 1 the same, 0 by chance; 95 % over runs
-    adjusted_rand_of_classes : the same with the terrains in place of their levels
+    Agreement is 1 where they are the same, 0 as by chance; the interval is of 95 % over runs.
     """
 
     n_clusters: int
@@ -281,8 +229,7 @@ def stiffness_figures(
 
     Parameters
     ----------
-    held_out : probabilities of windows that took no part in training, repeat by repeat
-    run_id : (n,) run of each window
+    held_out, run_id : of windows that took no part in training, repeat by repeat, and their runs (n,)
     known : level of terrains by name
     features, run_speed_mps : (n, f) of the windows and typical speed of each run, for the clusters
     seed : of the intervals and the clusters
@@ -295,10 +242,11 @@ def stiffness_figures(
     true = np.searchsorted(held_out.classes, terrain)
     most = held_out.probability.argmax(axis=2)
     least = np.stack([least_cost_class(each, cost) for each in held_out.probability])
+    runs = runs_by_terrain(run_id, terrain)
 
-    def over_runs(values: Array) -> tuple[float, tuple[float, float]]:
-        rng, runs = np.random.default_rng(seed), runs_by_terrain(run_id, terrain)
-        return float(values.mean()), run_bootstrap(values.mean(axis=0), runs, terrain, rng)
+    def over_runs(values: Array) -> tuple[float, Interval]:
+        interval = run_bootstrap(values.mean(axis=0), runs, terrain, np.random.default_rng(seed))
+        return float(values.mean()), interval
 
     apart = np.abs(levels[true][None, :] - levels[most]) == StiffnessLevel.HARD - StiffnessLevel.SOFT
     return StiffnessFigures(
@@ -328,10 +276,8 @@ def _level_clusters(
         return None
     agreed = []
     for of_window in groupings:
-        most = []
-        for run in runs:
-            names, counts = np.unique(of_window[run_id == run], return_counts=True)
-            most.append(str(names[counts.argmax()]))
-        agreed.append(agreement(cluster, np.array(most), np.random.default_rng(seed)))
+        groups = [np.unique(of_window[run_id == run], return_counts=True) for run in runs]
+        most = np.array([str(names[counts.argmax()]) for names, counts in groups])
+        agreed.append(agreement(cluster, most, np.random.default_rng(seed)))
     (by_level, interval), (by_class, _) = agreed
     return LevelClusters(int(bic.argmin()) + 1, by_level, interval, by_class)

@@ -88,11 +88,6 @@ class TerrainFilter(NamedTuple):
         n_classes = len(self.prior)
         return np.append(np.full(n_classes, (1.0 - self.unknown_ratio) / n_classes), self.unknown_ratio)
 
-    @property
-    def renewal_hz(self) -> float:
-        """Rate r at which a ground is drawn anew, so that a class holds for ``dwell_s`` on average."""
-        return 1.0 / (self.dwell_s * (1.0 - (1.0 - self.unknown_ratio) / len(self.prior)))
-
 
 class FilterBelief(NamedTuple):
     """Probability of each state (k + 1,), "unknown" last, and the time since the last output in s."""
@@ -108,12 +103,6 @@ def check_filter(settings: TerrainFilter) -> TerrainFilter:
     ------
     ConfigError
         if there are fewer than two classes, a share is not within 0 and 1, or a time is not above zero.
-
-    Examples
-    --------
-    >>> check_filter(TerrainFilter((0.5, 0.5), dwell_s=0.0))
-    Traceback (most recent call last):
-    terrain.errors.ConfigError: terrain filter: dwell_s is 0.0, a finite number above zero is required
     """
     if len(settings.prior) < 2:
         raise ConfigError(f"terrain filter: {len(settings.prior)} classes, at least 2 are required")
@@ -131,35 +120,16 @@ def check_filter(settings: TerrainFilter) -> TerrainFilter:
     return settings
 
 
-def initial_belief(settings: TerrainFilter) -> FilterBelief:
-    """Return the belief before any output: the shares of the grounds."""
-    return FilterBelief(settings.grounds)
-
-
 def filter_step(
     belief: FilterBelief, probability: Array, dt_s: float, settings: TerrainFilter, novelty: float = 0.0
 ) -> FilterBelief:
-    """Return the belief after a time, and one output of the classifier.
+    """Return the belief after a time, and one output of the classifier: probabilities (k,), NaN where there is none.
 
-    Parameters
-    ----------
-    belief : before
-    probability : (k,) class probabilities of the window that ends now; NaN where there is none
-    dt_s : time since the step before, not below zero
-    settings : of the filter
-    novelty : log-likelihood of "unknown" against that of all known grounds together
-
-    Examples
-    --------
-    >>> settings = TerrainFilter((0.5, 0.5))
-    >>> belief = initial_belief(settings)
-    >>> for _ in range(8):
-    ...     belief = filter_step(belief, np.array([0.9, 0.1]), 0.25, settings)
-    >>> belief.probability.round(2)
-    array([0.99, 0.  , 0.01])
+    ``novelty`` is the log-likelihood of "unknown" against that of all known grounds together.
     """
-    stays = math.exp(-settings.renewal_hz * dt_s)
-    now = stays * belief.probability + (1.0 - stays) * settings.grounds
+    grounds = settings.grounds
+    stays = math.exp(-dt_s / (settings.dwell_s * (1.0 - grounds[0])))
+    now = stays * belief.probability + (1.0 - stays) * grounds
     silent_s = belief.silent_s + dt_s
     if not np.isfinite(probability).all():
         return FilterBelief(now, silent_s)
@@ -179,7 +149,6 @@ def filter_run(
     ----------
     probability : (n, k) class probabilities; rows of NaN where the classifier refused a window
     time_s : (n,) end of each window, not decreasing
-    settings : of the filter
     novelty : (n,) log-likelihood of "unknown" against that of all known grounds together; 0 by default
 
     Raises
@@ -194,20 +163,17 @@ def filter_run(
     >>> float((reported(belief[24:], 0.5) == 1).argmax() / 4)  # s from the change to where it is reported
     0.75
     """
-    rows = np.asarray(probability, dtype=np.float64)
-    time_s = np.asarray(time_s, dtype=np.float64)
+    rows, time_s = np.asarray(probability, dtype=np.float64), np.asarray(time_s, dtype=np.float64)
     if rows.shape != (len(time_s), len(settings.prior)):
-        raise DataError(
-            f"class probabilities have the shape {rows.shape}, "
-            f"({len(time_s)}, {len(settings.prior)}) is needed"
-        )
+        needed = f"({len(time_s)}, {len(settings.prior)})"
+        raise DataError(f"class probabilities have the shape {rows.shape}, {needed} is needed")
     scores = np.zeros(len(rows)) if novelty is None else np.asarray(novelty, dtype=np.float64)
     if scores.shape != time_s.shape:
         raise DataError(f"{len(scores)} scores of novelty do not fit {len(time_s)} windows")
     dt_s = np.diff(time_s, prepend=time_s[:1])
     if not (dt_s >= 0.0).all():
         raise DataError("the windows of a run must be in order of time")
-    belief, out = initial_belief(settings), np.empty((len(rows), len(settings.prior) + 1))
+    belief, out = FilterBelief(settings.grounds), np.empty((len(rows), len(settings.prior) + 1))
     for i, (row, step_s, score) in enumerate(zip(rows, dt_s.tolist(), scores.tolist(), strict=True)):
         belief = filter_step(belief, row, step_s, settings, score)
         out[i] = belief.probability
@@ -215,27 +181,14 @@ def filter_run(
 
 
 def reported(belief: Array, threshold: float) -> Array:
-    """Return the class (n,) that is certain enough in each belief (n, k + 1); -1 for "unknown".
-
-    Examples
-    --------
-    >>> reported(np.array([[0.7, 0.2, 0.1], [0.4, 0.4, 0.2], [0.2, 0.2, 0.6]]), 0.5)
-    array([ 0, -1, -1])
-    """
+    """Return the class (n,) that is certain enough in each belief (n, k + 1); -1 for "unknown"."""
     best = belief[:, :-1].argmax(axis=1)
     certain = belief[np.arange(len(belief)), best] >= threshold
-    found: Array = np.where(certain, best, -1)
-    return found
+    return np.asarray(np.where(certain, best, -1))
 
 
 def novelty_evidence(novelty: Array, unknown: Array) -> Array:
-    """Return the log-likelihood (n,) of an unknown terrain against the learned ones; 0 without a score.
-
-    Examples
-    --------
-    >>> novelty_evidence(np.array([9.0, 1.0, np.nan]), np.array([True, False, False])).round(2).tolist()
-    [1.39, -0.17, 0.0]
-    """
+    """Return the log-likelihood (n,) of an unknown terrain against the learned ones; 0 without a score."""
     flagged = math.log(DETECTED_RATIO / KNOWN_FLAGGED_RATIO)
     passed = math.log((1.0 - DETECTED_RATIO) / (1.0 - KNOWN_FLAGGED_RATIO))
     return np.asarray(np.where(np.isnan(novelty) & ~unknown, 0.0, np.where(unknown, flagged, passed)))
@@ -243,10 +196,6 @@ def novelty_evidence(novelty: Array, unknown: Array) -> Array:
 
 class LiveTerrainFilter:
     """The filter from one output of the classifier to the next, as they come.
-
-    Parameters
-    ----------
-    settings : of the filter
 
     Examples
     --------
@@ -259,7 +208,7 @@ class LiveTerrainFilter:
 
     def __init__(self, settings: TerrainFilter) -> None:
         self.settings = settings
-        self._belief = initial_belief(settings)
+        self._belief = FilterBelief(settings.grounds)
         self._end_s = math.nan
 
     def take(

@@ -1,7 +1,7 @@
 r"""Slip from wheel speeds and motor currents alone, learned from runs whose slip was measured from outside.
 
 For each terrain of the training runs, currents and slip of the body are expected together, at the regime of
-motion, with one covariance of what is left (:mod:`terrain.classify.ground_response`).  A window's currents
+motion, with one covariance of what is left (:mod:`terrain.classify.response`).  A window's currents
 then say two things of its slip: which terrain expects them, by the classifier's probabilities
 :math:`p_c` (:mod:`terrain.classify.response`), and, on each, how far slip is from its expectation where the
 currents are,
@@ -27,8 +27,7 @@ from sklearn.base import BaseEstimator, RegressorMixin
 
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.classify.folds import split_runs
-from terrain.classify.ground_response import fit_ground, regimes
-from terrain.classify.response import GroupedResponse, ResponseColumns
+from terrain.classify.response import GroupedResponse, ResponseColumns, fit_ground, regimes
 from terrain.errors import DataError
 from terrain.identify import deal, folds
 from terrain.records import Array

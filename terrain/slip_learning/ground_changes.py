@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.classify.response_change import DetectorSettings, GroundChange, calibrate, changes_of
+from terrain.classify.changes import DetectorSettings, GroundChange, calibrate, changes_of
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
 from terrain.robots import Robot

@@ -21,8 +21,7 @@ from features.stream import WindowStream
 from features.windows import WindowRule, cut_windows, layout_of
 from pipelines.data.datasets import load_runs
 from pipelines.live.model import assess
-from terrain.classify.novelty import learn_novelty
-from terrain.classify.support import learn_support
+from terrain.classify.limits import learn_novelty, learn_support
 from terrain.records import RunLog, Stream
 
 N_COMPARED = 8  #: tsfel takes about a tenth of a second a window

@@ -26,9 +26,9 @@ from pipelines.report.settings import JobsSettings, setting
 from pipelines.report.tree import Column, Report, Table
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import Examples
-from terrain.classify.paired import Difference, Outcome, compare_outcomes
+from terrain.classify.limits import learn_support, support_of
+from terrain.classify.metrics import Difference, Outcome, compare_outcomes
 from terrain.classify.proposals import ACCEPTED, Proposal, questions
-from terrain.classify.support import learn_support, support_of
 from terrain.errors import DataError
 from terrain.records import Array
 

@@ -13,7 +13,7 @@ from features.recipes import feature_matrix, make_recipe
 from pipelines.learn.card import model_result
 from pipelines.learn.classifier import TerrainClassifier
 from pipelines.learn.crossval import cross_validate, crossval
-from terrain.classify.own import OwnClassifier
+from terrain.classify.grouped import OwnClassifier
 from terrain.errors import ConfigError, DataError, ModelError
 
 

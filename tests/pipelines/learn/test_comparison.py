@@ -8,8 +8,8 @@ import pytest
 from pipelines.learn.comparison import compare_models
 from pipelines.learn.crossval import crossval
 from pipelines.report.results import as_json
-from terrain.classify.paired import Verdict
-from terrain.classify.support import SupportLevel
+from terrain.classify.limits import SupportLevel
+from terrain.classify.metrics import Verdict
 from terrain.errors import DataError
 from terrain.logs.digest import data_digest
 

@@ -20,7 +20,7 @@ from pipelines.learn.settings import ProtocolName
 from pipelines.report.numbers import format_counts
 from pipelines.report.results import as_json
 from terrain.classify.held_out import Examples
-from terrain.classify.support import SupportLevel
+from terrain.classify.limits import SupportLevel
 from terrain.errors import ConfigError
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
@@ -178,7 +178,7 @@ def test_sequences_are_judged_beside_single_windows(with_extras, runs_at_speeds,
 def test_speed_alone_is_right_just_where_terrains_were_driven_at_speeds_of_their_own(
     drive, settings, monkeypatch
 ):
-    monkeypatch.setattr("terrain.classify.learning_curve.CURVE_RUNS", ())
+    monkeypatch.setattr("terrain.classify.held_out.CURVE_RUNS", ())
     accuracy = []
     for own_speeds in (True, False):
         runs = [

@@ -151,8 +151,8 @@ def changed(document, **info):
     [
         (lambda it: "{", "is damaged"),
         (lambda it: "[]", "is damaged"),
-        (lambda it: json.dumps({"version": 5, "info": it["info"]}), r"is damaged \(files: Field required\)"),
-        (lambda it: json.dumps(it | {"version": 99}), "has version 99; version 5 is read here"),
+        (lambda it: json.dumps({"version": 6, "info": it["info"]}), r"is damaged \(files: Field required\)"),
+        (lambda it: json.dumps(it | {"version": 99}), "has version 99; version 6 is read here"),
         (lambda it: json.dumps(it | {"version": ["x"] * 10**5}), "has version"),
         (lambda it: json.dumps(it | {"files": {}}), "its list of files is not that of a model"),
         (lambda it: json.dumps(it | {"files": {**it["files"], "../x": "a"}}), "its list of files is not"),

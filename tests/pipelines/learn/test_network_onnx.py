@@ -12,7 +12,7 @@ from skops import io
 
 from features.recipes import feature_matrix, make_recipe
 from pipelines.learn.model_file import MODEL_FILE, ONNX_FILE, TRUSTED_TYPES, read_model, seal, write_model
-from terrain.classify.network_onnx import require_onnx, time_of_onnx
+from terrain.classify.network import require_onnx, time_of_onnx
 from terrain.errors import ConfigError, ModelError
 
 

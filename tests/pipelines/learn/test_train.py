@@ -20,7 +20,7 @@ from pipelines.learn.model_file import CARD_FILE, TRAINING_FILE, read_model, sea
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.train import Settings, run
 from pipelines.report.results import as_json
-from terrain.classify.importance import ChannelDrops
+from terrain.classify.held_out import ChannelDrops
 from terrain.errors import ConfigError, ModelError, TerrainError
 from terrain.logs.write import write_run
 

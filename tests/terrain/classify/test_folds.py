@@ -74,23 +74,6 @@ def test_different_seeds_give_different_folds_though_runs_are_of_unequal_length(
     )
 
 
-def test_folds_are_of_similar_size():
-    y, groups = draw_runs({"ice": 10, "snow": 15, "sand": 12}, np.random.default_rng(1))
-    sizes = [
-        np.bincount(fold_numbers(y, groups, 5, np.random.default_rng(seed)), minlength=5)
-        for seed in range(20)
-    ]
-    assert np.max(sizes) < 1.7 * len(y) / 5
-    assert np.min(sizes) > 0.4 * len(y) / 5
-
-
-def test_classes_and_runs_may_be_numbers():
-    y, groups = np.repeat([3, 3, 8], 6), np.repeat([0, 1, 2], 6)
-    assert single_run_classes(y, groups) == [8]
-    for train, test in split_runs(y, groups, 2, np.random.default_rng(0)):
-        assert set(y[train]) == set(y[test]) == {3, 8}
-
-
 def test_too_few_classes_or_runs_for_folds_are_refused():
     rng = np.random.default_rng(0)
     with pytest.raises(DataError, match="all windows are 'ice': a classifier needs at least two classes"):

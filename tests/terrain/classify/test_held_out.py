@@ -1,69 +1,122 @@
-"""Figures of hand-made predictions."""
-
-from types import SimpleNamespace
+"""Folds beside those of a protocol: fewer runs, a terrain left out, slow against fast; and which runs train in them."""
 
 import numpy as np
 import pytest
 
-from terrain.classify.folds import Fold
-from terrain.classify.held_out import FoldResult, HeldOut, held_out_figures
-from terrain.records import Windows
-
-NONE = np.empty(0, dtype=int)
-
-
-def figures(run_ids, start_s, y, answers, folds):
-    """Return figures of windows of 1 s, of which ``answers`` (repeats, n) are predicted, at 0.8."""
-    windows = Windows(
-        {}, {}, {}, 1.0, np.asarray(start_s, float), np.array(run_ids, dtype=object), np.array(y)
-    )
-    results = []
-    for fold in folds:
-        predicted = np.asarray(answers)[fold.repeat][fold.test]
-        results.append(
-            FoldResult(fold, np.where(predicted[:, None] == np.array(["ice", "mud"]), 0.8, 0.2), {})
-        )
-    held_out = HeldOut.of_folds(results, np.array(y))
-    return SimpleNamespace(**held_out_figures(held_out, windows, windows.run_id, 0))
-
-
-def test_figures_of_hand_made_predictions():
-    y = ["ice"] * 4 + ["mud"] * 4
-    runs, start_s = ["a", "a", "b", "b", "c", "c", "d", "d"], [0, 1] * 4
-    answers = [
-        ["ice", "ice", "ice", "mud", "mud", "mud", "mud", "mud"],  # 7 of 8
-        ["ice", "ice", "mud", "mud", "mud", "mud", "ice", "mud"],  # 5 of 8
-    ]
-    folds = [Fold(r, k, NONE, np.arange(8)[k * 4 : k * 4 + 4]) for r in range(2) for k in range(2)]
-    found = figures(runs, start_s, y, answers, folds)
-    assert found.accuracy_per_repeat == (7 / 8, 5 / 8)
-    assert found.accuracy == 0.75
-    assert found.accuracy_spread == pytest.approx(np.std([7 / 8, 5 / 8], ddof=1))
-    assert (found.n_windows, found.n_runs, found.repeats) == (8, 4, 2)
-    assert found.confusion == ((5, 3), (1, 7))
-    assert found.per_class["ice"].recall == 5 / 8
-    assert [fold.accuracy for fold in found.folds] == [0.75, 1.0, 0.5, 0.75]
-    # All are equally confident: 0.8 stated, 7/8 and 5/8 right; every window its own bin of mass one.
-    assert found.ece == pytest.approx(np.mean([(7 * 0.2 + 1 * 0.8) / 8, (5 * 0.2 + 3 * 0.8) / 8]))
-    # Votes are of one or two windows of equal weight: only 'd' could be outvoted, in the second repeat.
-    per_run = {row.run_id: row for row in found.per_run}
-    assert (per_run["b"].accuracy, per_run["b"].mistaken_for) == (0.25, "mud")
-    low, high = found.accuracy_ci
-    assert 0.25 <= low < found.accuracy < high <= 1.0
-    assert figures(runs, start_s, y, answers[:1], folds[:2]).accuracy_spread is None
-
-
-@pytest.mark.parametrize(
-    ("runs", "first", "answers", "accuracy", "size"),
-    [
-        # run x1 in fold 12 and run x11 in fold 2: both would be x112 if names and numbers were just joined
-        (["x1"] * 3 + ["x11"] * 3, 3, ["ice"] * 3 + ["mud"] * 3, 1.0, 2.0),
-        # blocks of one run: a vote would otherwise reach into the block that another fold tested
-        (["a"] * 6 + ["b"], 3, ["mud"] * 3 + ["ice"] * 3 + ["mud"], 4 / 7, 13 / 7),
-    ],
+from terrain.classify.folds import Fold, split_runs
+from terrain.classify.held_out import (
+    CURVE_DRAWS,
+    Applicability,
+    drawn_folds,
+    left_out_folds,
+    run_speeds,
+    slow_fast_split,
 )
-def test_votes_stay_within_a_run_and_a_fold(runs, first, answers, accuracy, size):
-    y = ["ice"] * 3 + ["mud"] * 3 if "x1" in runs else ["ice"] * 6 + ["mud"]
-    folds = [Fold(0, 12, NONE, np.arange(first)), Fold(0, 2, NONE, np.arange(first, len(y)))]
-    found = figures(runs, range(len(y)), y, [answers], folds)
-    assert (found.vote_accuracy, found.vote_windows) == (accuracy, pytest.approx(size))
+from terrain.errors import DataError
+
+
+def test_the_curve_draws_that_many_runs_and_leaves_test_folds_alone():
+    names = [f"{terrain}_{i}" for terrain, n in (("ICE", 5), ("MUD", 5), ("TAR", 1)) for i in range(n)]
+    run_id = np.repeat(names, 10)
+    terrain = np.array([name[:3] for name in run_id])
+    rng = np.random.default_rng(0)
+    folds = [Fold(0, i, *rows) for i, rows in enumerate(split_runs(terrain, run_id, 5, rng))]
+    drawn_folds_, runs_per_class = drawn_folds(terrain, run_id, folds, 0)
+    assert len(drawn_folds_) == 3 * CURVE_DRAWS * len(folds)  # 1, 2 and 3 of the 4 training runs of each fold
+    for drawn in drawn_folds_:
+        original = folds[drawn.number]
+        assert np.array_equal(drawn.test, original.test)
+        size = 1 + drawn.repeat // CURVE_DRAWS
+        for name, n_runs in (("ICE", size), ("MUD", size), ("TAR", 1)):
+            assert len(set(run_id[drawn.train][terrain[drawn.train] == name])) == n_runs
+        whole = original.train[np.isin(run_id[original.train], run_id[drawn.train])]
+        np.testing.assert_array_equal(drawn.train, whole)  # a run that is drawn is drawn whole
+    draws = [
+        {tuple(fold.train) for fold in drawn_folds_ if fold.repeat == draw} for draw in range(CURVE_DRAWS)
+    ]
+    assert draws[0] != draws[1]
+    assert runs_per_class == pytest.approx([1.0, (2 + 2 + 1) / 3, (3 + 3 + 1) / 3, (4 + 4 + 1) / 3])
+
+
+RUN_ID = np.repeat([f"{name}_{i}" for name in ("ice", "mud", "tar") for i in range(4)], 6)
+
+
+TERRAIN = np.array([run[:3] for run in RUN_ID])
+
+
+def test_no_run_of_the_left_out_terrain_and_no_tested_run_trains():
+    folds = left_out_folds(TERRAIN, RUN_ID, 5, 1, 0)
+    assert len(folds) == 15
+    for train, test, unknown in folds:
+        (left_out,) = set(TERRAIN[unknown])
+        assert np.array_equal(unknown, np.flatnonzero(left_out == TERRAIN))
+        assert len(set(TERRAIN[train])) == 2
+        assert left_out not in {*TERRAIN[train], *TERRAIN[test]}
+        assert not set(RUN_ID[train]) & set(RUN_ID[test])
+        assert len(test)
+
+
+def test_two_terrains_and_few_runs_are_refused():
+    two = TERRAIN != "tar"
+    with pytest.raises(DataError, match=r"2 terrains \(ice, mud\).*at least 3"):
+        left_out_folds(TERRAIN[two], RUN_ID[two], 5, 1, 0)
+    few = two & np.isin(RUN_ID, ["ice_0", "ice_1", "mud_0", "mud_1"]) | ~two
+    with pytest.raises(DataError, match=r"4 runs without tar are fewer than 5 folds"):
+        left_out_folds(TERRAIN[few], RUN_ID[few], 5, 1, 0)
+
+
+PLAN = {
+    "ASPHALT": (0.3, 0.4, 0.7, 0.8),
+    "GRASS": (0.9, 0.5, 1.0, 0.6),
+    "GRAVEL": (0.1, 0.2, 0.3, 0.4, 0.5),
+}
+
+
+def windows_of(plan, duration_s=32.0, stride_s=2.0):
+    """Return wheel speeds, run, terrain and start of windows of 2 s, one run ``TERRAIN_i`` a speed."""
+    rng, rows = np.random.default_rng(0), []
+    for terrain, speeds in plan.items():
+        for i, speed in enumerate(speeds):
+            for start_s in np.arange(0.0, duration_s - 1.9, stride_s):
+                rows.append((speed + 0.005 * rng.normal(size=20), f"{terrain}_{i}", terrain, start_s))
+    return [np.array(column) for column in zip(*rows, strict=True)]
+
+
+def test_the_speed_of_a_run_is_that_where_it_moves():
+    fastest = np.vstack(
+        [np.full((6, 20), 0.01), np.full((4, 20), 0.6), np.zeros((3, 20)), np.full((1, 20), np.nan)]
+    )
+    speeds = run_speeds(fastest, np.repeat(["creeps", "rests", "unknown"], [10, 3, 1]))
+    assert speeds.pop("creeps") == 0.6
+    assert np.isnan(list(speeds.values())).all()
+
+
+def test_each_class_is_split_at_its_own_median_speed():
+    fastest, run_id, terrain, start_s = windows_of(PLAN)
+    side, split = slow_fast_split(fastest, run_id, terrain, start_s, 2.0)
+    assert (split.left_out, split.status) == ({}, Applicability.APPLICABLE)
+    slow, fast = (set(run_id[side == name].tolist()) for name in ("slow", "fast"))
+    assert slow == {"ASPHALT_0", "ASPHALT_1", "GRASS_1", "GRASS_3", "GRAVEL_0", "GRAVEL_1", "GRAVEL_2"}
+    assert fast == {"ASPHALT_2", "ASPHALT_3", "GRASS_0", "GRASS_2", "GRAVEL_3", "GRAVEL_4"}
+    assert split.classes["GRASS"] == pytest.approx((0.55, 0.95), abs=0.02)
+
+
+def test_a_class_with_too_little_on_a_side_is_left_out_and_named():
+    three = PLAN | {"GRAVEL": (0.3, 0.4, 0.8)}
+    fastest, run_id, terrain, start_s = windows_of(three)
+    side, split = slow_fast_split(fastest, run_id, terrain, start_s, 2.0)
+    assert split.left_out == {"GRAVEL": "fast runs: 1"}
+    assert split.status is Applicability.NOT_APPLICABLE  # three classes are needed
+    assert set(side[terrain == "GRAVEL"]) == {""}
+    for stride_s in (2.0, 0.5):  # windows that overlap cover no more, though they are more
+        _, split = slow_fast_split(*windows_of(PLAN, 28.0, stride_s), 2.0)
+        assert split.left_out["ASPHALT"] == "slow runs: 56 s"
+
+
+def test_a_run_slow_on_one_class_and_fast_on_another_is_on_no_side():
+    """Its windows would otherwise train and test at once."""
+    fastest, run_id, terrain, start_s = windows_of(PLAN)
+    run_id = np.where(np.isin(run_id, ["GRASS_1", "GRAVEL_4"]), "mixed", run_id)
+    side, _ = slow_fast_split(fastest, run_id, terrain, start_s, 2.0)
+    assert set(side[run_id == "mixed"]) == {""}
+    assert not set(run_id[side == "slow"]) & set(run_id[side == "fast"])

@@ -1,43 +1,58 @@
+"""Figures of held-out windows: two routes to each, laws, and intervals that hold the truth."""
+
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from sklearn.metrics import accuracy_score, balanced_accuracy_score, f1_score
+from sklearn.metrics import balanced_accuracy_score, f1_score, precision_score, roc_auc_score
 
+from terrain.classify import metrics
+from terrain.classify.folds import Fold
+from terrain.classify.held_out import FoldResult, HeldOut, Scored
 from terrain.classify.metrics import (
+    CALIBRATION_BINS,
+    STRIDE_S,
     ClassFigures,
-    RunFigures,
+    Outcome,
+    Verdict,
+    accuracy_at_coverage,
+    calibration_error,
     class_figures,
-    per_run_figures,
+    compare_outcomes,
+    confidence_auc,
+    confidence_figures,
+    enough_runs,
+    held_out_figures,
+    last_class,
+    learning_curve,
+    reliability_bins,
     run_bootstrap,
+    sequence_figures,
+    track_of,
     vote,
 )
+from terrain.errors import DataError
+from terrain.records import Label, Windows
+
+NONE = np.empty(0, dtype=int)
 
 
-def test_class_figures_agree_with_counting_by_hand_and_with_scikit_learn():
+def test_class_figures_agree_with_scikit_learn_and_a_class_without_windows_does_not_count():
     rng = np.random.default_rng(0)
     classes = np.array(["ice", "mud", "sand", "snow"])
     y = rng.choice(classes, 500, p=[0.5, 0.3, 0.15, 0.05])
     predicted = np.where(rng.random(500) < 0.6, y, rng.choice(classes, 500))
     figures = class_figures(y, predicted, classes)
-    confusion = np.array([[np.sum((y == t) & (predicted == p)) for p in classes] for t in classes])
-    np.testing.assert_array_equal(figures.confusion, confusion)
-    hits = np.diag(confusion)
-    recall, precision = hits / confusion.sum(axis=1), hits / confusion.sum(axis=0)
-    f1 = 2 * recall * precision / (recall + precision)
-    for i, name in enumerate(classes):
-        row = figures.per_class[name]
-        assert row.n_windows == np.sum(y == name)
-        assert (row.recall, row.precision, row.f1) == pytest.approx((recall[i], precision[i], f1[i]))
-    assert figures.accuracy == pytest.approx(accuracy_score(y, predicted))
-    assert figures.balanced_accuracy == pytest.approx(balanced_accuracy_score(y, predicted))
-    assert figures.macro_f1 == pytest.approx(f1_score(y, predicted, average="macro"))
-
-
-def test_a_class_without_windows_does_not_count_against_the_means():
+    counted = [[np.sum((y == t) & (predicted == p)) for p in classes] for t in classes]
+    np.testing.assert_array_equal(figures["confusion"], counted)
+    precision = precision_score(y, predicted, average=None)
+    assert [row.precision for row in figures["per_class"].values()] == pytest.approx(precision.tolist())
+    assert figures["balanced_accuracy"] == pytest.approx(balanced_accuracy_score(y, predicted))
+    assert figures["macro_f1"] == pytest.approx(f1_score(y, predicted, average="macro"))
     y = np.array(["ice", "ice", "mud", "mud"])
-    figures = class_figures(y, np.array(["ice", "snow", "mud", "mud"]), np.array(["ice", "mud", "snow"]))
-    assert figures.balanced_accuracy == pytest.approx((0.5 + 1.0) / 2)
-    assert figures.macro_f1 == pytest.approx((2 / 3 + 1.0) / 2)
-    assert figures.per_class["snow"] == ClassFigures(0.0, 0.0, 0.0, 0)
+    few = class_figures(y, np.array(["ice", "snow", "mud", "mud"]), np.array(["ice", "mud", "snow"]))
+    assert few["balanced_accuracy"] == pytest.approx((0.5 + 1.0) / 2)
+    assert few["per_class"]["snow"] == ClassFigures(0.0, 0.0, 0.0, 0)
 
 
 def ballots(*votes):
@@ -50,16 +65,17 @@ def ballots(*votes):
 
 def test_a_vote_counts_the_windows_of_the_last_five_seconds():
     votes = [("a", 0.9), ("b", 0.5), ("b", 0.5), ("b", 0.5), ("a", 0.9), ("a", 0.9), ("a", 0.9)]
-    voted = vote(ballots(*votes), np.zeros(7), np.arange(7.0), 1.0)
+    voted, sizes = vote(ballots(*votes), np.zeros(7), np.arange(7.0), 1.0)
     # At the end of window 4 the last 5 s hold a b b b a; of window 5: b b b a a; of window 6: b b a a a.
     assert "".join("abc"[i] for i in voted) == "aabbbba"
+    assert sizes.tolist() == [1, 2, 3, 4, 5, 5, 5]
     # Windows of 2 s: only two lie wholly within 5 s; of one each the more probable wins, in either order.
     pairs = [("a", 0.9), ("b", 0.5), ("a", 0.6), ("c", 0.8)]
-    assert vote(ballots(*pairs), np.zeros(4), 2.0 * np.arange(4), 2.0).tolist() == [0, 0, 0, 2]
+    assert vote(ballots(*pairs), np.zeros(4), 2.0 * np.arange(4), 2.0)[0].tolist() == [0, 0, 0, 2]
     # A pause of the log does not stretch the five seconds, and a window longer than that votes alone.
     late = np.array([0.0, 1.0, 2.0, 30.0])
-    assert vote(ballots(("a", 0.9), ("a", 0.9), ("a", 0.9), ("b", 0.5)), np.zeros(4), late, 1.0)[-1] == 1
-    assert vote(ballots(*votes), np.zeros(7), np.arange(7.0), 6.0).tolist() == [0, 1, 1, 1, 0, 0, 0]
+    assert vote(ballots(("a", 0.9), ("a", 0.9), ("a", 0.9), ("b", 0.5)), np.zeros(4), late, 1.0)[0][-1] == 1
+    assert vote(ballots(*votes), np.zeros(7), np.arange(7.0), 6.0)[0].tolist() == [0, 1, 1, 1, 0, 0, 0]
 
 
 def test_votes_agree_with_a_slow_count_and_never_cross_segments():
@@ -68,7 +84,7 @@ def test_votes_agree_with_a_slow_count_and_never_cross_segments():
     probability = rng.dirichlet(np.ones(4), n)
     segment = rng.choice(["x", "y", "z"], n)
     start_s = np.round(rng.uniform(0, 60, n), 1)
-    voted = vote(probability, segment, start_s, length_s)
+    voted, _ = vote(probability, segment, start_s, length_s)
     for row in range(n):
         back = start_s[row] + length_s - 5.0
         voters = (segment == segment[row]) & (start_s >= back - 1e-9) & (start_s <= start_s[row])
@@ -79,7 +95,8 @@ def test_votes_agree_with_a_slow_count_and_never_cross_segments():
         best = np.flatnonzero(count == count.max())
         assert voted[row] == best[probability[voters].sum(axis=0)[best].argmax()]
     alone = [
-        vote(probability[segment == s], segment[segment == s], start_s[segment == s], length_s) for s in "xyz"
+        vote(probability[segment == s], segment[segment == s], start_s[segment == s], length_s)[0]
+        for s in "xyz"
     ]
     for name, expected in zip("xyz", alone, strict=True):
         np.testing.assert_array_equal(voted[segment == name], expected)
@@ -105,30 +122,280 @@ def test_the_interval_covers_the_truth_where_a_binomial_one_does_not():
     assert np.mean(naive) < 0.75
 
 
-def test_the_interval_is_that_of_independent_windows_when_they_are():
-    rng = np.random.default_rng(4)
-    hits = (rng.random(2000) < 0.8).astype(float)
-    run_id = np.repeat(np.arange(100), 20).astype(str)
-    low, high = run_bootstrap(hits, run_id, np.where(np.arange(2000) < 1000, "ice", "mud"), rng)
-    assert high - low == pytest.approx(2 * 1.96 * np.sqrt(0.16 / 2000), rel=0.25)
-    assert low < hits.mean() < high
+def figures(run_ids, start_s, y, answers, folds):
+    """Return figures of windows of 1 s, of which ``answers`` (repeats, n) are predicted, at 0.8."""
+    windows = Windows(
+        {}, {}, {}, 1.0, np.asarray(start_s, float), np.array(run_ids, dtype=object), np.array(y)
+    )
+    results = []
+    for fold in folds:
+        predicted = np.asarray(answers)[fold.repeat][fold.test]
+        results.append(
+            FoldResult(fold, np.where(predicted[:, None] == np.array(["ice", "mud"]), 0.8, 0.2), {})
+        )
+    held_out = HeldOut.of_folds(results, np.array(y))
+    return SimpleNamespace(**held_out_figures(held_out, windows, windows.run_id, 0))
 
 
-def test_the_interval_repeats_with_its_seed_and_ignores_the_order_of_windows():
-    hits, run_id, terrain = hierarchical(np.random.default_rng(5))
-    first = run_bootstrap(hits, run_id, terrain, np.random.default_rng(7))
-    shuffled = np.random.default_rng(0).permutation(len(hits))
-    again = run_bootstrap(hits[shuffled], run_id[shuffled], terrain[shuffled], np.random.default_rng(7))
-    assert again == pytest.approx(first, abs=1e-12)
-    assert run_bootstrap(hits, run_id, terrain, np.random.default_rng(8)) != first
-    alone = np.array(["only"] * 5)
-    assert run_bootstrap(np.array([1, 1, 0, 1, 0]), alone, alone, np.random.default_rng(0)) == (0.6, 0.6)
+def test_figures_of_hand_made_predictions():
+    y = ["ice"] * 4 + ["mud"] * 4
+    runs, start_s = ["a", "a", "b", "b", "c", "c", "d", "d"], [0, 1] * 4
+    answers = [
+        ["ice", "ice", "ice", "mud", "mud", "mud", "mud", "mud"],  # 7 of 8
+        ["ice", "ice", "mud", "mud", "mud", "mud", "ice", "mud"],  # 5 of 8
+    ]
+    folds = [Fold(r, k, NONE, np.arange(8)[k * 4 : k * 4 + 4]) for r in range(2) for k in range(2)]
+    found = figures(runs, start_s, y, answers, folds)
+    assert found.accuracy_per_repeat == (7 / 8, 5 / 8)
+    assert found.accuracy == 0.75
+    assert found.accuracy_spread == pytest.approx(np.std([7 / 8, 5 / 8], ddof=1))
+    assert (found.n_windows, found.n_runs, found.repeats) == (8, 4, 2)
+    assert found.confusion == ((5, 3), (1, 7))
+    assert found.per_class["ice"].recall == 5 / 8
+    assert [fold.accuracy for fold in found.folds] == [0.75, 1.0, 0.5, 0.75]
+    # All are equally confident: 0.8 stated, 7/8 and 5/8 right; every window its own bin of mass one.
+    assert found.ece == pytest.approx(np.mean([(7 * 0.2 + 1 * 0.8) / 8, (5 * 0.2 + 3 * 0.8) / 8]))
+    # Votes are of one or two windows of equal weight: only 'd' could be outvoted, in the second repeat.
+    per_run = {row.run_id: row for row in found.per_run}
+    assert (per_run["b"].accuracy, per_run["b"].mistaken_for) == (0.25, "mud")
+    low, high = found.accuracy_ci
+    assert 0.25 <= low < found.accuracy < high <= 1.0
+    assert figures(runs, start_s, y, answers[:1], folds[:2]).accuracy_spread is None
 
 
-def test_figures_of_a_run_are_means_over_repeats_and_name_the_usual_mistake():
-    run_id, terrain = np.array(["r1"] * 4 + ["r2"] * 2), np.array(["ice"] * 4 + ["mud"] * 2)
-    predicted = np.array(["ice", "mud", "mud", "snow", "mud", "mud"])
-    correct = np.array([predicted == terrain, np.ones(6, dtype=bool)])
-    first, second = per_run_figures(correct, predicted, correct[:1], run_id, terrain)
-    assert first == RunFigures("r1", "ice", 4, 0.625, 0.25, "mud")
-    assert (second.accuracy, second.mistaken_for) == (1.0, None)
+@pytest.mark.parametrize(
+    ("runs", "first", "answers", "accuracy", "size"),
+    [
+        # run x1 in fold 12 and run x11 in fold 2: both would be x112 if names and numbers were just joined
+        (["x1"] * 3 + ["x11"] * 3, 3, ["ice"] * 3 + ["mud"] * 3, 1.0, 2.0),
+        # blocks of one run: a vote would otherwise reach into the block that another fold tested
+        (["a"] * 6 + ["b"], 3, ["mud"] * 3 + ["ice"] * 3 + ["mud"], 4 / 7, 13 / 7),
+    ],
+)
+def test_votes_stay_within_a_run_and_a_fold(runs, first, answers, accuracy, size):
+    y = ["ice"] * 3 + ["mud"] * 3 if "x1" in runs else ["ice"] * 6 + ["mud"]
+    folds = [Fold(0, 12, NONE, np.arange(first)), Fold(0, 2, NONE, np.arange(first, len(y)))]
+    found = figures(runs, range(len(y)), y, [answers], folds)
+    assert (found.vote_accuracy, found.vote_windows) == (accuracy, pytest.approx(size))
+
+
+def once(n):
+    return np.ones((1, n))
+
+
+def ece(confidence, right, n_bins=CALIBRATION_BINS):
+    return calibration_error(confidence, right.astype(float), once(len(right)), n_bins)[0]
+
+
+def test_calibration_bins_are_of_equal_mass_whatever_the_order():
+    rng = np.random.default_rng(1)
+    confidence = rng.beta(8, 1, 1003)  # crowded near 1: bins of equal width would be empty
+    right = rng.random(1003) < confidence**2
+    table = reliability_bins(confidence[None], right[None], once(1003), CALIBRATION_BINS)
+    counts = [row.n_windows for row in table]
+    assert len(table) == CALIBRATION_BINS
+    assert sum(counts) == 1003
+    assert max(counts) - min(counts) <= 1
+    assert np.all(np.diff([row.confidence for row in table]) > 0)
+    expected = (
+        sum(n * abs(row.accuracy - row.confidence) for n, row in zip(counts, table, strict=True)) / 1003
+    )
+    assert ece(confidence, right) == pytest.approx(expected)
+    shuffled = rng.permutation(1003)
+    assert ece(confidence[shuffled], right[shuffled]) == pytest.approx(expected)
+    few = reliability_bins(confidence[None, :4], right[None, :4], once(4), CALIBRATION_BINS)
+    assert [row.n_windows for row in few] == [1] * 4
+
+
+def test_the_area_is_that_of_scikit_learn_with_ties_and_with_weights():
+    rng = np.random.default_rng(2)
+    confidence = rng.integers(5, 11, 300) / 10  # many ties
+    right = rng.random(300) < confidence
+    drawn = rng.integers(0, 4, (6, 300)).astype(float)
+    found = confidence_auc(confidence, right.astype(float), drawn)
+    expected = [roc_auc_score(right, confidence, sample_weight=weights) for weights in drawn]
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert np.isnan(confidence_auc(confidence, np.ones(300), drawn)).all()
+
+
+def test_a_weight_is_as_good_as_a_copy():
+    rng = np.random.default_rng(3)
+    confidence, right = rng.random(200), rng.integers(0, 2, 200).astype(float)
+    copies = rng.integers(0, 4, 200)
+    rows = np.repeat(np.arange(200), copies)
+    for coverage in (0.3, 0.8, 1.0):
+        weighted = accuracy_at_coverage(confidence, right, copies[None].astype(float), coverage)[0]
+        copied = accuracy_at_coverage(confidence[rows], right[rows], once(len(rows)), coverage)[0]
+        assert weighted == pytest.approx(copied)
+    assert accuracy_at_coverage(confidence, right, once(200), 1.0)[0] == pytest.approx(right.mean())
+
+
+def test_where_all_are_right_the_area_is_not_known():
+    runs = np.arange(40) // 10
+    found = confidence_figures(
+        np.full((2, 40), 0.9), np.ones((2, 40), dtype=bool), runs, np.zeros(40), np.random.default_rng(0)
+    )
+    assert np.isnan(found["confidence_auc"])
+    assert np.isnan(found["confidence_auc_ci"]).all()
+    assert found["accuracy_at_coverage"][0].accuracy == 1.0
+    assert found["ece"] == pytest.approx(0.1)
+
+
+def outcomes(gain, seed, n_runs=24, n_windows=25, run_std=0.2):
+    """Return two outcomes on runs of unequal difficulty; b is right more often by ``gain``."""
+    rng = np.random.default_rng(seed)
+    difficulty = np.clip(0.65 + run_std * rng.standard_normal(n_runs), 0.1, 0.9).repeat(n_windows)
+    run = np.arange(n_runs).repeat(n_windows).astype(str)
+    terrain = np.where(np.arange(n_runs).repeat(n_windows) % 2, "ice", "mud")
+
+    def outcome(accuracy):
+        confidence = rng.uniform(0.5, 1.0, (1, len(run)))
+        return Outcome(run, terrain, rng.random((1, len(run))) < accuracy, confidence)
+
+    return outcome(difficulty), outcome(difficulty + gain)
+
+
+@pytest.mark.slow
+def test_intervals_hold_the_hidden_difference_and_are_narrower_than_unpaired_ones():
+    held, widths, found_better = 0, [], 0
+    for seed in range(30):
+        a, b = outcomes(0.08, seed)
+        row = compare_outcomes(a, b, np.random.default_rng(seed)).accuracy
+        held += row.interval[0] <= 0.08 <= row.interval[1]
+        found_better += row.verdict is Verdict.BETTER
+        widths.append(row.interval[1] - row.interval[0])
+    assert held >= 25
+    assert found_better >= 20
+    unpaired = 2 * 1.96 * np.sqrt(2 * 0.2**2 / 24)
+    assert np.mean(widths) < 0.7 * unpaired
+
+
+def test_a_classifier_does_not_differ_from_itself_and_the_sign_follows_the_order():
+    a, b = outcomes(0.1, 0)
+    same = compare_outcomes(a, a, np.random.default_rng(0))
+    assert same.accuracy.difference == 0.0
+    assert same.accuracy.interval == (0.0, 0.0)
+    assert same.accuracy.verdict is Verdict.NOT_DISTINGUISHED
+    forward, back = (compare_outcomes(*pair, np.random.default_rng(0)) for pair in ((a, b), (b, a)))
+    assert forward.accuracy.difference == pytest.approx(-back.accuracy.difference)
+    assert forward.accuracy.interval == pytest.approx([-end for end in back.accuracy.interval[::-1]])
+    assert back.accuracy.verdict is Verdict.WORSE
+
+
+def test_figures_are_those_of_counting():
+    a, b = outcomes(0.1, 3)
+    found = compare_outcomes(a, b, np.random.default_rng(0))
+    assert found.accuracy.a == pytest.approx(a.correct.mean())
+    assert found.by_class["ice"].b == pytest.approx(b.correct[:, b.terrain == "ice"].mean())
+    assert found.by_class["ice"].n_runs == 12
+    by_run = {row.run_id: row.a for row in found.by_run}
+    assert by_run["7"] == pytest.approx(a.correct[:, a.run_id == "7"].mean())
+    per_class = [np.mean([row.b for row in found.by_run if row.terrain == name]) for name in ("ice", "mud")]
+    assert found.macro_run_accuracy.b == pytest.approx(np.mean(per_class))
+
+
+def test_one_run_gives_no_interval():
+    a, b = outcomes(0.5, 2)
+    alone = [each._replace(terrain=np.where(each.run_id == "3", "sand", each.terrain)) for each in (a, b)]
+    row = compare_outcomes(*alone, np.random.default_rng(0)).by_class["sand"]
+    assert row.n_runs == 1
+    assert row.difference > 0
+    assert np.isnan(row.interval).all()
+    assert row.verdict is Verdict.NOT_DISTINGUISHED
+
+
+def test_windows_may_differ_but_runs_may_not():
+    a, b = outcomes(0.0, 1)
+    half = np.arange(len(b.run_id)) % 2 == 0
+    fewer = Outcome(b.run_id[half], b.terrain[half], b.correct[:, half], b.confidence[:, half])
+    assert compare_outcomes(a, fewer, np.random.default_rng(0)).accuracy.n_runs == 24
+    others = b.run_id != "5"
+    missing = Outcome(b.run_id[others], b.terrain[others], b.correct[:, others], b.confidence[:, others])
+    with pytest.raises(DataError, match=r"run 5 \(ice\) was judged by one of the two only"):
+        compare_outcomes(a, missing, np.random.default_rng(0))
+
+
+def test_area_by_runs_is_that_of_all_pairs():
+    rng = np.random.default_rng(0)
+    known, new = np.round(rng.normal(size=40), 1), np.round(rng.normal(0.7, 1, 30), 1)
+    run_of = np.concatenate([np.repeat(np.arange(4), 10), np.repeat(np.arange(4, 7), 10)])
+    part = Scored(np.arange(40), np.arange(40, 70), known, new, 0.0)
+    won, pairs = metrics._compare([part], run_of)
+    expected = roc_auc_score(np.repeat([0, 1], [40, 30]), np.concatenate([known, new]))
+    assert won.sum() / pairs.sum() == pytest.approx(expected)
+    weights = np.ones((50, 7)) + np.random.default_rng(1).multinomial(7, np.full(7, 1 / 7), 50)
+    low, high = metrics._area_interval([(won, pairs)], weights)
+    assert low < expected < high
+
+
+TRUE = np.repeat([0, 1, 0], 80)
+STARTS_S = STRIDE_S * np.arange(1, 241) - 2.0
+
+
+def track(filtered, single, runs=("run 0", "run 1", "run 2")):
+    """Return a track of three grounds of 20 s each."""
+    labels = [Label(20.0 * i, 20.0 * (i + 1), "ab"[i % 2]) for i in range(3)]
+    return track_of(labels, runs, STARTS_S, 2.0, filtered, single, np.array(["a", "b"]), True)
+
+
+def test_accuracy_delay_and_flips_are_those_that_were_put_in():
+    late = np.concatenate((TRUE[:1].repeat(10), TRUE[:-10]))  # every change 2.5 s late
+    noisy = TRUE.copy()
+    noisy[[40, 120, 200]] = 2
+    figures = sequence_figures([track(late, noisy)], 0)
+    delay = figures.filter_delay_s
+    assert (delay.p50, delay.p90, delay.n_changes, delay.n_missed) == (2.75, 2.75, 2, 0)
+    assert figures.filtered_accuracy_at_end == pytest.approx(1 - 20 / 240)
+    assert figures.single_accuracy_at_end == pytest.approx(1 - 3 / 240)
+    assert figures.filtered_accuracy == pytest.approx(1 - 6 / 219)
+    assert (figures.flips_per_minute, figures.duration_s) == (0.0, 60.0)
+    assert figures.single_flips_per_minute == pytest.approx(6.0)
+
+
+def test_a_change_that_is_never_found_is_counted_and_not_averaged():
+    never = np.zeros(240, dtype=int)
+    delay = sequence_figures([track(never, never)], 0).filter_delay_s
+    assert (delay.n_changes, delay.n_missed, delay.p90_of_all) == (2, 1, None)
+    assert delay.p90 == 0.25  # back on the ground that it never left
+    figures = sequence_figures([track(never - 1, never - 1)], 0)
+    assert (figures.unknown_ratio, figures.filtered_accuracy) == (1.0, 0.0)
+    assert np.isnan(figures.filter_delay_s.p90)
+    assert sequence_figures([], 0) is None
+
+
+def test_the_last_class_holds_through_refused_windows():
+    rng = np.random.default_rng(3)
+    probability = rng.dirichlet(np.ones(3), 50)
+    probability[rng.random(50) < 0.4] = np.nan
+    now, expected = -1, []
+    for row in probability:
+        now = now if np.isnan(row).any() else int(row.argmax())
+        expected.append(now)
+    assert last_class(probability).tolist() == expected
+
+
+@pytest.mark.parametrize(("scale", "power"), [(0.3, 1.0), (0.2, 0.6), (0.4, 1.5)])
+def test_enough_runs_of_a_known_law(scale, power):
+    m = np.array([1.0, 2.0, 3.0, 5.0, 8.0, 12.0])
+    n_runs, statement = enough_runs(m, 0.95 - scale * m**-power)
+    # Doubling m gains scale m^-power (1 - 2^-power); solved for a gain of one per cent.
+    law = (100 * scale * (1 - 2.0**-power)) ** (1 / power)
+    assert n_runs == pytest.approx(law, abs=1.05)
+    assert statement.startswith("enough:" if n_runs <= 12 else "not enough yet:")
+
+
+def test_a_curve_that_still_climbs_gives_no_number():
+    m = np.array([1.0, 2.0, 3.0, 4.0])
+    n_runs, statement = enough_runs(m, 0.1 + 0.1 * np.log2(m))
+    assert n_runs is None
+    assert statement.startswith("not enough yet: doubling the 4.0 runs per class would still gain")
+    few = enough_runs(m[:3], m[:3] / 4)
+    assert few == (None, "3 sizes are too few to estimate how many runs are enough")
+    assert enough_runs(m, np.full(4, 0.8))[0] == 1
+
+
+def test_a_learning_curve_has_the_mean_and_the_spread_of_its_draws():
+    curve = learning_curve(np.array([1.0, 2.0, 3.0, 4.0]), [0.4, 0.6, 0.6, 0.8, 0.7, 0.7], 0.77)
+    assert curve.accuracy == pytest.approx((0.5, 0.7, 0.7, 0.77))
+    assert curve.accuracy_spread[:-1] == pytest.approx((0.02**0.5, 0.02**0.5, 0.0))
+    assert curve.accuracy_spread[-1] is None

@@ -1,18 +1,8 @@
 import numpy as np
 import pytest
 from sklearn.base import clone
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from terrain.classify.ground_response import (
-    SPEED_LENGTH,
-    fit_process,
-    left_out,
-    regimes,
-    unit_means,
-    units_of,
-)
-from terrain.classify.response import GroupedResponse, ResponseColumns, log_density
+from terrain.classify.response import GroupedResponse, ResponseColumns, fit_process, left_out, log_density
 from terrain.errors import DataError
 
 WHEELS = np.radians([150.0, 270.0, 390.0])
@@ -41,15 +31,6 @@ def data_of(rng, terrains, directions, **keywords):
     return X, y, np.concatenate([groups for _, groups in parts])
 
 
-def test_the_regime_of_each_wheel_is_the_same_motion_seen_from_it():
-    speed = np.array([[0.1, -0.2, 0.3]])
-    found = regimes(speed, 1.0)[0]
-    np.testing.assert_allclose(found[0, [1, 2, 0]], found[1, :3])
-    np.testing.assert_allclose(np.linalg.norm(found[:, :3], axis=1), 1.0)
-    np.testing.assert_allclose(regimes(2 * speed, 2.0), found[None])
-    assert np.isnan(regimes(np.zeros((1, 3)), 1.0)[0, :, :3]).all()
-
-
 def test_what_is_left_out_is_what_a_fit_without_it_says():
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (30, 2))
@@ -63,37 +44,22 @@ def test_what_is_left_out_is_what_a_fit_without_it_says():
         np.testing.assert_allclose(found[own], response[own] - expected, rtol=1e-8)
 
 
-def test_a_process_predicts_as_the_library_does():
+def test_a_process_expects_what_wheels_answer_between_its_points():
     rng = np.random.default_rng(1)
-    X, groups = driven(rng, "carpet", np.linspace(-3, 3, 15), runs_each=1)
-    regime = regimes(X[:, :3], 0.2)
-    unit = units_of(regime[:, 0], groups)
-    mean_regime, mean_current = unit_means(regime, unit), unit_means(X[:, 3:], unit)
-    points = np.concatenate([mean_regime[:, i] for i in range(3)])
-    wheel = np.repeat(np.arange(3), len(mean_regime))
-    values = mean_current.T.ravel()
-    process, _ = fit_process(points, wheel, values, np.tile(np.arange(len(mean_regime)), 3))
-    scales = [process.length] * 3 + [SPEED_LENGTH]
-    kernel = ConstantKernel(process.common) * RBF([*scales, 1e6, 1e6, 1e6]) + ConstantKernel(
-        process.own
-    ) * RBF([*scales, 1.0, 1.0, 1.0])
-    apart = 10.0 * np.eye(3)
-    scaled = (values - values.mean()) / values.std()
-    noise = _noise_of(kernel, np.column_stack([points, apart[wheel]]), scaled, process, values.std())
-    library = GaussianProcessRegressor(kernel + WhiteKernel(noise), optimizer=None, alpha=1e-8)
-    library.fit(np.column_stack([points, apart[wheel]]), scaled)
-    new = regimes(driven(rng, "carpet", np.linspace(-2, 2, 7), windows=1)[0][:, :3], 0.2)
-    for i in range(3):
-        expected = library.predict(np.column_stack([new[:, i], np.tile(apart[i], (len(new), 1))]))
-        np.testing.assert_allclose(
-            process.predict(new[:, i], i), values.mean() + values.std() * expected, atol=1e-5
-        )
+    angle, wheel = rng.uniform(-3, 3, 120), np.arange(120) % 2
 
+    def regime(angle):
+        return np.column_stack([np.cos(angle), np.sin(angle), np.ones(len(angle))])
 
-def _noise_of(kernel, points, scaled, process, spread):
-    """Return the scatter that the weights of a process were solved with: (K + c 1) w = y."""
-    weight = process.weight / spread
-    return float(np.median((scaled - kernel(points) @ weight) / weight)) - 1e-8
+    def answer(angle, wheel):
+        return 1.0 + 0.5 * np.cos(angle) + 0.1 * wheel
+
+    noisy = answer(angle, wheel) + rng.normal(0, 0.01, 120)
+    process, left = fit_process(regime(angle), wheel, noisy, np.arange(120))
+    new = np.linspace(-2.9, 2.9, 20)
+    for i in range(2):
+        np.testing.assert_allclose(process.predict(regime(new), i), answer(new, i), atol=0.02)
+    assert 0.008 < left.std() < 0.016
 
 
 def test_ground_is_found_by_what_wheels_answer_on_runs_that_were_left_out():

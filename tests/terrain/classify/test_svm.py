@@ -1,15 +1,76 @@
+"""The support vector machine: pairwise coupling by its plain form, and a choice that never splits a run."""
+
 import numpy as np
 import pytest
 from scipy.special import expit
-from sklearn.base import clone
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from terrain.classify import svm
-from terrain.classify.folds import split_runs
-from terrain.classify.svm import CANDIDATES, GroupedSVC, class_probabilities
+from terrain.classify import folds, grouped, svm
+from terrain.classify.svm import CANDIDATES, GroupedSVC, class_probabilities, fit_scale, pairs_of
 from terrain.errors import DataError
 
 TERRAINS = np.array(["ice", "sand", "snow"])
+
+
+def coupled_plainly(margins, k, scale):
+    """Solve the system of the minimum under its constraint, window by window."""
+    found = []
+    for row in margins:
+        r = np.zeros((k, k))
+        for (a, b), margin in zip(pairs_of(k), row, strict=True):
+            r[a, b], r[b, a] = expit(scale * margin), expit(-scale * margin)
+        Q = -r.T * r
+        np.fill_diagonal(Q, (r**2).sum(axis=0))
+        system = np.block([[Q, np.ones((k, 1))], [np.ones((1, k)), np.zeros((1, 1))]])
+        found.append(np.linalg.solve(system, np.eye(k + 1)[-1])[:k])
+    return np.array(found)
+
+
+@pytest.mark.parametrize("k", [2, 3, 5, 8])
+def test_probabilities_are_those_of_the_plain_form(k):
+    margins = np.random.default_rng(k).normal(0, 2, (60, k * (k - 1) // 2))
+    found = class_probabilities(margins, k, 1.7)
+    np.testing.assert_allclose(found, coupled_plainly(margins, k, 1.7), atol=1e-10)
+    np.testing.assert_allclose(found.sum(axis=1), 1.0)
+    assert (found >= 0).all()
+
+
+def test_consistent_pairs_give_back_the_probabilities_that_they_are_made_of():
+    p = np.random.default_rng(0).dirichlet(np.ones(5), 40)
+    margins = np.column_stack([np.log(p[:, a] / p[:, b]) for a, b in pairs_of(5)])
+    np.testing.assert_allclose(class_probabilities(margins, 5, 1.0), p, atol=1e-6)
+
+
+def test_extreme_margins_give_finite_probabilities():
+    margins = np.array([[800.0, 800.0, -800.0], [-800.0, 800.0, 800.0], [1e300, -1e300, 0.0]])
+    found = class_probabilities(margins, 3, 50.0)
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found.sum(axis=1), 1.0)
+    assert found[0].argmax() == 0
+    assert found[0, 0] > 0.999
+
+
+def test_a_hidden_scale_is_recovered_from_several_classes():
+    rng = np.random.default_rng(2)
+    margins = rng.normal(0, 1, (6000, 6))
+    p = class_probabilities(margins, 4, 2.5)
+    drawn = (rng.random((6000, 1)) > p.cumsum(axis=1)).sum(axis=1)
+    assert fit_scale(margins, drawn, 4) == pytest.approx(2.5, rel=0.06)
+
+
+def test_a_class_that_was_not_there_to_train_on_gets_no_probability():
+    rng = np.random.default_rng(3)
+    margins = rng.normal(size=(20, 6))
+    margins[:10, [0, 3, 4]] = np.nan  # all pairs of class 1
+    found = class_probabilities(margins, 4, 1.3)
+    np.testing.assert_array_equal(found[:10, 1], 0.0)
+    without = class_probabilities(margins[:10][:, [1, 2, 5]], 3, 1.3)
+    np.testing.assert_allclose(found[:10][:, [0, 2, 3]], without)
+    np.testing.assert_allclose(found[10:], class_probabilities(margins[10:], 4, 1.3))
+    truth = found.argmax(axis=1)
+    truth[:3] = 1  # of the absent class: these rows do not count
+    others = np.arange(20) >= 3
+    assert fit_scale(margins, truth, 4) == pytest.approx(fit_scale(margins[others], truth[others], 4))
 
 
 def draw_runs(n_runs=4, n_windows=12, run_std=0.3, seed=0, n_features=6):
@@ -68,7 +129,7 @@ def test_inner_folds_never_split_a_run(monkeypatch):
     X, y, runs = draw_runs(n_runs=5)
     X[:, 0] = runs
     fitted, held_out = [], []
-    fit, prepare = svm.fit_preparation, svm.Preparation.of
+    fit, prepare = svm.fit_preparation, grouped.Preparation.of
 
     def seen(X):
         return set(X[:, 0].astype(int))
@@ -83,7 +144,7 @@ def test_inner_folds_never_split_a_run(monkeypatch):
         return prepare(self, X)
 
     monkeypatch.setattr(svm, "fit_preparation", spied_fit)
-    monkeypatch.setattr(svm.Preparation, "of", spied_preparation)
+    monkeypatch.setattr(grouped.Preparation, "of", spied_preparation)
     GroupedSVC().fit(X, y, groups=runs)
     assert len(held_out) == 3 * len({candidate.percentile for candidate in CANDIDATES})
     for trained, tested in held_out:
@@ -107,37 +168,6 @@ def test_labels_that_only_identify_runs_give_scores_of_chance():
     assert np.mean(split) > 0.95  # the test can fail: folds that split runs look perfect
 
 
-def test_confidence_agrees_with_accuracy():
-    rng = np.random.default_rng(0)
-
-    def draw(n):
-        y = rng.integers(0, 2, n)
-        return rng.normal(0, 1, (n, 3)) + np.array([1.2, 0.0, 0.0]) * y[:, None], y
-
-    X, y = draw(900)
-    new, truth = draw(6000)
-    model = GroupedSVC(((1.0, 0.2, 100.0), (10.0, 0.4, 100.0))).fit(X, y)
-    probability = model.predict_proba(new)
-    confidence, right = probability.max(axis=1), model.predict(new) == truth
-    parts = np.array_split(np.argsort(confidence), 15)
-    ece = sum(
-        len(part) / len(confidence) * abs(confidence[part].mean() - right[part].mean()) for part in parts
-    )
-    assert ece < 0.06  # of which 0.02 is the chance of 400 samples a bin
-    posterior = expit(1.2 * new[:, 0] - 0.72)
-    assert np.mean(np.abs(posterior - probability[:, 1])) < 0.1
-    uncalibrated = class_probabilities(model.margins(new), 2, 5.0 * model.scale_).max(axis=1)
-    assert abs(uncalibrated.mean() - right.mean()) > 3 * abs(confidence.mean() - right.mean())
-
-
-def test_fit_is_deterministic_and_clone_learns_the_same():
-    X, y, runs = draw_runs()
-    models = [GroupedSVC(seed=3).fit(X, y, groups=runs) for _ in range(2)]
-    models.append(clone(models[0]).fit(X, y, groups=runs.astype(str)))
-    for model in models[1:]:
-        np.testing.assert_array_equal(model.predict_proba(X), models[0].predict_proba(X))
-
-
 def test_features_that_are_missing_constant_or_extreme_do_no_harm():
     X, y, runs = draw_runs()
     new, truth, _ = draw_runs(seed=1)
@@ -150,14 +180,6 @@ def test_features_that_are_missing_constant_or_extreme_do_no_harm():
     faulty[3, 3] = 1e12
     assert np.mean(model.predict(faulty) == truth) > clean - 0.08
     assert np.isfinite(model.predict_proba(faulty)).all()
-
-
-def test_a_class_with_a_single_run_is_learned_all_the_same():
-    X, y, runs = draw_runs()
-    kept = (y != "sand") | (runs == runs[y == "sand"][0])
-    model = GroupedSVC().fit(X[kept], y[kept], groups=runs[kept])
-    assert model.classes_.tolist() == TERRAINS.tolist()
-    assert np.mean(model.predict(X[y == "sand"]) == "sand") > 0.5
 
 
 def test_too_few_classes_or_windows_are_refused():
@@ -174,14 +196,14 @@ def test_too_few_classes_or_windows_are_refused():
 
 def test_inner_folds_leave_out_what_shares_samples_with_a_test_block(monkeypatch):
     """The only run of a class is cut into inner blocks: windows that overlap one must not train."""
-    splits = []
+    splits, split_runs = [], folds.split_runs
 
     def spy(*args):
         for train, test in split_runs(*args):
             splits.append((train, test))
             yield train, test
 
-    monkeypatch.setattr(svm, "split_runs", spy)
+    monkeypatch.setattr(folds, "split_runs", spy)
     rng = np.random.default_rng(0)
     y = np.repeat(["ice", "snow"], 60)
     groups = np.where(y == "ice", "only", np.repeat([f"r{i}" for i in range(12)], 10))

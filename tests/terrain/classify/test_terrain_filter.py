@@ -10,7 +10,6 @@ from terrain.classify.terrain_filter import (
     check_filter,
     filter_run,
     filter_step,
-    initial_belief,
     reported,
 )
 from terrain.errors import ConfigError, DataError
@@ -56,22 +55,6 @@ def test_the_filter_agrees_with_a_dense_matrix_exponential(seed):
     np.testing.assert_allclose(found.sum(axis=1), 1.0, atol=1e-12)
 
 
-def test_step_by_step_equals_the_whole_run():
-    probability, time_s, novelty = draw(1)
-    belief, found = initial_belief(THREE), []
-    for p, dt_s, score in zip(probability, np.diff(time_s, prepend=time_s[0]), novelty, strict=True):
-        belief = filter_step(belief, p, dt_s, THREE, score)
-        found.append(belief.probability)
-    np.testing.assert_array_equal(found, filter_run(probability, time_s, THREE, novelty))
-
-
-def test_later_windows_change_nothing():
-    probability, time_s, _ = draw(2)
-    np.testing.assert_array_equal(
-        filter_run(probability, time_s, THREE)[:20], filter_run(probability[:20], time_s[:20], THREE)
-    )
-
-
 def test_refused_windows_only_let_time_pass():
     refused = np.full(3, np.nan)
     begin = FilterBelief(np.array([0.9, 0.05, 0.03, 0.02]), 0.0)
@@ -115,20 +98,6 @@ def test_the_hidden_terrain_of_a_model_is_recovered_more_often_than_by_single_wi
     assert np.mean(belief[:, :4].argmax(axis=1) == truth) > single + 0.05
     answered = reported(belief, 0.8)
     assert np.mean(answered[answered >= 0] == truth[answered >= 0]) > 0.8  # as certain as it claims
-
-
-def test_one_window_whatever_it_claims_does_not_settle_a_change():
-    belief = FilterBelief(np.array([0.97, 0.01, 0.01, 0.01]), 0.0)
-    after = filter_step(belief, np.array([0.0, 1.0, 0.0]), 0.25, THREE)
-    assert reported(after.probability[None], 0.5)[0] == 0
-
-
-def test_novelty_leads_to_unknown_and_flat_outputs_to_no_class():
-    flat = np.tile(np.array(THREE.prior), (100, 1))
-    time_s = np.arange(100) / 4
-    assert reported(filter_run(flat, time_s, THREE), 0.5)[-1] == -1
-    novel = filter_run(flat, time_s, THREE, np.full(100, 3.0))
-    assert novel[-1, -1] > 0.9
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,331 @@
+r"""Changes of the ground: within a run, under a label, and as motors answer while it drives.
+
+**Change points** of a sequence, without labels: the partition of least cost.
+``sum over segments of sum_i |z_i - mean|^2 + penalty`` is minimised exactly by dynamic programming over the
+last change (Jackson et al. 2005, "An algorithm for optimal partitioning of data on an interval"), with the
+scatter of each column taken from its differences from one row to the next, which a change of the mean hardly
+touches.
+
+**Breakaways**: stretches of a run that look like another terrain than their label, while the rest of the run does not.
+A robot that is stuck, a label that ends too late, or a patch of other ground shows as several held-out
+windows in a row in which the label is improbable and one other class is probable throughout.  Single windows
+are wrong now and then and are no stretch; a run that looks like another terrain as a whole is not recognised,
+which accuracy tells, and does not break away from itself.
+
+**Changes of response**, found as the robot drives.  Responses (motor currents) are averaged over blocks of
+:data:`BLOCK_S`.  Since the robot is driven in one regime, blocks before and after an instant j differ in mean only
+where the ground does; with the covariance S of a block's mean on one ground, n blocks so far and the means
+:math:`m_1` of the first j and :math:`m_2` of the others, the generalised likelihood ratio
+
+.. math:: G_n = \max_{n - w \le j \le n - k} \frac{j (n - j)}{n} (m_2 - m_1)^T S^{-1} (m_2 - m_1)
+
+grows with every block after a change (Basseville and Nikiforov, Detection of Abrupt Changes, 1993, 2.4.3, for
+a change of unknown size; here the mean before it is unknown too).  It is an alarm above a threshold, and the
+most likely j is the change; from there on everything begins anew.  The threshold is what runs on one ground each exceed
+in a given share of the runs.  No label is needed, and none is given: what the ground changed to is for the classifier.
+A change of regime (speed or direction of the wheels) also begins anew, since responses then change on any ground; a
+standing robot answers nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.classify.held_out import HeldOut
+from terrain.errors import DataError
+from terrain.records import Array, Windows
+
+PENALTY = 3.0
+"""A change costs this times the number of columns times the logarithm of the number of rows: three times what
+the criterion of Schwarz asks, as neighbouring windows resemble each other."""
+
+SHIFT_LEAST = 4.0
+"""A segment that differs from the longest by so many times the scatter, in the root mean square of all
+columns, stands out.  Both were chosen with the runs of BorealTC and Vulpi in view: 10 of 69 have one."""
+
+LEAST_ROWS = 3
+MIN_SCATTER = 0.05
+
+LEAST_S = 6.0
+"""Shortest stretch that breaks away: three windows of 2 s, as two wrong ones in a row are common in a class of 80 %
+accuracy."""
+
+LABEL_MOST = 0.2
+"""Mean probability of the label in the stretch, at most: that of a guess among five classes."""
+
+OTHER_LEAST = 0.5
+"""Probability of the other class in each window of the stretch, at least: above all others together."""
+
+REST_LEAST = 0.5
+"""Mean probability of the label in the rest of the run, at least: otherwise nothing is broken away from."""
+
+BLOCK_S = 0.25
+"""Means over less hold few samples of a slow logger; over more, each block delays the alarm."""
+
+MIN_BLOCKS = 3
+"""Before and after a change: two blocks differ by chance too often."""
+
+MAX_BLOCKS = 40
+"""Back to which changes are looked for, 10 s: a ground that changed before is found already."""
+
+SETTLING_S = 0.75
+"""After a start or a change of regime, until motors have settled."""
+
+MAX_REGIME_CHANGE = 0.15
+"""Of the wheels' mean speeds, as a share of their norm: larger, it is another regime."""
+
+MIN_SPEED_RATIO = 0.5
+"""Of the regime's speed; slower, the robot stops."""
+
+FALSE_ALARM_RATIO = 0.02
+"""Share of the runs on one ground in which the threshold is exceeded, unless another is given."""
+
+
+def change_points(values: Array) -> list[tuple[int, int, float]]:
+    """Return the segments of rows (n, c) that stand out from the longest one: first row, end, shift over the scatter.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> rows = rng.standard_normal((60, 4))
+    >>> rows[20:30] += 8.0
+    >>> [(first, end) for first, end, _ in change_points(rows)], change_points(rng.standard_normal((60, 4)))
+    ([(20, 30)], [])
+    """
+    n, c = values.shape
+    if n < 2 * LEAST_ROWS:
+        return []
+    scatter = 1.4826 * np.median(np.abs(np.diff(values, axis=0)), axis=0) / np.sqrt(2.0)
+    z = np.ascontiguousarray(values / np.maximum(scatter, MIN_SCATTER), dtype=np.float64)
+    ends = partition(z - z.mean(axis=0), LEAST_ROWS, PENALTY * c * np.log(n))
+    parts = list(zip([0, *ends[:-1]], ends, strict=True))
+    usual = max(parts, key=lambda part: part[1] - part[0])
+    centre = np.median(z[usual[0] : usual[1]], axis=0)
+    shifts = [float(np.sqrt(np.square(z[a:b].mean(axis=0) - centre).mean())) for a, b in parts]
+    found = zip(parts, shifts, strict=True)
+    return [(*part, shift) for part, shift in found if part != usual and shift >= SHIFT_LEAST]
+
+
+def partition(z: Array, least: int, penalty: float) -> list[int]:
+    """Return the end of each segment, of so many rows at least, of the best partition of rows (n, c), in order."""
+    n = len(z)
+    sums = np.concatenate([np.zeros((1, z.shape[1])), np.cumsum(z, axis=0)])
+    squares = np.concatenate([[0.0], np.cumsum(np.square(z).sum(axis=1))])
+    best, origin = np.full(n + 1, np.inf), np.zeros(n + 1, dtype=int)
+    best[0] = -penalty
+    for end in range(least, n + 1):
+        first = np.arange(end - least + 1)
+        within = (
+            squares[end] - squares[first] - np.square(sums[end] - sums[first]).sum(axis=1) / (end - first)
+        )
+        costs = best[first] + within + penalty
+        origin[end] = costs.argmin()
+        best[end] = costs[origin[end]]
+    ends = [n]
+    while origin[ends[-1]] > 0:
+        ends.append(int(origin[ends[-1]]))
+    return ends[::-1]
+
+
+class Breakaway(NamedTuple):
+    """A stretch of a run that looks like another terrain than its label, unlike the rest of the run.
+
+    From its first window to its last; mean probabilities in it of the terrain that it looks like and of the label, and
+    of the label over the rest of the run.
+    """
+
+    run_id: str
+    start_s: float
+    end_s: float
+    label: str
+    looks_like: str
+    probability: float
+    label_probability: float
+    rest_probability: float
+
+
+def breakaways(held_out: HeldOut, windows: Windows) -> tuple[Breakaway, ...]:
+    """Return the stretches that break away by their mean held-out probabilities, the surest first."""
+    run_id, probability = windows.run_id.astype(str), held_out.probability.mean(axis=0)
+    found = []
+    for run in np.unique(run_id).tolist():
+        for label in np.unique(held_out.truth[run_id == run]).tolist():
+            rows = np.flatnonzero((run_id == run) & (held_out.truth == label))
+            rows = rows[np.argsort(windows.start_s[rows], kind="stable")]
+            of_run = probability[rows], windows.start_s[rows], windows.length_s
+            found += stretches(run, label, held_out.classes, *of_run)
+    return tuple(sorted(found, key=lambda each: -each.probability * (each.end_s - each.start_s)))
+
+
+def stretches(
+    run_id: str, label: str, classes: Array, probability: Array, start_s: Array, length_s: float
+) -> list[Breakaway]:
+    """Return the stretches of one run under one label that break away, of its windows (n,) in order of time."""
+    column = int(np.searchsorted(classes, label))
+    best = probability.argmax(axis=1)
+    other = (best != column) & (probability.max(axis=1, initial=0.0) >= OTHER_LEAST)
+    state = np.where(other, best, -1)
+    apart = np.diff(start_s) > 2.0 * length_s  # windows on both sides of a pause are no stretch
+    found = []
+    for rows in np.split(np.arange(len(state)), np.flatnonzero((np.diff(state) != 0) | apart) + 1):
+        if not len(rows) or len(rows) == len(state) or state[rows[0]] < 0:
+            continue
+        begin_s, end_s = float(start_s[rows[0]]), float(start_s[rows[-1]] + length_s)
+        looks_like, label_ratio = state[rows[0]], float(probability[rows, column].mean())
+        rest_ratio = float(np.delete(probability[:, column], rows).mean())
+        if end_s - begin_s >= LEAST_S - 1e-6 and label_ratio <= LABEL_MOST and rest_ratio >= REST_LEAST:
+            means = float(probability[rows, looks_like].mean()), label_ratio, rest_ratio
+            found.append(Breakaway(run_id, begin_s, end_s, label, str(classes[looks_like]), *means))
+    return found
+
+
+class DetectorSettings(NamedTuple):
+    """What runs on one ground each show: the covariance (r, r) of a block's mean, and the threshold.
+
+    ``n_runs`` is how many they were, ``false_alarm_ratio`` how many of them exceed the threshold.
+    """
+
+    covariance: Array
+    threshold: float
+    n_runs: int
+    false_alarm_ratio: float
+
+
+class GroundChange(NamedTuple):
+    """A change: when it is known, when it was, how clear it is, and the responses (r,) before and after."""
+
+    alarm_s: float
+    change_s: float
+    statistic: float
+    before: Array
+    after: Array
+
+
+class Block(NamedTuple):
+    """Mean responses (r,) and wheel speeds (w,) of a block that ends at ``end_s``."""
+
+    end_s: float
+    responses: Array
+    wheel_speed_mps: Array
+
+
+class ChangeDetector:
+    """Finds changes of the ground block by block; ``blocks`` are of one regime and, as far as is known, one ground.
+
+    Examples
+    --------
+    >>> detector = ChangeDetector(DetectorSettings(np.eye(1) * 0.01, 30.0, 0, 0.0))
+    >>> time_s = np.arange(0.0, 10.0, 0.05)
+    >>> current_a, speed_mps = np.where(time_s < 5.0, 1.0, 2.0)[:, None], np.full((200, 1), 0.5)
+    >>> found = [detector.take(block) for block in blocks_of(time_s, current_a, speed_mps)]
+    >>> [(float(each.change_s), float(each.alarm_s)) for each in found if each is not None]
+    [(4.75, 5.5)]
+    """
+
+    def __init__(self, settings: DetectorSettings) -> None:
+        self.threshold = settings.threshold
+        self.blocks: list[Block] = []
+        self._precision = np.linalg.inv(settings.covariance)
+        self._regime: Array | None = None
+        self._settled_s = -np.inf
+
+    def take(self, block: Block) -> GroundChange | None:
+        """Take one block, after those before; return a change where it makes one known."""
+        begin_s, speed_mps = block.end_s - BLOCK_S, block.wheel_speed_mps
+        if not self._continues(speed_mps):
+            self.blocks, self._settled_s = [], begin_s + SETTLING_S
+        if begin_s < self._settled_s - 1e-9:
+            self._regime = speed_mps
+            return None
+        if not np.isfinite(block.responses).all():
+            return None
+        self.blocks.append(block)
+        self._regime = np.mean([each.wheel_speed_mps for each in self.blocks], axis=0)
+        statistic, at = self.ratio()
+        if statistic <= self.threshold:
+            return None
+        before, self.blocks = self.blocks[:at], self.blocks[at:]
+        means = (np.mean([each.responses for each in part], axis=0) for part in (before, self.blocks))
+        return GroundChange(block.end_s, before[-1].end_s, statistic, *means)
+
+    def _continues(self, wheel_speed_mps: Array) -> bool:
+        """Return whether a block's wheel speeds are of the regime so far."""
+        if self._regime is None or not np.isfinite(wheel_speed_mps).all():
+            return False
+        norm = float(np.linalg.norm(self._regime))
+        if norm == 0.0 or np.linalg.norm(wheel_speed_mps) < MIN_SPEED_RATIO * norm:
+            return False
+        return bool(np.linalg.norm(wheel_speed_mps - self._regime) <= MAX_REGIME_CHANGE * norm)
+
+    def ratio(self) -> tuple[float, int]:
+        """Return G of the blocks so far, and the number of blocks before the most likely change."""
+        n = len(self.blocks)
+        if n < 2 * MIN_BLOCKS:
+            return 0.0, 0
+        sums = np.cumsum(np.array([each.responses for each in self.blocks]), axis=0)
+        at = np.arange(max(MIN_BLOCKS, n - MAX_BLOCKS), n - MIN_BLOCKS + 1)
+        apart = (sums[-1] - sums[at - 1]) / (n - at)[:, None] - sums[at - 1] / at[:, None]
+        ratio = at * (n - at) / n * np.einsum("ji,ik,jk->j", apart, self._precision, apart)
+        best = int(np.argmax(ratio))
+        return float(ratio[best]), int(at[best])
+
+
+def blocks_of(time_s: Array, responses: Array, wheel_speed_mps: Array) -> Iterator[Block]:
+    """Yield the blocks of samples (n,), (n, r), (n, w), each once it is over, on a grid from the first sample."""
+    number = np.floor((time_s - time_s[:1]) / BLOCK_S + 1e-9).astype(int)
+    for rows in np.split(np.arange(len(time_s)), np.flatnonzero(np.diff(number) != 0) + 1)[:-1]:
+        end_s = time_s[0] + (number[rows[0]] + 1) * BLOCK_S
+        yield Block(end_s, _known_mean(responses[rows]), _known_mean(wheel_speed_mps[rows]))
+
+
+def _known_mean(values: Array) -> Array:
+    known = np.isfinite(values)
+    n = known.sum(axis=0)
+    total = np.where(known, values, 0.0).sum(axis=0)
+    return np.asarray(np.divide(total, n, out=np.full(n.shape, np.nan), where=n > 0))
+
+
+def changes_of(
+    time_s: Array, responses: Array, wheel_speed_mps: Array, settings: DetectorSettings
+) -> list[GroundChange]:
+    """Return the changes of a log of samples (n,), (n, r), (n, w), as they are found while it drives."""
+    detector = ChangeDetector(settings)
+    found = (detector.take(block) for block in blocks_of(time_s, responses, wheel_speed_mps))
+    return [each for each in found if each is not None]
+
+
+def calibrate(
+    logs: Iterable[tuple[Array, Array, Array]], false_alarm_ratio: float = FALSE_ALARM_RATIO
+) -> DetectorSettings:
+    """Return the settings with which runs on one ground each give an alarm in a given share of them.
+
+    ``logs`` are as :func:`changes_of` takes them; ``DataError`` where none is long enough.
+    """
+    runs = [blocks for log in logs if len(blocks := steady_blocks(*log)) >= 2 * MIN_BLOCKS]
+    if not runs:
+        raise DataError(
+            f"no run is driven steadily for {2 * MIN_BLOCKS * BLOCK_S + SETTLING_S:g} s, as a threshold takes"
+        )
+    values = [np.array([each.responses for each in blocks]) for blocks in runs]
+    apart = np.concatenate([part - part.mean(axis=0) for part in values])
+    covariance = apart.T @ apart / max(len(apart) - len(values), 1)
+    covariance += np.eye(len(covariance)) * 1e-9 * max(float(np.trace(covariance)), 1e-12)
+    largest = np.zeros(len(runs))
+    for i, blocks in enumerate(runs):
+        detector = ChangeDetector(DetectorSettings(covariance, np.inf, 0, 0.0))
+        for block in blocks:
+            detector.take(block)
+            largest[i] = max(largest[i], detector.ratio()[0])
+    threshold = float(np.quantile(largest, 1.0 - false_alarm_ratio))
+    return DetectorSettings(covariance, threshold, len(runs), float(np.mean(largest > threshold)))
+
+
+def steady_blocks(time_s: Array, responses: Array, wheel_speed_mps: Array) -> list[Block]:
+    """Return the blocks of a log that a detector compares: of one regime, settled, with all responses."""
+    detector = ChangeDetector(DetectorSettings(np.eye(responses.shape[1]), np.inf, 0, 0.0))
+    for block in blocks_of(time_s, responses, wheel_speed_mps):
+        detector.take(block)
+    return detector.blocks

@@ -1,0 +1,394 @@
+r"""Which motions the training runs cover, and which drives to record next: what more runs of a terrain would gain.
+
+The errors that are left fall with the number n of training runs near a window's motion, as
+
+.. math:: e(n) = e_\infty + b (1 + n)^{-c},
+
+fitted to held-out windows of all terrains.  A cell, one terrain in one regime, has an error rate of its own,
+which few windows state poorly: it is drawn towards the curve by ``PRIOR_WINDOWS`` windows.  With m runs more,
+it falls in the proportion in which the curve does.  Weighted by how much of the driving the cell is expected
+to be, this is the accuracy that the runs would gain.  The law is that of the learning curve (e.g. Cortes et
+al., Learning Curves: Asymptotic Values and Rate of Convergence, 1994).
+
+Regimes are those that a person can ask for: a range of speed, straight on, in a curve or on the spot.  Accuracy is also
+given by support, by the true terrain and by the mark that needs no label.  Each held-out window is judged by a table of
+the training windows of its own fold.  Figures are ratios of sums over windows, their intervals those of a bootstrap
+that draws whole runs within their classes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import IntEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from terrain.classify.held_out import HeldOut
+from terrain.classify.limits import SupportLevel, learn_support, support_levels, support_of
+from terrain.classify.metrics import N_BOOTSTRAP, Interval, confidence_auc, drawn_runs, ratio_over_runs
+from terrain.records import Array
+
+MAX_SPEEDS, MIN_WIDTH_MPS = 4, 0.15
+"""At most so many ranges of speed, none narrower: closer speeds are not worth asking an operator for."""
+
+EDGE_STEP_MPS, EDGE_SHIFT_MPS = 0.05, 0.1
+"""Edges are multiples of the first; an inner one is moved by up to the second to where fewest windows lie, so
+that one commanded speed is not cut in two."""
+
+STRAIGHT_RADPS = 0.1
+"""A smaller yaw rate is straight on: 11 degrees in a window of 2 s."""
+
+STRAIGHT_RATIO, SPIN_RATIO = 0.1, 0.8
+"""Difference of the speeds of the two sides over their sum: straight on below the first where no yaw rate is
+measured, on the spot above the second, where one side nearly stands or turns against the other."""
+
+SPIN_RADIUS_M = 0.3
+"""A robot without two sides turns on the spot below this speed per yaw rate: about half a track width."""
+
+ADDED_RUNS = 2
+"""Runs that are asked for: a single one may be unlike the others."""
+
+PRIOR_WINDOWS = 10.0
+"""Windows that the curve counts as beside those of a cell; a run in a cell has about so many."""
+
+MIN_COUNTS = 3
+"""With fewer different numbers of runs there is no curve; its law has three parameters."""
+
+RUN_WINDOWS, MIN_RUN_S = 10, 20.0
+"""Windows that a run to be recorded should give, as many as the prior of a cell, and its least length."""
+
+MAX_DRIVES = 20
+MIN_GAIN = 5e-5
+"""A drive that is expected to gain less is not named: it would be shown as 0.00 %."""
+
+
+class Motion(NamedTuple):
+    """How the robot moved in each of n windows.
+
+    Parameters
+    ----------
+    speed_mps : (n,) magnitude of the speed of the fastest wheel, mean over the window
+    yaw_rate_radps : (n,) magnitude of the mean yaw rate; NaN where no gyroscope measures it
+    turn_ratio : (n,) ``|v_right - v_left| / (|v_right| + |v_left|)`` of the mean speeds of the two sides: 0
+        straight on, 1 where one side stands or they turn against each other; NaN without two sides
+    """
+
+    speed_mps: Array
+    yaw_rate_radps: Array
+    turn_ratio: Array
+
+    def of(self, rows: Array) -> Motion:
+        """Return the motion in some of the windows."""
+        return Motion(*(each[rows] for each in self))
+
+
+class Manoeuvre(IntEnum):
+    """What a robot does in a window."""
+
+    STRAIGHT = 0
+    CURVE = 1
+    SPIN = 2
+
+
+def manoeuvres(motion: Motion) -> Array:
+    """Return the :class:`Manoeuvre` (n,) of each window."""
+    speed_mps, yaw_rate_radps, turn_ratio = motion
+    straight = np.where(
+        np.isnan(yaw_rate_radps), ~(turn_ratio >= STRAIGHT_RATIO), yaw_rate_radps < STRAIGHT_RADPS
+    )
+    by_radius = speed_mps < SPIN_RADIUS_M * yaw_rate_radps
+    spin = np.where(np.isnan(turn_ratio), ~straight & by_radius, turn_ratio >= SPIN_RATIO)
+    return np.where(spin, Manoeuvre.SPIN, np.where(straight, Manoeuvre.STRAIGHT, Manoeuvre.CURVE))
+
+
+def speed_edges(speed_mps: Array) -> tuple[float, ...]:
+    """Return the edges of ranges of speed that divide what was driven evenly, between commanded speeds.
+
+    The range is that from the 1st to the 99th percentile of the windows, whatever their terrain; what lies outside is
+    in the range beside it.
+
+    Examples
+    --------
+    >>> speed_edges(np.array([0.2, 0.22, 0.4, 0.6, 0.8])), speed_edges(np.array([0.48, 0.5, 0.52]))
+    ((0.2, 0.35, 0.55, 0.8), (0.45, 0.55))
+    """
+    low, high = np.quantile(speed_mps, [0.01, 0.99])
+    n_ranges = int(np.clip((high - low) / MIN_WIDTH_MPS, 1, MAX_SPEEDS))
+    reach, inner = round(EDGE_SHIFT_MPS / EDGE_STEP_MPS), set()
+    for edge in np.linspace(low, high, n_ranges + 1)[1:-1]:
+        nearest = round(edge / EDGE_STEP_MPS)
+        places = EDGE_STEP_MPS * np.arange(max(nearest - reach, 1), nearest + reach + 1)
+        beside = [int(np.sum(np.abs(speed_mps - place) < EDGE_STEP_MPS / 2)) for place in places]
+        best = min(
+            zip(beside, np.abs(places - edge), places, strict=True)
+        )  # of the fewest windows the nearest
+        inner.add(float(np.round(best[2], 6)))
+    ends = np.floor(low / EDGE_STEP_MPS), max(np.ceil(high / EDGE_STEP_MPS), 1.0)
+    first, last = (float(np.round(EDGE_STEP_MPS * end, 6)) for end in ends)
+    return (first, *sorted(edge for edge in inner if first < edge < last), last)
+
+
+def regime_numbers(edges_mps: tuple[float, ...], motion: Motion) -> Array:
+    """Return the regime (n,) of windows, numbered manoeuvre by manoeuvre within each range of speed."""
+    within = np.searchsorted(np.array(edges_mps[1:-1]), motion.speed_mps, side="right")
+    return np.asarray(within * len(Manoeuvre) + manoeuvres(motion), dtype=int)
+
+
+def regime_name(edges_mps: tuple[float, ...], number: int) -> str:
+    """Return a regime in words.
+
+    Examples
+    --------
+    >>> [regime_name((0.1, 0.3, 0.6), number) for number in (0, 4)]
+    ['straight at 0.1 to 0.3 m/s', 'curve at 0.3 to 0.6 m/s']
+    """
+    within, manoeuvre = divmod(number, len(Manoeuvre))
+    low, high = edges_mps[within : within + 2]
+    return f"{Manoeuvre(manoeuvre).name.lower()} at {low:g} to {high:g} m/s"
+
+
+class HeldOutSupport(NamedTuple):
+    """Support of held-out windows by the training runs of their folds, each (repeats, n).
+
+    Whether the prediction is right; training runs near the motion of the window, of the true terrain and of the
+    predicted one; and the supported probability of the latter, and whether that suffices.
+    """
+
+    correct: Array
+    true_runs: Array
+    predicted_runs: Array
+    probability: Array
+    supported: Array
+
+
+def held_out_support(held_out: HeldOut, run_id: Array, motion: Motion) -> HeldOutSupport:
+    """Return the support of each window, of a run and with a motion, by the training windows of its fold."""
+    shape, terrain = held_out.probability.shape[:2], held_out.truth
+    true_runs, predicted_runs = np.zeros((2, *shape), dtype=int)
+    probability, supported = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+    classes = [str(name) for name in held_out.classes]
+    true = np.searchsorted(held_out.classes, terrain)
+    for (repeat, _, train, test), stated, *_ in held_out.results:
+        driven, there = motion.of(train), motion.of(test)
+        table = learn_support(driven.speed_mps, driven.yaw_rate_radps, terrain[train], run_id[train], classes)
+        near = table.near_runs(there.speed_mps, there.yaw_rate_radps)
+        true_runs[repeat, test] = near[np.arange(len(test)), true[test]]
+        predicted_runs[repeat, test], probability[repeat, test], supported[repeat, test] = support_of(
+            stated, near
+        )
+    return HeldOutSupport(held_out.correct, true_runs, predicted_runs, probability, supported)
+
+
+class PartFigures(NamedTuple):
+    """A part of the held-out windows: of all windows, its accuracy, and of all errors those in it.
+
+    Intervals are of 95 % over runs, None where it holds no window; the ratio of errors is None where there is none.
+    """
+
+    windows_ratio: float
+    windows_ratio_ci: Interval
+    accuracy: float | None
+    accuracy_ci: Interval | None
+    errors_ratio: float | None
+    errors_ratio_ci: Interval | None
+
+
+def support_accuracy(
+    held_out: HeldOutSupport, run_id: Array, terrain: Array, rng: np.random.Generator
+) -> tuple[dict[str, PartFigures], PartFigures, PartFigures, float | None]:
+    """Return the accuracy of held-out windows of runs and true terrains (n,) by their support.
+
+    Returns
+    -------
+    by_true_terrain : by :class:`~terrain.classify.limits.SupportLevel` of the true terrain: needs labels
+    unsupported, supported : by the mark of the prediction, without a label
+    auc : area from the supported probability to correctness; None where all are right
+    """
+    weights, place = drawn_runs(run_id, terrain, N_BOOTSTRAP, rng)
+    level, wrong = support_levels(held_out.true_runs), ~held_out.correct
+
+    def total(windows: Array) -> Array:
+        return np.asarray(weights @ np.bincount(place, windows.sum(axis=0), weights.shape[1]))
+
+    n, errors = total(np.ones(wrong.shape)), total(wrong)
+
+    def part(inside: Array) -> PartFigures:
+        n_inside, wrong_inside = total(inside), total(inside & wrong)
+        ratio, interval = ratio_over_runs(n_inside, n)
+        accuracy = ratio_over_runs(n_inside - wrong_inside, n_inside)
+        return PartFigures(
+            ratio or 0.0, interval or (0.0, 0.0), *accuracy, *ratio_over_runs(wrong_inside, errors)
+        )
+
+    areas = [
+        confidence_auc(probability, right.astype(float), np.ones((1, right.size)))[0]
+        for probability, right in zip(held_out.probability, held_out.correct, strict=True)
+    ]
+    known = np.isfinite(areas)
+    return (
+        {each.value: part(level == each.value) for each in SupportLevel},
+        part(~held_out.supported),
+        part(held_out.supported),
+        float(np.mean(np.array(areas)[known])) if known.any() else None,
+    )
+
+
+def errors_left(law: Array, n_runs: Array) -> Array:
+    """Return the error rate ``floor + scale (1 + n) ** -power`` with so many training runs."""
+    floor, scale, power = law
+    return np.asarray(floor + scale * (1.0 + np.asarray(n_runs, dtype=float)) ** -power)
+
+
+def fit_growth(n_runs: Array, correct: Array) -> Array | None:
+    """Return the law of :func:`errors_left` of held-out windows (n,); None where the data cannot show it.
+
+    Examples
+    --------
+    >>> n_runs = np.repeat([0, 1, 3, 7], 1000)
+    >>> right = np.tile(np.arange(1000), 4) >= 1000 * 0.8 / (1 + n_runs)
+    >>> errors_left(fit_growth(n_runs, right), np.array([0, 3])).round(2).tolist()
+    [0.8, 0.2]
+    """
+    counts, of = np.unique(n_runs, return_inverse=True)
+    if len(counts) < MIN_COUNTS:
+        return None
+    n = np.bincount(of)
+    wrong = 1.0 - np.bincount(of, weights=correct.astype(float)) / n
+    weight = np.sqrt(n / n.sum())
+
+    def residual(law: Array) -> Array:
+        return np.asarray(weight * (errors_left(law, counts) - wrong))
+
+    fit = least_squares(residual, x0=[0.05, 0.5, 0.7], bounds=([0.0, 0.0, 0.05], [1.0, 1.0, 3.0]))
+    return np.asarray(fit.x)
+
+
+def expected_gain(
+    law: Array,
+    expected_ratio: Array,
+    n_windows: Array,
+    n_errors: Array,
+    held_out_runs: Array,
+    all_runs: Array,
+    added_runs: int = ADDED_RUNS,
+) -> Array:
+    """Return the accuracy that so many more runs in each cell, a terrain in a regime, would gain (cells,).
+
+    Parameters
+    ----------
+    expected_ratio : of the driving that is expected, what takes place in the cell
+    n_windows, n_errors : held-out windows in it, and how many of them, mean over repeats, were wrong
+    held_out_runs, all_runs : training runs near them when they were held out, and with all runs in training, mean
+    """
+    of_curve = errors_left(law, held_out_runs)
+    error = (n_errors + PRIOR_WINDOWS * of_curve) / (n_windows + PRIOR_WINDOWS)
+    fall = errors_left(law, all_runs) - errors_left(law, all_runs + added_runs)
+    relative = np.divide(fall, of_curve, out=np.zeros_like(fall), where=of_curve > 0)
+    return np.asarray(expected_ratio * error * relative)
+
+
+class SupportRow(NamedTuple):
+    """A terrain in a regime of driving: its windows, their runs, and their accuracy when held out, if any."""
+
+    terrain: str
+    regime: str
+    windows: int
+    n_runs: int
+    accuracy: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields; the terrain is the class."""
+        row = self._asdict()
+        return {"class": row.pop("terrain"), **row}
+
+
+class NextDrive(NamedTuple):
+    """A drive that is worth recording: of at least so many runs, each at least so long.
+
+    Parameters
+    ----------
+    gain : accuracy that these runs are expected to add; it orders the drives, and no more: with cells of
+        recorded runs taken away and put back (BorealTC, 35 cells), its rank correlation with the real gain
+        was 0.5 and its size far too small
+    support_runs : training runs near that motion so far, mean
+    windows, accuracy : of the terrain in the regime so far, and their accuracy when held out, if there are any
+    """
+
+    terrain: str
+    regime: str
+    runs: int
+    duration_s: float
+    gain: float
+    support_runs: float
+    windows: int
+    accuracy: float | None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all fields and the request in words; the terrain is the class."""
+        row = self._asdict()
+        return {"class": row.pop("terrain"), **row, "request": self.request}
+
+    @property
+    def request(self) -> str:
+        """The drive in words that an operator can take along."""
+        return f"{self.terrain}, {self.regime}, at least {self.runs} runs of {self.duration_s:g} s"
+
+
+def coverage_of(
+    held_out: HeldOut, run_id: Array, motion: Motion, window_s: float, seed: int
+) -> Mapping[str, Any]:
+    """Return the coverage of held-out windows, by name.
+
+    The regimes of the rows are cut from the speeds of all windows; no figure but the rows and the choice of
+    drives depends on them.  The driving that is expected is half as recorded and half as if terrains and
+    regimes met independently: a robot that drives both will drive one on the other, whether or not a run
+    shows it.
+
+    Returns
+    -------
+    support : a :class:`SupportRow` of each terrain in each regime, those without a window among them
+    next_drives : :class:`NextDrive`, best first; empty where the data cannot show what more runs gain
+    accuracy_by_support, unsupported, supported, supported_auc : as :func:`support_accuracy`
+    """
+    classes, tested = [str(name) for name in held_out.classes], np.flatnonzero(held_out.tested)
+    table = learn_support(motion.speed_mps, motion.yaw_rate_radps, held_out.truth, run_id, classes)
+    support = HeldOutSupport(*(each[:, tested] for each in held_out_support(held_out, run_id, motion)))
+    run_id, terrain, motion = run_id[tested], held_out.truth[tested], motion.of(tested)
+    near = table.near_runs(motion.speed_mps, motion.yaw_rate_radps)
+    edges_mps = speed_edges(motion.speed_mps)
+    regime = regime_numbers(edges_mps, motion)
+    rows, cells = [], []
+    for column, name in enumerate(classes):
+        for number in np.unique(regime):
+            of_class, of_regime = terrain == name, regime == number
+            inside = of_class & of_regime
+            n = int(inside.sum())
+            right = float(support.correct[:, inside].mean()) if n else None
+            named = regime_name(edges_mps, int(number))
+            rows.append(SupportRow(name, named, n, len(np.unique(run_id[inside])), right))
+            expected = float(inside.mean() + of_class.mean() * of_regime.mean()) / 2
+            at = inside if n else of_regime  # the motions of other terrains show where coverage lacks
+            all_runs = float(near[at, column].mean())
+            errors = float((~support.correct[:, inside]).mean(axis=0).sum()) if n else 0.0
+            true_runs = float(support.true_runs[:, inside].mean()) if n else all_runs
+            cells.append((expected, n, errors, true_runs, all_runs))
+    law = fit_growth(support.true_runs.ravel(), support.correct.ravel())
+    gain = np.zeros(len(cells)) if law is None else expected_gain(law, *np.array(cells, dtype=float).T)
+    lasts_s = max(RUN_WINDOWS * window_s, MIN_RUN_S)
+    drives = []
+    for i in np.argsort(-gain, kind="stable")[:MAX_DRIVES]:
+        if gain[i] >= MIN_GAIN:
+            name, driven, n, _, right = rows[i]
+            asked = name, driven, ADDED_RUNS, lasts_s, float(gain[i])
+            drives.append(NextDrive(*asked, cells[i][-1], n, right))
+    levels, without, supported, auc = support_accuracy(support, run_id, terrain, np.random.default_rng(seed))
+    return {
+        "support": tuple(rows),
+        "next_drives": tuple(drives),
+        "accuracy_by_support": tuple({"support": level, **part._asdict()} for level, part in levels.items()),
+        "unsupported": without,
+        "supported": supported,
+        "supported_auc": auc,
+    }

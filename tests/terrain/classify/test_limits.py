@@ -1,0 +1,240 @@
+"""Novelty, support and sets of classes: their plain forms, laws, hidden truth, and what is refused."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sklearn.svm import SVC
+
+from terrain.classify.limits import (
+    CLIP_STD,
+    GAMMA,
+    KNOWN_KEPT,
+    REACH,
+    SPEED_STEP_MPS,
+    SUPPORTED,
+    YAW_STEP_RADPS,
+    check_novelty,
+    check_support,
+    conformal_sets,
+    conformal_threshold,
+    largest_margin,
+    learn_novelty,
+    learn_support,
+    support_of,
+)
+from terrain.errors import DataError
+
+CLASSES = ["ice", "mud", "snow"]
+
+
+def draw(centres, n_runs=6, n_windows=15, seed=0, run_std=0.3, n_features=30):
+    """Return features, classes and runs: centres are numbers of random directions, apart from each other."""
+    rng = np.random.default_rng(seed)
+    directions = np.random.default_rng(5).standard_normal((8, n_features))
+    of_run = 1.2 * np.repeat(directions[list(centres)], n_runs, axis=0)
+    of_run = of_run + run_std * rng.standard_normal(of_run.shape)
+    X = np.repeat(of_run, n_windows, axis=0)
+    runs = np.repeat([f"{c} run {r} of {seed}" for c in centres for r in range(n_runs)], n_windows)
+    y = np.repeat([f"terrain {c}" for c in centres], n_runs * n_windows)
+    return X + rng.standard_normal(X.shape), y, runs
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return learn_novelty(*draw((0, 1, 2)), seed=1)
+
+
+def is_unknown(fitted, X):
+    return ~(fitted.score(X) <= fitted.threshold)
+
+
+def test_a_terrain_that_was_hidden_is_found_and_held_out_runs_of_known_ones_are_kept(fitted):
+    known, _, _ = draw((0, 1, 2), seed=1, n_runs=20)
+    hidden, _, _ = draw((4,), seed=2, n_runs=20)
+    assert is_unknown(fitted, hidden).mean() > 0.8
+    kept = 1.0 - is_unknown(fitted, known).mean()
+    assert abs(kept - KNOWN_KEPT) < 0.04  # 60 runs whose windows are alike: 3 x sqrt(0.05 x 0.95 / 300)
+    assert fitted.score(hidden).mean() > fitted.score(known).mean() + 2.0
+
+
+def test_the_score_of_a_window_does_not_depend_on_the_others_nor_on_the_order_of_runs(fitted):
+    X, y, runs = draw((0, 1, 2))
+    scores = fitted.score(X)
+    np.testing.assert_allclose(fitted.score(X[::-1]), scores[::-1], rtol=1e-9)
+    np.testing.assert_allclose(fitted.score(X[7:8]), scores[7:8], rtol=1e-9)
+    again = learn_novelty(X, y, runs, seed=1)
+    assert all(np.array_equal(a, b) for a, b in zip(again, fitted, strict=True))
+
+
+def test_terms_agree_with_their_equations(fitted):
+    X, _, _ = draw((0, 3), seed=4)
+    n = fitted
+    x = np.clip((X[:, n.columns] - n.mean) / n.scale, -CLIP_STD, CLIP_STD)
+    z = x @ n.components.T
+    to_class = [np.square(z @ n.within.T - m).sum(axis=1) for m in n.means]
+    relative = np.min(to_class, axis=0) - np.square(z @ n.background.T - n.centre).sum(axis=1)
+    near = np.linalg.norm(z[:, np.newaxis, : n.prototypes.shape[1]] - n.prototypes, axis=2).min(axis=1)
+    squares = np.square(x[:, np.newaxis] - n.vectors).sum(axis=2)
+    margins = np.exp(-GAMMA * squares / len(n.columns)) @ n.weights + n.offsets
+    wins = np.full((len(X), 3, 3), np.inf)
+    for pair, (a, b) in enumerate(combinations(range(3), 2)):
+        wins[:, a, b], wins[:, b, a] = margins[:, pair], -margins[:, pair]
+    expected = np.stack([-wins.min(axis=2).max(axis=1), relative, near], axis=1)
+    np.testing.assert_allclose(n.terms(X), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_pair_margins_are_those_of_scikit_learn():
+    for classes in ((0, 1), (0, 1, 2)):
+        X, y, runs = draw(classes)
+        n = learn_novelty(X, y, runs)
+        x = np.clip((X[:, n.columns] - n.mean) / n.scale, -CLIP_STD, CLIP_STD)
+        svc = SVC(C=10.0, gamma=1.0 / x.shape[1], decision_function_shape="ovo").fit(x, y)
+        margins = svc.decision_function(x)
+        margins = -margins[:, np.newaxis] if margins.ndim == 1 else margins
+        np.testing.assert_allclose(-n.terms(X)[:, 0], largest_margin(margins, len(classes)), atol=1e-5)
+
+
+def test_broken_and_missing_features(fitted):
+    X, _, _ = draw((0, 1, 2))
+    X = X[:3].copy()
+    X[0, :5], X[1, :4], X[2] = np.nan, np.inf, 1e200
+    scores = fitted.score(X)
+    assert np.isfinite(scores).tolist() == [True, False, True]
+    assert is_unknown(fitted, X)[1]  # what cannot be compared is not known
+    with pytest.raises(DataError, match=r"shape \(3, 29\), \(n, 30\)"):
+        fitted.score(X[:, 1:])
+
+
+def test_few_data():
+    X, y, runs = draw((0, 1))
+    alone = np.where(y == "terrain 1", "one run", runs)
+    assert np.isfinite(learn_novelty(X, y, alone).score(X)).all()
+    X[:, 3], X[:, 4] = np.nan, 7.0
+    assert np.isfinite(learn_novelty(X, y, runs).score(X)).all()
+    with pytest.raises(DataError, match="at least two classes"):
+        learn_novelty(X, np.full(len(y), "ice"), runs)
+    with pytest.raises(DataError, match="no feature varies"):
+        learn_novelty(np.ones_like(X), y, runs)
+    with pytest.raises(DataError, match="too few"):
+        learn_novelty(X[[0, -1]], y[[0, -1]], runs[[0, -1]])
+
+
+@pytest.mark.parametrize("name", ["columns", "within", "reference", "vectors"])
+def test_numbers_that_do_not_fit_are_refused(fitted, name):
+    numbers = fitted
+    check_novelty(numbers, 3)
+    wrong = getattr(numbers, name).copy()
+    wrong[-1] = -1 if name == "columns" else np.nan
+    with pytest.raises(DataError):
+        check_novelty(numbers._replace(**{name: wrong}), 3)
+    with pytest.raises(DataError):
+        check_novelty(numbers, 4)
+    assert len(numbers.score(np.zeros((0, 30)))) == 0
+
+
+def windows(seed, n=60):
+    rng = np.random.default_rng(seed)
+    terrain = rng.choice(CLASSES[:2], n)
+    return rng.uniform(0, 1, n), rng.uniform(0, 1.5, n), terrain, rng.choice(list("abcdef"), n)
+
+
+def counted(training, speed, yaw):
+    """Count one by one the runs with a window at most REACH cells away."""
+    found = np.zeros((len(speed), len(CLASSES)), dtype=int)
+    for i, (v, w) in enumerate(zip(speed, yaw, strict=True)):
+        for j, name in enumerate(CLASSES):
+            runs = {
+                run
+                for other_v, other_w, terrain, run in zip(*training, strict=True)
+                if terrain == name
+                and abs(int(v / SPEED_STEP_MPS) - int(other_v / SPEED_STEP_MPS)) <= REACH
+                and abs(int(w / YAW_STEP_RADPS) - int(other_w / YAW_STEP_RADPS)) <= REACH
+            }
+            found[i, j] = len(runs)
+    return found
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_table_counts_the_runs_that_are_near(seed):
+    training = windows(seed)
+    speed, yaw, *_ = windows(seed + 1, 20)
+    table = learn_support(*training, CLASSES)
+    np.testing.assert_array_equal(table.near_runs(speed, yaw), counted(training, speed, yaw))
+
+
+def test_what_is_faster_than_any_cell_is_still_counted():
+    table = learn_support(np.array([1e6]), np.array([1e3]), np.array(["mud"]), np.array(["a"]), CLASSES)
+    assert table.near_runs(np.array([30.0]), np.array([50.0])).tolist() == [[0, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"classes": ("ice", "mud", "sand")},
+        *({"n_runs": counts} for counts in (None, [[1]], np.full((3, 1, 1), 0.5), np.full((3, 1, 1), -1))),
+        *({"n_runs": np.zeros(shape, dtype=int)} for shape in ((3, 0, 1), (2, 1, 1), (3, 1))),
+    ],
+)
+def test_a_table_of_another_form_is_refused_in_one_sentence(changed):
+    table = learn_support(*windows(1), CLASSES)
+    check_support(table, CLASSES)
+    with pytest.raises(DataError, match=r"^the table of support [^.]*$"):
+        check_support(replace(table, **changed), CLASSES)
+
+
+@given(st.floats(0.5, 1), st.integers(0, 50))
+def test_the_supported_probability_never_exceeds_the_probability_and_grows_with_runs(probability, n_runs):
+    stated = np.array([[probability, 1 - probability]])
+    few, more = (support_of(stated, np.array([[n, 99]])) for n in (n_runs, n_runs + 1))
+    assert few.probability[0] < more.probability[0] <= probability
+    assert few.supported[0] == (few.probability[0] >= SUPPORTED)
+    if n_runs == 0:
+        assert not few.supported[0]
+
+
+def draw_scores(rng, n_runs):
+    """Return scores of runs that are alike: each has its own level and its own number of windows."""
+    n_windows = rng.integers(3, 60, n_runs)
+    runs = np.repeat(np.arange(n_runs), n_windows)
+    return np.clip(0.2 + 0.2 * rng.standard_normal(n_runs)[runs] + 0.1 * rng.random(len(runs)), 0, 1), runs
+
+
+@pytest.mark.parametrize("level", [0.8, 0.9])
+def test_coverage_of_runs_that_are_alike_is_the_level(level):
+    rng = np.random.default_rng(0)
+    coverage = []
+    for _ in range(400):
+        threshold = conformal_threshold(*draw_scores(rng, 30), level)
+        scores, runs = draw_scores(rng, 20)
+        coverage.append(np.mean([(scores[runs == r] <= threshold).mean() for r in range(20)]))
+    error = np.std(coverage) / np.sqrt(len(coverage))
+    assert level - 3 * error <= np.mean(coverage) <= level + 1 / 31 + 3 * error
+
+
+def test_runs_weigh_alike_however_long():
+    scores = np.concatenate([np.full(1000, 0.9), np.full(19, 0.1)])
+    runs = np.concatenate([np.zeros(1000), np.arange(1, 20)])
+    assert conformal_threshold(scores, runs, 0.9) == 0.1  # one run in twenty
+    assert conformal_threshold(scores, np.arange(1019), 0.9) == 0.9
+
+
+def test_sets_grow_with_the_threshold_and_hold_the_most_probable_class():
+    probability = np.random.default_rng(0).dirichlet(np.ones(4), 50)
+    before = conformal_sets(probability, 0.0)
+    assert (before.sum(axis=1) == 1).all()
+    for threshold in (0.3, 0.6, 0.9, 1.0):
+        now = conformal_sets(probability, threshold)
+        assert (now | before == now).all()
+        before = now
+    assert before.all()
+
+
+def test_few_runs_and_no_scores():
+    assert conformal_threshold(np.zeros(50), np.repeat(np.arange(5), 10), 0.9) == 1.0
+    assert conformal_threshold(np.append(np.zeros(20), np.nan), np.arange(21), 0.9) == 0.0
+    with pytest.raises(DataError, match="no held-out window"):
+        conformal_threshold(np.full(3, np.nan), np.arange(3))
