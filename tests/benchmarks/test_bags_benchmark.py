@@ -10,50 +10,13 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
 
 from pipelines.data.bag_runs import find_runs
 
 DURATION_S = 60.0
 
-IMU_TEXT = """\
-std_msgs/Header header
-geometry_msgs/Quaternion orientation
-float64[9] orientation_covariance
-geometry_msgs/Vector3 angular_velocity
-float64[9] angular_velocity_covariance
-geometry_msgs/Vector3 linear_acceleration
-float64[9] linear_acceleration_covariance
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
-
-JOINTS_TEXT = """\
-std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-"""
-
-HEADER_TEXT = """\
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
+STORE = get_typestore(Stores.ROS2_HUMBLE)
 
 
 @pytest.fixture(scope="module")
@@ -63,8 +26,10 @@ def drive(tmp_path_factory):
     rng = np.random.default_rng(0)
     with path.open("wb") as file:
         writer = Writer(file)
-        imu = writer.register_msgdef("sensor_msgs/msg/Imu", IMU_TEXT + HEADER_TEXT)
-        joints = writer.register_msgdef("sensor_msgs/msg/JointState", JOINTS_TEXT + HEADER_TEXT)
+        imu, joints = (
+            writer.register_msgdef(kind, STORE.generate_msgdef(kind, ros_version=2)[0])
+            for kind in ("sensor_msgs/msg/Imu", "sensor_msgs/msg/JointState")
+        )
         for i in range(int(100 * DURATION_S)):
             stamp = 1_700_000_000 * 10**9 + i * 10**7
             head = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "imu_link"}

@@ -21,10 +21,6 @@ STUDIES: dict[str, tuple[str, str]] = {
         "studies.long_drives",
         "yaw of a filter on long drives, and after the loss of the camera",
     ),
-    "slip-peaks": (
-        "studies.slip_peaks",
-        "coverage of the interval of a learned slip peak, over simulated terrains",
-    ),
     "intervals": ("studies.intervals", "coverage of the intervals of all that is identified"),
     "labels": ("studies.labels", "what chosen questions and self-training gain, from few labels"),
     "trials": (

@@ -11,13 +11,13 @@ from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import betaincinv
 from scipy.stats import truncnorm
 
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.settings import setting
 from pipelines.report.tree import Column, Report, Table
-from studies.slip_peaks import clopper_pearson
 from terrain.calibration.description import find
 from terrain.calibration.odometry import SLIP, fit_odometry, legs_of_poses, level
 from terrain.calibration.sensors import fit_gravity
@@ -27,15 +27,16 @@ from terrain.errors import ConfigError
 from terrain.files.documents import read_yaml
 from terrain.identify import Parameter, half_width, identify
 from terrain.kinematics.wheels import rolling_matrix
-from terrain.records import Array, Label, RunLog, Stream
+from terrain.records import Array, Label, RunLog, Stream, TargetStatus
 from terrain.robots import description_file, load_robot
 from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.omni import steady_twist
-from terrain.simulation.run import six_positions_log
+from terrain.simulation.run import learning_runs, six_positions_log
 from terrain.simulation.scenario import make_scenario
 from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
 from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio
 from terrain.slip_learning.forces import RunBins
+from terrain.slip_learning.learn import learn_terrain, terrain_runs
 from terrain.slip_learning.rollers import roller_findings
 from terrain.slip_learning.soil import (
     LAWS,
@@ -49,7 +50,8 @@ from terrain.slip_learning.soil import (
     sinkage_of,
 )
 from terrain.terramechanics.inflow_wheel import FORCE
-from terrain.terramechanics.soil import load_soil
+from terrain.terramechanics.soil import load_soil, soil_names
+from terrain.terramechanics.traction import net_pull
 
 EXAMPLE = "python tests/studies intervals --repeats 200 --seed 0"
 WHEEL = WHEELS["testbed_smooth"]
@@ -58,16 +60,17 @@ NOMINAL_M = 0.3  #: Wheel radius by which logs of a skid-steer robot are made
 
 
 class Interval(NamedTuple):
-    """What was stated of a number, and the number."""
+    """What was stated of a number, and the number; ``value`` where it is not the middle."""
 
     name: str
     low: float
     high: float
     truth: float
+    value: float = np.nan
 
 
 class Covered(NamedTuple):
-    """Coverage of one number in one use."""
+    """Coverage of one number in one use, and the median and the largest of its errors."""
 
     use: str
     name: str
@@ -75,6 +78,8 @@ class Covered(NamedTuple):
     coverage: float
     interval: tuple[float, float]
     stated: float
+    error_median: float
+    error_largest: float
 
 
 NOMINAL = load_robot("agrimaro")
@@ -305,6 +310,32 @@ def _slip_curve(seed: int) -> Iterator[Interval]:
         yield Interval(f"peak_{name}", *curve.peak_interval, true.slip_ratio)
 
 
+def _slip_peak(seed: int) -> Iterator[Interval]:
+    """A simulated terrain, the soils in turn; nothing where its targets are not learned.
+
+    The truth is the peak of the described soil's own net traction under a third of the robot's weight, by the same
+    definition over the slips that its runs observe.
+    """
+    terrain, body = soil_names()[seed % len(soil_names())], NOMINAL.body
+    runs = [each for run in learning_runs(NOMINAL, terrain, seed) for each in terrain_runs(run, NOMINAL)]
+    learned = learn_terrain(terrain, runs, seed)
+    curve = learned.curve
+    if curve is None or learned.status is not TargetStatus.ESTIMATED:
+        return
+    soil, load_n = load_soil(terrain), NOMINAL.mass_kg * GRAVITY_MPS2 / len(NOMINAL.wheels)
+    wheel = NOMINAL.wheel_radius_m, body.tyre_width_m, body.contact_length_m
+    true = net_peak(lambda slips: net_pull(soil, load_n, slips, *wheel), *curve.slip_range)
+    yield Interval("peak", *curve.peak_interval, true.slip_ratio, curve.peak.slip_ratio)
+
+
+def clopper_pearson(hits: int, n: int, level: float = 0.95) -> tuple[float, float]:
+    """Return the exact interval of a probability by ``hits`` of ``n``."""
+    tail = (1 - level) / 2
+    low = float(betaincinv(hits, n - hits + 1, tail)) if hits else 0.0
+    high = float(betaincinv(hits + 1, n - hits, 1 - tail)) if hits < n else 1.0
+    return low, high
+
+
 USES: dict[str, tuple[Callable[[int], Iterator[Interval]], float]] = {
     "regression": (_regression, 0.95),
     "six-positions": (_six_positions, 0.95),
@@ -314,6 +345,7 @@ USES: dict[str, tuple[Callable[[int], Iterator[Interval]], float]] = {
     "odometry": (_odometry, 0.95),
     "soil": (_soil, 0.95),
     "slip-curve": (_slip_curve, 0.9),
+    "slip-peak": (_slip_peak, 0.9),
 }
 """By name: what draws and identifies, and the probability that its intervals state."""
 
@@ -341,16 +373,21 @@ def run(settings: Settings, progress: Progress = silent) -> IntervalsResult:
         if use not in USES:
             raise ConfigError(f"--uses: there is no use {use!r}; there are {', '.join(USES)}")
         draw, stated = USES[use]
-        hits: dict[str, list[bool]] = {}
+        intervals: dict[str, list[Interval]] = {}
         for k in range(settings.repeats):
-            for name, low, high, truth in draw(settings.seed + k):
-                hits.setdefault(name, []).append(bool(low <= truth <= high))
+            for each in draw(settings.seed + k):
+                intervals.setdefault(each.name, []).append(each)
             progress(use, k + 1, settings.repeats)
-        rows += [
-            Covered(use, name, len(each), float(np.mean(each)), clopper_pearson(sum(each), len(each)), stated)
-            for name, each in hits.items()
-        ]
+        rows += [_covered(use, name, each, stated) for name, each in intervals.items()]
     return IntervalsResult(settings.repeats, settings.seed, tuple(rows))
+
+
+def _covered(use: str, name: str, intervals: list[Interval], stated: float) -> Covered:
+    n, hits = len(intervals), sum(bool(each.low <= each.truth <= each.high) for each in intervals)
+    middles = [each.value if np.isfinite(each.value) else (each.low + each.high) / 2 for each in intervals]
+    errors = np.abs(np.array(middles) - [each.truth for each in intervals])
+    median, largest = float(np.median(errors)), float(errors.max())
+    return Covered(use, name, n, hits / n, clopper_pearson(hits, n), stated, median, largest)
 
 
 def report(result: IntervalsResult) -> Report:
@@ -363,6 +400,8 @@ def report(result: IntervalsResult) -> Report:
         Column("coverage", ".3f"),
         Column("95 %", ".3f"),
         Column("stated", ".2f"),
+        Column("median error", ".3g"),
+        Column("largest", ".3g"),
     )
     return Report(
         "Intervals of what is identified",

@@ -14,12 +14,11 @@ import pytest
 
 from pipelines.report.results import Result
 from pipelines.report.tree import Report
-from studies import figures, labels, long_drives, mutants, scale, slip_peaks, trials
+from studies import figures, intervals, labels, long_drives, mutants, scale, trials
 from studies.__main__ import STUDIES, main
 from studies.blind_trials.hidden import Row
 from terrain.errors import ConfigError, DataError
 from terrain.robots import load_robot
-from terrain.simulation.run import Drive
 
 ROOT = Path(__file__).parents[2]
 ROBOT = load_robot("agrimaro")
@@ -111,34 +110,18 @@ def test_a_mutant_is_caught_by_a_test_that_fails_and_the_tree_is_as_it_was(tmp_p
 # -- slip, filters, trials, labels -------------------------------------------------------------------------
 
 
-SWEEP = Drive("sweep", 1.0, 0.8, 21.0)
-DRIVES = (SWEEP, SWEEP, SWEEP, Drive("starts", 1.5, 1.2, 15.0), Drive("climb", 2.0, 1.2, 15.0, 0.06, 0.06))
-
-
 @pytest.mark.slow
-def test_intervals_contain_the_true_peaks_of_two_terrains():
+def test_intervals_contain_the_true_peaks_of_learned_slip():
     """Eight cases at 90 %: fewer than five inside is one time in two hundred."""
-    cases = [
-        slip_peaks.run_case(ROBOT, terrain, 1400 + number, DRIVES, n_bootstrap=40)
-        for terrain in ("snow", "grass")
-        for number in range(4)
-    ]
-    result = slip_peaks.summary([*cases, None])
-    assert (result.n_cases, result.n_learned) == (9, 8)
-    assert result.all.coverage >= 5 / 8
-    assert result.all.error_median_abs < 0.03
-    assert result.all.status_right == 8
-    assert result.as_json()["coverage"] == result.all.coverage
-    assert "1 of 9 were not learned" in result.report.answer
+    (row,) = intervals.run(intervals.Settings(repeats=8, seed=1400, uses="slip-peak")).rows
+    assert row.coverage >= 5 / 8
+    assert row.error_median < 0.03
 
 
-def test_nothing_learned_is_no_coverage():
-    found = slip_peaks.summary([None])
-    assert (found.n_learned, found.all.coverage_ci) == (0, None)
-    assert np.isnan(found.all.coverage)
-    low, high = slip_peaks.clopper_pearson(0, 5)
-    assert (low, high) == (0.0, pytest.approx(1 - 0.025 ** (1 / 5)))
-    assert slip_peaks.clopper_pearson(5, 5)[0] == pytest.approx(0.025 ** (1 / 5))
+def test_the_interval_of_a_probability_is_exact():
+    assert intervals.clopper_pearson(0, 5) == (0.0, pytest.approx(1 - 0.025 ** (1 / 5)))
+    assert intervals.clopper_pearson(5, 5)[0] == pytest.approx(0.025 ** (1 / 5))
+    assert intervals.clopper_pearson(90, 100) == pytest.approx((0.824, 0.951), abs=1e-3)
 
 
 @pytest.mark.slow
