@@ -16,14 +16,12 @@ from features.statistics import channel_correlations
 from terrain.logs.schema import UNIT_SYMBOLS, signal_set_of, unit_of
 from terrain.records import Array
 
-MIN_SPEED_MPS = 0.05
-"""Division by speed stops here: below it a wheel reading is mostly quantisation."""
+MIN_SPEED_MPS = 0.05  #: Division by speed stops here: below it a wheel reading is mostly quantisation
 
 MIN_WHEEL_DIFFERENCE_MPS = 0.03
 """A smaller wheel difference (rms) does not count as a turn; the yaw rate per wheel difference is NaN."""
 
-N_PARTS = 8
-"""Parts of a window over which wheel difference and yaw rate are averaged."""
+N_PARTS = 8  #: Parts of a window over which wheel difference and yaw rate are averaged
 
 _LOG_FLOOR = 1e-4
 

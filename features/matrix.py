@@ -39,19 +39,12 @@ SAME_RATE = 1e-6
 
 
 class FeatureMatrix(NamedTuple):
-    """What features are computed from.
+    """What features are computed from."""
 
-    Parameters
-    ----------
-    layout : channels and rates of the streams that features are made of
-    length_s : of a window
-    n_samples : of each stream in a window
-    level_sets : signal sets of which the statistics in :data:`LEFT_OUT` are computed as well
-    """
-
-    layout: Layout
-    length_s: float
-    n_samples: Mapping[str, int]
+    layout: Layout  #: channels and rates of the streams that features are made of
+    length_s: float  #: of a window
+    n_samples: Mapping[str, int]  #: of each stream in a window
+    #: signal sets of which the statistics in :data:`LEFT_OUT` are computed as well
     level_sets: tuple[str, ...] = ()
 
     def equals(self, other: FeatureMatrix) -> bool:

@@ -20,8 +20,7 @@ __all__ = ["NO_MOTION", "Motion", "fastest_wheel", "wheel_stream", "window_motio
 NO_MOTION = "the windows hold no wheel speed, so that how the robot moved is not known"
 """Why there is no :class:`Motion`."""
 
-MIN_SIDE_SPEED_MPS = 1e-6
-"""Sides that are slower together stand: their ratio is not defined."""
+MIN_SIDE_SPEED_MPS = 1e-6  #: Sides that are slower together stand: their ratio is not defined
 
 
 def window_motion(windows: Windows) -> Motion | None:

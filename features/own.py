@@ -19,12 +19,6 @@ from terrain.records import Array, Windows
 class Window:
     """One window, as a user's own function is given it.
 
-    Parameters
-    ----------
-    values : per stream ``(n_channels, n_samples)``
-    channels, rate_hz : per stream
-    length_s : nominal length
-
     Examples
     --------
     >>> window = Window({"imu": np.array([[1.0, 2.0]])}, {"imu": ("accel_z_mps2",)}, {"imu": 1.0}, 2.0)
@@ -32,10 +26,11 @@ class Window:
     array([1., 2.])
     """
 
-    values: Mapping[str, Array]
+    values: Mapping[str, Array]  #: per stream ``(n_channels, n_samples)``
+    #: channels, rate_hz: per stream
     channels: Mapping[str, tuple[str, ...]]
     rate_hz: Mapping[str, float]
-    length_s: float
+    length_s: float  #: nominal length
 
     def __getitem__(self, place: tuple[str, str]) -> Array:
         """Return the samples (n,) of ``stream, channel``.

@@ -37,26 +37,15 @@ N_FOLDS = 5
 
 
 class Samples(NamedTuple):
-    """Labelled windows, and what protocols need besides.
+    """Labelled windows, and what protocols need besides."""
 
-    Parameters
-    ----------
-    windows : under one label each
-    dropped : how many windows were left out, by reason
-    group : (n,) what is never divided: the run, or under ``published`` the partition
-    gap : windows beside a window that may share samples with it
-    merged : ids of runs that hold the same measurements and were made one
-    runs : that the windows were cut from; empty where they are not at hand
-    repaired : what a repairing reader changed, by kind
-    """
-
-    windows: Windows
-    dropped: Mapping[str, int]
-    group: Array
-    gap: int
-    merged: tuple[tuple[str, ...], ...] = ()
-    runs: Sequence[RunLog] = ()
-    repaired: Mapping[str, int] = MappingProxyType({})
+    windows: Windows  #: under one label each
+    dropped: Mapping[str, int]  #: how many windows were left out, by reason
+    group: Array  #: (n,) what is never divided: the run, or under ``published`` the partition
+    gap: int  #: windows beside a window that may share samples with it
+    merged: tuple[tuple[str, ...], ...] = ()  #: ids of runs that hold the same measurements and were made one
+    runs: Sequence[RunLog] = ()  #: that the windows were cut from; empty where they are not at hand
+    repaired: Mapping[str, int] = MappingProxyType({})  #: what a repairing reader changed, by kind
 
     @property
     def terrain(self) -> Array:
@@ -70,24 +59,17 @@ class Samples(NamedTuple):
 
 
 class Protocol(NamedTuple):
-    """What is held out, and how.
+    """What is held out, and how."""
 
-    Parameters
-    ----------
-    held_out : in words
-    units : (n,) what is held out together; empty of a window that neither trains nor tests
-    deal : from class, unit, number of folds and random numbers of the repeat, the fold (n,) that tests each window,
-        -1 for none
-    repeats : fold assignments by default; 1 where there is one only
-    note : what a reader of the figures must know of it
-    whole_runs : whether a run is on one side of a split, but for the blocks of a class with one unit
-    """
-
-    held_out: str
+    held_out: str  #: in words
+    #: (n,) what is held out together; empty of a window that neither trains nor tests
     units: Callable[[Samples], Array]
+    #: from class, unit, number of folds and random numbers of the repeat, the fold (n,) that tests each
+    #: window, -1 for none
     deal: Callable[[Array, Array, int, np.random.Generator], Array]
-    repeats: int = 1
-    note: str = ""
+    repeats: int = 1  #: fold assignments by default; 1 where there is one only
+    note: str = ""  #: what a reader of the figures must know of it
+    #: whether a run is on one side of a split, but for the blocks of a class with one unit
     whole_runs: bool = True
 
 

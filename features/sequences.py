@@ -17,20 +17,14 @@ from terrain.records import Array, RunLog, Windows
 
 
 class Following(NamedTuple):
-    """Follows sequences with a classifier once it is fitted, in whatever process fits it.
+    """Follows sequences with a classifier once it is fitted, in whatever process fits it."""
 
-    Parameters
-    ----------
-    features : scikit-learn transformer of windows
-    sequences : to be followed
-    rule, layout : of the classifier's windows
-    classes, prior : (k,) names in the order of the columns, and the part of each among the training windows
-    """
-
-    features: Any
-    sequences: tuple[SplicedRun, ...]
+    features: Any  #: scikit-learn transformer of windows
+    sequences: tuple[SplicedRun, ...]  #: to be followed
+    #: rule, layout: of the classifier's windows
     rule: WindowRule
     layout: Layout
+    #: classes, prior: (k,) names in the order of the columns, and the part of each among the training windows
     classes: Array
     prior: Array
 

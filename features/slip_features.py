@@ -6,8 +6,7 @@ import numpy as np
 
 from terrain.records import Array
 
-MIN_DEFINED_FRACTION = 0.5
-"""With a smaller fraction of the window defined, its slip statistics are NaN."""
+MIN_DEFINED_FRACTION = 0.5  #: With a smaller fraction of the window defined, its slip statistics are NaN
 
 SLIP_STATISTICS: tuple[str, ...] = ("mean", "std", "min", "max", "mean_abs", "median")
 

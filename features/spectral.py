@@ -17,8 +17,7 @@ from terrain.records import Array
 
 MAX_BANDS = 20
 MIN_BINS_PER_BAND = 2
-MIN_SAMPLES = 48
-"""A spectrum of fewer samples has too few lines to add anything to the autocorrelation."""
+MIN_SAMPLES = 48  #: A spectrum of fewer samples has too few lines to add anything to the autocorrelation
 
 ROLLOFF = 0.85
 _FLOOR = 1e-10  # squared SI unit per Hz, under a logarithm: the noise density of a good sensor

@@ -44,16 +44,11 @@ DROP_REASONS = ("gap", "wrong rate", "not finite", "not moving", "not steady")
 
 @dataclass(frozen=True, slots=True)
 class SteadyMotion:
-    """When a window counts as steady motion (thesis 8.1 requires it without numbers: both are assumed).
+    """When a window counts as steady motion (thesis 8.1 requires it without numbers: both are assumed)."""
 
-    Parameters
-    ----------
-    min_speed_mps : the mean speed of the faster wheel must reach this
-    max_accel_mps2 : the mean speeds of a wheel in the two halves of the window may differ by at most
-        this acceleration times half the length; means, because single wheel readings are noisy
-    """
-
-    min_speed_mps: float = 0.03
+    min_speed_mps: float = 0.03  #: the mean speed of the faster wheel must reach this
+    #: the mean speeds of a wheel in the two halves of the window may differ by at most this acceleration times
+    #: half the length; means, because single wheel readings are noisy
     max_accel_mps2: float = 0.25
 
 
@@ -61,23 +56,18 @@ class SteadyMotion:
 class WindowRule:
     """How runs are cut.
 
-    Parameters
-    ----------
-    length_s : length of a window (thesis 8.1: 2 s)
-    stride_s : from start to start; ``None`` means one length, that is no overlap
-    steady : the rule of steady motion, ``None`` to keep every window
-    max_gap_periods : a longer step between two samples, in sample periods, is a gap; 1.8 lets jitter
-        through and catches one lost sample
-
     Raises
     ------
     ConfigError
         if a number is not positive and finite.
     """
 
-    length_s: float = 2.0
-    stride_s: float | None = None
+    length_s: float = 2.0  #: length of a window (thesis 8.1: 2 s)
+    stride_s: float | None = None  #: from start to start; ``None`` means one length, that is no overlap
+    #: the rule of steady motion, ``None`` to keep every window
     steady: SteadyMotion | None = field(default_factory=SteadyMotion)
+    #: a longer step between two samples, in sample periods, is a gap; 1.8 lets jitter through and catches one
+    #: lost sample
     max_gap_periods: float = 1.8
 
     def __post_init__(self) -> None:

@@ -18,8 +18,7 @@ from terrain import __version__
 from terrain.errors import OutsideRegionWarning, TerrainError
 from terrain.files.names import printable
 
-MAX_MESSAGE = 1000
-"""Characters of an error's message on the screen; of a longer one the middle is left out."""
+MAX_MESSAGE = 1000  #: Characters of an error's message on the screen; of a longer one the middle is left out
 
 HELP = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 

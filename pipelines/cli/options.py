@@ -15,8 +15,7 @@ from pipelines.cli.table import Command
 from pipelines.report.results import Result, write_json
 from pipelines.report.settings import ENDINGS, Settings, check_file, setting
 
-REQUIRED = "Required"
-"""Heading of what has to be given."""
+REQUIRED = "Required"  #: Heading of what has to be given
 
 
 class Output(Settings):

@@ -65,18 +65,11 @@ _LATEST_NS = 2**63 - 1
 
 
 class Bag(NamedTuple):
-    """A bag: its files in order, and what names it.
+    """A bag: its files in order, and what names it."""
 
-    Parameters
-    ----------
-    path : the file, or the folder with ``metadata.yaml``
-    files : with messages
-    distro : release of ROS 2 that wrote it, as rosbags names it; empty where unknown
-    """
-
-    path: Path
-    files: tuple[Path, ...]
-    distro: str = ""
+    path: Path  #: the file, or the folder with ``metadata.yaml``
+    files: tuple[Path, ...]  #: with messages
+    distro: str = ""  #: release of ROS 2 that wrote it, as rosbags names it; empty where unknown
 
 
 class _Head(BaseModel):

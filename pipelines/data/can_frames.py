@@ -42,13 +42,11 @@ if TYPE_CHECKING:
 
 DEFAULT_DBC = "agrimaro.dbc"
 MAX_BYTES = 8
-UNITLESS = ("", "-", "1")
-"""Units of a code."""
+UNITLESS = ("", "-", "1")  #: Units of a code
 
 library = partial(errors.library, need="CAN needs the packages python-can and cantools", extra="can")
 
-BUS_OFF_BIT = 0x40
-"""In the identifier of an error frame of socketcan."""
+BUS_OFF_BIT = 0x40  #: In the identifier of an error frame of socketcan
 
 COUNTER, CRC = "Counter", "Crc8"
 """Signals that any message may have: rises by one a sample; CRC-8 over identifier and data."""
@@ -75,11 +73,8 @@ READERS = {
 }
 """Reader of python-can for each kind of file, and how it is opened."""
 
-QUEUE = 1000
-"""Most samples of a stream between two readings: ten seconds of an IMU; the oldest are dropped."""
-
-INCOMPLETE_S = 0.02
-"""A sample whose other frames have not come for so long is used without them."""
+QUEUE = 1000  #: Most samples of a stream between two readings: ten seconds of an IMU; the oldest are dropped
+INCOMPLETE_S = 0.02  #: A sample whose other frames have not come for so long is used without them
 
 
 class Drop(StrEnum):
@@ -101,47 +96,28 @@ USUAL = (Drop.UNKNOWN, Drop.ERROR, Drop.BUS_OFF, Drop.REMOTE)
 
 @dataclass(frozen=True, slots=True)
 class SignalPlan:
-    """One signal of a message that is used; values are in the unit of the DBC.
+    """One signal of a message that is used; values are in the unit of the DBC."""
 
-    Parameters
-    ----------
-    name : in the DBC
-    column : of its channel in the stream
-    factor : from the unit of the DBC to SI
-    scale : one step of a raw value; 0 of floating point
-    low, high : least and largest value that is a measurement
-    absent : value that stands for one that was not measured
-    """
-
-    name: str
-    column: int
-    factor: float
-    scale: float
+    name: str  #: in the DBC
+    column: int  #: of its channel in the stream
+    factor: float  #: from the unit of the DBC to SI
+    scale: float  #: one step of a raw value; 0 of floating point
+    #: low, high: least and largest value that is a measurement
     low: float
     high: float
-    absent: float
+    absent: float  #: value that stands for one that was not measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MessagePlan:
-    """One message that is used.
+    """One message that is used."""
 
-    Parameters
-    ----------
-    message : of cantools
-    stream : that it carries
-    signals : of the stream's channels
-    counter_bits : of its counter; 0 without one
-    crc_bits : bits of its CRC in the data, the first byte the highest; 0 without one
-    others : value of each further signal when it is sent
-    """
-
-    message: Any
-    stream: str
-    signals: tuple[SignalPlan, ...]
-    counter_bits: int
-    crc_bits: int
-    others: Mapping[str, int | float]
+    message: Any  #: of cantools
+    stream: str  #: that it carries
+    signals: tuple[SignalPlan, ...]  #: of the stream's channels
+    counter_bits: int  #: of its counter; 0 without one
+    crc_bits: int  #: bits of its CRC in the data, the first byte the highest; 0 without one
+    others: Mapping[str, int | float]  #: value of each further signal when it is sent
 
 
 @dataclass(frozen=True, slots=True, eq=False)

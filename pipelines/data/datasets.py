@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     Readers = list[Callable[..., RunLog]]
     """One a run; called with ``repair=``."""
 
-CAN_ROBOT = "agrimaro"
-"""Robot of a log of a CAN bus where none is named."""
+CAN_ROBOT = "agrimaro"  #: Robot of a log of a CAN bus where none is named
 
 DRIVE_ROBOT = "husky"
 """Robot of a log of DRIVE where none is named: that of the log that was published with the paper."""
@@ -41,19 +40,13 @@ _log = logging.getLogger(__name__)
 
 
 class RunLoader(NamedTuple):
-    """Reads one run of a data set as :func:`load` gives it; it can be sent to another process.
+    """Reads one run of a data set as :func:`load` gives it; it can be sent to another process."""
 
-    Parameters
-    ----------
-    read : reader of the layout
-    repair, align : as :func:`load_runs`
-    robot : description of the robot that is named; None where none is
-    """
-
-    read: Callable[..., RunLog]
+    read: Callable[..., RunLog]  #: reader of the layout
+    #: repair, align: as :func:`load_runs`
     repair: bool
     align: bool
-    robot: Robot | None
+    robot: Robot | None  #: description of the robot that is named; None where none is
 
     def __call__(self) -> RunLog:
         """Return the run; errors as :func:`load_runs`."""

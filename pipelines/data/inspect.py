@@ -79,8 +79,7 @@ COLUMNS = (
     Column("missing"),
     Column("stuck"),
 )
-MAX_ROWS = 12
-"""Rows of streams on the first screen: those that need a look come first."""
+MAX_ROWS = 12  #: Rows of streams on the first screen: those that need a look come first
 
 
 def run(settings: Settings, progress: Progress = silent) -> Inspection:

@@ -13,8 +13,7 @@ from pipelines.report.tree import Report
 from terrain.errors import ConfigError, LogError
 
 EXAMPLE = "terrain simulate --robot husky --terrain grass --scenario survey --runs 8 --out runs/"
-EVERY = "all"
-"""Given in place of a terrain: each soil in turn."""
+EVERY = "all"  #: Given in place of a terrain: each soil in turn
 
 
 class Settings(BaseSettings):

@@ -49,8 +49,7 @@ from terrain.robots import load_robot
 if TYPE_CHECKING:
     from pipelines.drive.drive import Settings
 
-PICTURED = 3
-"""Metrics of the first picture."""
+PICTURED = 3  #: Metrics of the first picture
 
 
 class DriveResult(Result, eq=False):

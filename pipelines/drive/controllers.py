@@ -19,20 +19,12 @@ from terrain.robots import Robot
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveInputs:
-    """Robots and models of a comparison.
+    """Robots and models of a comparison."""
 
-    Parameters
-    ----------
-    robot : as the controllers assume it
-    table : target slips
-    model : classifier of ``classified`` and ``thesis:classified``
-    plant : the simulated robot, where it is another one
-    """
-
-    robot: Robot
-    table: SlipTable
-    model: TerrainModel | None = None
-    plant: Robot | None = None
+    robot: Robot  #: as the controllers assume it
+    table: SlipTable  #: target slips
+    model: TerrainModel | None = None  #: classifier of ``classified`` and ``thesis:classified``
+    plant: Robot | None = None  #: the simulated robot, where it is another one
 
     @property
     def simulated(self) -> Robot:

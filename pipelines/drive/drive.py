@@ -25,8 +25,7 @@ SITUATIONS = ("start", "stop", "steady")
 SlipSourceName = Literal["none", "dynamic", "kinematic", "multi", "multi-grip"]
 """Names of :class:`terrain.control.car_following.SlipSource`, which would load compiled code here."""
 
-ALL = "all"
-"""``--faults`` that names every fault."""
+ALL = "all"  #: ``--faults`` that names every fault
 
 Ratio = Annotated[float, Field(ge=0.5, le=2.0)]
 Duration = Annotated[float, Field(gt=0.0)]

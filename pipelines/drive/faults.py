@@ -53,21 +53,13 @@ from terrain.simulation.faults import fault_catalogue, select_faults
 if TYPE_CHECKING:
     from pipelines.drive.drive import Settings
 
-DELAY_S = PilotSettings().delay_s
-"""From a sample to the wheel."""
-
-LEARNING_SEED = 5000
-"""Of the simulated runs that targets are learned from; seeds of drives are far below."""
+DELAY_S = PilotSettings().delay_s  #: From a sample to the wheel
+LEARNING_SEED = 5000  #: Of the simulated runs that targets are learned from; seeds of drives are far below
 
 MET = "met"
-SHOWN_FAULTS = 8
-"""Faults with unmet bars that the answer's table has."""
-
-BEFORE_S = 1.0
-"""Shown before the fault."""
-
-FASTEST_MPS = 10.0
-"""Estimates of the speed beyond this, as a fault may cause, are not drawn."""
+SHOWN_FAULTS = 8  #: Faults with unmet bars that the answer's table has
+BEFORE_S = 1.0  #: Shown before the fault
+FASTEST_MPS = 10.0  #: Estimates of the speed beyond this, as a fault may cause, are not drawn
 
 
 class FaultsResult(Result, eq=False):

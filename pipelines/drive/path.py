@@ -37,16 +37,12 @@ if TYPE_CHECKING:
 
     from pipelines.drive.drive import Settings
 
-SPEED_MPS = 3.0
-"""Unless another is given."""
+SPEED_MPS = 3.0  #: Unless another is given
 
 DISTANCE = "distance along the path [m]"
 
-SHOWN_M = 1.5
-"""Lateral errors beyond this leave the figure."""
-
-STAND_S = 3.0
-"""Time of a stop."""
+SHOWN_M = 1.5  #: Lateral errors beyond this leave the figure
+STAND_S = 3.0  #: Time of a stop
 
 START_M, SLOW_MPS = 2.0, 0.5
 """Distance travelled beside that of speeding up, and speed, from which the robot counts as cruising."""

@@ -22,11 +22,8 @@ from terrain.robots import Robot
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names
 
-RUNS_A_TERRAIN, SCENARIO = 6, "survey"
-"""Simulated runs that the classifier is trained on."""
-
-MIN_RUNS, MIN_TERRAINS = 4, 2
-"""Least numbers of held-out runs and known terrains for an accuracy."""
+RUNS_A_TERRAIN, SCENARIO = 6, "survey"  #: Simulated runs that the classifier is trained on
+MIN_RUNS, MIN_TERRAINS = 4, 2  #: Least numbers of held-out runs and known terrains for an accuracy
 
 
 def classifier_gain(

@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from terrain.robots import Robot
 
 EXAMPLE = "terrain explain --data raw/ --robot husky --out explained/"
-RESULTS = ("pipelines.explain.explanation",)
-"""Modules of the results."""
+RESULTS = ("pipelines.explain.explanation",)  #: Modules of the results
 
 PAGE_FILE, EXTENDED_FILE, NEXT_FILE = "report.html", "extended.yaml", "next_drive.yaml"
 

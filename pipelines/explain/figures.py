@@ -16,16 +16,12 @@ from terrain.discrepancy.statements import CHANNEL_WORDS, INPUT_LABELS, channel_
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
-BAND_STDS = 2.0
-"""Half width of the noise band in standard deviations."""
+BAND_STDS = 2.0  #: Half width of the noise band in standard deviations
 
 MEASURED, BEFORE, AFTER = "measured", "simulated", "with the causes built in"
 BLUE, VERMILION, GREY = 0, 1, 6
-AXIS = "{} [{}]"
-"""Of what a channel is called, and its unit."""
-
-LEAST_POWER = 1e-300
-"""Under the logarithm of a spectrum."""
+AXIS = "{} [{}]"  #: Of what a channel is called, and its unit
+LEAST_POWER = 1e-300  #: Under the logarithm of a spectrum
 
 
 def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figure:

@@ -41,25 +41,17 @@ FORMAT_VERSION = 5
 
 
 class RunHead(NamedTuple):
-    """What is known of a run without its samples.
+    """What is known of a run without its samples."""
 
-    Parameters
-    ----------
-    run_id, robot, filter, digest : of the run; the digest is of its content
-    streams : name, channels and sample period in s of each
-    repaired : what a repairing reader dropped, as counts by kind
-    print_digest : of its samples, see :class:`~terrain.logs.duplicates.RunPrint`
-    fault : why it was skipped; empty of one that was read
-    """
-
+    #: run_id, robot, filter, digest: of the run; the digest is of its content
     run_id: str
     robot: str = ""
     filter: str = ""
     digest: str = ""
-    streams: Sequence[tuple[str, Sequence[str], float]] = ()
-    repaired: Mapping[str, int] = {}
-    print_digest: str = ""
-    fault: str = ""
+    streams: Sequence[tuple[str, Sequence[str], float]] = ()  #: name, channels and sample period in s of each
+    repaired: Mapping[str, int] = {}  #: what a repairing reader dropped, as counts by kind
+    print_digest: str = ""  #: of its samples, see :class:`~terrain.logs.duplicates.RunPrint`
+    fault: str = ""  #: why it was skipped; empty of one that was read
 
     def sketch(self) -> RunLog:
         """Return a run of two samples a stream that has these channels and rates, and nothing else."""

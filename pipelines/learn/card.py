@@ -42,11 +42,8 @@ if TYPE_CHECKING:
     from features.motion import Motion
     from terrain.records import Windows
 
-N_TIMED = 50
-"""Windows whose time is measured, one by one; the median is stated."""
-
-WEAK_BELOW = 0.5
-"""A terrain that is recognised less often is named among the limits."""
+N_TIMED = 50  #: Windows whose time is measured, one by one; the median is stated
+WEAK_BELOW = 0.5  #: A terrain that is recognised less often is named among the limits
 
 
 class TrainingRecord(BaseModel):

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "terrain label runs/ --run GRASS_01 --from 2 --to 6 --terrain SNOW"
 
-SOURCES_FILE = "label_sources.json"
-"""Beside a run: where each of its labels comes from."""
+SOURCES_FILE = "label_sources.json"  #: Beside a run: where each of its labels comes from
 
 
 class Settings(BaseSettings):

@@ -47,8 +47,7 @@ VERSION = 6
 
 FETCH_TIMEOUT_S = 120.0
 
-MAX_MODEL_BYTES = 256 * MEBIBYTE
-"""Of a file as it lies on disk; those of this package have some MiB."""
+MAX_MODEL_BYTES = 256 * MEBIBYTE  #: Of a file as it lies on disk; those of this package have some MiB
 
 MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 """Of all that a model's archive unpacks to: megabytes of zeros pack to kilobytes."""

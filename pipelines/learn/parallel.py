@@ -31,20 +31,14 @@ from terrain.errors import ConfigError, TerrainError
 
 LOCAL = "local"
 
-PARENT_POLL_S = 0.5
-"""From one look at the process that started a pool to the next."""
-
-CONNECT_S = 10.0
-"""To reach the scheduler, and to reach it again: a local network answers in milliseconds."""
-
-FIRST_WORKER_S = 20.0
-"""Until the first worker is there: one that was just started imports for some seconds."""
+PARENT_POLL_S = 0.5  #: From one look at the process that started a pool to the next
+CONNECT_S = 10.0  #: To reach the scheduler, and to reach it again: a local network answers in milliseconds
+FIRST_WORKER_S = 20.0  #: Until the first worker is there: one that was just started imports for some seconds
 
 ANSWER_S = 15.0
 """From one look at a result that is not there to the next, and how long the scheduler may take to answer."""
 
-NO_WORKER_S = 60.0
-"""Without a worker: one whose nanny starts it again is back in 10 s."""
+NO_WORKER_S = 60.0  #: Without a worker: one whose nanny starts it again is back in 10 s
 
 TASKS_A_THREAD = 3
 """In progress at once for each thread of a worker: one is computed, the next are there when it ends."""

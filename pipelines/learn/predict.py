@@ -38,8 +38,7 @@ if TYPE_CHECKING:
 EXAMPLE = "terrain predict --data runs/ --model models:/field@champion --out predicted.csv"
 
 DRIVE_STATES = ("traction", "braking", "steady")
-NOT_LEARNED = "unknown"
-"""Terrain of a window that is like none that was learned."""
+NOT_LEARNED = "unknown"  #: Terrain of a window that is like none that was learned
 
 ENDINGS = (".parquet", ".csv")
 MAX_ROWS, MAX_STRIPS = 8, 12
@@ -85,35 +84,26 @@ class Settings(PredictionSettings, ChangesSettings, AlignedRunsSettings):
 
 
 class WindowPrediction(NamedTuple):
-    """The predicted terrain of a window, and the target slips that follow from it.
+    """The predicted terrain of a window, and the target slips that follow from it."""
 
-    Parameters
-    ----------
-    run_id, start_s : of the window
-    terrain : predicted; ``unknown`` where the window is like none that was learned
-    probability : of ``nearest``
-    target_slip, status : by drive state
-    slip_entry : entry of the table of target slips; the fallback where the terrain has none or is unknown
-    label : true terrain; None where it is not known
-    filtered_terrain : by the windows of the run up to this one; None where none is certain enough
-    nearest : the most probable of the learned terrains
-    novelty : how unlike all of them the window is; None where the model has no such score
-    supported : whether training runs that drove like this support the prediction; None where not counted
-    terrain_set : terrains that hold the true one in 90 % of windows; None where not calibrated
-    """
-
+    #: run_id, start_s: of the window
     run_id: str
     start_s: float
-    terrain: str
-    probability: float
+    terrain: str  #: predicted; ``unknown`` where the window is like none that was learned
+    probability: float  #: of ``nearest``
+    #: target_slip, status: by drive state
     target_slip: Mapping[str, float]
+    #: entry of the table of target slips; the fallback where the terrain has none or is unknown
     slip_entry: str
     status: Mapping[str, str]
-    label: str | None
+    label: str | None  #: true terrain; None where it is not known
+    #: by the windows of the run up to this one; None where none is certain enough
     filtered_terrain: str | None
-    nearest: str
-    novelty: float | None
+    nearest: str  #: the most probable of the learned terrains
+    novelty: float | None  #: how unlike all of them the window is; None where the model has no such score
+    #: whether training runs that drove like this support the prediction; None where not counted
     supported: bool | None
+    #: terrains that hold the true one in 90 % of windows; None where not calibrated
     terrain_set: tuple[str, ...] | None
 
 

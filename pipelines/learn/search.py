@@ -31,8 +31,7 @@ from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
 from terrain.files.names import printable
 
-BATCH = 4
-"""Trials that are suggested together; a batch does not depend on how many are computed at once."""
+BATCH = 4  #: Trials that are suggested together; a batch does not depend on how many are computed at once
 
 SPACE = {"C": (0.3, 300.0), "gamma": (0.03, 3.0), "percentile": (40.0, 100.0)}
 """C and gamma are searched on a logarithmic scale."""
@@ -52,23 +51,16 @@ class Trial(NamedTuple):
 
 
 class SearchResult(NamedTuple):
-    """A finished search.
+    """A finished search."""
 
-    Parameters
-    ----------
-    trials, resumed : candidates that were tried, and how many of them lay there already
-    best : the most accurate on inner folds
-    held_out : accuracy on the runs that were held out of the search: ``a`` the default choice, ``b`` the best
-    held_out_runs : these runs
-    params_file : for ``--params``
-    """
-
+    #: trials, resumed: candidates that were tried, and how many of them lay there already
     trials: int
     resumed: int
-    best: Trial
+    best: Trial  #: the most accurate on inner folds
+    #: accuracy on the runs that were held out of the search: ``a`` the default choice, ``b`` the best
     held_out: Difference
-    held_out_runs: tuple[str, ...]
-    params_file: Path
+    held_out_runs: tuple[str, ...]  #: these runs
+    params_file: Path  #: for ``--params``
 
 
 def search(

@@ -15,10 +15,8 @@ from terrain.logs.schema import SIGNAL_SETS, check_signal_sets
 if TYPE_CHECKING:
     from features.windows import WindowRule
 
-RECIPES = ("svm", "cnn", "stack", "best", "response")
-"""The names of ``features.recipes.RECIPES``."""
-FEATURE_RECIPE = "svm"
-"""The recipe that learns from features alone, and so from cached ones."""
+RECIPES = ("svm", "cnn", "stack", "best", "response")  #: The names of ``features.recipes.RECIPES``
+FEATURE_RECIPE = "svm"  #: The recipe that learns from features alone, and so from cached ones
 WITHOUT_SVM = ("cnn", "response")
 
 ProtocolName = Literal[

@@ -26,21 +26,15 @@ from terrain.records import Array, RunLog
 
 
 class TrainedRun(NamedTuple):
-    """A run that a model is trained on.
+    """A run that a model is trained on."""
 
-    Parameters
-    ----------
-    run_id, robot, filter, digest : of the run; the digest is of its content
-    terrain : of its windows; several by commas
-    n_windows : of the run
-    """
-
+    #: run_id, robot, filter, digest: of the run; the digest is of its content
     run_id: str
     robot: str
     filter: str
     digest: str
-    terrain: str
-    n_windows: int
+    terrain: str  #: of its windows; several by commas
+    n_windows: int  #: of the run
 
 
 def trained_runs(runs: Iterable[tuple[str, str, str, str]], samples: Samples) -> tuple[TrainedRun, ...]:
@@ -53,26 +47,15 @@ def trained_runs(runs: Iterable[tuple[str, str, str, str]], samples: Samples) ->
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainingData:
-    """Labelled windows of runs, and what a recipe, its limits and its judge are made from.
+    """Labelled windows of runs, and what a recipe, its limits and its judge are made from."""
 
-    Parameters
-    ----------
-    samples : the windows; those of a cache have no samples
-    layout : channels and rates that a log must have
-    recipe : whose steps before the last one are fitted
-    rows : (n, columns) output of these steps
-    motion : how the robot moved in each window; None where no wheel speed was measured
-    runs : those that windows were cut from
-    digest : of the data
-    """
-
-    samples: Samples
-    layout: Layout
-    recipe: WindowPipeline
-    rows: Array
-    motion: Motion | None
-    runs: tuple[TrainedRun, ...]
-    digest: str
+    samples: Samples  #: the windows; those of a cache have no samples
+    layout: Layout  #: channels and rates that a log must have
+    recipe: WindowPipeline  #: whose steps before the last one are fitted
+    rows: Array  #: (n, columns) output of these steps
+    motion: Motion | None  #: how the robot moved in each window; None where no wheel speed was measured
+    runs: tuple[TrainedRun, ...]  #: those that windows were cut from
+    digest: str  #: of the data
 
     @property
     def features(self) -> Array:

@@ -49,28 +49,19 @@ class CommandStatus(StrEnum):
 
 
 class Step(NamedTuple):
-    """What a chain gives for a sample, and what a session says of it.
+    """What a chain gives for a sample, and what a session says of it."""
 
-    Parameters
-    ----------
-    windows : outputs of windows that were finished, in most steps none
-    command, status : of the wheels; None of a chain that gives no commands
-    failure : why the step failed; empty where it did not
-    time_s : on the robot's clock; NaN before its first sample
-    number : of the step, from 1
-    message : number of the last message that is in it; 0 before the first
-    observation : what is known of the robot, as ``docs/service.md`` describes it; None and NaN where it is not
-    latency_s : from the arrival of the newest sample to the end of the step; NaN without one
-    """
-
-    windows: Sequence[WindowOutput] = ()
+    windows: Sequence[WindowOutput] = ()  #: outputs of windows that were finished, in most steps none
+    #: command, status: of the wheels; None of a chain that gives no commands
     command: Command | None = None
     status: CommandStatus = CommandStatus.OK
-    failure: str = ""
-    time_s: float = math.nan
-    number: int = 0
-    message: int = 0
+    failure: str = ""  #: why the step failed; empty where it did not
+    time_s: float = math.nan  #: on the robot's clock; NaN before its first sample
+    number: int = 0  #: of the step, from 1
+    message: int = 0  #: number of the last message that is in it; 0 before the first
+    #: what is known of the robot, as ``docs/service.md`` describes it; None and NaN where it is not
     observation: Mapping[str, Any] = MappingProxyType({})
+    #: from the arrival of the newest sample to the end of the step; NaN without one
     latency_s: float = math.nan
 
     def content(self) -> dict[str, Any]:

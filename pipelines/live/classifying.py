@@ -25,8 +25,7 @@ from terrain.extension import correct_live
 from terrain.records import Reading, Sample, Windows
 from terrain.robots import Robot
 
-PILOT_FILTER = "vio15"
-"""Filter of :class:`pipelines.live.pilot.LivePilot`."""
+PILOT_FILTER = "vio15"  #: Filter of :class:`pipelines.live.pilot.LivePilot`
 
 MAX_WAITING = 1000
 """Steps of one robot that may wait for the thread: 20 s; of more, the oldest are left out and counted."""
@@ -36,30 +35,22 @@ AT_MOST = 25
 
 
 class WindowOutput(NamedTuple):
-    """What a model gives for a window.
+    """What a model gives for a window."""
 
-    Parameters
-    ----------
-    start_s, end_s : of the window, on the clock of its stamps
-    terrain, probability : class of the largest probability; empty and NaN where the window was refused, empty
-        where it is like no terrain that was learned
-    probabilities : of each class of the model, in its order
-    refused : why there is no output; empty where there is one
-    took_s : time of features and classifier
-    nearest : class of the largest probability also where the terrain is unknown
-    novelty : how unlike all learned terrains the window is; NaN where the model has no such score
-    supported : whether training runs that drove like this support the class; None where not counted
-    """
-
+    #: start_s, end_s: of the window, on the clock of its stamps
     start_s: float
     end_s: float
+    #: terrain, probability: class of the largest probability; empty and NaN where the window was refused,
+    #: empty where it is like no terrain that was learned
     terrain: str
     probability: float
-    probabilities: Mapping[str, float]
-    refused: str = ""
-    took_s: float = math.nan
-    nearest: str = ""
+    probabilities: Mapping[str, float]  #: of each class of the model, in its order
+    refused: str = ""  #: why there is no output; empty where there is one
+    took_s: float = math.nan  #: time of features and classifier
+    nearest: str = ""  #: class of the largest probability also where the terrain is unknown
+    #: how unlike all learned terrains the window is; NaN where the model has no such score
     novelty: float = math.nan
+    #: whether training runs that drove like this support the class; None where not counted
     supported: bool | None = None
 
     @property

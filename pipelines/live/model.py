@@ -81,19 +81,12 @@ class TerrainModel(NamedTuple):
 
 
 class Assessed(NamedTuple):
-    """Outputs of a model for n windows.
+    """Outputs of a model for n windows."""
 
-    Parameters
-    ----------
-    probability : (n, k) in the order of the model's classes
-    novelty : (n,) score; NaN where the model has none
-    unknown : (n,) whether the window is like no terrain that was learned
-    supported : (n,) whether training runs near the window's motion support the prediction; NaN where not counted
-    """
-
-    probability: Array
-    novelty: Array
-    unknown: Array
+    probability: Array  #: (n, k) in the order of the model's classes
+    novelty: Array  #: (n,) score; NaN where the model has none
+    unknown: Array  #: (n,) whether the window is like no terrain that was learned
+    #: (n,) whether training runs near the window's motion support the prediction; NaN where not counted
     supported: Array
 
 

@@ -21,8 +21,7 @@ from terrain.kinematics.logged_wheels import speed_columns
 from terrain.records import Reading, Sample
 from terrain.robots import Robot
 
-LONGEST_STEP_S = 1.0
-"""A longer time between two samples of the wheels is no driving time."""
+LONGEST_STEP_S = 1.0  #: A longer time between two samples of the wheels is no driving time
 
 _NO_TWIST = np.zeros(3)
 

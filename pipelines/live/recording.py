@@ -46,19 +46,15 @@ PART_BYTES = 128 << 20
 FREE_BYTES = 256 << 20
 """A recording ends where less is free on the disk: the states of the robots are to be saved there, too."""
 
-MAX_WAITING_BYTES = 4 << 20
-"""Memory of one session that may wait for the disk: minutes of its samples."""
-
-_OVERHEAD_BYTES = 200
-"""What an array takes beside its numbers."""
+MAX_WAITING_BYTES = 4 << 20  #: Memory of one session that may wait for the disk: minutes of its samples
+_OVERHEAD_BYTES = 200  #: What an array takes beside its numbers
 
 NOT_DECIDED = (CommandStatus.NO_SAMPLES, CommandStatus.FAILED)
 """Statuses of commands that no controller has decided on."""
 
 RECORDING, FINISHED, NOTHING_KEPT = "recording", "finished", "finished: nothing to keep"
 
-WINDOW = "a window"
-"""Takes the place of a stream's name for outputs of the model."""
+WINDOW = "a window"  #: Takes the place of a stream's name for outputs of the model
 
 
 class SessionRecorder:

@@ -32,15 +32,13 @@ from terrain.estimation.live import LiveEstimate
 from terrain.records import Sample
 from terrain.robots import Robot
 
-TWIST_FRESH_S = 0.5
-"""A desired motion that is older is none: the robot is commanded to stop."""
+TWIST_FRESH_S = 0.5  #: A desired motion that is older is none: the robot is commanded to stop
 
 CONTROL_RATE_LEAST_HZ = 5.0
 """Of commands: a longer step than half a second is taken for a clock that was set, and a command holds for a
 quarter of a second."""
 
-LATE_SHOWN_S = 4.0
-"""Without a window for so long, late samples are what there is no terrain for."""
+LATE_SHOWN_S = 4.0  #: Without a window for so long, late samples are what there is no terrain for
 
 _NO_TWIST = np.zeros(3)
 
@@ -53,19 +51,13 @@ WINDOW = ("start_s", "end_s", "terrain", "probabilities", "refused", "nearest", 
 
 
 class Served(NamedTuple):
-    """What all sessions use; it is replaced whole.
+    """What all sessions use; it is replaced whole."""
 
-    Parameters
-    ----------
-    number : rises with each replacement
-    model, model_name : that classifies, and its URI; without one the terrain is unknown
-    table : of target slips
-    """
-
-    number: int
+    number: int  #: rises with each replacement
+    #: model, model_name: that classifies, and its URI; without one the terrain is unknown
     model: TerrainModel | None
     model_name: str
-    table: SlipTable
+    table: SlipTable  #: of target slips
 
     def content(self) -> dict[str, Any]:
         """Return which model and table are used."""

@@ -33,8 +33,7 @@ from terrain.logs.schema import ESTIMATED
 from terrain.records import RunLog
 from terrain.robots import Robot, robot_named
 
-STRIDE_S = 0.25
-"""From window to window of a model whose outputs are filtered over time, in place of a dwell."""
+STRIDE_S = 0.25  #: From window to window of a model whose outputs are filtered over time, in place of a dwell
 
 
 def needs_filter(info: ModelInfo, streams: Container[str]) -> bool:

@@ -26,8 +26,7 @@ PNG_DPI = 160
 WIDTH_IN, PANEL_HEIGHT_IN, BAR_HEIGHT_IN, HEAD_IN = 8.4, 2.3, 0.26, 0.9
 STRIP_HEIGHT_IN = 0.7
 TITLE_LETTERS_AN_INCH = 11
-LONGEST_NAME = 40
-"""Letters of a category; of a longer name the middle is left out."""
+LONGEST_NAME = 40  #: Letters of a category; of a longer name the middle is left out
 
 INK = "#1f2933"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#e69f00", "#cc79a7", "#56b4e9", "#8c8c8c")

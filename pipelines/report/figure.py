@@ -8,8 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-Span = tuple[float, float, str]
-"""Start, end and name of an interval."""
+Span = tuple[float, float, str]  #: Start, end and name of an interval
 
 
 class Mark(NamedTuple):
@@ -91,17 +90,9 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """Panels below one another.
+    """Panels below one another."""
 
-    Parameters
-    ----------
-    title : above
-    panels : from the top
-    caption : below: what is to be seen
-    x_label : of the last panel
-    """
-
-    title: str
-    panels: Sequence[Panel]
-    caption: str = ""
-    x_label: str = ""
+    title: str  #: above
+    panels: Sequence[Panel]  #: from the top
+    caption: str = ""  #: below: what is to be seen
+    x_label: str = ""  #: of the last panel

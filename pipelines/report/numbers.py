@@ -9,14 +9,12 @@ from typing import Any
 
 from terrain.files.names import printable
 
-NOT_KNOWN = "\N{EN DASH}"
-"""Written where a figure is not known."""
+NOT_KNOWN = "\N{EN DASH}"  #: Written where a figure is not known
 
 NBSP = "\N{NO-BREAK SPACE}"
 MINUS = "\N{MINUS SIGN}"
 
-TINY = 1e-12
-"""Ends of an interval below this are written as 0: rounding of two equal numbers."""
+TINY = 1e-12  #: Ends of an interval below this are written as 0: rounding of two equal numbers
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

@@ -24,18 +24,14 @@ from pipelines.report.results import as_json
 from pipelines.report.tree import Part, Report, Section, Table
 
 ASSETS = Path(__file__).parent / "assets"
-DIGITS = 6
-"""Significant digits of what a figure draws: more than can be seen."""
+DIGITS = 6  #: Significant digits of what a figure draws: more than can be seen
 
 MARKDOWN = "parts.md.j2"
 _SPECIAL = re.compile(r"([\\`*_{}\[\]<>|#~&!])")
 _ADDRESS = re.compile(r"(https?|ftp)(?=://)", re.IGNORECASE)
 
-MAX_POINTS = 2000
-"""More points of a line than this are more than a page can show."""
-
-MAX_SVG_BYTES = 300_000
-"""A figure of a fragment that needs more as lines becomes points."""
+MAX_POINTS = 2000  #: More points of a line than this are more than a page can show
+MAX_SVG_BYTES = 300_000  #: A figure of a fragment that needs more as lines becomes points
 
 
 @cache

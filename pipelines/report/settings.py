@@ -17,8 +17,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from terrain.errors import ConfigError
 from terrain.files.atomic import ensure_writable
 
-ENDINGS = (".html", ".md")
-"""Of reports."""
+ENDINGS = (".html", ".md")  #: Of reports
 
 
 def separated(given: Any) -> Any:
@@ -28,11 +27,9 @@ def separated(given: Any) -> Any:
     return [part.strip() for part in given.split(",") if part.strip()]
 
 
-ByCommas = BeforeValidator(separated)
-"""Of a tuple: it may be given as one text."""
+ByCommas = BeforeValidator(separated)  #: Of a tuple: it may be given as one text
 
-Names = Annotated[tuple[str, ...], ByCommas]
-"""Texts, by commas."""
+Names = Annotated[tuple[str, ...], ByCommas]  #: Texts, by commas
 
 
 def setting(default: Any, text: str, option: str | None = None, repeated: bool = False, **bounds: Any) -> Any:

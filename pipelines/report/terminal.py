@@ -16,8 +16,7 @@ from pipelines.report.numbers import plain_line
 from pipelines.report.results import Progress
 from pipelines.report.tree import Pairs, Part, Report, Section, Table, Text
 
-WIDTH_OF_A_FILE = 110
-"""Characters of a line where the output is no terminal, which has a width of its own."""
+WIDTH_OF_A_FILE = 110  #: Characters of a line where the output is no terminal, which has a width of its own
 
 
 @contextmanager

@@ -28,25 +28,16 @@ class Text(NamedTuple):
 
 
 class Column(NamedTuple):
-    """Heading of a column, how its values are written, and where a record has them.
+    """Heading of a column, how its values are written, and where a record has them."""
 
-    Parameters
-    ----------
-    title : heading
-    form : format of the values, as :func:`pipelines.report.numbers.format_value` takes it
-    unit : stands in the heading
-    of : attribute or key of a record, as ``case.seed``, or a function of it; without one a row is a sequence of
-        the values of all columns
-    shade : of ratios between 0 and 1: the larger, the darker
-    long : holds sentences, which are wrapped
-    """
-
-    title: str
-    form: str = ""
-    unit: str = ""
+    title: str  #: heading
+    form: str = ""  #: format of the values, as :func:`pipelines.report.numbers.format_value` takes it
+    unit: str = ""  #: stands in the heading
+    #: attribute or key of a record, as ``case.seed``, or a function of it; without one a row is a sequence of
+    #: the values of all columns
     of: str | Callable[[Any], Any] | None = None
-    shade: bool = False
-    long: bool = False
+    shade: bool = False  #: of ratios between 0 and 1: the larger, the darker
+    long: bool = False  #: holds sentences, which are wrapped
 
 
 class Written(NamedTuple):
@@ -121,15 +112,10 @@ class Pairs:
 
 @dataclass(frozen=True)
 class Section:
-    """Parts under a heading.
+    """Parts under a heading."""
 
-    Parameters
-    ----------
-    title : heading
-    given : the parts, or what makes them when a writer comes to them: a screen without details needs none
-    """
-
-    title: str
+    title: str  #: heading
+    #: the parts, or what makes them when a writer comes to them: a screen without details needs none
     given: Sequence[Part] | Callable[[], Sequence[Part]] = ()
 
     @cached_property
@@ -152,26 +138,15 @@ def sections(*titled: tuple[str, Sequence[Part | str]]) -> tuple[Section, ...]:
 
 @dataclass(frozen=True)
 class Report:
-    """What a command answers.
+    """What a command answers."""
 
-    Parameters
-    ----------
-    title : what was done to what
-    answer : one sentence
-    picture : the one that shows it
-    parts : what a user decides by
-    details : folded on a page, behind ``--details`` on a screen
-    next_step : a command line
-    lead : a line below the title: how much data, which settings
-    """
-
-    title: str
-    answer: str
-    picture: Figure | None = None
-    parts: Sequence[Part] = ()
-    details: Sequence[Section] = ()
-    next_step: str = ""
-    lead: str = ""
+    title: str  #: what was done to what
+    answer: str  #: one sentence
+    picture: Figure | None = None  #: the one that shows it
+    parts: Sequence[Part] = ()  #: what a user decides by
+    details: Sequence[Section] = ()  #: folded on a page, behind ``--details`` on a screen
+    next_step: str = ""  #: a command line
+    lead: str = ""  #: a line below the title: how much data, which settings
 
     def save(self, path: str | Path) -> Path:
         """Write the report as a page (``.html``) or as Markdown (``.md``), by the ending of the path.

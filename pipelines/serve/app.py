@@ -20,8 +20,7 @@ from pipelines.serve.wire import encode
 from terrain import __version__
 from terrain.errors import TerrainError
 
-LARGEST_BODY = 262_144
-"""Bytes of a request's body: a table of target slips, or the name of a model."""
+LARGEST_BODY = 262_144  #: Bytes of a request's body: a table of target slips, or the name of a model
 
 PAGE = Path(__file__).parent / "page"
 FOLDERS = {"/page": PAGE, "/assets": Path(report.__file__).parent / "assets"}

@@ -45,21 +45,16 @@ from terrain.robots import SwerveRobot, load_robot
 if TYPE_CHECKING:
     from can import Message as Frame
 
-REOPEN_S = 0.5
-"""Between two attempts to open a bus that failed."""
-
-RECEIVE_S = 0.05
-"""For which the thread that reads waits at most, so that it ends soon when it has to."""
+REOPEN_S = 0.5  #: Between two attempts to open a bus that failed
+RECEIVE_S = 0.05  #: For which the thread that reads waits at most, so that it ends soon when it has to
 
 QUEUE = 20_000
 """Frames that wait for a control step: two seconds of a full bus; of more, the oldest are left out."""
 
-MAX_READ = 2000
-"""Frames that are taken between two control steps: a flooded bus delays none."""
+MAX_READ = 2000  #: Frames that are taken between two control steps: a flooded bus delays none
 
 
-KEPT = 100_000
-"""Latencies that are kept: half an hour at 50 Hz."""
+KEPT = 100_000  #: Latencies that are kept: half an hour at 50 Hz
 
 _NOT_DECIDED = {
     CommandStatus.NO_SAMPLES: BridgeState.STEERING,

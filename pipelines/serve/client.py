@@ -25,8 +25,7 @@ from terrain.errors import TerrainError
 
 MAX_ERRORS = 100
 
-TIMEOUT_S = 10.0
-"""For the connection, and for a step that is waited for."""
+TIMEOUT_S = 10.0  #: For the connection, and for a step that is waited for
 
 
 class ServiceError(WireError):

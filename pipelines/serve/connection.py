@@ -30,20 +30,11 @@ from pipelines.serve.wire import WireError, decode, encode
 from terrain.estimation.clocks import number
 from terrain.files.documents import first_fault
 
-MAX_NOTES = 1000
-"""Answers to messages that wait to be read; of more, the oldest are left out."""
-
-TURN = 16
-"""Messages of one robot in a row; then the others have their turn."""
-
-LARGE = 32_768
-"""Bytes of a message that is decoded in a thread; no hello is as large."""
-
-PAUSE_S = 0.5
-"""Before the next message of a robot is read whose hello was not accepted."""
-
-TRY_AGAIN_LATER, POLICY = 1013, 1008
-"""Codes of closed WebSockets (RFC 6455)."""
+MAX_NOTES = 1000  #: Answers to messages that wait to be read; of more, the oldest are left out
+TURN = 16  #: Messages of one robot in a row; then the others have their turn
+LARGE = 32_768  #: Bytes of a message that is decoded in a thread; no hello is as large
+PAUSE_S = 0.5  #: Before the next message of a robot is read whose hello was not accepted
+TRY_AGAIN_LATER, POLICY = 1013, 1008  #: Codes of closed WebSockets (RFC 6455)
 
 NO_TOKEN = "a token is required, or it is another"
 

@@ -16,8 +16,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from pipelines.serve.hub import Hub
 from pipelines.serve.serve import is_loopback
 
-REQUEST_S = 10.0
-"""For a request to come whole, and for a response to be read."""
+REQUEST_S = 10.0  #: For a request to come whole, and for a response to be read
 
 FLUSH_S = 3.0
 """For what is buffered when a WebSocket ends; a receiver that does not read would keep it for ever."""

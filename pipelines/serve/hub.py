@@ -35,34 +35,22 @@ WARM_STEPS = 30
 WRONG_TOKEN_S = 1.0
 """Before a token that is missing or another is answered: a thousand tries take a quarter of an hour."""
 
-REMEMBERED = 1000
-"""States of robots that have left, which are kept in memory for their return."""
-
-SILENT_S = 2.0
-"""A connection that has sent nothing for so long gives up its session to one that asks for it."""
+REMEMBERED = 1000  #: States of robots that have left, which are kept in memory for their return
+SILENT_S = 2.0  #: A connection that has sent nothing for so long gives up its session to one that asks for it
 
 
 class Limits(NamedTuple):
-    """How much is accepted.
+    """How much is accepted."""
 
-    Parameters
-    ----------
-    sessions : open at once
-    message_bytes : of one message
-    messages_per_s, rows_per_s, bytes_per_s : of one session
-    decoding_s_per_s : time that decoding the messages of one session takes
-    hello_s : to say hello
-    too_slow_s : for which a receiver may not read
-    """
-
-    sessions: int = 64
-    message_bytes: int = 262_144
+    sessions: int = 64  #: open at once
+    message_bytes: int = 262_144  #: of one message
+    #: messages_per_s, rows_per_s, bytes_per_s: of one session
     messages_per_s: float = 2000.0
     rows_per_s: float = 20_000.0
     bytes_per_s: float = 2_000_000.0
-    decoding_s_per_s: float = 0.1
-    hello_s: float = 10.0
-    too_slow_s: float = 5.0
+    decoding_s_per_s: float = 0.1  #: time that decoding the messages of one session takes
+    hello_s: float = 10.0  #: to say hello
+    too_slow_s: float = 5.0  #: for which a receiver may not read
 
     @property
     def per_s(self) -> dict[str, float]:

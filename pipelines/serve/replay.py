@@ -44,31 +44,22 @@ UNKNOWN = "unknown"
 
 SLIP, PERCENT = ".3f", ".1%"
 
-MAX_STRIPS = 8
-"""Runs in the picture."""
+MAX_STRIPS = 8  #: Runs in the picture
 
 
 class ObservedWindow(NamedTuple):
-    """A window as the live chain saw it.
+    """A window as the live chain saw it."""
 
-    Parameters
-    ----------
-    start_s, end_s : on the clock of the run
-    terrain, probability : output of the model; empty and NaN where it refused the window
-    refused : why it did
-    believed : terrain that was believed from then on; empty while it was unknown
-    target_ratio : target slip in traction of the believed terrain
-    label : of the run, where one covers the whole window
-    """
-
+    #: start_s, end_s: on the clock of the run
     start_s: float
     end_s: float
+    #: terrain, probability: output of the model; empty and NaN where it refused the window
     terrain: str
     probability: float
-    refused: str
-    believed: str
-    target_ratio: float
-    label: str | None
+    refused: str  #: why it did
+    believed: str  #: terrain that was believed from then on; empty while it was unknown
+    target_ratio: float  #: target slip in traction of the believed terrain
+    label: str | None  #: of the run, where one covers the whole window
 
     def __str__(self) -> str:
         named = f"{self.terrain} {format_value(self.probability, '.0%')}" if self.terrain else UNKNOWN

@@ -34,8 +34,7 @@ EXAMPLE = "terrain serve --model models:/field@champion --robot agrimaro --state
 RESULTS = ("pipelines.serve.can_bus", "pipelines.serve.replay")
 """Modes beside the service, each with a result and a report of its own."""
 
-SHORTEST_TOKEN = 16
-"""Characters; a shorter one can be tried out."""
+SHORTEST_TOKEN = 16  #: Characters; a shorter one can be tried out
 
 LONGEST_TOKEN = 512
 

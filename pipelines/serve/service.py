@@ -22,16 +22,12 @@ from pipelines.serve.serve import Settings
 from terrain.errors import ConfigError, TerrainError
 
 SAVE_EVERY_S = 5.0
-LARGEST_MESSAGE = 1_048_576
-"""Bytes of a message that is not even read: the connection is closed (code 1009)."""
+LARGEST_MESSAGE = 1_048_576  #: Bytes of a message that is not even read: the connection is closed (code 1009)
 
 PING_S = 10.0
 
-LEAVING_S = 3.5
-"""That robots have to read that the service ends."""
-
-CLOSING_S = 0.5
-"""For their answers: ended at once, what was sent last would be lost."""
+LEAVING_S = 3.5  #: That robots have to read that the service ends
+CLOSING_S = 0.5  #: For their answers: ended at once, what was sent last would be lost
 
 
 class Service:

@@ -23,11 +23,8 @@ from terrain.robots import Robot
 from terrain.slip_learning.curve import N_BOOTSTRAP, PeakStatus
 from terrain.slip_learning.learn import FILTER, LearnedTerrain, learn_terrains
 
-LAW_NAMES = {"janosi": "Janosi and Hanamoto", "magic": "Magic Formula"}
-"""Of the laws of thrust over slip."""
-
-LARGEST_THRUST_RATIO = 1.3
-"""Thrust over load up to which curves are drawn."""
+LAW_NAMES = {"janosi": "Janosi and Hanamoto", "magic": "Magic Formula"}  #: Of the laws of thrust over slip
+LARGEST_THRUST_RATIO = 1.3  #: Thrust over load up to which curves are drawn
 
 
 class LearnedCurves(LearnedSlipTable, eq=False, kw_only=True):

@@ -46,8 +46,7 @@ Filter = Literal[
 """Filters, the numbers being those of their states; observers of slip of tracked robots, and of car-like
 ones; and ``pose``, slip against an outside measurement of motion."""
 
-Tuning = Literal["physical", "thesis", "likelihood"]
-"""Sources of a filter's noise."""
+Tuning = Literal["physical", "thesis", "likelihood"]  #: Sources of a filter's noise
 
 
 class NoiseSettings(BaseSettings):
@@ -111,16 +110,11 @@ class Settings(EstimateOptions, AlignedRunsSettings):
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Estimates:
-    """Runs with the streams of their estimates, and what these come to.
+    """Runs with the streams of their estimates, and what these come to."""
 
-    Parameters
-    ----------
-    runs : with the stream ``slip`` and, of filters and observers, ``estimator`` and ``state``
-    result : of ``terrain estimate``
-    """
-
+    #: with the stream ``slip`` and, of filters and observers, ``estimator`` and ``state``
     runs: tuple[RunLog, ...]
-    result: TracksResult
+    result: TracksResult  #: of ``terrain estimate``
 
     @property
     def report(self) -> Report:

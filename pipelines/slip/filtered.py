@@ -103,8 +103,7 @@ RUNS = (
     Column("gated", of="n_gated"),
 )
 
-SEEING = ("vio12", "vio15")
-"""Filters that have a camera."""
+SEEING = ("vio12", "vio15")  #: Filters that have a camera
 
 BLIND = (
     "Blind: this filter takes no measurement of the speed over ground, so the figure is the wheels against "

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from terrain.robots import Robot
 
 EXAMPLE = "terrain learn-slip --data pull/ --robot agrimaro --out table.yaml"
-RESULTS = ("pipelines.slip.curves", "pipelines.slip.steady")
-"""Modules of the kinds, with their results."""
+RESULTS = ("pipelines.slip.curves", "pipelines.slip.steady")  #: Modules of the kinds, with their results
 
 
 class Settings(RunsSettings):

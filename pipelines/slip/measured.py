@@ -42,8 +42,7 @@ from terrain.slip_learning.rollers import (
 if TYPE_CHECKING:
     from pipelines.slip.estimate import EstimateOptions
 
-SHORT_S, SHORT_STRIDE_S = 0.5, 0.1
-"""Windows of the stream ``slip`` that runs are written with."""
+SHORT_S, SHORT_STRIDE_S = 0.5, 0.1  #: Windows of the stream ``slip`` that runs are written with
 
 UNLABELLED = "(no label)"
 SLIP, FINE = ".3f", ".4f"

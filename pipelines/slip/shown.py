@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from pipelines.report.figure import Figure
     from pipelines.report.tree import Part
 
-SHOWN_ROWS = 8
-"""Rows of a table that is continued in the details."""
+SHOWN_ROWS = 8  #: Rows of a table that is continued in the details
 
 
 def named(rows: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -16,11 +16,8 @@ from terrain.records import Array, RunLog
 Keep = Callable[[RunLog, Callable[[], Mapping[str, Figure]]], None]
 """Gets each run with its estimates, and what makes its pictures by name."""
 
-MAX_PICTURED = 3
-"""Runs whose pictures a page has; ``--figures`` writes those of all."""
-
-TRUTH_COLOUR = 6
-"""Grey, for what was true, of every estimate."""
+MAX_PICTURED = 3  #: Runs whose pictures a page has; ``--figures`` writes those of all
+TRUTH_COLOUR = 6  #: Grey, for what was true, of every estimate
 
 SLIP = "+.4f"
 
