@@ -29,18 +29,21 @@ from terrain.control.controllers import (
     make_controller,
     pairs_to_compare,
 )
-from terrain.control.drive_comparison import (
+from terrain.control.drive_metrics import (
     ABSOLUTE,
+    LABELS,
     Comparison,
     Difference,
     Drive,
     MeanInterval,
     Metrics,
     add_energies,
+    drive_history,
+    energy_curve,
+    evaluate_drive,
     matching_ramp,
     steepest_grade,
 )
-from terrain.control.drive_metrics import LABELS, drive_history, energy_curve, evaluate_drive
 from terrain.control.situations import COURSE, SITUATIONS, SLOPE, Situation, SituationOptions, make_situation
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.records import RunLog

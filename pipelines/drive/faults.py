@@ -27,7 +27,6 @@ from terrain.control.fault_drives import (
     LIMITS,
     STOP,
     BarCount,
-    CleanDrive,
     FaultCase,
     FaultLoop,
     FaultRow,
@@ -71,7 +70,7 @@ class FaultsResult(Result, eq=False):
     delay_s: float = described("from a sample to the wheel", "s")
     limits: Limits = described("of the figures")
     abouts: Mapping[str, str] = described("what each fault does, by its name")
-    clean: tuple[CleanDrive, ...] = described("drives without a fault")
+    clean: tuple[Mapping[str, Any], ...] = described("drives without a fault")
     rows: tuple[FaultRow, ...] = described("drives with one")
     bars: Mapping[str, BarCount] = described("each bar over all rows")
     n_rows: int = described("drives with a fault")
@@ -170,11 +169,11 @@ def _new_pilot(robot: Robot, slips: SlipTable, controller: str) -> LivePilot:
 
 def fault_figure(loop: FaultLoop, case: FaultCase, references: References) -> Figure:
     """Drive with a fault, and draw it beside the drives of the same place: speeds, slip, status over time."""
-    driven = drive_case(loop, case)
-    drive, plain, start_s = driven.drive, references.plain, references.start_s
+    (drive, pilot), plain, start_s = drive_case(loop, case), references.plain, references.start_s
     time_s, last_s = drive.time_s, float(drive.time_s[-1])
     acts = Strip([(start_s, min(start_s + case.duration_s, last_s), "the fault acts")])
-    estimated = np.where(np.abs(driven.speed_mps) < FASTEST_MPS, driven.speed_mps, math.nan)
+    speed_mps = np.array(pilot.speed_mps)
+    estimated = np.where(np.abs(speed_mps) < FASTEST_MPS, speed_mps, math.nan)
     shown_s = max(start_s - BEFORE_S, 0.0), last_s
     speeds = (
         Line("desired", time_s, drive.desired_mps, 6, dashed=True),
@@ -202,8 +201,9 @@ def duration_text(duration_s: float) -> str:
     return f"{duration_s:g} s" if math.isfinite(duration_s) else "for good"
 
 
-def _place(at: FaultCase | CleanDrive) -> str:
-    return f"{at.situation} on {at.terrain}"
+def _place(at: FaultCase | Mapping[str, Any]) -> str:
+    fields = at._asdict() if isinstance(at, FaultCase) else at
+    return f"{fields['situation']} on {fields['terrain']}"
 
 
 CLEAN = (

@@ -22,6 +22,7 @@ from terrain.control.live_state import LiveState
 from terrain.control.robot_control import (
     DEFAULT_SETTINGS,
     OPEN_LOOP,
+    PERIOD_S,
     PilotSettings,
     RobotControl,
     check_pilot,
@@ -29,7 +30,6 @@ from terrain.control.robot_control import (
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainSource
 from terrain.control.traction import TractionStatus
-from terrain.control.wheel_controllers import PERIOD_S
 from terrain.estimation.clocks import Clocks, finite_twist
 from terrain.estimation.health import SENSORS, Health
 from terrain.estimation.live import CHANNELS, LiveEstimate, LiveFilter, places_among

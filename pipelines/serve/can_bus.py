@@ -33,9 +33,8 @@ from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.tree import Column, Pairs, Report, Table, sections
 from pipelines.serve.serve import Settings, loaded, stopping
-from terrain.control.robot_control import PilotSettings, check_pilot
+from terrain.control.robot_control import PilotSettings, check_pilot, step_or_period
 from terrain.control.slip_table import load_slip_table
-from terrain.control.wheel_controllers import step_or_period
 from terrain.control.wheel_corrections import BridgeState, LowLevelKinematics, corrections, last_samples
 from terrain.errors import ConfigError, one_line
 from terrain.estimation.clocks import SessionClock

@@ -42,13 +42,9 @@ from terrain.simulation.conditions import Faults
 from terrain.simulation.faults import FaultyBus, Nature, fault_catalogue
 from terrain.simulation.scenario import Scenario
 
-START, STOP, STEADY = "start", "stop", "steady"
-
-FAULT_SITUATIONS = {
-    START: "from rest at 1 m/s^2 to 1 m/s; the fault begins as the start does",
-    STOP: "a command to stop at once from 1 m/s; the fault begins with the command",
-    STEADY: "at 1 m/s; the fault begins 3 s after the speed was reached",
-}
+FAULT_SITUATIONS = START, STOP, STEADY = "start", "stop", "steady"
+"""From rest at 1 m/s^2 to 1 m/s, where the fault begins as the start does; a command to stop at once from 1 m/s,
+where it begins with the command; and at 1 m/s, where it begins 3 s after the speed was reached."""
 
 LENGTHS_S = {START: 7.0, STEADY: 10.0}
 """Long enough for a fault of 3 s and 2 s after it."""
@@ -104,8 +100,7 @@ class FaultDrive(NamedTuple):
     commanded_mps: Array  # mean of the wheels
     desired_mps: Array
     speed_mps: Array  # true, over ground
-    stop_s: float = math.inf  # time of the command to stop; infinite without one
-    stop_m: float = math.nan  # travelled from then to standstill; NaN where there was none
+    stop_m: float = math.nan  # from the command to stop to standstill; NaN where there was none
 
 
 class FaultFigures(NamedTuple):
@@ -177,7 +172,6 @@ def fault_drive(run: RunLog, history: DriveHistory, robot: Robot, scenario: Scen
     )
     wheels = np.column_stack([commands.channel(f"wheel_{i}_radps") for i in robot.wheels])
     desired = np.hypot(scenario.twist[:, 0], scenario.twist[:, 1])
-    stop_s = brake_time(scenario) if scenario.name == BRAKE else math.inf
     return FaultDrive(
         time_s=time_s,
         ok=control.channel("status_code") == TractionStatus.OK,
@@ -188,8 +182,7 @@ def fault_drive(run: RunLog, history: DriveHistory, robot: Robot, scenario: Scen
         commanded_mps=np.abs(wheels).mean(axis=1) * robot.wheel_radius_m,
         desired_mps=desired,
         speed_mps=speed,
-        stop_s=stop_s,
-        stop_m=stopping_distance(history, stop_s) if math.isfinite(stop_s) else math.nan,
+        stop_m=stopping_distance(history, brake_time(scenario)) if scenario.name == BRAKE else math.nan,
     )
 
 
@@ -346,23 +339,6 @@ class FaultRow:
         return {**self.case._asdict(), **given, **self.figures._asdict(), "is_met": not self.unmet}
 
 
-@dataclass(frozen=True, slots=True)
-class CleanDrive:
-    """What the controller does without a fault, and plain commands do, from when faults begin in a place."""
-
-    situation: str
-    terrain: str
-    seed: int
-    start_s: float
-    slip_error_ratio: float
-    not_ok_s: float
-    slip_peak_ratio: float
-    plain_slip_peak_ratio: float
-    stop_m: float
-    plain_stop_m: float
-    overspeed_s: float
-
-
 class FaultLoop(NamedTuple):
     """The closed loop of all drives: a swerve robot, its pilots by controller, and the delay to the wheel."""
 
@@ -379,47 +355,33 @@ class References(NamedTuple):
     start_s: float
 
 
-class Driven(NamedTuple):
-    """A drive, the pilot with its record, and the estimated forward speed (n,)."""
-
-    drive: FaultDrive
-    pilot: GuardedPilot
-    speed_mps: Array
-
-
 def drive_references(loop: FaultLoop, place: Place) -> References:
     """Return the clean and the plain drive of a place."""
     made, start_s = make_fault_situation(place.situation, loop.robot, place.terrain, place.seed)
-    clean, plain = (
-        _drive(loop, made, GuardedPilot(loop.new_pilot(name))).drive for name in ("traction", "plain")
-    )
+    pilots = (GuardedPilot(loop.new_pilot(name)) for name in ("traction", "plain"))
+    clean, plain = (_drive(loop, made, pilot.step) for pilot in pilots)
     return References(clean, plain, start_s)
 
 
-def drive_case(loop: FaultLoop, case: FaultCase) -> Driven:
-    """Return the drive with a fault."""
+def drive_case(loop: FaultLoop, case: FaultCase) -> tuple[FaultDrive, GuardedPilot]:
+    """Return the drive with a fault, and its pilot with its record."""
     made, start_s = make_fault_situation(case.situation, loop.robot, case.terrain, case.seed)
     pilot, fault = GuardedPilot(loop.new_pilot("traction")), fault_catalogue(loop.robot)[case.fault]
     bus = FaultyBus(pilot.step, fault, start_s, start_s + case.duration_s, case.seed)
-    return _drive(loop, made, pilot, bus.__call__)
+    return _drive(loop, made, bus.__call__), pilot
 
 
-def _drive(
-    loop: FaultLoop,
-    made: Situation,
-    pilot: GuardedPilot,
-    step: Callable[[Sample], Command] | None = None,
-) -> Driven:
+def _drive(loop: FaultLoop, made: Situation, step: Callable[[Sample], Command]) -> FaultDrive:
     with np.errstate(all="ignore"):  # values of a fault are squared
-        log = simulate_situation(loop.robot, made, step or pilot.step, loop.delay_s)
+        log = simulate_situation(loop.robot, made, step, loop.delay_s)
     history = drive_history(log, loop.robot, made.conditions.radius_factors)
-    return Driven(fault_drive(log, history, loop.robot, made.scenario), pilot, np.array(pilot.speed_mps))
+    return fault_drive(log, history, loop.robot, made.scenario)
 
 
 def evaluate_case(loop: FaultLoop, case: FaultCase, references: References) -> FaultRow:
     """Return the row of a drive with a fault, compared with the references of the same place."""
     fault = fault_catalogue(loop.robot)[case.fault]
-    drive, pilot, _ = drive_case(loop, case)
+    drive, pilot = drive_case(loop, case)
     clean, plain, start_s = references
     end_s, time_s = start_s + case.duration_s, drive.time_s
     counts = pilot.n_exceptions, pilot.n_not_finite
@@ -455,22 +417,22 @@ def drawn_cases(rows: Sequence[FaultRow], draw: Sequence[str] = ()) -> list[Faul
     return [row.case for row in worst.values()]
 
 
-def clean_drive(place: Place, references: References) -> CleanDrive:
-    """Return what the clean and the plain drive of a place show."""
+def clean_drive(place: Place, references: References) -> dict[str, Any]:
+    """Return what the clean and the plain drive of a place show, from when faults begin."""
     clean, plain, start_s = references
     one = fault_figures(clean, clean, plain, start_s, math.inf)
     not_ok = ~clean.ok & clean.moving & (clean.time_s >= start_s)
-    return CleanDrive(
-        *place,
-        start_s=start_s,
-        slip_error_ratio=one.slip_error_ratio,
-        not_ok_s=float(not_ok.sum()) * float(clean.time_s[1] - clean.time_s[0]),
-        slip_peak_ratio=one.slip_peak_ratio,
-        plain_slip_peak_ratio=one.plain_slip_peak_ratio,
-        stop_m=clean.stop_m,
-        plain_stop_m=plain.stop_m,
-        overspeed_s=one.overspeed_s,
-    )
+    return {
+        **place._asdict(),
+        "start_s": start_s,
+        "slip_error_ratio": one.slip_error_ratio,
+        "not_ok_s": float(not_ok.sum()) * float(clean.time_s[1] - clean.time_s[0]),
+        "slip_peak_ratio": one.slip_peak_ratio,
+        "plain_slip_peak_ratio": one.plain_slip_peak_ratio,
+        "stop_m": clean.stop_m,
+        "plain_stop_m": plain.stop_m,
+        "overspeed_s": one.overspeed_s,
+    }
 
 
 class GuardedPilot:

@@ -8,19 +8,29 @@ Braking by controlled slip is aimed for where it stops a robot sooner than locke
 shears, thrust rises with slip up to the locked wheel: nothing stops sooner.  On hard terrain it falls again
 beyond a peak.  Slip is controlled in braking where it falls by more than the controller loses while slip
 builds up, and where friction is so small that wheels lock at all.
+
+Commands of the wheels: ``plain`` and ``ramp`` use no measurement; ``thesis`` is the PID on each wheel of
+:mod:`terrain.control.pid`; ``traction`` is the controller of :mod:`terrain.control.traction`.
+
+Wheels and steering are compared with their commands; else a sensor lies, or a motor does not follow.  A motor's
+rate follows its command within 0.4 s.  So it lies between the least and the largest command of
+that time, and what is outside by more than a tolerance for a while either measures something else or does not
+follow; and the same with steering angles.  A rate that repeats itself to the last bit, as that of a motor
+that stands, has less than half of that time; one that approaches its command, as that of a motor under
+load, has more.  Of three measured values the middle one counts, not a spike.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.actuation import Actuation
 from terrain.control.path_tracking import SETTINGS as TRACKING
 from terrain.control.path_tracking import (
     TrackReport,
@@ -30,8 +40,8 @@ from terrain.control.path_tracking import (
     check_tracking,
     track_step,
 )
-from terrain.control.pid import Gains
-from terrain.control.slip_table import CurveEntry, SlipTable
+from terrain.control.pid import LONGEST_STEP_S, DriveState, Gains, WheelPid, check_gains, wheel_step
+from terrain.control.slip_table import DRIVE_STATES, CurveEntry, SlipTable
 from terrain.control.stability import check_stable
 from terrain.control.switching import (
     SWITCHING,
@@ -43,21 +53,23 @@ from terrain.control.switching import (
     drive_on,
 )
 from terrain.control.traction import SETTINGS as TRACTION
-from terrain.control.traction import TractionSettings, TractionStatus, TractionTarget
-from terrain.control.wheel_controllers import (
-    UNOBSERVED,
-    WheelController,
-    estimate_age,
-    largest_forward,
-    observe_wheels,
-    step_or_period,
+from terrain.control.traction import (
+    TractionSettings,
+    TractionState,
+    TractionStatus,
+    TractionTarget,
+    WheelMotion,
+    WheelReport,
+    check_settings,
+    traction_step,
 )
 from terrain.errors import ConfigError
 from terrain.estimation.health import SENSORS, SLIP_SENSORS, SOUND, Health
 from terrain.estimation.live import LiveEstimate
 from terrain.kinematics.commands import FAR_RAD, wheel_command_step
+from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
-from terrain.records import Array, Command, Reading
+from terrain.records import Array, Command, Reading, SlipTarget
 from terrain.robots import Robot, SwerveRobot, as_drive
 from terrain.slip import MIN_SPEED_MPS
 
@@ -143,6 +155,159 @@ def check_table(table: SlipTable, robot: str) -> None:
         raise ConfigError(f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot!r}")
 
 
+PERIOD_S = 0.02
+"""Time step of the control loop; assumed where the clock is not valid."""
+
+
+def step_or_period(dt_s: float) -> float:
+    """Return a time step, or :data:`PERIOD_S` where it is none of a control loop."""
+    return dt_s if 0.0 < dt_s <= LONGEST_STEP_S else PERIOD_S
+
+
+_UNKNOWN = np.full(3, math.nan)
+UNOBSERVED = WheelMotion(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, math.nan, math.inf)
+"""Before the first estimate."""
+
+
+def observe_wheels(
+    robot: Robot, steer_states: Array, estimate: LiveEstimate | None, time_s: float
+) -> WheelMotion:
+    """Return the motion along each wheel from an estimate of the robot's motion; NaN before the first one.
+
+    Parameters
+    ----------
+    robot : swerve robot with motors
+    steer_states : (wheels,) places of the steering angles among the estimate's states
+    estimate, time_s : the last one, and the time of the step
+    """
+    if estimate is None:
+        return UNOBSERVED
+    motors, stale_s = robot.equipment.motors, estimate_age(estimate, time_s)
+    steer = estimate.mean[steer_states]
+    rows = estimate.wheel_speed_mps, estimate.slip_ratio, estimate.slip_std, steer
+    motion = estimate.speed_x_mps, estimate.speed_y_mps, estimate.yaw_rate_radps
+    columns = []
+    for (x_m, y_m), wheel_speed, slip, std, steer_rad in zip(
+        robot.wheel_positions_m, *(row.tolist() for row in rows), strict=True
+    ):
+        cos, sin = math.cos(steer_rad), math.sin(steer_rad)
+        speed, _ = in_wheel_frame(*point_velocity(*motion, x_m, y_m), cos, sin)
+        accel = estimate.accel_x_mps2 * cos + estimate.accel_y_mps2 * sin
+        fastest = abs(speed) if abs(wheel_speed) <= abs(speed) else abs(wheel_speed)  # NaN too
+        # a wheel stands by the filter's rate, which differs a little from the measured one
+        standing = fastest < (2.0 if math.isnan(slip) else 1.0) * MIN_SPEED_MPS
+        slip = 0.0 if standing and not math.isinf(stale_s) else slip
+        columns.append((speed, accel, slip, 0.0 if standing else std))
+    speed_mps, accel_mps2, slip_ratio, slip_std = np.array(columns).T
+    return WheelMotion(
+        speed_mps,
+        accel_mps2,
+        slip_ratio,
+        slip_std,
+        torque_nm=estimate.current_a
+        * (motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio),
+        wheel_radps=estimate.wheel_speed_mps / robot.wheel_radius_m,
+        chassis_mps=math.hypot(estimate.speed_x_mps, estimate.speed_y_mps),
+        stale_s=stale_s,
+    )
+
+
+def largest_forward(wheel_radps: Array, slip_ratio: Array) -> float:
+    """Return the largest slip of the wheels, positive in traction in the desired direction; NaN where one is."""
+    return float(np.where(wheel_radps < 0.0, -slip_ratio, slip_ratio).max())
+
+
+def estimate_age(estimate: LiveEstimate, time_s: float) -> float:
+    """Return the time since the speed over ground was measured last."""
+    return estimate.reference_age_s + max(time_s - estimate.time_s, 0.0)
+
+
+class WheelController:
+    """Turns desired wheel speeds into commanded ones, step by step.
+
+    Parameters
+    ----------
+    name : ``plain``, ``ramp``, ``thesis`` or ``traction``
+    robot : swerve robot
+    ramp_mps2 : largest rise of the speed of the fastest wheel, of ``ramp``
+    traction : settings of ``traction``, checked for every controller; ``thesis`` uses no older speed over ground
+    gains : of ``thesis``
+
+    Raises
+    ------
+    ConfigError
+        if a setting is not accepted.
+    """
+
+    def __init__(
+        self, name: str, robot: Robot, ramp_mps2: float, traction: TractionSettings, gains: Gains
+    ) -> None:
+        self._name, self._radius_m = name, robot.wheel_radius_m
+        self._traction = check_settings(traction, robot)
+        self._gains = check_gains(gains) if name == "thesis" else gains
+        self._ramp_mps2 = ramp_mps2 if name == "ramp" else math.inf
+        self._state = TractionState()
+        self._pids = [WheelPid()] * len(robot.wheels)
+        self._wheel_radps, self._driven_mps = np.zeros(3), 0.0
+
+    def reset_terrain(self) -> None:
+        """Drop what was learned of the terrain, as another one is classified: balance, and floor of the target."""
+        self._state = self._state.on_other_terrain()
+
+    def step(
+        self,
+        wheel_radps: Array,
+        seen: WheelMotion,
+        target: TractionTarget,
+        slip_targets: Mapping[str, SlipTarget],
+        dt_s: float,
+    ) -> tuple[Array, WheelReport]:
+        """Return the commanded rates (wheels,) and what was decided.
+
+        Parameters
+        ----------
+        wheel_radps : (wheels,) desired
+        seen : as estimated
+        target, slip_targets : slips of the current terrain, of the traction controller and by drive state
+        dt_s : since the step before; NaN where the clock is not valid
+        """
+        if self._name == "traction":
+            command, self._state, report = traction_step(
+                self._traction, self._state, target, self._radius_m, wheel_radps, seen, dt_s
+            )
+            return command, report
+        if self._name == "thesis":
+            return self._thesis(wheel_radps, seen, slip_targets, dt_s)
+        desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
+        before_mps = self._driven_mps if float(wheel_radps @ self._wheel_radps) >= 0.0 else 0.0
+        rise_mps = self._ramp_mps2 * step_or_period(dt_s)
+        self._wheel_radps, self._driven_mps = wheel_radps, min(desired_mps, before_mps + rise_mps)
+        command = wheel_radps * (self._driven_mps / desired_mps) if desired_mps > 0.0 else wheel_radps
+        unknown = math.nan, math.nan, math.nan
+        return command, WheelReport(self._driven_mps, *unknown, DriveState.STEADY, TractionStatus.OK)
+
+    def _thesis(
+        self, wheel_radps: Array, seen: WheelMotion, slip_targets: Mapping[str, SlipTarget], dt_s: float
+    ) -> tuple[Array, WheelReport]:
+        stale = seen.stale_s > self._traction.stale_max_s
+        targets = [slip_targets[state].slip_ratio for state in DRIVE_STATES]
+        columns = (wheel_radps, seen.wheel_radps, _UNKNOWN if stale else seen.speed_mps, seen.accel_mps2)
+        gains, radius_m, rows = self._gains, self._radius_m, (column.tolist() for column in columns)
+        steps = [
+            wheel_step(gains, radius_m, state, command, rate, speed, accel, seen.chassis_mps, targets, dt_s)
+            for state, command, rate, speed, accel in zip(self._pids, *rows, strict=True)
+        ]
+        wheels, self._pids = [step for step, _ in steps], [state for _, state in steps]
+        desired = np.array([one.desired_ratio for one in wheels])
+        status = TractionStatus.OK if np.isfinite(desired).all() else TractionStatus.NO_SLIP
+        if not 0.0 < dt_s <= LONGEST_STEP_S:
+            status = TractionStatus.BAD_TIME
+        command = wheel_radps + np.array([one.correction_radps for one in wheels])
+        driven_mps = float(np.abs(command).max()) * self._radius_m
+        aimed, largest = (largest_forward(wheel_radps, slips) for slips in (desired, seen.slip_ratio))
+        return command, WheelReport(driven_mps, aimed, math.nan, largest, wheels[0].drive_state, status)
+
+
 SLICK_RATIO = 0.5
 """Thrust over load at the peak, up to which terrain counts as slick: with more, a robot stops from 1 m/s in
 less than two tenths of a second, which is the response time of a slip controller."""
@@ -195,6 +360,103 @@ def traction_target(table: SlipTable, terrain: str) -> TractionTarget:
     margin = min(traction.slip_ratio - targets["steady"].slip_ratio, MARGIN_MAX_RATIO)
     braking = braking_by_slip(table.curves.get(traction.terrain)) or (0.0, 0.0)
     return TractionTarget(traction.slip_ratio, *braking, margin)
+
+
+N_COMMANDS = 32
+"""Of the last steps, which are compared."""
+
+WINDOW_S, PERSISTS_S, SETTLED_S, SMOOTH_S = 0.4, 0.06, 0.1, 0.04
+"""Time within which a command is followed; for which a deviation has to last; for which there must be none
+for it to be over; low-pass of what is measured, against the ripple of the Hall steps."""
+
+STILL_S = 0.18
+"""Time within which a motor changes its rate where the command has; a loaded one takes 0.12 s to start."""
+
+SLOW_S, APPROACH = 0.2, 0.02
+"""A second low-pass, and how far the first is ahead of it, in m/s or rad, where a command is approached."""
+
+SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
+"""Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle."""
+
+
+class Follower:
+    """A wheel's speed, or a steering angle, against its command: whether it ``is_off``.
+
+    The tolerance is a constant and a ratio of the command; a value that repeats itself has to change as the
+    command does within ``still_s``.
+    """
+
+    def __init__(self, tolerance: float, ratio: float = 0.0, still_s: float = math.inf) -> None:
+        self._tolerance, self._ratio, self._still_s = tolerance, ratio, still_s
+        self._commands: deque[tuple[float, float]] = deque(maxlen=N_COMMANDS)
+        self._last = self._before = self._smooth = self._slow = math.nan
+        self._repeated_s, self._off_s, self._on_s = 0.0, 0.0, SETTLED_S
+        self.is_off = False
+
+    def update(self, now_s: float, step_s: float, command: float, measured: float) -> None:
+        """Take the command that was in force until now, and what is measured; NaN for none."""
+        self._commands.append((now_s, command))
+        middle = self._middle(measured, step_s)
+        self._smooth = _low_passed(self._smooth, middle, step_s / SMOOTH_S)
+        self._slow = _low_passed(self._slow, middle, step_s / SLOW_S)
+        smooth, since_s = self._smooth, now_s - (STILL_S if self._repeated_s >= self._still_s else WINDOW_S)
+        commands = [value for time_s, value in self._commands if time_s >= since_s and not math.isnan(value)]
+        deviates = False
+        if commands and not math.isnan(smooth):
+            low, high = min(commands), max(commands)
+            slack = self._tolerance + self._ratio * max(abs(low), abs(high))
+            below, above = smooth < low - slack, smooth > high + slack
+            if (below and smooth > self._slow + APPROACH) or (above and smooth < self._slow - APPROACH):
+                return
+            deviates = below or above
+        self._off_s = self._off_s + step_s if deviates else 0.0
+        self._on_s = 0.0 if deviates else self._on_s + step_s
+        if self._off_s >= PERSISTS_S:
+            self.is_off = True
+        elif self._on_s >= SETTLED_S:
+            self.is_off = False
+
+    def _middle(self, measured: float, step_s: float) -> float:
+        """Return the middle one of the last three values, or this one where there are fewer."""
+        last, before = self._last, self._before
+        self._repeated_s = self._repeated_s + step_s if measured == last else 0.0
+        self._last, self._before = measured, last
+        if math.isnan(measured + last + before):
+            return measured
+        return max(min(measured, last), min(max(measured, last), before))
+
+
+def _low_passed(before: float, value: float, step_ratio: float) -> float:
+    """Return a value behind a low-pass; an unknown one leaves nothing there."""
+    return value if math.isnan(before + value) else before + (value - before) * -math.expm1(-step_ratio)
+
+
+class Actuation:
+    """Wheels and steering of a robot against their commands, step by step: which (6,) are ``off``.
+
+    ``mps_per_radps`` is the speed of a wheel by the rate of its motor.
+    """
+
+    def __init__(self, mps_per_radps: float) -> None:
+        self._mps_per_radps = mps_per_radps
+        self._command = [math.nan] * 6
+        self._followers = [Follower(SPEED_MPS, SPEED_RATIO, STILL_S) for _ in range(3)]
+        self._followers += [Follower(STEER_RAD) for _ in range(3)]
+        self.off = np.zeros(6, dtype=np.bool_)
+
+    def commanded(self, wheel_mps: Array, steer_rad: Array) -> None:
+        """Take the commands (3,), (3,) that are in force from now on."""
+        self._command = [*wheel_mps.tolist(), *steer_rad.tolist()]
+
+    def measured(self, now_s: float, step_s: float, wheels: Reading | None, steer_rad: Array | None) -> None:
+        """Compare the rates, first columns of the wheels, and steering angles (3,) with the commands."""
+        unknown = [math.nan] * 3
+        rates = unknown if wheels is None else wheels.values[-1, :3].tolist()
+        angles = unknown if steer_rad is None else steer_rad.tolist()
+        measured = [*(rate * self._mps_per_radps for rate in rates), *angles]
+        for follower, command, value in zip(self._followers, self._command, measured, strict=True):
+            follower.update(now_s, step_s, command, value)
+        self.off = np.array([follower.is_off for follower in self._followers])
 
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")

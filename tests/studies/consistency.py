@@ -13,7 +13,7 @@ from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import JobsSettings, Names, setting
 from pipelines.report.tree import Report, Table
-from terrain.control.drive_comparison import MeanInterval, mean_interval
+from terrain.control.drive_metrics import MeanInterval, mean_interval
 from terrain.estimation.consistency import consistency_report, lagged_slip_at
 from terrain.estimation.estimate import Estimate, estimate_run
 from terrain.robots import Robot, load_robot

@@ -15,8 +15,7 @@ from pipelines.live.model import TerrainModel
 from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.control.controllers import CONTROLLERS, make_controller
-from terrain.control.drive_comparison import Comparison
-from terrain.control.drive_metrics import METRICS, drive_history, evaluate_drive
+from terrain.control.drive_metrics import METRICS, Comparison, drive_history, evaluate_drive
 from terrain.control.situations import make_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import TerrainEstimate

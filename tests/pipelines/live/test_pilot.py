@@ -188,7 +188,7 @@ def test_lost_wheels_are_named_and_nothing_winds_up_meanwhile(place):
     assert found.figures.recovery_s <= LIMITS.recovery_s
     wheels = {"wheel_1", "wheel_2", "wheel_3"}
     assert {sensor for sensor in found.sensors_named if sensor.startswith("wheel")} == wheels
-    drive = drive_case(LOOP, FaultCase("loss_wheels", 3.0, *place)).drive
+    drive = drive_case(LOOP, FaultCase("loss_wheels", 3.0, *place))[0]
     after = drive.time_s > start_s + 3.0
     peak, clean_peak = (np.nanmax(np.abs(d.true_slip_ratio[after])) for d in (drive, clean))
     assert peak <= clean_peak + 0.03

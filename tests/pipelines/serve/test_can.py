@@ -20,9 +20,8 @@ from pipelines.live.chain import CommandStatus
 from pipelines.live.pilot import LivePilot
 from pipelines.serve.can_bus import Bridge, Link, open_bus
 from pipelines.serve.serve import Settings, run
-from terrain.control.robot_control import PilotSettings
+from terrain.control.robot_control import PERIOD_S, PilotSettings
 from terrain.control.slip_table import load_slip_table
-from terrain.control.wheel_controllers import PERIOD_S
 from terrain.control.wheel_corrections import BridgeState
 from terrain.errors import ConfigError
 from terrain.logs.replay import replay

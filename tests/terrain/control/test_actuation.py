@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from terrain.control.actuation import Actuation
+from terrain.control.robot_control import Actuation
 from terrain.records import Reading
 
 PERIOD_S = 0.02

@@ -5,14 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from terrain.control.drive_comparison import (
+from terrain.control.drive_metrics import (
     LEAST_RAMP_MPS2,
     Comparison,
     Drive,
-    matching_ramp,
-    steepest_grade,
-)
-from terrain.control.drive_metrics import (
     EnergyCurve,
     adaptation_times,
     command_change,
@@ -23,7 +19,9 @@ from terrain.control.drive_metrics import (
     final_speed,
     immobilised,
     lock_s,
+    matching_ramp,
     slip_peak,
+    steepest_grade,
     stopping_distance,
 )
 from terrain.records import RunLog, Stream

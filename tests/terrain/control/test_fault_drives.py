@@ -38,7 +38,6 @@ def during(value, start_s, end_s, usual):
 
 OK = np.ones(N, dtype=bool)
 LOST = ~between(START_S, END_S)
-STOPPED = {"stop_s": START_S, "stop_m": 1.0}
 
 
 def made(**changed):
@@ -130,7 +129,7 @@ def test_the_peak_of_slip_is_compared_with_that_of_plain_commands(peak, met):
     ("stop_m", "ratio", "met"), [(1.1, 1.1, True), (1.11, 1.11, False), (math.nan, math.inf, False)]
 )
 def test_the_stopping_distance_is_compared_with_that_of_plain_commands(stop_m, ratio, met):
-    plain, drive = made(**STOPPED), made(**(STOPPED | {"stop_m": stop_m}))
+    plain, drive = made(stop_m=1.0), made(stop_m=stop_m)
     assert figures(drive, plain=plain).stop_ratio == ratio
     assert bar("stop", drive, plain=plain) is met
 
