@@ -78,11 +78,6 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
 
     Runs go to ``out/runs``, the page to ``out/report.html``.  Where there are enough, some runs are held out, and
     these are predicted.
-
-    Raises
-    ------
-    TerrainError
-        if a run cannot be read, the data do not suffice, or something cannot be written.
     """
     from pipelines.data.datasets import load_runs
     from pipelines.data.tracking import ensure_tracking

@@ -73,17 +73,6 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
     is already in the folder is touched.  Windows that were recorded with a run go with it.  An implausible
     run becomes no run folder; with ``repair`` it is written as it is, and counts which checks it does not
     pass.
-
-    Raises
-    ------
-    LogError
-        if a run cannot be read or is implausible, or a place under ``out`` is taken.
-    DataError
-        if a run is longer than stamps can tell apart.
-    ConfigError
-        if a package is missing.
-    TerrainError
-        if ``out`` cannot be written.
     """
     from pipelines.data.run_writers import target_place, write
     from terrain.files.atomic import atomic_write

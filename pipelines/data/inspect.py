@@ -83,13 +83,7 @@ MAX_ROWS = 12  #: Rows of streams on the first screen: those that need a look co
 
 
 def run(settings: Settings, progress: Progress = silent) -> Inspection:
-    """Return the quality of the runs under a folder.
-
-    Raises
-    ------
-    LogError
-        if a run cannot be read.
-    """
+    """Return the quality of the runs under a folder."""
     from terrain.logs.digest import data_digest
     from terrain.logs.duplicates import shared_stretches
     from terrain.robots import load_robot

@@ -70,15 +70,7 @@ class SimulatedRuns(Result):
 
 
 def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
-    """Simulate runs and write them as run folders.
-
-    Raises
-    ------
-    ConfigError
-        if a setting is not accepted.
-    LogError
-        if a run of that name exists already; nothing is written then.
-    """
+    """Simulate runs and write them as run folders."""
     import math
 
     from terrain.effects import read_effects_of

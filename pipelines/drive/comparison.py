@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.drive.controllers import DriveInputs, drive_once, train_classifier
 from pipelines.drive.run_figures import DriveCurves, drive_curves, run_figures
 from pipelines.learn.parallel import parallel
+from pipelines.live.classifying import Classifier
+from pipelines.live.model import TerrainModel
 from pipelines.live.pilot import LivePilot
 from pipelines.report.figure import Bars, Figure, Panel, Points
 from pipelines.report.numbers import NOT_KNOWN, format_value, plural
@@ -24,6 +25,7 @@ from pipelines.slip.table import law_marks
 from terrain.control.controllers import (
     TRACK,
     Controller,
+    Source,
     adapts,
     kind_of,
     make_controller,
@@ -44,15 +46,79 @@ from terrain.control.drive_metrics import (
     matching_ramp,
     steepest_grade,
 )
-from terrain.control.situations import COURSE, SITUATIONS, SLOPE, Situation, SituationOptions, make_situation
+from terrain.control.situations import (
+    COURSE,
+    SITUATIONS,
+    SLOPE,
+    Situation,
+    SituationOptions,
+    make_situation,
+    simulate_situation,
+)
 from terrain.control.slip_table import SlipTable, load_slip_table
+from terrain.control.switching import KnownTerrain, TerrainSource
+from terrain.errors import ConfigError
 from terrain.records import RunLog
-from terrain.robots import load_robot
+from terrain.robots import Robot, load_robot
 
 if TYPE_CHECKING:
     from pipelines.drive.drive import Settings
 
 PICTURED = 3  #: Metrics of the first picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveInputs:
+    """Robots and models of a comparison."""
+
+    robot: Robot  # as the controllers assume it
+    table: SlipTable
+    model: TerrainModel | None = None  # classifier of ``classified`` and ``thesis:classified``
+    plant: Robot | None = None  # that is simulated, where it is another one
+
+    @property
+    def simulated(self) -> Robot:
+        """The robot that is simulated."""
+        return self.plant or self.robot
+
+    def of(self, controller: Controller) -> DriveInputs:
+        """Return what a controller needs: a model is large to send to another process."""
+        return self if controller.source is Source.CLASSIFIER else replace(self, model=None)
+
+
+def drive_once(inputs: DriveInputs, controller: Controller, situation: Situation) -> RunLog:
+    """Return the log of one drive, the pilot's status in its stream ``control``."""
+    source = _terrain_source(controller, inputs.model, inputs.robot)
+    pilot = LivePilot(inputs.robot, controller.table, source, controller.pilot)
+    return simulate_situation(inputs.simulated, situation, pilot.step, controller.pilot.delay_s)
+
+
+def _terrain_source(controller: Controller, model: TerrainModel | None, robot: Robot) -> TerrainSource:
+    if controller.source is Source.NONE:
+        return TerrainSource()
+    if controller.source is Source.TRUTH:
+        return KnownTerrain()
+    if controller.source is Source.KNOWN:
+        return KnownTerrain(lambda _: controller.known_terrain)
+    if model is None:
+        raise ConfigError(f"controller {controller.name!r} needs a classifier: give a model")
+    return Classifier(model, robot)
+
+
+def train_classifier(robot: Robot, seed: int, progress: Progress = silent) -> TerrainModel:
+    """Return a classifier that was trained on simulated labelled runs of a swerve robot, as many as of quickstart.
+
+    The runs differ from the drives of ``terrain drive`` at any seed.
+    """
+    from pipelines.learn.settings import RecipeSettings
+    from pipelines.learn.training_data import fitted_model
+    from pipelines.slip.labelled import RUNS_A_TERRAIN, labelled_runs
+
+    runs, _, _ = labelled_runs(seed, RUNS_A_TERRAIN, progress, robot)
+    progress("train", 0, 1)
+    model = fitted_model(runs, RecipeSettings(seed=seed), "simulated")
+    progress("train", 1, 1)
+    return model
 
 
 class DriveResult(Result, eq=False):
@@ -100,12 +166,8 @@ def run(settings: Settings, progress: Progress) -> DriveResult:
 def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent) -> DriveResult:
     """Drive all controllers at the same seeds, and evaluate them.
 
-    A classifier that a controller needs and the inputs lack is read or trained.
-
-    Raises
-    ------
-    ConfigError
-        before a training, if a controller does not exist on the robot or the table, or the situation does not.
+    A classifier that a controller needs and the inputs lack is read or trained; before, ``ConfigError`` is raised
+    if a controller does not exist on the robot or the table, or the situation does not.
     """
     names, table = settings.controllers, inputs.table
     controllers = [make_controller(name, table, settings.delay_s, settings.ramp_mps2) for name in names]
@@ -193,9 +255,9 @@ def report(result: DriveResult) -> Report:
     pairs = pairs_to_compare(names) if shown else []
     grade = f", {result.grade_deg:g}° uphill" if result.grade_deg else ""
     named = Path(result.terrain).stem if result.terrain.endswith("ml") else result.terrain
-    labels = [metric_label(key) for key in shown]
     means = [(name, *(compared.value(name, key).mean for key in shown)) for name in names]
-    columns = [Column("mean over seeds"), *(Column(label.text, unit=label.unit) for label in labels)]
+    labels = [metric_label(key) for key in shown]
+    columns = [Column("mean over seeds"), *(Column(text, unit=unit) for text, unit, _ in labels)]
     return Report(
         title=f"{result.scenario} on {'all terrains' if named == COURSE else named}{grade}",
         answer=verdict(result, pairs),
@@ -217,28 +279,17 @@ def report(result: DriveResult) -> Report:
     )
 
 
-class Label(NamedTuple):
-    """Name of a metric, and its unit or nothing."""
-
-    text: str
-    unit: str
-
-    @property
-    def with_unit(self) -> str:
-        """The name with its unit in brackets."""
-        return f"{self.text} [{self.unit}]" if self.unit else self.text
-
-
-def metric_label(key: str) -> Label:
-    """Return the label of a metric.
+def metric_label(key: str) -> tuple[str, str, str]:
+    """Return the name of a metric, its unit or nothing, and the name with the unit in brackets.
 
     Examples
     --------
-    >>> tuple(metric_label("first_distance_5s_m")), metric_label("energy_4m_j").with_unit
-    (('distance within 5 s of a start, first start', 'm'), 'energy of the first 4 m [J]')
+    >>> metric_label("first_distance_5s_m")[0], metric_label("energy_4m_j")[2]
+    ('distance within 5 s of a start, first start', 'energy of the first 4 m [J]')
     """
     text, unit = LABELS[key.removeprefix("first_")]
-    return Label(f"{text}, first start" if key.startswith("first_") else text, unit)
+    text = f"{text}, first start" if key.startswith("first_") else text
+    return text, unit, f"{text} [{unit}]" if unit else text
 
 
 def belief_notes(compared: Comparison) -> tuple[str, ...]:
@@ -264,7 +315,7 @@ def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]]) -> str:
     if not pairs:
         name = next(iter(result.controllers))
         values = [
-            f"{metric_label(key).text} {format_value(mean, unit=metric_label(key).unit)}"
+            f"{metric_label(key)[0]} {format_value(mean, unit=metric_label(key)[1])}"
             for key in compared.shown
             if (mean := compared.value(name, key).mean) is not None
         ]
@@ -278,9 +329,9 @@ def verdict(result: DriveResult, pairs: Sequence[tuple[str, str]]) -> str:
         if found is None:
             continue
         if math.isnan(found.low) or found.is_significant:
-            significant.append(f"{metric_label(key).text} {format_value(found.mean, *_signed(key))}")
+            significant.append(f"{metric_label(key)[0]} {format_value(found.mean, *_signed(key))}")
         else:
-            alike.append(metric_label(key).text)
+            alike.append(metric_label(key)[0])
     parts = [", ".join(significant)] if significant else []
     if alike:
         parts.append(f"no significant difference: {', '.join(alike)}")
@@ -303,7 +354,7 @@ def _picture(result: DriveResult) -> Figure | None:
         values = [result.compared.value(name, key) for name in names]
         means = [math.nan if value.mean is None else value.mean for value in values]
         low, high = zip(*(value.ci or (math.nan, math.nan) for value in values), strict=True)
-        panels.append(Panel([Bars(metric_label(key).with_unit, names, means, low, high)]))
+        panels.append(Panel([Bars(metric_label(key)[2], names, means, low, high)]))
     n = len(result.seeds)
     caption = "One seed, which gives no interval."
     if n > 1:
@@ -326,7 +377,7 @@ def _difference_parts(compared: Comparison, pairs: Sequence[tuple[str, str]]) ->
         "interval excludes zero, which happens by chance in one of twenty. The energy per metre is over the "
         "distance that all travelled who travelled at least half of the longest."
     )
-    return [Table(("", *(metric_label(key).text for key in keys)), rows, note=note)] if keys else []
+    return [Table(("", *(metric_label(key)[0] for key in keys)), rows, note=note)] if keys else []
 
 
 def _difference_text(found: Difference | None, key: str) -> str:
@@ -340,7 +391,7 @@ def _difference_text(found: Difference | None, key: str) -> str:
 
 def _signed(key: str) -> tuple[str, str]:
     """Return format and unit of a difference: a percentage, or in the metric's unit."""
-    return ("+.3g", metric_label(key).unit) if key in ABSOLUTE else ("+.1%", "")
+    return ("+.3g", metric_label(key)[1]) if key in ABSOLUTE else ("+.1%", "")
 
 
 def _metric_parts(result: DriveResult) -> list[Part | str]:
@@ -351,9 +402,9 @@ def _metric_parts(result: DriveResult) -> list[Part | str]:
         values = [compared.value(name, key) for name in result.controllers]
         if any(value.mean is not None for value in values):
             cells = (_metric_text(value, len(result.seeds)) for value in values)
-            rows.append((metric_label(key).with_unit, key, *cells))
+            rows.append((metric_label(key)[2], key, *cells))
         else:
-            undefined.append(f"{metric_label(key).text} ({key})")
+            undefined.append(f"{metric_label(key)[0]} ({key})")
     note = (
         "Means over seeds, with their 95 % intervals. Each seed draws load, soil, tyres, roughness and noise, the "
         "same for all controllers. n: the number of seeds at which a metric was defined, where it was not at all."

@@ -189,15 +189,7 @@ class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
 
 
 def run(settings: Settings, progress: Progress) -> Result:
-    """Drive what the settings name, and write the page.
-
-    Raises
-    ------
-    ConfigError
-        if a controller, a situation, a fault or a path does not go with the robot.
-    TerrainError
-        if a file cannot be read, or the folder cannot be written.
-    """
+    """Drive what the settings name, and write the page."""
     from terrain.files.atomic import ensure_writable
 
     if settings.out is not None:

@@ -83,13 +83,7 @@ class FaultsResult(Result, eq=False):
 
 
 def run(settings: Settings, progress: Progress) -> FaultsResult:
-    """Drive each fault in each situation, with the robot and the table of the settings.
-
-    Raises
-    ------
-    ConfigError
-        if the robot is no swerve robot with all sections, or as :func:`drive_faults`.
-    """
+    """Drive each fault in each situation, with the robot and the table of the settings."""
     refusal = "robot {name}: drive {drive!r} has no pilot, only 'swerve' has"
     robot = as_drive(SwerveRobot, load_robot(settings.robot), refusal)
     robot.require(*robot.sections)
@@ -102,12 +96,8 @@ def drive_faults(
 ) -> FaultsResult:
     """Drive each fault of the settings in each situation with a robot, and evaluate the drives.
 
-    Without a table one is learned in simulation.
-
-    Raises
-    ------
-    ConfigError
-        before anything is driven, if a fault, a situation or a terrain is unknown.
+    Without a table one is learned in simulation.  ``ConfigError`` is raised before anything is driven, if a fault,
+    a situation or a terrain is unknown.
     """
     catalogue, terrains = fault_catalogue(robot), [name.strip() for name in settings.terrain.split(",")]
     chosen = select_faults(catalogue, () if settings.faults == (ALL,) else settings.faults)

@@ -110,15 +110,7 @@ class PathResult(Result, eq=False):
 
 
 def run(settings: Settings, progress: Progress) -> PathResult:
-    """Follow the path of the settings in simulation; with ``out`` write the table ``drive.csv`` of the drive.
-
-    Raises
-    ------
-    ConfigError
-        if the robot is not car-like, or cannot drive as fast.
-    TerrainError
-        if the path cannot be read, or the folder not be written.
-    """
+    """Follow the path of the settings in simulation; with ``out`` write the table ``drive.csv`` of the drive."""
     assert settings.path is not None
     refusal = "robot {name}: drive {drive!r} cannot follow a path, only 'bicycle' can"
     robot = as_drive(BicycleRobot, load_robot(settings.robot), refusal)

@@ -53,13 +53,7 @@ class Settings(ExplainOptions, AlignedRunsSettings):
 
 
 def run(settings: Settings, progress: Progress) -> ExplainResult:
-    """Read runs, explain them as :func:`explain`, and write the page, the extended robot and the next drive.
-
-    Raises
-    ------
-    ConfigError
-        if the model is another robot's or has no covariance, or ``out`` has an extended description already.
-    """
+    """Read runs, explain them as :func:`explain`, and write the page, the extended robot and the next drive."""
     import numpy as np
     import yaml
 

@@ -42,13 +42,7 @@ class Settings(EvaluationSettings, AlignedRunsSettings, ComputeSettings):
 
 
 def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | ComparisonResult:
-    """Read runs, or their cached features, and evaluate recipes or models on them.
-
-    Raises
-    ------
-    ConfigError, LogError, DataError
-        if a setting is not accepted, a run cannot be read, or the data cannot answer.
-    """
+    """Read runs, or their cached features, and evaluate recipes or models on them."""
     from pipelines.learn.evaluation import CrossvalResult
 
     found: CrossvalResult | ComparisonResult

@@ -131,17 +131,7 @@ class AnswersResult(Result):
 def run(
     settings: Settings, progress: Progress = silent
 ) -> DoubtfulResult | LabelResult | ProposalsResult | AnswersResult:
-    """List doubtful windows, or change labels, or propose them, or take answers, as the settings have it.
-
-    Raises
-    ------
-    LogError, DataError
-        if there is no run, a file is damaged, or a run lacks what the model requires.
-    ConfigError
-        if there is no run of the id, an interval is outside of it, or answers do not fit.
-    TerrainError
-        if a file cannot be written.
-    """
+    """List doubtful windows, or change labels, or propose them, or take answers, as the settings have it."""
     from terrain.logs.labels import doubtful_windows, set_label
 
     if settings.model is not None:

@@ -206,13 +206,7 @@ class ServiceResult(Result):
 
 
 def run(settings: Settings, progress: Progress = silent) -> Result:
-    """Serve until it is ended; with ``--check`` only find out whether it could.
-
-    Raises
-    ------
-    TerrainError
-        in one sentence, if anything does not fit: model, table, robot, token, folder, port, bus.
-    """
+    """Serve until it is ended; with ``--check`` only find out whether it could."""
     on_bus, over_log = RESULTS
     if settings.can is not None or settings.replay is not None:
         mode: Any = import_module(on_bus if settings.can is not None else over_log)

@@ -88,13 +88,7 @@ GROUPS: dict[str, type[BaseSettings]] = {
 
 
 def run(settings: Settings, progress: Progress) -> Result:
-    """Calibrate, and write what was found.
-
-    Raises
-    ------
-    ConfigError
-        if an option is missing or for something else, or a file is there already.
-    """
+    """Calibrate, and write what was found."""
     for what, group in GROUPS.items():
         if what != settings.what:
             settings.refuse(group.model_fields, f"is for --what {what}, not for --what {settings.what}")

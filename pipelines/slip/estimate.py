@@ -181,13 +181,7 @@ def estimate_runs(
 
 
 def run(settings: Settings, progress: Progress) -> TracksResult:
-    """Read runs, estimate, and write them with their tracks, and their pictures.
-
-    Raises
-    ------
-    LogError
-        if a run is in ``out`` already; nothing is written then.
-    """
+    """Read runs, estimate, and write them with their tracks, and their pictures."""
     from pipelines.data.datasets import load
     from pipelines.slip.shown import write_figures
     from terrain.errors import LogError

@@ -30,15 +30,7 @@ class Settings(RunsSettings):
 
 
 def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
-    """Learn the table, write it and its pictures; what a swerve robot shows is logged with MLflow.
-
-    Raises
-    ------
-    ConfigError
-        if ``out`` is a folder.
-    TerrainError
-        if a folder cannot be written.
-    """
+    """Learn the table, write it and its pictures; what a swerve robot shows is logged with MLflow."""
     from pipelines.data.datasets import load
     from pipelines.slip.curves import LearnedCurves, log_curves
     from pipelines.slip.shown import write_figures

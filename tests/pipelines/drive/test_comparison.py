@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.drive import controllers
-from pipelines.drive.comparison import DriveResult, belief_notes, compare
-from pipelines.drive.controllers import DriveInputs, drive_once
+from pipelines.drive import comparison
+from pipelines.drive.comparison import DriveInputs, DriveResult, belief_notes, compare, drive_once
 from pipelines.drive.drive import Settings
 from pipelines.live.model import TerrainModel
 from pipelines.report.numbers import NOT_KNOWN
@@ -101,7 +100,7 @@ class Scripted:
 
 @pytest.mark.slow
 def test_the_thesis_takes_the_targets_of_the_classified_terrain(monkeypatch):
-    monkeypatch.setattr(controllers, "Classifier", lambda model, robot: Scripted("grass", 0.9))
+    monkeypatch.setattr(comparison, "Classifier", lambda model, robot: Scripted("grass", 0.9))
     settings = SHORT.with_(controllers=("thesis", "thesis:classified"), duration_s=16.0)
     result = compare(settings, DriveInputs(ROBOT, TABLE, TerrainModel(None, None)))  # for the source alone
     base, classified = (result.controllers[name] for name in ("thesis", "thesis:classified"))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipelines.drive.controllers import DriveInputs, drive_once
+from pipelines.drive.comparison import DriveInputs, drive_once
 from terrain.control.controllers import CONTROLLERS, make_controller
 from terrain.control.situations import make_situation
 from terrain.control.slip_table import load_slip_table

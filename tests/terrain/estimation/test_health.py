@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.drive.controllers import DriveInputs, drive_once
+from pipelines.drive.comparison import DriveInputs, drive_once
 from terrain.control.controllers import make_controller
 from terrain.control.fault_drives import START, STOP, make_fault_situation
 from terrain.control.slip_table import load_slip_table
