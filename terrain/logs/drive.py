@@ -9,17 +9,8 @@ robot changes its speed (``steady`` 0) and two after (``steady`` 1): they become
 Folders of sessions are read as one data set: runs are ``asphalt_1_step_000``, ..., and name their session.  A
 session's folder that is named ``<terrain>_<number>`` labels its runs; other runs have no label.
 
-============  ==========================================  ===============================================
-stream        channels                                    from
-============  ==========================================  ===============================================
-``wheels``    ``speed_left_mps speed_right_mps``          ``wheel_left wheel_right`` (rad/s) times the
-                                                          nominal wheel radius
-``imu``       ``gyro_z_radps``                            ``imu_yaw``, a rate and no angle
-\             ``accel_x_mps2 accel_y_mps2 accel_z_mps2``  ``-imu_ax -imu_ay imu_az``, specific force
-``lidar``     ``speed_x_mps speed_y_mps yaw_rate_radps``  ``icp_x icp_y icp_yaw``, see
-                                                          :func:`~terrain.logs.held.body_twists`
-``commands``  ``wheel_left_radps wheel_right_radps``      ``cmd_left cmd_right`` as published
-============  ==========================================  ===============================================
+Streams are ``wheels``, ``imu`` and ``commands`` (:data:`STREAMS`), in which ``imu_yaw`` is a rate and no angle, and
+``lidar`` of ``icp_x icp_y icp_yaw`` (:func:`~terrain.logs.held.body_twists`).
 
 Little of the files is documented.  What is assumed here was compared with the other columns, first of the
 Husky's log, then of six sessions of a Warthog and one of a Marmotte:

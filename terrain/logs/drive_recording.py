@@ -7,16 +7,8 @@ a recording is the session of its runs.  A step is one command: what was driven 
 runs ``..._hand_000``.  Terrain is taken to be that of the folder
 throughout.
 
-============  =================================================  ========================================
-stream        channels                                           from
-============  =================================================  ========================================
-``wheels``    ``speed_left_mps speed_right_mps``                 ``meas_*_vel`` times the nominal radius
-\             ``current_left_a ...`` ``voltage_left_v ...``      ``*_wheel_current``, ``*_wheel_voltage``
-``imu``       ``gyro_x_radps ...`` ``accel_x_mps2 ...``          ``imu_x ...``, ``imu_acceleration_x ...``
-``lidar``     ``speed_x_mps speed_y_mps yaw_rate_radps``         poses, see :mod:`~terrain.logs.held`
-``pose``      ``position_x_m position_y_m yaw_rad``              ``icp_pos_*``, ``icp_quat_*``
-``commands``  ``speed_x_mps yaw_rate_radps``                     ``cmd_vel_x``, ``cmd_vel_omega``
-============  =================================================  ========================================
+Streams are ``wheels`` (:data:`WHEELS`, times the nominal radius), ``imu`` (:data:`IMU`), ``commands``
+(:data:`COMMANDS`), and of ``icp_pos_*`` and ``icp_quat_*`` ``lidar`` (:mod:`~terrain.logs.held`) and ``pose``.
 
 Nothing of this is documented by the authors.  Compared with one another, the columns of four recordings of a
 Warthog and one of a Husky show:

@@ -1,26 +1,7 @@
 """Reader of run folders, the format in which this package keeps its logs.
 
-One folder per run holds ``run.json`` and one Parquet file per stream::
-
-    SNOW_07/
-      run.json
-      imu.parquet        columns time_s, gyro_x_radps, ... (64-bit floats; null and NaN: missing)
-      wheels.parquet     columns time_s, speed_left_mps, ...
-
-``run.json`` says what is in them::
-
-    {
-      "schema_version": 1,
-      "run_id": "SNOW_07",
-      "robot": "husky",
-      "session": "monday",
-      "source": "where the log comes from, in words",
-      "labels": [{"start_s": 0.0, "end_s": 54.92, "terrain": "SNOW"}],
-      "streams": {
-        "imu": {"file": "imu.parquet", "channels": {"gyro_x_radps": "radps"}}
-      },
-      "dropped": {"rows with a bad time": 3}
-    }
+One folder per run holds ``run.json``, which states what is in it (``docs/formats.md`` shows one), and one Parquet file
+per stream with the columns ``time_s`` and those of its channels (64-bit floats; null and NaN: missing).
 
 Times are seconds on the clock of the run and strictly increase.  A label holds from ``start_s`` to just
 before ``end_s``; labels do not overlap.  Each channel is named with its SI unit word, which is written

@@ -261,19 +261,6 @@ class RunRecorder:
 
     After :meth:`flush` all that was appended is in the file; if the process is killed then, readers read it.
     ``origin_s`` is the time on the clock of the run that is stamped 0; stamps reach 68 years from there.
-
-    Examples
-    --------
-    >>> class Shown:
-    ...     def write(self, of: Messages, log_ns: int, content: bytes) -> None:
-    ...         print(of.topic, log_ns, len(content))
-    ...     def flush(self) -> None: ...
-    ...     def finish(self) -> None: ...
-    >>> recorder = RunRecorder(Shown(), RunHead(run_id="drive_1", robot="husky", source="", labels=[]))
-    >>> recorder.append("imu", ("gyro_z_radps",), [0.0, 0.01], [[0.1], [0.2]])
-    /terrain/run 0 271
-    /terrain/imu 0 36
-    /terrain/imu 10000000 36
     """
 
     def __init__(self, writer: Writer, head: RunHead, origin_s: float = 0.0) -> None:
