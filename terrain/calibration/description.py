@@ -20,11 +20,8 @@ from terrain.records import RunLog
 from terrain.robots import OmniRobot, Robot, robot_from
 from terrain.terramechanics.soil import load_soil, soil_names
 
-IDENTIFIED = "identified"
-"""Section of a description that need not be there before."""
-
-MAX_NAMED_RUNS = 4
-"""A source names that many runs, and counts more."""
+IDENTIFIED = "identified"  #: Section of a description that need not be there before.
+MAX_NAMED_RUNS = 4  #: A source names that many runs, and counts more.
 
 
 def hard_grounds() -> tuple[str, ...]:

@@ -13,27 +13,17 @@ from terrain.records import Array
 
 
 class Finding(NamedTuple):
-    """One parameter estimated from logs; ``value`` is NaN where it is undetermined, and ``note`` says why.
+    """One parameter estimated from logs; ``value`` is NaN where it is undetermined, and ``note`` says why."""
 
-    Parameters
-    ----------
-    parameter : place in the description, ``sensors.gyro_bias_z_radps``
-    value, low, high : the number and its 95 % interval
-    n, counted : how many of what it rests on (12, ``"stretches"``)
-    runs : ids of the runs used
-    note : what is assumed; or why the value is undetermined
-    unit, described : of the number, and its value before; None where the description has no such number
-    """
-
-    parameter: str
-    value: float
+    parameter: str  #: place in the description, ``sensors.gyro_bias_z_radps``
+    value: float  #: the number and its 95 % interval
     low: float
     high: float
-    n: int
+    n: int  #: how many of what it rests on (12, ``"stretches"``)
     counted: str
-    runs: tuple[str, ...]
-    note: str = ""
-    unit: str = ""
+    runs: tuple[str, ...]  #: ids of the runs used
+    note: str = ""  #: what is assumed; or why the value is undetermined
+    unit: str = ""  #: of the number, and its value before; None where the description has no such number
     described: float | None = None
 
     @property
@@ -103,5 +93,4 @@ def biases(
     return [*found_biases, Finding(std_parameter, std, low, high, k, "power-ons", runs, note)]
 
 
-MIN_POWER_ONS = 3
-"""From two, the upper end of a scatter's interval is four times the scatter."""
+MIN_POWER_ONS = 3  #: From two, the upper end of a scatter's interval is four times the scatter.

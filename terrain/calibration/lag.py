@@ -33,38 +33,25 @@ from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.signals import at_times, low_passed
 
+#: Of the accelerometer itself: 62.5 Hz of bandwidth in the fusion modes (Bosch, BNO055 data sheet).
 REFERENCE_LAG_S = 1 / (2 * math.pi * 62.5)
-"""Of the accelerometer itself: 62.5 Hz of bandwidth in the fusion modes (Bosch, BNO055 data sheet)."""
-
-MIN_ACCEL_MPS2 = 0.3
-"""Of a start or stop, over :data:`SLOPE_S`."""
-
+MIN_ACCEL_MPS2 = 0.3  #: Of a start or stop, over :data:`SLOPE_S`.
 SLOPE_S = 0.2
 MIN_CHANGE_MPS = 0.2
 MIN_EVENT_S = 0.3
-LEVEL_S = 0.5
-"""What is taken before and after the speed changes: the level that a lag is seen against."""
-
+LEVEL_S = 0.5  #: What is taken before and after the speed changes: the level that a lag is seen against.
 MAX_YAW_RATE_RADPS = 0.1
-MAX_STEER_CHANGE_RAD = 0.03
-"""Beyond, it is no straight start, or the wheels are still being steered."""
-
+MAX_STEER_CHANGE_RAD = 0.03  #: Beyond, it is no straight start, or the wheels are still being steered.
 MAX_LAG_S = 0.5
 
+#: Stamps, and the reference's own lag, are trusted to that much; no number of events makes the interval narrower.
 STAMP_S = 0.001
-"""Stamps, and the reference's own lag, are trusted to that much; no number of events makes the interval
-narrower."""
-
-GRID_S = 0.002
-"""On which the acceleration is integrated and low-passed."""
-
-MIN_EVENTS = 5
-"""From fewer starts and stops, their scatter is not known."""
-
+GRID_S = 0.002  #: On which the acceleration is integrated and low-passed.
+MIN_EVENTS = 5  #: From fewer starts and stops, their scatter is not known.
 ENCODER, CAMERA = "sensors.encoder_time_constant_s", "camera.time_constant_s"
 
+#: Name of a finding that is no number of the description: what slip needs of both.
 DIFFERENCE = "encoder minus camera, s"
-"""Name of a finding that is no number of the description: what slip needs of both."""
 
 
 class Event(NamedTuple):

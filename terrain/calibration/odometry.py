@@ -64,37 +64,21 @@ from terrain.logs.drive import WindowPoses
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot
 
-STEP_S = 0.05
-"""Longest step within a leg: that of the logs of DRIVE."""
-
-GAP_S = 0.25
-"""Longest time without a sample within a leg, and without a pose at its ends."""
-
-MAX_WINDOW_GAP_S = 0.5
-"""Longest gap between two windows of a command."""
+STEP_S = 0.05  #: Longest step within a leg: that of the logs of DRIVE.
+GAP_S = 0.25  #: Longest time without a sample within a leg, and without a pose at its ends.
+MAX_WINDOW_GAP_S = 0.5  #: Longest gap between two windows of a command.
 
 
 class Leg(NamedTuple):
-    """A stretch of a run.
+    """A stretch of a run."""
 
-    Parameters
-    ----------
-    run : number of the run
-    moved : (3,) measured change of pose of the observed point, in the frame of its first pose
-    step_s : from sample to sample
-    speeds_mps : (n, 2) of the tracks
-    yaw_rate_radps : (n,) of the gyro
-    tilt_rad : (n, 2) roll and pitch; 0 where they are not measured
-    length_s : of the leg
-    """
-
-    run: int
-    moved: Array
-    step_s: float
-    speeds_mps: Array
-    yaw_rate_radps: Array
-    tilt_rad: Array
-    length_s: float
+    run: int  #: number of the run
+    moved: Array  #: (3,) measured change of pose of the observed point, in the frame of its first pose
+    step_s: float  #: from sample to sample
+    speeds_mps: Array  #: (n, 2) of the tracks
+    yaw_rate_radps: Array  #: (n,) of the gyro
+    tilt_rad: Array  #: (n, 2) roll and pitch; 0 where they are not measured
+    length_s: float  #: of the leg
 
 
 def odometry_rows(run: RunLog, robot: TrackedRobot) -> tuple[Array, Array]:
@@ -254,26 +238,19 @@ def _has_gap(time_s: Array, from_s: float, to_s: float) -> bool:
     )
 
 
+#: What is known of a mount before: on the robot, and mounted straight within 6 degrees.
 MOUNT = (
     Parameter("lever_x_m", 0.0, prior_std=0.3),
     Parameter("lever_y_m", 0.0, prior_std=0.3),
     Parameter("turned_rad", 0.0, prior_std=0.1),
 )
-"""What is known of a mount before: on the robot, and mounted straight within 6 degrees."""
-
-LOWEST = {EXPONENT: 0.0, TRACK_RATIO: 0.05}
-"""Bounds of parameters of the slip model."""
-
-SCALE_STD_RATIO = 0.1
-"""Of the sprocket's radius beside the described one."""
-
+LOWEST = {EXPONENT: 0.0, TRACK_RATIO: 0.05}  #: Bounds of parameters of the slip model.
+SCALE_STD_RATIO = 0.1  #: Of the sprocket's radius beside the described one.
+#: Error of a leg of 2 s that a fit begins with, and the least; each pass takes what the one before left.
 FIRST_ERROR_M, LEAST_ERROR_M, PASSES = 0.1, 1e-4, 4
-"""Error of a leg of 2 s that a fit begins with, and the least; each pass takes what the one before left."""
-
 MIN_LEGS = 10
 
-FLAT_RAD = 0.02
-"""Root mean square tilt, a degree, below which the ground counts as level."""
+FLAT_RAD = 0.02  #: Root mean square tilt, a degree, below which the ground counts as level.
 
 
 class Kind(NamedTuple):
@@ -288,24 +265,16 @@ ENCODER = Kind("encoder odometry", (COMPACTION, TRACK_RATIO), False)
 GYRODOMETRY = Kind("gyrodometry", (COMPACTION,), True)
 ENDO = Kind("Endo", (COMPACTION, EXPONENT), True)
 SLIP = Kind("slip-compensated", tuple(k for k in range(N_MODEL) if k != TRACK_RATIO), True)
-KINDS = (ENCODER, GYRODOMETRY, ENDO, SLIP)
-"""Encoder odometry has the best single effective track."""
+KINDS = (ENCODER, GYRODOMETRY, ENDO, SLIP)  #: Encoder odometry has the best single effective track.
 
 
 @dataclass(frozen=True, eq=False)
 class FittedOdometry:
-    """A kind of odometry fitted to legs.
+    """A kind of odometry fitted to legs."""
 
-    Parameters
-    ----------
-    kind : which
-    model : its slip model, with the covariance of what was fitted, clustered by runs
-    fit : of the free parameters of the model, and of :data:`MOUNT`
-    """
-
-    kind: Kind
-    model: SlipModel
-    fit: Fit
+    kind: Kind  #: which
+    model: SlipModel  #: its slip model, with the covariance of what was fitted, clustered by runs
+    fit: Fit  #: of the free parameters of the model, and of :data:`MOUNT`
 
     @property
     def mount(self) -> Array:
@@ -455,52 +424,33 @@ def _sum_legs(
     return out
 
 
-DRAWS = 2000
-"""Bootstrap samples of runs."""
+DRAWS = 2000  #: Bootstrap samples of runs.
 
 
 @dataclass(frozen=True, slots=True)
 class KindScore:
-    """Error of a kind of odometry over legs of one length.
+    """Error of a kind of odometry over legs of one length."""
 
-    Parameters
-    ----------
-    kind : name
-    rmse_m, rmse_ci_m : root mean square distance from the measured end, held out, and its 95 % interval
-    median_m : of the distances
-    yaw_rmse_rad : root mean square error of the heading
-    gain_encoder, gain_encoder_ci : by how much the RMSE is below that of encoder odometry, as a ratio
-    gain_gyro, gain_gyro_ci : the same against gyrodometry
-    """
-
-    kind: str
-    rmse_m: float
+    kind: str  #: name
+    rmse_m: float  #: root mean square distance from the measured end, held out, and its 95 % interval
     rmse_ci_m: tuple[float, float]
-    median_m: float
-    yaw_rmse_rad: float
-    gain_encoder: float
+    median_m: float  #: of the distances
+    yaw_rmse_rad: float  #: root mean square error of the heading
+    gain_encoder: float  #: by how much the RMSE is below that of encoder odometry, as a ratio
     gain_encoder_ci: tuple[float, float]
-    gain_gyro: float
+    gain_gyro: float  #: the same against gyrodometry
     gain_gyro_ci: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class LegScores:
-    """Scores of all kinds over legs of one length.
+    """Scores of all kinds over legs of one length."""
 
-    Parameters
-    ----------
-    length_s : of the legs, their mean
-    n_legs, n_runs : how many
-    path_m : root mean square of the distance between the ends of a leg
-    kinds : in the order of :data:`~terrain.calibration.odometry.KINDS`
-    """
-
-    length_s: float
-    n_legs: int
+    length_s: float  #: of the legs, their mean
+    n_legs: int  #: how many
     n_runs: int
-    path_m: float
-    kinds: tuple[KindScore, ...]
+    path_m: float  #: root mean square of the distance between the ends of a leg
+    kinds: tuple[KindScore, ...]  #: in the order of :data:`~terrain.calibration.odometry.KINDS`
 
 
 def held_out_ends(
@@ -580,10 +530,10 @@ def score_legs(legs: Sequence[Leg], ends: Mapping[str, Array], seed: int) -> Leg
     return LegScores(length_s, len(legs), len(runs), path_m, scores)
 
 
+#: Gains that settle within four seconds at any speed, and about the noise of these poses.
 SETTINGS = TrackedSettings(
     observation_gain_ps=(2.0, 2.0, 2.0), normalised=True, position_std_m=0.03, yaw_std_rad=0.04
 )
-"""Gains that settle within four seconds at any speed, and about the noise of these poses."""
 
 
 def efficiencies_before(
@@ -636,9 +586,8 @@ def end_by_efficiencies(leg: Leg, eta: Array, mount: Array, robot: TrackedRobot)
     return np.asarray(_ends(_packed([slipping]), SlipModel().vector, mount, robot, by_gyro=False)[0])
 
 
+#: A command's leg that is so much shorter than the longest of all is left out: its windows are not whole.
 SHORT_RATIO = 0.8
-"""A command's leg that is so much shorter than the longest of all is left out: its windows are not whole."""
-
 ADAPTIVE = "adaptive observer"
 
 
@@ -652,30 +601,19 @@ class ParameterFound:
 
 
 class JudgedOdometry(NamedTuple):
-    """What kinds of odometry are worth, and the slip model.
+    """What kinds of odometry are worth, and the slip model."""
 
-    Parameters
-    ----------
-    n_runs : runs with poses
-    scores : by length of the legs
-    model : slip model of slip-compensated odometry, fitted to all runs
-    parameters : of that
-    observed_point_m, observed_angle_rad : where the point that poses show lies in the body, and by which the
-        sensor of the poses is turned
-    adaptive : scores of the last windows of commands, by the adaptive observer and others; None without
-    delay_s : of the poses behind the gyro
-    flat : whether no slope was driven, or no tilt measured, so that what slopes do is not fitted
-    """
-
-    n_runs: int
-    scores: tuple[LegScores, ...]
-    model: SlipModel
-    parameters: Mapping[str, ParameterFound]
+    n_runs: int  #: runs with poses
+    scores: tuple[LegScores, ...]  #: by length of the legs
+    model: SlipModel  #: slip model of slip-compensated odometry, fitted to all runs
+    parameters: Mapping[str, ParameterFound]  #: of that
+    #: where the point that poses show lies in the body, and by which the sensor of the poses is turned
     observed_point_m: tuple[float, float]
     observed_angle_rad: float
+    #: scores of the last windows of commands, by the adaptive observer and others; None without
     adaptive: LegScores | None
-    delay_s: float
-    flat: bool
+    delay_s: float  #: of the poses behind the gyro
+    flat: bool  #: whether no slope was driven, or no tilt measured, so that what slopes do is not fitted
 
 
 def judge_odometry(

@@ -40,20 +40,13 @@ FRICTION = "motors.friction_nm"
 COM_X, COM_Y = "body.com_x_m", "body.com_y_m"
 RADIUS, DISTANCE = "identified.rolling_radius_m", "identified.wheel_distance_m"
 
+#: Over which speed and current of a motor are averaged: the steps of either are small over 16 samples.
 BLOCK_S = 0.5
-"""Over which speed and current of a motor are averaged: the steps of either are small over 16 samples."""
-
-MIN_RATE_RADPS = 1.0
-"""Of a wheel; slower, the speed of a motor alone is mostly its resolution."""
-
+MIN_RATE_RADPS = 1.0  #: Of a wheel; slower, the speed of a motor alone is mostly its resolution.
+#: Standard deviation of a motor's rate over a block, over its mean: beyond, it speeds up or slows down.
 MAX_SPREAD_RATIO = 0.1
-"""Standard deviation of a motor's rate over a block, over its mean: beyond, it speeds up or slows down."""
-
-MIN_SPEED_RATIO = 2.0
-"""Fastest over slowest steady speed of each motor, of motors that are tried alone."""
-
-MIN_BLOCKS = 8
-"""Of each motor: two unknowns."""
+MIN_SPEED_RATIO = 2.0  #: Fastest over slowest steady speed of each motor, of motors that are tried alone.
+MIN_BLOCKS = 8  #: Of each motor: two unknowns.
 
 
 def identify_omni(runs: Sequence[RunLog], robot: OmniRobot, seed: int = 0) -> list[Finding]:

@@ -38,27 +38,17 @@ from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
+#: Shorter stops are passed over: the robot still swings, and noise averages out too little.
 MIN_STANDING_S = 5.0
-"""Shorter stops are passed over: the robot still swings, and noise averages out too little."""
-
-BLOCK_S = 0.2
-"""Length over which the IMU is judged to be quiet."""
-
+BLOCK_S = 0.2  #: Length over which the IMU is judged to be quiet.
+#: A quiet sensor scatters at most this many times as much as its description says, which may be a poor guess.
 QUIET_FACTOR = 5.0
-"""A quiet sensor scatters at most this many times as much as its description says, which may be a poor
-guess."""
-
+#: A steady rate above this is a rotation: the BNO055's zero-rate offset is within 3 deg/s (Bosch data sheet).
 MAX_BIAS_RADPS = 0.06
-"""A steady rate above this is a rotation: the BNO055's zero-rate offset is within 3 deg/s (Bosch data
-sheet)."""
-
+#: Largest circumferential speed of a standing wheel: a single step of its Hall sensor reads as more after the low-pass
+#: of the motor driver.
 STANDING_MPS = 0.01
-"""Largest circumferential speed of a standing wheel: a single step of its Hall sensor reads as more after
-the low-pass of the motor driver."""
-
-BATCH_S = 1.0
-"""Means over batches of this length are as good as independent."""
-
+BATCH_S = 1.0  #: Means over batches of this length are as good as independent.
 NO_STANDING = f"no run has a standing stretch of {MIN_STANDING_S:g} s: let the robot stand, switched on"
 
 GYRO, ACCEL = IMU_CHANNELS[:3], IMU_CHANNELS[3:6]
@@ -150,15 +140,10 @@ def gyro_bias(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     return biases(names, std_name, found, variance, described, n, "samples", tuple(of_run))
 
 
-JUMP_S = 0.075
-"""Width of the running median that a relocalisation of the camera stands out from."""
-
+JUMP_S = 0.075  #: Width of the running median that a relocalisation of the camera stands out from.
+#: By more than this, in m/s of both speeds, rad/s and rad; driving and noise stay below.
 JUMP = (0.1, 0.1, 0.1, 0.05)
-"""By more than this, in m/s of both speeds, rad/s and rad; driving and noise stay below."""
-
-MAX_GAP_S = 0.1
-"""Over a longer gap nothing is interpolated."""
-
+MAX_GAP_S = 0.1  #: Over a longer gap nothing is interpolated.
 SEEN = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
 
 
@@ -196,18 +181,11 @@ def origin_twist(stretch: Stretch, robot: Robot) -> Stream | None:
     return Stream(seen.time_s, np.column_stack([*origin, turn_radps]), TWIST)
 
 
-MIN_POSITION_S = 2.0
-"""Of a position: "a couple of seconds" (thesis 3.3.3)."""
-
-UPRIGHT_SHARE = 0.8
-"""An axis points up or down where it carries that much of gravity: within 37 degrees."""
-
+MIN_POSITION_S = 2.0  #: Of a position: "a couple of seconds" (thesis 3.3.3).
+UPRIGHT_SHARE = 0.8  #: An axis points up or down where it carries that much of gravity: within 37 degrees.
+#: Means over batches of this length are as good as independent: an accelerometer at rest has little colour.
 POSITION_BATCH_S = 0.5
-"""Means over batches of this length are as good as independent: an accelerometer at rest has little
-colour."""
-
-PASSES = 3
-"""Each takes the errors of the positions from the fit before; they hardly depend on it."""
+PASSES = 3  #: Each takes the errors of the positions from the fit before; they hardly depend on it.
 
 LEVEL_ONLY = (
     "level standing alone cannot tell: along z a bias looks like a scale, along x and y like a tilt; "
@@ -306,19 +284,12 @@ def accelerometer(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:
     ]
 
 
-NO_NOISE_SHARE = 0.01
-"""Of the described standard deviation: a channel with less shows no noise at rest."""
-
+NO_NOISE_SHARE = 0.01  #: Of the described standard deviation: a channel with less shows no noise at rest.
+#: Noise under this share of an encoder's step hides in the step; above, step^2/12 taken off is right (Sheppard).
 MIN_NOISE_STEPS = 0.4
-"""Noise under this share of an encoder's step hides in the step; above, step^2/12 taken off is right
-(Sheppard)."""
-
-LAGS = 10
-"""Lags over which noise is looked at for colour."""
-
+LAGS = 10  #: Lags over which noise is looked at for colour.
+#: Least variance of a measurement, in its squared natural unit: no filter shall take a sensor for perfect (4.4.3).
 NOISE_FLOOR = 1e-5
-"""Least variance of a measurement, in its squared natural unit: no filter shall take a sensor for perfect
-(4.4.3)."""
 
 
 def sensor_noise(stretches: Sequence[Stretch], robot: Robot) -> list[Finding]:

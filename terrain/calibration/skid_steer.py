@@ -33,42 +33,29 @@ from terrain.identify import half_width, jackknife
 from terrain.records import Array, RunLog
 from terrain.signals import peak
 
+#: Of tyres that drive straight on over hard ground: a rolling resistance of 0.02 to 0.04 of the load over a slip
+#: stiffness of 2 to 10 loads.
 SLIP_RATIO = (0.0, 0.02)
-"""Of tyres that drive straight on over hard ground: a rolling resistance of 0.02 to 0.04 of the load over a
-slip stiffness of 2 to 10 loads."""
-
+#: Of tyres or tracks elsewhere: assumed, since nothing in a log tells it from the radius.
 SOFT_SLIP_RATIO = (0.0, 0.05)
-"""Of tyres or tracks elsewhere: assumed, since nothing in a log tells it from the radius."""
-
 STRETCH_S = 1.0
+#: Streams are brought to one grid: lidar twists are fits over 0.6 s, faster motion is not in them.
 GRID_S = 0.05
-"""Streams are brought to one grid: lidar twists are fits over 0.6 s, faster motion is not in them."""
-
 MAX_SPEED_CHANGE_MPS = 0.05
+#: From one half of a steady stretch to the other, of the mean and of the difference of the sides.
 MAX_TURN_CHANGE_MPS = 0.1
-"""From one half of a steady stretch to the other, of the mean and of the difference of the sides."""
-
+#: Least part of a stretch for which the lidar has a twist: windows of DRIVE lack them at their edges.
 MIN_SEEN = 0.5
-"""Least part of a stretch for which the lidar has a twist: windows of DRIVE lack them at their edges."""
-
 MIN_SPEED_MPS = 0.4
-MAX_CURVATURE_PER_M = 0.15
-"""Slower, or in a tighter curve, it is not straight driving."""
-
-MIN_YAW_RATE_RADPS = 0.15
-"""Slower turns are as small as their errors."""
-
-TRIMMED = 0.2
-"""Part of the stretches that is left out at either end: wheels that spin, poses that jump."""
-
+MAX_CURVATURE_PER_M = 0.15  #: Slower, or in a tighter curve, it is not straight driving.
+MIN_YAW_RATE_RADPS = 0.15  #: Slower turns are as small as their errors.
+TRIMMED = 0.2  #: Part of the stretches that is left out at either end: wheels that spin, poses that jump.
 MAX_DELAY_S = 1.0
 MIN_GROUPS = 4
+#: A fifth of a sample of logs at 20 Hz: no number of runs makes an interval narrower.
 DELAY_RESOLUTION_S = 0.01
-"""A fifth of a sample of logs at 20 Hz: no number of runs makes an interval narrower."""
-
+#: Of squares of yaw rates in rad^2/s^2, over a run: less are no turns, and show no delay.
 MIN_TURN_SUM = 0.5
-"""Of squares of yaw rates in rad^2/s^2, over a run: less are no turns, and show no delay."""
-
 RADIUS, TRACK = "identified.rolling_radius_m", "identified.effective_track_m"
 LIDAR_DELAY, WHEELS_DELAY = "identified.lidar_delay_s", "identified.wheels_delay_s"
 
@@ -105,19 +92,13 @@ def driven(run: RunLog) -> Driven | None:
 
 
 class Summary(NamedTuple):
-    """What one run shows.
+    """What one run shows."""
 
-    Parameters
-    ----------
-    run_id, session : of the run
-    stretches : (m, 4) of steady ones: mean and difference of the sides, speed and yaw rate of the lidar
-    lidar_sums, wheels_sums : (lags, 3) sums of products and squares of yaw rates at each lag
-    """
-
-    run_id: str
+    run_id: str  #: of the run
     session: str
+    #: (m, 4) of steady ones: mean and difference of the sides, speed and yaw rate of the lidar
     stretches: Array
-    lidar_sums: Array
+    lidar_sums: Array  #: (lags, 3) sums of products and squares of yaw rates at each lag
     wheels_sums: Array
 
 

@@ -39,45 +39,28 @@ from terrain.records import Array, RunLog
 from terrain.robots import Robot
 from terrain.signals import at_times
 
+#: Steady driving: the means over this time before and after an instant differ by no more than the two below.
 STEADY_S = 0.5
-"""Steady driving: the means over this time before and after an instant differ by no more than the two
-below."""
-
 MAX_SPEED_CHANGE_MPS = 0.02
 MAX_STEER_CHANGE_RAD = 0.003
 
-MAX_YAW_RATE_RADPS = 0.1
-"""In bends, side forces turn the wheels' travel away from where they point."""
-
-MIN_SPEED_MPS = 0.2
-"""Of each wheel's centre: below, the camera's noise shows in the direction."""
-
+MAX_YAW_RATE_RADPS = 0.1  #: In bends, side forces turn the wheels' travel away from where they point.
+MIN_SPEED_MPS = 0.2  #: Of each wheel's centre: below, the camera's noise shows in the direction.
 MIN_LENGTH_S = 0.8
 
 
 class Steady(NamedTuple):
-    """Means over a steady stretch, or over consecutive ones with the wheels steered alike.
+    """Means over a steady stretch, or over consecutive ones with the wheels steered alike."""
 
-    Parameters
-    ----------
-    run_id : of its run
-    travel : (3, 2) unit vectors along which the wheel centres travel, body axes
-    speed_mps : (3,) of the wheel centres
-    off_rad : (3,) raw steering angle minus the direction in which the wheel rolls
-    motor_radps, current_a : (3,) positive where they move the wheel along its travel
-    steering_rad, forward : (3,) unwrapped raw angle, and whether the motor turns forward
-    n : samples
-    """
-
-    run_id: str
-    travel: Array
-    speed_mps: Array
-    off_rad: Array
-    motor_radps: Array
+    run_id: str  #: of its run
+    travel: Array  #: (3, 2) unit vectors along which the wheel centres travel, body axes
+    speed_mps: Array  #: (3,) of the wheel centres
+    off_rad: Array  #: (3,) raw steering angle minus the direction in which the wheel rolls
+    motor_radps: Array  #: (3,) positive where they move the wheel along its travel
     current_a: Array
-    steering_rad: Array
+    steering_rad: Array  #: (3,) unwrapped raw angle, and whether the motor turns forward
     forward: Array
-    n: int
+    n: int  #: samples
 
 
 def steady_stretches(run: RunLog, robot: Robot, hard: Sequence[str]) -> list[Steady]:
@@ -204,18 +187,13 @@ def _mean(one: Steady, other: Steady) -> Steady:
     return one._replace(**mixed | {"travel": travel, "off_rad": off, "n": n})
 
 
+#: Residuals of more standard deviations weigh less; 95 % efficient where there is none (Huber 1964).
 HUBER = 1.345
-"""Residuals of more standard deviations weigh less; 95 % efficient where there is none (Huber 1964)."""
-
-ROUNDS = 30
-"""Of reweighting."""
-
-MIN_DOF = 3
-"""With fewer equations to spare, their scatter is not known."""
-
+ROUNDS = 30  #: Of reweighting.
+MIN_DOF = 3  #: With fewer equations to spare, their scatter is not known.
+#: Of a driven wheel in steady driving on hard ground: a rolling resistance of 0.01 to 0.02 of the load over a slip
+#: stiffness of 10 to 20 loads.
 SLIP_RATIO = (0.0, 0.002)
-"""Of a driven wheel in steady driving on hard ground: a rolling resistance of 0.01 to 0.02 of the load over
-a slip stiffness of 10 to 20 loads."""
 
 
 def steering_zeros(stretches: Sequence[Steady], robot: Robot) -> list[Finding]:

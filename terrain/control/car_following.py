@@ -77,37 +77,24 @@ class SteerStatus(StatusCode):
     """What a steering angle is worth."""
 
     OK = 0
-    CLAMPED = 1
-    """At the limit of the steering."""
-    SINGULAR = 2
-    """1 - c y close to 0 or below, or across the path: bounded."""
-    HELD = 3
-    """Deviations are not known: the curvature of the path is steered, nothing is corrected."""
-    BAD_INPUT = 4
-    """Speed or time are not numbers that can be: the steering is as it was."""
+    CLAMPED = 1  #: At the limit of the steering.
+    SINGULAR = 2  #: 1 - c y close to 0 or below, or across the path: bounded.
+    HELD = 3  #: Deviations are not known: the curvature of the path is steered, nothing is corrected.
+    BAD_INPUT = 4  #: Speed or time are not numbers that can be: the steering is as it was.
 
 
 class SteeringSettings(NamedTuple):
-    """Gains and what is known of the actuator.
+    """Gains and what is known of the actuator."""
 
-    Parameters
-    ----------
-    position_pm2, angle_pm : K_p and K_d; the default is critically damped
-    fastest_ps : bandwidth above which both fall with the speed, as delays are in seconds
-    offset_m : desired distance to the left of the path
-    delay_s : dead time of the steering
-    slip_lag_s : time constant of a low-pass of the slip angles.  The front one has -d in it, at once: fed
-        back without a lag it closes a fast loop of gain 1 around actuator and tyres
-    horizon_time_constants : H over the actuator's time constant, 3 for its response time (95 %); 0 passes the
-        curvature on as it is
-    """
-
-    position_pm2: float = 0.16
+    position_pm2: float = 0.16  #: K_p and K_d; the default is critically damped
     angle_pm: float = 0.8
-    fastest_ps: float = 1.5
-    offset_m: float = 0.0
-    delay_s: float = 0.05
+    fastest_ps: float = 1.5  #: bandwidth above which both fall with the speed, as delays are in seconds
+    offset_m: float = 0.0  #: desired distance to the left of the path
+    delay_s: float = 0.05  #: dead time of the steering
+    #: H over the actuator's time constant, 3 for its response time (95 %); 0 passes the curvature on as it is
     horizon_time_constants: float = 3.0
+    #: time constant of a low-pass of the slip angles. The front one has -d in it, at once: fed back without a lag it
+    #: closes a fast loop of gain 1 around actuator and tyres
     slip_lag_s: float = 0.05
 
 
@@ -224,10 +211,9 @@ def steer(
     )
 
 
+#: Of the steering, by which the sideslip expected ahead is steered before it comes, beside the dead time.
 REACH_TIME_CONSTANTS = 1.0
-"""Of the steering, by which the sideslip expected ahead is steered before it comes, beside the dead time."""
-LOST_STOP_S = 3.0
-"""Longer without a fix the robot stops."""
+LOST_STOP_S = 3.0  #: Longer without a fix the robot stops.
 
 
 class SlipSource(StrEnum):
@@ -237,8 +223,7 @@ class SlipSource(StrEnum):
     DYNAMIC = "dynamic"
     KINEMATIC = "kinematic"
     MULTI = "multi"
-    GRIP = "multi-grip"
-    """The multi-model observer, and the preview by its cornering stiffness."""
+    GRIP = "multi-grip"  #: The multi-model observer, and the preview by its cornering stiffness.
 
 
 def sideslip_observer(robot: BicycleRobot, source: SlipSource) -> Observer:
@@ -259,14 +244,13 @@ def sideslip_observer(robot: BicycleRobot, source: SlipSource) -> Observer:
     )
 
 
+#: Of the grip, what the side force ahead may take; and the braking before a bend, below the drive's acceleration.
 USED_PART, BRAKING_MPS2 = 0.75, 1.0
-"""Of the grip, what the side force ahead may take; and the braking before a bend, below the drive's acceleration."""
+#: Standard deviations of the grip's change within a second and of the nominal stiffness C_0, and the time for which
+#: errors of an estimated slip last; all assumed.
 GRIP_WALK, STIFFNESS_STD_RATIO, CORRELATION_S = 0.02, 0.2, 0.3
-"""Standard deviations of the grip's change within a second and of the nominal stiffness C_0, and the time for
-which errors of an estimated slip last; all assumed."""
 _LEAST_GRIP, _MOST_GRIP = 0.05, 1.5
-_SHOWS = 0.1
-"""Part of the load below which a side force shows nothing of the grip."""
+_SHOWS = 0.1  #: Part of the load below which a side force shows nothing of the grip.
 _LOOK_M = 0.5
 
 
@@ -382,10 +366,10 @@ class FollowedTick(NamedTuple):
     """What a controller knew and did at a tick."""
 
     time_s: float
-    place: Place  # on the path, by the estimated pose
+    place: Place  #: on the path, by the estimated pose
     estimate: ObserverOutput
     steer_status: SteerStatus
-    grip: Grip  # as estimated; NaN without the preview
+    grip: Grip  #: as estimated; NaN without the preview
 
 
 _NO_GRIP = Grip(math.nan, math.nan)
@@ -465,27 +449,27 @@ class CarFollower:
         return known.slip + ahead - here, min(desired_mps, fastest)
 
 
+#: Lateral specific force and slip angles from which a cornering stiffness can be compared with its secant.
 EXCITED_MPS2, EXCITED_RAD = 1.5, 0.02
-"""Lateral specific force and slip angles from which a cornering stiffness can be compared with its secant."""
 
 
 class FollowedDrive(NamedTuple):
     """Truth and estimates at the ticks of a drive: rows (n,) or, front and rear, (n, 2)."""
 
     time_s: Array
-    distance_m: Array  # of the true pose beside the path
+    distance_m: Array  #: of the true pose beside the path
     lateral_m: Array
-    position_m: Array  # (n, 2) true
-    speed_mps: Array  # true
-    slip_rad: Array  # (n, 2) as estimated; NaN where unknown, or at rest
+    position_m: Array  #: (n, 2) true
+    speed_mps: Array  #: true
+    slip_rad: Array  #: (n, 2) as estimated; NaN where unknown, or at rest
     slip_true_rad: Array
     slip_std_rad: Array
-    stiffness_npr: Array  # (n, 2) as estimated
-    secant_npr: Array  # (n, 2) -F/b of the truth where it is excited; else NaN
-    steer_rad: Array  # true
-    grip_ratio: Array  # as estimated; NaN without the preview
+    stiffness_npr: Array  #: (n, 2) as estimated
+    secant_npr: Array  #: (n, 2) -F/b of the truth where it is excited; else NaN
+    steer_rad: Array  #: true
+    grip_ratio: Array  #: as estimated; NaN without the preview
     grip_std: Array
-    reached_end: bool  # the drive came to the end of the path
+    reached_end: bool  #: the drive came to the end of the path
 
     def between(self, start_m: float, end_m: float) -> Array:
         """Return which ticks (n,) lie between two distances."""

@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from terrain.control.robot_control import PilotSettings
     from terrain.control.slip_table import SlipTable
 
-TRACK = "+track"
-"""Suffix of a controller with path tracking; all but ``plain`` and ``ramp`` can have it."""
+TRACK = "+track"  #: Suffix of a controller with path tracking; all but ``plain`` and ``ramp`` can have it.
 
 
 class Source(Enum):
@@ -41,6 +40,7 @@ class Kind(NamedTuple):
 _THESIS, _TRACTION = "The thesis' PID of slip on each wheel, with the target", "Traction control"
 _CLASSIFIED = "of the terrain that a classifier recognises while driving"
 
+#: By name; beside them there are ``known:NAME`` and ``target:SLIP``.
 KINDS = {
     "plain": Kind("plain", Source.NONE, "The wheel speeds of the kinematics; slip is not used."),
     "ramp": Kind("ramp", Source.NONE, "As plain, with a speed that rises by no more than {ramp}."),
@@ -62,10 +62,7 @@ KINDS = {
     ),
     "thesis:true_terrain": Kind("thesis", Source.TRUTH, f"{_THESIS}s of the true terrain."),
 }
-"""By name; beside them there are ``known:NAME`` and ``target:SLIP``."""
-
-CONTROLLERS = tuple(name for name in KINDS if ":" not in name)
-"""Those of a comparison by default."""
+CONTROLLERS = tuple(name for name in KINDS if ":" not in name)  #: Those of a comparison by default.
 
 
 def kind_of(name: str) -> Kind | None:
@@ -120,22 +117,13 @@ def pairs_to_compare(names: Sequence[str]) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Controller:
-    """What the name of a controller stands for.
+    """What the name of a controller stands for."""
 
-    Parameters
-    ----------
-    name : as given
-    pilot : its settings
-    table : its targets
-    source : of the current terrain
-    known_terrain : given to the pilot on every terrain, where the source is ``KNOWN``
-    """
-
-    name: str
-    pilot: PilotSettings
-    table: SlipTable
-    source: Source = Source.NONE
-    known_terrain: str = ""
+    name: str  #: as given
+    pilot: PilotSettings  #: its settings
+    table: SlipTable  #: its targets
+    source: Source = Source.NONE  #: of the current terrain
+    known_terrain: str = ""  #: given to the pilot on every terrain, where the source is ``KNOWN``
 
 
 def make_controller(

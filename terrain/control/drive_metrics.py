@@ -36,32 +36,20 @@ from terrain.robots import Robot
 from terrain.signals import low_pass
 from terrain.simulation.scenario import Scenario
 
-PEAK_ABOVE_MPS = 0.2
-"""Slip is evaluated above this speed: below it is the ratio of two small speeds."""
-
+PEAK_ABOVE_MPS = 0.2  #: Slip is evaluated above this speed: below it is the ratio of two small speeds.
+#: Time constant of the low-pass on slip, the one of its estimate: it removes the slip of single bumps.
 SMOOTH_S = 0.05
-"""Time constant of the low-pass on slip, the one of its estimate: it removes the slip of single bumps."""
-
+#: A wheel is locked where its circumferential speed is below this fraction of its speed over ground, above this speed
+#: over ground.
 LOCKED_RATIO, LOCKED_ABOVE_MPS = 0.1, 0.1
-"""A wheel is locked where its circumferential speed is below this fraction of its speed over ground, above
-this speed over ground."""
-
-STANDING_MPS = 0.02
-"""A robot that is slower than this stands."""
-
+STANDING_MPS = 0.02  #: A robot that is slower than this stands.
+#: A robot is immobilised where it is slower than the first for this time while a speed above the last is desired.
 STUCK_MPS, STUCK_S, STUCK_COMMAND_MPS = 0.03, 2.0, 0.2
-"""A robot is immobilised where it is slower than the first for this time while a speed above the last is
-desired."""
-
-FINAL_S = 20.0
-"""The final speed is the mean over this time, or over the last third of a shorter run."""
-
+FINAL_S = 20.0  #: The final speed is the mean over this time, or over the last third of a shorter run.
+#: Of a start: the distance over which energy is compared, the times within which distance is, and its slip.
 START_DISTANCE_M, START_TIME_S, START_WINDOW_S = 4.0, 5.0, 7.0
-"""Of a start: the distance over which energy is compared, the times within which distance is, and its slip."""
-
-TARGET_CHANGE = 0.02
-"""Targets that differ by less count as one."""
-
+TARGET_CHANGE = 0.02  #: Targets that differ by less count as one.
+#: Metrics that every drive has, with what they are called and their unit.
 METRICS = {
     "energy_j_per_m": ("energy per metre", "J/m"),
     "distance_m": ("distance travelled", "m"),
@@ -83,35 +71,32 @@ METRICS = {
     "command_mps2": ("change of the wheels' commands, rms", "m/s²"),
     "yaw_drift_rad": ("change of heading over the drive", "rad"),
 }
-"""Metrics that every drive has, with what they are called and their unit."""
-
+#: The same with those of some scenarios.
 LABELS = METRICS | {
     "stop_m": ("stopping distance", "m"),
     "steepest_deg": ("steepest grade climbed", "°"),
     f"distance_{START_TIME_S:g}s_m": (f"distance within {START_TIME_S:g} s of a start", "m"),
     f"energy_{START_DISTANCE_M:g}m_j": (f"energy of the first {START_DISTANCE_M:g} m", "J"),
 }
-"""The same with those of some scenarios."""
-
+#: Metrics of a controller that uses the terrain.
 BELIEF = ("believed_ratio", "n_accepted", "n_below_threshold", "n_refused")
-"""Metrics of a controller that uses the terrain."""
 
 
 class DriveHistory(NamedTuple):
     """The truth of a drive, evenly spaced: rows (n,) or, of wheels, (n, wheels)."""
 
     time_s: Array
-    speed_mps: Array  # magnitude of the velocity over ground
-    velocity_mps: Array  # (n, 2) in body axes
-    progress_mps: Array  # along the desired direction; negative where the robot slides back
-    distance_m: Array  # this and the next three cumulated
+    speed_mps: Array  #: magnitude of the velocity over ground
+    velocity_mps: Array  #: (n, 2) in body axes
+    progress_mps: Array  #: along the desired direction; negative where the robot slides back
+    distance_m: Array  #: this and the next three cumulated
     energy_j: Array
-    scrub_j: Array  # dissipated in the contacts
-    scrub_along_j: Array  # of it along the wheels
-    wheel_speed_mps: Array  # circumferential
-    ground_mps: Array  # of each wheel along it
-    slip_ratio: Array  # low-pass filtered, positive in traction in both directions; NaN at rest
-    sinkage_m: Array  # of the deepest wheel
+    scrub_j: Array  #: dissipated in the contacts
+    scrub_along_j: Array  #: of it along the wheels
+    wheel_speed_mps: Array  #: circumferential
+    ground_mps: Array  #: of each wheel along it
+    slip_ratio: Array  #: low-pass filtered, positive in traction in both directions; NaN at rest
+    sinkage_m: Array  #: of the deepest wheel
     yaw_rad: Array
 
 
@@ -469,23 +454,17 @@ def _half_interval(values: Array) -> float:
     return float(student.ppf(0.975, n - 1) * values.std(ddof=1) / math.sqrt(n))
 
 
+#: Range of the search for the steepest grade, and its bisections: to a tenth of a degree.
 STEEPEST_DEG, SLOPE_STEPS = 25.0, 9
-"""Range of the search for the steepest grade, and its bisections: to a tenth of a degree."""
-
-CLIMBING_MPS = 0.05
-"""A robot that is faster than this in the last second climbs."""
-
+CLIMBING_MPS = 0.05  #: A robot that is faster than this in the last second climbs.
+#: Range of the search for the matching ramp (up to twice the desired rise, where that is finite), and its bisections.
 LEAST_RAMP_MPS2, MOST_RAMP_MPS2, RAMP_STEPS = 0.1, 10.0, 7
-"""Range of the search for the matching ramp (up to twice the desired rise, where that is finite), and its
-bisections."""
-
+#: Controllers whose distance the ramp matches: the first of them that is driven.
 REFERENCES = ("true_terrain", "classified", "fallback")
-"""Controllers whose distance the ramp matches: the first of them that is driven."""
-
+#: Below this ratio of the driving time with a known terrain, nine tenths of a drive are the fallback's.
 HARDLY_BELIEVED_RATIO = 0.1
-"""Below this ratio of the driving time with a known terrain, nine tenths of a drive are the fallback's."""
-
 _GENERAL = ("slip_peak", "energy_j_per_m", "distance_m", "final_speed_mps")
+#: Metrics that a scenario is about, the most informative first.
 _OF_SCENARIO = {
     "starts": ("slip_peak", "energy_j_per_m", "distance_5s_m", "energy_4m_j", "final_speed_mps"),
     "brake": ("stop_m", "lock_s", "slip_peak", "energy_j_per_m"),
@@ -495,20 +474,13 @@ _OF_SCENARIO = {
     "course": (*_GENERAL, "adapt_s", "adapted_ratio"),
     "mixed": (*_GENERAL, "adapt_s", "adapted_ratio"),
 }
-"""Metrics that a scenario is about, the most informative first."""
-
+#: Metrics whose differences are given in their unit; all others relative, as drives differ in size.
 ABSOLUTE = ("steepest_deg", "lock_s", "immobilised", "adapt_s", "adapted_ratio")
-"""Metrics whose differences are given in their unit; all others relative, as drives differ in size."""
-
+#: Metrics that are compared only where a controller has another value than zero.
 WHERE_ANY = ("immobilised", "lock_s")
-"""Metrics that are compared only where a controller has another value than zero."""
-
+#: Metrics of controllers whose target follows the terrain; another's may be close to the target by chance.
 ADAPTATION = ("adapt_s", "adapted_ratio")
-"""Metrics of controllers whose target follows the terrain; another's may be close to the target by chance."""
-
-Metrics = Mapping[str, float]
-"""Metrics of one drive by name; NaN where one is undefined."""
-
+Metrics = Mapping[str, float]  #: Metrics of one drive by name; NaN where one is undefined.
 UNKNOWN = MeanInterval(None, None, 0)
 
 
@@ -576,16 +548,10 @@ def matching_ramp(
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Controllers over the same seeds.
+    """Controllers over the same seeds."""
 
-    Parameters
-    ----------
-    scenario : that was driven
-    rows : by controller, the metrics of each seed
-    """
-
-    scenario: str
-    rows: Mapping[str, Sequence[Metrics]]
+    scenario: str  #: that was driven
+    rows: Mapping[str, Sequence[Metrics]]  #: by controller, the metrics of each seed
 
     @cached_property
     def means(self) -> dict[str, dict[str, MeanInterval]]:

@@ -42,15 +42,12 @@ from terrain.simulation.conditions import Faults
 from terrain.simulation.faults import FaultyBus, Nature, fault_catalogue
 from terrain.simulation.scenario import Scenario
 
+#: From rest at 1 m/s^2 to 1 m/s, where the fault begins as the start does; a command to stop at once from 1 m/s, where
+#: it begins with the command; and at 1 m/s, where it begins 3 s after the speed was reached.
 FAULT_SITUATIONS = START, STOP, STEADY = "start", "stop", "steady"
-"""From rest at 1 m/s^2 to 1 m/s, where the fault begins as the start does; a command to stop at once from 1 m/s,
-where it begins with the command; and at 1 m/s, where it begins 3 s after the speed was reached."""
-
-LENGTHS_S = {START: 7.0, STEADY: 10.0}
-"""Long enough for a fault of 3 s and 2 s after it."""
-
+LENGTHS_S = {START: 7.0, STEADY: 10.0}  #: Long enough for a fault of 3 s and 2 s after it.
+#: By then the slip of steady motion is known to the controller, after 1 s of rest and 1 s of start.
 STEADY_FAULT_S = 5.0
-"""By then the slip of steady motion is known to the controller, after 1 s of rest and 1 s of start."""
 
 
 def make_fault_situation(name: str, robot: Robot, terrain: str, seed: int) -> tuple[Situation, float]:
@@ -79,63 +76,63 @@ def make_fault_situation(name: str, robot: Robot, terrain: str, seed: int) -> tu
 
 _SLACK_S = 1e-9  # figures and instants that differ by less are the same
 
+#: The error of slip is evaluated where each wheel, or the ground below it, is faster: there an error of 1 cm/s in a
+#: speed is 3 % of slip.
 RATIO_ABOVE_MPS = 0.3
-"""The error of slip is evaluated where each wheel, or the ground below it, is faster: there an error of
-1 cm/s in a speed is 3 % of slip."""
-
+#: A commanded speed counts as above the desired one by more than this; a wheel's share of the torque among wheels of
+#: different radii is corrected by less.
 OVERSPEED_MPS = 0.05
-"""A commanded speed counts as above the desired one by more than this; a wheel's share of the torque among
-wheels of different radii is corrected by less."""
 
 
 class FaultDrive(NamedTuple):
     """What is evaluated of a drive, at the instants of its control: rows (n,)."""
 
     time_s: Array
-    ok: Array  # whether the status is OK
-    slip_ratio: Array  # largest of the wheels, as the controller estimates it; NaN where unknown
-    true_slip_ratio: Array  # the true one behind the estimate's low-pass; NaN where a wheel is slow
-    body_slip_ratio: Array  # true slip of the robot, the mean over its wheels; NaN where it is slow
-    moving: Array  # whether the robot moves or motion is desired
-    commanded_mps: Array  # mean of the wheels
+    ok: Array  #: whether the status is OK
+    slip_ratio: Array  #: largest of the wheels, as the controller estimates it; NaN where unknown
+    true_slip_ratio: Array  #: the true one behind the estimate's low-pass; NaN where a wheel is slow
+    body_slip_ratio: Array  #: true slip of the robot, the mean over its wheels; NaN where it is slow
+    moving: Array  #: whether the robot moves or motion is desired
+    commanded_mps: Array  #: mean of the wheels
     desired_mps: Array
-    speed_mps: Array  # true, over ground
-    stop_m: float = math.nan  # from the command to stop to standstill; NaN where there was none
+    speed_mps: Array  #: true, over ground
+    stop_m: float = math.nan  #: from the command to stop to standstill; NaN where there was none
 
 
 class FaultFigures(NamedTuple):
     """Figures of a drive with a fault; NaN where one is not defined.  Slip counts from the fault's start on."""
 
-    ok_total_s: float  # with status OK while the fault acts and the robot is to move
-    ok_longest_s: float  # of it, the longest in one piece
-    not_ok_s: float  # without OK meanwhile, beyond the clean drive's
-    slip_error_ratio: float  # largest error of slip while the status is OK
-    clean_slip_error_ratio: float  # that of the clean drive
-    slip_peak_ratio: float  # largest magnitude of the robot's true slip
-    plain_slip_peak_ratio: float  # that of the plain drive
-    stop_m: float  # stopping distance; infinite without a standstill
-    stop_ratio: float  # over that of the plain drive
-    recovery_s: float  # from the fault's end until the status is OK for good; infinite where it is not
-    overspeed_s: float  # longest time for which the commanded speed is above the desired one
-    n_exceptions: int  # steps at which the controller raised
-    n_not_finite: int  # steps at which a command was not finite
+    ok_total_s: float  #: with status OK while the fault acts and the robot is to move
+    ok_longest_s: float  #: of it, the longest in one piece
+    not_ok_s: float  #: without OK meanwhile, beyond the clean drive's
+    slip_error_ratio: float  #: largest error of slip while the status is OK
+    clean_slip_error_ratio: float  #: that of the clean drive
+    slip_peak_ratio: float  #: largest magnitude of the robot's true slip
+    plain_slip_peak_ratio: float  #: that of the plain drive
+    stop_m: float  #: stopping distance; infinite without a standstill
+    stop_ratio: float  #: over that of the plain drive
+    recovery_s: float  #: from the fault's end until the status is OK for good; infinite where it is not
+    overspeed_s: float  #: longest time for which the commanded speed is above the desired one
+    n_exceptions: int  #: steps at which the controller raised
+    n_not_finite: int  #: steps at which a command was not finite
 
 
 class Limits(NamedTuple):
     """Limits of the figures."""
 
-    ok_s: float = 0.3  # for which a stream may be dead or lying before the status is another than OK
-    held_back_s: float = 0.3  # without OK beyond the clean drive's while a fault is tolerable
+    ok_s: float = 0.3  #: for which a stream may be dead or lying before the status is another than OK
+    held_back_s: float = 0.3  #: without OK beyond the clean drive's while a fault is tolerable
     slip_error_ratio: float = 0.05
-    slip_error_chance_ratio: float = 0.03  # the limit is at least the clean drive's own error and this
-    slip_peak_ratio: float = 0.03  # above the plain drive's: by chance between drives that differ little
-    stop_ratio: float = 1.1  # over the plain drive's
+    slip_error_chance_ratio: float = 0.03  #: the limit is at least the clean drive's own error and this
+    slip_peak_ratio: float = 0.03  #: above the plain drive's: by chance between drives that differ little
+    stop_ratio: float = 1.1  #: over the plain drive's
     recovery_s: float = 1.0
-    overspeed_s: float = 1.0  # a controlled braking from 1 m/s on a slick floor takes 0.5 s
+    overspeed_s: float = 1.0  #: a controlled braking from 1 m/s on a slick floor takes 0.5 s
 
 
 LIMITS = Limits()
 
+#: The bars by name, with the limits of :class:`Limits`.
 BARS = {
     "ok_ends": "status OK while a dead or lying stream acts: at most {ok_s:g} s in all",
     "goes_on": "status not OK while a tolerable fault acts: at most {held_back_s:g} s more than without it",
@@ -147,7 +144,6 @@ BARS = {
     "overspeed": "commanded speed above the desired one: for at most {overspeed_s:g} s",
     "finite": "commands that are not finite, and exceptions: none",
 }
-"""The bars by name, with the limits of :class:`Limits`."""
 
 
 def fault_drive(run: RunLog, history: DriveHistory, robot: Robot, scenario: Scenario) -> FaultDrive:
@@ -289,11 +285,8 @@ def count_bars(judged: Sequence[Mapping[str, bool | None]], limits: Limits = LIM
     return counted
 
 
-FRESH = "fresh"
-"""Status of a sensor that nothing is wrong with, in a pilot's ``health``."""
-
-NAMED_S = 0.1
-"""A sensor counts as named where it has been for this time."""
+FRESH = "fresh"  #: Status of a sensor that nothing is wrong with, in a pilot's ``health``.
+NAMED_S = 0.1  #: A sensor counts as named where it has been for this time.
 
 
 class Place(NamedTuple):
@@ -324,8 +317,8 @@ class FaultRow:
     nature: str
     figures: FaultFigures
     bars: Mapping[str, bool | None]
-    sensors_named: Mapping[str, str] | None  # by sensor, what the controller's health named it; None without
-    exception: str  # the first one that the controller raised, or empty
+    sensors_named: Mapping[str, str] | None  #: by sensor, what the controller's health named it; None without
+    exception: str  #: the first one that the controller raised, or empty
 
     @property
     def unmet(self) -> tuple[str, ...]:
@@ -343,7 +336,7 @@ class FaultLoop(NamedTuple):
     """The closed loop of all drives: a swerve robot, its pilots by controller, and the delay to the wheel."""
 
     robot: Robot
-    new_pilot: Callable[[str], Any]  # of ``traction`` or ``plain``; is sent to other processes
+    new_pilot: Callable[[str], Any]  #: of ``traction`` or ``plain``; is sent to other processes
     delay_s: float
 
 

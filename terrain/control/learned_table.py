@@ -39,12 +39,8 @@ from terrain.slip_learning.measured import (
 from terrain.terramechanics.soil import load_soil
 
 FALLBACK = "unknown"
-DIGITS = 4
-"""Of slips and ratios of forces in the table: a hundredth of their standard deviation."""
-
-MIN_RUNS = 3
-"""From fewer, how a median differs from run to run is not known."""
-
+DIGITS = 4  #: Of slips and ratios of forces in the table: a hundredth of their standard deviation.
+MIN_RUNS = 3  #: From fewer, how a median differs from run to run is not known.
 N_DRAWS = 1000
 
 NO_PEAK = (
@@ -212,26 +208,17 @@ def _rounded(pair: tuple[float, float]) -> tuple[float, float]:
 
 
 class Transfer(NamedTuple):
-    """The slip of one session taken for another of the same surface: what it costs.
+    """The slip of one session taken for another of the same surface: what it costs."""
 
-    Parameters
-    ----------
-    terrain, learned, driven : surface, and the two sessions
-    slip_learned, slip_driven : medians over runs
-    n_learned, n_driven : runs with a slip in steady motion
-    difference : of what was driven from what was learned
-    interval : its 95 % interval, by draws of runs of both; NaN where a session has fewer than
-        :data:`MIN_RUNS` runs
-    """
-
-    terrain: str
+    terrain: str  #: surface, and the two sessions
     learned: str
     driven: str
-    slip_learned: float
+    slip_learned: float  #: medians over runs
     slip_driven: float
-    n_learned: int
+    n_learned: int  #: runs with a slip in steady motion
     n_driven: int
-    difference: float
+    difference: float  #: of what was driven from what was learned
+    #: its 95 % interval, by draws of runs of both; NaN where a session has fewer than :data:`MIN_RUNS` runs
     interval: tuple[float, float]
 
 

@@ -21,15 +21,11 @@ from terrain.files.documents import accepted
 from terrain.files.names import read_regular
 from terrain.logs.labels import Number
 
+#: A bias older than that is estimated anew: with temperature it moves further than its walk says.
 BIASES_FRESH_S = 600.0
-"""A bias older than that is estimated anew: with temperature it moves further than its walk says."""
-
+#: As long as a terrain is believed without a window that confirms it (``SwitchSettings``).
 BELIEF_FRESH_S = 10.0
-"""As long as a terrain is believed without a window that confirms it (``SwitchSettings``)."""
-
-CLOCK_SLACK_S = 1.0
-"""A state may seem so far from the future: clocks are adjusted."""
-
+CLOCK_SLACK_S = 1.0  #: A state may seem so far from the future: clocks are adjusted.
 LARGEST_FILE = 65536
 
 
@@ -45,12 +41,12 @@ class LiveState:
     """What a live chain knew at a time."""
 
     robot: str
-    filter: str  # whose biases these are
-    saved_s: Number  # since 1970
-    biases: dict[str, Bias]  # by name of the state
-    terrain: str = UNKNOWN  # believed; empty where it was unknown
+    filter: str  #: whose biases these are
+    saved_s: Number  #: since 1970
+    biases: dict[str, Bias]  #: by name of the state
+    terrain: str = UNKNOWN  #: believed; empty where it was unknown
     probability: Number = math.nan
-    target_ratio: Number = math.nan  # target slip that was aimed for; NaN where there was none
+    target_ratio: Number = math.nan  #: target slip that was aimed for; NaN where there was none
 
     def usable(self, robot: str, filter_name: str, now_s: float) -> LiveState:
         """Return it without what may not be used now: what is too old, or another robot's or filter's.

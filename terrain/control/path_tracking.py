@@ -46,41 +46,29 @@ from terrain.records import Array
 from terrain.robots import Robot
 from terrain.status import StatusCode
 
-MOVING_MPS = 0.05
-"""From this speed on a motion has a direction."""
-
+MOVING_MPS = 0.05  #: From this speed on a motion has a direction.
 N_SPEEDS = 12
 
 
 class TrackSettings(NamedTuple):
-    """Gains and limits of path tracking; tuned on simulated drives whose seeds are used nowhere else.
+    """Gains and limits of path tracking; tuned on simulated drives whose seeds are used nowhere else."""
 
-    Parameters
-    ----------
-    arm_m : L; half the wheelbase, so that a correction of the heading is that angle of the steering
-    heading_pm, heading_integral_pm2 : k and k_I of the heading, rad of steering per m of L times heading
-    cross_pm, cross_integral_pm2 : the same per m of cross-track error; slower, as it is less urgent
-    heading_max_rad : clamp, as a steering angle: four times the backlash
-    cross_max_rad : the same; a side slope of 5 degrees on grass takes 0.2, which no backlash does
-    heading_fastest_ps, cross_fastest_ps : bandwidths above which the delays would matter
-    lag_s : from a desired twist to the estimated motion: delay, speed loop, steering and filter
-    yaw_std_max_rad : a heading that is less certain is not used; it is compared with changes of the heading,
-        which are known better
-    stale_max_s : without a measured speed over ground for longer, the position is not used
-    """
-
+    #: L; half the wheelbase, so that a correction of the heading is that angle of the steering
     arm_m: float = 0.5075
-    heading_pm: float = 3.0
+    heading_pm: float = 3.0  #: k and k_I of the heading, rad of steering per m of L times heading
     heading_integral_pm2: float = 0.7
-    cross_pm: float = 1.0
+    cross_pm: float = 1.0  #: the same per m of cross-track error; slower, as it is less urgent
     cross_integral_pm2: float = 0.2
-    heading_max_rad: float = 0.08
+    heading_max_rad: float = 0.08  #: clamp, as a steering angle: four times the backlash
+    #: the same; a side slope of 5 degrees on grass takes 0.2, which no backlash does
     cross_max_rad: float = 0.3
-    heading_fastest_ps: float = 3.0
+    heading_fastest_ps: float = 3.0  #: bandwidths above which the delays would matter
     cross_fastest_ps: float = 1.5
+    #: from a desired twist to the estimated motion: delay, speed loop, steering and filter
     lag_s: float = 0.15
+    #: a heading that is less certain is not used; it is compared with changes of the heading, which are known better
     yaw_std_max_rad: float = 0.1
-    stale_max_s: float = 3.0
+    stale_max_s: float = 3.0  #: without a measured speed over ground for longer, the position is not used
 
 
 SETTINGS = TrackSettings()
@@ -197,8 +185,8 @@ class TrackReport(NamedTuple):
     """Errors, NaN where nothing is corrected, and the correction."""
 
     heading_error_rad: float
-    cross_track_m: float  # distance from the path, positive to its left
-    correction_rad: float  # magnitude, as a steering angle
+    cross_track_m: float  #: distance from the path, positive to its left
+    correction_rad: float  #: magnitude, as a steering angle
     status: TrackStatus
 
 
@@ -211,11 +199,11 @@ class TrackState(NamedTuple):
     reference: Array | None = (
         None  # (3,) x, y and heading p* of the path; None where there is none, as at first
     )
-    desired_once: Array = _ZEROS  # (3,) desired twist behind a low-pass
-    desired: Array = _ZEROS  # (3,) behind two
-    integral: tuple[float, ...] = (0.0, 0.0, 0.0)  # of the errors along x, along y and of the heading
-    last: Array = _ZEROS  # (3,) pose of the robot
-    blind_s: float = 0.0  # without a pose
+    desired_once: Array = _ZEROS  #: (3,) desired twist behind a low-pass
+    desired: Array = _ZEROS  #: (3,) behind two
+    integral: tuple[float, ...] = (0.0, 0.0, 0.0)  #: of the errors along x, along y and of the heading
+    last: Array = _ZEROS  #: (3,) pose of the robot
+    blind_s: float = 0.0  #: without a pose
 
 
 _STAND_MPS = 0.02  # slower is standing: a tenth of the speed that counts as a drive

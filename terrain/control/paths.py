@@ -26,8 +26,7 @@ from terrain.files.names import MEBIBYTE, read_regular
 from terrain.records import Array, read_only
 from terrain.status import StatusCode
 
-GRID_M = 0.05
-"""Distance between the rows of a path."""
+GRID_M = 0.05  #: Distance between the rows of a path.
 _MERGED_M = 1e-3
 _LONGEST_M = 50_000.0
 
@@ -36,23 +35,19 @@ class PathStatus(StatusCode):
     """Where a robot is beside a path."""
 
     OK = 0
-    END = 1
-    """At or beyond the end."""
-    FAR = 2
-    """Further from the path than the search reaches: the place is as it was."""
-    SINGULAR = 3
-    """Near the centre of curvature, 1 - c y close to 0 or below."""
-    NO_POSE = 4
-    """The pose is not known: the place is as it was."""
+    END = 1  #: At or beyond the end.
+    FAR = 2  #: Further from the path than the search reaches: the place is as it was.
+    SINGULAR = 3  #: Near the centre of curvature, 1 - c y close to 0 or below.
+    NO_POSE = 4  #: The pose is not known: the place is as it was.
 
 
 class Place(NamedTuple):
     """Where a robot is on a path."""
 
-    distance_m: float  # s of the closest point
-    lateral_m: float  # y, of the robot to the left of the path
-    angle_rad: float  # theta~, heading of the robot less that of the path
-    curvature_pm: float  # c(s)
+    distance_m: float  #: s of the closest point
+    lateral_m: float  #: y, of the robot to the left of the path
+    angle_rad: float  #: theta~, heading of the robot less that of the path
+    curvature_pm: float  #: c(s)
     status: PathStatus
 
 
@@ -63,21 +58,15 @@ _AS_NEAR_M = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReferencePath:
-    """A path, at distances that rise by :data:`GRID_M` from 0.
+    """A path, at distances that rise by :data:`GRID_M` from 0."""
 
-    Parameters
-    ----------
-    x_m, y_m, heading_rad, curvature_pm : (n,)
-    roll_rad : (n,) side slope, left side up > 0; NaN where it is not known, as without any
-    n_merged : points that repeated the one before
-    """
-
-    x_m: Array
+    x_m: Array  #: (n,)
     y_m: Array
     heading_rad: Array
     curvature_pm: Array
+    #: (n,) side slope, left side up > 0; NaN where it is not known, as without any
     roll_rad: Array | None = None
-    n_merged: int = 0
+    n_merged: int = 0  #: points that repeated the one before
 
     def __post_init__(self) -> None:
         if self.roll_rad is None:

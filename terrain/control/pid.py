@@ -90,8 +90,8 @@ def checked(
     return made
 
 
+#: A longer step between two calls is no step of a control loop: the previous error tells nothing of the present.
 LONGEST_STEP_S = 0.5
-"""A longer step between two calls is no step of a control loop: the previous error tells nothing of the present."""
 
 
 class PidStatus(StatusCode):
@@ -106,12 +106,13 @@ class PidStatus(StatusCode):
 class Gains(NamedTuple):
     """Gains and limits of a controller; output and limits have the same unit."""
 
-    kp: float  # output per error
-    ki: float  # per error and second
-    kd: float  # per rate of error
-    limit: float  # largest magnitude of the output
-    integral_limit: float = math.inf  # of the integral; infinite where ``limit`` is sufficient
-    derivative_time_constant_s: float = 0.0  # of the error's low-pass before it is differentiated; 0 for none
+    kp: float  #: output per error
+    ki: float  #: per error and second
+    kd: float  #: per rate of error
+    limit: float  #: largest magnitude of the output
+    integral_limit: float = math.inf  #: of the integral; infinite where ``limit`` is sufficient
+    #: of the error's low-pass before it is differentiated; 0 for none
+    derivative_time_constant_s: float = 0.0
 
 
 class PidState(NamedTuple):
@@ -173,13 +174,12 @@ class DriveState(StatusCode):
     STEADY = 2
 
 
+#: Assumed, as the thesis specifies none: 0.1 m/s^2 at 1 m/s, the threshold of a steady speed elsewhere
+#: (``terrain.estimation.wheel_slip.STEADY_CHANGE_MPS``), and more than five times the effect of an accelerometer's
+#: bias.
 POWER_THRESHOLD_WPKG = 0.1
-"""Assumed, as the thesis specifies none: 0.1 m/s^2 at 1 m/s, the threshold of a steady speed elsewhere
-(``terrain.estimation.wheel_slip.STEADY_CHANGE_MPS``), and more than five times the effect of an
-accelerometer's bias."""
-
+#: Thesis 8.3.2: of a wheel, below which its error is 0, and of the robot, above which commands are corrected.
 LOW_SPEED_MPS = 0.05
-"""Thesis 8.3.2: of a wheel, below which its error is 0, and of the robot, above which commands are corrected."""
 
 
 class ThesisStatus(StatusCode):
@@ -208,8 +208,8 @@ class WheelPid(NamedTuple):
 class WheelStep(NamedTuple):
     """What a step gives a wheel."""
 
-    correction_radps: float  # to add to its command; 0 by every status but ok, clamped and low speed
-    desired_ratio: float  # signed along the wheel; NaN where the drive state or the target is unknown
+    correction_radps: float  #: to add to its command; 0 by every status but ok, clamped and low speed
+    desired_ratio: float  #: signed along the wheel; NaN where the drive state or the target is unknown
     drive_state: DriveState
     status: ThesisStatus
 

@@ -73,15 +73,12 @@ from terrain.records import Array, Command, Reading, SlipTarget
 from terrain.robots import Robot, SwerveRobot, as_drive
 from terrain.slip import MIN_SPEED_MPS
 
+#: Commands of the kinematics; with a bounded rise of speed; the thesis' PID on each wheel; the controller of
+#: :mod:`terrain.control.traction`.
 CONTROLLERS = ("plain", "ramp", "thesis", "traction")
-"""Commands of the kinematics; with a bounded rise of speed; the thesis' PID on each wheel; the controller of
-:mod:`terrain.control.traction`."""
-
-OPEN_LOOP = ("plain", "ramp")
-"""Controllers that use no measurement."""
-
+OPEN_LOOP = ("plain", "ramp")  #: Controllers that use no measurement.
+#: The thesis specifies none; these have a gain margin of 3 on the simulated robot (``check_stable``).
 THESIS_GAINS = Gains(0.5, 0.5, 0.0, limit=2.0)
-"""The thesis specifies none; these have a gain margin of 3 on the simulated robot (``check_stable``)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,14 +86,15 @@ class PilotSettings:
     """Controller of a pilot and its settings."""
 
     controller: str = "traction"  # one of :data:`CONTROLLERS`
-    ramp_mps2: float = 0.5  # largest rise of the speed of the fastest wheel, of ``ramp``
+    ramp_mps2: float = 0.5  #: largest rise of the speed of the fastest wheel, of ``ramp``
     traction: TractionSettings = TRACTION
     switching: SwitchSettings = SWITCHING
-    gains: Gains = THESIS_GAINS  # of ``thesis``
-    delay_s: float = 0.05  # from a sample to the wheel; the loops have to be stable with it
-    track: bool = False  # with path tracking; not with ``plain`` and ``ramp``, which estimate no pose
+    gains: Gains = THESIS_GAINS  #: of ``thesis``
+    delay_s: float = 0.05  #: from a sample to the wheel; the loops have to be stable with it
+    track: bool = False  #: with path tracking; not with ``plain`` and ``ramp``, which estimate no pose
     tracking: TrackSettings = TRACKING
-    follows: bool = True  # motors follow this pilot's commands, and are compared; not where a log is replayed
+    #: motors follow this pilot's commands, and are compared; not where a log is replayed
+    follows: bool = True
 
 
 DEFAULT_SETTINGS = PilotSettings()
@@ -105,24 +103,24 @@ DEFAULT_SETTINGS = PilotSettings()
 class PilotStatus(NamedTuple):
     """Status of a step; its fields are the channels of the stream ``control``."""
 
-    status_code: float  # :class:`terrain.control.traction.TractionStatus`
-    terrain_code: float  # place of the current terrain in the pilot's table; -1 where it is unknown
-    probability_ratio: float  # of the current terrain
+    status_code: float  #: :class:`terrain.control.traction.TractionStatus`
+    terrain_code: float  #: place of the current terrain in the pilot's table; -1 where it is unknown
+    probability_ratio: float  #: of the current terrain
     target_ratio: float
-    aimed_ratio: float  # the target with its floor
-    balance_ratio: float  # slip of steady motion
-    slip_ratio: float  # largest of a wheel
-    slip_std_ratio: float  # largest standard deviation
-    stale_s: float  # since the speed over ground was measured last
-    drive_state_code: float  # :class:`terrain.control.pid.DriveState`
-    driven_mps: float  # commanded speed of the fastest wheel
+    aimed_ratio: float  #: the target with its floor
+    balance_ratio: float  #: slip of steady motion
+    slip_ratio: float  #: largest of a wheel
+    slip_std_ratio: float  #: largest standard deviation
+    stale_s: float  #: since the speed over ground was measured last
+    drive_state_code: float  #: :class:`terrain.control.pid.DriveState`
+    driven_mps: float  #: commanded speed of the fastest wheel
     desired_mps: float
-    heading_error_rad: float  # of path tracking
+    heading_error_rad: float  #: of path tracking
     cross_track_m: float
-    track_status_code: float  # :class:`terrain.control.path_tracking.TrackStatus`
-    sensor_code: float  # place in :data:`terrain.estimation.health.SENSORS` of the least sound; -1 for none
-    health_code: float  # its :class:`terrain.estimation.health.Health`
-    output_code: float  # of the terrain source, :class:`terrain.control.switching.OutputStatus`
+    track_status_code: float  #: :class:`terrain.control.path_tracking.TrackStatus`
+    sensor_code: float  #: place in :data:`terrain.estimation.health.SENSORS` of the least sound; -1 for none
+    health_code: float  #: its :class:`terrain.estimation.health.Health`
+    output_code: float  #: of the terrain source, :class:`terrain.control.switching.OutputStatus`
 
 
 def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> SwerveRobot:
@@ -155,8 +153,7 @@ def check_table(table: SlipTable, robot: str) -> None:
         raise ConfigError(f"slip table {table.name}: is of the robot {table.robot!r}, not of {robot!r}")
 
 
-PERIOD_S = 0.02
-"""Time step of the control loop; assumed where the clock is not valid."""
+PERIOD_S = 0.02  #: Time step of the control loop; assumed where the clock is not valid.
 
 
 def step_or_period(dt_s: float) -> float:
@@ -165,8 +162,8 @@ def step_or_period(dt_s: float) -> float:
 
 
 _UNKNOWN = np.full(3, math.nan)
+#: Before the first estimate.
 UNOBSERVED = WheelMotion(_UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, _UNKNOWN, math.nan, math.inf)
-"""Before the first estimate."""
 
 
 def observe_wheels(
@@ -308,16 +305,14 @@ class WheelController:
         return command, WheelReport(driven_mps, aimed, math.nan, largest, wheels[0].drive_state, status)
 
 
+#: Thrust over load at the peak, up to which terrain counts as slick: with more, a robot stops from 1 m/s in less than
+#: two tenths of a second, which is the response time of a slip controller.
 SLICK_RATIO = 0.5
-"""Thrust over load at the peak, up to which terrain counts as slick: with more, a robot stops from 1 m/s in
-less than two tenths of a second, which is the response time of a slip controller."""
-
+#: Thrust of a locked wheel over that at the peak, up to which slip is controlled: with 0.92 a controlled stop came out
+#: longer in simulation, with 0.79 it was 7 to 22 % shorter.
 LOCKED_RATIO = 0.88
-"""Thrust of a locked wheel over that at the peak, up to which slip is controlled: with 0.92 a controlled
-stop came out longer in simulation, with 0.79 it was 7 to 22 % shorter."""
-
+#: Planned deceleration over that at the peak; with more, the slip would diverge from the peak.
 DECELERATION_RATIO = 0.9
-"""Planned deceleration over that at the peak; with more, the slip would diverge from the peak."""
 
 
 def braking_by_slip(curve: CurveEntry | None) -> tuple[float, float] | None:
@@ -339,10 +334,10 @@ def braking_by_slip(curve: CurveEntry | None) -> tuple[float, float] | None:
     return float(slip[peak]), deceleration_mps2
 
 
+#: The difference of a table's targets in traction and in steady motion is the slip above the balance that gives the
+#: working pull; up to this much is added to the measured balance. A larger difference is that of a table that aims for
+#: a peak.
 MARGIN_MAX_RATIO = 0.06
-"""The difference of a table's targets in traction and in steady motion is the slip above the balance that
-gives the working pull; up to this much is added to the measured balance.  A larger difference is that of a
-table that aims for a peak."""
 
 
 def traction_target(table: SlipTable, terrain: str) -> TractionTarget:
@@ -362,21 +357,16 @@ def traction_target(table: SlipTable, terrain: str) -> TractionTarget:
     return TractionTarget(traction.slip_ratio, *braking, margin)
 
 
-N_COMMANDS = 32
-"""Of the last steps, which are compared."""
-
+N_COMMANDS = 32  #: Of the last steps, which are compared.
+#: Time within which a command is followed; for which a deviation has to last; for which there must be none for it to
+#: be over; low-pass of what is measured, against the ripple of the Hall steps.
 WINDOW_S, PERSISTS_S, SETTLED_S, SMOOTH_S = 0.4, 0.06, 0.1, 0.04
-"""Time within which a command is followed; for which a deviation has to last; for which there must be none
-for it to be over; low-pass of what is measured, against the ripple of the Hall steps."""
-
+#: Time within which a motor changes its rate where the command has; a loaded one takes 0.12 s to start.
 STILL_S = 0.18
-"""Time within which a motor changes its rate where the command has; a loaded one takes 0.12 s to start."""
-
+#: A second low-pass, and how far the first is ahead of it, in m/s or rad, where a command is approached.
 SLOW_S, APPROACH = 0.2, 0.02
-"""A second low-pass, and how far the first is ahead of it, in m/s or rad, where a command is approached."""
-
+#: Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle.
 SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
-"""Tolerances: of a wheel's speed, a constant and a part of the command, and of a steering angle."""
 
 
 class Follower:

@@ -19,17 +19,14 @@ from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.scenario import RATE_HZ, SCENARIOS, Patch, Scenario, make_scenario
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
-COURSE = "course"
-"""Terrain of scenarios that cross all soils in one drive."""
-
+COURSE = "course"  #: Terrain of scenarios that cross all soils in one drive.
 STARTS, BRAKE, SLOPE, MIXED = "starts", "brake", "slope", "mixed"
 
+#: Of ``starts``: long enough to evaluate 5 s of each, and to learn the slip of steady motion.
 STARTS_HOLD_S, STARTS_REST_S, N_STARTS = 6.0, 1.5, 3
-"""Of ``starts``: long enough to evaluate 5 s of each, and to learn the slip of steady motion."""
-
+#: Default length of ``mixed``, and the interval in it without the camera.
 MIXED_S, CAMERA_LOST_S = 90.0, (28.0, 31.0)
-"""Default length of ``mixed``, and the interval in it without the camera."""
-
+#: Scenarios made for comparisons, and what there is to say of them; those of ``terrain simulate`` are accepted, too.
 SITUATIONS = {
     STARTS: "Stand, start, hold the speed, stop: three times. Metrics of a start are means of the second "
     "and third, when the slip of steady motion is known; those of the first are listed beside them in the "
@@ -42,8 +39,6 @@ SITUATIONS = {
     "crab": "",
     MIXED: "Terrains in any order, and no camera for three seconds.",
 }
-"""Scenarios made for comparisons, and what there is to say of them; those of ``terrain simulate`` are accepted,
-too."""
 
 
 class Situation(NamedTuple):
@@ -63,9 +58,9 @@ class SituationOptions:
     duration_s: float | None = None
     speed_mps: float = 1.0
     accel_mps2: float = 1.0
-    grade_deg: float = 0.0  # uphill along the initial heading
-    radius_factors: tuple[float, float, float] | None = None  # true over nominal radius; drawn by default
-    leg_backlash_rad: float = 0.0  # of the third leg
+    grade_deg: float = 0.0  #: uphill along the initial heading
+    radius_factors: tuple[float, float, float] | None = None  #: true over nominal radius; drawn by default
+    leg_backlash_rad: float = 0.0  #: of the third leg
 
 
 def make_situation(

@@ -28,11 +28,9 @@ from terrain.slip_learning.curve import LAW_BOUNDS, LAW_PARAMETERS, PeakStatus, 
 
 DRIVE_STATES = ("traction", "braking", "steady")
 
+#: Slip is positive in traction and negative in braking; steady motion needs traction against resistance.
 SIGN = {"traction": 1, "braking": -1, "steady": 1}
-"""Slip is positive in traction and negative in braking; steady motion needs traction against resistance."""
-
-SCHEMA = 2
-"""Newest form that is read, and the one that is written."""
+SCHEMA = 2  #: Newest form that is read, and the one that is written.
 
 _HEADER = """\
 # Target slip on each terrain, positive in traction (s = (w r - v) / max(|w r|, |v|)).
@@ -48,38 +46,25 @@ _CLOSED = ConfigDict(extra="forbid")
 
 @checked_dataclass(frozen=True, slots=True, config=_CLOSED)
 class CurveEntry:
-    """What a table holds of a learned curve; numbers as in the file, None where not known.
+    """What a table holds of a learned curve; numbers as in the file, None where not known."""
 
-    Parameters
-    ----------
-    law, parameters : by :data:`terrain.slip_learning.curve.LAW_PARAMETERS`
-    peak_slip_ratio, peak_interval_ratio, peak_status : of net traction (:mod:`terrain.slip_learning.curve`);
-        the interval contains it with 90 %
-    slip_range_ratio : slips that were observed
-    resistance_ratio, resistance_std : over load
-    balance_slip_ratio : where thrust equals resistance
-    peak_based_slip_ratio, working_slip_ratio : of which the target of traction is the lesser
-    traction_efficiency_ratio : tractive efficiency there
-    traction_energy_jpm, braking_energy_jpm, steady_energy_jpm : a metre, at each target, without payload
-    n_runs : the curve is fitted to
-    """
-
-    law: str
+    law: str  #: by :data:`terrain.slip_learning.curve.LAW_PARAMETERS`
     parameters: Mapping[str, Finite]
+    #: of net traction (:mod:`terrain.slip_learning.curve`); the interval contains it with 90 %
     peak_slip_ratio: Ratio
     peak_interval_ratio: tuple[Ratio, Ratio]
     peak_status: PeakStatus
-    slip_range_ratio: tuple[Ratio, Ratio]
-    resistance_ratio: Finite
+    slip_range_ratio: tuple[Ratio, Ratio]  #: slips that were observed
+    resistance_ratio: Finite  #: over load
     resistance_std: Finite
-    balance_slip_ratio: Ratio
-    peak_based_slip_ratio: Ratio
+    balance_slip_ratio: Ratio  #: where thrust equals resistance
+    peak_based_slip_ratio: Ratio  #: of which the target of traction is the lesser
     working_slip_ratio: Ratio | None = field(default=None, kw_only=True)
-    traction_efficiency_ratio: Finite
-    traction_energy_jpm: Finite
+    traction_efficiency_ratio: Finite  #: tractive efficiency there
+    traction_energy_jpm: Finite  #: a metre, at each target, without payload
     braking_energy_jpm: Finite
     steady_energy_jpm: Finite
-    n_runs: Annotated[int, Field(strict=True, ge=1)]
+    n_runs: Annotated[int, Field(strict=True, ge=1)]  #: the curve is fitted to
 
     def thrust_ratio(self, slip_ratio: Array) -> Array:
         """Return the thrust over load (n,) at each slip (n,)."""
@@ -90,23 +75,14 @@ class CurveEntry:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlipTable:
-    """Target slips by terrain and drive state.
+    """Target slips by terrain and drive state."""
 
-    Parameters
-    ----------
-    name : name of the table
-    fallback : the entry used for a terrain without a valid one
-    targets : by terrain, then by drive state
-    robot : that the slips are for; empty where the table is for any robot
-    curves : by terrain, where one was learned
-    reasons : by terrain, why its numbers are not learned or not used
-    """
-
-    name: str
-    fallback: str
-    targets: Mapping[str, Mapping[str, SlipTarget]]
-    robot: str = ""
-    curves: Mapping[str, CurveEntry] = field(default_factory=dict)
+    name: str  #: name of the table
+    fallback: str  #: the entry used for a terrain without a valid one
+    targets: Mapping[str, Mapping[str, SlipTarget]]  #: by terrain, then by drive state
+    robot: str = ""  #: that the slips are for; empty where the table is for any robot
+    curves: Mapping[str, CurveEntry] = field(default_factory=dict)  #: by terrain, where one was learned
+    #: by terrain, why its numbers are not learned or not used
     reasons: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

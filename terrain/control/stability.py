@@ -44,24 +44,15 @@ from terrain.robots import Robot
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
 from terrain.simulation.sensors import STEP_S
 
-SAMPLE_TIME_S = 0.02
-"""Sample time of the commands, assumed: the thesis specifies none."""
-
-DELAY_S = 0.05
-"""From the time of a measurement to the command computed from it; assumed."""
-
+SAMPLE_TIME_S = 0.02  #: Sample time of the commands, assumed: the thesis specifies none.
+DELAY_S = 0.05  #: From the time of a measurement to the command computed from it; assumed.
 LONGEST_DELAY_S = 1.0
 
 N_SPEEDS = 24
-SLIPS = (-0.2, 0.2)
-"""Braking has the full gain, traction 1 - s times as much."""
-
+SLIPS = (-0.2, 0.2)  #: Braking has the full gain, traction 1 - s times as much.
+#: Rise of the thrust with slip, in loads: turf at its balance slip has 0.6, tiles have 15.
 SLOPES = (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
-"""Rise of the thrust with slip, in loads: turf at its balance slip has 0.6, tiles have 15."""
-
-LARGEST_FACTOR = 1e3
-"""A larger gain margin is given as infinite."""
-
+LARGEST_FACTOR = 1e3  #: A larger gain margin is given as infinite.
 _HALVINGS, _TAYLOR_ORDER = 12, 8
 # All at once by a series, and squared: scipy's expm, matrix by matrix, takes seconds where cores are busy.
 

@@ -21,34 +21,26 @@ from terrain.status import StatusCode
 if TYPE_CHECKING:
     from terrain.estimation.choice import Estimate
 
+#: A robot whose fastest wheel is to turn at least so fast drives: windows are cut from this speed on
+#: (``features.windows.SteadyMotion``).
 DRIVING_MPS = 0.03
-"""A robot whose fastest wheel is to turn at least so fast drives: windows are cut from this speed on
-(``features.windows.SteadyMotion``)."""
-
-UNKNOWN = ""
-"""Name of a terrain that is not known."""
+UNKNOWN = ""  #: Name of a terrain that is not known.
 
 
 class SwitchSettings(NamedTuple):
-    """When a class is accepted, and how fast a target moves.
+    """When a class is accepted, and how fast a target moves."""
 
-    Parameters
-    ----------
-    probability_least : of a window's class, for it to count; below it the window counts as unknown.  With the
-        eight classes of the simulated runs the calibrated classifier is right more often than not above 0.5
-    dwell_s : time over which all windows have to agree; windows come every 2 s, so two of them
-    silent_s : after a gap of this length between outputs, as while the robot stands, the dwell starts again
-    unconfirmed_max_s : time of driving after which a class that no output has confirmed becomes unknown: five
-        windows.  Of the outputs on a simulated terrain 0.4 (tiles) to 1.0 (loam) are of its class, so that
-        five in a row are not by chance in 8 % of the cases at the worst
-    rate_ratio : change of the target per second: a start takes some seconds
-    """
-
+    #: of a window's class, for it to count; below it the window counts as unknown. With the eight classes of the
+    #: simulated runs the calibrated classifier is right more often than not above 0.5
     probability_least: float = 0.5
-    dwell_s: float = 1.5
+    dwell_s: float = 1.5  #: time over which all windows have to agree; windows come every 2 s, so two of them
+    #: after a gap of this length between outputs, as while the robot stands, the dwell starts again
     silent_s: float = 10.0
+    #: time of driving after which a class that no output has confirmed becomes unknown: five windows. Of the outputs
+    #: on a simulated terrain 0.4 (tiles) to 1.0 (loam) are of its class, so that five in a row are not by chance in 8
+    #: % of the cases at the worst
     unconfirmed_max_s: float = 10.0
-    rate_ratio: float = 0.1
+    rate_ratio: float = 0.1  #: change of the target per second: a start takes some seconds
 
 
 SWITCHING = SwitchSettings()
@@ -58,11 +50,11 @@ class TerrainBelief(NamedTuple):
     """The accepted terrain, and the candidate that may replace it."""
 
     terrain: str = UNKNOWN
-    probability: float = math.nan  # with which it was classified last; NaN before
-    candidate: str = UNKNOWN  # class of the last output
-    since_s: float = math.nan  # since when it is without interruption
-    received_s: float = math.nan  # time of the last output
-    unconfirmed_s: float = 0.0  # time of driving since an output of the accepted class
+    probability: float = math.nan  #: with which it was classified last; NaN before
+    candidate: str = UNKNOWN  #: class of the last output
+    since_s: float = math.nan  #: since when it is without interruption
+    received_s: float = math.nan  #: time of the last output
+    unconfirmed_s: float = 0.0  #: time of driving since an output of the accepted class
 
 
 NO_BELIEF = TerrainBelief()

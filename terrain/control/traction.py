@@ -48,40 +48,30 @@ from terrain.status import StatusCode
 
 
 class TractionSettings(NamedTuple):
-    """Settings; the defaults were tuned on simulated starts whose seeds are used nowhere else.
+    """Settings; the defaults were tuned on simulated starts whose seeds are used nowhere else."""
 
-    Parameters
-    ----------
-    launch_mps : v_l; at 0.2 m/s a speed error of 1 cm/s is 5 % of slip
-    lead_s, lead_max_mps2 : time by which q is extrapolated, and the largest acceleration used for it: the lag
-        of the filter, the delay of the command and half the response time of a motor driver; the acceleration
-        that 4 % of the weight gives
-    balance_margin_ratio : least s* above the slip that balances steady motion
-    gain_least_mps2 : a robot that is held back accelerates at least by this, or the floor of s* rises
-    floor_rate_ratio : rate at which the floor rises, per second
-    fade_mps2 : rate at which d approaches w while no correction can be made
-    droop_radps_per_nm, droop_max_ratio, droop_time_s : reduction of a wheel's speed per torque above the
-        mean; its limit as a fraction of the wheel's speed; time constant of its low-pass
-    std_max_ratio, stale_max_s : slip that is more uncertain, or older, is not used; below one and a half
-        launch speeds, and in a controlled braking, the error of the speed counts as at that speed
-    brake_lead_s : age of the ground speed during a braking
-    charge_mps_per_mps2, charge_time_s : what a motor driver's integral needs to carry the torque of a
-        braking, as a speed by its proportional gain, and its time constant; see :func:`with_motor_driver`
-    """
-
-    launch_mps: float = 0.22
+    launch_mps: float = 0.22  #: v_l; at 0.2 m/s a speed error of 1 cm/s is 5 % of slip
+    #: time by which q is extrapolated, and the largest acceleration used for it: the lag of the filter, the delay of
+    #: the command and half the response time of a motor driver; the acceleration that 4 % of the weight gives
     lead_s: float = 0.15
     lead_max_mps2: float = 0.3
-    balance_margin_ratio: float = 0.03
+    balance_margin_ratio: float = 0.03  #: least s* above the slip that balances steady motion
+    #: a robot that is held back accelerates at least by this, or the floor of s* rises
     gain_least_mps2: float = 0.25
-    floor_rate_ratio: float = 0.15
-    fade_mps2: float = 1.0
+    floor_rate_ratio: float = 0.15  #: rate at which the floor rises, per second
+    fade_mps2: float = 1.0  #: rate at which d approaches w while no correction can be made
+    #: reduction of a wheel's speed per torque above the mean; its limit as a fraction of the wheel's speed; time
+    #: constant of its low-pass
     droop_radps_per_nm: float = 0.02
     droop_max_ratio: float = 0.1
     droop_time_s: float = 1.5
+    #: slip that is more uncertain, or older, is not used; below one and a half launch speeds, and in a controlled
+    #: braking, the error of the speed counts as at that speed
     std_max_ratio: float = 0.025
     stale_max_s: float = 3.0
-    brake_lead_s: float = 0.15
+    brake_lead_s: float = 0.15  #: age of the ground speed during a braking
+    #: what a motor driver's integral needs to carry the torque of a braking, as a speed by its proportional gain, and
+    #: its time constant; see :func:`check_settings`
     charge_mps_per_mps2: float = 0.0
     charge_time_s: float = 0.2
 
@@ -92,23 +82,24 @@ SETTINGS = TractionSettings()
 class TractionTarget(NamedTuple):
     """Slip to aim for on the current terrain."""
 
-    traction_ratio: float  # s*, from 0 to below 1
-    braking_ratio: float = 0.0  # magnitude of the slip of a controlled braking
-    braking_mps2: float = 0.0  # deceleration at that slip; 0 leaves braking to the motor drivers
-    margin_ratio: float = 0.0  # above the balance, gives the working pull; at least the settings' own is used
+    traction_ratio: float  #: s*, from 0 to below 1
+    braking_ratio: float = 0.0  #: magnitude of the slip of a controlled braking
+    braking_mps2: float = 0.0  #: deceleration at that slip; 0 leaves braking to the motor drivers
+    #: above the balance, gives the working pull; at least the settings' own is used
+    margin_ratio: float = 0.0
 
 
 class WheelMotion(NamedTuple):
     """Estimated motion at the wheels; arrays (wheels,), signed along each wheel as it is steered."""
 
-    speed_mps: Array  # over ground, of the filter
+    speed_mps: Array  #: over ground, of the filter
     accel_mps2: Array
     slip_ratio: Array
     slip_std: Array
-    torque_nm: Array  # of the motors, at the wheels; NaN where it is not known
+    torque_nm: Array  #: of the motors, at the wheels; NaN where it is not known
     wheel_radps: Array
-    chassis_mps: float  # magnitude of the robot's velocity
-    stale_s: float  # since the speed over ground was measured last; infinite before the first time
+    chassis_mps: float  #: magnitude of the robot's velocity
+    stale_s: float  #: since the speed over ground was measured last; infinite before the first time
 
 
 def check_settings(settings: TractionSettings, robot: Robot | None = None) -> TractionSettings:
@@ -158,29 +149,33 @@ class TractionStatus(StatusCode):
 class WheelReport(NamedTuple):
     """What a step of a controller of the wheels decided, and by what; NaN where it does not have the figure."""
 
-    driven_mps: float  # commanded speed of the fastest wheel
-    aimed_ratio: float  # s* with its floor
-    balance_ratio: float  # slip of steady motion; NaN until it was measured
-    slip_ratio: float  # largest of the wheels, positive in traction
-    drive_state: DriveState  # by what is commanded, as the measured acceleration would latch into braking
+    driven_mps: float  #: commanded speed of the fastest wheel
+    aimed_ratio: float  #: s* with its floor
+    balance_ratio: float  #: slip of steady motion; NaN until it was measured
+    slip_ratio: float  #: largest of the wheels, positive in traction
+    drive_state: DriveState  #: by what is commanded, as the measured acceleration would latch into braking
     status: TractionStatus
 
 
 class TractionState(NamedTuple):
     """What a step leaves to the next; as it is at first, of a robot at rest on unknown terrain."""
 
-    driven_mps: float = 0.0  # d
-    desired_mps: float = 0.0  # w
-    reference_mps: float = 0.0  # speed that is commanded without a change
-    constant_s: float = 0.0  # for how long it has been
-    slow_mps: float = 0.0  # q behind a low-pass
-    balance_ratio: float = math.nan  # slip of steady motion, NaN until it was measured
-    floor_ratio: float = 0.0  # least s*
-    held_s: float = 0.0  # for how long d has been limited
-    braking_s: float = 0.0  # for how long braking has been controlled
-    braked_from_mps: float = 0.0  # largest d in it
-    droop_nm: tuple[float, ...] = (0.0, 0.0, 0.0)  # torque of each wheel behind its low-pass
-    rate_radpm: tuple[float, ...] = (0.0, 0.0, 0.0)  # of each wheel at w = 1 m/s, of the last command to move
+    driven_mps: float = 0.0  #: d
+    desired_mps: float = 0.0  #: w
+    reference_mps: float = 0.0  #: speed that is commanded without a change
+    constant_s: float = 0.0  #: for how long it has been
+    slow_mps: float = 0.0  #: q behind a low-pass
+    balance_ratio: float = math.nan  #: slip of steady motion, NaN until it was measured
+    floor_ratio: float = 0.0  #: least s*
+    held_s: float = 0.0  #: for how long d has been limited
+    braking_s: float = 0.0  #: for how long braking has been controlled
+    braked_from_mps: float = 0.0  #: largest d in it
+    droop_nm: tuple[float, ...] = (0.0, 0.0, 0.0)  #: torque of each wheel behind its low-pass
+    rate_radpm: tuple[float, ...] = (
+        0.0,
+        0.0,
+        0.0,
+    )  #: of each wheel at w = 1 m/s, of the last command to move
 
     def on_other_terrain(self) -> TractionState:
         """Return the state without what was learned of the terrain: for a change of the classified terrain."""

@@ -19,8 +19,7 @@ from terrain.records import Array, Command, Reading
 from terrain.robots import SwerveRobot
 from terrain.status import StatusCode
 
-AHEAD_S = 0.1
-"""A sample whose stamp is further ahead of the time is not built on."""
+AHEAD_S = 0.1  #: A sample whose stamp is further ahead of the time is not built on.
 
 
 class BridgeState(StatusCode):
