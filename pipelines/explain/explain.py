@@ -135,12 +135,13 @@ def explain(
         if the runs are of another robot, too few, or cannot be compared with the simulation.
     """
     from pipelines.explain.explanation import ExplainResult
+    from pipelines.explain.statements import notes_of, statements_of
     from pipelines.report.results import silent
     from terrain.discrepancy.diagnosed_runs import diagnose_runs, extended_effects, held_out_gain
     from terrain.discrepancy.next_drive import next_command
     from terrain.discrepancy.powertrain import powertrain_of
     from terrain.discrepancy.robot_terms import in_robot_terms
-    from terrain.discrepancy.statements import notes_of, statements_of, terrains_apart
+    from terrain.discrepancy.slopes import terrains_apart
     from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain
     from terrain.effects import chosen_effects, showing
     from terrain.extension import region_of
@@ -180,8 +181,8 @@ def explain(
         gain=gained,
         extended=extended,
         statements=statements_of(diagnosis, robot, diagnosed.compared, gained.gain, diagnosed.acting),
-        terms={cause.name: in_robot_terms(cause.name, cause.values, robot) for cause in diagnosis.causes},
-        next_command=next_command(diagnosis, description, robot, diagnosed.terrains),
+        terms={cause.name: in_robot_terms(cause.name, cause.parameters, robot) for cause in diagnosis.causes},
+        next_command=next_command(diagnosis.next_drive, description, robot, diagnosed.terrains),
         notes=notes_of(diagnosis, diagnosed.terrains, terrains_apart(diagnosis, diagnosed.compared)),
         powertrain=powertrain_of(chosen, robot, diagnosis.faults, seed),
     )

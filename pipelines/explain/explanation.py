@@ -8,6 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.explain import figures
+from pipelines.explain.statements import (
+    CHANNEL_WORDS,
+    Statement,
+    channel_label,
+    effect_label,
+    gain_text,
+    in_words_of,
+    limit_text,
+    quantity_interval,
+    reference_text,
+    split_ruled_out,
+    values_with_intervals,
+    varying_text,
+    verdict_text,
+)
 from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.results import Result, as_json, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
@@ -16,24 +31,8 @@ from terrain.discrepancy.compared import ComparedRun, channels_of, example_stret
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain import Powertrain
 from terrain.discrepancy.robot_terms import quantity
-from terrain.discrepancy.statements import (
-    CHANNEL_WORDS,
-    SESSION_COLUMNS,
-    Statement,
-    channel_label,
-    effect_label,
-    gain_text,
-    in_words_of,
-    limit_text,
-    quantity_interval,
-    session_rows,
-    split_ruled_out,
-    value_with_interval,
-    varying_text,
-    verdict_text,
-)
 from terrain.discrepancy.verdict import Diagnosis
-from terrain.effects import effect_named
+from terrain.effects import PARAMETER, effect_named
 from terrain.robots import Robot
 
 PICTURED = STATED = 3
@@ -99,7 +98,7 @@ class ExplainResult(Result, eq=False):
         """Return the described fields, those of the diagnosis, and what the runs were used for."""
         runs, extended = self.diagnosed, {"file": self.extended_file, "effects": self.extended.effects}
         beside = {
-            **self.diagnosis.as_json(),
+            **as_json(self.diagnosis),
             "built_in": runs.simulation.effects,
             "terrain_matches": runs.terrains,
             "used": [run.run_id for run in runs.used],
@@ -111,9 +110,9 @@ class ExplainResult(Result, eq=False):
     def records(self) -> Iterable[Any]:
         """Return the parameters of the named causes."""
         return (
-            {"cause": cause.name, **value._asdict(), "held_out_gain": cause.gain, "z": cause.z}
+            {"cause": cause.name, **value._asdict(), "held_out_gain": cause.held_out_gain, "z": cause.z}
             for cause in self.diagnosis.causes
-            for value in cause.values
+            for value in cause.parameters
         )
 
 
@@ -126,7 +125,7 @@ def report(result: ExplainResult) -> Report:
     if shown := result.gain.judged or runs.compared:  # held-out runs where there are any
         stretch = example_stretch(shown, runs.noise)
         there = channels_of([stretch])
-        stated = [each.channel for each in result.statements if each.channel in there and each.found]
+        stated = [each.channel for each in result.statements if each.channel in there and each.differs]
         picture = figures.run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
     written = Report(
         title=f"What the simulation of {diagnosis.robot} gets wrong",
@@ -152,13 +151,14 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
     if diagnosis.excluded_runs:
         yield Text(f"Runs that were excluded as unfit: {_ids(diagnosis.excluded_runs)}.", "warning")
     for statement in result.statements[:STATED]:  # what states something comes first
-        if statement.found:
+        if statement.differs:
             yield Text(sentence(statement.text))
     causes: list[tuple[Any, ...]] = []
     notes = ["Values are added to what the description has already."]
     for cause in diagnosis.causes:
-        label, beside = effect_label(cause.name), (cause.gain, cause.z, result.terms.get(cause.name, ""))
-        for value in cause.values:
+        label = effect_label(cause.name)
+        beside = cause.held_out_gain, cause.z, result.terms.get(cause.name, "")
+        for value in cause.parameters:
             causes.append((label, quantity(value.name, value.value), quantity_interval(value), *beside))
         if cause.aliases:
             notes.append(
@@ -174,10 +174,10 @@ def _decisive_parts(result: ExplainResult) -> Iterator[Part]:
         yield _rivals(names, diagnosis)
     for each in diagnosis.varying:
         yield Text(varying_text(each))
-    if result.gain.nameless is not None:
-        yield Text(result.gain.nameless.sentence)
+    if result.gain.black_box is not None:
+        yield Text(reference_text(result.gain.black_box))
     if n := len(diagnosis.not_excited):
-        of = len(diagnosis.limits)
+        of = len(diagnosis.detection_limits)
         yield Text(f"Of {of} parameters that may be wrong, {n} could not have been detected.")
     for note in result.notes:
         yield Text(note, "note")
@@ -197,38 +197,37 @@ def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:
             for other, channel in effect.twins
             if other in names
         ]
-        values = ", ".join(map(value_with_interval, diagnosis.ambiguous_values.get(name, ())))
+        values = values_with_intervals(diagnosis.ambiguous_values.get(name, ()), ", ")
         rows.append((effect_label(name), values, "; ".join(needs)))
     return Table(("one of", "its value, if it acts alone", NEEDS), rows)
 
 
-def _gain_parts(found: HeldOutGain) -> Iterator[Part]:
+def _gain_parts(measured: HeldOutGain) -> Iterator[Part]:
     """Yield by channel what an extension and a black-box reference gain, and what it is for a filter or classifier."""
-    gain, learned = found.gain, {} if found.nameless is None else found.nameless.channels
+    gain, references = measured.gain, {} if measured.black_box is None else measured.black_box.channels
     rows: list[tuple[Any, ...]] = []
-    for name in learned if gain is None else gain.channels:
-        own, reached = None if gain is None else gain.channels[name], learned.get(name)
-        cells: tuple[Any, ...] = (reached and reached.rms_before, *[None] * 3, "")
+    for name in references if gain is None else gain.channels:
+        own, reference = None if gain is None else gain.channels[name], references.get(name)
+        cells: tuple[Any, ...] = (reference and reference.rms_before, *[None] * 3, "")
         if own is not None:
-            ratio, low, high = own.reduction
-            remark = "" if not own.reduction.refused else "worse" if high < 0.0 else "no gain to claim"
-            cells = own.rms_before, own.rms_after, ratio, (low, high), remark
-        rows.append((*CHANNEL_WORDS[name], *cells, reached and reached.ratio))
+            remark = "" if not own.refused else "worse" if own.ci[1] < 0.0 else "no gain to claim"
+            cells = own.rms_before, own.rms_after, own.reduction, own.ci, remark
+        rows.append((*CHANNEL_WORDS[name], *cells, reference and reference.reduction))
     note = ""
     if gain is not None:
         note = (
             f"Low-pass filtered. Intervals: 95 %, bootstrap over {gain.clusters}. The answer's gain is of all "
             "channels whitened, with differences from run to run removed. The black-box reference is a Bayesian "
             "linear regression of the residual on the simulation's inputs, their products and rates, fitted to "
-            f"the runs behind the diagnosis and judged on the same {len(gain.run_ids)} held-out runs."
+            f"the runs behind the diagnosis and judged on the same {len(gain.runs)} held-out runs."
         )
-        if gain.excluded:
-            note += f" Excluded as unfit: {_ids(gain.excluded)}."
+        if gain.excluded_runs:
+            note += f" Excluded as unfit: {_ids(gain.excluded_runs)}."
     if rows:
         less, black_box = Column("square less by", PERCENT), Column("by a black-box reference", PERCENT)
         heads = ("channel", "unit", "rms before", "after", less, Column("95 %", PERCENT), "", black_box)
         yield Table(heads, rows, note=note)
-    for kind, compared in found.comparisons.items():
+    for kind, compared in measured.comparisons.items():
         if compared is not None and compared.reason:
             yield Text(f"What it changes for the {kind} {compared.name} is not measured: {compared.reason}.")
         elif compared is not None and compared.errors:
@@ -250,7 +249,7 @@ def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
     ):
         rows: list[tuple[Any, ...]] = []
         for each in effects:
-            values = " and ".join(map(value_with_interval, each.values))
+            values = values_with_intervals(each.parameters)
             rows.append((effect_label(each.name), values, sentence(each.reason), each.z))
         if rows:
             yield Table((title, "value it would have", WHY, Column("z", Z)), rows, note=note)
@@ -261,7 +260,7 @@ def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
                 channel_label(left.channel),
                 alike.get(left.input, f"depends on {left.input}"),
                 left.z,
-                left.ratio or None,
+                left.residual_ratio or None,
             )
             for left in diagnosis.unexplained
         ]
@@ -298,7 +297,7 @@ def _details(result: ExplainResult) -> Iterator[Section]:
     drawn = [figures.run_figure(run, runs.noise, channels_of([run])) for run in whole]
     yield Section("Whole runs", drawn)
     limits = []
-    for limit in diagnosis.limits:
+    for limit in diagnosis.detection_limits:
         missed = limit in diagnosis.not_excited
         limits.append((limit_text(limit, missed), not missed, limit.needs))
     meaning = "Not detected does not mean absent: at its limit an effect is found nine times in ten."
@@ -330,13 +329,20 @@ def _details(result: ExplainResult) -> Iterator[Section]:
 def _dependence_parts(runs: DiagnosedRuns) -> Iterator[Part]:
     """Yield by session, by parts of the data, by input and by frequency how far the two are apart."""
     diagnosis, compared = runs.diagnosis, runs.compared
-    if rows := session_rows(diagnosis):
+    rows = []
+    for value in diagnosis.by_session:
+        alike = "" if len(value.sessions) < 2 else "agree" if value.agree else "differ"
+        for i, own in enumerate(value.sessions):
+            first = ("", "") if i else (PARAMETER[value.name].label, value.terrain)
+            rows.append((*first, own.session, str(own.runs), own.text, "" if i else alike))
+    if rows:
         note = (
             "The causes named of all runs together, fitted to the runs of each session alone. Intervals "
             "include the scatter between its runs. Sessions of a terrain agree where Welch's test of equal "
             "means does not reject that at 1 %."
         )
-        yield Table(SESSION_COLUMNS, rows, "By session", note)
+        heads = ("value", "terrain", "session", "runs", "95 % interval", "sessions of the terrain")
+        yield Table(heads, rows, "By session", note)
     if runs.parts:
         yield figures.parts_figure(runs.parts)
     residuals = []

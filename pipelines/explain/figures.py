@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from pipelines.explain.statements import CHANNEL_WORDS, channel_label
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, channels_of, spread_of, strongest_input
 from terrain.discrepancy.constancy import PartValues
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.residuals import binned_means, noise_spectrum, run_means, spectrum
 from terrain.discrepancy.robot_terms import quantity
-from terrain.discrepancy.statements import CHANNEL_WORDS, INPUT_LABELS, channel_label
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
@@ -22,6 +22,18 @@ MEASURED, BEFORE, AFTER = "measured", "simulated", "with the causes built in"
 BLUE, VERMILION, GREY = 0, 1, 6
 AXIS = "{} [{}]"  #: Of what a channel is called, and its unit
 LEAST_POWER = 1e-300  #: Under the logarithm of a spectrum
+
+INPUT_LABELS = {
+    "speed_mps": "speed [m/s]",
+    "turn_mps": "turn [m/s]",
+    "steer_rad": "steering [rad]",
+    "grade_rad": "grade [rad]",
+    "roll_rad": "roll [rad]",
+    "force_ratio": "force [weight]",
+    "sideways_mps": "speed to the left [m/s]",
+    "time_s": "time [s]",
+}
+"""Inputs of the simulation as axes call them."""
 
 
 def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figure:
@@ -92,13 +104,14 @@ def parts_figure(parts: Sequence[PartValues]) -> Figure:
     """Return the value of each cause in thirds of the time and in halves of the runs."""
     panels = []
     for each in parts:
-        at, ends = np.arange(1.0, len(each.parts) + 1), np.array([0.5, len(each.parts) + 0.5])
-        values, halves = np.array([(part.value, part.half) for part in each.parts]).T
+        at, ends = np.arange(1.0, len(each.names) + 1), np.array([0.5, len(each.names) + 0.5])
         low, high = np.full(2, each.value.low), np.full(2, each.value.high)
         title = f"{each.value.name}: {quantity(each.value.name, each.value.value)}"
         band = Band("all runs, 95 %", ends, low, high, GREY)
-        panels.append(Panel([band, _points("a part", BLUE, at, values, halves)], each.value.unit, title))
-    names = "; ".join([f"{i}: {part.name}" for i, part in enumerate(parts[0].parts, start=1)])
+        panels.append(
+            Panel([band, _points("a part", BLUE, at, each.values, each.halves)], each.value.unit, title)
+        )
+    names = "; ".join([f"{i}: {name}" for i, name in enumerate(parts[0].names, start=1)])
     caption = (
         "The value of each cause fitted to a part of the data: thirds of each run's time, and halves of the "
         f"runs. Bars and band: 95 % intervals. {names}."

@@ -10,20 +10,21 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 
 from terrain.discrepancy.clocks import Latencies, Shift, latencies_of, shifts_of
-from terrain.discrepancy.constancy import CAVEAT_RATIO, constancy_of, values_by_session
-from terrain.discrepancy.evidence import Evidence, move_point, partial_information, recentre
+from terrain.discrepancy.constancy import CAVEAT_RATIO, values_by_session
+from terrain.discrepancy.evidence import Evidence, move_point, partial_information
 from terrain.discrepancy.faults import Fault, faults_of, repaired
 from terrain.discrepancy.next_drive import next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.robot_terms import UNITS
-from terrain.discrepancy.search import Found, Problem, names_of, pooled, refit, search, with_rivals
+from terrain.discrepancy.search import CauseFit, Problem, names_of, pooled, refit, rivals_of, search
 from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT, gain_interval
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
@@ -32,6 +33,7 @@ from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effec
 from terrain.discrepancy.verdict import (
     INTERVAL_T,
     Cause,
+    Covariance,
     Diagnosis,
     Excluded,
     Limit,
@@ -42,10 +44,19 @@ from terrain.discrepancy.verdict import (
     Varying,
     Verdict,
 )
-from terrain.discrepancy.withdrawal import raw_gain, reasons_to_withdraw, shown_beside, shown_channels
-from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect, effect_named
+from terrain.discrepancy.withdrawal import (
+    constancy_of_cause,
+    raw_gain,
+    reasons_to_withdraw,
+    shown_beside,
+    shown_channels,
+)
+from terrain.effects import BOUNDS, CHANNELS, Effect, effect_named
 from terrain.errors import DataError
-from terrain.records import RunLog
+from terrain.records import Array, RunLog
+
+MIN_RUNS = 3
+"""Least number of runs: with fewer none is left to validate a fit."""
 
 BLIND_RATIO = 0.05
 """Ratio of the library that may be not excited before the verdict ``none`` becomes ``not_excited``."""
@@ -55,6 +66,9 @@ MAX_WITHDRAWN = 6
 
 ENTANGLED = 0.97
 """Correlation of fitted values above which two causes are ambiguous: a collinearity index of 6."""
+
+POWER_Z = 1.28
+"""Added to the threshold, so that nine in ten are detected."""
 
 
 def diagnose(
@@ -79,227 +93,176 @@ def diagnose(
         raise DataError(f"runs: {twice[0]!r} is the id of {ids[twice[0]]} runs; each needs its own")
     if len(runs) < MIN_RUNS:
         raise DataError(f"runs: there are {len(runs)}, at least {MIN_RUNS} are required, to hold some out")
-    return diagnose_signals([signals_of(run, simulation.robot) for run in runs], simulation, library)
-
-
-def diagnose_signals(
-    signals: Sequence[Signals], simulation: Simulation, library: Sequence[Effect] | None = None
-) -> Diagnosis:
-    """Return the diagnosis of runs that are on one clock already; see :func:`diagnose`."""
     effects = simulation.library if library is None else tuple(library)
-    prepared = prepare(signals, simulation, effects)
+    prepared = prepare([signals_of(run, simulation.robot) for run in runs], simulation, effects)
     problem = with_conditions(prepared.problem, prepared.aligned)
     same = problem is prepared.problem and not prepared.seeds
     start = prepared.aligned if same else problem.at(simulation.vector)
-    found, withdrawn = _withdraw_wrong(problem, start, search(problem, start, prepared.seeds), {})
-    varying = varying_effects(problem, found)
-    if _is_beside(problem, found, varying):
+    withdrawn: dict[str, RuledOut] = {}
+    fit = _withdraw_wrong(problem, start, search(problem, start, prepared.seeds), withdrawn)
+    varying = varying_effects(problem, fit)
+    if _is_beside(problem, fit, varying):
         problem = problem._replace(varying={varying[0].parameter: varying[0].scatter})
-        info = recentre(problem.at(found.info.origin), start.vector)
-        again = list(dict.fromkeys([*found.causes, effect_named(varying[0].name)]))
-        found = refit(problem, start, found._replace(info=info), again)
-        found, withdrawn = _withdraw_wrong(problem, start, found, withdrawn)
-    found, withdrawn = _without_varying(problem, start, found, withdrawn, varying)
-    found = pooled(problem, with_rivals(problem, start, found))
-    unexplained = _unexplained_channels(problem, found, withdrawn, varying)
-    named, sets = _named_and_ambiguous(found, found.causes)
-    limits = tuple(limits_of(found, problem.library))
-    causes = tuple(cause_of(found, effect) for effect in named)
-    detected = {value.name for cause in causes for value in cause.values}
+        info = replace(problem.at(fit.info.origin), vector=start.vector)
+        again = list(dict.fromkeys([*fit.causes, effect_named(varying[0].name)]))
+        fit = _withdraw_wrong(problem, start, refit(problem, start, info, again), withdrawn)
+    fit = _withdraw_varying(problem, start, fit, withdrawn, varying)
+    fit = pooled(problem, fit._replace(rivals=rivals_of(problem, fit.info, start, fit.causes)))
+    unexplained = _unexplained_channels(problem, fit, withdrawn, varying)
+    named, sets = _named_and_ambiguous(fit)
+    causes, parameters = tuple(cause_of(fit, effect) for effect in named), names_of(named)
+    limits = limits_of(fit, problem.library)
+    most = {name: max(abs(low), high) for name, (low, high) in BOUNDS.items()}
     missed = tuple(
         limit
         for limit in limits
-        if limit.value > EXCITED_RATIO * _bound(limit.name) and limit.name not in detected
+        if limit.detection_limit > EXCITED_RATIO * most[limit.name] and limit.name not in parameters
     )
-    parameters = names_of(named)
-    at = [found.names.index(name) for name in parameters]
-    inflation = np.array([found.tried[effect.name].inflation for effect in named for _ in effect.parameters])
-    verdict = _verdict(sets, causes, varying, unexplained)
-    if verdict is None:
-        verdict = Verdict.NOT_EXCITED if len(missed) > BLIND_RATIO * len(limits) else Verdict.NONE
-    after = _information_after(problem, found, named)
+    at = [fit.names.index(name) for name in parameters]
+    inflation = np.array([fit.tests[effect.name].inflation for effect in named for _ in effect.parameters])
+    cov = fit.cov[np.ix_(at, at)] * np.sqrt(np.outer(inflation, inflation))
+    verdicts = {
+        Verdict.AMBIGUOUS: sets,
+        Verdict.EXPLAINED: causes,
+        Verdict.VARIES: varying,
+        Verdict.UNEXPLAINED: unexplained,
+        Verdict.NOT_EXCITED: len(missed) > BLIND_RATIO * len(limits),
+        Verdict.NONE: True,
+    }
+    built_in = problem.simulation.with_effects(dict(zip(parameters, fit.change[at].tolist(), strict=True)))
     return Diagnosis(
         robot=simulation.robot.name,
-        verdict=verdict,
+        verdict=next(verdict for verdict, holds in verdicts.items() if holds),
         causes=causes,
-        parameters=parameters,
-        cov=found.cov[np.ix_(at, at)] * np.sqrt(np.outer(inflation, inflation)),
+        covariance=Covariance(parameters, cov),
         ambiguous_sets=tuple(sets),
-        ambiguous_values=rival_values(found, sets),
+        ambiguous_values=rival_values(fit, sets),
         unexplained=unexplained,
-        limits=limits,
+        detection_limits=limits,
         not_excited=missed,
-        ruled_out=tuple(ruled_out_of(found, named, sets, withdrawn, problem.library)),
+        ruled_out=ruled_out_of(fit, named, sets, withdrawn, problem.library),
         excluded_runs=prepared.excluded,
         clocks=clocks_of(prepared.aligned, prepared.shift),
-        next_drive=next_drive(simulation, sets, missed, found.info),
+        next_drive=next_drive(simulation, sets, missed, fit.info),
         residual_before=residuals_of(start, start),
-        residual_after=residuals_of(after, start),
+        residual_after=residuals_of(problem.at(built_in.vector, (), fit.info.statistics), start),
         n_runs=len(problem.signals),
         varying=varying,
         faults=prepared.faults,
-        by_session=values_by_session(found, problem.signals, named, simulation.robot),
+        by_session=values_by_session(fit, problem.signals, named, simulation.robot),
     )
 
 
 def _withdraw_wrong(
-    problem: Problem, start: Evidence, found: Found, withdrawn: dict[str, RuledOut]
-) -> tuple[Found, dict[str, RuledOut]]:
-    """Return the causes that may be named, and those that were withdrawn, by name.
+    problem: Problem, start: Evidence, fit: CauseFit, withdrawn: dict[str, RuledOut]
+) -> CauseFit:
+    """Return the causes that may be named; those that were withdrawn are noted by name.
 
     One is withdrawn at a time, the one that gains least, and the others are fitted anew: a wrong cause
     distorts the others, and their reasons go with it.
     """
     for _ in range(MAX_WITHDRAWN):
-        probes = _probes(problem, found)
-        reasons = reasons_to_withdraw(problem, found, probes)
+        reasons = reasons_to_withdraw(problem, fit, _probes(problem, fit))
         if not reasons:
             break
-        worst = min(
-            (cause for cause in found.causes if cause.name in reasons), key=lambda each: raw_gain(found, each)
-        )
-        found = _withdraw(problem, start, found, worst, reasons[worst.name], withdrawn)
-    return found, withdrawn
+        doubtful = [cause for cause in fit.causes if cause.name in reasons]
+        gains = [raw_gain(fit, cause) for cause in doubtful]
+        worst = doubtful[int(np.argmin(gains))]
+        fit = _withdraw(problem, start, fit, worst, reasons[worst.name], withdrawn)
+    return fit
 
 
 def _withdraw(
     problem: Problem,
     start: Evidence,
-    found: Found,
+    fit: CauseFit,
     cause: Effect,
     reason: str,
     withdrawn: dict[str, RuledOut],
-) -> Found:
+) -> CauseFit:
     """Note why a cause is withdrawn, and return the others, fitted without it."""
-    evidence = found.tried[cause.name]
-    withdrawn[cause.name] = RuledOut(cause.name, reason, evidence.z, values_of(found, cause))
-    others = [other for other in found.causes if other is not cause and other.modifies != cause.name]
-    return refit(problem, start, found, others)
+    withdrawn[cause.name] = RuledOut(cause.name, reason, fit.tests[cause.name].z, values_of(fit, cause))
+    others = [other for other in fit.causes if other is not cause and other.modifies != cause.name]
+    return refit(problem, start, fit.info, others)
 
 
-def _is_beside(problem: Problem, found: Found, varying: Sequence[Varying]) -> bool:
+def _is_beside(problem: Problem, fit: CauseFit, varying: Sequence[Varying]) -> bool:
     """Return whether causes were found beside an effect that varies, of which runs had one value.
 
     What that value leaves may look like causes: they are fitted again with a value of each run.
     """
     return any(
-        each.parameter not in problem.scatter and cause.name not in (each.name, *each.rivals)
-        for each in varying
-        for cause in found.causes
+        effect.parameter not in problem.scatter and cause.name not in (effect.name, *effect.rivals)
+        for effect in varying
+        for cause in fit.causes
     )
 
 
-def _without_varying(
+def _withdraw_varying(
     problem: Problem,
     start: Evidence,
-    found: Found,
+    fit: CauseFit,
     withdrawn: dict[str, RuledOut],
     varying: Sequence[Varying],
-) -> tuple[Found, dict[str, RuledOut]]:
+) -> CauseFit:
     """Withdraw causes whose value is no value of all runs, since it differs from run to run."""
-    for each in varying:
-        for cause in found.causes:
-            alike = cause.name in (each.name, *each.rivals)
-            sizes = {p.name: abs(found.change[found.names.index(p.name)]) for p in cause.parameters}
+    for effect in varying:
+        for cause in fit.causes:
+            sizes = {p.name: abs(fit.change[fit.names.index(p.name)]) for p in cause.parameters}
             name, value = max(sizes.items(), key=lambda item: item[1])
-            scatter = run_scatter(found, name)
-            if alike and scatter > VARIES_RATIO * value:
+            scatter = run_scatter(fit, name)
+            if cause.name in (effect.name, *effect.rivals) and scatter > VARIES_RATIO * value:
                 reason = f"its value differs from run to run, by {scatter:.3g} about a size of {value:.3g}"
-                found = _withdraw(problem, start, found, cause, reason, withdrawn)
-    return found, withdrawn
+                fit = _withdraw(problem, start, fit, cause, reason, withdrawn)
+    return fit
 
 
-def _probes(problem: Problem, found: Found) -> dict[tuple[str, str], ProbeResult]:
+def _probes(problem: Problem, fit: CauseFit) -> dict[tuple[str, str], ProbeResult]:
     """Return the probes of the residual, those of a tilt that is only in part a slope left out."""
-    results = probe_residuals(found.info, found.names, found.change, problem.simulation.probe_error)
+    results = probe_residuals(fit.info, fit.names, fit.change, problem.simulation.probe_error)
     if all(problem.simulation.tilt_is_slope(run.terrain) for run in problem.signals):
         return results
-    return {at: each for at, each in results.items() if at[1] not in TILT_INPUTS}
+    return {at: probe for at, probe in results.items() if at[1] not in TILT_INPUTS}
 
 
 def _unexplained_channels(
-    problem: Problem, found: Found, withdrawn: Mapping[str, RuledOut], varying: Sequence[Varying]
+    problem: Problem, fit: CauseFit, withdrawn: Mapping[str, RuledOut], varying: Sequence[Varying]
 ) -> tuple[Unexplained, ...]:
     """Return the most significant input of every channel that depends on one."""
-    info = found.info
-    results = _probes(problem, found)
     best: dict[str, Unexplained] = {}
-    size = {c: sum(float((r[:, i] ** 2).sum()) for r in info.white_residual) for i, c in enumerate(CHANNELS)}
-    for (channel, name), answer in results.items():
-        if answer.significant and (channel not in best or answer.z > best[channel].z):
-            best[channel] = Unexplained(channel, name, answer.z, min(answer.gain / size[channel], 1.0))
-    for each in withdrawn.values():
-        channel = shown_beside(found, effect_named(each.name))
-        if channel not in best and not any(each.name in (v.name, *v.rivals) for v in varying):
-            best[channel] = Unexplained(channel, each.name, each.z, 0.0)
+    size = dict(zip(CHANNELS, sum((white[-1] ** 2).sum(axis=0) for white in fit.info.white), strict=True))
+    for (channel, name), probe in _probes(problem, fit).items():
+        if probe.significant and (channel not in best or probe.z > best[channel].z):
+            best[channel] = Unexplained(channel, name, probe.z, min(probe.gain / float(size[channel]), 1.0))
+    varies = {name for effect in varying for name in (effect.name, *effect.rivals)}
+    for cause in withdrawn.values():
+        channel = shown_beside(fit, effect_named(cause.name))
+        if channel not in best and cause.name not in varies:
+            best[channel] = Unexplained(channel, cause.name, cause.z, 0.0)
     return tuple(sorted(best.values(), key=lambda left: -left.z))
 
 
-def _named_and_ambiguous(
-    found: Found, causes: Sequence[Effect]
-) -> tuple[list[Effect], list[tuple[str, ...]]]:
+def _named_and_ambiguous(fit: CauseFit) -> tuple[list[Effect], list[tuple[str, ...]]]:
     """Return the causes that are named, and the ambiguous sets."""
-    named: list[Effect] = []
-    sets: list[tuple[str, ...]] = []
-    for cause in causes:
-        if not found.tried[cause.name].significant:
-            continue
-        if found.rivals[cause.name]:
-            sets.append((cause.name, *_rival_names(found, cause)))
-        else:
-            named.append(cause)
-    for one, other in combinations(causes, 2):
-        if (one in named or other in named) and _correlated(found, one, other):
+    members = {
+        cause.name: (cause.name, *(rival.effect.name for rival in fit.rivals[cause.name]))
+        for cause in fit.causes
+    }
+    significant = [cause for cause in fit.causes if fit.tests[cause.name].significant]
+    named = [cause for cause in significant if not fit.rivals[cause.name]]
+    sets = [members[cause.name] for cause in significant if fit.rivals[cause.name]]
+    std = np.sqrt(np.diag(fit.cov))
+    for one, other in combinations(fit.causes, 2):
+        i, j = ([fit.names.index(p.name) for p in effect.parameters] for effect in (one, other))
+        entangled = np.abs(fit.cov[np.ix_(i, j)]) > ENTANGLED * np.outer(std[i], std[j])
+        if (one in named or other in named) and entangled.any():
             sets = [names for names in sets if names[0] not in (one.name, other.name)]
-            members = (one.name, *_rival_names(found, one), other.name, *_rival_names(found, other))
-            sets.append(tuple(dict.fromkeys(members)))
+            sets.append(tuple(dict.fromkeys((*members[one.name], *members[other.name]))))
             named = [cause for cause in named if cause not in (one, other)]
     return named, sets
 
 
-def _rival_names(found: Found, cause: Effect) -> list[str]:
-    return [rival.effect.name for rival in found.rivals[cause.name]]
-
-
-def _correlated(found: Found, one: Effect, other: Effect) -> bool:
-    """Return whether the fitted values of two causes are too correlated to distinguish them."""
-    i, j = ([found.names.index(p.name) for p in effect.parameters] for effect in (one, other))
-    scale = np.sqrt(np.diag(found.cov))
-    correlation = found.cov / np.outer(scale, scale)
-    return bool(np.abs(correlation[np.ix_(i, j)]).max() > ENTANGLED)
-
-
-def _verdict(
-    sets: Sequence[object], causes: Sequence[Cause], varying: Sequence[object], unexplained: Sequence[object]
-) -> Verdict | None:
-    """Return the verdict; None where nothing was found."""
-    if sets:
-        return Verdict.AMBIGUOUS
-    if causes:
-        return Verdict.EXPLAINED
-    if varying:
-        return Verdict.VARIES
-    return Verdict.UNEXPLAINED if unexplained else None
-
-
-def _bound(parameter: str) -> float:
-    low, high = BOUNDS[parameter]
-    return max(abs(low), high)
-
-
-def _information_after(problem: Problem, found: Found, named: Sequence[Effect]) -> Evidence:
-    """Return the information around the simulation with the named causes built in."""
-    vector = problem.simulation.vector.copy()
-    for name, value in zip(found.names, found.change, strict=True):
-        if name in names_of(named):
-            vector[INDEX[name]] += value
-    return problem.at(vector, (), found.info.statistics)
-
-
 # -- What is done to runs before causes are searched: faults repaired, lags known, unfit runs excluded -----
-
-MIN_RUNS = 3
-"""Least number of runs: with fewer none is left to validate a fit."""
 
 REST_MPS = 0.02
 """Fastest that a wheel turns, by its sensor's noise, in a run that does not drive."""
@@ -362,120 +325,103 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
 
 def _aligned(problem: Problem, latencies: Latencies) -> tuple[dict[str, float], Evidence, Shift]:
     """Return lags to start from, the information of the runs with them built in, and their clocks there."""
-    values = latencies.starting_values()
-    seeds = {name: value for name, value in values.items() if name in problem.parameters}
-    there = move_point(problem.simulation.vector, tuple(seeds), np.array(list(seeds.values())))
-    aligned = problem.at(there)
+    known = names_of(problem.library)
+    seeds = {name: value for name, value in latencies.starting_values().items() if name in known}
+    aligned = problem.at(move_point(problem.simulation.vector, tuple(seeds), np.array(list(seeds.values()))))
     return seeds, aligned, shifts_of(aligned)
 
 
 # -- What a diagnosis states of what was found: causes, rivals, limits, what is ruled out, and residuals ---
 
-POWER_Z = 1.28
-"""Added to the threshold, so that nine in ten are detected."""
 
-
-def values_of(found: Found, effect: Effect) -> tuple[Value, ...]:
+def values_of(fit: CauseFit, effect: Effect) -> tuple[Value, ...]:
     """Return the fitted values of a cause."""
-    values = []
-    for parameter in effect.parameters:
-        at = found.names.index(parameter.name)
-        half = INTERVAL_T * float(np.sqrt(found.cov[at, at] * found.tried[effect.name].inflation))
-        value = float(found.change[at])
-        values.append(Value(parameter.name, value, parameter.unit, value - half, value + half))
-    return tuple(values)
+    at = [fit.names.index(p.name) for p in effect.parameters]
+    return _values(effect, fit.change[at], np.sqrt(fit.cov[at, at] * fit.tests[effect.name].inflation))
 
 
-def cause_of(found: Found, effect: Effect) -> Cause:
-    """Return what is stated of a cause that is named."""
-    own = found.tried[effect.name]
-    size = float(found.info.c.sum())
-    low, high = gain_interval(own.gain)
-    return Cause(
-        effect.name,
-        effect.aliases,
-        values_of(found, effect),
-        float(own.gain.sum()) / size,
-        low / size,
-        high / size,
-        shown_channels(found, effect),
-        own.z,
-        own.dispersion,
-        caveat_of(found, effect),
+def _values(effect: Effect, change: Array, std: Array) -> tuple[Value, ...]:
+    half = INTERVAL_T * std
+    return tuple(
+        Value(p.name, float(x), p.unit, float(x - h), float(x + h))
+        for p, x, h in zip(effect.parameters, change, half, strict=True)
     )
 
 
-def caveat_of(found: Found, effect: Effect) -> str:
-    """Return what the value of a cause depends on, in words; empty where it is one number."""
-    names = [p.name for p in effect.parameters]
-    constant = constancy_of(found.info, found.names, names, found.change, found.tried[effect.name].inflation)
+def cause_of(fit: CauseFit, effect: Effect) -> Cause:
+    """Return what is stated of a cause that is named."""
+    test, size = fit.tests[effect.name], float(fit.info.c.sum())
+    low, high = gain_interval(test.gain)
+    constant, parameter = constancy_of_cause(fit, effect), effect.parameters[0]
     caveats = [constant.caveat] if constant.caveat else []
-    value = abs(float(found.change[found.names.index(names[0])]))
-    scatter = run_scatter(found, names[0])
-    if len(names) == 1 and scatter > CAVEAT_RATIO * value:
-        unit = effect.parameters[0].unit
-        caveats.append(f"it differs from run to run by {scatter:.2g} {UNITS.get(unit, unit)}".strip())
-    return "; ".join(caveats)
+    scatter = run_scatter(fit, parameter.name)
+    if len(effect.parameters) == 1 and scatter > CAVEAT_RATIO * abs(
+        float(fit.change[fit.names.index(parameter.name)])
+    ):
+        unit = UNITS.get(parameter.unit, parameter.unit)
+        caveats.append(f"it differs from run to run by {scatter:.2g} {unit}".strip())
+    return Cause(
+        name=effect.name,
+        aliases=effect.aliases,
+        parameters=values_of(fit, effect),
+        held_out_gain=float(test.gain.sum()) / size,
+        gain_ci=(low / size, high / size),
+        channels=shown_channels(fit, effect),
+        z=test.z,
+        dispersion=test.dispersion,
+        caveat="; ".join(caveats),
+    )
 
 
-def rival_values(found: Found, sets: Sequence[tuple[str, ...]]) -> dict[str, tuple[Value, ...]]:
+def rival_values(fit: CauseFit, sets: Sequence[tuple[str, ...]]) -> dict[str, tuple[Value, ...]]:
     """Return the values that every member of an ambiguous set would have."""
-    values = {cause.name: values_of(found, cause) for cause in found.causes}
-    for rivals in found.rivals.values():
+    values = {cause.name: values_of(fit, cause) for cause in fit.causes}
+    for rivals in fit.rivals.values():
         for rival in rivals:
-            half = INTERVAL_T * rival.std
-            values.setdefault(
-                rival.effect.name,
-                tuple(
-                    Value(p.name, float(x), p.unit, float(x - h), float(x + h))
-                    for p, x, h in zip(rival.effect.parameters, rival.change, half, strict=True)
-                ),
-            )
+            values.setdefault(rival.effect.name, _values(rival.effect, rival.change, rival.std))
     return {name: values[name] for names in sets for name in names}
 
 
-def limits_of(found: Found, library: Sequence[Effect]) -> list[Limit]:
+def limits_of(fit: CauseFit, library: Sequence[Effect]) -> tuple[Limit, ...]:
     """Return the detection limit of every effect beside what was found."""
-    info, limits = found.info, []
-    a = info.a.sum(axis=0)
+    a, limits = fit.info.a.sum(axis=0), []
     for effect in library:
-        others = [name for name in found.names if name not in names_of([effect])]
-        base = info.places(others)
+        base = fit.info.places([name for name in fit.names if name not in names_of([effect])])
         for parameter in effect.parameters:
-            own = info.places([parameter.name])
+            own = fit.info.places([parameter.name])
             free = float(partial_information(a, base, own)[1][0, 0])
             known = free > 1e-9 * max(a[own[0], own[0]], 1e-12)
             value = (Z_EFFECT + POWER_Z) / float(np.sqrt(free)) if known else np.inf
             limits.append(Limit(parameter.name, value, parameter.unit, effect.needs))
-    return limits
+    return tuple(limits)
 
 
 def ruled_out_of(
-    found: Found,
+    fit: CauseFit,
     named: Sequence[Effect],
     sets: Sequence[tuple[str, ...]],
     withdrawn: Mapping[str, RuledOut],
     library: Sequence[Effect],
-) -> list[RuledOut]:
+) -> tuple[RuledOut, ...]:
     """Return the effects that are not the answer, those that were withdrawn first."""
-    answered = {effect.name for effect in named} | {name for names in sets for name in names}
+    answered = {effect.name for effect in named} | {name for names in sets for name in names} | {*withdrawn}
     out = list(withdrawn.values())
     for effect in library:
-        if effect.name in answered or effect.name in withdrawn:
+        if effect.name in answered:
             continue
-        own = found.tried[effect.name]
+        test = fit.tests[effect.name]
         values: tuple[Value, ...] = ()
-        if effect in found.causes:
+        if effect in fit.causes:
             reason = "it is not significant beside the other causes"
-            values = values_of(found, effect)
-        elif not own.inside:
+            values = values_of(fit, effect)
+        elif not test.inside:
             reason = "the fitted value is out of its bounds"
-        elif own.z <= Z_EFFECT:
+        elif test.z <= Z_EFFECT:
             reason = "it is not significant beside what was found"
         else:
             reason = "it does not reduce the residual of runs left out, or differs from run to run"
-        out.append(RuledOut(effect.name, reason, own.z, values))
-    return out
+        out.append(RuledOut(effect.name, reason, test.z, values))
+    return tuple(out)
 
 
 def residuals_of(info: Evidence, start: Evidence) -> dict[str, Residual]:
@@ -483,8 +429,7 @@ def residuals_of(info: Evidence, start: Evidence) -> dict[str, Residual]:
     out = {}
     for channel in measured_channels(info.rows):
         c = CHANNELS.index(channel)
-        left = np.concatenate([run.residual[:, c] for run in info.rows])
-        rms = float(np.sqrt(np.nanmean(left**2)))
+        rms = float(np.sqrt(np.nanmean(np.concatenate([run.residual[:, c] for run in info.rows]) ** 2)))
         noise = float(start.noise.std[c])
         systematic = max(1.0 - (noise / rms) ** 2, 0.0) if rms > 0 else 0.0
         out[channel] = Residual(rms, noise, systematic)

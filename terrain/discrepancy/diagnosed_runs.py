@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,26 +16,30 @@ from terrain.discrepancy.held_out import (
     HOLD_OUT_FROM,
     Comparison,
     Gain,
+    Reference,
+    black_box_reference,
     filter_gain,
     fit_to_judge,
     gain_of_signals,
     repair_held_out,
     split_runs,
 )
-from terrain.discrepancy.nameless import Nameless, nameless_gain
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.residuals import LowPass, low_pass_of
 from terrain.discrepancy.search import Problem
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.statements import acting_causes
 from terrain.discrepancy.terrain_match import TerrainMatch, simulation_for
 from terrain.discrepancy.verdict import INTERVAL_T, Diagnosis
-from terrain.effects import Effect
+from terrain.effects import CHANNELS, Effect
 from terrain.errors import ConfigError, DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
+
+ACTS_RATIO = 0.25
+"""Least part of the change of a channel by all causes, root mean square, that one of them makes to be named
+with it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,22 +83,21 @@ class HeldOutGain:
     gain : None where it was not measured
     reason : why it was not
     comparisons : by ``filter`` and ``classifier``; None for one that does not apply
-    nameless : what a black-box reference reaches on the same runs; None where none is held out
+    black_box : what a black-box reference reaches on the same runs; None where none is held out
     judged : held-out runs that are fit, beside the simulation
     """
 
     gain: Gain | None
     reason: str | None = None
     comparisons: Mapping[str, Comparison | None] = field(default_factory=dict)
-    nameless: Nameless | None = None
+    black_box: Reference | None = None
     judged: tuple[ComparedRun, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """Return the gain as JSON has it."""
-        nameless = {} if self.nameless is None else {"nameless": self.nameless.as_json()}
-        if self.gain is None:
-            return {"measured": False, "reason": self.reason, **self.comparisons, **nameless}
-        return {"measured": True, **self.gain.as_json(), **self.comparisons, **nameless}
+        measured = {"reason": self.reason} if self.gain is None else self.gain._asdict()
+        reference = {} if self.black_box is None else {"black_box_reference": self.black_box}
+        return {"measured": self.gain is not None, **measured, **self.comparisons, **reference}
 
 
 def diagnose_runs(
@@ -127,9 +130,7 @@ def diagnose_runs(
     compared = compare_runs(simulation, extended, signals, low_pass)
     last = extended or simulation
     info = Problem(signals, simulation, low_pass, tuple(library)).at(last.vector)
-    held_signals = repair_held_out(
-        [signals_of(run, robot) for run in held_out], diagnosis.faults, last, low_pass, _noise_of(diagnosis)
-    )
+    held_signals = [signals_of(run, robot) for run in held_out]
     return DiagnosedRuns(
         diagnosis=diagnosis,
         simulation=simulation,
@@ -139,7 +140,7 @@ def diagnose_runs(
         used=tuple(used),
         held_out=tuple(held_out),
         compared=compared,
-        held_signals=held_signals,
+        held_signals=repair_held_out(held_signals, diagnosis.faults, last, low_pass, _noise_of(diagnosis)),
         noise=without_levels(info.noise, compared),
         low_pass=low_pass,
         parts=part_values(info, diagnosis.causes),
@@ -149,6 +150,35 @@ def diagnose_runs(
 
 def _noise_of(diagnosis: Diagnosis) -> dict[str, float]:
     return {channel: residual.noise for channel, residual in diagnosis.residual_before.items()}
+
+
+def acting_causes(
+    simulation: Simulation, diagnosis: Diagnosis, signals: Sequence[Signals], used: Sequence[ComparedRun]
+) -> dict[str, tuple[str, ...]]:
+    """Return the channels that each named cause changes: where the extension without it predicts otherwise.
+
+    Parameters
+    ----------
+    simulation : before
+    diagnosis : of the runs
+    signals, used : runs behind the diagnosis, and the same beside the simulation
+    """
+    acting, low_pass = {}, low_pass_of(signals)
+
+    def squares(others: Sequence[ComparedRun], extended: bool) -> Array:
+        """Return the square (channels,) of differences from the extended simulation, where it was measured."""
+        apart = (
+            run.residual(True) - other.residual(extended) for run, other in zip(used, others, strict=True)
+        )
+        return np.asarray(sum((np.nansum(x**2, axis=0) for x in apart), np.zeros(len(CHANNELS))))
+
+    for cause in diagnosis.causes:
+        own = {value.name for value in cause.parameters}
+        others = {name: value for name, value in diagnosis.values.items() if name not in own}
+        without = compare_runs(simulation, simulation.with_effects(others), signals, low_pass)
+        acts = squares(without, True) > ACTS_RATIO**2 * squares(used, False)
+        acting[cause.name] = tuple(name for name, yes in zip(CHANNELS, acts, strict=True) if yes)
+    return acting
 
 
 def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutGain:
@@ -161,7 +191,7 @@ def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutG
     seed : of the bootstrap
     """
     simulation, extended, runs = diagnosed.simulation, diagnosed.extended, diagnosed.held_signals
-    found, reason = None, None
+    gain, reason = None, None
     comparisons: dict[str, Comparison | None] = {}
     fit: Sequence[Signals] = ()
     try:
@@ -174,8 +204,8 @@ def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutG
             reason = "no cause was named, so that nothing was built in"
             fit = fit_to_judge(simulation, runs)[0]
         else:
-            found = gain_of_signals(simulation, extended, runs, seed)
-            fit = [run for run in runs if run.run_id in found.run_ids]
+            gain = gain_of_signals(simulation, extended, runs, seed)
+            fit = [run for run in runs if run.run_id in gain.runs]
     except DataError as error:
         reason = reason or str(error)
     if extended is not None and runs:
@@ -183,8 +213,8 @@ def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutG
         faulty = bool(diagnosed.diagnosis.faults)
         comparisons["filter"] = None if faulty else filter_gain(diagnosed.held_out, robot, extended, seed)
     judged = compare_runs(simulation, extended, fit, diagnosed.low_pass, held_out=True)
-    nameless = nameless_gain(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis), seed)
-    return HeldOutGain(found, reason, comparisons, nameless, judged)
+    reference = black_box_reference(diagnosed.compared, judged, _noise_of(diagnosed.diagnosis), seed)
+    return HeldOutGain(gain, reason, comparisons, reference, judged)
 
 
 # -- The simulation, and the description of the robot, with what it lacked built in ------------------------
@@ -211,48 +241,37 @@ def extend(simulation: Simulation, diagnosis: Diagnosis) -> Simulation:
     return simulation.with_effects(diagnosis.values)
 
 
-class ExtendedEffects(NamedTuple):
-    """Effects of an extended robot.
-
-    Parameters
-    ----------
-    values : (k) by parameter
-    cov : (k, k) covariance of the values, in their order
-    intervals : 95 % interval by parameter
-    """
-
-    values: dict[str, float]
-    cov: Array
-    intervals: dict[str, tuple[float, float]]
-
-
-def extended_effects(robot: Robot, diagnosis: Diagnosis) -> ExtendedEffects:
+def extended_effects(
+    robot: Robot, diagnosis: Diagnosis
+) -> tuple[dict[str, float], Array, dict[str, tuple[float, float]]]:
     """Return the effects of the robot with the named causes added.
 
     The covariance of a parameter that was found again is that of the new estimate; all other parameters keep
     theirs, and the two groups are taken as independent.
+
+    Returns
+    -------
+    values : (k) by parameter
+    cov : (k, k) covariance of the values, in their order
+    intervals : 95 % interval by parameter
 
     Raises
     ------
     ConfigError
         if the covariance of the robot's effects is not known.
     """
-    names = list(dict.fromkeys([*robot.effects, *diagnosis.parameters]))
+    parameters, matrix = diagnosis.covariance
+    names = list(dict.fromkeys([*robot.effects, *parameters]))
     cov = np.zeros((len(names), len(names)))
-    old = [names.index(name) for name in robot.effects]
-    new = [names.index(name) for name in diagnosis.parameters]
+    old, new = ([names.index(name) for name in some] for some in (robot.effects, parameters))
     cov[np.ix_(old, old)] = robot.effects_cov
     cov[new], cov[:, new] = 0.0, 0.0
-    cov[np.ix_(new, new)] = diagnosis.cov
+    cov[np.ix_(new, new)] = matrix
     if not np.isfinite(cov).all():
         raise ConfigError(
             f"robot {robot.name}: its effects have no covariance, which an extended description requires"
         )
-    found = diagnosis.values
-    values = {name: robot.effects.get(name, 0.0) + found.get(name, 0.0) for name in names}
-    halves = INTERVAL_T * np.sqrt(cov.diagonal())
-    intervals = {
-        name: (values[name] - float(half), values[name] + float(half))
-        for name, half in zip(names, halves, strict=True)
-    }
-    return ExtendedEffects(values, cov, intervals)
+    added = diagnosis.values
+    values = {name: robot.effects.get(name, 0.0) + added.get(name, 0.0) for name in names}
+    halves = dict(zip(names, (INTERVAL_T * np.sqrt(cov.diagonal())).tolist(), strict=True))
+    return values, cov, {name: (values[name] - halves[name], values[name] + halves[name]) for name in names}

@@ -1,33 +1,40 @@
-"""Which runs are held out of a diagnosis, to measure on them what an extension gains, and their repair."""
+"""Runs held out of a diagnosis: which, their repair, and what an extension gains on them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
+from terrain.discrepancy.compared import ComparedRun, channels_of
 from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.discrepancy.evidence import N_BLOCKS, Evidence, evidence_at
 from terrain.discrepancy.faults import Fault
 from terrain.discrepancy.residuals import LowPass, low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.selection import MIN_CLUSTERS
-from terrain.discrepancy.signals import Signals, signals_of
+from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.unfit import unfit_runs
 from terrain.discrepancy.verdict import Excluded
 from terrain.effects import CHANNELS
-from terrain.errors import ConfigError, DataError, TerrainError
+from terrain.errors import DataError, TerrainError
 from terrain.estimation.estimate import Estimate, estimate_run, summarize
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
 HOLD_OUT_FROM, HOLD_OUT_EVERY = 6, 4
 """With so many runs or more, one in every so many is held out."""
+
+N_BOOTSTRAP = 2000
+
+MIN_JUDGED = 3
+"""Least number of runs among which an unfit one can be found."""
 
 
 def split_runs(runs: Sequence[RunLog], hold_out: int | None, seed: int) -> tuple[list[RunLog], list[RunLog]]:
@@ -96,35 +103,7 @@ def repair_held_out(
     return tuple(fixed)
 
 
-# -- What an extension gains on held-out runs --------------------------------------------------------------
-
-N_BOOTSTRAP = 2000
-
-MIN_JUDGED = 3
-"""Least number of runs among which an unfit one can be found."""
-
-
-class Reduction(NamedTuple):
-    """Ratio of the square that an extension removes, and its 95 % interval by bootstrap over clusters.
-
-    Examples
-    --------
-    >>> Reduction(0.4, 0.1, 0.6).refused, Reduction(0.4, -0.1, 0.6).refused
-    (False, True)
-    """
-
-    ratio: float
-    low: float
-    high: float
-
-    @property
-    def refused(self) -> bool:
-        """Whether no gain can be claimed: the interval includes zero, or lies below."""
-        return not self.low > 0.0
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        return {"reduction": self.ratio, "ci": (self.low, self.high), "refused": self.refused}
+# -- What an extension gains: the part of the square that it removes, by bootstrap over clusters -----------
 
 
 class ChannelGain(NamedTuple):
@@ -134,19 +113,17 @@ class ChannelGain(NamedTuple):
     ----------
     rms_before, rms_after : behind the common low-pass, in the channel's unit
     white_before, white_after : behind the whitening filter, too; noise alone has 1
-    reduction : of the square behind the low-pass
+    reduction, ci : ratio of the square behind the low-pass that is removed, and its 95 % interval
+    refused : whether no gain can be claimed: the interval includes zero, or lies below
     """
 
     rms_before: float
     rms_after: float
     white_before: float
     white_after: float
-    reduction: Reduction
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        named = self._asdict()
-        return {**named.pop("reduction").as_json(), **named}
+    reduction: float
+    ci: tuple[float, float]
+    refused: bool
 
 
 class Gain(NamedTuple):
@@ -154,31 +131,26 @@ class Gain(NamedTuple):
 
     Parameters
     ----------
-    run_ids : of the runs on which it was measured
-    excluded : runs that were given and are unfit
+    runs : ids of those on which it was measured
+    excluded_runs : that were given and are unfit
     clusters : ``runs``, or ``thirds of runs`` where runs are few
     channels : by name
-    reduction : of the whitened square of all channels, with variations from run to run marginalised
+    reduction, ci, refused : as of a channel, of the whitened square of all channels, with variations from run
+        to run marginalised
     """
 
-    run_ids: tuple[str, ...]
-    excluded: tuple[Excluded, ...]
+    runs: tuple[str, ...]
+    excluded_runs: tuple[Excluded, ...]
     clusters: str
     channels: dict[str, ChannelGain]
-    reduction: Reduction
-
-    @property
-    def refused(self) -> bool:
-        """Whether no gain can be claimed."""
-        return self.reduction.refused
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        own = {"runs": self.run_ids, "excluded_runs": self.excluded, "clusters": self.clusters}
-        return {**own, **self.reduction.as_json(), "channels": self.channels}
+    reduction: float
+    ci: tuple[float, float]
+    refused: bool
 
 
-def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], seed: int = 0) -> Gain:
+def gain_of_signals(
+    simulation: Simulation, extended: Simulation, runs: Sequence[Signals], seed: int = 0
+) -> Gain:
     """Return by how much an extension reduces the residual of runs that were not used to find it.
 
     One low-pass and one whitening filter serve before and after: fitted to the residual that
@@ -192,50 +164,29 @@ def gain(simulation: Simulation, extended: Simulation, runs: Sequence[RunLog], s
 
     Raises
     ------
-    ConfigError
-        if the two are of different robots.
     DataError
         if there is no run, or none is fit.
     """
-    if simulation.robot.name != extended.robot.name:
-        raise ConfigError(
-            f"the extension is of the robot {extended.robot.name!r}, not of {simulation.robot.name!r}"
-        )
-    return gain_of_signals(simulation, extended, [signals_of(run, simulation.robot) for run in runs], seed)
-
-
-def gain_of_signals(
-    simulation: Simulation, extended: Simulation, runs: Sequence[Signals], seed: int = 0
-) -> Gain:
-    """Return the same for runs that are on one clock already; see :func:`gain`."""
     signals, excluded, after = fit_to_judge(extended, runs)
-    low_pass = low_pass_of(signals)
-    before = evidence_at(signals, simulation, simulation.vector, (), low_pass, after.statistics)
+    before = evidence_at(signals, simulation, simulation.vector, (), low_pass_of(signals), after.statistics)
     by_run = len(signals) >= MIN_CLUSTERS
     weights = bootstrap_counts(len(signals) * (1 if by_run else N_BLOCKS), N_BOOTSTRAP, seed)
     channels = {}
     for name in measured_channels(after.rows):
-        c = CHANNELS.index(name)
-        plain = [_squares([run.residual[:, c] for run in info.rows], by_run) for info in (before, after)]
-        white = [
-            _squares([np.where(r[:, c] == 0.0, np.nan, r[:, c]) for r in info.white_residual], by_run)
-            for info in (before, after)
-        ]
-        channels[name] = ChannelGain(
-            _rms(plain[0]),
-            _rms(plain[1]),
-            _rms(white[0]),
-            _rms(white[1]),
-            _reduction(plain[0][:, 0], plain[1][:, 0], weights),
-        )
-    cost = [_costs(info, by_run) for info in (before, after)]
-    return Gain(
-        tuple(run.run_id for run in signals),
-        tuple(excluded),
-        "runs" if by_run else "thirds of runs",
-        channels,
-        _reduction(cost[0], cost[1], weights),
-    )
+        c, rms, squares = CHANNELS.index(name), [], []
+        for info in (before, after):
+            white = [np.where(run[-1, :, c] == 0.0, np.nan, run[-1, :, c]) for run in info.white]
+            for residuals in ([run.residual[:, c] for run in info.rows], white):
+                parts = [part for values in residuals for part in _clusters(values, by_run)]
+                square = np.array([np.nansum(part**2) for part in parts])
+                known = sum(int(np.isfinite(part).sum()) for part in parts)
+                rms.append(float(np.sqrt(square.sum() / known)) if known else math.nan)
+                squares.append(square)
+        sizes = rms[0], rms[2], rms[1], rms[3]
+        channels[name] = ChannelGain(*sizes, *_reduction(squares[0], squares[2], weights))
+    of_all = _reduction(_costs(before, by_run), _costs(after, by_run), weights)
+    ids = tuple(run.run_id for run in signals)
+    return Gain(ids, excluded, "runs" if by_run else "thirds of runs", channels, *of_all)
 
 
 def fit_to_judge(
@@ -268,16 +219,6 @@ def fit_to_judge(
     return signals, tuple(excluded), info
 
 
-def _squares(residuals: Sequence[Array], by_run: bool) -> Array:
-    """Return sum of squares and count (clusters, 2), a cluster a run or a third of one."""
-    out = []
-    for values in residuals:
-        for part in _clusters(values, by_run):
-            known = part[np.isfinite(part)]
-            out.append((float(known @ known), known.size))
-    return np.array(out)
-
-
 def _costs(info: Evidence, by_run: bool) -> Array:
     """Return what each cluster (n,) adds to minus twice the log-likelihood, its own scatter integrated out.
 
@@ -285,12 +226,14 @@ def _costs(info: Evidence, by_run: bool) -> Array:
     """
     prior = np.diag(1.0 / info.nuisance_std**2)
     costs = []
-    for residual, change in zip(info.white_residual, info.white_change, strict=True):
-        scatter = change[info.nuisances].transpose(1, 0, 2)  # rows first, so that clusters are cut of both
-        for r, n in zip(_clusters(residual, by_run), _clusters(scatter, by_run), strict=True):
-            shown = np.einsum("mqc,mc->q", n, r)
-            inner = np.einsum("mqc,mpc->qp", n, n) + prior
-            costs.append(float((r**2).sum() - shown @ np.linalg.solve(inner, shown)))
+    for white in info.white:
+        columns = white[[*info.nuisances, -1]].transpose(
+            1, 0, 2
+        )  # rows first, so that clusters are cut of all
+        for part in _clusters(columns, by_run):
+            gram = np.einsum("mqc,mpc->qp", part, part)
+            shown = gram[:-1, -1]
+            costs.append(float(gram[-1, -1] - shown @ np.linalg.solve(gram[:-1, :-1] + prior, shown)))
     return np.array(costs)
 
 
@@ -298,19 +241,15 @@ def _clusters(values: Array, by_run: bool) -> list[Array]:
     return [values] if by_run else np.array_split(values, N_BLOCKS)
 
 
-def _rms(squares: Array) -> float:
-    total, count = squares.sum(axis=0)
-    return float(np.sqrt(total / count)) if count else float("nan")
-
-
-def _reduction(before: Array, after: Array, weights: Array) -> Reduction:
-    drawn, left = weights @ before, weights @ after
+def _reduction(before: Array, after: Array, weights: Array) -> tuple[float, tuple[float, float], bool]:
+    """Return the part of the square that is removed, its 95 % interval, and whether no gain can be claimed."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = 1.0 - left / drawn
-        ratio = 1.0 - after.sum() / before.sum()
+        ratios = 1.0 - (weights @ after) / (weights @ before)
+        ratio = float(1.0 - after.sum() / before.sum())
     if not np.isfinite(ratios).any():
-        return Reduction(float("nan"), float("nan"), float("nan"))
-    return Reduction(float(ratio), *percentile_interval(ratios))
+        return math.nan, (math.nan, math.nan), True
+    low, high = percentile_interval(ratios)
+    return ratio, (low, high), not low > 0.0
 
 
 # -- What an extension gains for the robot's filter, against the truth of runs that have one ---------------
@@ -350,10 +289,7 @@ class Comparison(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """Return the comparison as JSON has it."""
-        shown = self._asdict()
-        if self.terrains is None:
-            del shown["terrains"]
-        return shown
+        return {key: value for key, value in self._asdict().items() if key != "terrains" or value is not None}
 
 
 def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed: int) -> Comparison | None:
@@ -372,21 +308,18 @@ def filter_gain(runs: Sequence[RunLog], robot: Robot, extended: Simulation, seed
             rows.append([_errors(estimate_run(run, one, name)) for one in (robot, better)])
     except TerrainError as error:
         return Comparison(name, str(error), len(known), {})
-    table = np.array(rows)  # (runs, 2, errors)
-    counts = bootstrap_counts(len(rows), N_BOOTSTRAP, seed)
-    errors = {}
-    for k, key in enumerate(ERRORS):
-        both = table[:, :, k]
+    counts, errors = bootstrap_counts(len(rows), N_BOOTSTRAP, seed), {}
+    for key, both in zip(ERRORS, np.array(rows).transpose(2, 1, 0), strict=True):
         if np.isfinite(both).all():
-            changes = counts @ (both[:, 1] - both[:, 0]) / len(rows)
+            changes = counts @ (both[1] - both[0]) / len(rows)
             interval = percentile_interval(changes) if len(rows) > 1 else None
-            errors[key] = Change(float(both[:, 0].mean()), float(both[:, 1].mean()), interval)
+            errors[key] = Change(float(both[0].mean()), float(both[1].mean()), interval)
     return Comparison(name, None, len(rows), errors)
 
 
-def _errors(found: Estimate) -> tuple[float, ...]:
+def _errors(estimate: Estimate) -> tuple[float, ...]:
     """Return the errors of a run, in the order of :data:`ERRORS`."""
-    summary, track, truth = summarize(found), found.track, found.run.streams["truth"]
+    summary, track, truth = summarize(estimate), estimate.track, estimate.run.streams["truth"]
     squares = dict.fromkeys(("speed", "yaw_rate"), np.zeros(len(track.time_s)))
     for state in track.states:
         kind = state.removesuffix("_mps").removesuffix("_radps").removesuffix("_x").removesuffix("_y")
@@ -421,3 +354,145 @@ def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Ch
     counts = bootstrap_counts(n, N_BOOTSTRAP, seed)
     interval = percentile_interval((counts @ change) / (counts @ windows))
     return Change(float(before.mean()), float(after.mean()), interval)
+
+
+# -- What a black-box reference reaches on the runs held out: how much of the residual is there to be found -
+# Measured minus simulated of each channel is regressed on the inputs of the simulation, their products,
+# magnitudes and rates, a few rows before and after, by Bayesian linear regression, whose two variances are
+# set by the data (MacKay, Bayesian interpolation, Neural Computation 1992; ``BayesianRidge`` of scikit-learn).
+# It is fitted to the runs behind the diagnosis and judged on the others: what it removes there and the named
+# causes do not, some cause without a name makes.
+
+DRIVEN = ("speed_mps", "turn_mps", "steer_rad", "grade_rad", "roll_rad", "sideways_mps")
+"""Inputs that are logged; the force is the simulation's own."""
+
+LAGS = (-2, -1, 1, 2)
+"""Rows by which inputs are taken later and earlier: a third of a second at the rate of a 50 Hz log, where any
+sensor may be the late one."""
+
+LEAST_RANGE = 1e-6
+"""Spread of a column that counts as constant."""
+
+
+class ChannelReference(NamedTuple):
+    """Squared residual of one channel on the runs held out.
+
+    Parameters
+    ----------
+    rms_before, rms_after : root mean square before, and behind the reference, in the channel's unit
+    reduction : part of the square that the reference removes; below 0 where it adds to it
+    named_reduction : part that the named causes remove; NaN where none was named
+    left_to_find_from : lower end of the 95 % interval, by bootstrap over runs, of what the reference removes
+        beyond the named causes; NaN where runs are too few: what one run has in common in itself is no cause
+    """
+
+    rms_before: float
+    rms_after: float
+    reduction: float
+    named_reduction: float
+    left_to_find_from: float
+
+
+class Reference(NamedTuple):
+    """What a black-box reference reaches, beside the named causes.
+
+    Parameters
+    ----------
+    n_runs : held out, on which it is judged
+    reduction, named_reduction : of the squares of all channels, each over its noise
+    channels : by name
+    """
+
+    n_runs: int
+    reduction: float
+    named_reduction: float
+    channels: Mapping[str, ChannelReference]
+
+
+def black_box_reference(
+    used: Sequence[ComparedRun],
+    held_out: Sequence[ComparedRun],
+    noise: Mapping[str, float],
+    seed: int = 0,
+) -> Reference | None:
+    """Return what a black-box reference reaches on runs held out; None where there are none.
+
+    Parameters
+    ----------
+    used : runs that it is fitted to
+    held_out : on which it and the named causes are judged, behind the same low-pass
+    noise : by channel, over which the squares of channels are added
+    seed : of the bootstrap
+    """
+    if not used or not held_out:
+        return None
+    columns, test = (np.concatenate([_columns(run) for run in runs]) for runs in (used, held_out))
+    run_of_row = np.repeat(np.arange(len(held_out)), [len(run.time_s) for run in held_out])
+    channels, total = {}, np.zeros(3)
+    for name in channels_of(used):
+        c = CHANNELS.index(name)
+        before = np.concatenate([run.residual(False)[:, c] for run in held_out])
+        known = np.isfinite(before)
+        if not known.any():
+            continue
+        target = np.concatenate([run.residual(False)[:, c] for run in used])
+        after = before[known] - _predicted(columns, target, test[known])
+        named = rival = before[known]
+        if held_out[0].after is None:
+            named = np.full(after.size, np.nan)
+        else:
+            named = rival = np.concatenate([run.residual(True)[:, c] for run in held_out])[known]
+        squares = np.array([float(x @ x) for x in (before[known], after, named)])
+        rms_before, rms_after, _ = np.sqrt(squares / known.sum()).tolist()
+        left_low = _left_low(before[known] ** 2, rival**2 - after**2, run_of_row[known], seed)
+        channels[name] = ChannelReference(rms_before, rms_after, *_removed(squares), left_low)
+        if noise.get(name, math.nan) > 0:
+            total += squares / noise[name] ** 2
+    return Reference(len(held_out), *_removed(total), channels)
+
+
+def _left_low(before: Array, more: Array, run_of_row: Array, seed: int) -> float:
+    """Return the lower end of the interval of what is removed more (n,), over the square before (n,)."""
+    parts = [run_of_row == run for run in np.unique(run_of_row)]
+    if len(parts) < MIN_CLUSTERS:
+        return math.nan
+    sums = np.array([[more[part].sum(), before[part].sum()] for part in parts])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = np.divide(*(bootstrap_counts(len(parts), N_BOOTSTRAP, seed) @ sums).T)
+    return float(percentile_interval(ratios)[0]) if np.isfinite(ratios).any() else math.nan
+
+
+def _removed(squares: Array) -> tuple[float, float]:
+    """Return the parts of the first square that are removed in the second and in the third."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratios = 1.0 - squares[1:] / squares[0]
+    return float(ratios[0]), float(ratios[1])
+
+
+def _columns(run: ComparedRun) -> Array:
+    """Return the regressors (m, k) of a run: a row at its ends takes the last input that there is."""
+    inputs = [run.inputs[name] for name in DRIVEN]
+    driven = [*inputs[:2], inputs[-1]]  # that is 0, and left out, but of omni robots
+    plain = [*inputs, *(np.abs(x) for x in driven), *(np.tanh(x / 0.05) for x in driven)]
+    products = [a * b for a, b in combinations_with_replacement(inputs, 2)]
+    signed = [x * np.abs(x) for x in driven]
+    at = np.arange(len(run.time_s))
+    rates = [np.gradient(x) if at.size > 1 else np.zeros_like(x) for x in inputs]
+    moving = np.column_stack([*inputs[:3], inputs[-1], inputs[0] * inputs[1], *signed])
+    late = [moving[np.clip(at - lag, 0, at.size - 1)] for lag in LAGS]
+    return np.hstack([np.column_stack([*plain, *products, *signed, *rates]), *late])
+
+
+def _predicted(columns: Array, target: Array, test: Array) -> Array:
+    """Return what a Bayesian linear regression of the target (n,) predicts for the test rows (m, k)."""
+    from sklearn.linear_model import BayesianRidge
+
+    known = np.isfinite(target) & np.isfinite(columns).all(axis=1)
+    mean, spread = columns[known].mean(axis=0), columns[known].std(axis=0)
+    use = spread > LEAST_RANGE
+    if not use.any() or not target[known].std() > 0.0:
+        return np.full(len(test), float(target[known].mean()) if known.any() else 0.0)
+    ridge = BayesianRidge()
+    ridge.fit((columns[known][:, use] - mean[use]) / spread[use], target[known])
+    out: Array = ridge.predict(np.nan_to_num((test[:, use] - mean[use]) / spread[use]))
+    return out

@@ -27,11 +27,12 @@ from terrain.discrepancy.evidence import (
 )
 from terrain.discrepancy.noise import ORDER, Noise
 from terrain.discrepancy.residuals import low_pass_of, measured_channels
+from terrain.discrepancy.robot_terms import listed
 from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT
 from terrain.discrepancy.signals import PARALLEL, Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.terrain_match import TerrainMatch, drivable
-from terrain.discrepancy.verdict import Diagnosis, Limit, NextDrive
+from terrain.discrepancy.verdict import Limit, NextDrive
 from terrain.effects import (
     ACCEL,
     BOUNDS,
@@ -92,6 +93,9 @@ TYPICAL_STD = {
 }
 """Noise of channels that the runs do not have; assumed, white."""
 
+MOST = {name: max(abs(value) for value in bounds) for name, bounds in BOUNDS.items()}
+"""Largest size that a parameter may have."""
+
 
 class _Drive(NamedTuple):
     """A scenario, and its information (k, k) on the parameters."""
@@ -137,37 +141,33 @@ def _separating_drive(
     """Return the drive that best distinguishes all sets, with more channels if none does."""
     logged = _logged(simulation.robot, info)
     names = list(dict.fromkeys(p for group in sets for effect in group for p in _parameters(effect)))
-    desired = [
-        channel
-        for group in sets
-        for effect in group
-        for twin, channel in effect_named(effect).twins
-        if twin in group and channel not in logged
-    ]
-    groups = " and ".join(dict.fromkeys(_listed(group) for group in sets))
+    twins = [(twin, group) for group in sets for effect in group for twin in effect_named(effect).twins]
+    more = list(dict.fromkeys(to for (twin, to), group in twins if twin in group and to not in logged))
+    groups = " and ".join(dict.fromkeys(listed(group) for group in sets))
     now = _Separation(np.inf, 0.0)
     if info is not None:
-        at = info.places(names)
-        now = _separation(sets, names, info.a[:, at][:, :, at].sum(axis=0))
-    for channels in (logged, (*logged, *desired)) if desired else (logged,):
-        drives = _drives(simulation, names, channels, info)
-        found = [(_separation(sets, names, drive.a), drive) for drive in drives]
-        found = [pair for pair in found if pair[0].collinearity < SEPARABLE_INDEX]
-        if not found:
+        now = _separation(sets, names, info.total(names)[0])
+    for lacking in ([], more) if more else ([],):
+        drives = [
+            (_separation(sets, names, drive.a), drive)
+            for drive in _drives(simulation, names, (*logged, *lacking), info)
+        ]
+        drives = [pair for pair in drives if pair[0].collinearity < SEPARABLE_INDEX]
+        if not drives:
             continue
-        separation, drive = max(found, key=lambda pair: pair[0].power)
+        separation, drive = max(drives, key=lambda pair: pair[0].power)
         index = f"{separation.collinearity:.2g}"
-        if channels is not logged:
-            lacking = _listed(list(dict.fromkeys(desired)))
+        if lacking:
+            channels = listed(lacking)
             reason = (
-                f"{groups} are one without {lacking}; with it logged, their collinearity index is {index}"
+                f"{groups} are one without {channels}; with it logged, their collinearity index is {index}"
             )
         elif info is None:
             reason = f"the collinearity index of {groups} would be {index}"
         elif now.collinearity > MIN_IMPROVEMENT_RATIO * separation.collinearity:
-            reason = (
-                f"the collinearity index of {groups} falls from {_index_text(now.collinearity)} to {index}"
-            )
+            exact = now.collinearity < EXACT_INDEX
+            was = f"{now.collinearity:.2g}" if exact else f"over {EXACT_INDEX:g}"
+            reason = f"the collinearity index of {groups} falls from {was} to {index}"
         else:
             times = separation.power / max(now.power / math.sqrt(len(info.a)), 1e-9)
             if times < MIN_IMPROVEMENT_RATIO:
@@ -182,8 +182,8 @@ def _exciting_drive(
 ) -> NextDrive | None:
     """Return the drive that excites most of what the runs did not excite."""
     names = [limit.name for limit in missed]
-    before = np.array([limit.value for limit in missed])
-    bound = np.array([max(abs(value) for value in BOUNDS[name]) for name in names])
+    before = np.array([limit.detection_limit for limit in missed])
+    bound = np.array([MOST[name] for name in names])
     best: tuple[float, _Drive, Array] | None = None
     for drive in _drives(simulation, names, _logged(simulation.robot, info), info):
         with np.errstate(divide="ignore"):
@@ -212,27 +212,16 @@ def _separation(sets: Sequence[tuple[str, ...]], names: Sequence[str], a: Array)
             one, other = ([names.index(name) for name in _parameters(effect)] for effect in pair)
             r = correlation(a, one, other)
             index = max(index, math.inf if r >= 1.0 else 1.0 / math.sqrt(1.0 - r))
-            power = min(power, _free(a, names, one, other), _free(a, names, other, one))
+            for own, beside in ((one, other), (other, one)):
+                free = partial_information(a, beside, own)[1]
+                size = np.array([MOST[names[k]] for k in own])
+                least = float(np.linalg.eigvalsh(free * np.outer(size, size))[0])
+                power = min(power, math.sqrt(max(least, 0.0)))
     return _Separation(index, power)
-
-
-def _free(a: Array, names: Sequence[str], one: list[int], other: list[int]) -> float:
-    """Return the evidence, in sigmas, of the one at its bounds that the other cannot explain."""
-    free = partial_information(a, other, one)[1]
-    size = np.array([max(abs(value) for value in BOUNDS[names[k]]) for k in one])
-    return math.sqrt(max(float(np.linalg.eigvalsh(free * np.outer(size, size))[0]), 0.0))
 
 
 def _parameters(effect: str) -> tuple[str, ...]:
     return tuple(p.name for p in effect_named(effect).parameters)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:-1]) + " and " + names[-1] if len(names) > 1 else names[0]
-
-
-def _index_text(index: float) -> str:
-    return f"{index:.2g}" if index < EXACT_INDEX else f"over {EXACT_INDEX:g}"
 
 
 def _logged(robot: Robot, info: Evidence | None) -> tuple[str, ...]:
@@ -252,29 +241,24 @@ def _drives(
     simulation: Simulation, names: Sequence[str], channels: Sequence[str], info: Evidence | None
 ) -> list[_Drive]:
     """Return the information of each scenario on each grade on parameters, from channels."""
-    driven, signals = [], []
+    driven: list[tuple[str, float]] = []
+    signals: list[Signals] = []
     grades = GRADES_DEG[:1] if simulation.robot.on_omni_wheels else GRADES_DEG  # those log no tilt
     for name in SCENARIOS:
-        inputs = _inputs(simulation.robot, name)
-        if inputs is None:
-            continue
-        for grade_deg in grades:
-            driven.append((name, grade_deg))
-            signals.append(_signals(simulation, *inputs, grade_deg, channels))
+        wheels = _wheels(simulation.robot, name)
+        if wheels is not None:
+            driven += [(name, grade_deg) for grade_deg in grades]
+            signals += [_signals(simulation, *wheels, grade_deg, channels) for grade_deg in grades]
     if not signals:
         return []
     vector = simulation.vector if info is None else info.vector
-    info_of_drives = evidence_at(
-        signals, simulation, vector, names, low_pass_of(signals), _statistics(simulation, info)
-    )
-    at = info_of_drives.places(names)
-    return [
-        _Drive(name, grade_deg, a[np.ix_(at, at)])
-        for (name, grade_deg), a in zip(driven, info_of_drives.a, strict=True)
-    ]
+    low_pass = low_pass_of(signals)
+    of_drives = evidence_at(signals, simulation, vector, names, low_pass, _statistics(simulation, info))
+    a, _ = of_drives.clusters(of_drives.places(names))
+    return [_Drive(*drive, own) for drive, own in zip(driven, a, strict=True)]
 
 
-def _inputs(robot: Robot, name: str) -> tuple[Array, Array] | None:
+def _wheels(robot: Robot, name: str) -> tuple[Array, Array] | None:
     """Return wheel speeds and steering (n, wheels) of a scenario, or None if the robot cannot drive it."""
     speed_mps = None  # that it cruises with
     if not isinstance(robot, BicycleRobot):
@@ -303,52 +287,43 @@ def _signals(
     channels: Sequence[str],
 ) -> Signals:
     """Return the signals of a drive without noise; of its measurements only the pattern of holes is used."""
-    level, vector = np.zeros(len(wheel_speed_mps)), simulation.vector
+    level, dt_s = np.zeros(len(wheel_speed_mps)), 1.0 / CLOCK_HZ
     measured = np.full((len(wheel_speed_mps), len(CHANNELS)), np.nan)
     measured[:, [CHANNELS.index(name) for name in channels]] = 0.0
     parallel = np.abs(np.exp(1j * steer_rad).mean(axis=1)) > PARALLEL
     measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
-    grade, roll = level, level
+    grade = roll = level
     if grade_deg:
-        flat = move(
-            simulation.planar,
-            vector,
-            1.0 / CLOCK_HZ,
-            wheel_speed_mps,
-            steer_rad,
-            level,
-            level,
-            np.zeros((0, 3)),
-        )
+        driven = wheel_speed_mps, steer_rad, level, level, np.zeros((0, 3))
+        flat = move(simulation.planar, simulation.vector, dt_s, *driven)
         yaw = np.cumsum(flat[:, TRUTH.index("yaw_rate_radps")]) / CLOCK_HZ
         steepness = math.tan(math.radians(grade_deg))
         ahead, left = steepness * np.cos(yaw), -steepness * np.sin(yaw)
         grade, roll = np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)
-    return Signals("", "", 1.0 / CLOCK_HZ, 0.0, wheel_speed_mps, steer_rad, grade, roll, measured)
+    return Signals("", "", dt_s, 0.0, wheel_speed_mps, steer_rad, grade, roll, measured)
 
 
 def _statistics(simulation: Simulation, info: Evidence | None) -> Statistics:
     """Return noise and scatter of the runs, and a typical noise of channels that they do not have."""
     std = np.array([TYPICAL_STD[name] for name in CHANNELS])
-    growth, filters = np.zeros((len(CHANNELS), 3)), np.zeros((len(CHANNELS), ORDER + 1))
-    growth[:, 0], filters[:, 0] = std**2, 1.0
-    if info is not None:
-        known = np.isfinite(info.noise.filters).all(axis=1)
-        growth[known], filters[known] = info.noise.growth[known], info.noise.filters[known]
-        std[known] = info.noise.std[known]
-    scatter = simulation.scatter if info is None else info.statistics.scatter
-    return Statistics(Noise(growth, filters, std), scatter)
+    noise = Noise(np.zeros((len(CHANNELS), 3)), np.zeros((len(CHANNELS), ORDER + 1)), std)
+    noise.growth[:, 0], noise.filters[:, 0] = std**2, 1.0
+    if info is None:
+        return Statistics(noise, simulation.scatter)
+    known = np.isfinite(info.noise.filters).all(axis=1)
+    for typical, measured in zip(noise, info.noise, strict=True):
+        typical[known] = measured[known]
+    return Statistics(noise, info.statistics.scatter)
 
 
 def next_command(
-    diagnosis: Diagnosis, description: str, robot: Robot, terrains: Sequence[TerrainMatch]
+    drive: NextDrive | None, description: str, robot: Robot, terrains: Sequence[TerrainMatch]
 ) -> str | None:
     """Return the command that simulates the next drive; None where none is suggested."""
-    coming = diagnosis.next_drive
-    if coming is None:
+    if drive is None:
         return None
     default = DEFAULT_SOIL if drivable(robot, DEFAULT_SOIL) else HARD_SOIL
     soil = next((match.soil for match in terrains if match.soil), default)
-    grade = f" --grade {coming.grade_deg:g}" if coming.grade_deg else ""
-    words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {coming.scenario}{grade}"
+    grade = f" --grade {drive.grade_deg:g}" if drive.grade_deg else ""
+    words = f"--robot {shlex.quote(description)} --terrain {soil} --scenario {drive.scenario}{grade}"
     return f"terrain simulate {words} --runs {NEXT_RUNS} --out next_drive"

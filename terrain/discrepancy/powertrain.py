@@ -29,7 +29,7 @@ import numpy as np
 
 from terrain.bootstrap import LEVEL, bootstrap_counts, percentile_interval
 from terrain.discrepancy.faults import Fault
-from terrain.discrepancy.statements import listed
+from terrain.discrepancy.robot_terms import listed
 from terrain.identify import Fit, Parameter, deal, folds, identify
 from terrain.kernels import njit, record
 from terrain.records import Array, RunLog

@@ -126,37 +126,28 @@ def probe_residuals(
     rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
     results: dict[tuple[str, str], ProbeResult] = {}
     inputs = [probe_inputs(run, rate_hz) for run in info.rows]
-    edges = [_block_edges(run) for run in info.rows]
     for c, channel in enumerate(CHANNELS):
-        if not any(residual[:, c].any() for residual in info.white_residual):
+        if not any(white[-1, :, c].any() for white in info.white):
             continue
-        columns = [_white(info, i, c, np.array(list(given.values()))) for i, given in enumerate(inputs)]
+        columns = [_whitened(info, i, c, np.array(list(own.values()))) for i, own in enumerate(inputs)]
         own = np.array([error.get((channel, name), 0.0) for name in inputs[0]])
-        found = _probe_results(info, names, change, c, columns, edges, own)
-        results |= {(channel, name): result for name, result in zip(inputs[0], found, strict=True)}
-        n_wheels = info.rows[0].inputs.shape[1] - len(INPUTS) + 1
-        for wheel in range(n_wheels):
+        tested = _results(info, names, change, c, columns, own)
+        results |= {(channel, name): result for name, result in zip(inputs[0], tested, strict=True)}
+        for wheel in range(info.rows[0].inputs.shape[1] - len(INPUTS) + 1):
             false = np.concatenate([_wave_statistics(info, c, wheel, times) for times in PLACEBOS])
             placebo = float(np.mean(false)) / 2.0 if false.size else 1.0
             for harmonic in HARMONICS:
                 name = f"wheel {wheel + 1} turn" + ("" if harmonic == 1 else f" x{harmonic}")
-                results[channel, name] = _wheel_turn_probe(
-                    _wave_statistics(info, c, wheel, harmonic), placebo
-                )
+                waves = _wave_statistics(info, c, wheel, harmonic)
+                results[channel, name] = _wheel_turn_probe(waves, placebo)
     return results
 
 
-def _block_edges(run: Rows) -> Array:
-    """Return the first rows of the blocks of a run, and the end."""
-    n_blocks = max(round(float(run.time_s[-1] - run.time_s[0]) / BLOCK_S), 1)
-    return np.linspace(0, len(run.time_s), n_blocks + 1).astype(int)
-
-
-def _white(info: Evidence, i: int, c: int, columns: Array) -> Array:
+def _whitened(info: Evidence, i: int, c: int, columns: Array) -> Array:
     """Whiten columns (q, m) of a run as channel c, 0 where its residual is not known."""
     scaled = columns / info.noise.size(info.rows[i].pace_mps)[:, c]
     white = whiten(info.noise.filters[c : c + 1], np.ascontiguousarray(scaled[:, :, None]))[:, :, 0]
-    return np.asarray(white * (info.white_residual[i][:, c] != 0.0))
+    return np.asarray(white * (info.white[i][-1, :, c] != 0.0))
 
 
 def _products(
@@ -164,26 +155,27 @@ def _products(
 ) -> Array:
     """Return products (blocks, z, z) of columns of a run with the same, nuisances taken out of the second.
 
-    They are the sensitivities of some parameters, whitened columns (q, m) of channel c, and the residual.
+    They are the sensitivities of some parameters, whitened columns (q, m) of channel c, and the residual;
+    ``edges`` are the first rows of the blocks, and the end.
     """
-    nuisances, residual = info.white_change[i][info.nuisances], info.white_residual[i]
-    in_channel = np.zeros((len(columns), *residual.shape))
+    white = info.white[i]
+    nuisances = white[info.nuisances]
+    in_channel = np.zeros((len(columns), *white.shape[1:]))
     in_channel[:, :, c] = columns
-    every = np.concatenate([info.white_change[i][at], in_channel, residual[None]])
-    coefficients = info.inner[i] @ np.tensordot(nuisances, every, axes=((1, 2), (1, 2)))
-    free, z = every - np.tensordot(coefficients.T, nuisances, axes=1), len(every)
+    every = np.concatenate([white[at], in_channel, white[-1:]])
+    deviations = info.marginal[2][i] @ np.tensordot(nuisances, every, axes=((1, 2), (1, 2)))
+    free, z = every - np.tensordot(deviations.T, nuisances, axes=1), len(every)
     return np.array(
         [every[:, a:b].reshape(z, -1) @ free[:, a:b].reshape(z, -1).T for a, b in pairwise(edges)]
     )
 
 
-def _probe_results(
+def _results(
     info: Evidence,
     names: Sequence[str],
     change: Array,
     c: int,
     columns: Sequence[Array],
-    edges: Sequence[Array],
     error: Array,
 ) -> list[ProbeResult]:
     """Return the results of whitened columns (q, m) a run, in channel c, where the simulation has an error (q,).
@@ -193,25 +185,28 @@ def _probe_results(
     """
     at, q = info.places(names), len(columns[0])
     selected, probe = slice(0, len(at)), slice(len(at), len(at) + q)
-    products = np.concatenate(
-        [_products(info, i, c, at, x, e) for i, (x, e) in enumerate(zip(columns, edges, strict=True))]
-    )
-    first = np.cumsum([0, *(len(each) - 1 for each in edges[:-1])])
+    products: list[Array] = []
+    first: list[int] = []
+    for i, (run, own_columns) in enumerate(zip(info.rows, columns, strict=True)):
+        n_blocks = max(round(float(run.time_s[-1] - run.time_s[0]) / BLOCK_S), 1)
+        first.append(sum(len(blocks) for blocks in products))
+        edges = np.linspace(0, len(run.time_s), n_blocks + 1).astype(int)
+        products.append(_products(info, i, c, at, own_columns, edges))
+    every = np.concatenate(products)
     fitted = change - info.away[at]
-    a = (products[:, selected, selected] + products[:, selected, selected].transpose(0, 2, 1)) / 2.0
-    g = products[:, selected, -1] - a @ fitted
-    own = np.diagonal(products[:, probe, probe], axis1=1, axis2=2)
-    cross, score = products[:, probe, selected], products[:, probe, -1]
+    a = (every[:, selected, selected] + every[:, selected, selected].transpose(0, 2, 1)) / 2.0
+    g = every[:, selected, -1] - a @ fitted
+    own = np.diagonal(every[:, probe, probe], axis1=1, axis2=2)
+    cross, score = every[:, probe, selected], every[:, probe, -1]
     follow = np.zeros((0, q))
     if at:
         follow = np.linalg.lstsq(a.sum(axis=0), cross.sum(axis=0).T, rcond=1e-10)[0]
-    of_model = _of_model(info, at, c, columns, follow)
     free = own.sum(axis=0) - (cross.sum(axis=0) * follow.T).sum(axis=1)
     sizes = own - 2 * (cross * follow.T).sum(axis=2) + ((a @ follow) * follow).sum(axis=1)
     part = score - cross @ fitted - g @ follow
     enough = free > 1e-6 * np.maximum(own.sum(axis=0), 1e-12)
-    free = np.where(enough, free, np.inf)
-    power = sum(((white[at][:, :, c] ** 2).sum(axis=1) for white in info.white_change), np.zeros(len(at)))
+    by_model = _model_variance(info, at, c, columns, follow) + (np.where(enough, free, 0.0) * error) ** 2
+    power = sum(((white[at][:, :, c] ** 2).sum(axis=1) for white in info.white), np.zeros(len(at)))
     both = np.sqrt(np.outer(own.sum(axis=0), power))
     alike = np.divide(np.abs(cross.sum(axis=0)), both, out=np.zeros_like(both), where=both > 1e-9)
     results = []
@@ -219,46 +214,32 @@ def _probe_results(
         if not enough[k]:
             results.append(ProbeResult(0.0, 0.0))
             continue
-        total = float(part[:, k].sum())
-        left = part[:, k] - sizes[:, k] * total / free[k]
-        by_model = float(of_model[k] + (free[k] * error[k]) ** 2)
-        z = _z(total, float(free[k]), left, sizes[:, k], first, by_model)
+        total, information = float(part[:, k].sum()), float(free[k])
+        left = part[:, k] - sizes[:, k] * total / information
+        # the variance of the score is estimated between blocks, or between runs
+        by_run = (np.add.reduceat(each, first) for each in (left, sizes[:, k]))
+        (variance, dof), over_runs = (
+            pooled_variance(scores, np.clip(shares / information, 0.0, 0.9), information)
+            for scores, shares in ((left, sizes[:, k]), by_run)
+        )
+        if over_runs[0] > RUN_RATIO * variance:
+            variance, dof = over_runs
+        z = z_of_t(abs(total) / math.sqrt(information * variance + float(by_model[k])), dof)
         known = dict(zip(names, np.minimum(alike[k], 1.0).tolist(), strict=True))
-        results.append(ProbeResult(z, float(total**2 / free[k]), known))
+        results.append(ProbeResult(z, total**2 / information, known))
     return results
 
 
-def _of_model(info: Evidence, at: list[int], c: int, columns: Sequence[Array], follow: Array) -> Array:
+def _model_variance(info: Evidence, at: list[int], c: int, columns: Sequence[Array], follow: Array) -> Array:
     """Return the variance (q,) of a probe's score by the simulation's own error.
 
     Of errors in units of several parameters the largest counts: each was measured as if it were alone.
     """
     doubtful = np.flatnonzero(info.model_std)
     shown = -follow.T @ info.a[:, at][:, :, doubtful].sum(axis=0)
-    for x, white, shift in zip(columns, info.white_change, info.shift, strict=True):
+    for x, white, shift in zip(columns, info.white, info.marginal[1], strict=True):
         shown += x @ (white[doubtful, :, c] - shift[:, doubtful].T @ white[info.nuisances, :, c]).T
     return np.asarray(((shown * info.model_std[doubtful]) ** 2).max(axis=1, initial=0.0))
-
-
-def _z(total: float, free: float, left: Array, sizes: Array, first: Array, of_model: float) -> float:
-    """Return the evidence of a score, whose variance is estimated between blocks, or between runs.
-
-    Parameters
-    ----------
-    total, free : score of all runs, and its information, which is its variance by the noise
-    left, sizes : (blocks,) what is left of each block's score at the fit, and its information
-    first : (runs,) number of the first block of each run
-    of_model : its variance by the simulation's own error
-    """
-    by_run, dof_by_run = _variance(np.add.reduceat(left, first), np.add.reduceat(sizes, first), free)
-    variance, dof = _variance(left, sizes, free)
-    if by_run > RUN_RATIO * variance:
-        variance, dof = by_run, dof_by_run
-    return z_of_t(abs(total) / math.sqrt(free * variance + of_model), dof)
-
-
-def _variance(left: Array, sizes: Array, free: float) -> tuple[float, float]:
-    return pooled_variance(left, np.clip(sizes / free, 0.0, 0.9), free)
 
 
 def _wheel_turn_probe(statistics: Array, placebo: float) -> ProbeResult:
@@ -280,7 +261,7 @@ def _wave_statistics(info: Evidence, c: int, wheel: int, times: float) -> Array:
     each = []
     for i, run in enumerate(info.rows):
         phase = times * run.inputs[:, len(INPUTS) - 1 + wheel]
-        waves = _white(info, i, c, run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)]))
+        waves = _whitened(info, i, c, run.inputs[:, 0] * np.array([np.cos(phase), np.sin(phase)]))
         (products,) = _products(info, i, c, [], waves, (0, len(phase)))
         own, score = products[:2, :2], products[:2, 2]
         if np.linalg.eigvalsh(own)[0] > 1e-6:

@@ -114,6 +114,11 @@ def quantity(parameter: str, value: float) -> str:
     return f"{number}\N{NO-BREAK SPACE}{written}".rstrip("\N{NO-BREAK SPACE}")
 
 
+def listed(words: Sequence[str], last: str = "and") -> str:
+    """Return words as a sentence lists them."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
 def described_as(basis: Basis) -> str:
     """Return the number of the description beside which a value stands, and whether it is assumed.
 

@@ -11,19 +11,17 @@ import numpy as np
 
 from terrain.discrepancy.evidence import (
     Evidence,
-    Nearby,
     Statistics,
     correlation,
     evidence_at,
+    fit_change,
     loss_of,
-    misfit_of,
     move_point,
-    nearby,
     partial_information,
-    recentre,
+    whiten_run,
 )
-from terrain.discrepancy.residuals import LowPass
-from terrain.discrepancy.selection import WaldTest, fit_change, wald_test
+from terrain.discrepancy.residuals import LowPass, rows_of
+from terrain.discrepancy.selection import WaldTest, wald_test
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import BOUNDS, INDEX, Effect
@@ -46,8 +44,25 @@ RIVAL_REFITS = 3
 """Most relinearisations of a rival."""
 
 
+class Nearby(NamedTuple):
+    """Quadratic form of a few parameters at another point, by the noise and scatter of an evidence.
+
+    Parameters
+    ----------
+    vector : the point
+    a, g, c : (k, k), (k,) and the constant, all runs together
+    white_residual : of each run (rows, channels)
+    """
+
+    vector: Array
+    a: Array
+    g: Array
+    c: float
+    white_residual: tuple[Array, ...]
+
+
 class Problem(NamedTuple):
-    """Runs, the simulation, and the low-pass of all.
+    """Runs, the simulation, the low-pass of all, and the effects that may be named.
 
     Parameters
     ----------
@@ -65,11 +80,6 @@ class Problem(NamedTuple):
         """Standard deviation from run to run that is assumed, by parameter."""
         return {**self.simulation.scatter, **self.varying}
 
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Of the library."""
-        return tuple(p.name for effect in self.library for p in effect.parameters)
-
     def at(
         self,
         vector: Array,
@@ -77,15 +87,45 @@ class Problem(NamedTuple):
         statistics: Statistics | None = None,
         own: Mapping[str, Array] | None = None,
     ) -> Evidence:
-        """Return the information of the runs around a point; see :func:`evidence_at`."""
-        desired = self.parameters if names is None else names
-        return evidence_at(
-            self.signals, self.simulation, vector, desired, self.low_pass, statistics, own, self.scatter
-        )
+        """Return the evidence of the runs around a point, on the library by default; see :func:`evidence_at`."""
+        names = names_of(self.library) if names is None else names
+        about = self.low_pass, statistics, own, self.scatter
+        return evidence_at(self.signals, self.simulation, vector, names, *about)
 
     def near(self, info: Evidence, vector: Array, names: Sequence[str]) -> Nearby:
-        """Return the information on a few parameters at another point, with the noise of an information."""
-        return nearby(info, self.signals, self.simulation, vector, names, self.low_pass)
+        """Return the form of a few parameters at another point; much faster than the evidence there."""
+        k, white = len(names), []
+        total = np.zeros((k + 1, k + 1))
+        planar = {run.terrain: self.simulation.planar_on(run.terrain) for run in self.signals}
+        for run, around, inner in zip(self.signals, info.white, info.marginal[2], strict=True):
+            rows = rows_of(run, planar[run.terrain], vector, names, self.low_pass)
+            columns = whiten_run(info.noise, rows)
+            flat = columns.reshape(k + 1, -1)
+            along = around[info.nuisances].reshape(len(info.nuisances), flat.shape[1]) @ flat.T
+            total += flat @ flat.T - along.T @ inner @ along
+            white.append(columns[-1])
+        return Nearby(vector, total[:k, :k], total[:k, k], float(total[k, k]), tuple(white))
+
+
+def misfit_of(info: Evidence, white_residual: Sequence[Array]) -> float:
+    """Return by how much the whole library could still reduce residuals (rows, channels) at another point.
+
+    Parameters
+    ----------
+    info : whose sensitivities and noise are the measure
+    white_residual : of each run, whitened by the noise of ``info``
+
+    Notes
+    -----
+    Up to a constant it is minus twice the log-likelihood there, as far as the problem is linear.  The sum of
+    squares itself will not do: the noise of the wheels is in the prediction, and a cause that makes it larger
+    or smaller, as a mass does, would be judged by it.
+    """
+    score = np.zeros(len(info.names))
+    for residual, white, shift in zip(white_residual, info.white, info.marginal[1], strict=True):
+        flat = white[:-1].reshape(len(score), -1) @ residual.ravel()
+        score += flat - shift[:, :-1].T @ flat[info.nuisances]
+    return float(score @ np.linalg.solve(info.freed, score))
 
 
 class Refit(NamedTuple):
@@ -93,8 +133,7 @@ class Refit(NamedTuple):
 
     Parameters
     ----------
-    loss : how badly it fits, as minus twice a log-likelihood; see
-        :func:`~terrain.discrepancy.evidence.misfit_of`
+    loss : how badly it fits, as minus twice a log-likelihood; see :func:`misfit_of`
     square : whitened square that it leaves
     change, std : (k,) of its parameters
     """
@@ -120,7 +159,7 @@ def names_of(effects: Sequence[Effect]) -> tuple[str, ...]:
 def steps_of(
     problem: Problem, info: Evidence, base: Array, names: Sequence[str], n_most: int
 ) -> Iterator[Nearby]:
-    """Yield the information at the points of a nonlinear fit of parameters, until it converges.
+    """Yield the forms at the points of a nonlinear fit of parameters, until it converges.
 
     A step that raises the whitened square is halved, and given up after :data:`MAX_HALVINGS`.
     """
@@ -144,28 +183,19 @@ def steps_of(
 
 
 def relinearize(problem: Problem, info: Evidence, base: Array, causes: Sequence[Effect]) -> Evidence:
-    """Fit, and return the information around the fitted point."""
+    """Fit, and return the evidence around the fitted point."""
     point = info.origin if causes else base
     for near in steps_of(problem, info, base, names_of(causes), MAX_REFITS):
         point = near.vector
-    return recentre(problem.at(point), base)
-
-
-def penalised_loss(info: Evidence, causes: Sequence[Effect]) -> float:
-    """Return minus twice the log-likelihood of causes, with what each of their parameters has to gain."""
-    names = names_of(causes)
-    return loss_of(info, names) + PARAMETER_LOSS * len(names)
+    return replace(problem.at(point), vector=base)
 
 
 def fit_again(problem: Problem, info: Evidence, base: Array, names: Sequence[str]) -> Refit:
     """Return the best point of a nonlinear fit of parameters."""
-    best: tuple[float, Nearby] | None = None
-    for near in steps_of(problem, info, base, names, RIVAL_REFITS):
-        misfit = misfit_of(info, near.white_residual)
-        if best is None or misfit < best[0]:
-            best = misfit, near
-    assert best is not None
-    misfit, near = best
+    points = steps_of(problem, info, base, names, RIVAL_REFITS)
+    misfit, near = min(
+        ((misfit_of(info, near.white_residual), near) for near in points), key=lambda pair: pair[0]
+    )
     at = [INDEX[name] for name in names]
     std = np.sqrt(np.maximum(np.diag(np.linalg.pinv(near.a, hermitian=True)), 0.0))
     return Refit(misfit + PARAMETER_LOSS * len(names), near.c, near.vector[at] - base[at], std)
@@ -226,48 +256,35 @@ def rivals_of(
     for cause in causes:
         others = [other for other in causes if other is not cause]
         inflation = wald_test(runs_alone, names_of(others), cause).inflation
-        found = []
-        for effect in _near(problem, info, cause, others, inflation):
+        as_good = []
+        for effect, alike in _near(problem, info, cause, others, inflation):
             own = own or [fit_again(problem, judge, base, names_of(causes)) for judge in judges]
             swapped = names_of([*others, effect])
             here, there = (fit_again(problem, judge, base, swapped) for judge in judges)
             behind = min(here.loss - own[0].loss, there.loss - own[1].loss) / inflation
             worse = here.square > (1.0 + RIVAL_RISE) * own[0].square + RIVAL_LOSS * inflation
-            if not worse and behind < _allowed(info, others, cause, effect):
+            if not worse and behind < (TWIN_LOSS if alike > TWIN else RIVAL_LOSS):
                 at = [swapped.index(p.name) for p in effect.parameters]
-                found.append(Rival(effect, behind, here.change[at], here.std[at]))
-        rivals[cause.name] = tuple(sorted(found, key=lambda rival: rival.behind))
+                as_good.append(Rival(effect, behind, here.change[at], here.std[at]))
+        rivals[cause.name] = tuple(sorted(as_good, key=lambda rival: rival.behind))
     return rivals
 
 
 def _near(
     problem: Problem, info: Evidence, cause: Effect, others: Sequence[Effect], inflation: float
-) -> list[Effect]:
-    """Return the effects that come near a cause beside the others, by linear fits."""
-    causes = [*others, cause]
-    now = loss_of(info, names_of(causes))
-    gain = loss_of(info, names_of(others)) - now
+) -> Iterator[tuple[Effect, float]]:
+    """Yield the effects that come near a cause beside the others by linear fits, and how alike the two are."""
+    now, beside = loss_of(info, names_of([*others, cause])), names_of(others)
+    gain = loss_of(info, beside) - now
     most = min(RIVAL_LINEAR * inflation, RIVAL_LOSS * inflation + RIVAL_RATIO * gain)
-    return [
-        effect
-        for effect in problem.library
-        if effect not in causes
-        and loss_of(info, names_of([*others, effect])) - now < most
-        and _alike(info, others, cause, effect) > SHARED
-        and wald_test(info, names_of(others), effect).inside
-    ]
-
-
-def _allowed(info: Evidence, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
-    """Return by how much a rival may fit worse than a cause and still be a rival."""
-    return TWIN_LOSS if _alike(info, others, cause, rival) > TWIN else RIVAL_LOSS
-
-
-def _alike(info: Evidence, others: Sequence[Effect], cause: Effect, rival: Effect) -> float:
-    """Return the correlation of what a cause and another effect change beside the others."""
-    base, own, its = (info.places(names_of(effects)) for effects in (others, [cause], [rival]))
-    free = partial_information(info.a.sum(axis=0), base, [*own, *its])[1]
-    return correlation(free, range(len(own)), range(len(own), len(own) + len(its)))
+    for effect in problem.library:
+        if effect is cause or effect in others or loss_of(info, names_of([*others, effect])) - now >= most:
+            continue
+        base, own, its = (info.places(names) for names in (beside, names_of([cause]), names_of([effect])))
+        free = partial_information(info.a.sum(axis=0), base, [*own, *its])[1]
+        alike = correlation(free, range(len(own)), range(len(own), len(free)))
+        if alike > SHARED and wald_test(info, beside, effect).inside:
+            yield effect, alike
 
 
 # -- The search: greedy addition, refit, drop and swap ---------------------------------------------------------
@@ -290,17 +307,17 @@ ALIKE = 0.99
 """Two effects whose sensitivities correlate more are not taken for a pair."""
 
 
-class Found(NamedTuple):
-    """Where the search ended.
+class CauseFit(NamedTuple):
+    """Causes fitted to the runs together.
 
     Parameters
     ----------
     causes : effects selected, in the order in which they came
     info : of the runs there, changes counted from the simulation that was given
-    change : (k,) of the parameters ``names``, and its covariance
-    rivals : by cause, the effects that fit as well in its place, once :func:`with_rivals` has looked
-    tried : last evidence of every effect
+    names, change, cov : parameters (k,), their change and its covariance
+    tests : evidence of every effect of the library beside them
     assumed_scatter : from run to run, by parameter, that is no news
+    rivals : by cause, the effects that fit as well in its place, once they have been looked for
     """
 
     causes: tuple[Effect, ...]
@@ -308,12 +325,12 @@ class Found(NamedTuple):
     names: tuple[str, ...]
     change: Array
     cov: Array
-    rivals: dict[str, tuple[Rival, ...]]
-    tried: dict[str, WaldTest]
+    tests: dict[str, WaldTest]
     assumed_scatter: Mapping[str, float]
+    rivals: Mapping[str, tuple[Rival, ...]] = MappingProxyType({})
 
 
-def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None = None) -> Found:
+def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None = None) -> CauseFit:
     """Return the causes that explain the runs.
 
     Parameters
@@ -323,17 +340,34 @@ def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None 
     seeds : parameters whose values are so large that sensitivities without them would mislead, as lags of
         sensors: other causes are first searched with them built in, then all are fitted together
     """
-    base = start.vector
+    base, info = start.vector, start
     causes: list[Effect] = []
-    info = start
     if seeds:
         there = move_point(base, tuple(seeds), np.array(list(seeds.values())))
         first, info = _add_causes(problem, problem.at(there), there, [])
-        seeded = [each for each in problem.library if set(names_of([each])) & set(seeds)]
+        seeded = [effect for effect in problem.library if set(names_of([effect])) & set(seeds)]
         causes = [*seeded, *(cause for cause in first if cause not in seeded)]
-        causes, info = _refit_significant(problem, recentre(info, base), base, causes)
+        causes, info = _refit_significant(problem, replace(info, vector=base), base, causes)
     causes, info = _add_causes(problem, info, base, causes)
-    return _found(problem, info, causes)
+    return cause_fit(problem, info, causes)
+
+
+def refit(problem: Problem, start: Evidence, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
+    """Return some causes, fitted without others; those that are no longer significant are dropped."""
+    significant, info = _refit_significant(problem, info, start.vector, list(causes))
+    return cause_fit(problem, info, significant)
+
+
+def cause_fit(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> CauseFit:
+    """Return the values of causes by the evidence at their fit, and the evidence of every effect beside them."""
+    names = names_of(causes)
+    tests = {
+        effect.name: wald_test(info, [n for n in names if n not in names_of([effect])], effect)
+        for effect in problem.library
+    }
+    return CauseFit(
+        tuple(causes), info, names, *fit_change(info, names), tests, problem.simulation.known_scatter
+    )
 
 
 def _add_causes(
@@ -351,7 +385,7 @@ def _add_causes(
         return fits[key]
 
     for _ in range(MAX_STEPS):
-        left = [each for each in problem.library if each not in causes and each.name not in barred]
+        left = [effect for effect in problem.library if effect not in causes and effect.name not in barred]
         new = _next(info, base, causes, left, fit)
         if not new or len(causes) + len(new) > MAX_CAUSES:
             break
@@ -366,31 +400,6 @@ def _add_causes(
     return causes, info
 
 
-def refit(problem: Problem, start: Evidence, found: Found, causes: Sequence[Effect]) -> Found:
-    """Return some of the causes that were found, fitted without the others; no other is searched.
-
-    Those that are no longer significant are dropped.
-    """
-    significant, info = _refit_significant(problem, found.info, start.vector, list(causes))
-    return _found(problem, info, significant)
-
-
-def _found(problem: Problem, info: Evidence, causes: Sequence[Effect]) -> Found:
-    """Return what there is to say about causes at their fit, rivals left out."""
-    names = names_of(causes)
-    change, cov = fit_change(info, names)
-    tried = {
-        effect.name: wald_test(info, [n for n in names if n not in names_of([effect])], effect)
-        for effect in problem.library
-    }
-    return Found(tuple(causes), info, names, change, cov, {}, tried, problem.simulation.known_scatter)
-
-
-def with_rivals(problem: Problem, start: Evidence, found: Found) -> Found:
-    """Return the same with the effects that fit as well in the place of a cause."""
-    return found._replace(rivals=rivals_of(problem, found.info, start, found.causes))
-
-
 def _next(
     info: Evidence,
     base: Array,
@@ -402,34 +411,32 @@ def _next(
 
     Where much is wrong the linear gain is inaccurate: then the best few are compared by nonlinear fits.
     """
-    found = [(wald_test(info, names_of(causes), effect), effect) for effect in left]
+    names = names_of(causes)
+
+    def inside_by_fit(effect: Effect, test: WaldTest) -> bool:
+        # a robot that turns twice as fast as it should has half the track, which straight lines take for none
+        if test.inside or not test._replace(inside=True).significant or test.gain.sum() < MUCH_GAIN:
+            return False
+        every = names_of([*causes, effect])
+        values = base[[INDEX[name] for name in every]] + fit(effect).change
+        return all(
+            BOUNDS[name][0] < value < BOUNDS[name][1] for name, value in zip(every, values, strict=True)
+        )
+
+    tests = [(effect, wald_test(info, names, effect)) for effect in left]
     candidates = [
-        (float(each.gain.sum()), effect)
-        for each, effect in found
-        if each.significant or _is_inside_by_fit(base, causes, effect, each, fit)
+        (float(test.gain.sum()), effect)
+        for effect, test in tests
+        if test.significant or inside_by_fit(effect, test)
     ]
     if not candidates:
-        return _pair(info, causes, left)
+        return _pair(info, names, left)
     candidates.sort(key=lambda pair: -pair[0])
     best = candidates[0][0]
     close = [effect for gain, effect in candidates[:MAX_FITTED] if gain > CLOSE_GAIN * best]
     if best < MUCH_GAIN or len(close) == 1:
         return [candidates[0][1]]
     return [min(close, key=lambda effect: fit(effect).loss)]
-
-
-def _is_inside_by_fit(
-    base: Array, causes: Sequence[Effect], effect: Effect, found: WaldTest, fit: Callable[[Effect], Refit]
-) -> bool:
-    """Return whether an effect that gains much is within its bounds by a nonlinear fit alone.
-
-    A robot that turns twice as fast as it should has half the track, which straight lines take for none.
-    """
-    if found.inside or not found._replace(inside=True).significant or found.gain.sum() < MUCH_GAIN:
-        return False
-    names = names_of([*causes, effect])
-    values = base[[INDEX[name] for name in names]] + fit(effect).change
-    return all(BOUNDS[name][0] < value < BOUNDS[name][1] for name, value in zip(names, values, strict=True))
 
 
 def _refit_significant(
@@ -472,13 +479,13 @@ def _swap_for_better(
     return causes, info
 
 
-def _pair(info: Evidence, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect]:
+def _pair(info: Evidence, names: Sequence[str], library: Sequence[Effect]) -> list[Effect]:
     """Return two effects that are significant beside each other and the causes, where neither is alone.
 
     Two of opposite sign, as an offset and a rate of a clock, hide each other.
     """
     left = [effect for effect in library if len(effect.parameters) == 1]
-    base, own = info.places(names_of(causes)), info.places(names_of(left))
+    base, own = info.places(names), info.places(names_of(left))
     a, g = info.a.sum(axis=0), info.g.sum(axis=0)
     follow, a_free = partial_information(a, base, own)
     g_free = g[own] - g[base] @ follow
@@ -493,10 +500,8 @@ def _pair(info: Evidence, causes: Sequence[Effect], library: Sequence[Effect]) -
         if both[i, j] < Z_PAIR:
             break
         pair = [left[int(i)], left[int(j)]]
-        found = [
-            wald_test(info, (*names_of(causes), *names_of([other])), one) for one, other in (pair, pair[::-1])
-        ]
-        if all(one.significant and one.z > Z_PAIR for one in found):
+        tests = [wald_test(info, (*names, *names_of([other])), one) for one, other in (pair, pair[::-1])]
+        if all(test.significant and test.z > Z_PAIR for test in tests):
             return pair
     return []
 
@@ -505,27 +510,29 @@ def _weakest(info: Evidence, causes: Sequence[Effect]) -> int | None:
     """Return the least significant cause, None if all are significant beside the others."""
     z = []
     for cause in causes:
-        others = names_of([other for other in causes if other is not cause])
-        found = wald_test(info, others, cause)
-        z.append(np.inf if found.significant else found.z)
+        test = wald_test(info, names_of([other for other in causes if other is not cause]), cause)
+        z.append(np.inf if test.significant else test.z)
     weakest = int(np.argmin(z))
     return weakest if np.isfinite(z[weakest]) else None
 
 
 def _better(info: Evidence, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect] | None:
     """Return the causes with one replaced by an effect that fits better, if there is one."""
-    now = penalised_loss(info, causes)
-    best: tuple[float, list[Effect]] = (now - RIVAL_LOSS, [])
+
+    def penalised_loss(effects: Sequence[Effect]) -> float:
+        names = names_of(effects)
+        return loss_of(info, names) + PARAMETER_LOSS * len(names)
+
+    least, best = penalised_loss(causes) - RIVAL_LOSS, None
     for i, cause in enumerate(causes):
-        others = [other for other in causes if other is not cause]
+        others = names_of([other for other in causes if other is not cause])
         for effect in library:
-            if effect in causes or not wald_test(info, names_of(others), effect).significant:
+            if effect in causes or not wald_test(info, others, effect).significant:
                 continue
             swapped = [*causes[:i], effect, *causes[i + 1 :]]
-            loss = penalised_loss(info, swapped)
-            if loss < best[0]:
-                best = loss, swapped
-    return best[1] or None
+            if (loss := penalised_loss(swapped)) < least:
+                least, best = loss, swapped
+    return best
 
 
 # -- Values of named causes that one simulation has for all runs -------------------------------------------
@@ -543,27 +550,25 @@ N_STEPS = 4
 """Gauss-Newton steps from the mean over runs: more than linear problems need, and these are nearly so."""
 
 
-def pooled(problem: Problem, found: Found) -> Found:
-    """Return what was found with the values that leave the least square over all runs."""
-    scatter = dict(found.info.statistics.scatter)
+def pooled(problem: Problem, fit: CauseFit) -> CauseFit:
+    """Return the causes with the values that leave the least square over all runs."""
     assumed = problem.simulation.scatter
-    scatter = {name: std for name, std in scatter.items() if name in assumed}
-    own = [n for n in found.names if n in scatter and scatter[n] > SCATTERS_RATIO * assumed[n]]
+    scatter = {name: std for name, std in fit.info.statistics.scatter.items() if name in assumed}
+    own = [n for n in fit.names if n in scatter and scatter[n] > SCATTERS_RATIO * assumed[n]]
     if not own and not problem.varying:
-        return found
+        return fit
     problem = problem._replace(varying={})
-    statistics = Statistics(found.info.noise, scatter | {name: assumed[name] for name in own})
+    statistics = Statistics(fit.info.noise, scatter | {name: assumed[name] for name in own})
     base = problem.simulation.vector
-    point, change = found.info.origin, found.change
+    point, change = fit.info.origin, fit.change
     for _ in range(N_STEPS):
-        info = recentre(problem.at(point, found.names, statistics), base)
-        change = fit_change(info, found.names)[0]
+        info = replace(problem.at(point, fit.names, statistics), vector=base)
+        change = fit_change(info, fit.names)[0]
         point = base.copy()
-        for name, value in zip(found.names, change, strict=True):
-            point[INDEX[name]] += value
-    at, mine = info.places(found.names), [found.names.index(name) for name in own]
-    a = info.a[:, at][:, :, at]
+        point[[INDEX[name] for name in fit.names]] += change
+    a, _ = info.clusters(info.places(fit.names))
+    mine = [fit.names.index(name) for name in own]
     more = np.diag([scatter[name] ** 2 - assumed[name] ** 2 for name in own])
     b = a.sum(axis=0) + np.einsum("nip,pq,njq->ij", a[:, :, mine], more, a[:, :, mine])
     inverse = np.linalg.pinv(a.sum(axis=0), hermitian=True)
-    return found._replace(change=change, cov=inverse @ b @ inverse)
+    return fit._replace(change=change, cov=inverse @ b @ inverse)

@@ -35,7 +35,6 @@ class WaldTest(NamedTuple):
 
     Parameters
     ----------
-    name : of the effect
     change : (p,) of its parameters, fitted together with the selected ones
     z : evidence as a standard normal number of the same improbability: the fit over its noise, whose variance
         is weighed from whitening and from the scatter between clusters, as a t statistic
@@ -44,7 +43,6 @@ class WaldTest(NamedTuple):
     inside : whether the fitted values lie within their bounds
     """
 
-    name: str
     change: Array
     z: float
     dispersion: float
@@ -62,24 +60,14 @@ class WaldTest(NamedTuple):
         return max(self.dispersion, 1.0)
 
 
-def fit_change(info: Evidence, names: Sequence[str]) -> tuple[Array, Array]:
-    """Return the change (k,) of parameters that fits all runs best, and its covariance by the noise."""
-    at = info.places(names)
-    a = info.a[:, at][:, :, at].sum(axis=0)
-    cov = np.linalg.pinv(a, hermitian=True)
-    return cov @ info.g[:, at].sum(axis=0), cov
-
-
 def wald_test(info: Evidence, selected: Sequence[str], effect: Effect) -> WaldTest:
     """Return the evidence of an effect beside the parameters selected."""
     own = [p.name for p in effect.parameters]
-    base, new = info.places([name for name in selected if name not in own]), info.places(own)
-    both = base + new
-    a, g = info.a[:, both][:, :, both], info.g[:, both]
-    total, score = a.sum(axis=0), g.sum(axis=0)
-    n = len(base)
+    base = info.places([name for name in selected if name not in own])
+    both, n = base + info.places(own), len(base)
+    total, score = info.total([*(info.names[i] for i in base), *own])
     if not np.diag(total)[n:].min() > 1e-12:
-        return WaldTest(effect.name, np.zeros(len(own)), 0.0, 0.0, np.zeros(len(a)), False)
+        return WaldTest(np.zeros(len(own)), 0.0, 0.0, np.zeros(len(info.a)), False)
     # direction in which the new ones change while the selected ones follow
     follow, free = partial_information(total, range(n), range(n, len(both)))
     own_score = score[n:] - follow.T @ score[:n]
@@ -87,13 +75,13 @@ def wald_test(info: Evidence, selected: Sequence[str], effect: Effect) -> WaldTe
         free = free + 1e-9 * np.diag(np.diag(total)[n:])
     change = np.linalg.solve(free, own_score)
     statistic = float(own_score @ change)
-    now = np.array([info.vector[INDEX[name]] for name in own]) + change
     inside = all(
-        BOUNDS[name][0] - 1e-9 <= value <= BOUNDS[name][1] for name, value in zip(own, now, strict=True)
+        BOUNDS[name][0] - 1e-9 <= info.vector[INDEX[name]] + value <= BOUNDS[name][1]
+        for name, value in zip(own, change, strict=True)
     )
     dispersion, dof = _dispersion(info, both, n, follow, free, change)
     z = z_of_t(math.sqrt(_one_degree(statistic, len(own))) / math.sqrt(dispersion), dof)
-    return WaldTest(effect.name, change, z, dispersion, held_out_gain(info, base, both), inside)
+    return WaldTest(change, z, dispersion, held_out_gain(info, base, both), inside)
 
 
 def _one_degree(statistic: float, degrees: int) -> float:
@@ -179,21 +167,17 @@ def z_of(log_p: float) -> float:
 
 
 def held_out_gain(info: Evidence, base: list[int], both: list[int]) -> Array:
-    """Return the fall (runs,) of each run's loss when it is left out, of ``both`` over ``base``."""
-    return _held_out_loss(info, base) - _held_out_loss(info, both)
-
-
-def _held_out_loss(info: Evidence, at: list[int]) -> Array:
-    x = fits_without_each(info, at)
-    loss: Array = np.einsum("ki,kij,kj->k", x, info.a[:, at][:, :, at], x) - 2 * (x * info.g[:, at]).sum(
-        axis=1
-    )
-    return loss
+    """Return the fall (runs,) of each run's loss when it is left out of the fit, of ``both`` over ``base``."""
+    losses = []
+    for at in (base, both):
+        x, (a, g) = fits_without_each(info, at), info.clusters(at)
+        losses.append(np.einsum("ki,kij,kj->k", x, a, x) - 2 * (x * g).sum(axis=1))
+    return np.asarray(losses[0] - losses[1])
 
 
 def fits_without_each(info: Evidence, at: Sequence[int]) -> Array:
     """Return the change (runs, k) of parameters that fits all runs but each of them."""
-    a, g = info.clusters(at, by_run=True)
+    a, g = info.clusters(at)
     # in standard deviations of each parameter; one without information in the other runs keeps its value
     unit = np.sqrt(np.maximum(np.einsum("kii->i", a), 1e-30))
     rest = (a.sum(axis=0) - a) / np.outer(unit, unit) + 1e-9 * np.eye(len(at))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.evidence import Evidence, evidence_at
+from terrain.discrepancy.evidence import evidence_at
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.signals import Signals, signals_of
@@ -21,6 +21,13 @@ from terrain.robots import Robot
 from terrain.simulation.planar.model import Ground, planar_ground
 from terrain.simulation.planar.noise import load_model_error, load_scatter
 from terrain.terramechanics.soil import extra_soil_names, load_soil, soil_names
+
+RATIOS = (0.0, 0.5, 1.0)
+"""Effective ratios that are tried; the best lies on the parabola through their losses."""
+
+TILT_LOSS = 20.0
+"""All of the tilt counts as a slope, unless a smaller part fits better by that in minus twice the
+log-likelihood."""
 
 
 class TerrainMatch(NamedTuple):
@@ -55,26 +62,25 @@ def simulation_for(
     terrain.
     """
     labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
-    grounds = {label: ground for label in labels if (ground := _ground(robot, label)) is not None}
+    known = {*soil_names(), *extra_soil_names()}
+    grounds = {
+        label: planar_ground(robot, load_soil(label))
+        for label in labels
+        if label in known and drivable(robot, label)
+    }
     simulation = Simulation(robot, Ground(), robot.effects, load_scatter()._asdict(), grounds)
     if grounds:
-        simulation = with_model_error(simulation)
         signals = [signals_of(run, robot) for run in runs]
-        simulation = with_effective_tilt(simulation, signals, library)
-    matches = []
-    for label in labels:
-        ground = simulation.grounds.get(label)
-        known = ground is not None
-        matches.append(
-            TerrainMatch(label, label if known else None, ground.effective_ratio if ground else None)
-        )
-    return simulation, tuple(matches)
+        simulation = with_effective_tilt(with_model_error(simulation), signals, library)
+    ratios = {label: ground.effective_ratio for label, ground in simulation.grounds.items()}
+    return simulation, tuple(
+        TerrainMatch(label, label if label in ratios else None, ratios.get(label)) for label in labels
+    )
 
 
 def with_model_error(simulation: Simulation) -> Simulation:
     """Return the simulation with its own error on the soils of the package."""
-    parameters = set(parameters_of(simulation.robot.drive))
-    error = load_model_error()
+    parameters, error = set(parameters_of(simulation.robot.drive)), load_model_error()
     common, varied, scatter = (
         {name: size for name, size in sizes.items() if name in parameters}
         for sizes in (error.common, error.varied, error.scatter)
@@ -86,12 +92,6 @@ def with_model_error(simulation: Simulation) -> Simulation:
         varied_scatter=scatter,
         probe_error=error.probes,
     )
-
-
-def _ground(robot: Robot, label: str) -> Ground | None:
-    """Return the soil of a label for the planar simulation; None where there is none that can be driven."""
-    known = label in (*soil_names(), *extra_soil_names())
-    return planar_ground(robot, load_soil(label)) if known and drivable(robot, label) else None
 
 
 def drivable(robot: Robot, soil: str) -> bool:
@@ -113,9 +113,7 @@ def runs_of_terrain(runs: Sequence[RunLog], terrain: str | None) -> list[RunLog]
     """
     if not runs:
         raise DataError("there is no run to explain")
-    if terrain is None:
-        return list(runs)
-    chosen = [run for run in runs if run.terrains == (terrain,)]
+    chosen = [run for run in runs if terrain is None or run.terrains == (terrain,)]
     if not chosen:
         labels = sorted({name for run in runs for name in run.terrains})
         raise DataError(
@@ -140,23 +138,13 @@ def check_robots(runs: Sequence[RunLog], robot: Robot) -> None:
         )
 
 
-# -- Which part of the measured tilt is a slope, and which part a body that rides over bumps ---------------
-# A tilt that is no slope takes no traction; simulated as a slope it biases mass, resistance and slip.  The part
-# that acts as a slope is estimated for each terrain: the runs fit best with it, all parameters of the library
-# freed.
-
-RATIOS = (0.0, 0.5, 1.0)
-"""Effective ratios that are tried; the best lies on the parabola through their losses."""
-
-TILT_LOSS = 20.0
-"""All of the tilt counts as a slope, unless a smaller part fits better by that in minus twice the
-log-likelihood."""
-
-
 def with_effective_tilt(
     simulation: Simulation, signals: Sequence[Signals], library: Sequence[Effect]
 ) -> Simulation:
-    """Return the simulation with the effective ratio of the tilt on each labelled terrain.
+    """Return the simulation with the part of the measured tilt that acts as a slope on each labelled terrain.
+
+    A tilt that is no slope, of a body that rides over bumps, takes no traction; simulated as a slope it biases
+    mass, resistance and slip.  The runs fit best with the part that acts, all parameters of the library freed.
 
     Parameters
     ----------
@@ -164,26 +152,24 @@ def with_effective_tilt(
     signals : of runs
     library : effects that are freed meanwhile
     """
-    grounds = dict(simulation.grounds)
+    grounds, names = dict(simulation.grounds), names_of(library)
     for terrain, ground in simulation.grounds.items():
         runs = [run for run in signals if run.terrain == terrain]
+        losses = np.zeros(len(RATIOS))
+        for k, ratio in enumerate(RATIOS if runs else ()):
+            tried = replace(simulation, grounds={terrain: ground._replace(effective_ratio=ratio)})
+            info = evidence_at(runs, tried, simulation.vector, names, low_pass_of(runs))
+            # minus twice the log-likelihood of what the whole library leaves, up to a constant
+            scale = -np.log(np.abs(info.noise.filters[:, 0]))
+            for run in info.rows:
+                size = np.log(info.noise.size(run.pace_mps)) + scale
+                losses[k] += 2.0 * float(size[np.isfinite(run.residual) & np.isfinite(size)].sum())
         if runs:
+            ratio, least = best_ratio(losses)
             grounds[terrain] = ground._replace(
-                effective_ratio=_best_effective_ratio(simulation, runs, ground, library)
+                effective_ratio=ratio if losses[-1] - least > TILT_LOSS else 1.0
             )
     return replace(simulation, grounds=grounds)
-
-
-def _best_effective_ratio(
-    simulation: Simulation, runs: Sequence[Signals], ground: Ground, library: Sequence[Effect]
-) -> float:
-    names, low_pass = names_of(library), low_pass_of(runs)
-    losses = []
-    for ratio in RATIOS:
-        tried = replace(simulation, grounds={runs[0].terrain: ground._replace(effective_ratio=ratio)})
-        losses.append(_loss(evidence_at(runs, tried, simulation.vector, names, low_pass)))
-    ratio, least = best_ratio(np.array(losses))
-    return ratio if losses[-1] - least > TILT_LOSS else 1.0
 
 
 def best_ratio(losses: Array) -> tuple[float, float]:
@@ -197,13 +183,3 @@ def best_ratio(losses: Array) -> tuple[float, float]:
     a, b, c = np.polyfit(RATIOS, losses, 2)
     bottom = min(max(-b / (2.0 * a), 0.0), 1.0) if a > 0.0 else float(RATIOS[int(np.argmin(losses))])
     return round(float(bottom), 3), float(a * bottom**2 + b * bottom + c)
-
-
-def _loss(info: Evidence) -> float:
-    """Return minus twice the log-likelihood of what the whole library leaves, up to a constant."""
-    scale = -np.log(np.abs(info.noise.filters[:, 0]))
-    total = 0.0
-    for run in info.rows:
-        each = np.log(info.noise.size(run.pace_mps)) + scale
-        total += 2.0 * float(each[np.isfinite(run.residual) & np.isfinite(each)].sum())
-    return total

@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
 from terrain.discrepancy.clocks import MAX_LAG_S, MIN_LAG_S, Latencies, Shift, offsets_of, shifts_of
-from terrain.discrepancy.evidence import PRIOR_STD, Evidence
+from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.faults import LEAST, MOTION, G, H, Response, X, Y, gains_of, responses_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.verdict import Clock, Excluded
@@ -60,7 +59,6 @@ costs them among themselves, and so many variances of the noise a row.  Of 15 00
 fault, whatever was hidden in all runs of a set, one passed both."""
 
 _SPEEDS = [CHANNELS.index(SPEED_X), CHANNELS.index(SPEED_Y)]
-_CURRENT = CHANNELS.index(CURRENT)
 
 
 def unfit_runs(
@@ -87,20 +85,19 @@ def unfit_runs(
     responses = responses_of(info.rows, latencies, shift)
     has_clock = [bool(np.isfinite(lag_s).any()) for lag_s in shift.lag_s]
     stalled = stalled_runs(responses, has_clock, MAX_LAG_S + MARGIN_S - STRETCH_S)
-    reasons: dict[int, str] = {}
-    for found in (_dead(signals, info, responses), _late(info, shift), stalled, _frozen(signals, info)):
-        reasons = found | reasons
-    for odd in (partial(odd_runs, responses), partial(_unlike, info)):
-        reasons |= odd([i for i in range(len(signals)) if i not in reasons])
+    dead, late, frozen = _dead(signals, info, responses), _late(info, shift), _frozen(signals, info)
+    reasons = frozen | stalled | late | dead  # the first of these counts last
+    reasons |= odd_runs(responses, [i for i in range(len(signals)) if i not in reasons])
+    reasons |= _unlike(info, [i for i in range(len(signals)) if i not in reasons])
     return tuple(Excluded(signals[i].run_id, reasons[i]) for i in sorted(reasons))
 
 
 def clocks_of(info: Evidence, shift: Shift | None = None) -> tuple[Clock, ...]:
     """Return how far IMU and camera are behind the wheels at the middle of each run, NaN where unknown."""
     offset_s, std_s = offsets_of(shifts_of(info) if shift is None else shift)
-    built_in = info.vector[INDEX["clock_offset_s"]]
+    offset_s = offset_s + info.vector[INDEX["clock_offset_s"]]
     return tuple(
-        Clock(run.run_id, float(offset + built_in), float(std))
+        Clock(run.run_id, float(offset), float(std))
         for run, offset, std in zip(info.rows, offset_s, std_s, strict=True)
     )
 
@@ -114,18 +111,19 @@ def _dead(signals: Sequence[Signals], info: Evidence, responses: Sequence[Respon
     for i, run in enumerate(signals):
         dead = (known_ratio[i] > 0) & (known_ratio[i] < MIN_FINITE_RATIO) & (usual > USUAL_FINITE_RATIO)
         if run.steer_rad.any():
-            dead[_CURRENT] = False  # it is compared only while the wheels are parallel
+            dead[CHANNELS.index(CURRENT)] = False  # it is compared only while the wheels are parallel
         for c in np.flatnonzero(dead):
             reasons[i] = f"its {CHANNELS[c]} is known in {known_ratio[i, c]:.0%} of its samples"
         known = np.isfinite(run.wheel_speed_mps).all(axis=1)
         if known.mean() < MIN_FINITE_RATIO:
             reasons[i] = f"its wheel speeds are known in {known.mean():.0%} of its samples"
             continue
-        spread = run.wheel_speed_mps[known].std(axis=0)
+        speed_mps = run.wheel_speed_mps[known]
+        spread = speed_mps.std(axis=0)
         constant = spread.min() < STILL_MPS and spread.max() > VARIES_MPS
         if constant and _disagrees(responses[i], common):
             reasons[i] = f"its wheel {int(np.argmin(spread)) + 1} never turns faster or slower, the others do"
-        elif np.abs(run.wheel_speed_mps[known]).max() < STILL_MPS:
+        elif np.abs(speed_mps).max() < STILL_MPS:
             shown = info.rows[i].measured[:, _SPEEDS]
             if shown.size and np.nanmax(np.hypot(*np.nan_to_num(shown).T)) > MOVING_MPS:
                 reasons[i] = "its wheels are at rest, its camera moves"
@@ -145,6 +143,10 @@ def _disagrees(response: Response, common: Array) -> bool:
 
 def _late(info: Evidence, shift: Shift) -> dict[int, str]:
     """Return runs with a clock of their own: all channels that measure it are off, and by the same lag."""
+
+    def behind(offset_s: float) -> str:
+        return f"{abs(offset_s):.2f} s {'behind' if offset_s >= 0 else 'ahead of'}"
+
     offset_s = offsets_of(shift)[0] + info.vector[INDEX["clock_offset_s"]]
     reasons: dict[int, str] = {}
     for i in range(len(offset_s)):
@@ -162,15 +164,11 @@ def _late(info: Evidence, shift: Shift) -> dict[int, str]:
             error.append(math.hypot(float(shift.std_s[i, c]), scatter_s))
         own = all(abs(a) > max(CLOCK_S, CLOCK_SIGMAS * b) for a, b in zip(off, error, strict=True))
         if off and own and max(off) - min(off) < CLOCK_S + CLOCK_SIGMAS * max(error):
-            own_s, usual_s = float(offset_s[i]), float(np.nanmedian(offset_s[others]))
+            usual = behind(float(np.nanmedian(offset_s[others])))
             reasons[i] = (
-                f"its IMU and camera are {_behind(own_s)} its wheels, {_behind(usual_s)} in the other runs"
+                f"its IMU and camera are {behind(float(offset_s[i]))} its wheels, {usual} in the other runs"
             )
     return reasons
-
-
-def _behind(offset_s: float) -> str:
-    return f"{abs(offset_s):.2f} s {'behind' if offset_s >= 0 else 'ahead of'}"
 
 
 def _frozen(signals: Sequence[Signals], info: Evidence) -> dict[int, str]:
@@ -207,24 +205,16 @@ def _unlike(info: Evidence, among: Sequence[int]) -> dict[int, str]:
     reasons: dict[int, str] = {}
     for terrain in dict.fromkeys(info.rows[i].terrain for i in among):
         left = [i for i in among if info.rows[i].terrain == terrain]
-        most = (len(left) - 1) // MIN_OTHERS
-        while most > 0 and (odd := _least_alike(info, left)) is not None:
-            reasons[odd[0]] = odd[1]
-            left.remove(odd[0])
-            most -= 1
+        for _ in range((len(left) - 1) // MIN_OTHERS):
+            ratio, noise_ratio = common_fit_cost(info, left)
+            worst = int(np.argmax(ratio))
+            if not (ratio[worst] > UNLIKE_RATIO and noise_ratio[worst] > UNLIKE_NOISE_RATIO):
+                break
+            reasons[left.pop(worst)] = (
+                f"it is unlike the other runs: in common with them it fits {ratio[worst]:.0f} times worse than "
+                "they do among themselves"
+            )
     return reasons
-
-
-def _least_alike(info: Evidence, left: Sequence[int]) -> tuple[int, str] | None:
-    """Return the run that is least consistent with the others, and why, if it is an outlier."""
-    ratio, noise_ratio = common_fit_cost(info, left)
-    worst = int(np.argmax(ratio))
-    if ratio[worst] > UNLIKE_RATIO and noise_ratio[worst] > UNLIKE_NOISE_RATIO:
-        return left[worst], (
-            f"it is unlike the other runs: in common with them it fits {ratio[worst]:.0f} times worse than "
-            "they do among themselves"
-        )
-    return None
 
 
 def common_fit_cost(info: Evidence, left: Sequence[int]) -> tuple[Array, Array]:
@@ -232,7 +222,7 @@ def common_fit_cost(info: Evidence, left: Sequence[int]) -> tuple[Array, Array]:
 
     The cost is that in minus twice the log-likelihood, over a fit of each run by itself.
     """
-    prior = np.diag(1.0 / np.array([PRIOR_STD.get(name, 1e-6) for name in info.parameters]) ** 2)
+    prior = info.prior
     a, g, c = info.a[left], info.g[left], info.c[left]
     n = len(left)
     k = int((a.sum(axis=0).diagonal() > UNKNOWN_RATIO * prior.diagonal()).sum())
@@ -242,7 +232,7 @@ def common_fit_cost(info: Evidence, left: Sequence[int]) -> tuple[Array, Array]:
         return np.asarray(-(x * g).sum(axis=-1))
 
     own = loss(a, g)
-    n_rows = np.array([int((info.white_residual[i] != 0.0).sum()) for i in left])
+    n_rows = np.array([int((info.white[i][-1] != 0.0).sum()) for i in left])
     seen = n_rows > 0  # of a short run nothing may be left once filters have settled
     noise = float(np.median((c + own)[seen] / n_rows[seen])) if seen.any() else 1.0
     without = loss(a.sum(axis=0) - a, g.sum(axis=0) - g)
@@ -299,10 +289,17 @@ MAX_ODD_RATIO = 1 / 3
 ODD_CHANNELS = {G: "yaw rate", H: "heading rate", X: "speed"}
 """Channels by which runs are compared: gains of the others depend on what was driven."""
 
+STALLS = {
+    G: "its wheels turn it at {:.2f} rad/s by the other runs, its body turns at {:.2f} rad/s",
+    H: "its wheels turn it at {:.2f} rad/s by the other runs, its heading changes at {:.2f} rad/s",
+    X: "its wheels drive it at {:.2f} m/s by the other runs, its body moves at {:.2f} m/s",
+}
+"""What wheels make of a body in the common response, and what it does."""
+
 
 def common_gains(responses: Sequence[Response]) -> Array:
     """Return the common response (channels,): the median gain of runs that follow; NaN for too few."""
-    gain, correlation = (np.array(each) for each in zip(*(gains_of(run) for run in responses), strict=True))
+    gain, correlation = (np.array(each) for each in zip(*map(gains_of, responses), strict=True))
     common = np.full(gain.shape[1], np.nan)
     for c in range(gain.shape[1]):
         shown = gain[(correlation[:, c] > FOLLOWS) & (gain[:, c] > 0), c]
@@ -324,39 +321,37 @@ def stalled_runs(responses: Sequence[Response], has_clock: Sequence[bool], extra
     if len(responses) < 2:
         return {}
     common = common_gains(responses)
-    pairs = [
-        _stalled_rows(run, common, STRETCH_S + (0.0 if known or _follows(run) else extra_s))
-        for run, known in zip(responses, has_clock, strict=True)
-    ]
-    time_s, asked_s = (
-        np.array([run.period_s * each[k].sum() for run, each in zip(responses, pairs, strict=True)])
-        for k in (0, 1)
-    )
+    known = np.isfinite(common)
+    least_ratio = np.where(known, STALLED_RATIO, NOMINAL_RATIO)
+    stalls, time_s, asked_s = [], [], []
+    for run, clock in zip(responses, has_clock, strict=True):
+        follows = bool((gains_of(run)[1][list(MOTION)] > FOLLOWS).any())
+        expected = run.predicted * np.where(known, common, 1.0)
+        least_s = STRETCH_S + (0.0 if clock or follows else extra_s)
+        stalled, asked = _stalled_rows(run, expected, least_ratio, least_s)
+        stalls.append((expected, stalled))
+        time_s.append(run.period_s * stalled.sum())
+        asked_s.append(run.period_s * asked.sum())
     reasons = {}
     for i, run in enumerate(responses):
         least_s = min(STALLED_S, max(ALL_RATIO * asked_s[i], STRETCH_S))
-        if time_s[i] >= least_s + 3.0 * float(np.median(np.delete(time_s, i))):
-            words = _stall_words(run, common, pairs[i][0])
-            reasons[i] = f"it is stalled for {time_s[i]:.1f} s in all: {words}"
+        if time_s[i] < least_s + 3.0 * float(np.median(np.delete(time_s, i))):
+            continue
+        expected, stalled = stalls[i]
+        words = []
+        for c, text in STALLS.items():
+            should, does = np.abs(expected[stalled, c]), np.abs(run.measured[stalled, c])
+            seen = np.isfinite(does)
+            if seen.any() and should[seen].mean() > LEAST[c]:
+                words.append(text.format(should[seen].mean(), does[seen].mean()))
+        words.append("its wheels turn, its body is at rest")
+        reasons[i] = f"it is stalled for {time_s[i]:.1f} s in all: {words[0]}"
     return reasons
 
 
-def _follows(run: Response) -> bool:
-    return bool((gains_of(run)[1][list(MOTION)] > FOLLOWS).any())
-
-
-def _expected(run: Response, common: Array) -> tuple[Array, Array]:
-    """Return what the common response makes of the wheels (m, channels), and the ratio of it at a stall."""
-    known = np.isfinite(common)
-    expected = run.predicted * np.where(known, common, 1.0)
-    return expected, np.where(known, STALLED_RATIO, NOMINAL_RATIO)
-
-
-def _stalled_rows(run: Response, common: Array, least_s: float) -> tuple[Array, Array]:
+def _stalled_rows(run: Response, expected: Array, least_ratio: Array, least_s: float) -> tuple[Array, Array]:
     """Return where (m,) a body should move and does not, in stretches, and where it should."""
-    expected, ratio = _expected(run, common)
-    n = len(expected)
-    seen = run.measured.copy()
+    n, seen = len(expected), run.measured.copy()
     straight = np.isfinite(seen[:, G]) & (np.abs(expected[:, G]) < STRAIGHT_RADPS)
     if straight.sum() >= MIN_STRAIGHT:
         seen[:, G] -= np.median(seen[straight, G])
@@ -366,31 +361,14 @@ def _stalled_rows(run: Response, common: Array, least_s: float) -> tuple[Array, 
         if c == X:  # the body may slide sideways
             size = np.hypot(size, np.where(np.isfinite(seen[:, Y]), seen[:, Y], 0.0))
         known = np.isfinite(size)
-        still = size < ratio[c] * np.abs(expected[:, c]) + FLOOR[c]
+        still = size < least_ratio[c] * np.abs(expected[:, c]) + FLOOR[c]
         asked |= known & (np.abs(expected[:, c]) > LEAST[c])
         rests |= known & still
         moves |= known & ~still
-    stays = asked & rests & ~moves
     stalled = np.zeros(n, dtype=bool)
-    for start, end in stretches(stays):
+    for start, end in stretches(asked & rests & ~moves):
         stalled[start:end] = (end - start) * run.period_s >= least_s
     return stalled, asked
-
-
-def _stall_words(run: Response, common: Array, stay: Array) -> str:
-    """Return how fast the wheels would move a body in the common response, and how fast it moves."""
-    expected = _expected(run, common)[0]
-    words = []
-    for c, text in (
-        (G, "its wheels turn it at {:.2f} rad/s by the other runs, its body turns at {:.2f} rad/s"),
-        (H, "its wheels turn it at {:.2f} rad/s by the other runs, its heading changes at {:.2f} rad/s"),
-        (X, "its wheels drive it at {:.2f} m/s by the other runs, its body moves at {:.2f} m/s"),
-    ):
-        should, does = np.abs(expected[stay, c]), np.abs(run.measured[stay, c])
-        known = np.isfinite(does)
-        if known.any() and should[known].mean() > LEAST[c]:
-            words.append(text.format(should[known].mean(), does[known].mean()))
-    return words[0] if words else "its wheels turn, its body is at rest"
 
 
 def odd_runs(responses: Sequence[Response], among: Sequence[int]) -> dict[int, str]:
@@ -417,10 +395,8 @@ def _outliers(responses: Sequence[Response], c: int, name: str) -> dict[int, str
         gain, correlation = (each[c] for each in gains_of(run))
         if math.isfinite(gain) and gain > 0 and correlation > FOLLOWS:
             logs[i] = math.log(gain)
-            rows = np.isfinite(run.measured[:, c]).sum()
-            error[i] = math.sqrt(
-                max(1.0 / correlation**2 - 1.0, 0.0) / max(rows * min(run.period_s, 1.0), 1.0)
-            )
+            seconds = np.isfinite(run.measured[:, c]).sum() * min(run.period_s, 1.0)
+            error[i] = math.sqrt(max(1.0 / correlation**2 - 1.0, 0.0) / max(seconds, 1.0))
     known = np.isfinite(logs)
     if known.sum() < MIN_COMPARED:
         return {}

@@ -11,14 +11,14 @@ run's value is that between the thirds of each run, since noise that lasts is in
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from terrain.discrepancy.evidence import PRIOR_STD, Evidence, marginal_parts, recentre
-from terrain.discrepancy.search import RIVAL_LINEAR, RIVAL_LOSS, Found, Problem
+from terrain.discrepancy.evidence import PRIOR_STD, Evidence, marginal_parts
+from terrain.discrepancy.search import RIVAL_LINEAR, RIVAL_LOSS, CauseFit, Problem, cause_fit
 from terrain.discrepancy.selection import TRUST_DOF, z_of_t
 from terrain.discrepancy.verdict import RunGroup, Varying
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
@@ -70,7 +70,7 @@ class _RunValues(NamedTuple):
     z: float
 
 
-class _Tried(NamedTuple):
+class _OwnValues(NamedTuple):
     """An effect of which each run has its own values, by parameter, and how well that fits.
 
     Parameters
@@ -86,55 +86,60 @@ class _Tried(NamedTuple):
     @property
     def clearest(self) -> _RunValues:
         """The parameter that differs most clearly."""
-        return max(self.runs, key=lambda each: each.z)
+        return max(self.runs, key=lambda runs: runs.z)
 
 
-def run_scatter(found: Found, name: str) -> float:
+def run_scatter(fit: CauseFit, name: str) -> float:
     """Return the scatter from run to run of a parameter, noise taken off."""
-    shared = found.change - found.info.away[found.info.places(found.names)]
-    fit = MixedFit(0.0, shared, found.info.nuisance_std)
-    return _values_by_run(found, name, found.names, (), fit).scatter
+    return _at_common_fit(fit, name, fit.info.nuisance_std).scatter
 
 
-def varying_effects(problem: Problem, found: Found) -> tuple[Varying, ...]:
+def varying_effects(problem: Problem, fit: CauseFit) -> tuple[Varying, ...]:
     """Return the effect whose size differs most clearly from run to run; none where runs are alike.
 
     Only one is returned: what one effect varies by looks like a variation of all that resemble it.
     """
-    info = found.info
+    info = fit.info
     if len(info.rows) < 2 * MIN_GROUP:
         return ()
-    clear = {effect.name: _clearness(found, effect) for effect in problem.library}
+    least = _least_std(fit, ())
+    common = {
+        effect.name: [_at_common_fit(fit, p.name, least) for p in effect.parameters]
+        for effect in problem.library
+    }
+    clear = {name: max(runs.z for runs in values) for name, values in common.items()}
     if not max(clear.values()) > Z_VARIES:
         return ()
-    tried = [_tried(found, effect) for effect in problem.library if clear[effect.name] > Z_NEAR]
-    first = min(tried, key=lambda each: each.loss)
+    tried = [
+        _own_values(fit, effect, [runs.scatter for runs in common[effect.name]])
+        for effect in problem.library
+        if clear[effect.name] > Z_NEAR
+    ]
+    first = min(tried, key=lambda own: own.loss)
     behind = max(RIVAL_LINEAR, NEAR_RATIO * first.gain)
-    refitted = [(_refitted(problem, found, each), each) for each in tried if each.loss <= first.loss + behind]
+    refitted = [(_refitted(problem, fit, own), own) for own in tried if own.loss <= first.loss + behind]
     near = [pair for pair in refitted if _is_possible(info, pair[0].clearest)]
     if not near:
         return ()
     best, linear = min(near, key=lambda pair: pair[0].loss)
     # a mass makes more or less of the noise of the wheels, which a nonlinear fit counts: either may say so
-    alike = [
-        each for each, before in near if min(each.loss - best.loss, before.loss - linear.loss) < RIVAL_LOSS
-    ]
-    if not max(each.clearest.z for each in alike) > Z_VARIES:
+    alike = [own for own, before in near if min(own.loss - best.loss, before.loss - linear.loss) < RIVAL_LOSS]
+    if not max(own.clearest.z for own in alike) > Z_VARIES:
         return ()
-    rivals = [each.effect.name for each in alike if each is not best]
     runs = best.clearest
     parameter = best.effect.parameters[best.runs.index(runs)]
+    channel = CHANNELS[int(np.argmax(info.channel_power(np.eye(len(info.names))[info.places([runs.name])])))]
     return (
         Varying(
             best.effect.name,
             parameter.name,
             parameter.unit,
-            tuple(rivals),
+            tuple(own.effect.name for own in alike if own is not best),
             float(np.average(runs.value, weights=runs.weight)),
             runs.scatter,
             runs.z,
             _two_groups(runs, [run.run_id for run in info.rows]),
-            _clearest_channel(info, runs.name),
+            channel,
         ),
     )
 
@@ -148,96 +153,80 @@ def _is_possible(info: Evidence, runs: _RunValues) -> bool:
     return bool(np.mean((value < low - margin) | (value > high + margin)) <= OUT_RATIO)
 
 
-def _clearness(found: Found, effect: Effect) -> float:
-    """Return the evidence that an effect varies by itself, at the common fit of all runs."""
-    return max(each.z for each in _at_common_fit(found, effect))
+def _at_common_fit(fit: CauseFit, name: str, std: Array) -> _RunValues:
+    """Return the values of a parameter by each run at the common fit, beside nuisances of standard deviations (q,)."""
+    shared = fit.change - fit.info.away[fit.info.places(fit.names)]
+    return _values_by_run(fit, name, fit.names, shared, fit.info.nuisances, std)
 
 
-def _at_common_fit(found: Found, effect: Effect) -> list[_RunValues]:
-    fit = MixedFit(0.0, found.change - found.info.away[found.info.places(found.names)], _least_std(found, ()))
-    return [_values_by_run(found, p.name, found.names, (), fit) for p in effect.parameters]
-
-
-def _tried(found: Found, effect: Effect, scatter: Sequence[float] = ()) -> _Tried:
+def _own_values(fit: CauseFit, effect: Effect, scatter: Sequence[float]) -> _OwnValues:
     """Fit runs with values of their own of an effect, all else as it is assumed.
 
     Parameters
     ----------
-    scatter : of its parameters, to start from; estimated at the common fit by default
+    scatter : of its parameters, to start from
     """
-    info, own = found.info, tuple(p.name for p in effect.parameters)
-    names = (*found.names, *(name for name in own if name not in found.names))
-    least = _least_std(found, own)
-    free = np.arange(len(least)) >= len(least) - len(own)
-    start = least.copy()
-    start[free] = scatter or [each.scatter for each in _at_common_fit(found, effect)]
-    varies = [*info.nuisances[_is_beside(info, own)], *info.places(own)]
+    info, own = fit.info, tuple(p.name for p in effect.parameters)
+    names = tuple(dict.fromkeys([*fit.names, *own]))
+    beside = info.nuisances[~np.isin(info.nuisances, info.places(own))]
+    varies = np.array([*beside, *info.places(own)], dtype=int)
+    least = _least_std(fit, own)
+    free = np.arange(len(least)) >= len(beside)
+    start = np.where(free, 0.0, least)
+    start[free] = scatter
     gram, shared = info.grams.sum(axis=1), info.places(names)
-    fit = fit_mixed(gram, shared, varies, least, start, free)
+    mixed = fit_mixed(gram, shared, varies, least, start, free)
     alike = fit_mixed(gram, shared, varies, least, least, np.zeros_like(free))
-    runs = tuple(_values_by_run(found, name, names, own, fit) for name in own)
-    return _Tried(effect, runs, fit.loss, alike.loss - fit.loss)
+    runs = tuple(_values_by_run(fit, name, names, mixed.shared, varies, mixed.std) for name in own)
+    return _OwnValues(effect, runs, mixed.loss, alike.loss - mixed.loss)
 
 
-def _refitted(problem: Problem, found: Found, tried: _Tried) -> _Tried:
+def _refitted(problem: Problem, fit: CauseFit, tried: _OwnValues) -> _OwnValues:
     """Return the same by a nonlinear fit: sensitivities of each run at its own values."""
-    base = found.info.vector
-    names = tuple(dict.fromkeys([*found.names, *(p.name for p in tried.effect.parameters)]))
+    base = fit.info.vector
+    names = tuple(dict.fromkeys([*fit.names, *(p.name for p in tried.effect.parameters)]))
     for _ in range(N_STEPS):
-        own: Mapping[str, Array] = {
+        own = {
             runs.name: np.clip(base[INDEX[runs.name]] + runs.value, *BOUNDS[runs.name]) for runs in tried.runs
         }
-        there = problem.at(found.info.origin, names, found.info.statistics, own)
-        scatter = [runs.scatter for runs in tried.runs]
-        tried = _tried(found._replace(info=recentre(there, base)), tried.effect, scatter)
+        there = problem.at(fit.info.origin, names, fit.info.statistics, own)
+        moved = fit._replace(info=replace(there, vector=base))
+        tried = _own_values(moved, tried.effect, [runs.scatter for runs in tried.runs])
     return tried
 
 
-def _is_beside(info: Evidence, own: Sequence[str]) -> Array:
-    """Return which of the nuisances are of no effect of their own."""
-    return ~np.isin(info.nuisances, info.places(own))
+def _least_std(fit: CauseFit, own: Sequence[str]) -> Array:
+    """Return the standard deviations assumed of nuisances, and those of an effect, last.
 
-
-def _least_std(found: Found, own: Sequence[str]) -> Array:
-    """Return the standard deviations assumed of nuisances, and those of an effect, last."""
-    info = found.info
-    names = [info.parameters[i] for i in info.nuisances[_is_beside(info, own)]]
-    return np.array([_assumed(found, name) or LEAST_RATIO * PRIOR_STD[name] for name in (*names, *own)])
-
-
-def _assumed(found: Found, name: str) -> float:
-    """Return the scatter that is no news: what was assumed of the parameter, not what was estimated."""
-    return float(found.assumed_scatter.get(name, 0.0))
+    What was assumed of a parameter is no news, other than what was estimated.
+    """
+    info = fit.info
+    names = [info.names[i] for i in info.nuisances if info.names[i] not in own]
+    return np.array([fit.assumed_scatter.get(n, 0.0) or LEAST_RATIO * PRIOR_STD[n] for n in (*names, *own)])
 
 
 def _values_by_run(
-    found: Found, name: str, names: Sequence[str], own: Sequence[str], fit: MixedFit
+    fit: CauseFit, name: str, names: Sequence[str], shared: Array, varies: Array, std: Array
 ) -> _RunValues:
     """Return the values of a parameter by each run, with all that varies beside it marginalised.
 
     Parameters
     ----------
-    names : of the parameters whose shared values ``fit`` has
-    own : parameters that ``fit`` has deviations of beside the nuisances, last
+    names, shared : parameters, and their values (m,) over where sensitivities were taken, that all runs share
+    varies, std : (q,) places of what varies, and its standard deviations
     """
-    info = found.info
-    varies = np.array([*info.nuisances[_is_beside(info, own)], *info.places(own)], dtype=int)
-    beside = varies != info.places([name])[0]
-    random, q = varies[beside], int(beside.sum())
-    columns = np.zeros((len(info.parameters) + 1, q + 2))  # what varies, the parameter, and the residual
+    info, (place,) = fit.info, fit.info.places([name])
+    random, std = varies[varies != place], std[varies != place]
+    q = len(random)
+    columns = np.zeros((len(info.names) + 1, q + 2))  # what varies, the parameter, and the residual
     columns[random, np.arange(q)] = 1.0
-    columns[info.places([name])[0], q] = 1.0
-    columns[info.places(names), -1] = -fit.shared
+    columns[place, q] = 1.0
+    columns[info.places(names), -1] = -shared
     columns[-1, -1] = 1.0
-    taken = marginal_parts(columns.T @ info.grams @ columns, np.arange(q), fit.std[beside])[:, :, q:, q:]
-    mean = info.away[info.places([name])[0]] + (fit.shared[list(names).index(name)] if name in names else 0.0)
-    return _between_runs(name, taken[:, :, 0, 1], taken[:, :, 0, 0], _assumed(found, name), float(mean))
-
-
-def _clearest_channel(info: Evidence, name: str) -> str:
-    place = info.places([name])[0]
-    power = sum((change[place] ** 2).sum(axis=0) for change in info.white_change)
-    return CHANNELS[int(np.argmax(power))]
+    taken = marginal_parts(columns.T @ info.grams @ columns, np.arange(q), std)[:, :, q:, q:]
+    mean = info.away[place] + (shared[list(names).index(name)] if name in names else 0.0)
+    assumed = float(fit.assumed_scatter.get(name, 0.0))
+    return _between_runs(name, taken[:, :, 0, 1], taken[:, :, 0, 0], assumed, float(mean))
 
 
 def _between_runs(name: str, score: Array, weight: Array, assumed_std: float, mean: float) -> _RunValues:
@@ -245,31 +234,26 @@ def _between_runs(name: str, score: Array, weight: Array, assumed_std: float, me
     total = weight.sum(axis=1)
     seen = total > 1e-6 * max(float(total.max()), 1e-30)
     if seen.sum() < 2 * MIN_GROUP or not total.max() > 0:
-        nothing = np.zeros(len(total))
-        return _RunValues(name, nothing, np.ones(len(total)), 0.0, 0.0)
+        return _RunValues(name, np.zeros(len(total)), np.ones(len(total)), 0.0, 0.0)
     value = np.where(seen, score.sum(axis=1) / np.where(seen, total, 1.0), 0.0)
-    inside, dof = 0.0, 0
-    for i in np.flatnonzero(seen):
-        use = weight[i] > 0.05 * total[i]
-        inside += float(((score[i] - weight[i] * value[i])[use] ** 2 / weight[i][use]).sum())
-        dof += max(int(use.sum()) - 1, 0)
+    use = seen[:, None] & (weight > 0.05 * total[:, None])
+    apart = (score - weight * value[:, None]) ** 2 / np.where(use, weight, 1.0)
+    inside, dof = float(apart[use].sum()), int(np.maximum(use.sum(axis=1) - 1, 0).sum())
     # thirds of a run share its deviations, most of the variance of a short one: no less than by whitening
     noise = max((TRUST_DOF + inside) / (TRUST_DOF + dof), 1.0)
     precision = np.where(seen, 1.0 / (noise / np.where(seen, total, 1.0) + assumed_std**2), 0.0)
-    square = _squares(value, precision)
     # one run that is far out is no variation from run to run: the others have to differ as well
     known = np.flatnonzero(seen)
-    likelihood = min(_likelihood_ratio(value[rest], precision[rest]) for rest in _left_out(known))
+    rests = [np.delete(known, i) for i in range(len(known))]
+    likelihood = min(_likelihood_ratio(value[rest], precision[rest]) for rest in rests)
     z = z_of_t(math.sqrt(max(likelihood, 0.0)), TRUST_DOF + dof)
-    square = _squares(value, precision)
+    # squares about the mean, in variances, those far out limited
+    square = precision * (value - (precision * value).sum() / precision.sum()) ** 2
+    square = np.minimum(square, 9.0 * max(float(np.median(square[precision > 0])), 1.0))
     beyond = float(square.sum()) - (len(known) - 1)
     spread = float(precision.sum() - (precision**2).sum() / precision.sum())
     scatter = math.sqrt(max(beyond / spread, 0.0) + assumed_std**2)
     return _RunValues(name, value + mean, precision, scatter, z)
-
-
-def _left_out(places: Array) -> list[Array]:
-    return [np.delete(places, i) for i in range(len(places))]
 
 
 def _likelihood_ratio(value: Array, precision: Array) -> float:
@@ -280,36 +264,28 @@ def _likelihood_ratio(value: Array, precision: Array) -> float:
     return float(loss[0] - loss.min())
 
 
-def _squares(value: Array, precision: Array) -> Array:
-    """Return the squares (runs,) of values about their mean, in variances, those far out limited."""
-    square = precision * (value - (precision * value).sum() / precision.sum()) ** 2
-    return np.asarray(np.minimum(square, 9.0 * max(float(np.median(square[precision > 0])), 1.0)))
-
-
 def _two_groups(best: _RunValues, run_ids: Sequence[str]) -> tuple[RunGroup, ...]:
     """Return two groups of runs, if values fall into two; none if they do not."""
     order = [i for i in np.argsort(best.value, kind="stable") if best.weight[i] > 0]
     value, weight = best.value[order], best.weight[order]
-    mean = np.average(value, weights=weight)
-    total = float((weight * (value - mean) ** 2).sum())
-    least, cut = math.inf, 0
-    for k in range(MIN_GROUP, len(order) - MIN_GROUP + 1):
-        left = sum(
-            float((w * (v - np.average(v, weights=w)) ** 2).sum())
-            for v, w in ((value[:k], weight[:k]), (value[k:], weight[k:]))
-        )
-        if left < least:
-            least, cut = left, k
-    if not cut or max(least - (len(order) - 2), 0.0) > TWO_GROUPS_RATIO * total:
+
+    def square(part: slice) -> float:
+        v, w = value[part], weight[part]
+        return float((w * (v - np.average(v, weights=w)) ** 2).sum())
+
+    cuts = range(MIN_GROUP, len(order) - MIN_GROUP + 1)
+    left = {k: square(slice(0, k)) + square(slice(k, None)) for k in cuts}
+    cut = min(left, key=lambda k: left[k], default=0)
+    if not cut or max(left[cut] - (len(order) - 2), 0.0) > TWO_GROUPS_RATIO * square(slice(None)):
         return ()
-    groups = []
-    for part in (slice(0, cut), slice(cut, None)):
-        w = weight[part]
-        ids = tuple(sorted(run_ids[i] for i in order[part]))
-        groups.append(
-            RunGroup(float(np.average(value[part], weights=w)), float(1.0 / math.sqrt(w.sum())), ids)
+    return tuple(
+        RunGroup(
+            float(np.average(value[part], weights=weight[part])),
+            float(1.0 / math.sqrt(weight[part].sum())),
+            tuple(sorted(run_ids[i] for i in order[part])),
         )
-    return tuple(groups)
+        for part in (slice(0, cut), slice(cut, None))
+    )
 
 
 # -- Linear mixed model of runs: parameters that all runs share, and such of which each run has its own value --
@@ -342,7 +318,12 @@ class MixedFit(NamedTuple):
 
 
 def fit_mixed(
-    gram: Array, shared: Sequence[int], own: Sequence[int], least_std: Array, start_std: Array, free: Array
+    gram: Array,
+    shared: Sequence[int],
+    own: Sequence[int] | Array,
+    least_std: Array,
+    start_std: Array,
+    free: Array,
 ) -> MixedFit:
     """Return the fit of greatest likelihood.
 
@@ -365,24 +346,21 @@ def fit_mixed(
     >>> bool(abs(fit.shared[0] - 1.0) < 0.1), bool(abs(fit.std[0] - 0.5) < 0.1)
     (True, True)
     """
-    last = gram.shape[1] - 1
-    outer, m = [*shared, last], len(shared)
+    outer, m = [*shared, gram.shape[1] - 1], len(shared)
     inside, cross = gram[:, own][:, :, own], gram[:, own][:, :, outer]
     outside = gram[:, outer][:, :, outer].sum(axis=0)
     std = np.maximum(start_std, least_std)
-    values, loss = np.zeros(m), 0.0
     for step in range(EM_STEPS + 1):
         inner = np.linalg.inv(inside + np.diag(1.0 / std**2))
         follow = inner @ cross
         total = outside - (cross.transpose(0, 2, 1) @ follow).sum(axis=0)
-        values = np.linalg.lstsq(total[:m, :m], total[:m, m], rcond=1e-10)[0] if m else values
-        if step == EM_STEPS:
-            scaled = np.eye(len(std)) + std[:, None] * inside * std
-            loss = float(total[m, m] - values @ total[:m, m] + np.linalg.slogdet(scaled)[1].sum())
-            break
-        deviation = follow @ np.concatenate([-values, [1.0]])
-        square = (deviation**2 + np.einsum("iqq->iq", inner)).mean(axis=0)
-        std = np.where(free, np.maximum(np.sqrt(square), least_std), std)
+        values = np.linalg.lstsq(total[:m, :m], total[:m, m], rcond=1e-10)[0] if m else np.zeros(0)
+        if step < EM_STEPS:
+            deviation = follow @ np.concatenate([-values, [1.0]])
+            square = (deviation**2 + np.einsum("iqq->iq", inner)).mean(axis=0)
+            std = np.where(free, np.maximum(np.sqrt(square), least_std), std)
+    scaled = np.eye(len(std)) + std[:, None] * inside * std
+    loss = float(total[m, m] - values @ total[:m, m] + np.linalg.slogdet(scaled)[1].sum())
     return MixedFit(loss, values, std)
 
 
@@ -406,11 +384,11 @@ def with_conditions(problem: Problem, info: Evidence) -> Problem:
     simulation = problem.simulation
     if not simulation.varied_error:
         return problem
-    found = Found((), info, (), np.zeros(0), np.zeros((0, 0)), {}, {}, simulation.scatter)
+    fit = cause_fit(problem._replace(library=()), info, ())._replace(assumed_scatter=simulation.scatter)
     error = dict(simulation.model_error)
     for effect in problem.library:
         name = effect.parameters[0].name
         if name in simulation.varied_error:
-            mean = min(MEAN_PER_SCATTER * run_scatter(found, name), simulation.varied_error[name])
+            mean = min(MEAN_PER_SCATTER * run_scatter(fit, name), simulation.varied_error[name])
             error[name] = math.hypot(error.get(name, 0.0), mean)
     return problem._replace(simulation=replace(simulation, model_error=error))

@@ -1,8 +1,11 @@
-"""The diagnosis: what the simulation gets wrong, with which evidence, and what could not be detected."""
+"""The diagnosis: what the simulation gets wrong, with which evidence, and what could not be detected.
+
+The fields of these records are the keys of ``terrain explain --json``.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -12,7 +15,6 @@ from terrain.records import Array
 AGREE_P = 0.01
 """Probability below which sessions of one terrain do not agree: of some six values of a diagnosis, hardly
 any by chance."""
-
 
 INTERVAL_T = 2.36
 """Half a 95 % interval in standard deviations: t with the 7 degrees that eight runs give."""
@@ -35,7 +37,7 @@ class Verdict(StrEnum):
 
 
 class Value(NamedTuple):
-    """A parameter that was found, and the interval (low, high) that holds it with 95 %."""
+    """A parameter's value, and the interval (low, high) that holds it with 95 %."""
 
     name: str
     value: float
@@ -54,9 +56,9 @@ class Cause(NamedTuple):
     Parameters
     ----------
     name, aliases : of the effect
-    values : its parameters, over what the simulation has of them already
-    gain, gain_low, gain_high : ratio of the whitened squared residual that it removes from runs left out of
-        its fit, and its 95 % interval by bootstrap over runs
+    parameters : its values, over what the simulation has of them already
+    held_out_gain, gain_ci : ratio of the whitened squared residual that it removes from runs left out of its
+        fit, and its 95 % interval by bootstrap over runs
     channels : where it shows, the clearest first
     z, dispersion : its evidence, see :class:`terrain.discrepancy.selection.WaldTest`
     caveat : what the values depend on, in words; empty where they are the same throughout
@@ -64,22 +66,13 @@ class Cause(NamedTuple):
 
     name: str
     aliases: tuple[str, ...]
-    values: tuple[Value, ...]
-    gain: float
-    gain_low: float
-    gain_high: float
+    parameters: tuple[Value, ...]
+    held_out_gain: float
+    gain_ci: tuple[float, float]
     channels: tuple[str, ...]
     z: float
     dispersion: float
     caveat: str = ""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        own = {
-            name: getattr(self, name) for name in ("name", "aliases", "channels", "z", "dispersion", "caveat")
-        }
-        interval = self.gain_low, self.gain_high
-        return {**own, "parameters": self.values, "held_out_gain": self.gain, "gain_ci": interval}
 
 
 class RunGroup(NamedTuple):
@@ -87,11 +80,7 @@ class RunGroup(NamedTuple):
 
     value: float
     std: float
-    run_ids: tuple[str, ...]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        return {"value": self.value, "std": self.std, "runs": self.run_ids}
+    runs: tuple[str, ...]
 
 
 class Varying(NamedTuple):
@@ -123,23 +112,16 @@ class SessionValue(NamedTuple):
 
     Parameters
     ----------
-    session, n_runs : name, and runs that were compared
-    value, low, high, std : of the parameter, 95 % interval and standard deviation with the scatter of runs
+    session, runs : name, and number of runs that were compared
+    value, ci : of the parameter, and its 95 % interval with the scatter of runs
     text : value and interval in quantities of the robot's description
     """
 
     session: str
-    n_runs: int
+    runs: int
     value: float
-    low: float
-    high: float
-    std: float
+    ci: tuple[float, float]
     text: str
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        named = {"session": self.session, "runs": self.n_runs, "value": self.value}
-        return {**named, "ci": (self.low, self.high), "text": self.text}
 
 
 class BySession(NamedTuple):
@@ -147,28 +129,20 @@ class BySession(NamedTuple):
 
     Parameters
     ----------
-    parameter, unit, terrain : names
+    name, unit, terrain : of the parameter, and the label of the runs
     sessions : values
     p : probability of such differences where sessions agree; NaN for one session
     between_std : standard deviation between sessions beyond that of their values; NaN for one session
+    agree : whether sessions may have one value (``p`` from :data:`AGREE_P`); one session does
     """
 
-    parameter: str
+    name: str
     unit: str
     terrain: str
     sessions: tuple[SessionValue, ...]
     p: float
     between_std: float
-
-    @property
-    def agree(self) -> bool:
-        """Whether sessions may have one value; one session does."""
-        return not self.p < AGREE_P
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        named = self._asdict()
-        return {"name": named.pop("parameter"), **named, "agree": self.agree}
+    agree: bool
 
 
 class Unexplained(NamedTuple):
@@ -178,54 +152,31 @@ class Unexplained(NamedTuple):
     ----------
     channel, input : names
     z : evidence, in standard deviations
-    ratio : part of the channel's whitened squared residual that depends on it
+    residual_ratio : part of the channel's whitened squared residual that depends on it
     """
 
     channel: str
     input: str
     z: float
-    ratio: float
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        named = self._asdict()
-        return {"residual_ratio": named.pop("ratio"), **named}
+    residual_ratio: float
 
 
 class Limit(NamedTuple):
     """The smallest value of an effect that these runs would have revealed nine times in ten."""
 
     name: str
-    value: float
+    detection_limit: float
     unit: str
     needs: str
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        named = self._asdict()
-        return {"detection_limit": named.pop("value"), **named}
-
 
 class RuledOut(NamedTuple):
-    """An effect that is not the answer, and why.
-
-    Parameters
-    ----------
-    name : of the effect
-    reason : a sentence
-    z : its evidence
-    values : fitted ones, of an effect that was withdrawn although it reduces the residual
-    """
+    """An effect that is not the answer: why, its evidence, and the values of one that was withdrawn."""
 
     name: str
     reason: str
     z: float
-    values: tuple[Value, ...] = ()
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields as JSON names them."""
-        named = self._asdict()
-        return {"parameters": named.pop("values"), **named}
+    parameters: tuple[Value, ...] = ()
 
 
 class Residual(NamedTuple):
@@ -266,9 +217,16 @@ class Clock(NamedTuple):
     std_s: float
 
 
+class Covariance(NamedTuple):
+    """Covariance (k, k) of the values of parameters."""
+
+    parameters: tuple[str, ...]
+    matrix: Array
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Diagnosis:
-    """What :func:`terrain.discrepancy.diagnose.diagnose` found.
+    """What :func:`terrain.discrepancy.diagnose.diagnose` states.
 
     Parameters
     ----------
@@ -276,11 +234,11 @@ class Diagnosis:
     verdict : ``explained`` where a cause is named, also when something else is left unexplained; ``varies``
         where what was found has no value that all runs share
     causes : named
-    parameters, cov : names (k,) of their parameters, and the covariance (k, k) of the values
+    covariance : of their parameters
     ambiguous_sets : effects of which one is present, and which these runs cannot distinguish; best fit first
     ambiguous_values : fitted values of each of them, by the effect's name
     unexplained : channels that depend on an input without a known cause
-    limits : detection limit of every effect
+    detection_limits : of every effect
     not_excited : those whose limit is beyond what an effect may be
     ruled_out : effects that are not the answer
     excluded_runs, clocks : by run
@@ -295,12 +253,11 @@ class Diagnosis:
     robot: str
     verdict: Verdict
     causes: tuple[Cause, ...]
-    parameters: tuple[str, ...]
-    cov: Array
+    covariance: Covariance
     ambiguous_sets: tuple[tuple[str, ...], ...]
     ambiguous_values: dict[str, tuple[Value, ...]]
     unexplained: tuple[Unexplained, ...]
-    limits: tuple[Limit, ...]
+    detection_limits: tuple[Limit, ...]
     not_excited: tuple[Limit, ...]
     ruled_out: tuple[RuledOut, ...]
     excluded_runs: tuple[Excluded, ...]
@@ -316,14 +273,4 @@ class Diagnosis:
     @property
     def values(self) -> dict[str, float]:
         """The parameters of all named causes."""
-        return {value.name: value.value for cause in self.causes for value in cause.values}
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the fields by name, the covariance with the names of its rows."""
-        named = {each.name: getattr(self, each.name) for each in fields(self)}
-        parameters, cov, limits = (named.pop(name) for name in ("parameters", "cov", "limits"))
-        return {
-            **named,
-            "covariance": {"parameters": parameters, "matrix": cov},
-            "detection_limits": limits,
-        }
+        return {value.name: value.value for cause in self.causes for value in cause.parameters}

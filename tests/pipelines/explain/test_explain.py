@@ -57,7 +57,7 @@ def test_the_hidden_cause_is_named_built_in_and_absent_when_tested_again(terrain
     assert "° to the right its error falls from" in statement["text"]
     assert statement["text"][1:] in out
     assert statement["rms_after"] < 0.5 * statement["rms_before"]
-    named = gain["nameless"]["channels"]["speed_y_mps"]["named_reduction"]
+    named = gain["black_box_reference"]["channels"]["speed_y_mps"]["named_reduction"]
     assert named == pytest.approx(gain["channels"]["speed_y_mps"]["reduction"], abs=0.01)
 
     late = {part["name"]: part for part in found["powertrain"]["parts"] if part["status"] == "found"}

@@ -11,8 +11,14 @@ from pipelines.report.terminal import terminal_text
 from terrain.discrepancy import verdict
 from terrain.discrepancy.compared import channels_of
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
-from terrain.discrepancy.held_out import Change, ChannelGain, Comparison, Gain, Reduction
-from terrain.discrepancy.nameless import Learned, Nameless
+from terrain.discrepancy.held_out import (
+    Change,
+    ChannelGain,
+    ChannelReference,
+    Comparison,
+    Gain,
+    Reference,
+)
 from terrain.discrepancy.verdict import Clock, Excluded
 from terrain.robots import load_robot
 
@@ -27,15 +33,15 @@ LEVER_ARM = verdict.Cause(
     "lever_arm",
     ("an_alias",),
     (verdict.Value("lever_x_m", 0.1, "m", 0.09, 0.11), verdict.Value("lever_y_m", -0.05, "m", -0.06, -0.04)),
-    *(0.4, 0.3, 0.5, ("speed_y_mps", "speed_x_mps"), 9.04, 4.0),
+    *(0.4, (0.3, 0.5), ("speed_y_mps", "speed_x_mps"), 9.04, 4.0),
 )
 
 
 def a_gain(refused=False, high=0.8, **comparisons):
-    channel = ChannelGain(0.02, 0.01, 2.0, np.nan, Reduction(0.75, -0.1 if refused else 0.7, high))
-    whole = Reduction(0.5, -0.2 if refused else 0.4, 0.6)
-    found = Gain(("r1", "r2"), (), "thirds of runs", {"speed_x_mps": channel}, whole)
-    return HeldOutGain(found, None, {"filter": None, **comparisons})
+    channel = ChannelGain(0.02, 0.01, 2.0, np.nan, 0.75, (-0.1 if refused else 0.7, high), refused)
+    whole = 0.5, (-0.2 if refused else 0.4, 0.6), refused
+    gain = Gain(("r1", "r2"), (), "thirds of runs", {"speed_x_mps": channel}, *whole)
+    return HeldOutGain(gain, None, {"filter": None, **comparisons})
 
 
 @pytest.fixture
@@ -43,7 +49,13 @@ def explained(few):
     """Return what makes a result without any finding but those that are given."""
 
     def make(gain=None, robot=HUSKY, **findings):
-        empty = {"robot": "a<b>", "causes": (), "limits": LIMITS, "not_excited": (), "next_drive": None}
+        empty = {
+            "robot": "a<b>",
+            "causes": (),
+            "detection_limits": LIMITS,
+            "not_excited": (),
+            "next_drive": None,
+        }
         empty["ruled_out"] = (verdict.RuledOut("scrub", "the runs show nothing of it", 0.44),)
         diagnosed = replace(few.diagnosed, diagnosis=replace(few.diagnosis, **(empty | findings)))
         gain = gain or HeldOutGain(None, "nothing was built in")
@@ -73,7 +85,7 @@ def test_the_answer_is_the_cause_with_its_interval_and_the_gain(explained):
     )
 
 
-NAMELESS = Nameless(2, {"speed_x_mps": Learned(0.02, 0.01, 0.76, 0.75, -0.02)}, 0.76, 0.75)
+REFERENCE = Reference(2, 0.76, 0.75, {"speed_x_mps": ChannelReference(0.02, 0.01, 0.76, 0.75, -0.02)})
 FILTER = Comparison("vio12", None, 2, {"speed_mps": Change(0.1, 0.05, (-0.06, -0.04))})
 CLASSIFIER = Comparison("svm", None, 2, {"accuracy": Change(0.8, 0.9, None)}, ("a",))
 RIVALS = {
@@ -93,7 +105,7 @@ FINDINGS = (
     ({"gain": a_gain(refused=True)}, ("no gain can be claimed", "no gain to claim")),
     ({"gain": a_gain(refused=True, high=-0.05)}, (" worse ",)),
     (
-        {"gain": replace(a_gain(filter=FILTER, classifier=CLASSIFIER), nameless=NAMELESS)},
+        {"gain": replace(a_gain(filter=FILTER, classifier=CLASSIFIER), black_box=REFERENCE)},
         (
             "speed ahead m/s 0.02 0.01 75.0 % 70.0 to 80.0 % 76.0 %",
             "reference 76 %: little is left to find.",
@@ -146,7 +158,7 @@ def test_what_was_found_is_stated_with_its_numbers(explained, findings, stated):
 
 def test_robots_on_tracks_have_sprockets(explained):
     value = verdict.Value("wheel_radius_ratio", 0.1, "ratio", 0.09, 0.11)
-    cause = LEVER_ARM._replace(name="wheel_radius", aliases=(), values=(value,))
+    cause = LEVER_ARM._replace(name="wheel_radius", aliases=(), parameters=(value,))
     text = text_of(explained(causes=(cause,), robot=load_robot("marmotte")))
     assert "lacks sprocket radius, 10 %" in text
     assert "wheel" not in text.partition("Where these numbers")[0]
@@ -168,6 +180,6 @@ def test_figures_show_the_residual_before_and_after_with_the_noise_about_the_mea
     levels = {each.label: np.median(each.y) for each in spectra.panels[place].marks}
     assert levels["noise"] == pytest.approx(levels["with the causes built in"], abs=5.0)
     band, points = parts_figure(few.diagnosed.parts).panels[0].marks
-    (value,) = few.diagnosis.causes[0].values
+    (value,) = few.diagnosis.causes[0].parameters
     assert (band.low[0], band.high[0]) == (value.low, value.high)
     assert points.low[0] < value.value < points.high[0]

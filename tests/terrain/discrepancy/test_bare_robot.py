@@ -30,13 +30,6 @@ def robot(tmp_path_factory):
     return load_robot(path)
 
 
-@pytest.fixture(scope="module")
-def wide_runs(robot):
-    """Runs of a robot that turns as if its track were 40 % wider."""
-    given = {"duration_s": 40.0, "effects": WIDE}
-    return [simulate_run(robot, "asphalt", "complex", 0, number, **given) for number in range(1, 7)]
-
-
 def test_a_simulated_run_has_no_currents_and_turns_as_its_geometry_says(robot):
     twist = np.zeros((501, 3))
     twist[50:, 0], twist[50:, 2] = 0.6, 0.4
@@ -50,20 +43,21 @@ def test_a_simulated_run_has_no_currents_and_turns_as_its_geometry_says(robot):
     assert all(np.isfinite(streams[name].values).all() for name in ("wheels", "imu", "odometry"))
 
 
-def test_the_log_replayed_is_what_was_measured(robot, wide_runs):
-    """Two routes: the simulation that wrote the log, and its replay from the wheel speeds logged."""
-    signals = signals_of(wide_runs[0], robot)
+def test_its_runs_are_replayed_explained_and_filtered_without_what_is_not_described(robot):
+    """Of a robot that turns as if its track were 40 % wider."""
+    runs = [
+        simulate_run(robot, "asphalt", "complex", 0, number, duration_s=40.0, effects=WIDE)
+        for number in range(1, 7)
+    ]
+    # two routes: the simulation that wrote the log, and its replay from the wheel speeds logged
+    signals = signals_of(runs[0], robot)
     logged = (signals.wheel_speed_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad)
     # copies: read-only arrays would be another signature, for which nothing else compiles
     copies = (values.copy() for values in logged)
     seen = replay(make_planar(robot, Ground()), vector_of(WIDE), signals.dt_s, *copies)
     column = CHANNELS.index("yaw_rate_radps")
-    error = (signals.measured - seen)[50:-50, column]
-    assert np.std(error) < 0.03 < np.nanstd(signals.measured[:, column])
-
-
-def test_runs_are_explained_and_filtered_without_what_is_not_described(robot, wide_runs):
+    assert np.std((signals.measured - seen)[50:-50, column]) < 0.03 < np.nanstd(signals.measured[:, column])
     library = [effect_named("effective_track"), effect_named("lever_arm")]
-    (cause,) = diagnose_runs(wide_runs, robot, library, None, 0).diagnosis.causes
-    assert (cause.name, cause.values[0].value) == ("effective_track", pytest.approx(0.4, abs=0.05))
-    assert np.isfinite(enriched(estimate_run(wide_runs[0], robot, "skid")).streams["estimator"].values).all()
+    (cause,) = diagnose_runs(runs, robot, library, None, 0).diagnosis.causes
+    assert (cause.name, cause.parameters[0].value) == ("effective_track", pytest.approx(0.4, abs=0.05))
+    assert np.isfinite(enriched(estimate_run(runs[0], robot, "skid")).streams["estimator"].values).all()

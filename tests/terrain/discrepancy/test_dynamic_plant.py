@@ -18,42 +18,38 @@ AGRIMARO, HUSKY = load_robot("agrimaro"), load_robot("husky")
 LIBRARY = library_of("swerve")
 
 
-def runs_of(effects=None, robot=AGRIMARO, terrain="grass", n=6, seed=0, **options):
-    return [simulate_run(robot, terrain, "survey", seed, i + 1, effects=effects, **options) for i in range(n)]
+def runs_of(effects=None, robot=AGRIMARO, terrain="grass", n=6, **options):
+    return [simulate_run(robot, terrain, "survey", 0, i + 1, effects=effects, **options) for i in range(n)]
 
 
 def explained(runs):
-    simulation, _ = simulation_for(runs, AGRIMARO, LIBRARY)
-    return diagnose(runs, simulation, LIBRARY)
-
-
-QUIET = (Verdict.NONE, Verdict.NOT_EXCITED)
+    return diagnose(runs, simulation_for(runs, AGRIMARO, LIBRARY)[0], LIBRARY)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("vary", [False, True])
 @pytest.mark.parametrize("terrain", ["grass", "firm_soil_gravel"])
 def test_without_a_hidden_effect_nothing_is_stated(terrain, vary):
-    found = explained(runs_of(terrain=terrain, vary=vary))
-    assert found.verdict in QUIET
-    assert (found.excluded_runs, found.faults) == ((), ())
+    diagnosis = explained(runs_of(terrain=terrain, vary=vary))
+    assert diagnosis.verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
+    assert (diagnosis.excluded_runs, diagnosis.faults) == ((), ())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("parameter", "value"),
     [
-        pytest.param("wheel_radius_ratio", 0.05, marks=pytest.mark.slow),
-        pytest.param("camera_yaw_rad", 0.05, marks=pytest.mark.slow),
-        pytest.param("camera_latency_s", 0.1, marks=pytest.mark.slow),
-        pytest.param("gyro_scale_ratio", 0.1, marks=pytest.mark.slow),
-        pytest.param("payload_ratio", 0.3, marks=pytest.mark.slow),
+        ("wheel_radius_ratio", 0.05),
+        ("camera_yaw_rad", 0.05),
+        ("camera_latency_s", 0.1),
+        ("gyro_scale_ratio", 0.1),
+        ("payload_ratio", 0.3),
     ],
 )
 def test_an_effect_hidden_in_the_plant_is_named_and_nothing_else(parameter, value):
-    found = explained(runs_of({parameter: value}))
-    assert list(found.values) == [parameter]
-    assert found.values[parameter] == pytest.approx(value, rel=0.15)
-    assert found.ambiguous_sets == ()
+    diagnosis = explained(runs_of({parameter: value}))
+    assert diagnosis.values == {parameter: pytest.approx(value, rel=0.15)}
+    assert diagnosis.ambiguous_sets == ()
 
 
 def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
@@ -64,15 +60,14 @@ def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
     assert [match[:2] for match in matches] == [("", None), ("grass", "grass"), ("moon", None)]
     soil = planar_ground(AGRIMARO, load_soil("grass"))
     assert simulation.grounds["grass"]._replace(effective_ratio=1.0) == soil
-    assert simulation.ground == Ground()
     assert simulation.planar_on("grass").slip_ratio == soil.slip_ratio
     assert simulation.planar_on("moon").slip_ratio == simulation.planar.slip_ratio == Ground().slip_ratio
     assert simulation_for(unknown, AGRIMARO, LIBRARY)[0].grounds == {}
 
 
-def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps():
-    for robot, effective in ((AGRIMARO, 0.0), (HUSKY, 1.0)):
-        runs = runs_of(robot=robot, n=3, vary=robot is HUSKY)
-        simulation, _ = simulation_for(runs, robot, library_of(robot.drive))
-        assert simulation.grounds["grass"].effective_ratio == pytest.approx(effective, abs=0.05)
-        assert simulation.tilt_is_slope("grass") == (simulation.grounds["grass"].effective_ratio == 1.0)
+@pytest.mark.parametrize(("robot", "effective"), [(AGRIMARO, 0.0), (HUSKY, 1.0)])
+def test_tilt_acts_as_a_slope_but_not_where_a_body_rides_over_bumps(robot, effective):
+    runs = runs_of(robot=robot, n=3, vary=robot is HUSKY)
+    simulation, _ = simulation_for(runs, robot, library_of(robot.drive))
+    assert simulation.grounds["grass"].effective_ratio == pytest.approx(effective, abs=0.05)
+    assert simulation.tilt_is_slope("grass") == (simulation.grounds["grass"].effective_ratio == 1.0)

@@ -1,16 +1,29 @@
 """The gain of an extension is the reduction of the residual on held-out runs; noise alone gives none."""
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from pipelines.explain.statements import reference_text
 from pipelines.report.results import as_json
+from terrain.discrepancy.compared import ComparedRun, compare_runs
+from terrain.discrepancy.diagnosed_runs import acting_causes, extend, extended_effects
 from terrain.discrepancy.faults import Change, Column, Fault, FaultKind
-from terrain.discrepancy.held_out import accuracy_change, gain, repair_held_out, split_runs
+from terrain.discrepancy.held_out import (
+    DRIVEN,
+    accuracy_change,
+    black_box_reference,
+    gain_of_signals,
+    repair_held_out,
+    split_runs,
+)
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.verdict import INTERVAL_T, Cause, Value, Verdict
 from terrain.effects import CHANNELS, GYRO
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog
@@ -20,87 +33,77 @@ from terrain.simulation.planar.run import simulate_planar
 
 HUSKY = load_robot("husky")
 LONGER = {"wheel_radius_ratio": 0.03}
+TIME_S = np.arange(1500) / 50
+TWIST = np.column_stack(
+    [0.5 * np.sin(0.5 * TIME_S) + 0.2 * np.sin(1.7 * TIME_S), 0.0 * TIME_S, 0.4 * np.sin(0.9 * TIME_S)]
+)
+"""Forward, back and around, at several speeds."""
 
 
-def twist(duration_s=30.0):
-    """Forward, back and around, at several speeds."""
-    time_s = np.arange(round(50 * duration_s)) / 50
-    ahead = 0.5 * np.sin(0.5 * time_s) + 0.2 * np.sin(1.7 * time_s)
-    return np.column_stack([ahead, np.zeros_like(ahead), 0.4 * np.sin(0.9 * time_s)])
-
-
-def runs(n, effects):
+def signals(n, effects):
     options = {"effects": effects, "scatter": load_scatter(), "noise": load_noise()}
-    return [simulate_planar(HUSKY, twist(), i, run_id=f"r{i}", **options) for i in range(n)]
+    return [signals_of(simulate_planar(HUSKY, TWIST, i, run_id=f"r{i}", **options), HUSKY) for i in range(n)]
 
 
 @pytest.fixture(scope="module")
 def longer():
-    return runs(7, LONGER)
+    return signals(7, LONGER)
 
 
-def simulation(effects=None, scatter=True):
-    return Simulation(HUSKY, effects=effects or {}, scatter=load_scatter()._asdict() if scatter else {})
+def gain(runs, effects, seed=0, scatter=True):
+    simulation = Simulation(HUSKY, scatter=load_scatter()._asdict() if scatter else {})
+    return gain_of_signals(simulation, simulation.with_effects(effects), runs, seed)
 
 
 def test_the_true_extension_leaves_noise_and_scatter(longer):
-    found = gain(simulation(), simulation(LONGER), longer)
+    found = gain(longer, LONGER)
     ahead = found.channels["speed_x_mps"]
-    assert not found.refused
-    assert found.clusters == "runs"
-    assert ahead.reduction.low > 0.5
+    assert (found.refused, found.clusters) == (False, "runs")
+    assert ahead.ci[0] > 0.5
     # what is left ahead: noise, and radii that scatter by 0.003 of 0.4 m/s
     assert ahead.rms_after < 0.006 < ahead.rms_before
     assert ahead.white_after < 1.3
-    assert found.channels["turning_current_a"].reduction.refused
+    assert found.channels["turning_current_a"].refused
 
 
 def test_no_gain_is_claimed_for_nothing_for_the_wrong_sign_or_where_nothing_is_hidden(longer):
-    nothing = gain(simulation(), simulation(), longer)
-    assert nothing.reduction == (0.0, 0.0, 0.0)
-    assert nothing.refused
-    wrong = gain(simulation(), simulation({"wheel_radius_ratio": -0.03}), longer)
-    assert wrong.reduction.high < 0.0
+    nothing = gain(longer, {})
+    assert (nothing.reduction, nothing.ci, nothing.refused) == (0.0, (0.0, 0.0), True)
+    wrong = gain(longer, {"wheel_radius_ratio": -0.03})
     assert wrong.refused
-    assert gain(simulation(), simulation(LONGER), runs(6, {})).refused
+    assert wrong.ci[1] < 0.0
+    assert gain(signals(6, {}), LONGER).refused
+    with pytest.raises(DataError, match="no run that was not used"):
+        gain([], LONGER)
 
 
 def test_without_scatter_the_gain_is_that_of_the_whitened_squares(longer):
     """Two routes: the form that has scatter integrated out, and plain sums over the channels."""
-    found = gain(simulation(scatter=False), simulation(LONGER, scatter=False), longer)
+    found = gain(longer, LONGER, scatter=False)
     before, after = (
         sum(getattr(channel, key) ** 2 for channel in found.channels.values())
         for key in ("white_before", "white_after")
     )
     # channels have all the same rows here
-    assert found.reduction.ratio == pytest.approx(1.0 - after / before, rel=1e-9)
+    assert found.reduction == pytest.approx(1.0 - after / before, rel=1e-9)
 
 
 def test_few_runs_are_cut_into_thirds_and_the_same_seed_gives_the_same_gain(longer):
-    few = gain(simulation(), simulation(LONGER), longer[:2], seed=3)
-    assert few.clusters == "thirds of runs"
-    assert not few.refused
-    assert as_json(few) == as_json(gain(simulation(), simulation(LONGER), longer[:2], seed=3))
-    assert as_json(few)["ci"] != as_json(gain(simulation(), simulation(LONGER), longer[:2], seed=4))["ci"]
-
-
-def test_a_gain_without_held_out_runs_or_of_another_robot_is_refused(longer):
-    with pytest.raises(DataError, match="no run that was not used"):
-        gain(simulation(), simulation(LONGER), [])
-    with pytest.raises(ConfigError, match="'agrimaro', not of 'husky'"):
-        gain(simulation(), Simulation(load_robot("agrimaro")), longer)
+    few, again, other = (gain(longer[:2], LONGER, seed) for seed in (3, 3, 4))
+    assert (few.refused, few.clusters) == (False, "thirds of runs")
+    assert as_json(few) == as_json(again)
+    assert few.ci != other.ci
 
 
 def test_the_interval_of_an_accuracy_is_over_runs():
     rng = np.random.default_rng(0)
     run_id = np.repeat([f"r{i}" for i in range(20)], 10)
     before = rng.random(200) < 0.6
-    each = np.repeat(rng.random(20) < 0.5, 10)  # whole runs become correct
-    change = accuracy_change(before, before | each, run_id, 0).change_ci
-    gained = (before | each).mean() - before.mean()
-    assert change[0] < gained < change[1]
-    spread = np.array([(each & ~before)[run_id == name].mean() for name in np.unique(run_id)]).std()
-    assert change[1] - change[0] == pytest.approx(2 * 1.96 * spread / np.sqrt(20), rel=0.2)
+    correct = np.repeat(rng.random(20) < 0.5, 10)  # whole runs become correct
+    low, high = accuracy_change(before, before | correct, run_id, 0).change_ci
+    assert low < (before | correct).mean() - before.mean() < high
+    spread = np.array([(correct & ~before)[run_id == name].mean() for name in np.unique(run_id)]).std()
+    assert high - low == pytest.approx(2 * 1.96 * spread / np.sqrt(20), rel=0.2)
 
 
 # -- Which runs are held out of a diagnosis, and which of them have the faults that were found in the others --
@@ -120,18 +123,116 @@ def test_every_terrain_is_held_out_in_proportion_and_the_seed_chooses_runs():
 
 
 def test_a_fault_is_repaired_in_the_held_out_runs_that_have_it():
-    robot = load_robot("husky")
-    time_s = np.arange(1000) / 50
-    twist = np.column_stack([0.5 * np.sin(0.6 * time_s), 0.0 * time_s, 0.5 * np.sin(0.9 * time_s)])
-    right = signals_of(simulate_planar(robot, twist, 1, run_id="right"), robot)
+    (right,) = signals(1, {})
     turned = Change(FaultKind.SIGN, Column.GYRO, -1.0)
-    wrong = turned.applied(right)
     fault = Fault(turned, ("other",), "turned", "multiply")
-    simulation, low_pass = Simulation(robot), low_pass_of([right])
-    noise = dict.fromkeys(CHANNELS, 0.01)
-    for given in (right, wrong):
-        (fixed,) = repair_held_out([given], [fault], simulation, low_pass, noise)
+    about = Simulation(HUSKY), low_pass_of([right]), dict.fromkeys(CHANNELS, 0.01)
+    for given in (right, turned.applied(right)):
+        (fixed,) = repair_held_out([given], [fault], *about)
         np.testing.assert_array_equal(fixed.measured, right.measured)
     unclear = Fault(turned._replace(factor=math.nan), ("other",), "?", "left out")
-    (fixed,) = repair_held_out([right], [unclear], simulation, low_pass, noise)
+    (fixed,) = repair_held_out([right], [unclear], *about)
     assert np.isnan(fixed.measured[:, CHANNELS.index(GYRO)]).all()
+
+
+# -- What is named is built in -------------------------------------------------------------------------------
+
+
+def diagnosis(robot="husky", cov=None, **values):
+    causes = [
+        Cause(
+            name, (), (Value(name, x, "", x - 0.01, x + 0.01),), 0.2, (0.1, 0.3), ("speed_x_mps",), 9.0, 5.0
+        )
+        for name, x in values.items()
+    ]
+    about = {"robot": robot, "causes": causes, "values": values, "verdict": Verdict.NONE}
+    return SimpleNamespace(covariance=(tuple(values), cov), **about)
+
+
+def test_causes_are_added_to_what_is_built_in_already_of_the_same_robot():
+    built_in = {"payload_ratio": 0.1, "scrub_ratio": 0.02}
+    simulation = Simulation(HUSKY, effects=built_in, scatter={"gyro_bias_radps": 0.1})
+    extended = extend(simulation, diagnosis(payload_ratio=0.05, gyro_scale_ratio=0.02))
+    assert extended.effects == pytest.approx(
+        {"payload_ratio": 0.15, "scrub_ratio": 0.02, "gyro_scale_ratio": 0.02}
+    )
+    assert (extended.robot, extended.scatter) == (simulation.robot, simulation.scatter)
+    with pytest.raises(ConfigError, match="names no cause"):
+        extend(simulation, diagnosis())
+    with pytest.raises(ConfigError, match="'agrimaro'"):
+        extend(simulation, diagnosis("agrimaro", payload_ratio=0.05))
+
+
+def test_the_covariance_of_what_is_found_again_replaces_the_known_one():
+    again = diagnosis(cov=np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-6, lever_x_m=0.1, lever_y_m=-0.05)
+    known = {"lever_x_m": 0.2, "payload_ratio": 0.1}
+    robot = replace(HUSKY, effects=known, effects_cov=np.array([[1.0, 0.5], [0.5, 16.0]]) * 1e-4)
+    values, cov, intervals = extended_effects(robot, again)
+    assert values == pytest.approx({"lever_x_m": 0.3, "payload_ratio": 0.1, "lever_y_m": -0.05})
+    np.testing.assert_allclose(cov, [[4e-6, 0, 1e-6], [0, 16e-4, 0], [1e-6, 0, 9e-6]])
+    assert intervals["payload_ratio"] == pytest.approx((0.1 - INTERVAL_T * 0.04, 0.1 + INTERVAL_T * 0.04))
+    with pytest.raises(ConfigError, match="no covariance"):
+        extended_effects(replace(HUSKY, effects=known), again)
+
+
+def test_a_cause_acts_on_the_channels_that_it_changes():
+    both, simulation, runs = (
+        diagnosis(effective_track_ratio=1.5, camera_yaw_rad=0.1),
+        Simulation(HUSKY),
+        signals(1, {}),
+    )
+    used = compare_runs(simulation, simulation.with_effects(both.values), runs, low_pass_of(runs))
+    acting = acting_causes(simulation, both, runs, used)
+    assert "yaw_rate_radps" in acting["effective_track_ratio"]
+    assert "speed_y_mps" in acting["camera_yaw_rad"]
+    assert "yaw_rate_radps" not in acting["camera_yaw_rad"]
+
+
+# -- A black-box reference finds what depends on the inputs, no more than is there, beside the names -----------
+
+C, CHANNEL, STD = CHANNELS.index("speed_x_mps"), "speed_x_mps", 0.05
+
+
+def a_run(seed, hidden=0.0, named=None, late=0, n=300):
+    """Measured minus simulated is ``hidden speed turn`` of some rows ago; ``named`` of it is built in."""
+    rng, time_s = np.random.default_rng(seed), np.arange(n) / 6.25
+    inputs = {name: np.zeros(n) for name in DRIVEN} | {"time_s": time_s}
+    inputs["speed_mps"], inputs["turn_mps"] = np.sin(0.7 * time_s + seed), np.sin(1.1 * time_s + 2.0 * seed)
+    shape = np.roll(inputs["speed_mps"] * inputs["turn_mps"], late)
+    before, after, measured = np.full((3, n, len(CHANNELS)), np.nan)
+    before[:, C], after[:, C] = 0.0, (named or 0.0) * shape
+    measured[:, C] = hidden * shape + STD * rng.standard_normal(n)
+    compared = measured, before, None if named is None else after
+    return ComparedRun(f"r{seed}", "", False, time_s, np.ones(n), *compared, inputs)
+
+
+def reference(hidden, named, late=0, n_judged=8):
+    used, judged = (
+        [a_run(seed, hidden, named, late) for seed in seeds]
+        for seeds in (range(12), range(50, 50 + n_judged))
+    )
+    found = black_box_reference(used, judged, {CHANNEL: STD})
+    return found.channels[CHANNEL], reference_text(found)
+
+
+@pytest.mark.parametrize("late", [-1, 0, 1])
+def test_it_finds_what_depends_on_the_inputs_also_if_sensors_are_late(late):
+    channel, text = reference(0.5, named=0.0, late=late)
+    assert channel.rms_after == pytest.approx(STD, rel=0.15)
+    assert channel.reduction > 0.85
+    assert text.endswith("more is left to find in speed ahead.")
+
+
+def test_where_the_names_are_right_and_in_noise_little_is_left_and_few_runs_state_no_more():
+    channel, text = reference(0.5, named=0.5)
+    assert channel.named_reduction == pytest.approx(channel.reduction, abs=0.03)
+    assert text.endswith("little is left to find.")
+    channel, text = reference(0.0, named=None)
+    assert abs(channel.reduction) < 0.05
+    assert as_json(channel)["named_reduction"] is None
+    assert text.startswith("Nothing was named")
+    assert text.endswith("little is left to find.")
+    channel, text = reference(0.5, named=0.0, n_judged=2)
+    assert math.isnan(channel.left_to_find_from)
+    assert text.endswith("2 runs are too few to state more.")
+    assert black_box_reference([a_run(1)], [], {}) is None
