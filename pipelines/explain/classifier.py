@@ -37,16 +37,9 @@ def classifier_gain(
 ) -> Comparison:
     """Return the accuracy on held-out runs of a recipe trained on runs simulated without and with effects.
 
-    Both are trained on the same varied drives with the same seeds, and tested on the same windows.  The
-    interval is that of the difference, by bootstrap over runs.
-
-    Parameters
-    ----------
-    held_out : measured runs; those that are labelled with one soil of the package are used
-    robot : of the runs
-    before, after : effects in the simulation
-    seed : of simulation, inner folds and bootstrap
-    runs_a_terrain : simulated on each
+    Both are trained on the same varied drives with the same seeds, so many on each terrain, and tested on the
+    same windows of the runs that are labelled with one soil of the package.  The interval is that of the
+    difference, by bootstrap over runs.
     """
     settings = LearnSettings(seed=seed)
     known = [run for run in held_out if len(run.terrains) == 1 and run.terrains[0] in soil_names()]

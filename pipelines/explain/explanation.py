@@ -9,17 +9,12 @@ from typing import Any
 
 from pipelines.explain import figures
 from pipelines.explain.statements import (
-    CHANNEL_WORDS,
     Statement,
-    channel_label,
     effect_label,
     gain_text,
     in_words_of,
-    limit_text,
-    quantity_interval,
     reference_text,
     split_ruled_out,
-    values_with_intervals,
     varying_text,
     verdict_text,
 )
@@ -30,7 +25,8 @@ from pipelines.report.versions import versions
 from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain import Powertrain
-from terrain.discrepancy.robot_terms import quantity
+from terrain.discrepancy.robot_terms import limit_text, quantity, quantity_interval, values_with_intervals
+from terrain.discrepancy.slopes import CHANNEL_WORDS
 from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import PARAMETER, effect_named
 from terrain.robots import Robot
@@ -55,15 +51,8 @@ WHY, NEEDS = Column("why", long=True), Column("driving that shows it", long=True
 class ExplainResult(Result, eq=False):
     """What the simulation of a robot gets wrong about runs, and what building that in gains.
 
-    In JSON the fields of the diagnosis stand beside the others.
-
-    Parameters
-    ----------
-    robot : as it was tested
-    diagnosed : runs with their diagnosis, beside the simulation
-    extended : the robot with the causes built in; as it was where none was named
-    extended_file : of the extended robot, if it was written
-    n_pictures : most runs that are drawn; None for all
+    In JSON the fields of the diagnosis stand beside the others.  ``robot`` is that which was tested, ``extended``
+    the same with the causes built in, where any was named; ``n_pictures`` runs are drawn at the most, None for all.
     """
 
     robot: Robot
@@ -192,11 +181,9 @@ def _rivals(names: Sequence[str], diagnosis: Diagnosis) -> Table:
     for name in names:
         effect = effect_named(name)
         needs = [effect.needs]
-        needs += [
-            f"{channel_label(channel)} distinguishes it from {effect_label(other)}"
-            for other, channel in effect.twins
-            if other in names
-        ]
+        for other, channel in effect.twins:
+            if other in names:
+                needs.append(f"{CHANNEL_WORDS[channel][0]} distinguishes it from {effect_label(other)}")
         values = values_with_intervals(diagnosis.ambiguous_values.get(name, ()), ", ")
         rows.append((effect_label(name), values, "; ".join(needs)))
     return Table(("one of", "its value, if it acts alone", NEEDS), rows)
@@ -239,14 +226,9 @@ def _gain_parts(measured: HeldOutGain) -> Iterator[Part]:
 def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
     """Yield the effects that were withdrawn, what is left unexplained, and the effects that are ruled out."""
     withdrawn, ruled_out = split_ruled_out(diagnosis)
-    for effects, title, note in (
-        (
-            withdrawn,
-            "withdrawn",
-            "These reduce the residual, and something speaks against each as its cause.",
-        ),
-        (ruled_out, "ruled out", "These runs would have shown them."),
-    ):
+    speaks = "These reduce the residual, and something speaks against each as its cause."
+    shown = "These runs would have shown them."
+    for effects, title, note in ((withdrawn, "withdrawn", speaks), (ruled_out, "ruled out", shown)):
         rows: list[tuple[Any, ...]] = []
         for each in effects:
             values = values_with_intervals(each.parameters)
@@ -255,15 +237,10 @@ def _open_parts(diagnosis: Diagnosis) -> Iterator[Part]:
             yield Table((title, "value it would have", WHY, Column("z", Z)), rows, note=note)
     if diagnosis.unexplained:
         alike = {each.name: f"resembles {effect_label(each.name)}, which was withdrawn" for each in withdrawn}
-        unexplained = [
-            (
-                channel_label(left.channel),
-                alike.get(left.input, f"depends on {left.input}"),
-                left.z,
-                left.residual_ratio or None,
-            )
-            for left in diagnosis.unexplained
-        ]
+        unexplained = []
+        for left in diagnosis.unexplained:
+            what = alike.get(left.input, f"depends on {left.input}")
+            unexplained.append((CHANNEL_WORDS[left.channel][0], what, left.z, left.residual_ratio or None))
         note = (
             "Beside all causes the residual of the channel depends on the input, and no effect of the library "
             "explains it. The input is the clearest of some thirty that were tried."

@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pipelines.explain.statements import CHANNEL_WORDS, channel_label
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, channels_of, spread_of, strongest_input
 from terrain.discrepancy.constancy import PartValues
 from terrain.discrepancy.noise import Noise
 from terrain.discrepancy.residuals import binned_means, noise_spectrum, run_means, spectrum
 from terrain.discrepancy.robot_terms import quantity
+from terrain.discrepancy.slopes import CHANNEL_WORDS, INPUT_LABELS
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
@@ -23,24 +23,10 @@ BLUE, VERMILION, GREY = 0, 1, 6
 AXIS = "{} [{}]"  #: Of what a channel is called, and its unit
 LEAST_POWER = 1e-300  #: Under the logarithm of a spectrum
 
-INPUT_LABELS = {
-    "speed_mps": "speed [m/s]",
-    "turn_mps": "turn [m/s]",
-    "steer_rad": "steering [rad]",
-    "grade_rad": "grade [rad]",
-    "roll_rad": "roll [rad]",
-    "force_ratio": "force [weight]",
-    "sideways_mps": "speed to the left [m/s]",
-    "time_s": "time [s]",
-}
-"""Inputs of the simulation as axes call them."""
 
 
 def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figure:
-    """Return channels of a run, or of a stretch of one, as measured and simulated, a panel each.
-
-    The noise is drawn about the measurement: a simulation outside of the band is off by more than noise.
-    """
+    """Return channels of a run as measured and simulated, a panel each, the noise about the measurement."""
     bands = BAND_STDS * noise.size(run.pace_mps)
     panels = []
     for name in channels:
@@ -64,11 +50,7 @@ def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figur
 
 
 def dependence_figures(runs: Sequence[ComparedRun], noise: Noise) -> tuple[Figure, list[Figure]]:
-    """Return the mean residual of each channel over the input on which it depends most, and over every one.
-
-    The first figure has a panel a channel; of the others each is of a channel, with panels of every input that
-    varies, of time and of run.
-    """
+    """Return the mean residual of each channel over the input on which it depends most, and figures of every one."""
     strongest, every = [], []
     for name in channels_of(runs):
         c, axis = CHANNELS.index(name), AXIS.format(*CHANNEL_WORDS[name])
@@ -92,7 +74,7 @@ def dependence_figures(runs: Sequence[ComparedRun], noise: Noise) -> tuple[Figur
             "wheel."
         )
         panels["run"] = Panel(marks, axis, x_label="run")
-        every.append(Figure(channel_label(name), list(panels.values()), caption))
+        every.append(Figure(CHANNEL_WORDS[name][0], list(panels.values()), caption))
     caption = (
         "Measured minus simulated: means over bins of the input on which the residual depends most, with 95 % "
         "intervals over runs. A residual that is noise depends on nothing: its means lie on zero."
@@ -135,7 +117,7 @@ def spectra_figure(runs: Sequence[ComparedRun], noise: Noise, cutoff_hz: float) 
             Line(kind, at_hz, 10.0 * np.log10(np.maximum(density, LEAST_POWER)), colour, kind == "noise")
             for kind, at_hz, density, colour in curves
         ]
-        panels.append(Panel(marks, f"dB of ({unit})²/Hz", channel_label(name), log_x=True))
+        panels.append(Panel(marks, f"dB of ({unit})²/Hz", CHANNEL_WORDS[name][0], log_x=True))
     caption = (
         "Spectrum of measured minus simulated, mean over runs. A line above that of the noise is more than "
         f"noise. Beyond the cut-off of the low-pass, {cutoff_hz:.2g} Hz, nothing is compared."

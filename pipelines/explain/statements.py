@@ -11,22 +11,11 @@ from typing import Any, NamedTuple
 from pipelines.report.numbers import enumerated
 from terrain.discrepancy.compared import ComparedRun, channels_of, rms_of
 from terrain.discrepancy.held_out import Gain, Reference
-from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity
-from terrain.discrepancy.slopes import Slope, slopes_of
+from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity, values_with_intervals
+from terrain.discrepancy.slopes import CHANNEL_WORDS, Slope, off_by, slopes_of
 from terrain.discrepancy.terrain_match import TerrainMatch
-from terrain.discrepancy.verdict import Diagnosis, Limit, RuledOut, Value, Varying
-from terrain.effects import (
-    ACCEL,
-    CURRENT,
-    GYRO,
-    HEADING,
-    PARAMETER,
-    SPEED_X,
-    SPEED_Y,
-    TRACKED,
-    TURNING_CURRENT,
-    effect_named,
-)
+from terrain.discrepancy.verdict import Diagnosis, RuledOut, Varying
+from terrain.effects import PARAMETER, TRACKED, effect_named
 from terrain.robots import Robot
 
 CHANGED = 0.05
@@ -36,33 +25,10 @@ LITTLE_LEFT = 0.05
 """Part of the square that a black-box reference has to remove beyond the named causes, at the lower end of its
 interval, before something is left to find: less would not change what the simulation is good for."""
 
-TIMES, MOST_TIMES = 1.5, 20.0
-"""A factor from the first is stated as "2.5 times", below it in percent; over the second it is not stated."""
-
 MINUS, NBSP = "\N{MINUS SIGN}", "\N{NO-BREAK SPACE}"
 
 SHOWN_RUNS = 5
 """Names of runs that a sentence lists."""
-
-CHANNEL_WORDS = {
-    GYRO: ("yaw rate (gyro)", "rad/s"),
-    SPEED_X: ("speed ahead", "m/s"),
-    SPEED_Y: ("speed to the left", "m/s"),
-    ACCEL: ("accelerometer ahead", "m/s²"),
-    CURRENT: ("sum of the currents", "A"),
-    TURNING_CURRENT: ("right minus left current", "A"),
-    HEADING: ("heading rate (no gyro)", "rad/s"),
-}
-"""What a channel is called, and its unit."""
-
-TURNS, DRIVES, SIZE = (
-    ("the simulation turns", "fast", "slowly", "slow"),
-    ("the simulation drives", "fast", "slowly", "slow"),
-    ("simulated, it is", "large", "small", "small"),
-)
-"""What a simulation does with too much of it and too little, and with too low a level."""
-
-OFF_WORDS = {**dict.fromkeys(CHANNEL_WORDS, SIZE), GYRO: TURNS, HEADING: TURNS, SPEED_X: DRIVES}
 
 AGREE = "measured and simulated agree"
 
@@ -77,16 +43,10 @@ OF_TRACKS = {
 
 
 class Statement(NamedTuple):
-    """A channel in one sentence.
+    """A channel in one sentence, with the causes that act on it and how far measured and simulated are apart.
 
-    Parameters
-    ----------
-    channel : name
-    causes : named ones that act on it
-    rms_before, rms_after : of measured minus simulated; the second NaN where nothing was built in
-    text : the sentence
-    measured_over_simulated, measured_minus_simulated : of the runs compared, NaN where not clear
-    runs : of which runs the errors are
+    Errors are root mean squares of measured minus simulated in the ``runs`` named, the second NaN where nothing
+    was built in; factor and level are of the runs compared, NaN where not clear.
     """
 
     channel: str
@@ -113,13 +73,8 @@ def statements_of(
 ) -> tuple[Statement, ...]:
     """Return a sentence a channel, those that state something first.
 
-    Parameters
-    ----------
-    diagnosis : of the runs
-    robot : as it was tested
-    used : runs behind the diagnosis, beside the simulation
-    gain : on the runs held out; None where that was not measured
-    acting : by cause, the channels that it changes; where it shows by default
+    Errors are those of the gain on held-out runs where it was measured, else of the runs behind the diagnosis;
+    ``acting`` has by cause the channels that it changes, those where it shows by default.
     """
     slopes, extended = slopes_of(used), bool(used) and used[0].after is not None
     acts = {cause.name: cause.channels for cause in diagnosis.causes} if acting is None else acting
@@ -131,110 +86,60 @@ def statements_of(
             before, after, *_ = gain.channels[channel]
             where = "on held-out runs"
         causes = tuple(cause.name for cause in diagnosis.causes if channel in acts[cause.name])
+        of = Statement(channel, causes, before, after, "", slope.ratio, slope.level, where)
         name, unit = CHANNEL_WORDS[channel]
-        repair = _repair(channel, causes, (before, after), where, diagnosis, robot)
-        error = after if math.isfinite(after) else before
-        rest = _remainder(channel, slope, f"{error:.2g} {unit}", bool(repair), diagnosis, robot)
-        parts = [off_by(channel, slope), repair, *_rivals_and_variation(channel, diagnosis, robot), *rest]
-        text = "; ".join(filter(None, parts)) or f"{AGREE} to {before:.2g} {unit} rms {where}"
-        apart = slope.ratio, slope.level, where
-        statements.append(Statement(channel, causes, before, after, f"{name}: {text}.", *apart))
+        text = "; ".join(_clauses(of, diagnosis, robot)) or f"{AGREE} to {before:.2g} {unit} rms {where}"
+        statements.append(of._replace(text=f"{name}: {text}."))
     return tuple(sorted(statements, key=lambda statement: not statement.differs))
 
 
-def _repair(
-    channel: str,
-    names: Sequence[str],
-    rms: tuple[float, float],
-    where: str,
-    diagnosis: Diagnosis,
-    robot: Robot,
-) -> str:
-    """Return what the named causes make of the error."""
-    before, after = rms
-    if not math.isfinite(after):
-        return ""
-    changed = abs(after - before) >= CHANGED * before
-    causes = {cause.name: cause for cause in diagnosis.causes}
-    if not changed:  # that is worth stating where a cause shows most
-        names = [name for name in names if causes[name].channels[0] == channel]
-        if not names:
-            return ""
-    words = enumerated([in_robot_terms(name, causes[name].parameters, robot) for name in names])
-    words, unit = words or "what is named for other channels", CHANNEL_WORDS[channel][1]
-    if not changed:
-        return f"with {words} its error stays at {after:.2g} {unit} {where}"
-    verb = "falls" if after < before else "rises"
-    return f"with {words} its error {verb} from {before:.2g} to {after:.2g} {unit} {where}"
-
-
-def _rivals_and_variation(channel: str, diagnosis: Diagnosis, robot: Robot) -> Iterator[str]:
-    """Yield the effects of which one explains the channel, and how the effect behind it differs from run to run."""
-    for names in diagnosis.ambiguous_sets:
-        if channel in effect_named(names[0]).channels[:1]:
-            values = diagnosis.ambiguous_values
-            rivals = [in_robot_terms(name, values[name], robot) for name in names if name in values]
-            if rivals:
-                yield f"{enumerated(rivals, 'or')} explains it, and these runs do not distinguish which"
+def _clauses(of: Statement, diagnosis: Diagnosis, robot: Robot) -> Iterator[str]:
+    """Yield what is wrong in a channel, what repairs it, what may be behind it, and what remains."""
+    channel, before, after = of.channel, of.rms_before, of.rms_after
+    unit, ratio, level = CHANNEL_WORDS[channel][1], of.measured_over_simulated, of.measured_minus_simulated
+    if math.isfinite(ratio) or math.isfinite(level):
+        yield off_by(channel, ratio, level)
+    changed, causes = (
+        abs(after - before) >= CHANGED * before,
+        {cause.name: cause for cause in diagnosis.causes},
+    )
+    # an error that stays is worth stating where a cause shows most
+    names = [name for name in of.causes if changed or causes[name].channels[0] == channel]
+    repaired = math.isfinite(after) and (changed or bool(names))
+    if repaired:
+        terms = enumerated([in_robot_terms(name, causes[name].parameters, robot) for name in names])
+        verb = "falls" if after < before else "rises"
+        sizes = f"{verb} from {before:.2g} to {after:.2g}" if changed else f"stays at {after:.2g}"
+        yield f"with {terms or 'what is named for other channels'} its error {sizes} {unit} {of.runs}"
+    values = diagnosis.ambiguous_values
+    for rivals in diagnosis.ambiguous_sets:
+        terms = enumerated(
+            [in_robot_terms(name, values[name], robot) for name in rivals if name in values], "or"
+        )
+        if terms and channel in effect_named(rivals[0]).channels[:1]:
+            yield f"{terms} explains it, and these runs do not distinguish which"
     for effect in diagnosis.varying:
         if effect.channel == channel:
             parameter = PARAMETER[effect.parameter]
             size = f"{100.0 * effect.scatter:.2g} %" if parameter.as_percent else f"{effect.scatter:.2g}"
-            unit = "" if parameter.unit == "ratio" else f" {UNITS.get(parameter.unit, parameter.unit)}"
-            yield f"the {parameter.label} differs from run to run by {size}{unit}"
-
-
-def _remainder(
-    channel: str, slope: Slope, rest: str, repaired: bool, diagnosis: Diagnosis, robot: Robot
-) -> Iterator[str]:
-    """Yield what the named causes do not explain, and what it depends on."""
-    withdrawn = {effect.name: effect for effect in diagnosis.ruled_out if effect.parameters}
+            size_unit = "" if parameter.unit == "ratio" else f" {UNITS.get(parameter.unit, parameter.unit)}"
+            yield f"the {parameter.label} differs from run to run by {size}{size_unit}"
+    rest = f"{after if math.isfinite(after) else before:.2g} {unit}"
+    withdrawn = {effect.name: effect.parameters for effect in diagnosis.ruled_out if effect.parameters}
     for left in diagnosis.unexplained:
         constant = left.input == "constant"
-        if left.channel != channel or (constant and not repaired and math.isfinite(slope.level)):
+        if left.channel != channel or (constant and not repaired and math.isfinite(level)):
             continue  # that is the level already stated
+        many, one, what = "depend", "depends", f"on {left.input}"
         if left.input in withdrawn:
-            words = in_robot_terms(left.input, withdrawn[left.input].parameters, robot)
-            many, one, what = "look", "looks", f"like {words}, a cause that was withdrawn"
+            terms = in_robot_terms(left.input, withdrawn[left.input], robot)
+            many, one, what = "look", "looks", f"like {terms}, a cause that was withdrawn"
         elif constant:
             many, one, what = "are", "is", "a constant offset"
-        else:
-            many, one, what = "depend", "depends", f"on {left.input}"
         if repaired:
             yield f"{rest} rms remain, which {many} {what}"
         else:
             yield f"measured and simulated are {rest} rms apart, which {one} {what}"
-
-
-def off_by(channel: str, slope: Slope) -> str:
-    """Return by which factor or level the simulation is off in a channel; empty where neither is clear.
-
-    Examples
-    --------
-    >>> off_by("yaw_rate_radps", Slope(0.4, 0.01)), off_by("speed_x_mps", Slope(1.05, 0.01))
-    ('the simulation turns 2.5 times too fast', 'the simulation drives 4.8 % too slowly')
-    >>> off_by("current_a", Slope(level=1.98))
-    'simulated, it is 2 A too small throughout'
-    """
-    verb, more, less, low = OFF_WORDS[channel]
-    if math.isfinite(slope.ratio):
-        if slope.ratio < 0.0:
-            return f"{verb} of the wrong sign" if more == "large" else f"{verb} backward"
-        times = 1.0 / max(slope.ratio, 1e-9) if slope.ratio < 1.0 else slope.ratio
-        if times > MOST_TIMES:
-            size = f"more than {MOST_TIMES:g} times"
-        elif times >= TIMES:
-            size = f"{times:.2g} times"
-        else:
-            size = f"{100.0 * abs(1.0 / slope.ratio - 1.0):.2g} %"
-        return f"{verb} {size} too {more if slope.ratio < 1.0 else less}"
-    if not math.isfinite(slope.level):
-        return ""
-    size = f"{abs(slope.level):.2g} {CHANNEL_WORDS[channel][1]}"
-    if channel in (GYRO, HEADING, SPEED_Y):  # a level to one side is no lack of turning
-        return f"measured is {size} more to the {'left' if slope.level > 0 else 'right'} throughout"
-    is_off = verb if more == "large" else "the simulation is"
-    return f"{is_off} {size} too {low if slope.level > 0 else more} throughout"
 
 
 def split_ruled_out(diagnosis: Diagnosis) -> tuple[list[RuledOut], list[RuledOut]]:
@@ -253,11 +158,8 @@ def notes_of(
 ) -> tuple[str, ...]:
     """Return what a reader has to know of terrains and sessions that differ, in sentences.
 
-    Parameters
-    ----------
-    diagnosis : of the runs
-    matches : on which the runs of each label were simulated
-    apart : measured over simulated by label, as of :func:`terrain.discrepancy.slopes.terrains_apart`
+    Terrains are ``apart`` where measured over simulated differs, as of
+    :func:`terrain.discrepancy.slopes.terrains_apart`.
     """
     notes = [
         f"On {match.terrain} runs fit best if {100.0 * match.effective_ratio:.0f} % of the measured tilt "
@@ -288,29 +190,6 @@ def effect_label(effect: str) -> str:
     return effect.replace("_", " ")
 
 
-def channel_label(channel: str) -> str:
-    """Return what a channel is called."""
-    return CHANNEL_WORDS[channel][0]
-
-
-def quantity_interval(value: Value) -> str:
-    r"""Return the 95 % interval of a value; a unit that both ends have stands once.
-
-    Examples
-    --------
-    >>> quantity_interval(Value("payload_ratio", 0.2, "ratio", 0.1, 0.3)).replace("\xa0", " ")
-    '10 to 30 %'
-    """
-    low, high = quantity(value.name, value.low), quantity(value.name, value.high)
-    number, _, unit = low.partition(NBSP)
-    return f"{number if unit == high.partition(NBSP)[2] else low} to {high}"
-
-
-def values_with_intervals(values: Sequence[Value], last: str = " and ") -> str:
-    """Return values and their intervals."""
-    return last.join(f"{quantity(value.name, value.value)} ({quantity_interval(value)})" for value in values)
-
-
 def verdict_text(diagnosis: Diagnosis) -> str:
     """Return what the simulation gets wrong, with values and intervals."""
     sentences = []
@@ -327,7 +206,9 @@ def verdict_text(diagnosis: Diagnosis) -> str:
         varying = enumerated([effect_label(effect.name) for effect in diagnosis.varying])
         sentences.append(f"The size of {varying} differs from run to run.")
     if diagnosis.unexplained:
-        channels = enumerated([*dict.fromkeys(channel_label(left.channel) for left in diagnosis.unexplained)])
+        channels = enumerated(
+            [*dict.fromkeys(CHANNEL_WORDS[left.channel][0] for left in diagnosis.unexplained)]
+        )
         also = " also" if sentences else ""
         sentences.append(f"The residual is{also} systematic, without a known cause, in {channels}.")
     return " ".join(sentences) or f"These runs show nothing that the simulation of {diagnosis.robot} lacks."
@@ -360,13 +241,9 @@ def reference_text(reference: Reference) -> str:
     """
     named = reference.named_reduction if math.isfinite(reference.named_reduction) else 0.0
     left, removed = reference.reduction - named, f"{100.0 * max(reference.reduction, 0.0):.0f} %"
-    channels = [
-        channel_label(name)
-        for name, channel in reference.channels.items()
-        if channel.left_to_find_from > LITTLE_LEFT
-    ]
-    if channels:
-        judged = f"more is left to find in {enumerated(channels)}"
+    more = [name for name, of in reference.channels.items() if of.left_to_find_from > LITTLE_LEFT]
+    if more:
+        judged = f"more is left to find in {enumerated([CHANNEL_WORDS[name][0] for name in more])}"
     elif left > LITTLE_LEFT:
         judged = f"{reference.n_runs} runs are too few to state more"
     else:
@@ -396,34 +273,6 @@ def varying_text(effect: Varying) -> str:
         rivals = enumerated([effect_label(rival) for rival in effect.rivals], "or")
         text += f" These runs do not distinguish that from {rivals}."
     return text
-
-
-def limit_text(limit: Limit, missed: bool) -> str:
-    r"""Return a detection limit as a sentence.
-
-    Parameters
-    ----------
-    missed : whether the runs did not excite the effect
-
-    Examples
-    --------
-    >>> limit = Limit("steering_offset_1_rad", 0.003, "rad", "several speeds")
-    >>> limit_text(limit, False)
-    'A steering offset 1 under 3\xa0mrad would not have been detected.'
-    >>> limit_text(limit._replace(detection_limit=math.inf), True)
-    'A steering offset 1 of any size would not have been detected.'
-    """
-    parameter, value = PARAMETER[limit.name], limit.detection_limit
-    name = parameter.label
-    article = "An" if name[0] in "aeiou" and not name.startswith("one") else "A"
-    most = max(-parameter.low, parameter.high)
-    if not math.isfinite(value):
-        size = "of any size"
-    elif missed and value >= most:
-        size = f"of any size that is likely (up to {quantity(limit.name, most)})"
-    else:
-        size = f"{'off by ' if parameter.is_error else ''}under {quantity(limit.name, value)}"
-    return f"{article} {name} {size} would not have been detected."
 
 
 def in_words_of(drive: str, part: Any) -> Any:

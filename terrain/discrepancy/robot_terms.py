@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from terrain.discrepancy.verdict import Value
+from terrain.discrepancy.verdict import Limit, Value
 from terrain.effects import PARAMETER, Term, effect_named, rounded
 from terrain.extension import Basis, Origin, basis_of
 from terrain.robots import Robot
@@ -32,6 +32,8 @@ UNITS = {
     "nmpa": "N m/A",
 }
 """How sentences write the last word of a name, where that is not the unit itself."""
+
+MINUS, NBSP = "\N{MINUS SIGN}", "\N{NO-BREAK SPACE}"
 
 SMALL = {"rad": "mrad", "radps": "mrad/s", "s": "ms", "m": "mm"}
 """Units of a thousandth."""
@@ -110,8 +112,50 @@ def quantity(parameter: str, value: float) -> str:
         value, written = 1000.0 * value, SMALL[unit]
     else:
         written = UNITS.get(unit, unit)
-    number = f"{float(f'{value:.2g}'):g}".replace("-", "\N{MINUS SIGN}")
-    return f"{number}\N{NO-BREAK SPACE}{written}".rstrip("\N{NO-BREAK SPACE}")
+    number = f"{float(f'{value:.2g}'):g}".replace("-", MINUS)
+    return f"{number}{NBSP}{written}".rstrip(NBSP)
+
+
+def quantity_interval(value: Value) -> str:
+    r"""Return the 95 % interval of a value; a unit that both ends have stands once.
+
+    Examples
+    --------
+    >>> quantity_interval(Value("payload_ratio", 0.2, "ratio", 0.1, 0.3)).replace("\xa0", " ")
+    '10 to 30 %'
+    """
+    low, high = quantity(value.name, value.low), quantity(value.name, value.high)
+    number, _, unit = low.partition(NBSP)
+    return f"{number if unit == high.partition(NBSP)[2] else low} to {high}"
+
+
+def values_with_intervals(values: Sequence[Value], last: str = " and ") -> str:
+    """Return values and their intervals."""
+    return last.join(f"{quantity(value.name, value.value)} ({quantity_interval(value)})" for value in values)
+
+
+def limit_text(limit: Limit, missed: bool) -> str:
+    r"""Return a detection limit as a sentence; the runs that ``missed`` it did not excite the effect.
+
+    Examples
+    --------
+    >>> limit = Limit("steering_offset_1_rad", 0.003, "rad", "several speeds")
+    >>> limit_text(limit, False)
+    'A steering offset 1 under 3\xa0mrad would not have been detected.'
+    >>> limit_text(limit._replace(detection_limit=math.inf), True)
+    'A steering offset 1 of any size would not have been detected.'
+    """
+    parameter, value = PARAMETER[limit.name], limit.detection_limit
+    name = parameter.label
+    article = "An" if name[0] in "aeiou" and not name.startswith("one") else "A"
+    most = max(-parameter.low, parameter.high)
+    if not math.isfinite(value):
+        size = "of any size"
+    elif missed and value >= most:
+        size = f"of any size that is likely (up to {quantity(limit.name, most)})"
+    else:
+        size = f"{'off by ' if parameter.is_error else ''}under {quantity(limit.name, value)}"
+    return f"{article} {name} {size} would not have been detected."
 
 
 def listed(words: Sequence[str], last: str = "and") -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.verdict import Diagnosis
-from terrain.effects import CHANNELS
+from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.records import Array
 
 CLEAR_STDS = 3.0
@@ -143,3 +143,68 @@ def terrains_apart(diagnosis: Diagnosis, used: Sequence[ComparedRun]) -> Mapping
             if high.ratio - low.ratio > least:
                 return known
     return {}
+
+
+# -- What sentences call channels, and what a simulation does that is off in one ---------------------------
+
+TIMES, MOST_TIMES = 1.5, 20.0
+"""A factor from the first is stated as "2.5 times", below it in percent; over the second it is not stated."""
+
+CHANNEL_WORDS = {
+    GYRO: ("yaw rate (gyro)", "rad/s"),
+    SPEED_X: ("speed ahead", "m/s"),
+    SPEED_Y: ("speed to the left", "m/s"),
+    ACCEL: ("accelerometer ahead", "m/s²"),
+    CURRENT: ("sum of the currents", "A"),
+    TURNING_CURRENT: ("right minus left current", "A"),
+    HEADING: ("heading rate (no gyro)", "rad/s"),
+}
+"""What a channel is called, and its unit."""
+
+INPUT_LABELS = {
+    "speed_mps": "speed [m/s]",
+    "turn_mps": "turn [m/s]",
+    "steer_rad": "steering [rad]",
+    "grade_rad": "grade [rad]",
+    "roll_rad": "roll [rad]",
+    "force_ratio": "force [weight]",
+    "sideways_mps": "speed to the left [m/s]",
+    "time_s": "time [s]",
+}
+"""Inputs of the simulation as axes call them."""
+
+TURNS, DRIVES, SIZE = (
+    ("the simulation turns", "fast", "slowly", "slow"),
+    ("the simulation drives", "fast", "slowly", "slow"),
+    ("simulated, it is", "large", "small", "small"),
+)
+"""What a simulation does with too much of it and too little, and with too low a level."""
+
+OFF_WORDS = {**dict.fromkeys(CHANNEL_WORDS, SIZE), GYRO: TURNS, HEADING: TURNS, SPEED_X: DRIVES}
+
+
+def off_by(channel: str, ratio: float, level: float = math.nan) -> str:
+    """Return by which factor (measured over simulated) or level (measured minus simulated) a channel is off.
+
+    Examples
+    --------
+    >>> off_by("yaw_rate_radps", 0.4), off_by("speed_x_mps", 1.05)
+    ('the simulation turns 2.5 times too fast', 'the simulation drives 4.8 % too slowly')
+    >>> off_by("current_a", math.nan, 1.98)
+    'simulated, it is 2 A too small throughout'
+    """
+    verb, more, less, low = OFF_WORDS[channel]
+    if not math.isfinite(ratio):
+        size = f"{abs(level):.2g} {CHANNEL_WORDS[channel][1]}"
+        if channel in (GYRO, HEADING, SPEED_Y):  # a level to one side is no lack of turning
+            return f"measured is {size} more to the {'left' if level > 0 else 'right'} throughout"
+        is_off = verb if more == "large" else "the simulation is"
+        return f"{is_off} {size} too {low if level > 0 else more} throughout"
+    if ratio < 0.0:
+        return f"{verb} of the wrong sign" if more == "large" else f"{verb} backward"
+    times = max(ratio, 1.0 / max(ratio, 1e-9))
+    if times < TIMES:
+        size = f"{100.0 * abs(1.0 / ratio - 1.0):.2g} %"
+    else:
+        size = f"{times:.2g} times" if times <= MOST_TIMES else f"more than {MOST_TIMES:g} times"
+    return f"{verb} {size} too {more if ratio < 1.0 else less}"

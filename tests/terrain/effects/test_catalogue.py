@@ -188,8 +188,7 @@ exec(compile(source.replace("    *CAR,\n", "    *CAR,\n" + entry), str(place), "
 from dataclasses import replace
 import numpy as np
 import terrain.effects as effects
-from pipelines.explain.statements import limit_text
-from terrain.discrepancy.robot_terms import in_robot_terms, quantity
+from terrain.discrepancy.robot_terms import in_robot_terms, limit_text, quantity
 from terrain.discrepancy import residuals, evidence
 from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit, Value
