@@ -24,7 +24,6 @@ AXIS = "{} [{}]"  #: Of what a channel is called, and its unit
 LEAST_POWER = 1e-300  #: Under the logarithm of a spectrum
 
 
-
 def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figure:
     """Return channels of a run as measured and simulated, a panel each, the noise about the measurement."""
     bands = BAND_STDS * noise.size(run.pace_mps)
