@@ -8,128 +8,96 @@ import pytest
 from terrain.control.robot_control import Actuation
 from terrain.records import Reading
 
-PERIOD_S = 0.02
-MPS_PER_RADPS = 0.02
+PERIOD_S, MPS_PER_RADPS = 0.02, 0.02
 
 
-def accelerating(time_s):
-    """A start at 1 m/s^2 to 1 m/s, steady motion, and a stop at once at 4 s."""
-    return 0.0 if time_s > 4.0 else min(max(time_s, 0.0), 1.0)
-
-
-def steering(time_s):
-    """Turned by 0.3 rad within a second, held, and turned back from 4 s on."""
-    return 0.3 * min(time_s, 1.0) if time_s < 4.0 else max(0.3 - 0.5 * (time_s - 4.0), 0.0)
-
-
-def drive(wheels=None, steers=None, duration_s=6.0, lag_s=0.0, seed=0):
+def drive(change=lambda time_s, values: values, lag_s=0.0):
     """Return the times, and (n, 6) what was off its command, of a robot whose motors lag by a low-pass.
 
-    ``wheels(time_s, mps)`` and ``steers(time_s, rad)`` change what is measured, (3,) each.
+    A start at 1 m/s^2 to 1 m/s, steered by 0.3 rad, and a stop at once at 4 s while it is steered back.  What is
+    measured of wheels and steering (6,) is changed by ``change(time_s, values)``; None is no sample of the wheels.
     """
-    rng, actuation = np.random.default_rng(seed), Actuation(MPS_PER_RADPS)
-    mps, off, times_s = np.zeros(3), [], []
-    for k in range(round(duration_s / PERIOD_S)):
-        time_s = k * PERIOD_S
-        command = np.full(3, accelerating(time_s))
+    rng, actuation = np.random.default_rng(0), Actuation(MPS_PER_RADPS)
+    mps, off, times_s = np.zeros(3), [], np.arange(300) * PERIOD_S
+    for time_s in times_s:
+        command = np.full(3, 0.0 if time_s > 4.0 else min(time_s, 1.0))
+        steer = np.full(3, 0.3 * min(time_s, 1.0) if time_s < 4.0 else max(0.3 - 0.5 * (time_s - 4.0), 0.0))
         mps += (command - mps) * (1.0 if lag_s == 0.0 else -math.expm1(-PERIOD_S / lag_s))
-        measured = mps + 0.004 * rng.standard_normal(3)
-        angles = np.full(3, steering(time_s)) + 0.001 * rng.standard_normal(3)
-        measured = measured if wheels is None else wheels(time_s, measured)
-        angles = angles if steers is None else steers(time_s, angles)
-        reading = None
+        noise = np.repeat([0.004, 0.001], 3) * rng.standard_normal(6)
+        measured, reading = change(time_s, np.concatenate([mps, steer]) + noise), None
         if measured is not None:
-            values = np.concatenate([measured / MPS_PER_RADPS, np.ones(3)])[None]
+            values = np.concatenate([measured[:3] / MPS_PER_RADPS, np.ones(3)])[None]
             reading = Reading(np.array([time_s]), values)
-        actuation.measured(time_s, PERIOD_S, reading, angles)
-        actuation.commanded(command, np.full(3, steering(time_s)))
+        actuation.measured(time_s, PERIOD_S, reading, None if measured is None else measured[3:])
+        actuation.commanded(command, steer)
         off.append(actuation.off.copy())
-        times_s.append(time_s)
-    return np.array(times_s), np.array(off)
+    return times_s, np.array(off)
 
 
-def one(change, place=1, until_s=math.inf):
-    """Change one of three values from a time on."""
+def one(place, change, until_s=math.inf):
+    """Change one of six values from 2 s on."""
 
     def changed(time_s, values):
         if 2.0 <= time_s < until_s:
-            values[place] = change(time_s, values[place])
+            values[place] = change(values[place])
         return values
 
     return changed
 
 
-@pytest.mark.parametrize("lag_s", [0.0, 0.05, 0.1])
-def test_wheels_that_follow_with_a_lag_are_never_off(lag_s):
-    _, off = drive(lag_s=lag_s)
-    assert not off.any()
-
-
-DEVIATIONS = {
-    "stands": lambda time_s, value: 0.0,
-    "reads a fifth more": lambda time_s, value: 1.2 * value,
-    "reads a fifth less": lambda time_s, value: 0.8 * value,
-    "reads backwards": lambda time_s, value: -value,
-    "reads something else": lambda time_s, value: 3.0,
-}
-
-
-@pytest.mark.parametrize(("place", "deviation"), [*enumerate(DEVIATIONS)])
-def test_a_wheel_that_does_not_follow_is_off_within_a_quarter_of_a_second_and_alone(deviation, place):
-    place %= 3
-    time_s, off = drive(wheels=one(DEVIATIONS[deviation], place, until_s=3.0))
-    assert not off[:, [i for i in range(6) if i != place]].any()
-    assert not off[time_s < 2.0].any()
-    assert off[(time_s >= 2.25) & (time_s < 3.0), place].all()
-    assert not off[time_s > 3.4].any()
-
-
-def test_a_motor_whose_command_changes_and_whose_rate_does_not_is_off():
-    """Frozen at 1 m/s; the command to stop is what shows it."""
-    time_s, off = drive(wheels=one(lambda time_s, value: 1.0))
-    assert off[time_s > 4.8, 1].all()
-    assert not off[:, [0, 2]].any()
-
-
-@pytest.mark.parametrize(
-    ("place", "error_rad", "is_off"), [(0, 0.1, True), (2, -0.1, True), (1, 0.03, False)]
-)
-def test_a_steering_angle_that_does_not_follow_is_off(place, error_rad, is_off):
-    time_s, off = drive(steers=one(lambda time_s, value: value + error_rad, place, until_s=3.0))
-    assert not off[:, [i for i in range(6) if i != 3 + place]].any()
-    if is_off:
-        assert off[(time_s >= 2.25) & (time_s < 3.0), 3 + place].all()
-    else:
-        assert not off.any()
-    assert not off[time_s > 3.5].any()
-
-
-def test_steering_that_stands_while_its_command_turns_is_off():
-    held = []
-    time_s, off = drive(steers=one(lambda time_s, value: held.append(value) or held[0], 2))
-    assert off[time_s > 4.7, 5].all()
-    assert not off[time_s < 4.0].any()
-    assert not off[:, :5].any()
-
-
-@pytest.mark.parametrize("value", [1e3, -1e3, 1.5, math.nan])
-def test_single_spikes_and_gaps_are_not_off(value):
-    def spiky(time_s, values):
+def spiky(value):
+    def changed(time_s, values):
         if round(time_s / PERIOD_S) % 25 == 7:
             values[0] = value
         return values
 
-    _, off = drive(wheels=spiky)
-    assert not off.any()
+    return changed
 
 
-@pytest.mark.parametrize("silence", [lambda t, v: None, lambda t, v: np.full(3, math.nan)])
-def test_what_is_not_measured_is_not_off_and_what_was_off_before_is_over(silence):
+@pytest.mark.parametrize(
+    "following",
+    [
+        *({"lag_s": lag_s} for lag_s in (0.0, 0.05, 0.1)),
+        *({"change": spiky(value)} for value in (1e3, 1.5, math.nan)),
+        {"change": one(4, lambda angle: angle + 0.03, 3.0)},
+    ],
+)
+def test_what_follows_with_a_lag_spikes_gaps_or_a_small_error_is_never_off(following):
+    assert not drive(**following)[1].any()
+
+
+@pytest.mark.parametrize(
+    ("place", "change"),
+    [
+        (0, lambda mps: 0.0),
+        (1, lambda mps: 1.2 * mps),
+        (2, lambda mps: 0.8 * mps),
+        (0, lambda mps: -mps),
+        (1, lambda mps: 3.0),
+        (3, lambda angle: angle + 0.1),
+        (5, lambda angle: angle - 0.1),
+    ],
+)
+def test_what_does_not_follow_is_off_within_a_quarter_of_a_second_and_alone(place, change):
+    time_s, off = drive(one(place, change, until_s=3.0))
+    assert not off[:, [i for i in range(6) if i != place]].any()
+    assert not off[time_s < 2.0].any()
+    assert off[(time_s >= 2.25) & (time_s < 3.0), place].all()
+    assert not off[time_s > 3.5].any()
+
+
+@pytest.mark.parametrize(("place", "frozen"), [(1, 1.0), (5, 0.3)])
+def test_what_stands_while_its_command_changes_is_off(place, frozen):
+    time_s, off = drive(one(place, lambda value: frozen))
+    assert off[time_s > 4.8, place].all()
+    assert not off[time_s < 4.0].any()
+    assert not off[:, [i for i in range(6) if i != place]].any()
+
+
+def test_what_is_not_measured_is_not_off_and_what_was_off_before_is_over():
     def change(time_s, values):
-        if 2.0 <= time_s < 3.0:
-            values[0] = 0.0
-        return silence(time_s, values) if time_s >= 3.0 else values
+        return one(0, lambda mps: 0.0)(time_s, values) if time_s < 3.0 else None
 
-    time_s, off = drive(wheels=change)
+    time_s, off = drive(change)
     assert off[(time_s > 2.3) & (time_s < 3.0), 0].all()
     assert not off[time_s > 3.3].any()

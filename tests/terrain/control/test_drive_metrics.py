@@ -18,7 +18,6 @@ from terrain.control.drive_metrics import (
     energy_over,
     final_speed,
     immobilised,
-    lock_s,
     matching_ramp,
     slip_peak,
     steepest_grade,
@@ -120,14 +119,6 @@ def test_peak_slip_is_the_mean_over_wheels_above_a_speed_and_ignores_single_samp
     assert math.isnan(slip_peak(found, time_s < 2))
 
 
-def test_a_wheel_is_locked_where_it_hardly_turns_or_turns_backwards():
-    time_s = time_of()
-    locked = np.where(time_s < 1.5, -0.04, -0.5), np.where(time_s < 0.5, 0.5, -0.5)
-    found = history(speed_x_mps=-0.5, wheel_speed=(*locked, np.full_like(time_s, -0.06)))
-    assert lock_s(found) == pytest.approx(1.5)
-    assert lock_s(history(speed_x_mps=0.09, wheel_speed=0.0)) == 0.0
-
-
 def test_a_robot_is_stuck_where_it_does_not_move_although_desired():
     time_s = time_of(20.0)
     speed = np.full_like(time_s, 0.5)
@@ -188,17 +179,6 @@ def test_a_difference_is_taken_seed_by_seed():
     assert found.difference("fallback", "plain", "slip_peak").mean == pytest.approx(gain[1:].mean() / 3.0)
     one = compared(plain=("slip_peak", [1.0]), fallback=("slip_peak", [0.5]))
     assert not one.difference("fallback", "plain", "slip_peak").is_significant
-
-
-def test_only_controllers_that_use_the_terrain_adapt_to_it_and_one_hardly_believed_is_known():
-    names = ("plain", "true_terrain", "true_terrain+track")
-    both = compared("course", **{name: ("adapt_s", [1.0, 2.0]) for name in names})
-    assert [both.value(name, "adapt_s").mean for name in names] == [None, 1.5, 1.5]
-    assert both.difference("true_terrain", "plain", "adapt_s") is None
-    assert both.shown == ["adapt_s"]
-    both = compared(classified=("believed_ratio", [0.05, 0.1]), true_terrain=("believed_ratio", [0.0, 0.0]))
-    assert [both.is_hardly_believed(name) for name in both.rows] == [True, False]
-    assert not compared(classified=("believed_ratio", [0.2, 0.3])).is_hardly_believed("classified")
 
 
 def test_the_ramp_travels_as_far_as_the_first_reference():

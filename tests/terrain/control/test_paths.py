@@ -40,17 +40,6 @@ def test_noise_of_driven_points_does_not_become_curvature():
     assert points_of(noisy)[:n] == pytest.approx(points_of(ARC)[:n], abs=0.06)
 
 
-def test_place_is_the_one_on_exact_arcs():
-    for s in (3.0, 12.0, 20.0, 27.3):
-        i = round(s / 0.05)
-        heading = ARC.heading_rad[i]
-        for lateral in (-1.0, 0.3, 2.0):
-            x, y = ARC.x_m[i] - lateral * np.sin(heading), ARC.y_m[i] + lateral * np.cos(heading)
-            found = ARC.locate(x, y, heading + 0.1)
-            assert found[:4] == pytest.approx((s, lateral, 0.1, ARC.curvature_pm[i]), abs=0.01)
-            assert found.status == PathStatus.OK
-
-
 def test_search_is_local_and_does_not_go_back():
     loop = path_from_curvature(np.array([0.0, 100.0]), np.array([0.1, 0.1]))  # passes each point 1.6 times
     s, found = np.nan, []

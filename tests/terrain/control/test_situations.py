@@ -12,13 +12,10 @@ from terrain.control.situations import (
     SITUATIONS,
     STARTS_HOLD_S,
     SituationOptions,
-    brake_time,
     make_situation,
     start_times,
-    terrain_changes,
 )
 from terrain.errors import ConfigError
-from terrain.records import Label
 from terrain.robots import load_robot
 from terrain.terramechanics.soil import load_soil
 
@@ -73,13 +70,6 @@ def test_starts_begin_at_rest_and_last_as_long_as_is_evaluated(speed_mps, accel_
         assert np.abs(np.diff(speed)).max() == pytest.approx(accel_mps2 / scenario.rate_hz)
 
 
-def test_a_braking_begins_where_standstill_is_first_desired():
-    scenario = situation("brake", ROBOT, "grass", 0).scenario
-    at = int(np.searchsorted(scenario.time_s, brake_time(scenario)))
-    assert scenario.twist[at - 1, 0] == 1.0
-    assert not scenario.twist[at:].any()
-
-
 def test_mixed_changes_terrain_throughout_and_loses_its_camera():
     mixed = situation(MIXED, ROBOT, COURSE, 1)
     patches = mixed.scenario.patches
@@ -91,12 +81,6 @@ def test_mixed_changes_terrain_throughout_and_loses_its_camera():
     assert {patch.terrain for patch in patches} <= set(mixed.soils)
     assert mixed.faults.camera_lost_s == (CAMERA_LOST_S,)
     assert mixed.scenario.time_s[-1] > CAMERA_LOST_S[1]
-
-
-def test_changes_are_where_another_terrain_begins():
-    labels = (Label(0, 4, "a"), Label(4.5, 6, "a"), Label(7, 9, "b"), Label(9, 11, "a"))
-    assert terrain_changes(labels) == [(7.0, "b"), (9.0, "a")]
-    assert terrain_changes(labels[:2]) == terrain_changes(()) == []
 
 
 @pytest.mark.parametrize(

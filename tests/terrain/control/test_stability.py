@@ -4,17 +4,11 @@ import numpy as np
 import pytest
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.control.pid import Gains, PidState, WheelPid, check_gains, pid_step, wheel_step
+from terrain.control.pid import Gains, PidState, check_gains, pid_step
 from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrices, spectral_radius
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
-from terrain.simulation.dynamic.plant import make_plant, start_state, uniform_profile
-from terrain.simulation.dynamic.step import advance
-from terrain.simulation.sensors import BODY_ROW
-from terrain.terramechanics.soil import load_soil
-from terrain.terramechanics.traction import equilibrium_slip, net_pull
 
 ROBOT = load_robot("agrimaro")
 DT_S = 0.02
@@ -92,50 +86,6 @@ def test_a_small_change_grows_or_decays_by_the_largest_eigenvalue(numbers, n_del
     slip = np.abs(small_changes(gains, n_delayed, *where, 500))
     early, late = slip[150:250].max(), slip[400:500].max()  # a hundred samples hold a whole swing
     assert (late / early) ** (1 / 250) == pytest.approx(spectral_radius(matrix), rel=2e-3)
-
-
-def on_grass(gains, target, wheel_speed_mps, n_delayed, duration_s=14.0):
-    """Slip at each sample; from 3 s on under control, at 5 s a kick. Truth behind the encoders' low-pass."""
-    plant, profile = make_plant(ROBOT, Conditions()), uniform_profile(ROBOT, load_soil("grass"))
-    state, memory, record = start_state(np.zeros(3)), [WheelPid()] * 3, np.zeros(20, BODY_ROW)
-    queue, found = [np.zeros(3)] * n_delayed, []
-    rate, speed, share = np.zeros(3), 0.0, 0.001 / ROBOT.sensors.encoder_time_constant_s
-    for k in range(round(duration_s / DT_S)):
-        command, added = np.full(3, min(k * DT_S, 1.0) * wheel_speed_mps / RADIUS_M), np.zeros(3)
-        if k >= 150:
-            steps = [
-                wheel_step(gains, RADIUS_M, state, u, w, speed, 0.0, speed, [target] * 3, DT_S)
-                for state, u, w in zip(memory, command.tolist(), rate.tolist(), strict=True)
-            ]
-            added, memory = np.array([step.correction_radps for step, _ in steps]), [m for _, m in steps]
-        queue.append(added + (0.2 * command if 250 <= k < 255 else 0.0))
-        sent = (command + queue.pop(0))[None]
-        advance(plant, profile, state, sent, np.zeros((1, 3)), 20, np.zeros((20, 3)), record)
-        for row in record:
-            rate = rate + share * (row["wheels"]["wheel_radps"] - rate)
-            speed += share * (row["speed_x_mps"] - speed)
-        found.append(record["wheels"]["slip_ratio"][-1, 0])
-    return np.array(found)
-
-
-def test_the_full_robot_on_grass_settles_below_the_critical_gain_and_oscillates_above_it():
-    soil, aside, wheel_speed_mps = load_soil("grass"), 1e-4, 0.5
-    balance = equilibrium_slip(soil, LOAD_N, 0.0, *GEOMETRY)
-    below, above = net_pull(soil, LOAD_N, np.array([balance - aside, balance + aside]), *GEOMETRY)
-    slope = (above - below) / (2 * aside) / LOAD_N
-    gain = critical_gain(3 * DT_S, wheel_speed_mps, balance, slope)
-    settled, swinging = (
-        on_grass(
-            Gains(factor * gain, 0.0, 0.0, 2 * wheel_speed_mps / RADIUS_M),
-            balance,
-            wheel_speed_mps,
-            3,
-        )[-100:]
-        for factor in (0.85, 1.2)
-    )
-    assert np.ptp(settled) < 1e-3
-    assert settled[-1] == pytest.approx(balance, abs=1e-3)
-    assert np.ptp(swinging) > 0.5
 
 
 def test_the_margin_is_the_same_at_any_speed():

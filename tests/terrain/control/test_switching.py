@@ -62,33 +62,6 @@ def test_an_output_that_is_not_later_is_ignored(time_s):
     assert update(GRASS, time_s, "clay", 0.9) is GRASS
 
 
-def test_the_probability_is_that_of_the_last_output_of_the_accepted_class():
-    belief = update(GRASS, 102.0, "clay", 0.99)
-    assert belief.probability == 0.9
-    assert update(belief, 104.0, "clay", 0.8).probability == 0.8
-
-
-outputs = st.tuples(
-    st.sampled_from(["grass", "clay", ""]), st.sampled_from([0.9, 0.3, NAN]), st.floats(0.1, 12)
-)
-
-
-@given(st.lists(outputs, max_size=20))
-def test_an_accepted_class_was_classified_for_the_whole_dwell(classified):
-    belief, time_s, row = NO_BELIEF, 0.0, []
-    for terrain, probability, wait_s in classified:
-        time_s += wait_s
-        meant = terrain if probability >= 0.5 else ""
-        whole = row and row[-1][1] == meant and wait_s <= SWITCHING.silent_s
-        row = [*row, (time_s, meant)] if whole else [(time_s, meant)]
-        before, belief = belief, update(belief, time_s, terrain, probability)
-        if belief.terrain != before.terrain:
-            assert belief.terrain == meant
-            assert time_s - row[0][0] >= SWITCHING.dwell_s - 1e-6
-        elif meant != before.terrain:
-            assert time_s - row[0][0] < SWITCHING.dwell_s
-
-
 # A time of driving or standing, or an output (terrain, probability)
 events = st.one_of(
     st.tuples(st.sampled_from([0.0, 0.02, 0.5, 1.0]), st.floats(0.01, 6.0)),
@@ -120,21 +93,6 @@ def test_a_class_is_believed_for_a_bounded_time_of_driving_after_its_last_output
             assert math.isfinite(belief.probability)
         else:
             assert math.isnan(belief.probability)
-
-
-@given(st.floats(0.1, 100.0), st.lists(st.floats(0.001, 3.0), min_size=1, max_size=30))
-def test_when_a_class_expires_does_not_depend_on_the_steps(total_s, parts):
-    belief = GRASS
-    for part in parts:
-        belief = drive_on(belief, 1.0, total_s * part / sum(parts))
-    if abs(total_s - SWITCHING.unconfirmed_max_s) > 1e-6:
-        assert belief.terrain == drive_on(GRASS, 1.0, total_s).terrain
-
-
-def test_a_class_that_expired_has_to_be_repeated_for_the_dwell_again():
-    expired = drive_on(GRASS, 1.0, 11.0, SWITCHING._replace(silent_s=100.0))
-    assert expired == NO_BELIEF._replace(received_s=GRASS.received_s)
-    assert accepted([("grass", 0.9)] * 2, expired, 104.0) == [UNKNOWN, "grass"]
 
 
 def test_driving_is_what_windows_are_cut_of():

@@ -6,7 +6,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.control import traction
-from terrain.control.pid import DriveState
 from terrain.control.traction import (
     SETTINGS,
     TractionState,
@@ -27,7 +26,6 @@ DT_S = 0.02
 NAN, INF = math.nan, math.inf
 BAD_TIMES = (NAN, 0.0, -0.02, 0.6, INF, -INF)
 TARGET = TractionTarget(0.1)
-SLICK = TractionTarget(0.1, 0.15, 3.0)
 """Terrain on which braking is controlled."""
 
 
@@ -230,70 +228,6 @@ def test_speed_never_falls_while_more_is_desired_and_the_turning_centre_stays(
         assert np.array_equal(back, -command)
         assert np.array_equal(report_back, report, equal_nan=True)
         assert np.array_equal(numbers_of(after_back)[:-3], numbers_of(after)[:-3], equal_nan=True)
-
-
-def driven_along(target, duration_s=30.0, desired_mps=1.0, shear=0.1, limit=0.4, resistance=0.2):
-    """Speed over ground (n,) of a point on wheels: ``v' = g (limit (1 - exp(-s / shear)) - resistance)``."""
-    state, v, speeds = TractionState(), 0.0, []
-    for k in range(round(duration_s / DT_S)):
-        command = min(desired_mps, k * DT_S)
-        d = state.driven_mps
-        if target is not None:
-            slip = (d - v) / max(d, v) if max(d, v) > 0.05 else 0.0
-            _, state, report = steps(state, command / RADIUS_M, ground_mps=v, slip=slip, aim=(target,))
-            command = report.driven_mps
-        for _ in range(40):
-            slip = (command - v) / max(command, v) if max(command, v) > 1e-6 else 0.0
-            thrust = math.copysign(limit * (1 - math.exp(-abs(slip) / shear)), slip)
-            v = max(0.0, v + 9.81 * (thrust - resistance * min(v / 0.02, 1.0)) * DT_S / 40)
-        speeds.append(v)
-    return np.array(speeds)
-
-
-def test_no_target_reduces_the_steady_speed():
-    free = driven_along(None)
-    balance = 0.1 * math.log(2)
-    assert free[-1] == pytest.approx(1 - balance, rel=1e-3)
-    for target in (0.02, 0.05, 0.1, 0.25, 0.6):
-        speed = driven_along(target)
-        assert speed[-1] == pytest.approx(free[-1], rel=0.005)
-        assert speed[250] > 0.8 * free[250], target
-
-
-def braked(aim, wheel, v, slowing=3.0, using=SETTINGS):
-    """Commands (n, 3), speed and state after a command to stop, at a given deceleration."""
-    state = TractionState()
-    directions = np.sign(wheel)
-    _, state, _ = steps(state, wheel, ground_mps=v * directions, aim=aim, using=using)
-    state = state._replace(driven_mps=v)
-    rows = []
-    while len(rows) < 100:
-        command, state, report = steps(state, 0.0, ground_mps=v * directions, aim=aim, using=using)
-        rows.append([*command, report.driven_mps, report.drive_state, v])
-        v = max(v - slowing * DT_S, 0.0)
-    return np.array(rows), state
-
-
-def test_braking_on_slick_terrain_keeps_the_directions_and_its_slip_and_ends():
-    wheel = np.array([5.0, -5.0, 4.0])
-    loose, _ = braked(TractionTarget(0.1), wheel, 1.0)
-    assert not loose[:, :4].any()
-    using = check_settings(SETTINGS, ROBOT)
-    held, state = braked(SLICK, wheel, 1.0, using=using)
-    command, driven, drive_state, v = held[:, :3], held[:, 3], held[:, 4], held[:, 5]
-    busy = driven > 0
-    assert 5 < busy.sum() < 20
-    assert command[busy] == pytest.approx(driven[busy, None] / 1.0 * wheel)
-    assert (np.diff(driven) <= 1e-12).all()
-    assert set(drive_state[busy]) == {DriveState.BRAKING}
-    # the slip asked for, at the speed that the lead makes of the one seen
-    time_s = np.arange(1, 101) * DT_S
-    charge = using.charge_mps_per_mps2 * 3.0 * np.exp(-time_s / using.charge_time_s)
-    expected = (v - 3.0 * np.minimum(time_s, using.brake_lead_s)) * (1 - 0.15) - charge
-    assert driven[busy] == pytest.approx(expected[busy])
-    assert (expected + charge)[busy].min() > 0.1  # slower, the wheels are commanded to stop
-    assert not held[~busy][:, :4].any()
-    assert state.driven_mps == 0.0
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from terrain.control.wheel_corrections import BridgeState, LastSample, LowLevelKinematics, corrections
+from terrain.control.wheel_corrections import BridgeState, LastSample, corrections
 from terrain.records import Command, Reading
 from terrain.robots import load_robot
 
@@ -31,15 +31,6 @@ def test_elsewhere_nothing_is_added(angle_rad):
         added, state = corrections(command, RADPS, STEER_RAD, np.array([0.2, angle_rad, 0.2]))
     assert state == BridgeState.STEERING
     assert not added.any()
-
-
-def test_kinematics_begins_where_the_steering_is():
-    """A crab from steering that is there already: the theoretical rate at once, and nothing is steered."""
-    heading_rad = 1.3
-    kinematics = LowLevelKinematics(ROBOT, np.full(3, heading_rad))
-    wheel_radps = kinematics.step(0.5 * np.array([np.cos(heading_rad), np.sin(heading_rad), 0.0]), 0.02)
-    assert wheel_radps == pytest.approx(np.full(3, 0.5 / ROBOT.wheel_radius_m))
-    assert kinematics.steer_rad == pytest.approx(np.full(3, heading_rad))
 
 
 @pytest.mark.parametrize(
