@@ -7,10 +7,19 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
-from terrain.discrepancy.compared import MIN_SPREAD, ComparedRun, channels_of, spread_of, strongest_input
+from terrain.discrepancy.compared import (
+    MIN_SPREAD,
+    ComparedRun,
+    binned_means,
+    channels_of,
+    noise_spectrum,
+    run_means,
+    spectrum,
+    spread_of,
+    strongest_input,
+)
 from terrain.discrepancy.constancy import PartValues
 from terrain.discrepancy.noise import Noise
-from terrain.discrepancy.residuals import binned_means, noise_spectrum, run_means, spectrum
 from terrain.discrepancy.robot_terms import quantity
 from terrain.discrepancy.slopes import CHANNEL_WORDS, INPUT_LABELS
 from terrain.effects import CHANNELS

@@ -6,14 +6,11 @@ the noise of a differentiated encoder, which otherwise looks like latency or mas
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.signal import welch
-from scipy.stats import t as student
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.discrepancy.signals import Signals
@@ -67,8 +64,7 @@ class LowPass(NamedTuple):
     ----------
     taps : on the clock of the replay
     every : samples of that clock a row
-    rate_hz : of the rows
-    cutoff_hz : of the window
+    rate_hz, cutoff_hz : of the rows, and of the window
     inputs_every : samples of the signals' clock a sample of the replay's; 0 where that clock is too slow for
         a window of its own in between
     instrument_cutoff_hz : cut-off of the wheel speeds that serve as instruments of the sensitivities, see
@@ -116,14 +112,8 @@ class Rows(NamedTuple):
 
 
 INPUTS: tuple[str, ...] = (
-    "speed_mps",
-    "turn_mps",
-    "steer_rad",
-    "grade_rad",
-    "roll_rad",
-    "force_ratio",
-    "sideways_mps",
-    "wheel_phase_rad",
+    *("speed_mps", "turn_mps", "steer_rad", "grade_rad", "roll_rad"),
+    *("force_ratio", "sideways_mps", "wheel_phase_rad"),
 )
 """Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt, traction over
 weight, 0, and how far the wheels have turned: a column for each of them.  Of an omni robot speed, turn and
@@ -151,14 +141,8 @@ def low_pass_of(signals: Sequence[Signals]) -> LowPass:
     inputs_every = int(near * rate_hz / (CLOCKS_PER_CUTOFF * cutoff_hz))
     clock_hz = rate_hz / max(inputs_every, 1)
     every = max(int(near * clock_hz / (ROWS_PER_CUTOFF * cutoff_hz)), 1)
-    return LowPass(
-        _window(cutoff_hz, clock_hz),
-        every,
-        clock_hz / every,
-        cutoff_hz,
-        inputs_every,
-        INSTRUMENT_CUTOFF_RATIO * cutoff_hz,
-    )
+    of_rows = every, clock_hz / every, cutoff_hz
+    return LowPass(_window(cutoff_hz, clock_hz), *of_rows, inputs_every, INSTRUMENT_CUTOFF_RATIO * cutoff_hz)
 
 
 def _window(cutoff_hz: float, rate_hz: float) -> Array:
@@ -191,52 +175,34 @@ def rows_of(
     """
     dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(signals, low_pass)
     n_rows = max((len(wheel_speed) - low_pass.taps.size) // low_pass.every + 1, 0)
-    first = low_pass.taps.size // 2
+    first = slice(0, math.ceil(STEADY_S / dt) + 1)
+    change_mps, change_rad = (np.ptp(values[first], axis=0).max() for values in (wheel_speed, steer))
+    steady = change_mps <= STEADY_MPS and change_rad <= STEADY_RAD
     skip = math.ceil(SETTLE_S * low_pass.rate_hz)
-    is_short = len(wheel_speed) * dt < SHORT_S
-    start = 0 if is_short and _begins_steadily(wheel_speed, steer, dt) else skip
-    keep = slice(start, max(n_rows - skip, start))
+    start = 0 if len(wheel_speed) * dt < SHORT_S and steady else skip
+    kept = slice(start, max(n_rows - skip, start))
 
     known = np.isfinite(measured)
-    whole = bool(known[:, known.any(axis=0)].all())
-
-    def plain(values: Array) -> Array:
-        rows: Array = decimate(np.ascontiguousarray(values), low_pass.taps, low_pass.every)
-        return rows[keep]
-
-    def smooth(values: Array) -> Array:
-        if whole:
-            return plain(values)
-        rows: Array = decimate_known(np.ascontiguousarray(values), known, low_pass.taps, low_pass.every)
-        return rows[keep]
-
-    instruments = _instruments(wheel_speed, low_pass, dt)
+    holes = known[:, :0] if known[:, known.any(axis=0)].all() else known
+    window = low_pass.taps, low_pass.every
+    instruments = wheel_speed
+    if math.isfinite(low_pass.instrument_cutoff_hz):
+        instruments = _decimated(wheel_speed, _window(low_pass.instrument_cutoff_hz, 1.0 / dt), 1)
     true_wheel_speed, true_grade, true_roll = undone(planar, vector, dt, instruments, grade, roll)
     truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll, np.zeros((0, 3)))
     points, sensed, spans = _evaluation_points(vector, parameters)
-    holes = np.zeros((0, 0), dtype=np.bool_) if whole else known
-    window = holes, low_pass.taps, low_pass.every
-    now = _predictions(planar, points[:1], sensed[:1], dt, wheel_speed, steer, grade, roll, truth, *window)[
-        0, keep
-    ]
-    both = _predictions(planar, points[1:], sensed[1:], dt, instruments, steer, grade, roll, truth, *window)[
-        :, keep
-    ]
+    inputs = steer, grade, roll, truth, holes, *window
+    now = _predictions(planar, points[:1], sensed[:1], dt, wheel_speed, *inputs)[0, kept]
+    both = _predictions(planar, points[1:], sensed[1:], dt, instruments, *inputs)[:, kept]
     change = (both[::2] - both[1::2]) / spans[:, None, None]
     speed, turn, sideways = _rolled(planar, instruments, steer)
     force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
-    inputs = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, force, sideways])
+    driven = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, force, sideways])
     phase = np.cumsum(instruments, axis=0) * (dt / planar.radius_m)
-    at = first + low_pass.every * np.arange(n_rows)[keep]
-    return Rows(
-        signals.run_id,
-        signals.terrain,
-        at * dt,
-        smooth(measured),
-        now,
-        change,
-        np.column_stack([plain(inputs), phase[at]]),
-    )
+    at = low_pass.taps.size // 2 + low_pass.every * np.arange(n_rows)[kept]
+    shown = decimate(np.ascontiguousarray(measured), holes, *window)[kept]
+    driven = np.column_stack([decimate(driven, known[:, :0], *window)[kept], phase[at]])
+    return Rows(signals.run_id, signals.terrain, at * dt, shown, now, change, driven)
 
 
 def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Array, Array]:
@@ -250,21 +216,11 @@ def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Ar
     return speed, wheel_speed[:, -1] - wheel_speed[:, 0], np.zeros_like(speed)
 
 
-def _begins_steadily(wheel_speed: Array, steer: Array, dt: float) -> bool:
-    first = slice(0, math.ceil(STEADY_S / dt) + 1)
-    return bool(
-        np.ptp(wheel_speed[first], axis=0).max() <= STEADY_MPS
-        and np.ptp(steer[first], axis=0).max() <= STEADY_RAD
-    )
-
-
-def _instruments(wheel_speed: Array, low_pass: LowPass, dt: float) -> Array:
-    """Return wheel speeds (n, wheels) low-pass filtered as instruments, of the same length."""
-    if not math.isfinite(low_pass.instrument_cutoff_hz):
-        return wheel_speed
-    taps = _window(low_pass.instrument_cutoff_hz, 1.0 / dt)
+def _decimated(values: Array, taps: Array, every: int) -> Array:
+    """Return columns behind a window, of the same length where none is left out, held at both ends."""
     half = taps.size // 2
-    return np.asarray(decimate(np.pad(wheel_speed, ((half, half), (0, 0)), mode="edge"), taps, 1))
+    padded = np.pad(values, ((half, half), (0, 0)), mode="edge")
+    return np.asarray(decimate(padded, np.zeros((0, 0), dtype=np.bool_), taps, every))
 
 
 def _evaluation_points(vector: Array, parameters: Sequence[str]) -> tuple[Array, Array, Array]:
@@ -302,8 +258,7 @@ def _predictions(
 ) -> Array:
     """Return the low-pass filtered prediction of the simulation at each point (points, rows, channels).
 
-    ``truth`` is the motion of the body at all points where only sensors change; ``known`` states where
-    channels were measured, or is empty where that is everywhere.
+    ``truth`` is the motion of the body at all points where only sensors change.
     """
     m = max((wheel_speed_mps.shape[0] - taps.size) // every + 1, 0)
     out = np.empty((points.shape[0], m, 7))
@@ -312,9 +267,7 @@ def _predictions(
             shown = sense(planar, points[i], dt, truth)
         else:
             shown = replay(planar, points[i], dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad)
-        out[i] = (
-            decimate_known(shown, known, taps, every) if known.shape[0] > 0 else decimate(shown, taps, every)
-        )
+        out[i] = decimate(shown, known, taps, every)
     return out
 
 
@@ -324,9 +277,8 @@ def prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, A
     Holes of the inputs are bridged, and measurements there are dropped.  Both pass a window far above the
     low-pass: nonlinearities of the simulation, as friction about rest, turn noise of the wheels into a bias.
     """
-    columns = np.column_stack(
-        [signals.wheel_speed_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad]
-    )
+    tilt = signals.grade_rad, signals.roll_rad
+    columns = np.column_stack([signals.wheel_speed_mps, signals.steer_rad, *tilt])
     measured = np.array(signals.measured)
     holes = ~np.isfinite(columns).all(axis=1)
     if holes.any():
@@ -335,190 +287,48 @@ def prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, A
             known = np.isfinite(column)
             column[:] = np.interp(at, at[known], column[known]) if known.any() else 0.0
         measured[holes] = np.nan
-    every = low_pass.inputs_every
-    if every > 0:
+    if low_pass.inputs_every > 0:
         taps = _window(INPUT_CUTOFFS * low_pass.cutoff_hz, 1 / signals.dt_s)
-        both = np.column_stack([columns, measured])
-        half = taps.size // 2
-        padded = np.pad(both, ((half, half), (0, 0)), mode="edge")
-        both = decimate(padded, taps, every)
+        both = _decimated(np.column_stack([columns, measured]), taps, low_pass.inputs_every)
         columns, measured = both[:, : columns.shape[1]], both[:, columns.shape[1] :]
     wheels = signals.wheel_speed_mps.shape[1]
-    wheel_speed, steer, tilt = np.split(columns, [wheels, 2 * wheels], axis=1)
-    return (
-        signals.dt_s * max(every, 1),
-        np.ascontiguousarray(wheel_speed),
-        np.ascontiguousarray(steer),
-        np.ascontiguousarray(tilt[:, 0]),
-        np.ascontiguousarray(tilt[:, 1]),
-        measured,
-    )
+    parts = np.split(columns, [wheels, 2 * wheels, 2 * wheels + 1], axis=1)
+    wheel_speed, steer, grade, roll = (np.ascontiguousarray(part) for part in parts)
+    return signals.dt_s * max(low_pass.inputs_every, 1), wheel_speed, steer, grade[:, 0], roll[:, 0], measured
 
 
 @njit
-def decimate(values: Array, taps: Array, every: int) -> Array:
-    """Return columns (m, c) of ``values`` (n, c) filtered by a window and decimated; a NaN spreads."""
+def decimate(values: Array, known: Array, taps: Array, every: int) -> Array:
+    """Return columns (m, c) of ``values`` (n, c) filtered by a window and decimated; a NaN spreads.
+
+    Where ``known`` (n, c) is not empty, it is the window's mean over what is known of each: the same samples have to
+    be left out of whatever is compared.  Where less than :data:`MIN_KNOWN` of the window's weight is known, it is the
+    mean over all: NaN, if there is one among them.
+    """
     n, c = values.shape
     m = max((n - taps.size) // every + 1, 0)
     out = np.zeros((m, c))
+    whole = np.abs(taps).sum()
     for row in range(m):
         start = row * every
         for t in range(taps.size):
             for j in range(c):
                 out[row, j] += taps[t] * values[start + t, j]
-    return out
-
-
-@njit
-def decimate_known(values: Array, known: Array, taps: Array, every: int) -> Array:
-    """Return the same of columns with holes: the window's mean over what is known (n, c) of each.
-
-    The same samples have to be left out of whatever is compared.  Where less than :data:`MIN_KNOWN` of the
-    window's weight is known, it is the mean over all: NaN, if there is one among them.
-    """
-    n, c = values.shape
-    m = max((n - taps.size) // every + 1, 0)
-    out = np.empty((m, c))
-    whole = np.abs(taps).sum()
-    for row in range(m):
-        start = row * every
-        for j in range(c):
-            total, weight, there, plain = 0.0, 0.0, 0.0, 0.0
+        for j in range(known.shape[1]):
+            total, weight, there = 0.0, 0.0, 0.0
             for t in range(taps.size):
-                plain += taps[t] * values[start + t, j]
                 if known[start + t, j]:
                     total += taps[t] * values[start + t, j]
                     weight += taps[t]
                     there += abs(taps[t])
-            out[row, j] = total / weight if there >= MIN_KNOWN * whole else plain
+            if there >= MIN_KNOWN * whole:
+                out[row, j] = total / weight
     return out
 
 
-def measured_channels(rows: Sequence[Rows]) -> tuple[str, ...]:
-    """Return the channels that any run has, in the order of ``CHANNELS``."""
+def measured_channels(rows: Sequence[Any]) -> tuple[str, ...]:
+    """Return the channels that any run, with what it measured, has, in the order of ``CHANNELS``."""
     seen = np.zeros(len(CHANNELS), dtype=bool)
     for run in rows:
         seen |= np.isfinite(run.measured).any(axis=0)
     return tuple(name for name, there in zip(CHANNELS, seen, strict=True) if there)
-
-
-# -- Statistics of residuals: their spectra, and their means over bins of an input and over runs -----------
-
-N_BINS = 6
-
-TAIL_RATIO = 0.01
-"""Part of an input's values beyond the outer bins on either side: outliers would stretch all of them."""
-
-MIN_IN_BIN = 3
-"""Least rows of a run in a bin for a mean."""
-
-SEGMENT_ROWS = 64
-"""Longest segment of a spectrum: some 10 s."""
-
-MIN_SEGMENT_ROWS = 8
-"""Shortest segment of a spectrum."""
-
-COVARIANCE_ROWS = 8192
-"""Grid of the spectrum from which the covariance of coloured noise is taken."""
-
-
-class BinnedMeans(NamedTuple):
-    """Means of residuals over bins of an input: centres, means and half 95 % intervals (bins,)."""
-
-    centre: Array
-    mean: Array
-    half_interval: Array
-
-
-def spectrum(residuals: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
-    """Return frequencies and one-sided density of residuals of several runs, of stretches without a hole.
-
-    The segment length is halved until half of the known rows lie in stretches of that length; where no
-    stretch has :data:`MIN_SEGMENT_ROWS`, the density is NaN.
-    """
-    parts = [part for values in residuals for part in _without_holes(values)]
-    n_known = sum(map(len, parts))
-    n_rows = SEGMENT_ROWS
-    while n_rows > MIN_SEGMENT_ROWS and 2 * sum(len(part) for part in parts if len(part) >= n_rows) < n_known:
-        n_rows //= 2
-    long = [part for part in parts if len(part) >= n_rows]
-    total = np.zeros(n_rows // 2 + 1) if long else np.full(n_rows // 2 + 1, np.nan)
-    for part in long:
-        total += len(part) * welch(part, rate_hz, nperseg=n_rows, detrend=False)[1]
-    frequency = np.fft.rfftfreq(n_rows, 1.0 / rate_hz)
-    return frequency[1:], total[1:] / max(sum(map(len, long)), 1)
-
-
-def noise_spectrum(weights: Array, frequency_hz: Array, rate_hz: float) -> Array:
-    """Return the one-sided density of the noise that a whitening filter (order + 1,) turns white."""
-    turn = np.exp(-2j * np.pi * np.outer(frequency_hz / rate_hz, np.arange(len(weights))))
-    density: Array = 2.0 / rate_hz / np.abs(turn @ weights) ** 2
-    return density
-
-
-def _without_holes(values: Array) -> Iterator[Array]:
-    """Yield the stretches of a signal without a hole."""
-    known = np.isfinite(values)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
-        yield values[start:end]
-
-
-def input_range(known: Array) -> tuple[float, float]:
-    """Return the range of values without outliers."""
-    low, high = np.quantile(known, [TAIL_RATIO, 1.0 - TAIL_RATIO])
-    return float(low), float(high)
-
-
-def binned_means(inputs: Sequence[Array], residuals: Sequence[Array]) -> BinnedMeans:
-    """Return the means of residuals in bins of equal width, with intervals over runs.
-
-    Examples
-    --------
-    >>> x = np.linspace(-0.06, 6.06, 613)
-    >>> centres, means, _ = binned_means([x, x], [2 * x, 2 * x + 2])
-    >>> centres.round(1), means.round(0)
-    (array([0.5, 1.5, 2.5, 3.5, 4.5, 5.5]), array([ 2.,  4.,  6.,  8., 10., 12.]))
-    """
-    known = np.concatenate([x[np.isfinite(x)] for x in inputs])
-    nothing = np.empty(0)
-    if not known.size:
-        return BinnedMeans(nothing, nothing, nothing)
-    edges = np.linspace(*input_range(known), N_BINS + 1)
-    found = []
-    for low, high in itertools.pairwise(edges):
-        each = []
-        for given, left in zip(inputs, residuals, strict=True):
-            inside = (given >= low) & (given < high) & np.isfinite(left)
-            if inside.sum() >= MIN_IN_BIN:
-                each.append(float(left[inside].mean()))
-        n = len(each)
-        if n:
-            half = student.ppf(0.975, n - 1) * np.std(each, ddof=1) / math.sqrt(n) if n > 2 else math.nan
-            found.append(((low + high) / 2, float(np.mean(each)), half))
-    return BinnedMeans(*np.array(found).T) if found else BinnedMeans(nothing, nothing, nothing)
-
-
-def run_means(residuals: Sequence[Array], sizes: Sequence[Array], weights: Array) -> tuple[Array, Array]:
-    """Return the mean of each run and half its 95 % interval, if all but the mean is coloured noise.
-
-    Parameters
-    ----------
-    residuals : (m,) of each run
-    sizes : (m,) of the noise
-    weights : of the filter that whitens it
-    """
-    covariance = np.fft.irfft(1.0 / np.abs(np.fft.rfft(weights, COVARIANCE_ROWS)) ** 2)
-    means, halves = [], []
-    for left, size in zip(residuals, sizes, strict=True):
-        known = np.isfinite(left)
-        n = int(known.sum())
-        if not n:
-            means.append(math.nan)
-            halves.append(math.nan)
-            continue
-        lags = np.arange(1, min(n, COVARIANCE_ROWS // 2))
-        spread = (covariance[0] + 2.0 * float(((1.0 - lags / n) * covariance[lags]).sum())) / n
-        means.append(float(left[known].mean()))
-        halves.append(1.96 * math.sqrt(float((size[known] ** 2).mean()) * max(spread, 0.0)))
-    return np.array(means), np.array(halves)
