@@ -85,33 +85,31 @@ def noise_of(
     orders : of the autoregression that are tried, from the longest; :data:`WHITE` for none
     """
     n_channels = residuals[0].shape[1]
-    filters, stds = np.full((n_channels, ORDER + 1), np.nan), np.full(n_channels, np.nan)
-    growth = np.full((n_channels, 3), np.nan)
-    powers = np.concatenate([_powers(speed) for speed in speeds_mps])
+    growth, filters = np.full((n_channels, 3), np.nan), np.full((n_channels, ORDER + 1), np.nan)
+    noise = Noise(growth, filters, np.full(n_channels, np.nan))
+    powers = [_powers(speed) for speed in speeds_mps]
     n_rows = sum(int(np.isfinite(r).sum()) for r in residuals)
     for c in range(n_channels):
         square = np.concatenate([r[:, c] for r in residuals]) ** 2
         seen = np.isfinite(square)
         if seen.sum() < 10 * ORDER or not square[seen].any():
             continue
-        growth[c] = _growth(square[seen], powers[seen])
+        noise.growth[c] = _growth(square[seen], np.concatenate(powers)[seen])
         scaled = [
-            r[:, c] / np.sqrt(_powers(v) @ growth[c]) for r, v in zip(residuals, speeds_mps, strict=True)
+            r[:, c] / np.sqrt(power @ noise.growth[c]) for r, power in zip(residuals, powers, strict=True)
         ]
         tables = {order: _lag_table(scaled, order) for order in orders}
-        enough = [order for order in orders if len(tables[order]) >= WHOLE_RATIO * len(tables[orders[-1]])]
-        table, order = tables[enough[0]], enough[0]
+        order = next(n for n in orders if len(tables[n]) >= WHOLE_RATIO * len(tables[orders[-1]]))
+        table = tables[order]
         if len(table) < 10 * ORDER:
             continue
         grow = 1.0 / max(1.0 - n_fitted / n_rows - order / len(table), 0.2)
         weights = _autoregression(table, row_s)
-        left = table[:, 0] - table[:, 1:] @ weights
-        scale = np.sqrt(np.mean(left**2) * grow)
-        if not scale > 0:
-            continue
-        filters[c] = np.concatenate([[1.0], -weights, np.zeros(ORDER - order)]) / scale
-        stds[c] = np.sqrt(np.mean(square[seen]) * grow)
-    return Noise(growth, filters, stds)
+        scale = np.sqrt(np.mean((table[:, 0] - table[:, 1:] @ weights) ** 2) * grow)
+        if scale > 0:
+            noise.filters[c] = np.concatenate([[1.0], -weights, np.zeros(ORDER - order)]) / scale
+            noise.std[c] = np.sqrt(np.mean(square[seen]) * grow)
+    return noise
 
 
 def _autoregression(table: Array, row_s: float) -> Array:
@@ -128,9 +126,8 @@ def _autoregression(table: Array, row_s: float) -> Array:
     gram += 1e-9 * np.trace(gram) / order * np.eye(order)
     weights = np.asarray(np.linalg.solve(gram, table[:, 1:].T @ table[:, 0]))
     most = 2.0 * LONGEST_MEMORY_S / row_s * float(np.mean(table[:, 0] ** 2))
-    lags = np.arange(1, order + 1)
     for shrink in SHRINKS:
-        drawn_in = weights * shrink**lags
+        drawn_in = weights * shrink ** np.arange(1, order + 1)
         power = float(np.mean((table[:, 0] - table[:, 1:] @ drawn_in) ** 2))
         if power <= most * (1.0 - drawn_in.sum()) ** 2 and drawn_in.sum() < 1.0:
             return np.asarray(drawn_in)
@@ -150,10 +147,9 @@ def _growth(square: Array, powers: Array) -> Array:
 
 def _lag_table(signals: Sequence[Array], order: int) -> Array:
     """Return rows ``x_k, x_(k-1), ... x_(k-order)`` of all signals, as far as they are known."""
-    rows = [
-        np.lib.stride_tricks.sliding_window_view(x, order + 1)[:, ::-1] for x in signals if len(x) > order
-    ]
-    table = np.concatenate(rows) if rows else np.empty((0, order + 1))
+    window = np.lib.stride_tricks.sliding_window_view
+    rows = [window(x, order + 1)[:, ::-1] for x in signals if len(x) > order]
+    table = np.concatenate(rows or [np.empty((0, order + 1))])
     return np.asarray(table[np.isfinite(table).all(axis=1)])
 
 

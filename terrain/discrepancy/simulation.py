@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 
 from terrain.effects import CHANNELS, INDEX, NUISANCES, Effect, library_of, vector_of
@@ -54,20 +54,17 @@ class Simulation:
                     f"scatter: {name} is {std!r}; a standard deviation of a nuisance is required"
                 )
         for kind in ("model_error", "varied_error", "varied_scatter"):
-            sizes = getattr(self, kind)
-            for name, size in sizes.items():
+            for name, size in getattr(self, kind).items():
                 if name not in INDEX or not size >= 0:
                     raise ConfigError(f"{kind}: {name} is {size!r}; a size from 0 of a parameter is required")
-            object.__setattr__(self, kind, MappingProxyType(dict(sizes)))
         for (channel, name), size in self.probe_error.items():
             if channel not in CHANNELS or not size >= 0:
                 raise ConfigError(
                     f"probe_error: {name} in {channel} is {size!r}; a size from 0 in a channel is required"
                 )
-        object.__setattr__(self, "probe_error", MappingProxyType(dict(self.probe_error)))
-        object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
-        object.__setattr__(self, "scatter", MappingProxyType(dict(self.scatter)))
-        object.__setattr__(self, "grounds", MappingProxyType(dict(self.grounds)))
+        for each in fields(self):
+            if isinstance(value := getattr(self, each.name), Mapping):
+                object.__setattr__(self, each.name, MappingProxyType(dict(value)))
 
     @property
     def library(self) -> tuple[Effect, ...]:

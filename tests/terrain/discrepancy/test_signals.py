@@ -7,16 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.signals import PARALLEL, signals_of
-from terrain.effects import (
-    ACCEL,
-    CHANNELS,
-    CURRENT,
-    GYRO,
-    HEADING,
-    SPEED_X,
-    SPEED_Y,
-    TURNING_CURRENT,
-)
+from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.errors import DataError
 from terrain.records import Label, Stream
 from terrain.robots import load_robot
@@ -63,16 +54,19 @@ def test_streams_of_a_skid_steer_robot_are_resampled_to_one_clock(husky):
     assert_allclose(signals.time_s, wheels.time_s)
     assert_array_equal(signals.wheel_speed_mps, wheels.values[:, :2])
     assert not signals.steer_rad.any()
-    assert_allclose(signals.grade_rad, -imu.channel("pitch_rad")[::2], atol=1e-12)
-    assert_allclose(signals.roll_rad, imu.channel("roll_rad")[::2], atol=1e-12)
-    assert_allclose(channel(signals, GYRO), imu.channel("gyro_z_radps")[::2], atol=1e-12)
-    assert_allclose(channel(signals, ACCEL), imu.channel("accel_x_mps2")[::2], atol=1e-12)
-    assert_allclose(channel(signals, SPEED_X), seen.values[:, 0], atol=1e-12)
-    assert_allclose(channel(signals, SPEED_Y), seen.values[:, 1], atol=1e-12)
-    assert_allclose(channel(signals, HEADING), husky.streams["lidar"].values[:, 0], atol=1e-12)
     left, right = wheels.values[:, 2:].T
-    assert_allclose(channel(signals, CURRENT), left + right)
-    assert_allclose(channel(signals, TURNING_CURRENT), right - left)
+    for shown, logged in (
+        (signals.grade_rad, -imu.channel("pitch_rad")[::2]),
+        (signals.roll_rad, imu.channel("roll_rad")[::2]),
+        (channel(signals, GYRO), imu.channel("gyro_z_radps")[::2]),
+        (channel(signals, ACCEL), imu.channel("accel_x_mps2")[::2]),
+        (channel(signals, SPEED_X), seen.values[:, 0]),
+        (channel(signals, SPEED_Y), seen.values[:, 1]),
+        (channel(signals, HEADING), husky.streams["lidar"].values[:, 0]),
+        (channel(signals, CURRENT), left + right),
+        (channel(signals, TURNING_CURRENT), right - left),
+    ):
+        assert_allclose(shown, logged, atol=1e-12)
     with pytest.raises(ValueError, match="read-only"):
         signals.measured[0, 0] = 1.0
 
@@ -92,23 +86,16 @@ def test_a_tracking_camera_measures_the_speed_of_its_own_point_in_body_axes(agri
 
 def test_steering_zeros_and_turns_are_subtracted_and_motor_rates_become_wheel_speeds(agrimaro):
     signals, truth = signals_of(agrimaro, AGRIMARO), agrimaro.streams["truth"]
-    for i in range(3):
-        assert_allclose(signals.steer_rad[:, i], truth.channel(f"steer_{i + 1}_rad")[::2], atol=1e-9)
-    wheels = agrimaro.streams["wheels"]
+    wheels, steering = agrimaro.streams["wheels"], agrimaro.streams["steering"]
+    expected = np.column_stack([truth.channel(f"steer_{i}_rad")[::2] for i in (1, 2, 3)])
     per_motor = AGRIMARO.wheel_radius_m / AGRIMARO.motors.reduction_ratio
-    assert_allclose(signals.wheel_speed_mps, wheels.values[:, :3] * per_motor)
-    steering = agrimaro.streams["steering"]
     turned = replace(steering, values=np.angle(np.exp(1j * (steering.values + 2 * np.pi))))
-    assert_allclose(
-        signals_of(with_stream(agrimaro, "steering", turned), AGRIMARO).steer_rad,
-        signals.steer_rad,
-        atol=1e-9,
-    )
-
-
-def test_the_sum_of_currents_counts_only_while_the_wheels_are_parallel(agrimaro):
-    signals = signals_of(agrimaro, AGRIMARO)
-    parallel = np.abs(np.exp(1j * signals.steer_rad).mean(axis=1)) > PARALLEL
+    for run in (agrimaro, with_stream(agrimaro, "steering", turned)):
+        assert_allclose(signals_of(run, AGRIMARO).steer_rad, expected, atol=1e-9)
+    assert_allclose(signals.wheel_speed_mps, wheels.values[:, :3] * per_motor)
+    parallel = (
+        np.abs(np.exp(1j * signals.steer_rad).mean(axis=1)) > PARALLEL
+    )  # else no sum of currents counts
     assert 0.1 < parallel.mean() < 0.9
     assert_array_equal(np.isfinite(channel(signals, CURRENT)), parallel)
     assert np.isnan(channel(signals, TURNING_CURRENT)).all()
@@ -138,39 +125,29 @@ def test_long_holes_stay_holes_and_short_ones_are_bridged(husky):
     seen, wheels, imu = (husky.streams[name] for name in ("odometry", "wheels", "imu"))
     lost = (seen.time_s > 5.0) & (seen.time_s < 7.0)
     short = (seen.time_s > 9.995) & (seen.time_s < 10.025)
-    run = with_stream(husky, "odometry", kept(seen, ~lost & ~short))
     blank = wheels.values.copy()
     blank[(wheels.time_s > 12.0) & (wheels.time_s < 13.0), 0] = np.nan
+    run = with_stream(husky, "odometry", kept(seen, ~lost & ~short))
     run = with_stream(run, "wheels", replace(wheels, values=blank))
-    signals = signals_of(run, HUSKY)
-    known = np.isfinite(channel(signals, SPEED_X))
-    expected = ~((signals.time_s > 5.0 + 1e-9) & (signals.time_s < 7.0 - 1e-9))
-    assert_array_equal(known, expected)
-    assert_allclose(channel(signals, SPEED_X)[known], seen.values[known, 0], atol=1e-3)
-    assert_array_equal(
-        np.isfinite(signals.wheel_speed_mps[:, 0]),
-        ~((signals.time_s > 12.0) & (signals.time_s < 13.0 - 1e-9)),
+    signals = signals_of(
+        with_stream(run, "imu", replace(imu, values=np.full_like(imu.values, np.nan))), HUSKY
     )
-    assert np.isfinite(signals.wheel_speed_mps[:, 1]).all()
-    nothing = replace(imu, values=np.full_like(imu.values, np.nan))
-    signals = signals_of(with_stream(husky, "imu", nothing), HUSKY)
+    time_s, known = signals.time_s, np.isfinite(channel(signals, SPEED_X))
+    assert_array_equal(known, ~((time_s > 5.0 + 1e-9) & (time_s < 7.0 - 1e-9)))
+    assert_allclose(channel(signals, SPEED_X)[known], seen.values[known, 0], atol=1e-3)
+    silent = (time_s > 12.0) & (time_s < 13.0 - 1e-9)
+    assert_array_equal(np.isfinite(signals.wheel_speed_mps), np.column_stack([~silent, silent | True]))
     assert np.isnan(channel(signals, GYRO)).all()
 
 
-def test_the_clock_is_that_of_slow_wheels_and_runs_as_long_as_all_streams(husky):
-    slow = kept(husky.streams["wheels"], slice(None, None, 5))
-    late = kept(husky.streams["imu"], slice(300, 1500))
+def test_what_is_slow_late_or_not_there_sets_the_clock_and_what_is_known(husky):
+    slow, imu = kept(husky.streams["wheels"], slice(None, None, 5)), husky.streams["imu"]
+    late = kept(imu, slice(300, 1500))
     signals = signals_of(with_stream(with_stream(husky, "wheels", slow), "imu", late), HUSKY)
     assert (signals.dt_s, signals.start_s, len(signals)) == pytest.approx((0.1, 3.0, 120))
-
-
-def test_without_tilt_the_accelerometer_is_not_used_and_with_two_labels_no_terrain_is_named(husky):
-    imu = husky.streams["imu"]
     gyro = Stream(imu.time_s, imu.values[:, 2:4], imu.channels[2:4])
-    run = replace(
-        with_stream(husky, "imu", gyro), labels=(Label(0.0, 9.0, "grass"), Label(9.0, 20.0, "gravel"))
-    )
-    signals = signals_of(run, HUSKY)
+    labels = Label(0.0, 9.0, "grass"), Label(9.0, 20.0, "gravel")
+    signals = signals_of(replace(with_stream(husky, "imu", gyro), labels=labels), HUSKY)
     assert signals.terrain == ""
     assert np.isnan(channel(signals, ACCEL)).all()
     assert np.isfinite(channel(signals, GYRO)).all()
