@@ -1,25 +1,359 @@
-"""Windows to named feature vectors, as a scikit-learn transformer.
+"""Windows to named feature vectors, as scikit-learn transformers: features, samples, and a user's own functions.
 
 Every feature names the signal sets that it is computed from, and is left out when one of them is switched
 off, so that the value of a set can be measured by switching it off.  What depends on the length of the
 window or on the rate of a stream (bands, lags) is relative to that stream's own rate.
+
+Beside the statistics of each channel there are features of several: norms of vectors, totals, left against right, per
+speed.  Symbols: v the mean speed of the faster wheel over the window (not under ``MIN_SPEED_MPS``), I a motor
+current, d = v_right - v_left, w the yaw rate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from numbers import Real
+from typing import Any, NamedTuple
 
 import numpy as np
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
-from features.matrix import FeatureMatrix, of_signal_sets
-from terrain.errors import DataError
-from terrain.logs.schema import SIGNAL_SETS, check_signal_sets
+from features.statistics import (
+    MIN_SAMPLES,
+    SLIP_STATISTICS,
+    STATISTICS,
+    channel_correlations,
+    channel_spectra,
+    channel_statistics,
+    slip_statistics,
+    spectrum_names,
+)
+from features.windows import MAX_RATE_DEVIATION, Layout, left_right, rows_of, wheel_stream
+from terrain.classify.network import SampleColumns
+from terrain.errors import ConfigError, DataError
+from terrain.logs.schema import SIGNAL_SETS, UNIT_SYMBOLS, check_signal_sets, signal_set_of, unit_of
 from terrain.records import Array, Windows
 
+LEVEL_STATISTICS = frozenset({"mean", "min", "max", "q05", "q25", "median", "q75", "q95", "rms", "mean_abs"})
+"""Statistics that move with the level of a signal."""
 
+LEFT_OUT = {
+    "imu": frozenset({"mean", "median"}),
+    "wheels": LEVEL_STATISTICS,
+    "driving": LEVEL_STATISTICS,
+}
+"""Statistics that are computed only on request.  The mean of an IMU channel depends on mounting, bias and
+slope, the level of a speed, measured or estimated, on how the robot was driven; neither is a property of the
+terrain.  ``driving``: speeds and yaw rates among the estimator's states.
+"""
+
+SAME_RATE = 1e-6
+"""Rates that differ by less, relative to one another, give the same features but for rounding."""
+
+MIN_SPEED_MPS = 0.05
+"""Division by speed stops here: below it a wheel reading is mostly quantisation."""
+
+MIN_WHEEL_DIFFERENCE_MPS = 0.03
+"""A smaller wheel difference (rms) does not count as a turn; the yaw rate per wheel difference is NaN."""
+
+N_PARTS = 8
+"""Parts of a window over which wheel difference and yaw rate are averaged."""
+
+_LOG_FLOOR = 1e-4
+
+
+class Feature(NamedTuple):
+    """Name and unit of a feature, and the signal sets it is computed from."""
+
+    name: str
+    unit: str
+    sets: frozenset[str]
+
+    @property
+    def label(self) -> str:
+        """Name with its unit, as in tables and plots."""
+        return f"{self.name} [{self.unit}]"
+
+
+def derived_channels(values: Array, channels: Sequence[str]) -> tuple[Array, tuple[str, ...]]:
+    """Return norms of vectors, and total and difference of currents, as further channels with their names.
+
+    ``gyro_norm`` and ``accel_norm`` do not change when the sensor is mounted turned; the difference of
+    the currents is right minus left, or largest minus smallest where there are not just these two.
+    """
+    derived: list[Array] = [np.empty((values.shape[0], 0, values.shape[2]))]
+    names: list[str] = []
+    for quantity in ("gyro", "accel"):
+        rows = rows_of(channels, quantity)
+        if len(rows) > 1:
+            derived.append(np.sqrt(np.sum(values[:, rows] ** 2, axis=1))[:, None])
+            names.append(f"{quantity}_norm_{unit_of(channels[rows[0]])}")
+    rows = rows_of(channels, "current")
+    if len(rows) > 1:
+        current, sides = values[:, rows], left_right(channels, "current")
+        apart = values[:, sides[1]] - values[:, sides[0]] if sides else np.ptp(current, axis=1)
+        derived += [current.sum(axis=1)[:, None], apart[:, None]]
+        names += ["current_total_a", "current_difference_a"]
+    return np.concatenate(derived, axis=1), tuple(names)
+
+
+def _correlation_features(values: Array, channels: Sequence[str], stream: str) -> tuple[list[Feature], Array]:
+    """Return the correlation of each pair of IMU channels, and of each pair of currents."""
+    correlated = [
+        (rows, signal_set)
+        for quantities, signal_set in ((("gyro", "accel"), "imu"), (("current",), "currents"))
+        if len(rows := [i for quantity in quantities for i in rows_of(channels, quantity)]) > 1
+    ]
+    parts = [
+        np.empty((values.shape[0], 0)),
+        *(channel_correlations(values[:, rows]) for rows, _ in correlated),
+    ]
+    features = [
+        feature
+        for rows, of in correlated
+        for feature in _pair_names(stream, tuple(channels[i] for i in rows), of)
+    ]
+    return features, np.concatenate(parts, axis=1)
+
+
+@lru_cache(maxsize=256)
+def _pair_names(stream: str, channels: tuple[str, ...], signal_set: str) -> tuple[Feature, ...]:
+    short = [channel.rpartition("_")[0] for channel in channels]
+    return tuple(
+        Feature(f"{stream}.{a}~{b}.correlation", "1", frozenset({signal_set}))
+        for j, a in enumerate(short)
+        for b in short[j + 1 :]
+    )
+
+
+def speed_features(
+    values: Mapping[str, Array], channels: Mapping[str, Sequence[str]]
+) -> tuple[list[Feature], Array]:
+    """Return currents, vibration and yaw rate per wheel speed, (n_windows, n_features); none without wheel speeds.
+
+    ``current_per_speed = mean(I) / v``, ``log_drive_effort = log10 mean |sum I v_wheel|``,
+    ``log_std_per_speed = log10(std / v)`` of each IMU channel, and the turning-slip measure
+    ``yaw_per_wheel_difference = sum(w d) / sum(d d)``, which is one over the track width for wheels
+    that do not slip and less the more they do; NaN where the robot does not turn.  The means of w and d
+    are taken in eight equal parts of the window, since the two streams have different rates, or in as many
+    as the slower stream has samples.
+    """
+    wheel, n = wheel_stream(channels), len(next(iter(values.values())))
+    features: list[Feature] = []
+    columns: list[Array] = []
+    if wheel is None:
+        return features, np.empty((n, 0))
+
+    def add(column: Array, name: str, unit: str, *sets: str) -> None:
+        features.append(Feature(name, unit, frozenset(sets)))
+        columns.append(column)
+
+    wheels, wheel_channels = values[wheel], channels[wheel]
+    speeds = wheels[:, rows_of(wheel_channels, "speed")]
+    fastest_mps = np.maximum(np.abs(speeds).mean(axis=2).max(axis=1), MIN_SPEED_MPS)
+    current_rows = rows_of(wheel_channels, "current")
+    for i in current_rows:
+        name = f"{wheel}.{wheel_channels[i].rpartition('_')[0]}.per_speed"
+        add(wheels[:, i].mean(axis=1) / fastest_mps, name, "A s/m", "currents", "wheels")
+    if current_rows and len(current_rows) == speeds.shape[1]:
+        effort = np.abs(np.sum(wheels[:, current_rows] * speeds, axis=1)).mean(axis=1)
+        name = f"{wheel}.log_drive_effort"
+        add(np.log10(effort + _LOG_FLOOR), name, "log10 A m/s", "currents", "wheels")
+    for stream, names in channels.items():
+        for i in rows_of(names, "gyro") + rows_of(names, "accel"):
+            if signal_set_of(stream, names[i]) == "imu":
+                std = values[stream][:, i].std(axis=1) + _LOG_FLOOR
+                name = f"{stream}.{names[i].rpartition('_')[0]}.log_std_per_speed"
+                unit = f"log10 ({UNIT_SYMBOLS[unit_of(names[i])]})/(m/s)"
+                add(np.log10(std / fastest_mps), name, unit, "imu", "wheels")
+    sides = left_right(wheel_channels, "speed")
+    yaw_stream = next((stream for stream, names in channels.items() if "gyro_z_radps" in names), None)
+    if sides and yaw_stream:
+        turning_mps = wheels[:, sides[1]] - wheels[:, sides[0]]
+        gyro = values[yaw_stream][:, channels[yaw_stream].index("gyro_z_radps")]
+        n_parts = min(N_PARTS, turning_mps.shape[1], gyro.shape[1])
+        difference, yaw_rate = _part_means(turning_mps, n_parts), _part_means(gyro, n_parts)
+        power = np.sum(difference**2, axis=1)
+        gain = np.full(n, np.nan)
+        turning = np.sqrt(power / difference.shape[1]) >= MIN_WHEEL_DIFFERENCE_MPS
+        np.divide(np.sum(yaw_rate * difference, axis=1), power, out=gain, where=turning)
+        add(gain, "turning.yaw_per_wheel_difference", "rad/m", "imu", "wheels")
+    return features, np.stack(columns, axis=1) if columns else np.empty((n, 0))
+
+
+def _part_means(signal: Array, n_parts: int) -> Array:
+    edges = np.linspace(0, signal.shape[1], n_parts + 1).round().astype(int)
+    sums: Array = np.add.reduceat(signal, edges[:-1], axis=1)
+    return sums / np.diff(edges)
+
+
+def left_out_of(stream: str, channel: str) -> frozenset[str]:
+    """Return the statistics of a channel that are computed on request only."""
+    signal_set = signal_set_of(stream, channel) or ""
+    driving = signal_set == "estimator" and channel.startswith(("speed_", "yaw_"))
+    return LEFT_OUT.get("driving" if driving else signal_set, frozenset())
+
+
+def is_centred(stream: str, channel: str, level_sets: Iterable[str]) -> bool:
+    """Return whether the mean over the window is subtracted from the samples of a channel: where it is no feature.
+
+    That is what depends on mounting, slope, or on how the robot was driven (:data:`LEFT_OUT`).
+    """
+    return (
+        left_out_of(stream, channel) != frozenset()
+        and (signal_set_of(stream, channel) or "") not in level_sets
+    )
+
+
+class FeatureMatrix(NamedTuple):
+    """What features are computed from: channels and rates of streams, length of a window, samples of each stream.
+
+    ``level_sets`` are signal sets of which the statistics in :data:`LEFT_OUT` are computed as well.
+    """
+
+    layout: Layout
+    length_s: float
+    n_samples: Mapping[str, int]
+    level_sets: tuple[str, ...] = ()
+
+    def equals(self, other: FeatureMatrix) -> bool:
+        """Whether both give the same features of a window, but for rounding."""
+        own, its = ((m.layout.channels, dict(m.n_samples), m.length_s, m.level_sets) for m in (self, other))
+        its_hz, rates_hz = other.layout.rate_hz, self.layout.rate_hz.items()
+        return own == its and all(abs(rate / its_hz[name] - 1.0) <= SAME_RATE for name, rate in rates_hz)
+
+    def of(self, windows: Windows) -> Array:
+        """Return the features (n_windows, n_features), NaN where not defined; errors as :meth:`selected`."""
+        return self.named(windows)[1]
+
+    def named(self, windows: Windows) -> tuple[list[Feature], Array]:
+        """Return the features beside their values."""
+        values, features, parts = self.selected(windows), list[Feature](), list[Array]()
+        for stream, names in self.layout.channels.items():
+            for found, part in (
+                self._channel_features(stream, values[stream], names),
+                _correlation_features(values[stream], names, stream),
+            ):
+                features += found
+                parts.append(part)
+        found, part = speed_features(values, self.layout.channels) if values else ([], np.empty((0, 0)))
+        return features + found, np.concatenate([*parts, part], axis=1)
+
+    def selected(self, X: Windows) -> dict[str, Array]:
+        """Return the samples of the channels that are used, by stream (n, channels, samples).
+
+        ``DataError`` where the windows lack a channel, or have another length, rate or number of samples.
+        """
+        if abs(X.length_s - self.length_s) > 1e-9:
+            raise DataError(
+                f"windows last {X.length_s:g} s; the features were learned on {self.length_s:g} s"
+            )
+        missing = [
+            f"{stream}.{name}"
+            for stream, names in self.layout.channels.items()
+            for name in names
+            if name not in X.channels.get(stream, ())
+        ]
+        if missing:
+            raise DataError(
+                f"the windows lack {', '.join(missing)}: they have {_listed(X.channels)}; the features were "
+                f"learned on {_listed(self.layout.channels)}"
+            )
+        values = {}
+        for stream, names in self.layout.channels.items():
+            rate_hz = X.rate_hz[stream]
+            if abs(rate_hz / self.layout.rate_hz[stream] - 1) > MAX_RATE_DEVIATION:
+                raise DataError(
+                    f"stream {stream!r} runs at {rate_hz:.4g} Hz; the features were learned at "
+                    f"{self.layout.rate_hz[stream]:.4g} Hz"
+                )
+            order = [X.channels[stream].index(name) for name in names]
+            array = (
+                X.values[stream]
+                if order == list(range(len(X.channels[stream])))
+                else X.values[stream][:, order]
+            )
+            values[stream] = _of_length(array, self.n_samples[stream], stream)
+        return values
+
+    def _channel_features(
+        self, stream: str, values: Array, names: tuple[str, ...]
+    ) -> tuple[Sequence[Feature], Array]:
+        if stream == "slip":
+            features = [
+                Feature(f"slip.{name.rpartition('_')[0]}.{statistic}", "1", frozenset({"slip"}))
+                for name in names
+                for statistic in SLIP_STATISTICS
+            ]
+            return features, slip_statistics(values).reshape(len(values), len(features))
+        derived, derived_names = derived_channels(values, names)
+        values, rate_hz = np.concatenate([values, derived], axis=1), self.layout.rate_hz[stream]
+        columns, table = list(STATISTICS), channel_statistics(values, rate_hz)
+        if values.shape[2] >= MIN_SAMPLES:
+            columns += spectrum_names(values.shape[2])
+            table = np.concatenate([table, channel_spectra(values, rate_hz)], axis=2)
+        described = stream, (*names, *derived_names), tuple(columns), frozenset(self.level_sets)
+        features_of, kept = _described(*described)
+        return features_of, table[:, kept]
+
+    def samples(self, windows: Windows) -> Array:
+        """Return the samples (n_windows, n_columns) of all channels, stream by stream, centred where they must be."""
+        parts = []
+        for stream, values in self.selected(windows).items():
+            names = self.layout.channels[stream]
+            centred = np.array([is_centred(stream, name, self.level_sets) for name in names])[:, None]
+            mean = np.where(centred, values.mean(axis=2, keepdims=True), 0.0)
+            parts.append((values - mean).reshape(len(values), -1))
+        return np.concatenate(parts, axis=1)
+
+
+def _listed(channels: Mapping[str, tuple[str, ...]]) -> str:
+    return (
+        "; ".join(f"{stream} with {', '.join(names)}" for stream, names in channels.items()) or "no channel"
+    )
+
+
+def _of_length(values: Array, n: int, stream: str) -> Array:
+    """Return the first n samples of windows; where their own set of runs gave a few less, the last are mirrored.
+
+    The number of samples follows the rate that was measured of a set of runs, which the next set's differs from
+    by a little.
+    """
+    held = values.shape[2]
+    if held == n:
+        return values
+    if abs(held - n) > MAX_RATE_DEVIATION * n + 1:
+        raise DataError(
+            f"a window holds {held} samples of stream {stream!r}; the features were learned on {n}"
+        )
+    return np.asarray(np.take(values, held - 1 - np.abs(held - 1 - np.arange(n)), axis=2))
+
+
+@lru_cache(maxsize=256)
+def _described(
+    stream: str, names: tuple[str, ...], columns: tuple[tuple[str, str], ...], level_sets: frozenset[str]
+) -> tuple[tuple[Feature, ...], Array]:
+    """Return the features of a stream's channels, and which (channels, statistics) they are.
+
+    They are those of every window of a model: made once, as their names cost more than their values.
+    """
+    features, kept = [], np.zeros((len(names), len(columns)), dtype=bool)
+    for i, name in enumerate(names):
+        signal_set = signal_set_of(stream, name) or ""
+        left_out, unit = left_out_of(stream, name), UNIT_SYMBOLS[unit_of(name)]
+        for j, (statistic, of) in enumerate(columns):
+            if statistic not in left_out or signal_set in level_sets:
+                kept[i, j] = True
+                named = f"{stream}.{name.rpartition('_')[0]}.{statistic}"
+                features.append(Feature(named, unit if of == "x" else of, frozenset({signal_set})))
+    kept.flags.writeable = False
+    return tuple(features), kept
+
+
+@dataclass(eq=False, repr=False)
 class FeatureExtractor(TransformerMixin, BaseEstimator):
     """Turn :class:`~terrain.records.Windows` into a feature matrix.
 
@@ -31,10 +365,8 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
 
     Attributes
     ----------
-    layout_ : channels and rates that the windows must have
-    length_s_ : window length
-    n_samples_ : samples of each stream in a window
-    features_ : list of :class:`~features.cross_channel.Feature`, one a column
+    layout_, length_s_, n_samples_ : channels, rates, length and samples that the windows must have
+    features_ : list of :class:`Feature`, one a column
 
     Examples
     --------
@@ -46,13 +378,8 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
     ('imu.accel_z.std [m/s^2]', (3, 51))
     """
 
-    def __init__(
-        self,
-        signal_sets: Iterable[str] = SIGNAL_SETS,
-        level_sets: Iterable[str] = (),
-    ) -> None:
-        self.signal_sets = signal_sets
-        self.level_sets = level_sets
+    signal_sets: Iterable[str] = SIGNAL_SETS
+    level_sets: Iterable[str] = ()
 
     def fit(self, X: Windows, y: Any = None) -> FeatureExtractor:
         """Learn which channels and rates the windows have, and so the names of the features.
@@ -65,9 +392,16 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
             if the windows have no channel of the chosen sets.
         """
         check_signal_sets((*self.signal_sets, *self.level_sets))
-        matrix = of_signal_sets(X, self.signal_sets, self.level_sets)
-        self.layout_, self.length_s_, self.n_samples_, _ = matrix
-        self.features_ = matrix.named(X[:0])[0]
+        chosen = set(self.signal_sets)
+        channels = {
+            stream: kept
+            for stream, names in X.channels.items()
+            if (kept := tuple(name for name in names if signal_set_of(stream, name) in chosen))
+        }
+        self.layout_ = Layout(channels, {stream: float(X.rate_hz[stream]) for stream in channels})
+        self.length_s_ = float(X.length_s)
+        self.n_samples_ = {stream: int(X.values[stream].shape[2]) for stream in channels}
+        self.features_ = self.matrix.named(X[:0])[0]
         if not self.features_:
             raise DataError(f"the windows hold no channel of the signal sets {', '.join(self.signal_sets)}")
         return self
@@ -76,17 +410,10 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         """Return the features (n_windows, n_features); NaN where a feature is not defined.
 
         Besides windows, plain arrays by stream ``(n_windows, n_channels, n_samples)`` are taken, with the
-        channels and rates of ``fit``; this is the form in which a model server passes them.
-
-        Raises
-        ------
-        DataError
-            if the windows lack a channel, or have another length, rate or number of samples than those of
-            ``fit``.
+        channels and rates of ``fit``; this is the form in which a model server passes them.  ``DataError`` where
+        the windows are of another kind than those of ``fit``.
         """
-        check_is_fitted(self)
-        windows = X if isinstance(X, Windows) else self._as_windows(X)
-        return self.matrix.of(windows)
+        return self.matrix.of(self._windows(X))
 
     @property
     def matrix(self) -> FeatureMatrix:
@@ -99,17 +426,178 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
         check_is_fitted(self)
         return np.array([feature.label for feature in self.features_], dtype=object)
 
-    def _as_windows(self, arrays: Mapping[str, Array]) -> Windows:
-        for stream, names in self.layout_.channels.items():
+    def _windows(self, X: Windows | Mapping[str, Array]) -> Windows:
+        check_is_fitted(self)
+        if isinstance(X, Windows):
+            return X
+        channels, rate_hz = self.layout_.channels, self.layout_.rate_hz
+        for stream, names in channels.items():
             n_samples = self.layout_.n_samples(stream, self.length_s_)
-            shape = np.shape(arrays[stream]) if stream in arrays else None
+            shape = np.shape(X[stream]) if stream in X else None
             if shape is None or shape[1:] != (len(names), n_samples):
                 raise DataError(
                     f"stream {stream!r} has the shape {shape}; (windows, {len(names)}, {n_samples}) is needed"
                 )
-        n = len(next(iter(arrays.values())))
+        values = {stream: np.asarray(X[stream], dtype=float) for stream in channels}
+        n = len(next(iter(values.values())))
         unknown = np.full(n, "", dtype=object)
-        values = {stream: np.asarray(arrays[stream], dtype=float) for stream in self.layout_.channels}
-        return Windows(
-            values, self.layout_.channels, self.layout_.rate_hz, self.length_s_, np.zeros(n), unknown, unknown
+        return Windows(values, channels, rate_hz, self.length_s_, np.zeros(n), unknown, unknown)
+
+
+@dataclass(eq=False, repr=False)
+class SampleExtractor(FeatureExtractor):
+    """Turn windows into the matrix of their samples, with or without their features before them.
+
+    Attributes
+    ----------
+    columns_ : :class:`~terrain.classify.network.SampleColumns` of each stream, the last columns of the matrix
+
+    Examples
+    --------
+    >>> values = np.random.default_rng(0).normal(size=(3, 1, 200))
+    >>> windows = Windows({"imu": values}, {"imu": ("accel_z_mps2",)}, {"imu": 100.0}, 2.0,
+    ...                   np.arange(3.0), np.array(["a"] * 3), np.array(["grass"] * 3))
+    >>> samples = SampleExtractor().fit(windows)
+    >>> samples.columns_
+    (SampleColumns(stream='imu', channels=('accel_z_mps2',), rate_hz=100.0, n_samples=200),)
+    >>> samples.transform(windows).shape, SampleExtractor(with_features=True).fit_transform(windows).shape
+    ((3, 200), (3, 251))
+    """
+
+    with_features: bool = False
+
+    def fit(self, X: Windows, y: Any = None) -> SampleExtractor:
+        """Learn which channels and rates the windows have; errors as of the features."""
+        super().fit(X, y)
+        rates_hz, n_samples = self.layout_.rate_hz, self.n_samples_
+        self.columns_ = tuple(
+            SampleColumns(stream, names, rates_hz[stream], n_samples[stream])
+            for stream, names in self.layout_.channels.items()
         )
+        return self
+
+    def transform(self, X: Windows | Mapping[str, Array]) -> Array:
+        """Return the matrix (n_windows, n_columns); errors as of the features."""
+        windows = self._windows(X)
+        samples = self.matrix.samples(windows)
+        return np.concatenate([self.matrix.of(windows), samples], axis=1) if self.with_features else samples
+
+    def get_feature_names_out(self, input_features: Any = None) -> Array:
+        """Return the name of each column with its unit."""
+        names = [
+            f"{each.stream}.{channel.rpartition('_')[0]}.sample [{UNIT_SYMBOLS[unit_of(channel)]}]"
+            for each in self.columns_
+            for channel in each.channels
+            for _ in range(each.n_samples)
+        ]
+        features = super().get_feature_names_out().tolist() if self.with_features else []
+        return np.array([*features, *names], dtype=object)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """One window, as a user's own function is given it: values per stream ``(n_channels, n_samples)``.
+
+    Examples
+    --------
+    >>> window = Window({"imu": np.array([[1.0, 2.0]])}, {"imu": ("accel_z_mps2",)}, {"imu": 1.0}, 2.0)
+    >>> window["imu", "accel_z_mps2"]
+    array([1., 2.])
+    """
+
+    values: Mapping[str, Array]
+    channels: Mapping[str, tuple[str, ...]]
+    rate_hz: Mapping[str, float]
+    length_s: float
+
+    def __getitem__(self, place: tuple[str, str]) -> Array:
+        """Return the samples (n,) of ``stream, channel``; ``DataError`` where there is no such channel."""
+        stream, channel = place
+        if channel not in self.channels.get(stream, ()):
+            known = ", ".join(f"{name}: {' '.join(names)}" for name, names in self.channels.items())
+            raise DataError(
+                f"the windows have no channel {channel!r} of a stream {stream!r}; they have {known}"
+            )
+        samples: Array = self.values[stream][self.channels[stream].index(channel)]
+        return samples
+
+
+WindowFunction = Callable[[Window], float | Mapping[str, float]]
+"""From a window to a number, or to several by name; NaN where it is not defined."""
+
+
+@dataclass(eq=False, repr=False)
+class FunctionExtractor(FeatureExtractor):
+    """Turn windows into features and, in the last columns, what a user's own functions give for each window.
+
+    Attributes
+    ----------
+    own_names_ : names of the last columns
+
+    Examples
+    --------
+    >>> def roughness(window):
+    ...     return np.abs(np.diff(window["imu", "accel_z_mps2"])).mean()
+    >>> windows = Windows({"imu": np.zeros((3, 1, 200))}, {"imu": ("accel_z_mps2",)}, {"imu": 100.0}, 2.0,
+    ...                   np.arange(3.0), np.array(["a"] * 3), np.array(["grass"] * 3))
+    >>> extractor = FunctionExtractor(functions=(roughness,)).fit(windows)
+    >>> extractor.transform(windows).shape, str(extractor.get_feature_names_out()[-1])
+    ((3, 52), 'roughness')
+    """
+
+    functions: Sequence[WindowFunction] = ()
+
+    def fit(self, X: Windows, y: Any = None) -> FunctionExtractor:
+        """Learn channels and rates, and the names of what the functions give."""
+        super().fit(X, y)
+        self.own_names_ = tuple(self._numbers(X, 0)) if len(X) else ()
+        return self
+
+    def transform(self, X: Windows | Mapping[str, Array]) -> Array:
+        """Return the matrix (n_windows, n_columns); errors as of features.
+
+        ``ConfigError`` where a function fails, or gives what is no number or has other names than in ``fit``.
+        """
+        windows = self._windows(X)
+        own = np.empty((len(windows), len(self.own_names_)))
+        for row in range(len(windows)):
+            numbers = self._numbers(windows, row)
+            if tuple(numbers) != self.own_names_:
+                raise ConfigError(
+                    f"own features of {_place(windows, row)} are {', '.join(numbers)}; those of the first "
+                    f"window are {', '.join(self.own_names_)}"
+                )
+            own[row] = list(numbers.values())
+        return np.concatenate([super().transform(windows), own], axis=1)
+
+    def get_feature_names_out(self, input_features: Any = None) -> Array:
+        """Return the name of each column, of the package's own features with the unit."""
+        return np.array([*super().get_feature_names_out(), *self.own_names_], dtype=object)
+
+    def _numbers(self, windows: Windows, row: int) -> dict[str, float]:
+        """Return what all functions give for a window, by name."""
+        values = {name: values[row] for name, values in windows.values.items()}
+        window = Window(values, windows.channels, windows.rate_hz, windows.length_s)
+        found: dict[str, float] = {}
+        for function in self.functions:
+            name = str(getattr(function, "__name__", type(function).__name__))
+            try:
+                given = function(window)
+            except Exception as error:
+                raise ConfigError(
+                    f"feature {name!r} fails on {_place(windows, row)}: {type(error).__name__}: {error}"
+                ) from error
+            if isinstance(given, Mapping):
+                named = {f"{name}.{key}": value for key, value in given.items()}
+            else:
+                named = {name: given}
+            for key, value in named.items():
+                if not isinstance(value, Real | np.generic) or key in found:
+                    what = "a second time" if key in found else f"{value!r} for {_place(windows, row)}"
+                    raise ConfigError(f"feature {key!r} is given {what}; one number a window is needed")
+                found[key] = float(value) if np.isfinite(value) else np.nan
+        return found
+
+
+def _place(windows: Windows, row: int) -> str:
+    return f"the window of run {windows.run_id[row]} at {windows.start_s[row]:.2f} s"

@@ -14,11 +14,29 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from sklearn.model_selection import StratifiedKFold
 
-from features.labelled import cut_labelled, cut_partitions, deal_partitions
 from features.motion import fastest_wheel
-from features.windows import WindowRule
-from terrain.classify.folds import Fold, block_groups, fold_numbers, numbered_folds, single_run_classes
+from features.windows import (
+    TIME_TOLERANCE_S,
+    WindowCut,
+    WindowRule,
+    cut_windows,
+    label_windows,
+    labelled,
+    layout_of,
+    regular_starts,
+    span_of,
+)
+from terrain.classify.folds import (
+    N_FOLDS,
+    Fold,
+    block_groups,
+    fold_numbers,
+    numbered_folds,
+    single_run_classes,
+    two_classes,
+)
 from terrain.classify.held_out import (
     MIN_CLASSES,
     MIN_RUNS_A_SIDE,
@@ -27,25 +45,35 @@ from terrain.classify.held_out import (
     SlowFast,
     slow_fast_split,
 )
-from terrain.errors import DataError
+from terrain.errors import ConfigError, DataError
 from terrain.logs.duplicates import distinct_runs
 from terrain.logs.regimes import driven_at, regime_of
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 
-N_FOLDS = 5
+PARTITION_S, PUBLISHED_STRIDE_S = 5.0, 0.1
+"""Of the papers: length of a partition, and stride of the class with the fewest."""
 
 
 class Samples(NamedTuple):
-    """Labelled windows, and what protocols need besides."""
+    """Windows under one label each, how many were left out by reason, and what protocols need besides.
 
-    windows: Windows  #: under one label each
-    dropped: Mapping[str, int]  #: how many windows were left out, by reason
-    group: Array  #: (n,) what is never divided: the run, or under ``published`` the partition
-    gap: int  #: windows beside a window that may share samples with it
-    merged: tuple[tuple[str, ...], ...] = ()  #: ids of runs that hold the same measurements and were made one
-    runs: Sequence[RunLog] = ()  #: that the windows were cut from; empty where they are not at hand
-    repaired: Mapping[str, int] = MappingProxyType({})  #: what a repairing reader changed, by kind
+    Parameters
+    ----------
+    group : (n,) what is never divided: the run, or under ``published`` the partition
+    gap : windows beside a window that may share samples with it
+    merged : ids of runs that hold the same measurements and were made one
+    runs : that the windows were cut from; empty where they are not at hand
+    repaired : what a repairing reader changed, by kind
+    """
+
+    windows: Windows
+    dropped: Mapping[str, int]
+    group: Array
+    gap: int
+    merged: tuple[tuple[str, ...], ...] = ()
+    runs: Sequence[RunLog] = ()
+    repaired: Mapping[str, int] = MappingProxyType({})
 
     @property
     def terrain(self) -> Array:
@@ -59,23 +87,43 @@ class Samples(NamedTuple):
 
 
 class Protocol(NamedTuple):
-    """What is held out, and how."""
+    """What is held out, in words, and how.
 
-    held_out: str  #: in words
-    #: (n,) what is held out together; empty of a window that neither trains nor tests
+    Parameters
+    ----------
+    units : (n,) what is held out together; empty of a window that neither trains nor tests
+    deal : from class, unit, number of folds and random numbers of the repeat, the fold (n,) that tests each window,
+        -1 for none
+    repeats : fold assignments by default; 1 where there is one only
+    note : what a reader of the figures must know of it
+    whole_runs : whether a run is on one side of a split, but for the blocks of a class with one unit
+    """
+
+    held_out: str
     units: Callable[[Samples], Array]
-    #: from class, unit, number of folds and random numbers of the repeat, the fold (n,) that tests each
-    #: window, -1 for none
     deal: Callable[[Array, Array, int, np.random.Generator], Array]
-    repeats: int = 1  #: fold assignments by default; 1 where there is one only
-    note: str = ""  #: what a reader of the figures must know of it
-    #: whether a run is on one side of a split, but for the blocks of a class with one unit
+    repeats: int = 1
+    note: str = ""
     whole_runs: bool = True
 
 
-def leave_one_out(y: Array, group: Array, n_folds: int, rng: np.random.Generator) -> Array:
+def _leave_one_out(y: Array, group: Array, n_folds: int, rng: np.random.Generator) -> Array:
     """Return the number of each group: it is a fold of its own, however many there are."""
     return np.asarray(np.unique(group, return_inverse=True)[1])
+
+
+def deal_partitions(y: Array, partition: Array, n_folds: int, rng: np.random.Generator) -> Array:
+    """Return the fold (n,) that tests each window: partitions (n,) are dealt at random, stratified by class."""
+    names, first, group_of = np.unique(partition, return_index=True, return_inverse=True)
+    labels = y[first]
+    short = [f"{name} ({n})" for name, n in sorted(Counter(labels.tolist()).items()) if n < n_folds]
+    if short:
+        raise DataError(f"fewer than {n_folds} partitions of {PARTITION_S:g} s: {', '.join(short)}")
+    number = np.empty(len(names), dtype=int)
+    deal = StratifiedKFold(n_folds, shuffle=True, random_state=int(rng.integers(2**31)))
+    for fold, (_, test) in enumerate(deal.split(names, labels)):
+        number[test] = fold
+    return number[group_of]
 
 
 def sessions(samples: Samples) -> Array:
@@ -106,14 +154,8 @@ def slow_and_fast(samples: Samples) -> tuple[Array, SlowFast]:
     return slow_fast_split(fastest_wheel(windows), run_id, samples.terrain, windows.start_s, windows.length_s)
 
 
-def sides(samples: Samples) -> Array:
-    """Return ``slow`` or ``fast`` (n,), on which side of its class's median speed a window's run lies.
-
-    Raises
-    ------
-    DataError
-        if too few classes have enough slow and fast runs.
-    """
+def _sides(samples: Samples) -> Array:
+    """Return ``slow`` or ``fast`` (n,); ``DataError`` where too few classes have enough slow and fast runs."""
     side, split = slow_and_fast(samples)
     if split.status is Applicability.NOT_APPLICABLE:
         reasons = "; ".join(f"{name}: {reason}" for name, reason in split.left_out.items())
@@ -131,7 +173,7 @@ def _from_to(trained: str, tested: str) -> Protocol:
     def deal(_: Array, side: Array, *__: Any) -> Array:
         return np.where(side == tested, 0, -1)
 
-    return Protocol(held_out, sides, deal, note=note, whole_runs=False)
+    return Protocol(held_out, _sides, deal, note=note, whole_runs=False)
 
 
 def _groups(samples: Samples) -> Array:
@@ -140,8 +182,8 @@ def _groups(samples: Samples) -> Array:
 
 PROTOCOLS: dict[str, Protocol] = {
     "grouped": Protocol("whole runs held out", _groups, fold_numbers, 5),
-    "leave-one-run-out": Protocol("one run held out at a time", _groups, leave_one_out),
-    "leave-sessions-out": Protocol("one session held out at a time", sessions, leave_one_out),
+    "leave-one-run-out": Protocol("one run held out at a time", _groups, _leave_one_out),
+    "leave-sessions-out": Protocol("one session held out at a time", sessions, _leave_one_out),
     "leave-regimes-out": Protocol("speeds and directions of driving held out", regimes, fold_numbers, 5),
     "leave-terrain-out": Protocol(
         "whole runs held out",
@@ -166,17 +208,13 @@ PROTOCOLS: dict[str, Protocol] = {
 def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed: int = 0) -> list[Fold]:
     """Return the folds of a protocol, repeat by repeat; each repeat deals anew from ``(seed, repeat)``.
 
-    Raises
-    ------
-    DataError
-        if there is one class only, or there are fewer runs than folds.
+    ``DataError`` where there is one class only, or there are fewer runs than folds.
     """
     scheme = PROTOCOLS[protocol]
     unit = scheme.units(samples)
     used = np.flatnonzero(unit != "")
     y, unit = samples.terrain[used], unit[used]
-    if len(np.unique(y)) < 2:
-        raise DataError(f"all windows are {str(y[0])!r}: a classifier needs at least two classes")
+    two_classes(y)
     n_runs = len(np.unique(samples.run_id))
     if scheme.whole_runs and scheme.deal is fold_numbers and n_runs < N_FOLDS:
         raise DataError(f"{n_runs} runs are fewer than {N_FOLDS} folds")
@@ -196,6 +234,43 @@ def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed
     ]
 
 
+def cut_partitions(
+    runs: Sequence[RunLog], rule: WindowRule, signal_sets: Iterable[str] = SIGNAL_SETS
+) -> tuple[WindowCut, Array]:
+    """Cut windows as the papers do, and name the partition (n,) of each: slid inside 5 s, classes balanced by stride.
+
+    The class with the fewest partitions is cut every 0.1 s, the others in proportion to their number.
+    No rule of steady motion is applied.
+    """
+    if rule.length_s > PARTITION_S:
+        raise ConfigError(
+            f"a window of {rule.length_s:g} s does not fit into a partition of {PARTITION_S:g} s"
+        )
+    layout = layout_of(runs, signal_sets, speeds=False)
+    begin_s = {run.run_id: span_of(run, layout)[0] for run in runs}
+    places = []
+    for run in runs:
+        starts = regular_starts(*span_of(run, layout), PARTITION_S, PARTITION_S)
+        labels = label_windows(run, starts, PARTITION_S)
+        places += [(run.run_id, name, start) for start, name in zip(starts, labels, strict=True) if name]
+    if not places:
+        raise DataError(f"no partition of {PARTITION_S:g} s lies under one label")
+    names, counts = np.unique(np.array([place[1] for place in places]), return_counts=True)
+    stride_s = dict(zip(names, PUBLISHED_STRIDE_S * counts / counts.min(), strict=True))
+    starts_s: dict[str, list[float]] = {}
+    for run_id, name, start in places:
+        inside = regular_starts(start, start + PARTITION_S, rule.length_s, stride_s[name])
+        starts_s.setdefault(run_id, []).extend(inside)
+    plain = WindowRule(rule.length_s, rule.stride_s, None, rule.max_gap_periods)
+    at = {run_id: np.array(each) for run_id, each in starts_s.items()}
+    cut = labelled(cut_windows(runs, plain, layout=layout, starts_s=at, skip_short=True))
+    partition = [
+        f"{run_id} part {int((start - begin_s[run_id] + TIME_TOLERANCE_S) // PARTITION_S)}"
+        for start, run_id in zip(cut.windows.start_s, cut.windows.run_id, strict=True)
+    ]
+    return cut, np.array(partition, dtype=object)
+
+
 def samples_of(
     runs: Sequence[RunLog],
     rule: WindowRule,
@@ -210,9 +285,6 @@ def samples_of(
 
     Parameters
     ----------
-    runs : labelled
-    rule, signal_sets : how windows are cut, and of which signals
-    protocol : one of :data:`PROTOCOLS`
     speed_mps : only runs that were driven between these speeds
     merge_duplicates : whether runs that hold the same measurements are one run, in place of being refused
     skip_short : whether runs shorter than a window are left out and counted
@@ -228,12 +300,12 @@ def samples_of(
         if not runs:
             raise DataError(f"no run is driven at a speed of {speed_mps[0]:g} to {speed_mps[1]:g} m/s")
     distinct = distinct_runs(runs, merge=merge_duplicates)
-    cut_of = distinct.runs, rule, signal_sets
     if protocol == "published":
-        cut, group = cut_partitions(*cut_of)
+        cut, group = cut_partitions(distinct.runs, rule, signal_sets)
         gap = 0
     else:
-        cut = cut_labelled(*cut_of, skip_short=skip_short)
+        layout = layout_of(distinct.runs, signal_sets, speeds=rule.steady is not None)
+        cut = labelled(cut_windows(distinct.runs, rule, layout=layout, skip_short=skip_short))
         group, gap = cut.windows.run_id, rule.overlap
     values = cut.windows.values
     if not any((each != each[:1, :, :1]).any() for each in values.values()):

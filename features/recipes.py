@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from sklearn.base import ClassifierMixin
 from sklearn.pipeline import Pipeline
 
-from features.extractor import FeatureExtractor
-from features.matrix import FeatureMatrix
+from features.extractor import (
+    FeatureExtractor,
+    FeatureMatrix,
+    FunctionExtractor,
+    SampleExtractor,
+    WindowFunction,
+)
 from features.response import ResponseExtractor
-from features.sample_extractor import SampleExtractor
+from terrain.classify.grouped import OwnClassifier
 from terrain.classify.network import GroupedNetwork
 from terrain.classify.response import GroupedResponse
 from terrain.classify.stack import GroupedStack
@@ -20,9 +25,6 @@ from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
-
-if TYPE_CHECKING:
-    from features.own import WindowFunction
 
 RECIPES = ("svm", "cnn", "stack", "best", "response")
 """SVM on features, network on samples, both joined, and which of these three held-out runs favour; and what
@@ -71,9 +73,7 @@ def make_recipe(
     ----------
     recipe : one of :data:`RECIPES`; or a scikit-learn classifier of features, or what returns one; or a
         :class:`WindowPipeline`, which is returned as it is
-    signal_sets, level_sets : as :class:`~features.extractor.FeatureExtractor`
     gap : windows left out beside an inner test block; as many as share samples with a window
-    seed : deals runs into the inner folds
     candidates : hyper-parameters that the SVM chooses among
     functions : own functions of a window, beside the features
 
@@ -99,8 +99,6 @@ def make_recipe(
         raise ConfigError(f"recipe {recipe!r} does not take features of your own; 'svm' does")
     features: FeatureExtractor = FeatureExtractor(*sets)
     if functions:
-        from features.own import FunctionExtractor
-
         features = FunctionExtractor(*sets, tuple(functions))
     classifier: ClassifierMixin
     if recipe == "svm":
@@ -114,8 +112,6 @@ def make_recipe(
         features = SampleExtractor(*sets, with_features=True)
         classifier = GroupedStack(choose=recipe == "best", candidates=candidates, gap=gap, seed=seed)
     else:
-        from terrain.classify.grouped import OwnClassifier
-
         made = recipe if hasattr(recipe, "fit") and not isinstance(recipe, type) else recipe()
         if isinstance(made, WindowPipeline):
             return made

@@ -30,10 +30,7 @@ class ResponseExtractor(FeatureExtractor):
     A current that has a sign counts as positive where it drives the wheel on, so that it compares with one
     that a logger stores as a magnitude.
 
-    Parameters
-    ----------
-    signal_sets : whose responses are used, of :data:`RESPONSES`; wheel speeds are always used
-    level_sets : not used; as :class:`~features.extractor.FeatureExtractor` has them
+    Responses are those of :data:`RESPONSES` among the signal sets; wheel speeds are always used.
 
     Attributes
     ----------
@@ -50,13 +47,7 @@ class ResponseExtractor(FeatureExtractor):
     """
 
     def fit(self, X: Windows, y: Any = None) -> ResponseExtractor:
-        """Learn which wheels and responses the windows have.
-
-        Raises
-        ------
-        DataError
-            if the windows have no wheel speeds, or no response of each wheel.
-        """
+        """Learn which wheels and responses the windows have; ``DataError`` where one of the two is missing."""
         super().fit(X, y)
         names = self.get_feature_names_out()
         n_wheels = len(self._wheels())
@@ -64,15 +55,8 @@ class ResponseExtractor(FeatureExtractor):
         return self
 
     def transform(self, X: Windows | Mapping[str, Array]) -> Array:
-        """Return the matrix (n_windows, n_wheels + n_responses); NaN where a window has no sample.
-
-        Raises
-        ------
-        DataError
-            as of the features.
-        """
-        windows = X if isinstance(X, Windows) else self._as_windows(X)
-        values = self.matrix.selected(windows)
+        """Return the matrix (n_windows, n_wheels + n_responses); NaN where a window has no sample."""
+        values = self.matrix.selected(self._windows(X))
         speeds = np.stack([_channel(values, self.layout_.channels, name) for name in self._speed_names()], 1)
         norm = np.linalg.norm(speeds, axis=1)
         turning = norm >= MIN_TURNING * np.median(norm, axis=1, keepdims=True)
@@ -127,10 +111,7 @@ class ResponseExtractor(FeatureExtractor):
 def slip_cases(measured: Sequence[RunLog], slips: Sequence[MeasuredSlip], window_s: float) -> Cases:
     """Return the windows of runs whose slip was measured in steady motion, with what may predict it.
 
-    Raises
-    ------
-    DataError
-        if the runs have no currents, or no window has a slip.
+    ``DataError`` where the runs have no currents, or no window has a slip.
     """
     steady = {each.run_id: each for each in slips if each.known.size}
     runs = [run for run in measured if run.run_id in steady]

@@ -17,14 +17,16 @@ from terrain.records import Array, RunLog, Windows
 
 
 class Following(NamedTuple):
-    """Follows sequences with a classifier once it is fitted, in whatever process fits it."""
+    """Follows sequences with a classifier once it is fitted, in whatever process fits it.
 
-    features: Any  #: scikit-learn transformer of windows
-    sequences: tuple[SplicedRun, ...]  #: to be followed
-    #: rule, layout: of the classifier's windows
+    ``rule`` and ``layout`` are of the classifier's windows; ``classes`` and ``prior`` (k,) names in the order of the
+    columns, and the part of each among the training windows.
+    """
+
+    features: Any
+    sequences: tuple[SplicedRun, ...]
     rule: WindowRule
     layout: Layout
-    #: classes, prior: (k,) names in the order of the columns, and the part of each among the training windows
     classes: Array
     prior: Array
 
@@ -62,13 +64,7 @@ def following(
 ) -> Iterator[Following]:
     """Yield what follows, for each fold, the sequences through its held-out runs.
 
-    Parameters
-    ----------
-    features : scikit-learn transformer of windows, which learns nothing but their channels and rates
-    windows, runs : labelled windows as the folds number them, and the runs that they are of
-    rule : of the windows
-    folds : training and test rows
-    seed : of what is drawn
+    ``features`` transforms windows, and learns nothing but their channels and rates; the folds number ``windows``.
     """
     by_id, layout = {run.run_id: run for run in runs}, Layout(windows.channels, windows.rate_hz)
     classes, class_of = np.unique(windows.terrain.astype(str), return_inverse=True)

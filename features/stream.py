@@ -39,32 +39,15 @@ _MIN_BUFFER = 64
 class _Buffer:
     """Accepted samples of one stream, oldest first, in arrays that are made once."""
 
-    __slots__ = ("end", "first_s", "last_s", "n_channels", "suspect", "time_s", "values")
-
     def __init__(self, capacity: int, n_channels: int) -> None:
         self.time_s = np.empty(capacity)
         self.values = np.empty((capacity, n_channels))
-        self.n_channels = n_channels
         self.end = 0
-        self.first_s = math.nan
-        self.last_s = math.nan
+        self.first_s = self.last_s = math.nan
         self.suspect: tuple[float, Array] | None = None
-
-    def append(self, time_s: float, values: Sequence[float] | Array) -> None:
-        self.values[self.end] = values
-        self.time_s[self.end] = time_s
-        self.end += 1
-        self.last_s = time_s
 
     def first_at(self, time_s: float) -> int:
         return int(np.searchsorted(self.time_s[: self.end], time_s - TIME_TOLERANCE_S))
-
-    def forget(self, n: int) -> None:
-        """Remove the oldest ``n`` samples."""
-        kept = self.end - n
-        self.time_s[:kept] = self.time_s[n : self.end]
-        self.values[:kept] = self.values[n : self.end]
-        self.end = kept
 
 
 class WindowStream:
@@ -82,23 +65,15 @@ class WindowStream:
 
     Parameters
     ----------
-    rule : how to cut
-    layout : streams, channels (in the order in which their values are pushed) and rates
+    rule, layout : how to cut; streams, channels (in the order in which their values are pushed) and rates
     run_id : run of the windows
     patience_s : how far the others are ahead before a stream counts as stopped and the windows that wait
-        for it are dropped
+        for it are dropped; longer than the longest step between two samples that is no gap
 
     Attributes
     ----------
     dropped : windows dropped so far, by reason (:data:`~features.windows.DROP_REASONS`)
     dropped_samples : samples dropped so far, by stream and reason
-
-    Raises
-    ------
-    ConfigError
-        if ``patience_s`` is not longer than the longest step between two samples that is no gap.
-    DataError
-        if a window holds too few samples of a stream, or steady motion is asked for without wheel speeds.
 
     Examples
     --------
@@ -129,9 +104,9 @@ class WindowStream:
         self.dropped: Counter[str] = Counter()
         self.dropped_samples: Counter[tuple[str, str]] = Counter()
         self._n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
-        if rule.steady is not None:
-            nothing = {name: np.empty((0, len(channels), 0)) for name, channels in layout.channels.items()}
-            wheel_speeds(nothing, layout.channels)  # refused now and not at the first window
+        if rule.steady is not None:  # refused now and not at the first window
+            empty = {name: np.empty((0, len(names), 0)) for name, names in layout.channels.items()}
+            wheel_speeds(empty, layout.channels)
         self._period_s = {name: 1 / layout.rate_hz[name] for name in layout.channels}
         span_s = rule.length_s + rule.step_s + self.patience_s
         self._buffers = {
@@ -165,13 +140,8 @@ class WindowStream:
     def push(self, stream: str, time_s: float, values: Sequence[float] | Array) -> list[Windows]:
         """Take one sample and return the windows that it completes, each a ``Windows`` of length 1.
 
-        A sample whose time is not finite, goes back or repeats is dropped and counted.
-
-        Parameters
-        ----------
-        stream : name of a stream of the layout
-        time_s : time of the sample
-        values : one number a channel, in the order of the layout; NaN where one is missing
+        Values are one number a channel, in the order of the layout; NaN where one is missing.  A sample whose time is
+        not finite, goes back or repeats is dropped and counted.
 
         Raises
         ------
@@ -180,21 +150,25 @@ class WindowStream:
         ValueError
             if there are not as many values as channels.
         """
-        try:
-            buffer = self._buffers[stream]
-        except KeyError:
+        buffer = self._buffers.get(stream)
+        if buffer is None:
             known = ", ".join(self._buffers)
-            raise ConfigError(f"there is no stream {stream!r} in the layout; it has {known}") from None
-        if len(values) != buffer.n_channels:
+            raise ConfigError(f"there is no stream {stream!r} in the layout; it has {known}")
+        if len(values) != buffer.values.shape[1]:
             raise ValueError(
-                f"stream {stream!r} has {buffer.n_channels} channels; the sample has {len(values)} values"
+                f"stream {stream!r} has {buffer.values.shape[1]} channels; the sample has {len(values)} values"
             )
         if buffer.suspect is None and 0.0 < time_s - buffer.last_s <= self.patience_s:  # False for NaN
-            if buffer.end == len(buffer.time_s):
-                self._make_room(stream)
-            buffer.append(time_s, values)
+            self._append(stream, buffer, time_s, values)
             return self._advance() if time_s >= self._due_s[stream] else []
         return self._push_doubtful(stream, buffer, float(time_s), values)
+
+    def _append(self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array) -> None:
+        if buffer.end == len(buffer.time_s):
+            self._make_room(stream)
+        buffer.values[buffer.end] = values
+        buffer.time_s[buffer.end] = buffer.last_s = time_s
+        buffer.end += 1
 
     def _push_doubtful(
         self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array
@@ -214,21 +188,16 @@ class WindowStream:
             buffer.suspect = (time_s, np.array(values, dtype=float))
             return []
         buffer.suspect = None
-        for sample in (suspect, (time_s, values)):
-            if sample is not None:
-                if buffer.end == len(buffer.time_s):
-                    self._make_room(stream)
-                buffer.append(*sample)
+        if suspect is not None:
+            self._append(stream, buffer, *suspect)
+        self._append(stream, buffer, time_s, values)
         if math.isnan(buffer.first_s) and suspect is not None:
             buffer.first_s = suspect[0]
-            self._begin()
+            begun_s = [each.first_s for each in self._buffers.values()]
+            if not any(math.isnan(each_s) for each_s in begun_s):
+                self._start_s = max(begun_s)
+                self._set_due()
         return self._advance() if time_s >= self._due_s[stream] else []
-
-    def _begin(self) -> None:
-        first = [buffer.first_s for buffer in self._buffers.values()]
-        if not any(math.isnan(time_s) for time_s in first):
-            self._start_s = max(first)
-            self._set_due()
 
     def _set_due(self) -> None:
         end_s = self._start_of(self._next) + self.rule.length_s - 2 * TIME_TOLERANCE_S
@@ -301,7 +270,10 @@ class WindowStream:
         if n < enough:
             self.dropped_samples[stream, "faster than its rate"] += enough - n
             n = enough
-        buffer.forget(n)
+        kept = buffer.end - n
+        for array in (buffer.time_s, buffer.values):
+            array[:kept] = array[n : buffer.end]
+        buffer.end = kept
 
 
 class WindowFeed:
@@ -316,16 +288,12 @@ class WindowFeed:
     rule, layout : of the windows
     channels : of each stream that is measured, in the order of the columns of its readings
     estimated : of each stream that a filter adds (:func:`terrain.estimation.choice.estimated_channels`)
-    robot : corrected; may be missing where every channel of the windows is measured
+    robot : corrected; may be missing where every channel of the windows is measured; ``DataError`` where one is
+        neither measured nor estimated
 
     Attributes
     ----------
     unreadable : number of readings that were no arrays of the right shape, by stream
-
-    Raises
-    ------
-    DataError
-        if a channel of the windows is neither measured nor estimated.
 
     Examples
     --------

@@ -37,37 +37,40 @@ SPAN_TOLERANCE = 0.1
 """A window whose samples span this much more or less time than they should, and one period, was not sampled
 at the rate it is read with: a slow or a fast stretch of a logger, or a live stream set to another rate."""
 
-WHEELS = frozenset({"wheels"})
-
 DROP_REASONS = ("gap", "wrong rate", "not finite", "not moving", "not steady")
 
 
 @dataclass(frozen=True, slots=True)
 class SteadyMotion:
-    """When a window counts as steady motion (thesis 8.1 requires it without numbers: both are assumed)."""
+    """When a window counts as steady motion (thesis 8.1 requires it without numbers: both are assumed).
 
-    min_speed_mps: float = 0.03  #: the mean speed of the faster wheel must reach this
-    #: the mean speeds of a wheel in the two halves of the window may differ by at most this acceleration times
-    #: half the length; means, because single wheel readings are noisy
+    Parameters
+    ----------
+    min_speed_mps : the mean speed of the faster wheel must reach this
+    max_accel_mps2 : the mean speeds of a wheel in the two halves of the window may differ by at most
+        this acceleration times half the length; means, because single wheel readings are noisy
+    """
+
+    min_speed_mps: float = 0.03
     max_accel_mps2: float = 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class WindowRule:
-    """How runs are cut.
+    """How runs are cut; ``ConfigError`` where a number is not positive and finite.
 
-    Raises
-    ------
-    ConfigError
-        if a number is not positive and finite.
+    Parameters
+    ----------
+    length_s : length of a window (thesis 8.1: 2 s)
+    stride_s : from start to start; ``None`` means one length, that is no overlap
+    steady : the rule of steady motion, ``None`` to keep every window
+    max_gap_periods : a longer step between two samples, in sample periods, is a gap; 1.8 lets jitter
+        through and catches one lost sample
     """
 
-    length_s: float = 2.0  #: length of a window (thesis 8.1: 2 s)
-    stride_s: float | None = None  #: from start to start; ``None`` means one length, that is no overlap
-    #: the rule of steady motion, ``None`` to keep every window
+    length_s: float = 2.0
+    stride_s: float | None = None
     steady: SteadyMotion | None = field(default_factory=SteadyMotion)
-    #: a longer step between two samples, in sample periods, is a gap; 1.8 lets jitter through and catches one
-    #: lost sample
     max_gap_periods: float = 1.8
 
     def __post_init__(self) -> None:
@@ -113,6 +116,43 @@ class Layout:
         return n
 
 
+def rows_of(channels: Sequence[str], quantity: str) -> list[int]:
+    """Return the positions of the channels of one quantity.
+
+    Examples
+    --------
+    >>> rows_of(("gyro_x_radps", "accel_x_mps2", "gyro_y_radps"), "gyro")
+    [0, 2]
+    """
+    return [i for i, channel in enumerate(channels) if channel.partition("_")[0] == quantity]
+
+
+def left_right(channels: Sequence[str], quantity: str) -> tuple[int, int] | None:
+    """Return the positions of the left and the right channel of a quantity, None without such a pair."""
+    side = {channel.split("_")[1]: i for i, channel in enumerate(channels) if channel.startswith(quantity)}
+    return (side["left"], side["right"]) if {"left", "right"} <= set(side) else None
+
+
+@lru_cache(maxsize=1024)
+def rows_of_sets(stream: str, channels: tuple[str, ...], sets: frozenset[str]) -> tuple[int, ...]:
+    """Return which channels of a stream belong to some signal sets; all runs of a data set ask for the same."""
+    return tuple(i for i, channel in enumerate(channels) if signal_set_of(stream, channel) in sets)
+
+
+def wheel_stream(channels: Mapping[str, Sequence[str]]) -> str | None:
+    """Return the stream that measures wheel speeds; None where none does, so that there is no motion."""
+    wheels = frozenset({"wheels"})
+    return next((name for name, names in channels.items() if rows_of_sets(name, tuple(names), wheels)), None)
+
+
+def wheel_speeds(values: Mapping[str, Array], channels: Mapping[str, tuple[str, ...]]) -> Array:
+    """Return the wheel speeds (n_windows, wheels, samples) in m/s; ``DataError`` where there is none."""
+    stream = wheel_stream(channels)
+    if stream is None:
+        raise DataError("steady motion cannot be judged without wheel speeds; switch the rule off")
+    return values[stream][:, list(rows_of_sets(stream, tuple(channels[stream]), frozenset({"wheels"})))]
+
+
 def layout_of(
     runs: Sequence[RunLog], signal_sets: Iterable[str] = SIGNAL_SETS, *, speeds: bool = True
 ) -> Layout:
@@ -141,15 +181,14 @@ def layout_of(
         for run in runs:
             if name not in run.streams:
                 raise DataError(f"run {run.run_id} has no stream {name!r}, which other runs have")
-        desired = used(name, runs[0].streams[name])
+        channels[name] = used(name, runs[0].streams[name])
         for run in runs:
-            differing = sorted(set(used(name, run.streams[name])) ^ set(desired))
+            differing = sorted(set(used(name, run.streams[name])) ^ set(channels[name]))
             if differing:
                 raise DataError(
                     f"run {run.run_id}, stream {name!r}: channel {differing[0]!r} is not in all runs"
                 )
-        rates = np.array([run.streams[name].rate_hz for run in runs])
-        channels[name], rate_hz[name] = desired, float(np.median(rates))
+        rate_hz[name] = float(np.median([run.streams[name].rate_hz for run in runs]))
     layout = Layout(channels, rate_hz)
     for run in runs:
         check_layout(run, layout)
@@ -159,13 +198,7 @@ def layout_of(
 
 
 def shared_layout(own: Layout, other: Layout) -> Layout:
-    """Return the streams and channels that two layouts have in common, at the rates of the first.
-
-    Raises
-    ------
-    DataError
-        if there are none.
-    """
+    """Return the streams and channels that two layouts have in common, at the rates of the first."""
     channels = {
         stream: both
         for stream, names in own.channels.items()
@@ -174,59 +207,6 @@ def shared_layout(own: Layout, other: Layout) -> Layout:
     if not channels:
         raise DataError("simulated and measured runs have no channel in common")
     return Layout(channels, {stream: own.rate_hz[stream] for stream in channels})
-
-
-@lru_cache(maxsize=1024)
-def rows_of_sets(stream: str, channels: tuple[str, ...], sets: frozenset[str]) -> tuple[int, ...]:
-    """Return which channels of a stream belong to some signal sets; all runs of a data set ask for the same."""
-    return tuple(i for i, channel in enumerate(channels) if signal_set_of(stream, channel) in sets)
-
-
-def windows_of(
-    runs: Iterable[RunLog], length_s: float = 2.0, stride_s: float | None = None, *, steady: bool = True
-) -> Windows:
-    """Cut runs into windows of equal length; runs that are shorter are left out.
-
-    Parameters
-    ----------
-    runs : whose channels and rates fit each other
-    length_s, stride_s : of a window, and from start to start; one length by default
-    steady : keep windows of steady motion only
-
-    Raises
-    ------
-    DataError
-        if no window is left, or runs do not fit each other.
-
-    Examples
-    --------
-    >>> import terrain
-    >>> terrain.cut_windows([terrain.simulate("husky", "grass", "straight", duration_s=8.0)])
-    3 windows of 2 s from 1 runs: grass
-    """
-    rule = WindowRule(length_s, stride_s, SteadyMotion() if steady else None)
-    found = cut_windows(list(runs), rule, skip_short=True)
-    if not len(found.windows):
-        dropped = ", ".join(f"{n} {why}" for why, n in found.dropped.items())
-        raise DataError(
-            f"no window of {length_s:g} s is left; dropped: {dropped or 'none, there are no runs'}"
-        )
-    return found.windows
-
-
-def overlap_of(windows: Windows) -> int:
-    """Return how many windows on either side of a window may share samples with it; at least its neighbour.
-
-    Examples
-    --------
-    >>> run = np.array(["a"] * 3, dtype=object)
-    >>> overlap_of(Windows({}, {}, {}, 2.0, np.array([0.0, 0.5, 1.0]), run, run))
-    4
-    """
-    same = windows.run_id[1:] == windows.run_id[:-1]
-    steps_s = np.diff(windows.start_s)[same]
-    steps_s = steps_s[steps_s > 0]
-    return int(np.ceil(windows.length_s / steps_s.min() - 1e-9)) if len(steps_s) else 1
 
 
 def check_layout(run: RunLog, layout: Layout) -> None:
@@ -248,14 +228,7 @@ def check_layout(run: RunLog, layout: Layout) -> None:
 def cut_at(
     streams: Mapping[str, Stream], starts_s: Array, rule: WindowRule, layout: Layout
 ) -> tuple[dict[str, Array], Array]:
-    """Cut one run's streams at the given starts.
-
-    Parameters
-    ----------
-    streams : the streams of one run
-    starts_s : (k,) starts of windows
-    rule : length, gap and steady-motion rule; its stride is not used
-    layout : which channels, in which order, at which rate
+    """Cut one run's streams at the starts (k,) of windows; the stride of the rule is not used.
 
     Returns
     -------
@@ -268,6 +241,7 @@ def cut_at(
     for name, channels in layout.channels.items():
         stream = streams[name]
         n = layout.n_samples(name, rule.length_s)
+        period_s = 1 / layout.rate_hz[name]
         limit_s = rule.max_gap_periods / layout.rate_hz[name]
         first = np.searchsorted(stream.time_s, starts_s - TIME_TOLERANCE_S)
         complete = first + n <= len(stream)
@@ -276,53 +250,34 @@ def cut_at(
             values[name] = np.zeros((len(starts_s), len(channels), n))
             reason[:] = "incomplete"
             continue
-        order = [stream.channels.index(channel) for channel in channels]
-        samples = stream.values[:, order]
+        samples = stream.values[:, [stream.channels.index(channel) for channel in channels]]
         gaps_before = np.concatenate(([0], np.cumsum(np.diff(stream.time_s) > limit_s)))
         bad = ~usable_rows(samples, unknown_is_a_value=name in NAN_TOLERANT_STREAMS)
         bad_before = np.concatenate(([0], np.cumsum(bad)))
-        has_gap = (gaps_before[first + n - 1] > gaps_before[first]) | (
-            stream.time_s[first] - starts_s > limit_s
+        first_s, last_s = stream.time_s[first], stream.time_s[first + n - 1]
+        has_gap = (gaps_before[first + n - 1] > gaps_before[first]) | (first_s - starts_s > limit_s)
+        off_rate = (
+            np.abs(last_s - first_s - (n - 1) * period_s) > SPAN_TOLERANCE * (n - 1) * period_s + period_s
         )
-        reason[(reason == "") & has_gap] = "gap"
-        period_s = 1 / layout.rate_hz[name]
-        excess_s = stream.time_s[first + n - 1] - stream.time_s[first] - (n - 1) * period_s
-        off_rate = np.abs(excess_s) > SPAN_TOLERANCE * (n - 1) * period_s + period_s
-        reason[(reason == "") & off_rate] = "wrong rate"
-        reason[(reason == "") & (bad_before[first + n] > bad_before[first])] = "not finite"
+        faults = {
+            "gap": has_gap,
+            "wrong rate": off_rate,
+            "not finite": bad_before[first + n] > bad_before[first],
+        }
+        for why, faulty in faults.items():
+            reason[(reason == "") & faulty] = why
         reason[~complete] = "incomplete"
         # Contiguous, so that numpy adds one window's samples in the same order as those of many.
         values[name] = np.ascontiguousarray(samples[first[:, None] + np.arange(n)].transpose(0, 2, 1))
     if rule.steady is not None:
-        _mark_unsteady(values, rule, rule.steady, layout, reason)
+        candidate = reason == ""
+        speeds = np.ascontiguousarray(wheel_speeds(values, layout.channels)[candidate])
+        half = speeds.shape[2] // 2
+        before, after = speeds[:, :, :half].mean(axis=2), speeds[:, :, -half:].mean(axis=2)
+        moving = np.abs(speeds).mean(axis=2).max(axis=1) >= rule.steady.min_speed_mps
+        even = np.abs(after - before).max(axis=1) <= rule.steady.max_accel_mps2 * rule.length_s / 2
+        reason[candidate] = np.where(moving, np.where(even, "", "not steady"), "not moving")
     return values, reason
-
-
-def _mark_unsteady(
-    values: Mapping[str, Array], rule: WindowRule, steady: SteadyMotion, layout: Layout, reason: Array
-) -> None:
-    candidate = reason == ""
-    speeds = np.ascontiguousarray(wheel_speeds(values, layout.channels)[candidate])
-    half = speeds.shape[2] // 2
-    before, after = speeds[:, :, :half].mean(axis=2), speeds[:, :, -half:].mean(axis=2)
-    moving = np.abs(speeds).mean(axis=2).max(axis=1) >= steady.min_speed_mps
-    even = np.abs(after - before).max(axis=1) <= steady.max_accel_mps2 * rule.length_s / 2
-    reason[candidate] = np.where(moving, np.where(even, "", "not steady"), "not moving")
-
-
-def wheel_speeds(values: Mapping[str, Array], channels: Mapping[str, tuple[str, ...]]) -> Array:
-    """Return the wheel speeds (n_windows, wheels, samples) in m/s.
-
-    Raises
-    ------
-    DataError
-        if there is no wheel speed, so that steady motion cannot be judged.
-    """
-    for name, names in channels.items():
-        rows = rows_of_sets(name, tuple(names), WHEELS)
-        if rows:
-            return values[name][:, list(rows)]
-    raise DataError("steady motion cannot be judged without wheel speeds; switch the rule off")
 
 
 def label_windows(run: RunLog, starts_s: Array, length_s: float) -> Array:
@@ -376,21 +331,16 @@ def cut_windows(
     starts_s: Mapping[str, Array] | None = None,
     skip_short: bool = False,
 ) -> WindowCut:
-    """Cut all runs into windows.
+    """Cut all runs into windows, run by run and in order of time, and count what was dropped.
+
+    A window whose samples lie under two labels keeps ``terrain == ""`` and is no sample for training.
 
     Parameters
     ----------
-    runs : run logs
     rule : how to cut; 2 s without overlap in steady motion by default
     layout : channels and rates to expect; what the runs have in common by default
     starts_s : starts by run id, where they are not the regular ones of ``rule``
     skip_short : leave out runs that are shorter than a window instead of refusing them
-
-    Returns
-    -------
-    WindowCut
-        the windows, run by run and in order of time, and what was dropped; a window whose samples lie
-        under two labels keeps ``terrain == ""`` and is no sample for training.
 
     Raises
     ------
@@ -416,47 +366,29 @@ def cut_windows(
             f"window stride_s is {rule.step_s:g}; at least the shortest sample period, {fastest_s:g} s, "
             "is needed"
         )
-    parts = [_no_windows(rule, layout)]
+
+    def windows(values: dict[str, Array], at: Array, run_id: str, terrain: Array) -> Windows:
+        names = np.full(len(at), run_id, dtype=object)
+        return Windows(values, layout.channels, layout.rate_hz, rule.length_s, at, names, terrain)
+
+    n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
+    nothing = {name: np.empty((0, len(names), n_samples[name])) for name, names in layout.channels.items()}
+    parts = [windows(nothing, np.empty(0), "", np.empty(0, dtype=object))]
     dropped: Counter[str] = Counter()
     for run in runs:
         refuse_implausible(run, layout.channels)
         if not holds_a_window(run, layout, rule.length_s, skip_short=skip_short):
             dropped["run too short"] += 1
             continue
-        begin_s, end_s = span_of(run, layout)
         if starts_s is None:
-            at = regular_starts(begin_s, end_s, rule.length_s, rule.step_s)
+            at = regular_starts(*span_of(run, layout), rule.length_s, rule.step_s)
         else:
             at = np.asarray(starts_s.get(run.run_id, ()), dtype=float)
-        cut = _cut_run(run, at, rule, layout)
-        parts.append(cut.windows)
-        dropped.update(cut.dropped)
+        values, reason = cut_at(run.streams, at, rule, layout)
+        dropped.update(str(why) for why in reason if why not in ("", "incomplete"))
+        kept, at = {name: array[reason == ""] for name, array in values.items()}, at[reason == ""]
+        parts.append(windows(kept, at, run.run_id, label_windows(run, at, rule.length_s)))
     return WindowCut(join_windows(parts), dict(dropped))
-
-
-def _no_windows(rule: WindowRule, layout: Layout) -> Windows:
-    values = {
-        name: np.empty((0, len(channels), layout.n_samples(name, rule.length_s)))
-        for name, channels in layout.channels.items()
-    }
-    nothing = np.empty(0, dtype=object)
-    return Windows(values, layout.channels, layout.rate_hz, rule.length_s, np.empty(0), nothing, nothing)
-
-
-def _cut_run(run: RunLog, starts_s: Array, rule: WindowRule, layout: Layout) -> WindowCut:
-    values, reason = cut_at(run.streams, starts_s, rule, layout)
-    kept = reason == ""
-    starts_kept_s = starts_s[kept]
-    windows = Windows(
-        {name: array[kept] for name, array in values.items()},
-        layout.channels,
-        layout.rate_hz,
-        rule.length_s,
-        starts_kept_s,
-        np.full(len(starts_kept_s), run.run_id, dtype=object),
-        label_windows(run, starts_kept_s, rule.length_s),
-    )
-    return WindowCut(windows, Counter(str(r) for r in reason[~kept] if r != "incomplete"))
 
 
 def join_windows(parts: Sequence[Windows]) -> Windows:
@@ -471,3 +403,66 @@ def join_windows(parts: Sequence[Windows]) -> Windows:
         np.concatenate([part.run_id for part in parts]),
         np.concatenate([part.terrain for part in parts]),
     )
+
+
+def labelled(cut: WindowCut) -> WindowCut:
+    """Keep the windows that lie under one label; the others are counted as ``no single label``.
+
+    ``DataError`` where there is no window, or none with a label.
+    """
+    known = cut.windows.terrain != ""
+    if not len(known):
+        dropped = ", ".join(f"{n} {reason}" for reason, n in sorted(cut.dropped.items()))
+        raise DataError(f"not one window is left: {dropped or 'no run is long enough'}")
+    if not known.any():
+        raise DataError("no window has a terrain label: nothing can be trained or tested")
+    if known.all():
+        return cut
+    return WindowCut(cut.windows[known], {**cut.dropped, "no single label": int((~known).sum())})
+
+
+def windows_of(
+    runs: Iterable[RunLog], length_s: float = 2.0, stride_s: float | None = None, *, steady: bool = True
+) -> Windows:
+    """Cut runs into windows of equal length; runs that are shorter are left out.
+
+    Parameters
+    ----------
+    runs : whose channels and rates fit each other
+    length_s, stride_s : of a window, and from start to start; one length by default
+    steady : keep windows of steady motion only
+
+    Raises
+    ------
+    DataError
+        if no window is left, or runs do not fit each other.
+
+    Examples
+    --------
+    >>> import terrain
+    >>> terrain.cut_windows([terrain.simulate("husky", "grass", "straight", duration_s=8.0)])
+    3 windows of 2 s from 1 runs: grass
+    """
+    rule = WindowRule(length_s, stride_s, SteadyMotion() if steady else None)
+    found = cut_windows(list(runs), rule, skip_short=True)
+    if not len(found.windows):
+        dropped = ", ".join(f"{n} {why}" for why, n in found.dropped.items())
+        raise DataError(
+            f"no window of {length_s:g} s is left; dropped: {dropped or 'none, there are no runs'}"
+        )
+    return found.windows
+
+
+def overlap_of(windows: Windows) -> int:
+    """Return how many windows on either side of a window may share samples with it; at least its neighbour.
+
+    Examples
+    --------
+    >>> run = np.array(["a"] * 3, dtype=object)
+    >>> overlap_of(Windows({}, {}, {}, 2.0, np.array([0.0, 0.5, 1.0]), run, run))
+    4
+    """
+    same = windows.run_id[1:] == windows.run_id[:-1]
+    steps_s = np.diff(windows.start_s)[same]
+    steps_s = steps_s[steps_s > 0]
+    return int(np.ceil(windows.length_s / steps_s.min() - 1e-9)) if len(steps_s) else 1

@@ -19,7 +19,7 @@ from pipelines.report.tree import Column, Report, Table, Text, sections
 if TYPE_CHECKING:
     import pandas as pd
 
-    from features.breaks import OddStretch
+    from features.motion import OddStretch
     from terrain.logs.clock import ClockEstimate
     from terrain.logs.duplicates import SharedStretch
     from terrain.logs.plausibility import Check, StreamQuality
@@ -98,7 +98,7 @@ def run(settings: Settings, progress: Progress = silent) -> Inspection:
 
 
 def _inspected(run: RunLog, robot: Robot | None) -> InspectedRun:
-    from features.breaks import odd_stretches
+    from features.motion import odd_stretches
     from terrain.errors import ConfigError, DataError
     from terrain.logs.clock import estimate_clock
     from terrain.logs.plausibility import stream_quality

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from features.labelled import labelled
-from features.windows import cut_windows, layout_of, shared_layout
+from features.windows import cut_windows, labelled, layout_of, shared_layout
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import FEATURE_RECIPE, LearnSettings
 from pipelines.report.numbers import plural

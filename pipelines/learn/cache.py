@@ -19,10 +19,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from features.extractor import FeatureExtractor
-from features.labelled import labelled
-from features.motion import Motion, wheel_stream, window_motion
+from features.motion import window_motion
 from features.protocols import Samples
-from features.windows import Layout, WindowCut, WindowRule, cut_windows, layout_of
+from features.windows import Layout, WindowCut, WindowRule, cut_windows, labelled, layout_of, wheel_stream
 from pipelines.data.datasets import RunLoader, run_loaders
 from pipelines.data.settings import AlignedRunsSettings, chosen_runs
 from pipelines.learn.parallel import parallel
@@ -31,6 +30,7 @@ from pipelines.learn.settings import LearnSettings
 from pipelines.learn.training_data import TrainingData, trained_runs
 from pipelines.report.results import Progress, as_json, silent
 from terrain import __version__
+from terrain.classify.limits import Motion
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
 from terrain.logs.digest import data_digest, joint_digest

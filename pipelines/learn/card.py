@@ -39,7 +39,7 @@ from terrain.files.documents import parse_document
 from terrain.files.names import printable
 
 if TYPE_CHECKING:
-    from features.motion import Motion
+    from terrain.classify.limits import Motion
     from terrain.records import Windows
 
 N_TIMED = 50  #: Windows whose time is measured, one by one; the median is stated

@@ -11,11 +11,10 @@ import pandas as pd
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.utils.validation import check_is_fitted
 
-from features.labelled import labelled
 from features.motion import window_motion
 from features.protocols import Samples
 from features.recipes import WindowPipeline, make_recipe
-from features.windows import WindowCut, WindowRule, overlap_of
+from features.windows import WindowCut, WindowRule, labelled, overlap_of
 from pipelines.learn.model_file import MANIFEST_FILE, model_info, read_model, write_model
 from pipelines.learn.training_data import with_limits
 from terrain.errors import ConfigError, DataError

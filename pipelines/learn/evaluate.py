@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from features.extractor import FeatureExtractor
-from features.motion import NO_MOTION, Motion, fastest_wheel, wheel_stream, window_motion
-from features.protocols import N_FOLDS, PROTOCOLS, Samples, folds_of, slow_and_fast
+from features.motion import NO_MOTION, fastest_wheel, window_motion
+from features.protocols import PROTOCOLS, Samples, folds_of, slow_and_fast
 from features.recipes import WindowPipeline, feature_matrix
 from features.sequences import following
+from features.windows import wheel_stream
 from pipelines.learn.evaluation import CrossvalResult
 from pipelines.learn.parallel import parallel
 from pipelines.learn.recipes import recipe_of
@@ -21,7 +22,7 @@ from pipelines.report.numbers import format_counts
 from pipelines.report.results import Progress, silent
 from terrain.classify.changes import breakaways
 from terrain.classify.coverage import coverage_of
-from terrain.classify.folds import Fold, single_run_classes
+from terrain.classify.folds import N_FOLDS, Fold, single_run_classes
 from terrain.classify.held_out import (
     Applicability,
     ChannelDrops,
@@ -34,6 +35,7 @@ from terrain.classify.held_out import (
     run_speeds,
     score_fold,
 )
+from terrain.classify.limits import Motion
 from terrain.classify.metrics import (
     held_out_figures,
     learning_curve,

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from features.samples import is_centred
+from features.extractor import is_centred
 from features.windows import Layout, WindowRule
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain import __version__
@@ -54,10 +54,10 @@ MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 
 TRUSTED_TYPES: tuple[str, ...] = (
     "builtins.frozenset",
-    "features.cross_channel.Feature",
+    "features.extractor.Feature",
     "features.extractor.FeatureExtractor",
     "features.response.ResponseExtractor",
-    "features.sample_extractor.SampleExtractor",
+    "features.extractor.SampleExtractor",
     "features.windows.Layout",
     "numpy.dtype",
     "features.recipes.WindowPipeline",

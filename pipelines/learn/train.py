@@ -246,7 +246,7 @@ def _check_storable(data: TrainingData) -> None:
     import numpy as np
     from sklearn.base import clone
 
-    from features.own import FunctionExtractor
+    from features.extractor import FunctionExtractor
     from pipelines.learn.model_file import packed
     from terrain.classify.grouped import OwnClassifier
     from terrain.classify.network import GroupedNetwork, require_onnx

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from features.extractor import FeatureExtractor
-from features.motion import Motion, window_motion
+from features.motion import window_motion
 from features.protocols import Samples, samples_of
 from features.recipes import WindowPipeline, feature_matrix
 from features.windows import Layout
@@ -18,7 +18,7 @@ from pipelines.learn.model_file import model_info
 from pipelines.learn.recipes import recipe_of
 from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
-from terrain.classify.limits import conformal_threshold, held_out_scores, learn_novelty, learn_support
+from terrain.classify.limits import Motion, conformal_threshold, held_out_scores, learn_novelty, learn_support
 from terrain.errors import DataError
 from terrain.logs.digest import data_digest
 from terrain.logs.schema import ESTIMATED

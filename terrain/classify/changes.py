@@ -30,13 +30,15 @@ standing robot answers nothing.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from terrain.classify.held_out import HeldOut
 from terrain.errors import DataError
 from terrain.records import Array, Windows
+
+if TYPE_CHECKING:
+    from terrain.classify.held_out import HeldOut
 
 PENALTY = 3.0
 """A change costs this times the number of columns times the logarithm of the number of rows: three times what

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from terrain.classify.held_out import HeldOut
-from terrain.classify.limits import SupportLevel, learn_support, support_levels, support_of
+from terrain.classify.limits import Motion, SupportLevel, learn_support, support_levels, support_of
 from terrain.classify.metrics import N_BOOTSTRAP, Interval, confidence_auc, drawn_runs, ratio_over_runs
 from terrain.records import Array
 
@@ -62,26 +62,6 @@ RUN_WINDOWS, MIN_RUN_S = 10, 20.0
 MAX_DRIVES = 20
 MIN_GAIN = 5e-5
 """A drive that is expected to gain less is not named: it would be shown as 0.00 %."""
-
-
-class Motion(NamedTuple):
-    """How the robot moved in each of n windows.
-
-    Parameters
-    ----------
-    speed_mps : (n,) magnitude of the speed of the fastest wheel, mean over the window
-    yaw_rate_radps : (n,) magnitude of the mean yaw rate; NaN where no gyroscope measures it
-    turn_ratio : (n,) ``|v_right - v_left| / (|v_right| + |v_left|)`` of the mean speeds of the two sides: 0
-        straight on, 1 where one side stands or they turn against each other; NaN without two sides
-    """
-
-    speed_mps: Array
-    yaw_rate_radps: Array
-    turn_ratio: Array
-
-    def of(self, rows: Array) -> Motion:
-        """Return the motion in some of the windows."""
-        return Motion(*(each[rows] for each in self))
 
 
 class Manoeuvre(IntEnum):

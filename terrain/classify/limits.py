@@ -279,6 +279,26 @@ def _whitening(residuals: Array) -> Array:
     return found
 
 
+class Motion(NamedTuple):
+    """How the robot moved in each of n windows.
+
+    Parameters
+    ----------
+    speed_mps : (n,) magnitude of the speed of the fastest wheel, mean over the window
+    yaw_rate_radps : (n,) magnitude of the mean yaw rate; NaN where no gyroscope measures it
+    turn_ratio : (n,) ``|v_right - v_left| / (|v_right| + |v_left|)`` of the mean speeds of the two sides: 0
+        straight on, 1 where one side stands or they turn against each other; NaN without two sides
+    """
+
+    speed_mps: Array
+    yaw_rate_radps: Array
+    turn_ratio: Array
+
+    def of(self, rows: Array) -> Motion:
+        """Return the motion in some of the windows."""
+        return Motion(*(each[rows] for each in self))
+
+
 SPEED_STEP_MPS, YAW_STEP_RADPS = 0.05, 0.1
 """Cells of motion."""
 

@@ -1,10 +1,10 @@
-"""The motion of a window: what a mirror or a direction changes nothing of, and what is not known."""
+"""The motion of a window, which a mirror or a direction does not change, and stretches that differ."""
 
 import numpy as np
 import pytest
 
-from features.motion import window_motion
-from terrain.records import Windows
+from features.motion import odd_stretches, window_motion
+from terrain.records import RunLog, Stream, Windows
 
 RNG = np.random.default_rng(5)
 CHANNELS = {"imu": ("gyro_z_radps",), "wheels": ("speed_left_mps", "speed_right_mps", "current_left_a")}
@@ -46,7 +46,18 @@ def test_what_is_not_measured_is_nan_and_without_wheels_there_is_no_motion(value
     assert window_motion(windows_of({"imu": values["imu"]}, {"imu": ("gyro_z_radps",)})) is None
 
 
-def test_a_robot_that_stands_has_no_turn_ratio():
-    motion = window_motion(windows_of({"imu": np.zeros((1, 1, 10)), "wheels": np.zeros((1, 3, 10))}))
-    assert (motion.speed_mps[0], motion.yaw_rate_radps[0]) == (0, 0)
-    assert np.isnan(motion.turn_ratio[0])
+def test_a_stretch_of_another_vibration_is_found_and_a_plain_run_has_none(drive):
+    """Nor has one that stands, or that has no wheels or no IMU."""
+    imu, wheels = (drive("a", "GRASS", 21, duration_s=60.0).streams[name] for name in ("imu", "wheels"))
+    stopped = Stream(wheels.time_s, np.zeros_like(wheels.values), wheels.channels)
+    both = {"imu": imu, "wheels": wheels}
+    for streams in (both, {"imu": imu}, {"wheels": wheels}, both | {"wheels": stopped}):
+        assert odd_stretches(RunLog("a", "husky", streams)) == ()
+    still = (imu.time_s - imu.time_s[0] >= 20) & (imu.time_s - imu.time_s[0] < 34)
+    values = imu.values.copy()
+    values[still] = values[still].mean(axis=0) + 0.02 * (values[still] - values[still].mean(axis=0))
+    stuck = Stream(imu.time_s, values, imu.channels)
+    (found,) = odd_stretches(RunLog("b", "husky", both | {"imu": stuck}))
+    assert abs(found.start_s - imu.time_s[0] - 20) <= 2
+    assert abs(found.end_s - imu.time_s[0] - 34) <= 2
+    assert found.speed_mps > 0.1  # the wheels turn on

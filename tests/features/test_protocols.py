@@ -5,11 +5,10 @@ from zlib import crc32
 import numpy as np
 import pytest
 
-from features.labelled import PARTITION_S, PUBLISHED_STRIDE_S
-from features.protocols import N_FOLDS, folds_of, samples_of
+from features.protocols import PARTITION_S, PUBLISHED_STRIDE_S, folds_of, samples_of
 from features.windows import WindowRule
+from terrain.classify.folds import N_FOLDS
 from terrain.errors import DataError
-from terrain.logs.regimes import driven_at
 from terrain.records import Label, RunLog, Stream
 
 
@@ -130,15 +129,6 @@ def test_published_has_no_rule_of_steady_motion_and_grouped_has():
     assert samples.dropped == {"not moving": 24}
 
 
-def test_windows_without_one_label_are_left_out_and_counted(drive):
-    run = drive("r", "GRASS", 0)
-    halves = RunLog("r", "husky", run.streams, (Label(0.0, 11.0, "GRASS"), Label(11.0, 20.0, "GRAVEL")))
-    samples = samples_under("grouped", [halves])
-    # Of twelve windows of 2 s the one from 10 s lies under both, those from 20 and 22 s under none.
-    assert samples.windows.terrain.tolist() == ["GRASS"] * 5 + ["GRAVEL"] * 4
-    assert samples.dropped == {"no single label": 3}
-
-
 def test_what_cannot_be_split_is_refused(drive, drive_all):
     unlabelled = [drive(f"r{i}", "GRASS", i, label=None) for i in range(6)]
     one_class, unnamed = drive_all(("GRASS",), 6), drive_all(n_runs=2)
@@ -159,11 +149,3 @@ def test_what_cannot_be_split_is_refused(drive, drive_all):
     ):
         with pytest.raises(DataError, match=sentence):
             folds_of(samples_under(protocol, runs), protocol, 1, 0)
-
-
-def test_runs_are_chosen_by_their_commanded_speed():
-    runs = [commanded("slow", "ICE", 0.1), commanded("fast", "ICE", 0.6)]
-    bare = RunLog("bare", "husky", {"wheels": runs[1].streams["wheels"]})
-    there = [driven_at(run, 0.0, 0.2) for run in (*runs, bare, RunLog("none", "husky", {}))]
-    assert there == [True, False, False, False]
-    assert driven_at(bare, 0.5, 0.7)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from sklearn.base import clone
 
-from features.motion import Motion, window_motion
+from features.motion import window_motion
 from features.protocols import folds_of, samples_of
 from features.recipes import feature_matrix
 from pipelines.data.datasets import load_runs
@@ -26,7 +26,7 @@ from pipelines.report.settings import JobsSettings, setting
 from pipelines.report.tree import Column, Report, Table
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import Examples
-from terrain.classify.limits import learn_support, support_of
+from terrain.classify.limits import Motion, learn_support, support_of
 from terrain.classify.metrics import Difference, Outcome, compare_outcomes
 from terrain.classify.proposals import ACCEPTED, Proposal, questions
 from terrain.errors import DataError

@@ -14,7 +14,6 @@ from terrain.classify.coverage import (
     MIN_WIDTH_MPS,
     HeldOutSupport,
     Manoeuvre,
-    Motion,
     coverage_of,
     errors_left,
     expected_gain,
@@ -27,7 +26,7 @@ from terrain.classify.coverage import (
 )
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import FoldResult, HeldOut
-from terrain.classify.limits import SupportLevel
+from terrain.classify.limits import Motion, SupportLevel
 
 RUNS = [(name, speed) for speed in (0.2, 0.6) for name in ("ice", "mud") for _ in range(5)]
 
