@@ -37,31 +37,22 @@ from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS, UNIT_SYMBOLS, check_signal_sets, signal_set_of, unit_of
 from terrain.records import Array, Windows
 
+#: Statistics that move with the level of a signal.
 LEVEL_STATISTICS = frozenset({"mean", "min", "max", "q05", "q25", "median", "q75", "q95", "rms", "mean_abs"})
-"""Statistics that move with the level of a signal."""
-
+#: Statistics that are computed only on request. The mean of an IMU channel depends on mounting, bias and slope, the
+#: level of a speed, measured or estimated, on how the robot was driven; neither is a property of the terrain.
+#: ``driving``: speeds and yaw rates among the estimator's states.
 LEFT_OUT = {
     "imu": frozenset({"mean", "median"}),
     "wheels": LEVEL_STATISTICS,
     "driving": LEVEL_STATISTICS,
 }
-"""Statistics that are computed only on request.  The mean of an IMU channel depends on mounting, bias and
-slope, the level of a speed, measured or estimated, on how the robot was driven; neither is a property of the
-terrain.  ``driving``: speeds and yaw rates among the estimator's states.
-"""
-
+#: Rates that differ by less, relative to one another, give the same features but for rounding.
 SAME_RATE = 1e-6
-"""Rates that differ by less, relative to one another, give the same features but for rounding."""
-
-MIN_SPEED_MPS = 0.05
-"""Division by speed stops here: below it a wheel reading is mostly quantisation."""
-
+MIN_SPEED_MPS = 0.05  #: Division by speed stops here: below it a wheel reading is mostly quantisation.
+#: A smaller wheel difference (rms) does not count as a turn; the yaw rate per wheel difference is NaN.
 MIN_WHEEL_DIFFERENCE_MPS = 0.03
-"""A smaller wheel difference (rms) does not count as a turn; the yaw rate per wheel difference is NaN."""
-
-N_PARTS = 8
-"""Parts of a window over which wheel difference and yaw rate are averaged."""
-
+N_PARTS = 8  #: Parts of a window over which wheel difference and yaw rate are averaged.
 _LOG_FLOOR = 1e-4
 
 
@@ -357,12 +348,6 @@ def _described(
 class FeatureExtractor(TransformerMixin, BaseEstimator):
     """Turn :class:`~terrain.records.Windows` into a feature matrix.
 
-    Parameters
-    ----------
-    signal_sets : names out of :data:`~terrain.logs.schema.SIGNAL_SETS`; a feature is computed only when all
-        sets it needs are named
-    level_sets : sets of which the statistics in :data:`LEFT_OUT` are computed as well
-
     Attributes
     ----------
     layout_, length_s_, n_samples_ : channels, rates, length and samples that the windows must have
@@ -378,8 +363,10 @@ class FeatureExtractor(TransformerMixin, BaseEstimator):
     ('imu.accel_z.std [m/s^2]', (3, 51))
     """
 
+    #: names out of :data:`~terrain.logs.schema.SIGNAL_SETS`; a feature is computed only when all sets it needs are
+    #: named
     signal_sets: Iterable[str] = SIGNAL_SETS
-    level_sets: Iterable[str] = ()
+    level_sets: Iterable[str] = ()  #: sets of which the statistics in :data:`LEFT_OUT` are computed as well
 
     def fit(self, X: Windows, y: Any = None) -> FeatureExtractor:
         """Learn which channels and rates the windows have, and so the names of the features.
@@ -522,8 +509,8 @@ class Window:
         return samples
 
 
+#: From a window to a number, or to several by name; NaN where it is not defined.
 WindowFunction = Callable[[Window], float | Mapping[str, float]]
-"""From a window to a number, or to several by name; NaN where it is not defined."""
 
 
 @dataclass(eq=False, repr=False)

@@ -19,13 +19,11 @@ from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import signal_set_of
 from terrain.records import Array, RunLog, Windows
 
+#: Why there is no :class:`~terrain.classify.limits.Motion`.
 NO_MOTION = "the windows hold no wheel speed, so that how the robot moved is not known"
-"""Why there is no :class:`~terrain.classify.limits.Motion`."""
-
 MIN_SIDE_SPEED_MPS = 1e-6  #: Sides that are slower together stand: their ratio is not defined
 
-MIN_SPEED_MPS, MIN_VIBRATION = 0.05, 1e-4
-"""Speed and vibration are not taken for less under a logarithm."""
+MIN_SPEED_MPS, MIN_VIBRATION = 0.05, 1e-4  #: Speed and vibration are not taken for less under a logarithm.
 
 
 def window_motion(windows: Windows) -> Motion | None:

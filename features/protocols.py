@@ -51,29 +51,20 @@ from terrain.logs.regimes import driven_at, regime_of
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 
+#: Of the papers: length of a partition, and stride of the class with the fewest.
 PARTITION_S, PUBLISHED_STRIDE_S = 5.0, 0.1
-"""Of the papers: length of a partition, and stride of the class with the fewest."""
 
 
 class Samples(NamedTuple):
-    """Windows under one label each, how many were left out by reason, and what protocols need besides.
-
-    Parameters
-    ----------
-    group : (n,) what is never divided: the run, or under ``published`` the partition
-    gap : windows beside a window that may share samples with it
-    merged : ids of runs that hold the same measurements and were made one
-    runs : that the windows were cut from; empty where they are not at hand
-    repaired : what a repairing reader changed, by kind
-    """
+    """Windows under one label each, how many were left out by reason, and what protocols need besides."""
 
     windows: Windows
     dropped: Mapping[str, int]
-    group: Array
-    gap: int
-    merged: tuple[tuple[str, ...], ...] = ()
-    runs: Sequence[RunLog] = ()
-    repaired: Mapping[str, int] = MappingProxyType({})
+    group: Array  #: (n,) what is never divided: the run, or under ``published`` the partition
+    gap: int  #: windows beside a window that may share samples with it
+    merged: tuple[tuple[str, ...], ...] = ()  #: ids of runs that hold the same measurements and were made one
+    runs: Sequence[RunLog] = ()  #: that the windows were cut from; empty where they are not at hand
+    repaired: Mapping[str, int] = MappingProxyType({})  #: what a repairing reader changed, by kind
 
     @property
     def terrain(self) -> Array:
@@ -87,24 +78,19 @@ class Samples(NamedTuple):
 
 
 class Protocol(NamedTuple):
-    """What is held out, in words, and how.
-
-    Parameters
-    ----------
-    units : (n,) what is held out together; empty of a window that neither trains nor tests
-    deal : from class, unit, number of folds and random numbers of the repeat, the fold (n,) that tests each window,
-        -1 for none
-    repeats : fold assignments by default; 1 where there is one only
-    note : what a reader of the figures must know of it
-    whole_runs : whether a run is on one side of a split, but for the blocks of a class with one unit
-    """
+    """What is held out, in words, and how."""
 
     held_out: str
+    #: (n,) what is held out together; empty of a window that neither trains nor tests
     units: Callable[[Samples], Array]
+    #: from class, unit, number of folds and random numbers of the repeat, the fold (n,) that tests each window, -1
+    #: for none
     deal: Callable[[Array, Array, int, np.random.Generator], Array]
-    repeats: int = 1
-    note: str = ""
-    whole_runs: bool = True
+    repeats: int = 1  #: fold assignments by default; 1 where there is one only
+    note: str = ""  #: what a reader of the figures must know of it
+    whole_runs: bool = (
+        True  #: whether a run is on one side of a split, but for the blocks of a class with one unit
+    )
 
 
 def _leave_one_out(y: Array, group: Array, n_folds: int, rng: np.random.Generator) -> Array:
@@ -180,6 +166,7 @@ def _groups(samples: Samples) -> Array:
     return samples.group
 
 
+#: By name.
 PROTOCOLS: dict[str, Protocol] = {
     "grouped": Protocol("whole runs held out", _groups, fold_numbers, 5),
     "leave-one-run-out": Protocol("one run held out at a time", _groups, _leave_one_out),
@@ -202,7 +189,6 @@ PROTOCOLS: dict[str, Protocol] = {
     "slow-fast": _from_to("slow", "fast"),
     "fast-slow": _from_to("fast", "slow"),
 }
-"""By name."""
 
 
 def folds_of(samples: Samples, protocol: str = "grouped", repeats: int = 1, seed: int = 0) -> list[Fold]:

@@ -26,9 +26,9 @@ from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, Windows
 
+#: SVM on features, network on samples, both joined, and which of these three held-out runs favour; and what wheels
+#: answer to how they are driven.
 RECIPES = ("svm", "cnn", "stack", "best", "response")
-"""SVM on features, network on samples, both joined, and which of these three held-out runs favour; and what
-wheels answer to how they are driven."""
 
 
 class WindowPipeline(Pipeline):

@@ -16,12 +16,11 @@ from terrain.records import Array, RunLog, Windows
 from terrain.slip_learning.currents import Cases
 from terrain.slip_learning.measured import MeasuredSlip
 
+#: Quantity and unit of the channels that are responses, by signal set.
 RESPONSES: Mapping[str, tuple[str, str]] = {"currents": ("current", "a"), "slip": ("slip", "ratio")}
-"""Quantity and unit of the channels that are responses, by signal set."""
-
+#: Share of the median speed of a window below which its wheels do not turn yet, or no longer: such samples are left
+#: out of its means.
 MIN_TURNING = 0.5
-"""Share of the median speed of a window below which its wheels do not turn yet, or no longer: such samples
-are left out of its means."""
 
 
 class ResponseExtractor(FeatureExtractor):

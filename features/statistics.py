@@ -17,6 +17,7 @@ from scipy import fft
 from terrain.kernels import njit
 from terrain.records import Array
 
+#: Name and unit of each column; ``x`` is the unit of the channel.
 STATISTICS: tuple[tuple[str, str], ...] = (
     *(("mean", "x"), ("std", "x"), ("log_std", "1"), ("skewness", "1"), ("kurtosis", "1"), ("min", "x")),
     *(("max", "x"), ("q05", "x"), ("q25", "x"), ("median", "x"), ("q75", "x"), ("q95", "x"), ("iqr", "x")),
@@ -24,7 +25,6 @@ STATISTICS: tuple[tuple[str, str], ...] = (
     *(("log_step_ratio", "1"), ("autocorrelation_1", "1"), ("autocorrelation_2", "1")),
     *(("autocorrelation_4", "1"), ("autocorrelation_8", "1")),
 )
-"""Name and unit of each column; ``x`` is the unit of the channel."""
 
 MOMENTS: tuple[tuple[str, str], ...] = (
     *(("log_power", "1"), ("centroid", "Hz"), ("spread", "Hz"), ("spectral_skewness", "1")),
@@ -34,13 +34,9 @@ MOMENTS: tuple[tuple[str, str], ...] = (
 
 SLIP_STATISTICS: tuple[str, ...] = ("mean", "std", "min", "max", "mean_abs", "median")
 
-MIN_DEFINED_FRACTION = 0.5
-"""With a smaller fraction of the window defined, its slip statistics are NaN."""
-
+MIN_DEFINED_FRACTION = 0.5  #: With a smaller fraction of the window defined, its slip statistics are NaN.
 MAX_BANDS, MIN_BINS_PER_BAND = 20, 2
-MIN_SAMPLES = 48
-"""A spectrum of fewer samples has too few lines to add anything to the autocorrelation."""
-
+MIN_SAMPLES = 48  #: A spectrum of fewer samples has too few lines to add anything to the autocorrelation.
 ROLLOFF = 0.85
 
 _QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)

@@ -26,13 +26,11 @@ from terrain.kinematics.logged_wheels import wheel_speeds_from
 from terrain.records import Array, Reading, Stream, Windows
 from terrain.robots import Robot
 
+#: A stream that lags further behind the others has stopped: longer than a logger takes to write its buffer, shorter
+#: than an operator waits.
 PATIENCE_S = 5.0
-"""A stream that lags further behind the others has stopped: longer than a logger takes to write its buffer,
-shorter than an operator waits."""
-
+#: Room of a buffer over what its nominal rate fills; a stream that overruns it loses its oldest samples.
 BUFFER_MARGIN = 4
-"""Room of a buffer over what its nominal rate fills; a stream that overruns it loses its oldest samples."""
-
 _MIN_BUFFER = 64
 
 

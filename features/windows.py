@@ -21,56 +21,41 @@ from terrain.logs.schema import SIGNAL_SETS, signal_set_of
 from terrain.logs.schema import TIME_TOLERANCE_S as TIME_TOLERANCE_S
 from terrain.records import Array, RunLog, Stream, Windows
 
+#: Runs whose rates differ by more than this cannot share windows of one length. The clocks of real loggers differ by
+#: up to 4 % (lengths of the two files of a BorealTC run), which alignment turns into rates.
 MAX_RATE_DEVIATION = 0.05
-"""Runs whose rates differ by more than this cannot share windows of one length.  The clocks of real loggers
-differ by up to 4 % (lengths of the two files of a BorealTC run), which alignment turns into rates."""
-
+#: Streams whose NaN is a value (slip is undefined at a standstill) and drops no window.
 NAN_TOLERANT_STREAMS = ("slip",)
-"""Streams whose NaN is a value (slip is undefined at a standstill) and drops no window."""
-
+#: Of a sample, by which a window may fall short of its last one. Loggers hold a whole or a half number of samples in a
+#: window at their nominal rate; the rate that is measured of a set of runs lies a little beside it, on either side,
+#: and windows of two sets must hold the same number.
 RATE_SLACK = 0.1
-"""Of a sample, by which a window may fall short of its last one.  Loggers hold a whole or a half number of samples
-in a window at their nominal rate; the rate that is measured of a set of runs lies a little beside it, on either
-side, and windows of two sets must hold the same number."""
-
+#: A window whose samples span this much more or less time than they should, and one period, was not sampled at the
+#: rate it is read with: a slow or a fast stretch of a logger, or a live stream set to another rate.
 SPAN_TOLERANCE = 0.1
-"""A window whose samples span this much more or less time than they should, and one period, was not sampled
-at the rate it is read with: a slow or a fast stretch of a logger, or a live stream set to another rate."""
-
 DROP_REASONS = ("gap", "wrong rate", "not finite", "not moving", "not steady")
 
 
 @dataclass(frozen=True, slots=True)
 class SteadyMotion:
-    """When a window counts as steady motion (thesis 8.1 requires it without numbers: both are assumed).
+    """When a window counts as steady motion (thesis 8.1 requires it without numbers: both are assumed)."""
 
-    Parameters
-    ----------
-    min_speed_mps : the mean speed of the faster wheel must reach this
-    max_accel_mps2 : the mean speeds of a wheel in the two halves of the window may differ by at most
-        this acceleration times half the length; means, because single wheel readings are noisy
-    """
-
-    min_speed_mps: float = 0.03
+    min_speed_mps: float = 0.03  #: the mean speed of the faster wheel must reach this
+    #: the mean speeds of a wheel in the two halves of the window may differ by at most this acceleration times half
+    #: the length; means, because single wheel readings are noisy
     max_accel_mps2: float = 0.25
 
 
 @dataclass(frozen=True, slots=True)
 class WindowRule:
-    """How runs are cut; ``ConfigError`` where a number is not positive and finite.
+    """How runs are cut; ``ConfigError`` where a number is not positive and finite."""
 
-    Parameters
-    ----------
-    length_s : length of a window (thesis 8.1: 2 s)
-    stride_s : from start to start; ``None`` means one length, that is no overlap
-    steady : the rule of steady motion, ``None`` to keep every window
-    max_gap_periods : a longer step between two samples, in sample periods, is a gap; 1.8 lets jitter
-        through and catches one lost sample
-    """
-
-    length_s: float = 2.0
-    stride_s: float | None = None
+    length_s: float = 2.0  #: length of a window (thesis 8.1: 2 s)
+    stride_s: float | None = None  #: from start to start; ``None`` means one length, that is no overlap
+    #: the rule of steady motion, ``None`` to keep every window
     steady: SteadyMotion | None = field(default_factory=SteadyMotion)
+    #: a longer step between two samples, in sample periods, is a gap; 1.8 lets jitter through and catches one lost
+    #: sample
     max_gap_periods: float = 1.8
 
     def __post_init__(self) -> None:

@@ -40,50 +40,34 @@ from terrain.records import Array, Windows
 if TYPE_CHECKING:
     from terrain.classify.held_out import HeldOut
 
+#: A change costs this times the number of columns times the logarithm of the number of rows: three times what the
+#: criterion of Schwarz asks, as neighbouring windows resemble each other.
 PENALTY = 3.0
-"""A change costs this times the number of columns times the logarithm of the number of rows: three times what
-the criterion of Schwarz asks, as neighbouring windows resemble each other."""
-
+#: A segment that differs from the longest by so many times the scatter, in the root mean square of all columns, stands
+#: out. Both were chosen with the runs of BorealTC and Vulpi in view: 10 of 69 have one.
 SHIFT_LEAST = 4.0
-"""A segment that differs from the longest by so many times the scatter, in the root mean square of all
-columns, stands out.  Both were chosen with the runs of BorealTC and Vulpi in view: 10 of 69 have one."""
-
 LEAST_ROWS = 3
 MIN_SCATTER = 0.05
 
+#: Shortest stretch that breaks away: three windows of 2 s, as two wrong ones in a row are common in a class of 80 %
+#: accuracy.
 LEAST_S = 6.0
-"""Shortest stretch that breaks away: three windows of 2 s, as two wrong ones in a row are common in a class of 80 %
-accuracy."""
-
+#: Mean probability of the label in the stretch, at most: that of a guess among five classes.
 LABEL_MOST = 0.2
-"""Mean probability of the label in the stretch, at most: that of a guess among five classes."""
-
+#: Probability of the other class in each window of the stretch, at least: above all others together.
 OTHER_LEAST = 0.5
-"""Probability of the other class in each window of the stretch, at least: above all others together."""
-
+#: Mean probability of the label in the rest of the run, at least: otherwise nothing is broken away from.
 REST_LEAST = 0.5
-"""Mean probability of the label in the rest of the run, at least: otherwise nothing is broken away from."""
-
-BLOCK_S = 0.25
-"""Means over less hold few samples of a slow logger; over more, each block delays the alarm."""
-
-MIN_BLOCKS = 3
-"""Before and after a change: two blocks differ by chance too often."""
-
+BLOCK_S = 0.25  #: Means over less hold few samples of a slow logger; over more, each block delays the alarm.
+MIN_BLOCKS = 3  #: Before and after a change: two blocks differ by chance too often.
+#: Back to which changes are looked for, 10 s: a ground that changed before is found already.
 MAX_BLOCKS = 40
-"""Back to which changes are looked for, 10 s: a ground that changed before is found already."""
-
-SETTLING_S = 0.75
-"""After a start or a change of regime, until motors have settled."""
-
+SETTLING_S = 0.75  #: After a start or a change of regime, until motors have settled.
+#: Of the wheels' mean speeds, as a share of their norm: larger, it is another regime.
 MAX_REGIME_CHANGE = 0.15
-"""Of the wheels' mean speeds, as a share of their norm: larger, it is another regime."""
-
-MIN_SPEED_RATIO = 0.5
-"""Of the regime's speed; slower, the robot stops."""
-
+MIN_SPEED_RATIO = 0.5  #: Of the regime's speed; slower, the robot stops.
+#: Share of the runs on one ground in which the threshold is exceeded, unless another is given.
 FALSE_ALARM_RATIO = 0.02
-"""Share of the runs on one ground in which the threshold is exceeded, unless another is given."""
 
 
 def change_points(values: Array) -> list[tuple[int, int, float]]:

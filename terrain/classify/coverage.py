@@ -30,38 +30,25 @@ from terrain.classify.limits import Motion, SupportLevel, learn_support, support
 from terrain.classify.metrics import N_BOOTSTRAP, Interval, confidence_auc, drawn_runs, ratio_over_runs
 from terrain.records import Array
 
+#: At most so many ranges of speed, none narrower: closer speeds are not worth asking an operator for.
 MAX_SPEEDS, MIN_WIDTH_MPS = 4, 0.15
-"""At most so many ranges of speed, none narrower: closer speeds are not worth asking an operator for."""
-
+#: Edges are multiples of the first; an inner one is moved by up to the second to where fewest windows lie, so that one
+#: commanded speed is not cut in two.
 EDGE_STEP_MPS, EDGE_SHIFT_MPS = 0.05, 0.1
-"""Edges are multiples of the first; an inner one is moved by up to the second to where fewest windows lie, so
-that one commanded speed is not cut in two."""
-
-STRAIGHT_RADPS = 0.1
-"""A smaller yaw rate is straight on: 11 degrees in a window of 2 s."""
-
+STRAIGHT_RADPS = 0.1  #: A smaller yaw rate is straight on: 11 degrees in a window of 2 s.
+#: Difference of the speeds of the two sides over their sum: straight on below the first where no yaw rate is measured,
+#: on the spot above the second, where one side nearly stands or turns against the other.
 STRAIGHT_RATIO, SPIN_RATIO = 0.1, 0.8
-"""Difference of the speeds of the two sides over their sum: straight on below the first where no yaw rate is
-measured, on the spot above the second, where one side nearly stands or turns against the other."""
-
+#: A robot without two sides turns on the spot below this speed per yaw rate: about half a track width.
 SPIN_RADIUS_M = 0.3
-"""A robot without two sides turns on the spot below this speed per yaw rate: about half a track width."""
-
-ADDED_RUNS = 2
-"""Runs that are asked for: a single one may be unlike the others."""
-
+ADDED_RUNS = 2  #: Runs that are asked for: a single one may be unlike the others.
+#: Windows that the curve counts as beside those of a cell; a run in a cell has about so many.
 PRIOR_WINDOWS = 10.0
-"""Windows that the curve counts as beside those of a cell; a run in a cell has about so many."""
-
-MIN_COUNTS = 3
-"""With fewer different numbers of runs there is no curve; its law has three parameters."""
-
+MIN_COUNTS = 3  #: With fewer different numbers of runs there is no curve; its law has three parameters.
+#: Windows that a run to be recorded should give, as many as the prior of a cell, and its least length.
 RUN_WINDOWS, MIN_RUN_S = 10, 20.0
-"""Windows that a run to be recorded should give, as many as the prior of a cell, and its least length."""
-
 MAX_DRIVES = 20
-MIN_GAIN = 5e-5
-"""A drive that is expected to gain less is not named: it would be shown as 0.00 %."""
+MIN_GAIN = 5e-5  #: A drive that is expected to gain less is not named: it would be shown as 0.00 %.
 
 
 class Manoeuvre(IntEnum):
@@ -285,23 +272,18 @@ class SupportRow(NamedTuple):
 
 
 class NextDrive(NamedTuple):
-    """A drive that is worth recording: of at least so many runs, each at least so long.
-
-    Parameters
-    ----------
-    gain : accuracy that these runs are expected to add; it orders the drives, and no more: with cells of
-        recorded runs taken away and put back (BorealTC, 35 cells), its rank correlation with the real gain
-        was 0.5 and its size far too small
-    support_runs : training runs near that motion so far, mean
-    windows, accuracy : of the terrain in the regime so far, and their accuracy when held out, if there are any
-    """
+    """A drive that is worth recording: of at least so many runs, each at least so long."""
 
     terrain: str
     regime: str
     runs: int
     duration_s: float
+    #: accuracy that these runs are expected to add; it orders the drives, and no more: with cells of recorded runs
+    #: taken away and put back (BorealTC, 35 cells), its rank correlation with the real gain was 0.5 and its size far
+    #: too small
     gain: float
-    support_runs: float
+    support_runs: float  #: training runs near that motion so far, mean
+    #: windows, accuracy: of the terrain in the regime so far, and their accuracy when held out, if there are any
     windows: int
     accuracy: float | None
 

@@ -17,12 +17,8 @@ import numpy as np
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
 
-ENOUGH_RUNS = 6
-"""A terrain with so many runs gives one of them away: five are left, one for each fold."""
-
-FEWEST_RUNS = 3
-"""Where no terrain has enough, the one with the most runs gives one away if two are left."""
-
+ENOUGH_RUNS = 6  #: A terrain with so many runs gives one of them away: five are left, one for each fold.
+FEWEST_RUNS = 3  #: Where no terrain has enough, the one with the most runs gives one away if two are left.
 N_FOLDS = 5
 
 TOO_FEW = "the windows are too few to hold some of them out; add runs"

@@ -20,9 +20,8 @@ from terrain.classify.folds import inner_splits, two_classes
 from terrain.errors import DataError
 from terrain.records import Array
 
+#: Scaled features are clipped here, so that one faulty sample cannot move a window far from all others.
 CLIP_STD = 5.0
-"""Scaled features are clipped here, so that one faulty sample cannot move a window far from all others."""
-
 N_INNER_FOLDS = 3
 
 
@@ -110,12 +109,6 @@ class OwnClassifier(GroupedClassifier):
     classifier has margins only, a logistic regression of the classes on these margins (Platt, 1999, for more
     than two classes).  A classifier that has neither gives its class the probability 1.
 
-    Parameters
-    ----------
-    estimator : with ``fit`` and ``predict``; a clone of it is fitted
-    gap : windows left out beside an inner test block, where the only run of a class is cut
-    seed : deals runs into inner folds
-
     Examples
     --------
     >>> from sklearn.linear_model import RidgeClassifier
@@ -127,9 +120,9 @@ class OwnClassifier(GroupedClassifier):
     ('decision_function', (80, 2))
     """
 
-    estimator: Any
-    gap: int = 1
-    seed: int = 0
+    estimator: Any  #: with ``fit`` and ``predict``; a clone of it is fitted
+    gap: int = 1  #: windows left out beside an inner test block, where the only run of a class is cut
+    seed: int = 0  #: deals runs into inner folds
 
     @property
     def outputs(self) -> str:

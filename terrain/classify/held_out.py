@@ -83,24 +83,14 @@ def itself(fitted: Any) -> Any:
 
 
 class HeldOut(NamedTuple):
-    """Held-out probabilities of every repeat, and the folds that they come from.
+    """Held-out probabilities of every repeat, and the folds that they come from."""
 
-    Parameters
-    ----------
-    classes : (k,) sorted
-    probability : (repeats, n, k); NaN of a window that was not held out
-    fold_number : (repeats, n); -1 of such a window
-    truth : (n,) class of each window
-    results : fold by fold; empty of a model that was fitted before
-    fitted : on all windows, where that was asked for
-    """
-
-    classes: Array
-    probability: Array
-    fold_number: Array
-    truth: Array
-    results: Sequence[FoldResult] = ()
-    fitted: Any = None
+    classes: Array  #: (k,) sorted
+    probability: Array  #: (repeats, n, k); NaN of a window that was not held out
+    fold_number: Array  #: (repeats, n); -1 of such a window
+    truth: Array  #: (n,) class of each window
+    results: Sequence[FoldResult] = ()  #: fold by fold; empty of a model that was fitted before
+    fitted: Any = None  #: on all windows, where that was asked for
 
     @classmethod
     def of_folds(cls, results: Sequence[FoldResult], truth: Array) -> Self:
@@ -168,8 +158,7 @@ def drawn_folds(y: Array, group: Array, folds: Sequence[Fold], seed: int) -> tup
     return drawn, np.mean(means, axis=1)
 
 
-MIN_TERRAINS = 3
-"""Two are needed to train without the third."""
+MIN_TERRAINS = 3  #: Two are needed to train without the third.
 
 
 def left_out_folds(
@@ -216,12 +205,10 @@ def score_fold(
     return Scored(test, unknown, fitted.score(X[test]), fitted.score(X[unknown]), fitted.threshold)
 
 
+#: Slow and fast runs of a class that are compared: at least so many, of so much time.
 MIN_RUNS_A_SIDE, MIN_TIME_A_SIDE_S = 2, 60.0
-"""Slow and fast runs of a class that are compared: at least so many, of so much time."""
-MIN_CLASSES = 3
-"""Slow and fast runs are compared where at least so many classes have enough of both."""
-MOVING_MPS = 0.03
-"""The faster wheel moves above this; it is the steady-motion rule's own threshold."""
+MIN_CLASSES = 3  #: Slow and fast runs are compared where at least so many classes have enough of both.
+MOVING_MPS = 0.03  #: The faster wheel moves above this; it is the steady-motion rule's own threshold.
 
 
 class Applicability(StrEnum):

@@ -57,60 +57,42 @@ from terrain.errors import DataError
 from terrain.records import Array
 
 N_TERMS = 3
-N_NEAR = 10
-"""Neighbours are sought in so many leading components: in more, all distances become alike."""
-KNOWN_KEPT = 0.95
-"""Part of the windows of known terrains that is not to be called unknown."""
+N_NEAR = 10  #: Neighbours are sought in so many leading components: in more, all distances become alike.
+KNOWN_KEPT = 0.95  #: Part of the windows of known terrains that is not to be called unknown.
 N_COMPONENTS = 40
+#: Neighbours are sought among at most so many training windows, thinned evenly: 15 us a window.
 MAX_PROTOTYPES = 1500
-"""Neighbours are sought among at most so many training windows, thinned evenly: 15 us a window."""
 MAX_REFERENCE = 2000
-CLIP_STD = 5.0
-"""Scaled features are clipped here, as those of the classifier."""
-SELECTED = 0.8
-"""Part of the features that an F test between classes keeps, as the classifier's."""
+CLIP_STD = 5.0  #: Scaled features are clipped here, as those of the classifier.
+SELECTED = 0.8  #: Part of the features that an F test between classes keeps, as the classifier's.
 N_INNER_FOLDS = 5
+#: Of the support vector machine; gamma is relative to 1 / number of features. The kernel is narrower than what
+#: classifies best.
 PENALTY, GAMMA = 10.0, 1.0
-"""Of the support vector machine; gamma is relative to 1 / number of features.  The kernel is narrower than
-what classifies best."""
 
 
 class Novelty(NamedTuple):
-    """A fitted score of novelty.
+    """A fitted score of novelty."""
 
-    Parameters
-    ----------
-    n_features : before selection
-    columns : (m,) places of the features that are used
-    fill, mean, scale : (m,) median, mean and standard deviation of each
-    components : (q, m) principal directions, divided by the square root of m
-    within, background : (q, q) W and B
-    means, centre : (k, q) and (q,) means of the classes and of all windows, multiplied by W and by B
-    prototypes : (s, at most 10) training windows in the leading components
-    vectors, weights, offsets : (v, m), (v, p) and (p,) of the pairs' margins
-        ``f = sum_i w_i exp(-gamma / m |x - v_i|^2) + c``, positive for the first class of a pair
-    squares : (v,) squared lengths of the vectors
-    reference : (n, 3) ascending terms of held-out known windows
-    threshold : of the score, above which a window is unknown; so is one without a score
-    """
-
-    n_features: int
-    columns: Array
-    fill: Array
+    n_features: int  #: before selection
+    columns: Array  #: (m,) places of the features that are used
+    fill: Array  #: fill, mean, scale: (m,) median, mean and standard deviation of each
     mean: Array
     scale: Array
-    components: Array
-    within: Array
+    components: Array  #: (q, m) principal directions, divided by the square root of m
+    within: Array  #: within, background: (q, q) W and B
     background: Array
-    means: Array
+    means: Array  #: means, centre: (k, q) and (q,) means of the classes and of all windows, multiplied by W and by B
     centre: Array
-    prototypes: Array
+    prototypes: Array  #: (s, at most 10) training windows in the leading components
+    #: vectors, weights, offsets: (v, m), (v, p) and (p,) of the pairs' margins ``f = sum_i w_i exp(-gamma / m |x -
+    #: v_i|^2) + c``, positive for the first class of a pair
     vectors: Array
     weights: Array
     offsets: Array
-    squares: Array
-    reference: Array
-    threshold: float
+    squares: Array  #: (v,) squared lengths of the vectors
+    reference: Array  #: (n, 3) ascending terms of held-out known windows
+    threshold: float  #: of the score, above which a window is unknown; so is one without a score
 
     def score(self, features: Array) -> Array:
         """Return the score (n,) of features (n, f), NaN where not defined; NaN where one is infinite.
@@ -280,18 +262,12 @@ def _whitening(residuals: Array) -> Array:
 
 
 class Motion(NamedTuple):
-    """How the robot moved in each of n windows.
+    """How the robot moved in each of n windows."""
 
-    Parameters
-    ----------
-    speed_mps : (n,) magnitude of the speed of the fastest wheel, mean over the window
-    yaw_rate_radps : (n,) magnitude of the mean yaw rate; NaN where no gyroscope measures it
-    turn_ratio : (n,) ``|v_right - v_left| / (|v_right| + |v_left|)`` of the mean speeds of the two sides: 0
-        straight on, 1 where one side stands or they turn against each other; NaN without two sides
-    """
-
-    speed_mps: Array
-    yaw_rate_radps: Array
+    speed_mps: Array  #: (n,) magnitude of the speed of the fastest wheel, mean over the window
+    yaw_rate_radps: Array  #: (n,) magnitude of the mean yaw rate; NaN where no gyroscope measures it
+    #: (n,) ``|v_right - v_left| / (|v_right| + |v_left|)`` of the mean speeds of the two sides: 0 straight on, 1
+    #: where one side stands or they turn against each other; NaN without two sides
     turn_ratio: Array
 
     def of(self, rows: Array) -> Motion:
@@ -299,22 +275,16 @@ class Motion(NamedTuple):
         return Motion(*(each[rows] for each in self))
 
 
-SPEED_STEP_MPS, YAW_STEP_RADPS = 0.05, 0.1
-"""Cells of motion."""
-
+SPEED_STEP_MPS, YAW_STEP_RADPS = 0.05, 0.1  #: Cells of motion.
+#: A run supports the cells around those it drove, up to so many: about 0.2 m/s and 0.4 rad/s. Chosen, with
+#: ``SUPPORTED``, on held-out runs of BorealTC and Vulpi dealt by seed 101; between 0.15 and 0.2 m/s, and 0.25 and 0.4
+#: rad/s, the figures differ little.
 REACH = 3
-"""A run supports the cells around those it drove, up to so many: about 0.2 m/s and 0.4 rad/s.  Chosen, with
-``SUPPORTED``, on held-out runs of BorealTC and Vulpi dealt by seed 101; between 0.15 and 0.2 m/s, and 0.25
-and 0.4 rad/s, the figures differ little."""
-
+#: What is faster counts as 20 m/s, and as 6.4 rad/s, so that a table stays small.
 MAX_SPEED_CELLS, MAX_YAW_CELLS = 400, 64
-"""What is faster counts as 20 m/s, and as 6.4 rad/s, so that a table stays small."""
-
+#: A prediction of a smaller supported probability is unsupported: rather wrong or unseen than right.
 SUPPORTED = 0.5
-"""A prediction of a smaller supported probability is unsupported: rather wrong or unseen than right."""
-
-ENOUGH_RUNS = 4
-"""Of so many training runs near its motion a terrain counts as well supported."""
+ENOUGH_RUNS = 4  #: Of so many training runs near its motion a terrain counts as well supported.
 
 
 class SupportLevel(StrEnum):
@@ -417,8 +387,7 @@ def support_levels(n_runs: Array) -> Array:
     return names[np.digitize(n_runs, [1, ENOUGH_RUNS])]
 
 
-LEVEL = 0.9
-"""Of the sets of classes."""
+LEVEL = 0.9  #: Of the sets of classes.
 
 
 def held_out_scores(classifier: Any, terrain: Array) -> Array:

@@ -201,13 +201,12 @@ def macro_run_accuracy(runs: Iterable[RunFigures]) -> float:
     return float(np.mean([np.mean(accuracies) for accuracies in of_class.values()]))
 
 
+#: Fractions of the windows, the most confident first, of which the accuracy is given.
 COVERAGES = (0.8, 0.5)
-"""Fractions of the windows, the most confident first, of which the accuracy is given."""
-
 N_DRAWS = 1000
 CALIBRATION_BINS = 15
+#: Bootstrap draws are computed in blocks of at most so many weights: 32 MB.
 DRAWS_AT_ONCE_VALUES = 4_000_000
-"""Bootstrap draws are computed in blocks of at most so many weights: 32 MB."""
 
 
 class CoverageFigures(NamedTuple):
@@ -387,22 +386,15 @@ def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: in
 
 
 class ConformalFigures(NamedTuple):
-    """What sets of classes hold, of windows whose runs were held out.
+    """What sets of classes hold, of windows whose runs were held out."""
 
-    Parameters
-    ----------
-    level : that they were calibrated for
-    coverage, coverage_ci : fraction of windows whose set holds their class, with its 95 % interval over runs
-    coverage_per_run : mean over runs of the fraction of their windows, the level's own measure
-    coverage_worst_run : least of a run
-    set_size, single_ratio : mean number of classes in a set, and fraction of the sets that name one class
-    """
-
-    level: float
+    level: float  #: that they were calibrated for
+    #: coverage, coverage_ci: fraction of windows whose set holds their class, with its 95 % interval over runs
     coverage: float
     coverage_ci: Interval
-    coverage_per_run: float
-    coverage_worst_run: float
+    coverage_per_run: float  #: mean over runs of the fraction of their windows, the level's own measure
+    coverage_worst_run: float  #: least of a run
+    #: set_size, single_ratio: mean number of classes in a set, and fraction of the sets that name one class
     set_size: float
     single_ratio: float
 
@@ -440,8 +432,8 @@ def conformal_figures(
 
 
 N_PAIRED_DRAWS = 2000
+#: With fewer runs a bootstrap over runs gives no interval: that of one run would have no width.
 MIN_RUNS = 3
-"""With fewer runs a bootstrap over runs gives no interval: that of one run would have no width."""
 
 
 class Verdict(StrEnum):
@@ -612,24 +604,16 @@ def _difference(of_a: Array, of_b: Array, n_runs: int) -> Difference:
     return Difference(float(of_a[0]), float(of_b[0]), float(of_b[0] - of_a[0]), (low, high), verdict, n_runs)
 
 
-MEAN_SPAN_S = 10.0
-"""Novelty scores are averaged over so long: a robot crosses a terrain for longer."""
+MEAN_SPAN_S = 10.0  #: Novelty scores are averaged over so long: a robot crosses a terrain for longer.
 
 
 class LeftOutTerrain(NamedTuple):
-    """How well the windows of a terrain that was left out differ in score from held-out ones of others.
+    """How well the windows of a terrain that was left out differ in score from held-out ones of others."""
 
-    Parameters
-    ----------
-    auroc, auroc_10s : area under the ROC curve of single windows, and of means over 10 s
-    accepted : part of its windows that are taken for a known terrain
-    known_kept : part of the held-out windows of the other terrains that are not called unknown
-    """
-
-    auroc: float
+    auroc: float  #: auroc, auroc_10s: area under the ROC curve of single windows, and of means over 10 s
     auroc_10s: float
-    accepted: float
-    known_kept: float
+    accepted: float  #: part of its windows that are taken for a known terrain
+    known_kept: float  #: part of the held-out windows of the other terrains that are not called unknown
 
 
 def unknown_figures(
@@ -715,8 +699,8 @@ def _area_interval(compared: Sequence[tuple[Array, Array]], weights: Array) -> I
     return percentile_interval(draws / len(compared))
 
 
+#: A window comes so often: four times as often as terrain has to be known at 1 Hz, an eighth of a window.
 STRIDE_S = 0.25
-"""A window comes so often: four times as often as terrain has to be known at 1 Hz, an eighth of a window."""
 
 
 class DelayFigures(NamedTuple):
@@ -736,43 +720,35 @@ class DelayFigures(NamedTuple):
 
 
 class SequenceFigures(NamedTuple):
-    """How well single windows and the filter follow sequences; every ``_ci`` is 95 % by bootstrap over runs.
+    """How well single windows and the filter follow sequences; every ``_ci`` is 95 % by bootstrap over runs."""
 
-    Parameters
-    ----------
-    filtered_accuracy : fraction of the time at which the right terrain was reported, where the window that
-        ends then lies wholly on one terrain; "unknown" counts as wrong
-    single_accuracy : the same of the last window's own class
-    gain : filtered minus single, paired
-    filtered_accuracy_at_end, single_accuracy_at_end : the same over all time, where windows across a change
-        are judged by the terrain at their end
-    filter_delay_s : from a change to its report
-    flips_per_minute, single_flips_per_minute : changes of the reported terrain, less the true ones
-    unknown_ratio : fraction of the time at which "unknown" was reported
-    n_courses, n_grounds, duration_s : sequences, stretches on one terrain, and time
-    """
-
+    #: fraction of the time at which the right terrain was reported, where the window that ends then lies wholly on
+    #: one terrain; "unknown" counts as wrong
     filtered_accuracy: float
     filtered_accuracy_ci: Interval
-    single_accuracy: float
+    single_accuracy: float  #: the same of the last window's own class
     single_accuracy_ci: Interval
-    gain: float
+    gain: float  #: filtered minus single, paired
     gain_ci: Interval
+    #: filtered_accuracy_at_end, single_accuracy_at_end: the same over all time, where windows across a change are
+    #: judged by the terrain at their end
     filtered_accuracy_at_end: float
     filtered_accuracy_at_end_ci: Interval
     single_accuracy_at_end: float
     single_accuracy_at_end_ci: Interval
-    filter_delay_s: DelayFigures
+    filter_delay_s: DelayFigures  #: from a change to its report
+    #: flips_per_minute, single_flips_per_minute: changes of the reported terrain, less the true ones
     flips_per_minute: float
     flips_per_minute_ci: Interval
     single_flips_per_minute: float
     single_flips_per_minute_ci: Interval
-    unknown_ratio: float
-    n_courses: int
+    unknown_ratio: float  #: fraction of the time at which "unknown" was reported
+    n_courses: int  #: n_courses, n_grounds, duration_s: sequences, stretches on one terrain, and time
     n_grounds: int
     duration_s: float
 
 
+#: Of a stretch on one terrain; flips are changes of the reported terrain less the true one.
 COUNTS = (
     "whole",
     "filtered",
@@ -784,7 +760,6 @@ COUNTS = (
     "flips",
     "single_flips",
 )
-"""Of a stretch on one terrain; flips are changes of the reported terrain less the true one."""
 
 
 class Track(NamedTuple):
@@ -898,29 +873,22 @@ def _delays(delay_s: Array, draws: Array) -> DelayFigures:
     return DelayFigures(*quantile(0.5), *quantile(0.9), len(changes), n_missed, known)
 
 
-MIN_CURVE_POINTS = 4
-"""The law of the learning curve has three parameters."""
-ENOUGH_GAIN = 0.01
-"""Enough runs: doubling them would gain less than this accuracy."""
+MIN_CURVE_POINTS = 4  #: The law of the learning curve has three parameters.
+ENOUGH_GAIN = 0.01  #: Enough runs: doubling them would gain less than this accuracy.
 
 
 class LearningCurve(NamedTuple):
-    """Accuracy against the number of training runs of each class.
+    """Accuracy against the number of training runs of each class."""
 
-    Parameters
-    ----------
-    runs_per_class : mean over classes and folds, since a class may have fewer than were asked for
-    accuracy : with so many training runs
-    accuracy_spread : over draws of runs; None for all runs
-    enough_runs : the number of runs beyond which doubling brings next to nothing; None when not reached
-    statement : the same in a sentence
-    """
-
-    runs_per_class: tuple[float, ...]
-    accuracy: tuple[float, ...]
-    accuracy_spread: tuple[float | None, ...]
-    enough_runs: int | None
-    statement: str
+    runs_per_class: tuple[
+        float, ...
+    ]  #: mean over classes and folds, since a class may have fewer than were asked for
+    accuracy: tuple[float, ...]  #: with so many training runs
+    accuracy_spread: tuple[float | None, ...]  #: over draws of runs; None for all runs
+    enough_runs: (
+        int | None
+    )  #: the number of runs beyond which doubling brings next to nothing; None when not reached
+    statement: str  #: the same in a sentence
 
 
 def learning_curve(runs_per_class: Array, drawn: Sequence[float], full: float) -> LearningCurve:

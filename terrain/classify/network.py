@@ -46,39 +46,31 @@ from terrain.errors import ConfigError, DataError
 from terrain.records import Array, Windows
 
 FRAME_S, HOP_S = 0.4, 0.1
+#: A stream with fewer samples in a frame is slow: the network sees its samples, not their spectrum.
 MIN_FRAME = 16
-"""A stream with fewer samples in a frame is slow: the network sees its samples, not their spectrum."""
-
+#: The floor of a spectrogram as a fraction of the channel's mean power in training windows.
 FLOOR_RATIO = 1e-4
-"""The floor of a spectrogram as a fraction of the channel's mean power in training windows."""
-
 CLIP_STD = 5.0
 
 BATCH = 64
-MIN_BATCHES, SMALL_BATCH = 4, 8
-"""Few windows make so many batches an epoch, of at least so many windows."""
-
+MIN_BATCHES, SMALL_BATCH = 4, 8  #: Few windows make so many batches an epoch, of at least so many windows.
 LEARNING_RATE, WEIGHT_DECAY, LABEL_SMOOTHING = 3e-3, 1e-2, 0.05
 DROPOUT, INPUT_DROPOUT = 0.4, 0.1
 HIDDEN_SPECTRUM, HIDDEN_SAMPLES = 48, 16
 
 LOG_TEMPERATURE_BOUNDS = (-3.0, 3.0)
 
-GAIN_STD = 0.5
-"""Standard deviation of the logarithm of the amplitude of vibration: assumed."""
-
-DROPOUT_RATIO = 0.1
-"""How often a stream is taken for failed."""
-
+GAIN_STD = 0.5  #: Standard deviation of the logarithm of the amplitude of vibration: assumed.
+DROPOUT_RATIO = 0.1  #: How often a stream is taken for failed.
+#: Axes along which a quantity changes its sign in the mirror; x points ahead, y to the left.
 TURNED = {"gyro": "xz", "accel": "y", "speed": "y", "position": "y", "velocity": "y", "odometry": "y"}
-"""Axes along which a quantity changes its sign in the mirror; x points ahead, y to the left."""
-
 TURNED_WORDS = frozenset({"roll", "yaw", "lateral"})
 
 OPSET, IR_VERSION = 17, 8
 OUTPUT, LOG_OUTPUT = "probabilities", "log_probabilities"
 ROWS_AT_ONCE = 256
 
+#: Of the graph; none of them repeats or reads anything, so that a stranger's file cannot either.
 OPERATORS = frozenset(
     (
         *("Add", "Clip", "Concat", "Conv", "Div", "IsNaN", "Log", "LogSoftmax", "MatMul", "Mul", "ReduceMax"),
@@ -86,7 +78,6 @@ OPERATORS = frozenset(
         "Where",
     )
 )
-"""Of the graph; none of them repeats or reads anything, so that a stranger's file cannot either."""
 
 
 class SampleColumns(NamedTuple):
@@ -167,25 +158,18 @@ def log_softmax(logits: Array) -> Array:
 
 
 class Augmentation(NamedTuple):
-    """Which variations are used.
+    """Which variations are used."""
 
-    Parameters
-    ----------
-    shift : of the window, its end continued by its beginning
-    gain : of the vibration in a window, log-normal, one for all channels of a stream that is fast enough to
-        hold it: speed, load and tyres shake all axes; what a slow stream measures stays as it is
-    mirror : half of the windows, left for right
-    dropout : a stream at its training mean, in a window out of ten
-    """
-
-    shift: bool = False
+    shift: bool = False  #: of the window, its end continued by its beginning
+    #: of the vibration in a window, log-normal, one for all channels of a stream that is fast enough to hold it:
+    #: speed, load and tyres shake all axes; what a slow stream measures stays as it is
     gain: bool = False
-    mirror: bool = False
-    dropout: bool = False
+    mirror: bool = False  #: half of the windows, left for right
+    dropout: bool = False  #: a stream at its training mean, in a window out of ten
 
 
+#: Where each channel's mirror image is among the channels, and its sign.
 Mirror = tuple[tuple[int, ...], tuple[float, ...]]
-"""Where each channel's mirror image is among the channels, and its sign."""
 
 
 def mirror_of(channels: Sequence[str]) -> Mirror | None:
@@ -681,16 +665,6 @@ class Trial(NamedTuple):
 class GroupedNetwork(GroupedClassifier):
     """Ensemble of small convolutional networks that keeps runs whole.
 
-    Parameters
-    ----------
-    columns : :class:`SampleColumns` of each stream
-    n_inner_folds : networks that choose and calibrate, one an inner fold
-    n_members : networks that predict, each fitted on all runs
-    epochs : at most, of each
-    trial_epochs : of the networks that choose the augmentation; 0 for none, and no choice
-    gap : windows left out beside an inner test block, where the only run of a class is cut
-    seed : deals runs into inner folds, and of all that is drawn
-
     Attributes
     ----------
     best_ : :class:`NetworkChoice`
@@ -698,13 +672,13 @@ class GroupedNetwork(GroupedClassifier):
     onnx_ : the graph that it predicts with
     """
 
-    columns: Sequence[SampleColumns] = ()
-    n_inner_folds: int = 5
-    n_members: int = 3
-    epochs: int = 30
-    trial_epochs: int = 10
-    gap: int = 1
-    seed: int = 0
+    columns: Sequence[SampleColumns] = ()  #: :class:`SampleColumns` of each stream
+    n_inner_folds: int = 5  #: networks that choose and calibrate, one an inner fold
+    n_members: int = 3  #: networks that predict, each fitted on all runs
+    epochs: int = 30  #: at most, of each
+    trial_epochs: int = 10  #: of the networks that choose the augmentation; 0 for none, and no choice
+    gap: int = 1  #: windows left out beside an inner test block, where the only run of a class is cut
+    seed: int = 0  #: deals runs into inner folds, and of all that is drawn
 
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedNetwork:
         """Choose, fit and calibrate on samples (n, n_columns), NaN where missing.

@@ -20,17 +20,11 @@ from terrain.errors import ConfigError
 from terrain.files.names import plain_name, shown
 from terrain.records import Array
 
-MAX_GAP_WINDOWS = 2.0
-"""A stretch ends where windows are missing for longer."""
-
-ACCEPTED = 0.9
-"""Least mean probability of a proposal that is taken over without a question."""
-
-TOLERANCE_S = 0.5
-"""A stretch of a table may be that far outside of its run, and reach into the next one."""
-
+MAX_GAP_WINDOWS = 2.0  #: A stretch ends where windows are missing for longer.
+ACCEPTED = 0.9  #: Least mean probability of a proposal that is taken over without a question.
+TOLERANCE_S = 0.5  #: A stretch of a table may be that far outside of its run, and reach into the next one.
+#: Answers beside the name of a terrain: the proposal is right; the stretch is of no terrain.
 YES, NONE = "yes", "none"
-"""Answers beside the name of a terrain: the proposal is right; the stretch is of no terrain."""
 
 
 def smoothed_classes(probability: Array, time_s: Array, prior: Array, dwell_s: float = DWELL_S) -> Array:
@@ -60,24 +54,18 @@ def smoothed_classes(probability: Array, time_s: Array, prior: Array, dwell_s: f
 
 
 class Proposal(NamedTuple):
-    """A stretch of a run, on its clock, and the terrain that a model proposes for it.
-
-    Parameters
-    ----------
-    confidence : mean probability of that terrain over the windows
-    supported_ratio : share of the windows whose prediction training runs support; 1 where not counted
-    unknown_ratio : share of the windows that are like no terrain that was learned
-    n_windows : in the stretch
-    """
+    """A stretch of a run, on its clock, and the terrain that a model proposes for it."""
 
     run_id: str
     start_s: float
     end_s: float
     terrain: str
-    confidence: float
-    supported_ratio: float
-    unknown_ratio: float
-    n_windows: int
+    confidence: float  #: mean probability of that terrain over the windows
+    supported_ratio: (
+        float  #: share of the windows whose prediction training runs support; 1 where not counted
+    )
+    unknown_ratio: float  #: share of the windows that are like no terrain that was learned
+    n_windows: int  #: in the stretch
 
     def taken_over(self, confidence_least: float) -> bool:
         """Whether it may become a label without a question."""

@@ -45,33 +45,25 @@ from terrain.classify.grouped import GroupedClassifier
 from terrain.errors import DataError
 from terrain.records import Array
 
+#: Length scales of the direction among which the likelihood chooses: 0.4 is 23 degrees of an omni robot's direction of
+#: travel; shorter ones would follow single runs.
 LENGTHS = (0.4, 0.5, 0.6, 0.8)
-"""Length scales of the direction among which the likelihood chooses: 0.4 is 23 degrees of an omni robot's
-direction of travel; shorter ones would follow single runs."""
-
-SPEED_LENGTH = 1.0
-"""Length scale of the speed, over the fastest: responses change little with it."""
-
+SPEED_LENGTH = 1.0  #: Length scale of the speed, over the fastest: responses change little with it.
 MIN_SPREAD = 1e-9
 
+#: Standard deviation of a run's regime below which it is one; a run that is driven in many is cut into cells.
 SAME_REGIME, CELL = 0.1, 0.25
-"""Standard deviation of a run's regime below which it is one; a run that is driven in many is cut into cells."""
-
+#: Of a process: its cost grows with their cube. Where there are more, units are thinned evenly.
 MAX_POINTS = 1200
-"""Of a process: its cost grows with their cube.  Where there are more, units are thinned evenly."""
-
+#: Distance of two wheels as the kernel sees it: far for a wheel's own part, nothing for the shared one.
 APART, FAR = 10.0, 1e6
-"""Distance of two wheels as the kernel sees it: far for a wheel's own part, nothing for the shared one."""
-
+#: Of a standard deviation, as a share of the response's spread over the ground: a response that repeats exactly (a
+#: counter that never moves) would outweigh all others.
 FLOOR = 1e-3
-"""Of a standard deviation, as a share of the response's spread over the ground: a response that repeats
-exactly (a counter that never moves) would outweigh all others."""
-
 DEGREES_OF_FREEDOM = 5.0
 LOG_TEMPERATURE_BOUNDS = (-3.0, 1.0)
 
-MIN_SPEED_RATIO = 0.05
-"""Of the fastest window of training: slower, a robot stands."""
+MIN_SPEED_RATIO = 0.05  #: Of the fastest window of training: slower, a robot stands.
 
 
 def regimes(wheel_speed_mps: Array, fastest_mps: float) -> Array:
@@ -268,10 +260,6 @@ class ResponseChoice(NamedTuple):
 class GroupedResponse(GroupedClassifier):
     """Terrain by the responses of wheels, with whole runs left out where it judges itself.
 
-    Parameters
-    ----------
-    columns : :class:`ResponseColumns` of the matrix, or () until they are known
-
     Attributes
     ----------
     grounds_ : :class:`GroundResponse` of each class
@@ -281,7 +269,7 @@ class GroupedResponse(GroupedClassifier):
         robot stands
     """
 
-    columns: Any = ()
+    columns: Any = ()  #: :class:`ResponseColumns` of the matrix, or () until they are known
 
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedResponse:
         """Fit the responses of each terrain to wheel speeds in m/s and responses, NaN where missing.

@@ -21,13 +21,11 @@ from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import DataError
 from terrain.records import Array
 
+#: Of the squared distance of the weights from one half, against the mean log loss of a window.
 PENALTY = 0.1
-"""Of the squared distance of the weights from one half, against the mean log loss of a window."""
-
 N_CROSS_FOLDS = 5
+#: The SVM is left only for what has a lower loss by so many standard errors over runs.
 MIN_STANDARD_ERRORS = 1.0
-"""The SVM is left only for what has a lower loss by so many standard errors over runs."""
-
 TINY = np.finfo(float).tiny
 
 
@@ -49,29 +47,23 @@ class StackChoice(NamedTuple):
 class GroupedStack(GroupedClassifier):
     """Stack of :class:`GroupedSVC` and :class:`GroupedNetwork` that keeps runs whole.
 
-    Parameters
-    ----------
-    columns : of the samples, the last columns of a row; the features are before them
-    choose : use whichever of the SVM, the network and the stack held-out runs favour, instead of the stack
-    candidates : of the SVM
-    n_inner_folds : of both, which are thus weighed on the same held-out runs
-    n_members, epochs, trial_epochs : of the network
-    gap, seed : of both
-
     Attributes
     ----------
     best_ : :class:`StackChoice`
     svm_, network_ : the two, fitted; None where it is not used
     """
 
-    columns: Sequence[SampleColumns] = ()
+    columns: Sequence[
+        SampleColumns
+    ] = ()  #: of the samples, the last columns of a row; the features are before them
+    #: use whichever of the SVM, the network and the stack held-out runs favour, instead of the stack
     choose: bool = False
-    candidates: Sequence[Sequence[float]] = CANDIDATES
-    n_inner_folds: int = 3
-    n_members: int = 3
+    candidates: Sequence[Sequence[float]] = CANDIDATES  #: of the SVM
+    n_inner_folds: int = 3  #: of both, which are thus weighed on the same held-out runs
+    n_members: int = 3  #: n_members, epochs, trial_epochs: of the network
     epochs: int = 30
     trial_epochs: int = 10
-    gap: int = 1
+    gap: int = 1  #: gap, seed: of both
     seed: int = 0
 
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedStack:

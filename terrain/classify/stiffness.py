@@ -25,29 +25,19 @@ from terrain.classify.metrics import NO_INTERVAL, Interval, run_bootstrap, runs_
 from terrain.errors import DataError
 from terrain.records import Array
 
+#: Cost of a wrong class of the right level, where soft taken for hard costs 1; chosen, not measured: the slip to aim
+#: for differs less within a level than between levels, and is not the same.
 WITHIN_LEVEL_COST = 0.25
-"""Cost of a wrong class of the right level, where soft taken for hard costs 1; chosen, not measured: the slip
-to aim for differs less within a level than between levels, and is not the same."""
-
-MAX_CLUSTERS = 6
-"""More clusters are not tried: with 50 runs each would have eight."""
-
+MAX_CLUSTERS = 6  #: More clusters are not tried: with 50 runs each would have eight.
+#: Fewer runs are not clustered: two clusters and their covariance have more numbers than these.
 MIN_RUNS = 8
-"""Fewer runs are not clustered: two clusters and their covariance have more numbers than these."""
-
+#: Principal components in which runs are clustered, at most, one for each four runs; so much of the variance they have
+#: to explain: what is left is mostly noise of single features.
 N_COMPONENTS, EXPLAINED_RATIO = 5, 0.8
-"""Principal components in which runs are clustered, at most, one for each four runs; so much of the variance they
-have to explain: what is left is mostly noise of single features."""
-
-N_STARTS = 10
-"""Starts of the mixture model, of which the most likely result is kept."""
-
+N_STARTS = 10  #: Starts of the mixture model, of which the most likely result is kept.
+#: Added to the variance of a cluster, so that two runs alike are no cluster of infinite density.
 MIN_VARIANCE = 1e-3
-"""Added to the variance of a cluster, so that two runs alike are no cluster of infinite density."""
-
-CLIP_STD = 5.0
-"""Scaled values are clipped here, so that one run is not a cluster because of one feature."""
-
+CLIP_STD = 5.0  #: Scaled values are clipped here, so that one run is not a cluster because of one feature.
 N_BOOTSTRAP = 1000
 
 
@@ -189,32 +179,22 @@ class LevelClusters(NamedTuple):
 
 
 class StiffnessFigures(NamedTuple):
-    """Accuracy by stiffness level and the cost of confusing levels, all with 95 % intervals over runs.
+    """Accuracy by stiffness level and the cost of confusing levels, all with 95 % intervals over runs."""
 
-    Parameters
-    ----------
-    levels : of each class
-    accuracy, accuracy_ci : of the level, whichever the class
-    cost, cost_ci : mean cost a window of the most probable class
-    least_cost, least_cost_ci : mean cost of the class of least expected cost
-    gain, gain_ci : the first less the second, run by run
-    least_cost_accuracy : accuracy of the class of least expected cost
-    soft_hard_ratio : windows of which soft was taken for hard or hard for soft, by the most probable class
-    clusters : None where there are too few runs
-    """
-
-    levels: Mapping[str, str]
-    accuracy: float
+    levels: Mapping[str, str]  #: of each class
+    accuracy: float  #: accuracy, accuracy_ci: of the level, whichever the class
     accuracy_ci: Interval
-    cost: float
+    cost: float  #: cost, cost_ci: mean cost a window of the most probable class
     cost_ci: Interval
-    least_cost: float
+    least_cost: float  #: least_cost, least_cost_ci: mean cost of the class of least expected cost
     least_cost_ci: Interval
-    gain: float
+    gain: float  #: gain, gain_ci: the first less the second, run by run
     gain_ci: Interval
-    least_cost_accuracy: float
-    soft_hard_ratio: float
-    clusters: LevelClusters | None
+    least_cost_accuracy: float  #: accuracy of the class of least expected cost
+    soft_hard_ratio: (
+        float  #: windows of which soft was taken for hard or hard for soft, by the most probable class
+    )
+    clusters: LevelClusters | None  #: None where there are too few runs
 
 
 def stiffness_figures(

@@ -40,15 +40,13 @@ from terrain.errors import DataError
 from terrain.kernels import njit
 from terrain.records import Array
 
+#: Margins of support vectors are 1: beyond these bounds probabilities of the pairs are flat or 0 and 1.
 LOG_SCALE_BOUNDS = (-4.0, 5.0)
-"""Margins of support vectors are 1: beyond these bounds probabilities of the pairs are flat or 0 and 1."""
-
+#: Probabilities of pairs are kept from 0 and 1 by this, as in LIBSVM: the linear system is regular then.
 MIN_PAIR_PROBABILITY = 1e-7
-"""Probabilities of pairs are kept from 0 and 1 by this, as in LIBSVM: the linear system is regular then."""
-
+#: Hyper-parameters are chosen on at most so many rows, thinned evenly: overlapping windows repeat each other, and the
+#: cost of an SVM grows with the square of their number. The last fit uses all rows.
 MAX_INNER_ROWS = 4000
-"""Hyper-parameters are chosen on at most so many rows, thinned evenly: overlapping windows repeat each other,
-and the cost of an SVM grows with the square of their number.  The last fit uses all rows."""
 
 
 def pairs_of(n_classes: int) -> list[tuple[int, int]]:
@@ -166,14 +164,6 @@ CANDIDATES: tuple[Candidate, ...] = (
 class GroupedSVC(GroupedClassifier):
     """RBF SVM with its own scaling, selection, choice of hyper-parameters and calibration.
 
-    Parameters
-    ----------
-    candidates : sequence of :class:`Candidate` to choose from
-    n_inner_folds : inner folds; the number of inner fits is this times the number of candidates
-    gap : windows left out beside an inner test block, where the only run of a class is cut; as many as
-        share samples with a window
-    seed : deals runs into inner folds
-
     Attributes
     ----------
     best_, scale_ : the chosen :class:`Candidate`, and the scale of the margins
@@ -181,10 +171,12 @@ class GroupedSVC(GroupedClassifier):
     n_inner_fits_ : how many SVMs were fitted to choose and to calibrate
     """
 
-    candidates: Sequence[Sequence[float]] = CANDIDATES
-    n_inner_folds: int = 3
+    candidates: Sequence[Sequence[float]] = CANDIDATES  #: sequence of :class:`Candidate` to choose from
+    n_inner_folds: int = 3  #: inner folds; the number of inner fits is this times the number of candidates
+    #: windows left out beside an inner test block, where the only run of a class is cut; as many as share samples
+    #: with a window
     gap: int = 1
-    seed: int = 0
+    seed: int = 0  #: deals runs into inner folds
 
     def fit(self, X: Array, y: Array, groups: Array | None = None) -> GroupedSVC:
         """Choose, calibrate and fit; ``DataError`` where a class has too few windows to hold some of them out."""

@@ -33,52 +33,36 @@ import numpy as np
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array
 
+#: Mean time on one ground: assumed. Robots of the thesis cross fields and paths at 0.5 to 1 m/s, so 10 to 20 m.
 DWELL_S = 20.0
-"""Mean time on one ground: assumed.  Robots of the thesis cross fields and paths at 0.5 to 1 m/s, so 10 to 20
-m."""
-
+#: Time between windows that bring evidence of their own. The length of a window would be right of windows that err
+#: independently of the ground's age, but makes a change of ground cost seconds. A settled belief has to be outweighed
+#: by about 6 nats (0.98 against the 0.002 of a ground that may have come since the last window), and a window at 0.8
+#: among five classes brings 2.8: at 0.4 s a change is found within 1 s of windows on the new ground, beside the time
+#: in which windows hold samples of both. 0.25, 0.5, 1 and 2 s were compared on spliced courses of BorealTC and Vulpi,
+#: where accuracy falls beyond 0.5 s: the value was chosen with these figures in view.
 EVIDENCE_S = 0.4
-"""Time between windows that bring evidence of their own.  The length of a window would be right of windows
-that err independently of the ground's age, but makes a change of ground cost seconds.  A settled belief has
-to be outweighed by about 6 nats (0.98 against the 0.002 of a ground that may have come since the last
-window), and a window at 0.8 among five classes brings 2.8: at 0.4 s a change is found within 1 s of windows
-on the new ground, beside the time in which windows hold samples of both.  0.25, 0.5, 1 and 2 s were compared
-on spliced courses of BorealTC and Vulpi, where accuracy falls beyond 0.5 s: the value was chosen with these
-figures in view."""
-
-THRESHOLD = 0.5
-"""Above it one terrain is more likely than all others and "unknown" together."""
-
+THRESHOLD = 0.5  #: Above it one terrain is more likely than all others and "unknown" together.
+#: Assumed share of windows that follow no class, as at an obstacle; it bounds the evidence of a window.
 OUTLIER_RATIO = 0.02
-"""Assumed share of windows that follow no class, as at an obstacle; it bounds the evidence of a window."""
-
+#: Assumed share of grounds that no class describes; it only decides where no class is likely.
 UNKNOWN_RATIO = 0.05
-"""Assumed share of grounds that no class describes; it only decides where no class is likely."""
-
+#: Assumed share of the windows of a terrain that was never learned that are found to be unknown. It is 0.17 of those
+#: of BorealTC, each terrain left out in turn, at the threshold that keeps 95 % of known windows.
 DETECTED_RATIO = 0.2
-"""Assumed share of the windows of a terrain that was never learned that are found to be unknown.  It is 0.17
-of those of BorealTC, each terrain left out in turn, at the threshold that keeps 95 % of known windows."""
-
+#: Share of windows of learned terrains that are taken for unknown, by the definition of the threshold.
 KNOWN_FLAGGED_RATIO = 0.05
-"""Share of windows of learned terrains that are taken for unknown, by the definition of the threshold."""
 
 
 class TerrainFilter(NamedTuple):
-    """Settings of the filter.
+    """Settings of the filter."""
 
-    Parameters
-    ----------
-    prior : share of each of the k classes among the training windows, in the order of the probabilities
-    evidence_s : T, time between windows that bring evidence of their own
-    dwell_s : D, mean time on one ground
-    threshold : probability from which a class is reported
-    outlier_ratio, unknown_ratio : share of windows that follow no class, and of grounds that are unknown
-    """
-
+    #: share of each of the k classes among the training windows, in the order of the probabilities
     prior: tuple[float, ...]
-    evidence_s: float = EVIDENCE_S
-    dwell_s: float = DWELL_S
-    threshold: float = THRESHOLD
+    evidence_s: float = EVIDENCE_S  #: T, time between windows that bring evidence of their own
+    dwell_s: float = DWELL_S  #: D, mean time on one ground
+    threshold: float = THRESHOLD  #: probability from which a class is reported
+    #: outlier_ratio, unknown_ratio: share of windows that follow no class, and of grounds that are unknown
     outlier_ratio: float = OUTLIER_RATIO
     unknown_ratio: float = UNKNOWN_RATIO
 
