@@ -244,6 +244,7 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
     """Faults and effects that vary are read where a diagnosis has them."""
     value = Value("motor_constant_ratio", 0.1, "ratio", 0.0, 0.2)
     groups = (RunGroup(0.1, 0.01, ("a",)), RunGroup(0.2, 0.01, ("c",)))
+    deg = SimpleNamespace(kind=FaultKind.UNIT, column=Column.GYRO)
     answer = SimpleNamespace(
         causes=(),
         ambiguous_sets=(("payload", "motor_constant"),),
@@ -252,7 +253,7 @@ def test_a_trial_takes_what_the_diagnosis_answers(monkeypatch):
         unexplained=(),
         clocks=(Clock("a", -0.2, 0.01), Clock("b", math.nan, math.nan), Clock("c", -0.3, 0.01)),
         excluded_runs=(SimpleNamespace(run_id="b"),),
-        faults=(SimpleNamespace(kind=FaultKind.UNIT, column=Column.GYRO, sentence="it is in deg/s"),),
+        faults=(SimpleNamespace(change=deg, sentence="it is in deg/s"),),
         varying=(SimpleNamespace(name="payload", groups=groups, rivals=("motor_constant",)),),
     )
     monkeypatch.setattr("studies.blind_trials.trial.diagnose", lambda *_: answer)

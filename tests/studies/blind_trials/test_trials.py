@@ -304,12 +304,12 @@ def test_the_cramer_rao_limit_and_the_diagnosis_agree_on_what_can_be_seen(world)
     per_std = norm.isf(TEST_SIZE / 2 / limits.library_size) + norm.ppf(POWER)
     ratios = {}
     modifying = {p.name for e in library_of(robot.drive) if e.modifies for p in e.parameters}
-    assert all(math.isinf(limit.value) == (limit.name in modifying) for limit in found.limits)
-    for limit in found.limits:
+    assert all(math.isinf(limit.detection_limit) == (limit.name in modifying) for limit in found.detection_limits)
+    for limit in found.detection_limits:
         if limit.name in modifying:
             continue
         std = 1 / math.sqrt(limits.information.diagonal()[limits.names.index(limit.name)])
-        ratios[limit.name] = limit.value / (Z_EFFECT + POWER_Z) / std
+        ratios[limit.name] = limit.detection_limit / (Z_EFFECT + POWER_Z) / std
         for effect in library_of(robot.drive):
             if effect.parameters[0].name == limit.name:
                 assert limits.of(effect) == pytest.approx(per_std * std)

@@ -219,7 +219,7 @@ def _answered(answer: Diagnosis | None) -> dict[str, Any]:
         for n in names
         for value in answer.ambiguous_values.get(n, ())
     ]
-    values = [*in_sets, *(value for cause in causes for value in cause.values)]
+    values = [*in_sets, *(value for cause in causes for value in cause.parameters)]
     offset_s = np.array([clock.offset_s for clock in answer.clocks])
     known_s = offset_s[np.isfinite(offset_s)]
     return {
@@ -228,11 +228,11 @@ def _answered(answer: Diagnosis | None) -> dict[str, Any]:
         "sets": answer.ambiguous_sets,
         "unexplained": tuple((each.channel, each.input) for each in answer.unexplained),
         "intervals": {value.name: (value.value, value.low, value.high) for value in values},
-        "gain_low": min((cause.gain_low for cause in causes), default=math.nan),
+        "gain_low": min((cause.gain_ci[0] for cause in causes), default=math.nan),
         "clock_s": float(np.median(known_s)) if known_s.size else math.nan,
         "excluded": tuple(run.run_id for run in answer.excluded_runs),
         "varying": tuple(
-            Varying(each.name, tuple((group.value, group.run_ids) for group in each.groups), each.rivals)
+            Varying(each.name, tuple((group.value, group.runs) for group in each.groups), each.rivals)
             for each in answer.varying
         ),
         "statements": tuple(
