@@ -6,7 +6,7 @@ python examples/observe_slip.py
 import numpy as np
 
 from terrain.estimation.observers.choice import make_observer
-from terrain.estimation.observers.live import LiveObserver
+from terrain.estimation.observers.rows import LiveObserver
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.tracked import Slope, Stretch, simulate_tracked

@@ -10,17 +10,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from car_scenarios import GRIP_RATIO, STOP, Course, slope_course, stop_course
 from claims import Finding, Numbers, Trial
+from multi_model import Gains, MultiModel
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.control.car_following import CarFollower, FollowedDrive, SlipSource, followed_drive
-from terrain.estimation.observers.family import Observer
-from terrain.estimation.observers.sideslip_dynamic import DynamicSettings, sideslip_dynamic_observer
-from terrain.estimation.observers.sideslip_forces import C_LOW_NPR
-from terrain.estimation.observers.sideslip_multi import (
-    SECTION_VI,
-    MultiModelSettings,
-    sideslip_multi_observer,
-)
+from terrain.estimation.observers.observer import Observer
+from terrain.estimation.observers.sideslip import C_LOW_NPR, SETTINGS, Sideslip
 from terrain.records import Array
 from terrain.robots import BicycleRobot, as_drive, load_robot
 from terrain.simulation.car import simulate_car
@@ -46,21 +41,21 @@ class Variant(NamedTuple):
     observer: Callable[[BicycleRobot], Observer] | None = None
 
 
-def _with(settings: MultiModelSettings) -> Callable[[BicycleRobot], Observer]:
-    return lambda robot: sideslip_multi_observer(robot, settings)
-
-
 VARIANTS: dict[str, Variant] = {
     "no observer": Variant(SlipSource.NONE),
     "dynamic": Variant(SlipSource.DYNAMIC),
     "kinematic": Variant(SlipSource.KINEMATIC),
     "multi-model": Variant(SlipSource.MULTI),
-    "multi-model, gains of section VI": Variant(SlipSource.MULTI, _with(SECTION_VI)),
-    "multi-model, printed signs": Variant(SlipSource.MULTI, _with(MultiModelSettings(as_printed=True))),
+    "multi-model, gains of section VI": Variant(SlipSource.MULTI, MultiModel),
+    "multi-model, printed signs": Variant(
+        SlipSource.MULTI, lambda robot: MultiModel(robot, Gains(as_printed=True))
+    ),
     "multi-model with preview": Variant(SlipSource.GRIP),
     "dynamic at every speed": Variant(
         SlipSource.DYNAMIC,
-        lambda robot: sideslip_dynamic_observer(robot, DynamicSettings(slowest_mps=1e-3)),
+        lambda robot: Sideslip(
+            robot, "sideslip-dynamic", SETTINGS["sideslip-dynamic"]._replace(slowest_mps=1e-3)
+        ),
     ),
 }
 """Controllers by name."""

@@ -11,22 +11,15 @@ from claims import Finding, Numbers, Trial
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from tracked_speed import TrackSpeedSettings, track_speed_step
+from tracked_stability import ErrorBound, disturbance_bound, error_matrix, measured_efficiency, regressor
 from tracks import janosi_slip
 
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.observers.family import ObserverStatus, ObserverTrack, observe
-from terrain.estimation.observers.rows import feed_of, rows_of
-from terrain.estimation.observers.track_efficiency import measured_efficiency
-from terrain.estimation.observers.tracked import tracked_observer
-from terrain.estimation.observers.tracked_settings import TrackedSettings
-from terrain.estimation.observers.tracked_stability import (
-    ErrorBound,
-    disturbance_bound,
-    error_matrix,
-    regressor,
-)
+from terrain.estimation.observers.observer import ObserverStatus, ObserverTrack, observe
+from terrain.estimation.observers.rows import rows_of
+from terrain.estimation.observers.tracked import TrackedObserver, TrackedSettings
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
 from terrain.simulation.tracked import (
@@ -132,8 +125,8 @@ def observed(
     run = simulate_tracked(robot, ground, speeds_mps, seed, sensors=sensors)
     streams = {name: stream for name, stream in run.streams.items() if name != "pose"}
     run = replace(run, streams=streams)
-    observer = tracked_observer(robot, settings)
-    time_s, rows = rows_of(run, feed_of(run, robot, observer.rows))
+    observer = TrackedObserver(robot, settings)
+    time_s, rows, _ = rows_of(run, robot, observer.rows)
     rows[(time_s >= lost_s[0]) & (time_s < lost_s[1]), 2:5] = np.nan
     truth = streams["truth"]
     at = np.minimum(np.searchsorted(truth.time_s, time_s - 1e-6), len(truth.time_s) - 1)
@@ -588,15 +581,16 @@ def closed_loop(seed: np.random.SeedSequence, duration_s: float, compensated: bo
     robot, rng = orchard_ugv(), np.random.default_rng(seed)
     grounds = zip(SOILS, (FIRST_M, np.inf), strict=True)
     tracks = np.concatenate([tracks_on(robot, load_soil(name), until_m) for name, until_m in grounds])
-    settings, observer = TrackSpeedSettings(), tracked_observer(robot, NORMALISED)
-    memory, used, state, belts = np.array(observer.start), np.ones(2), np.zeros(2, STATE), np.zeros(2)
+    settings, observer = TrackSpeedSettings(), TrackedObserver(robot, NORMALISED)
+    used, state, belts = np.ones(2), np.zeros(2, STATE), np.zeros(2)
+    known, unknown = (np.ones(2), np.full(2, NORMALISED.eta_std_ratio)), (np.ones(2), np.zeros(2))
     noise = np.array([NOISY.gnss_m, NOISY.gnss_m, NOISY.compass_rad])
     keep, n = np.exp(-STEP_S / NOISY.belt_lag_s), round(duration_s / TICK_S)
     speed, etas = np.empty((n, 2)), np.empty((n, 2))
     for k in range(n):
-        reading = observer.read(observer.params, memory)
-        eta, std = (reading.mean[5:7], reading.std[5:7]) if compensated else (np.ones(2), np.zeros(2))
-        command = track_speed_step(robot, settings, used, DESIRED, eta, std, TICK_S)
+        command = track_speed_step(
+            robot, settings, used, DESIRED, *(known if compensated else unknown), TICK_S
+        )
         used = command.eta
         for _ in range(round(TICK_S / STEP_S)):
             belts = keep * belts + (1.0 - keep) * np.array([command.left_mps, command.right_mps])
@@ -608,6 +602,7 @@ def closed_loop(seed: np.random.SeedSequence, duration_s: float, compensated: bo
         if k % FIX_TICKS == 0:
             row[2:5] = state[["position_x_m", "position_y_m", "yaw_rad"]][0].tolist()
             row[2:5] += noise * rng.standard_normal(3)
-        memory = observer.step(observer.params, memory, row, TICK_S)
+        output = observer.step(row, TICK_S)
+        known = output.mean[5:7], output.std[5:7]
         speed[k], etas[k] = state[["speed_x_mps", "yaw_rate_radps"]][0].tolist(), used
     return ClosedLoop(TICK_S * np.arange(1, n + 1), speed, etas)

@@ -33,25 +33,19 @@ from yamauchi_slip import (
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.calibration.odometry import odometry_rows
-from terrain.estimation.observers.family import Observer, ObserverTrack, observe
-from terrain.estimation.observers.plain_odometry import endo_odometry_observer, gyrodometry_observer
-from terrain.estimation.observers.rows import feed_of, ticks
-from terrain.estimation.observers.slip_learning import (
-    OBSERVED_RATIO,
-    PRIOR_STD,
-    learned_model,
-    slip_learning_observer,
-    unknown_ground,
-)
+from terrain.estimation.observers.observer import Observer, ObserverTrack, observe
+from terrain.estimation.observers.rows import rows_of
 from terrain.estimation.observers.slip_model import (
     N_PARAMETERS,
     PARAMETERS,
+    PRIOR_STD,
     REGRESSORS,
     SIDE,
     SlipModel,
     body_velocity,
+    unknown_ground,
 )
-from terrain.estimation.observers.slip_odometry import slip_odometry_observer
+from terrain.estimation.observers.slip_odometry import OBSERVED_RATIO, SlipOdometry, plain_odometry
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
 from terrain.simulation.tracked import PrescribedSlip, Slope, simulate_tracked
@@ -80,6 +74,10 @@ SETTLE_S = 1.0
 LOST_RATIO = 0.38
 """Of the input yaw rate in a turn on sand: only how long a turn is commanded, so that it ends near 90
 degrees."""
+
+
+MakeOdometry = Callable[[], Observer]
+"""Each drive has an odometry of its own."""
 
 
 class Run(NamedTuple):
@@ -165,9 +163,9 @@ def force_balance(trial: Trial) -> Finding:
     )
     carried = [float(bekker_pressure(each, *soil)) / pressure for each in depths]
     x = 0.5  # (17) and (19)
-    theta, slopes_of = np.zeros(N_PARAMETERS), np.empty((2, N_PARAMETERS))
+    theta = np.zeros(N_PARAMETERS)
     theta[SIDE] = 0.5
-    drift = body_velocity(theta, robot.half_track_m, (-0.05, -0.05), 0.0, (0.1, 0.0), 0.0, slopes_of)[1]
+    drift = body_velocity(theta, robot.half_track_m, (-0.05, -0.05), 0.0, (0.1, 0.0), 0.0)[1]
     right = -50.0 * math.tan(math.atan(0.05))
     numbers = {
         "fall": Numbers(
@@ -478,9 +476,9 @@ def driven(run: Run) -> Driven:
     return Driven(log, *odometry_rows(log, patako()))
 
 
-def follow(observer: Observer, drive: Driven) -> ObserverTrack:
+def follow(odometry: MakeOdometry, drive: Driven) -> ObserverTrack:
     """Return the estimates of an odometry over a run."""
-    return observe(observer, drive.time_s, drive.rows)
+    return observe(odometry(), drive.time_s, drive.rows)
 
 
 def position_error(track: ObserverTrack, run: RunLog) -> Array:
@@ -503,18 +501,18 @@ def mean_interval(values: Array, seed: int) -> tuple[float, float]:
     return percentile_interval(values[rows].mean(axis=1))
 
 
-def odometries(trained: Trained) -> dict[str, Observer]:
+def odometries(trained: Trained) -> dict[str, MakeOdometry]:
     """Return gyrodometry, Endo's law with the exponent that suits it best, and slip-compensated odometry."""
     robot = patako()
     return {
-        GYRO: gyrodometry_observer(robot),
-        ENDO: endo_odometry_observer(robot, trained.endo.exponent),
-        SLIP: slip_odometry_observer(robot, trained.found.model),
+        GYRO: partial(plain_odometry, "gyrodometry", robot),
+        ENDO: partial(plain_odometry, "endo", robot, SlipModel(turning_exponent=trained.endo.exponent)),
+        SLIP: partial(SlipOdometry, robot, trained.found.model),
     }
 
 
 def errors_of(
-    methods: Mapping[str, Observer], cases: Mapping[tuple[float, float], Sequence[Run]]
+    methods: Mapping[str, MakeOdometry], cases: Mapping[tuple[float, float], Sequence[Run]]
 ) -> dict[tuple[float, float], dict[str, Array]]:
     """Return the position RMSE (trials,) in m of each method under each condition."""
     out = {}
@@ -538,7 +536,7 @@ def turning_odometry(trial: Trial) -> Finding:
     """Train on experiments I and II and judge the position in held-out turns."""
     plain = train(trial, (UPHILL,), drift=False)
     methods = odometries(train(trial, (UPHILL, DOWNHILL), drift=True))
-    methods[PLAIN] = slip_odometry_observer(patako(), plain.found.model)
+    methods[PLAIN] = partial(SlipOdometry, patako(), plain.found.model)
     judged = {name: judged_runs(trial, uphill_rad) for name, uphill_rad in TURNING.items()}
     errors = {name: errors_of(methods, runs) for name, runs in judged.items()}
     gain = [
@@ -599,33 +597,33 @@ def _angles(runs: Sequence[Run]) -> Numbers:
     return Numbers.over(own[:, 1].tolist(), beside, start=start)
 
 
-def _coverage(observer: Observer, runs: Sequence[Run]) -> Numbers:
+def _coverage(odometry: MakeOdometry, runs: Sequence[Run]) -> Numbers:
     """Return how large the error at the end is for the standard deviation that is stated for it."""
     ratios = []
     for run in runs:
         drive = driven(run)
-        track = follow(observer, drive)
+        track = follow(odometry, drive)
         stated = np.hypot(track.std[-1, 0], track.std[-1, 1])
         ratios.append(position_error(track, drive.run)[-1] / stated)
     root = float(np.sqrt(np.mean(np.square(ratios))))
     return Numbers(root, (float(np.min(ratios)), float(np.max(ratios))))
 
 
-def _positions_figure(methods: Mapping[str, Observer], runs: Mapping[tuple[float, float], Run]) -> Figure:
+def _positions_figure(methods: Mapping[str, MakeOdometry], runs: Mapping[tuple[float, float], Run]) -> Figure:
     panels = []
     for (slope, rate), run in runs.items():
         drive = driven(run)
         truth = drive.run.streams["truth"]
         lines = [Line("true", truth.channel("position_x_m"), truth.channel("position_y_m"), 6)]
-        for k, (name, observer) in enumerate(methods.items()):
-            track = follow(observer, drive)
+        for k, (name, odometry) in enumerate(methods.items()):
+            track = follow(odometry, drive)
             place = track.state("position_x_m"), track.state("position_y_m")
             lines.append(Line(name, *place, k, dashed=name == PLAIN))
         panels.append(Panel(tuple(lines), "y [m]", title=f"{slope:g}°, {rate:g}°/s", equal=True))
     return Figure("Position in turns on a slope by four odometries", tuple(panels), x_label="x [m]")
 
 
-def _angle_figure(methods: Mapping[str, Observer], run: Run) -> Figure:
+def _angle_figure(methods: Mapping[str, MakeOdometry], run: Run) -> Figure:
     drive = driven(run)
     truth = drive.run.streams["truth"]
     moving = truth.time_s > 0.5
@@ -666,7 +664,7 @@ def online(trial: Trial) -> Finding:
     order = np.random.default_rng(seed).permutation(len(runs))
     learned = learn([simulate(runs[k]) for k in order])
     offline = train(trial, (UPHILL, DOWNHILL), drift=True)
-    methods = odometries(offline) | {"online": slip_odometry_observer(robot, learned.model)}
+    methods = odometries(offline) | {"online": partial(SlipOdometry, robot, learned.model)}
     errors = {
         name: errors_of(methods, judged_runs(trial, uphill_rad)) for name, uphill_rad in TURNING.items()
     }
@@ -722,12 +720,9 @@ def learn(runs: Sequence[RunLog]) -> Learned:
     for run in runs:
         seen = {name: stream for name, stream in run.streams.items() if name not in ("pose", "truth")}
         without_cameras = RunLog(run.run_id, run.robot, seen)
-        observer = slip_learning_observer(patako(), model)
-        memory, last_s = observer.start, None
-        for time_s, row in ticks(without_cameras, feed_of(run, patako(), observer.rows)):
-            memory = observer.step(observer.params, memory, row, 0.0 if last_s is None else time_s - last_s)
-            last_s = time_s
-        model = learned_model(observer.params, memory)
+        odometry = SlipOdometry(patako(), model, name="slip-learning")
+        observe(odometry, *rows_of(without_cameras, patako(), odometry.rows)[:2])
+        model = odometry.learned_model
         means.append(model.vector)
         stds.append(np.sqrt(np.diag(model.covariance)))
     return Learned(np.array(means), np.array(stds), model)

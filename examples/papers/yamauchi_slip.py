@@ -64,7 +64,6 @@ from scipy import stats
 from terrain.angles import unwrapped
 from terrain.calibration.odometry import odometry_rows
 from terrain.errors import DataError
-from terrain.estimation.observers.slip_learning import unknown_ground
 from terrain.estimation.observers.slip_model import (
     ANGLE,
     COMPACTION,
@@ -83,6 +82,7 @@ from terrain.estimation.observers.slip_model import (
     body_velocity,
     model_of,
     next_displacement,
+    unknown_ground,
 )
 from terrain.identify import Parameter, half_width, identify, jackknife_covariance, leave_out, select
 from terrain.records import Array, RunLog
@@ -599,7 +599,7 @@ class SlipIdentification(NamedTuple):
 
     Parameters
     ----------
-    model : for :func:`terrain.estimation.observers.slip_odometry.slip_odometry_observer`
+    model : for :func:`terrain.estimation.observers.slip_odometry.SlipOdometry`
     straight, side : of straight motion
     turning, angle, track : of turns; the angle with the drift beside it, or as printed
     notes : what is missing, and why
@@ -692,13 +692,11 @@ def _joined(fits: Mapping[int, LinearFit | None], endo: TurningFit | None, *, dr
 
 def _residual_noise(model: SlipModel, samples: SlipSamples, half_track_m: float) -> dict[str, float]:
     """Return the residuals of a model: within the runs and their correlation time, and of the runs."""
-    theta, slopes = np.zeros(N_PARAMETERS), np.empty((2, N_PARAMETERS))
+    theta = np.zeros(N_PARAMETERS)
     theta[: len(model.vector)] = model.vector
     predicted = np.empty((len(samples.run), 2))
     for i, (left, right, rate, roll, pitch, turned) in enumerate(zip(*samples[:6], strict=True)):
-        predicted[i] = body_velocity(theta, half_track_m, (left, right), rate, (roll, pitch), turned, slopes)[
-            :2
-        ]
+        predicted[i] = body_velocity(theta, half_track_m, (left, right), rate, (roll, pitch), turned)
     speed = 0.5 * (np.abs(samples.left_mps) + np.abs(samples.right_mps))
     error = (np.column_stack([samples.forward_mps, samples.lateral_mps]) - predicted) / speed[:, None]
     _, number = np.unique(samples.run, return_inverse=True)

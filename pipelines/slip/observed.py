@@ -26,10 +26,16 @@ from pipelines.slip.tracks import (
 )
 from terrain.errors import ConfigError
 from terrain.estimation.observers.choice import BY_MODEL
-from terrain.estimation.observers.estimate import ObserverEstimate, observe_run, with_estimates
-from terrain.estimation.observers.family import ObserverStatus
+from terrain.estimation.observers.estimate import (
+    SETTLED,
+    ObserverEstimate,
+    ObserverSummary,
+    observe_run,
+    summarize_observer,
+    with_estimates,
+)
+from terrain.estimation.observers.observer import ObserverStatus
 from terrain.estimation.observers.slip_model_file import read_slip_model
-from terrain.estimation.observers.summary import SETTLED, ObserverSummary, summarize_observer
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, packaged_robot
 

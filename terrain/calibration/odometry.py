@@ -12,7 +12,7 @@ its sensor is turned by :math:`\gamma`; with the pose of the body :math:`(p, \ps
 
 and parameters minimise the distance from the measured end of each leg, bounded in its influence (soft L1, at
 the median distance that is left), with the prior of unknown ground
-(:func:`~terrain.estimation.observers.slip_learning.unknown_ground`) as a ridge.  All kinds have the same
+(:func:`~terrain.estimation.observers.slip_model.unknown_ground`) as a ridge.  All kinds have the same
 scale of the tracks, l and :math:`\gamma` fitted, which are no slip.
 
 **The adaptive observer** is judged on a command's last window by efficiencies of the first ones.  The lidar poses of
@@ -34,9 +34,8 @@ import numpy as np
 from terrain.angles import unwrapped
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.errors import DataError
-from terrain.estimation.observers.family import ObserverStatus, observe
-from terrain.estimation.observers.rows import feed_of, rows_of
-from terrain.estimation.observers.slip_learning import unknown_ground
+from terrain.estimation.observers.observer import ObserverStatus, observe
+from terrain.estimation.observers.rows import rows_of
 from terrain.estimation.observers.slip_model import (
     ANGLE,
     COMPACTION,
@@ -54,10 +53,10 @@ from terrain.estimation.observers.slip_model import (
     body_velocity,
     model_of,
     next_displacement,
+    unknown_ground,
 )
 from terrain.estimation.observers.slip_odometry import ROWS as ODOMETRY_ROWS
-from terrain.estimation.observers.tracked import ROWS, tracked_observer
-from terrain.estimation.observers.tracked_settings import TrackedSettings
+from terrain.estimation.observers.tracked import ROWS, TrackedObserver, TrackedSettings
 from terrain.identify import Fit, Parameter, deal, folds, identify
 from terrain.kernels import njit
 from terrain.logs.drive import WindowPoses
@@ -89,7 +88,7 @@ def odometry_rows(run: RunLog, robot: TrackedRobot) -> tuple[Array, Array]:
     DataError
         if the run has no speeds of tracks.
     """
-    return rows_of(run, feed_of(run, robot, ODOMETRY_ROWS))
+    return rows_of(run, robot, ODOMETRY_ROWS)[:2]
 
 
 def legs_of_windows(
@@ -395,7 +394,7 @@ def _sum_legs(
     """Return the change of pose (legs, 3) of the observed point; ``geometry`` is d and the length."""
     speeds, rate, tilt, end, step_s = packed
     half_track_m, length_m = geometry
-    out, slopes, first = np.empty((len(end), 3)), np.empty((3, N_PARAMETERS)), 0
+    out, first = np.empty((len(end), 3)), 0
     by_track = 2.0 * half_track_m * theta[TRACK_RATIO]
     for leg in range(len(end)):
         x, y, yaw, displaced = 0.0, 0.0, 0.0, 0.0
@@ -404,9 +403,7 @@ def _sum_legs(
             turn = rate[k] if by_gyro else (pair[1] - pair[0]) * (1.0 - theta[COMPACTION]) / by_track
             displaced = next_displacement(displaced, pair, turn, length_m, step_s[leg])
             if by_gyro:
-                v_x, v_y, _, _ = body_velocity(
-                    theta, half_track_m, pair, turn, (tilt[k, 0], tilt[k, 1]), displaced, slopes
-                )
+                v_x, v_y = body_velocity(theta, half_track_m, pair, turn, (tilt[k, 0], tilt[k, 1]), displaced)
             else:
                 v_x, v_y = 0.5 * (pair[0] + pair[1]) * (1.0 - theta[COMPACTION]), 0.0
             middle = yaw + 0.5 * turn * step_s[leg]
@@ -557,7 +554,7 @@ def efficiencies_before(
     until = int(np.searchsorted(time_s, windows[-2].time_s[-1] - delay_s, side="right"))
     if until < 2:
         return None
-    track = observe(tracked_observer(robot, SETTINGS), time_s[:until], rows[:until])
+    track = observe(TrackedObserver(robot, SETTINGS), time_s[:until], rows[:until])
     if track.status[-1] == ObserverStatus.STARTING:
         return None
     return np.array([track.state(f"eta_{side}_ratio")[-1] for side in ("left", "right")])

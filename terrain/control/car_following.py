@@ -55,18 +55,8 @@ import numpy as np
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.paths import GRID_M, PathStatus, Place, ReferencePath
 from terrain.control.pid import LONGEST_STEP_S, checked
-from terrain.estimation.observers.family import Observer, ObserverOutput
-from terrain.estimation.observers.sideslip_dynamic import sideslip_dynamic_observer
-from terrain.estimation.observers.sideslip_kinematic import sideslip_kinematic_observer
-from terrain.estimation.observers.sideslip_multi import sideslip_multi_observer
-from terrain.estimation.observers.sideslip_pose import (
-    IN_RATE,
-    IN_SPEED,
-    ROLL,
-    SINCE_FIX,
-    SPEED,
-    PoseSettings,
-)
+from terrain.estimation.observers.observer import Observer, ObserverOutput, ObserverStatus
+from terrain.estimation.observers.sideslip import RATE, ROLL, SETTINGS, SPEED, Sideslip, X
 from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot
 from terrain.simulation.car import CarCommand, CarSample
@@ -94,8 +84,9 @@ class SteeringSettings(NamedTuple):
     #: H over the actuator's time constant, 3 for its response time (95 %); 0 passes the curvature on as it is
     horizon_time_constants: float = 3.0
     #: time constant of a low-pass of the slip angles. The front one has -d in it, at once: fed back without a lag it
-    #: closes a fast loop of gain 1 around actuator and tyres
-    slip_lag_s: float = 0.05
+    #: closes a fast loop of gain 1 around actuator and tyres, which swings near the grip's limit even where the slip that
+    #: is estimated has no lag of its own
+    slip_lag_s: float = 0.4
 
 
 _LEAST_BESIDE, _ACROSS_RAD = 0.2, 1.3
@@ -236,12 +227,9 @@ def sideslip_observer(robot: BicycleRobot, source: SlipSource) -> Observer:
     'sideslip-multi'
     """
     if source is SlipSource.NONE:
-        return sideslip_kinematic_observer(robot, PoseSettings(slip_gain=0.0))
-    if source is SlipSource.KINEMATIC:
-        return sideslip_kinematic_observer(robot)
-    return (
-        sideslip_dynamic_observer(robot) if source is SlipSource.DYNAMIC else sideslip_multi_observer(robot)
-    )
+        return Sideslip(robot, "sideslip-kinematic", SETTINGS["sideslip-kinematic"]._replace(by_fixes=False))
+    name = SlipSource.MULTI if source is SlipSource.GRIP else source
+    return Sideslip(robot, f"sideslip-{name}")
 
 
 #: Of the grip, what the side force ahead may take; and the braking before a bend, below the drive's acceleration.
@@ -401,7 +389,7 @@ class CarFollower:
     ) -> None:
         self._robot, self._path, self._source = robot, path, SlipSource(source)
         self._observer = sideslip_observer(robot, self._source) if observer is None else observer
-        self._memory, self._steered = np.array(self._observer.start), SteerState()
+        self._steered, self._speed_mps, self._roll_rad, self._without_fix_s = SteerState(), 0.0, 0.0, 0.0
         self._steering, self._grip = check_steering(steering), Grip()
         self._reach_s = steering.delay_s + REACH_TIME_CONSTANTS * robot.steering_time_constant_s
         self._before_m, self._time_s = math.nan, math.nan
@@ -411,9 +399,14 @@ class CarFollower:
         """Return the command of a tick."""
         dt_s = 0.0 if math.isnan(self._time_s) else sample.time_s - self._time_s
         self._time_s = sample.time_s
-        self._memory = self._observer.step(self._observer.params, self._memory, sample.measured, dt_s)
-        known = self._observer.read(self._observer.params, self._memory)
-        speed = float(self._memory[SPEED])
+        known, measured = self._observer.step(sample.measured, dt_s), sample.measured
+        if math.isfinite(measured[SPEED]):
+            self._speed_mps = float(measured[SPEED])
+        if math.isfinite(measured[ROLL]):
+            self._roll_rad = float(measured[ROLL])
+        is_fixed = math.isfinite(measured[X]) and known.status != ObserverStatus.REJECTED
+        self._without_fix_s = 0.0 if is_fixed else self._without_fix_s + dt_s
+        speed = self._speed_mps
         x_m, y_m, yaw_rad = known.mean[:3].tolist()
         place = self._path.locate(x_m, y_m, yaw_rad, self._before_m)
         is_first = math.isnan(self._before_m)
@@ -429,7 +422,7 @@ class CarFollower:
         steer_rad, self._steered, status = steer(
             self._robot, self._steering, self._steered, self._path, place, slips, speed, dt_s
         )
-        stops = self._memory[SINCE_FIX] > LOST_STOP_S or place.status is PathStatus.FAR
+        stops = self._without_fix_s > LOST_STOP_S or place.status is PathStatus.FAR
         finished = place.status is PathStatus.END
         self.ticks.append(FollowedTick(sample.time_s, place, known, status, grip))
         return CarCommand(steer_rad, 0.0 if stops or finished else desired, finished)
@@ -438,8 +431,8 @@ class CarFollower:
         self, known: ObserverOutput, sample: CarSample, distance_m: float, dt_s: float, desired_mps: float
     ) -> tuple[Array, float]:
         """Return slips with what is expected of the path ahead, and the speed that the grip allows."""
-        speed, roll = float(self._memory[SPEED]), float(self._memory[ROLL])
-        force = float(sample.measured[IN_SPEED] * sample.measured[IN_RATE]) + GRAVITY_MPS2 * math.sin(roll)
+        speed, roll = self._speed_mps, self._roll_rad
+        force = float(sample.measured[SPEED] * sample.measured[RATE]) + GRAVITY_MPS2 * math.sin(roll)
         self._grip = grip_step(self._robot, self._grip, force, known.slip, known.slip_std, dt_s)
         fastest = preview_speed(self._grip, self._path, distance_m, roll)
         here, ahead = (

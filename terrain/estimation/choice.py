@@ -9,7 +9,7 @@ import numpy as np
 
 from terrain.estimation.live import LiveEstimate, LiveFilter
 from terrain.estimation.observers.choice import OBSERVERS, make_observer
-from terrain.estimation.observers.live import LiveObserver, LiveObserverEstimate
+from terrain.estimation.observers.rows import LiveObserver, LiveObserverEstimate
 from terrain.extension import Correction
 from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import Array

@@ -18,8 +18,7 @@ from tracked_speed import (
 )
 
 from terrain.errors import ConfigError
-from terrain.estimation.observers.tracked import tracked_observer
-from terrain.estimation.observers.tracked_settings import TrackedSettings
+from terrain.estimation.observers.tracked import TrackedObserver, TrackedSettings
 from terrain.robots import load_robot
 
 ROBOT = load_robot("orchard_ugv")
@@ -39,12 +38,11 @@ def closed_loop(true_eta, compensate, seed=0, forward=0.5, turn=0.1, lag_s=0.1):
     Tracks follow their commands with a lag.
     """
     rng = np.random.default_rng(seed)
-    observer = tracked_observer(ROBOT, TrackedSettings(observation_gain_ps=(2.0, 2.0, 2.0), normalised=True))
-    memory, used, pose, tracks, motion = np.array(observer.start), ONES, np.zeros(3), np.zeros(2), []
+    observer = TrackedObserver(ROBOT, TrackedSettings(observation_gain_ps=(2.0, 2.0, 2.0), normalised=True))
+    known, used, pose, tracks, motion = (ONES, np.full(2, 0.3)), ONES, np.zeros(3), np.zeros(2), []
     for k, eta in enumerate(true_eta):
-        reading = observer.read(observer.params, memory)
-        known = (reading.mean[5:7], reading.std[5:7]) if compensate else (ONES, NONE)
-        asked = track_speed_step(ROBOT, SETTINGS, used, (forward, turn), *known, DT_S)
+        assumed = known if compensate else (ONES, NONE)
+        asked = track_speed_step(ROBOT, SETTINGS, used, (forward, turn), *assumed, DT_S)
         used = asked.eta
         ground = eta * tracks
         speed, rate = ground.mean(), (ground[1] - ground[0]) / (2 * D)
@@ -53,7 +51,8 @@ def closed_loop(true_eta, compensate, seed=0, forward=0.5, turn=0.1, lag_s=0.1):
         row = np.r_[tracks, np.full(3, np.nan), rate + 0.002 * rng.standard_normal()]
         if k % 5 == 0:
             row[2:5] = pose + rng.standard_normal(3) * [0.02, 0.02, 0.009]
-        memory = observer.step(observer.params, memory, row, DT_S)
+        output = observer.step(row, DT_S)
+        known = output.mean[5:7], output.std[5:7]
         motion.append([speed, rate])
     return np.array(motion)
 

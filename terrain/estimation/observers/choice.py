@@ -3,52 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
 
 from terrain.errors import ConfigError
-from terrain.estimation.observers.family import Observer
-from terrain.estimation.observers.plain_odometry import (
-    encoder_odometry_observer,
-    endo_odometry_observer,
-    gyrodometry_observer,
-)
-from terrain.estimation.observers.sideslip_dynamic import sideslip_dynamic_observer
-from terrain.estimation.observers.sideslip_kinematic import sideslip_kinematic_observer
-from terrain.estimation.observers.sideslip_multi import sideslip_multi_observer
-from terrain.estimation.observers.slip_learning import slip_learning_observer
-from terrain.estimation.observers.slip_model import SlipModel
-from terrain.estimation.observers.slip_odometry import slip_odometry_observer
-from terrain.estimation.observers.tracked import tracked_observer
-from terrain.estimation.observers.tracked_settings import TrackedSettings
-from terrain.robots import BicycleRobot, Robot, TrackedRobot
+from terrain.estimation.observers import sideslip
+from terrain.estimation.observers.observer import Observer
+from terrain.estimation.observers.slip_model import SlipModel, unknown_ground
+from terrain.estimation.observers.slip_odometry import SlipOdometry, plain_odometry
+from terrain.estimation.observers.tracked import TrackedObserver
+from terrain.robots import BicycleRobot, Robot
 
-IN_MANOEUVRES = TrackedSettings(observation_gain_ps=(2.0, 2.0, 2.0), normalised=True, eta_walk_ratio=0.03)
-"""Gains of the adaptive observer for logs of any driving: as fast at every speed, and efficiencies that
-change by a tenth within some seconds, as from straight motion to a turn.  Squared errors over their variance
-are then 1 to 2 in manoeuvres and well below 1 in steady motion.  The paper's gains, for slip that stays as it
-is, are the defaults of :class:`~terrain.estimation.observers.tracked_settings.TrackedSettings`."""
+PLAIN = ("encoder-odometry", "gyrodometry", "endo")
+"""Odometry that slip-compensated odometry is compared with."""
 
-OF_TRACKED: Mapping[str, Callable[[TrackedRobot, SlipModel], Observer]] = {
-    "tracked": lambda robot, _: tracked_observer(robot, IN_MANOEUVRES),
-    "slip-odometry": slip_odometry_observer,
-    "slip-learning": lambda robot, model: slip_learning_observer(robot),
-    "encoder-odometry": lambda robot, model: encoder_odometry_observer(robot, track_ratio=model.track_ratio),
-    "gyrodometry": lambda robot, _: gyrodometry_observer(robot),
-    "endo": lambda robot, model: endo_odometry_observer(robot, model.turning_exponent),
+
+def _sideslip(name: str, robot: BicycleRobot, _: SlipModel) -> Observer:
+    return sideslip.Sideslip(robot, name)
+
+
+OBSERVERS_OF_DRIVE: Mapping[str, Mapping[str, Callable[[Any, SlipModel], Observer]]] = {
+    "tracked": {
+        "tracked": lambda robot, _: TrackedObserver(robot),
+        "slip-odometry": SlipOdometry,
+        "slip-learning": lambda robot, _: SlipOdometry(robot, unknown_ground(), name="slip-learning"),
+        **{name: partial(plain_odometry, name) for name in PLAIN},
+    },
+    "bicycle": {name: partial(_sideslip, name) for name in sideslip.SETTINGS},
 }
-"""Observers of tracked robots: the adaptive one, slip-compensated odometry by a slip model, the same that
-finds its model by fixes, and the odometry that it is compared with."""
-
-OF_CARS: Mapping[str, Callable[[BicycleRobot], Observer]] = {
-    "sideslip-kinematic": sideslip_kinematic_observer,
-    "sideslip-dynamic": sideslip_dynamic_observer,
-    "sideslip-multi": sideslip_multi_observer,
-}
-"""Observers of car-like robots."""
+"""Observers of each drive, from a robot and its slip model."""
 
 BY_MODEL = ("slip-odometry", "endo")
 """Observers that are nothing without a slip model."""
 
-OBSERVERS: tuple[str, ...] = (*OF_TRACKED, *OF_CARS)
+OBSERVERS: tuple[str, ...] = tuple(name for known in OBSERVERS_OF_DRIVE.values() for name in known)
 """Names of all observers."""
 
 
@@ -58,20 +46,15 @@ def observers_of(robot: Robot) -> tuple[str, ...]:
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> observers_of(load_robot("adap2e"))
-    ('sideslip-kinematic', 'sideslip-dynamic', 'sideslip-multi')
-    >>> observers_of(load_robot("husky"))
-    ()
+    >>> observers_of(load_robot("adap2e")), observers_of(load_robot("husky"))
+    (('sideslip-kinematic', 'sideslip-dynamic', 'sideslip-multi'), ())
     """
-    if isinstance(robot, TrackedRobot):
-        known = tuple(OF_TRACKED)
-    else:
-        known = tuple(OF_CARS) if isinstance(robot, BicycleRobot) else ()
-    return tuple(name for name in known if name in robot.filters) if robot.filters else known
+    known = OBSERVERS_OF_DRIVE.get(robot.drive, {})
+    return tuple(name for name in known if not robot.filters or name in robot.filters)
 
 
 def make_observer(name: str, robot: Robot, slip_model: SlipModel | None = None) -> Observer:
-    """Return an observer of a robot.
+    """Return an observer of a robot, before its first step.
 
     Parameters
     ----------
@@ -98,12 +81,9 @@ def make_observer(name: str, robot: Robot, slip_model: SlipModel | None = None) 
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: {fits}"
         )
-    if isinstance(robot, BicycleRobot):
-        return OF_CARS[name](robot)
     if slip_model is None and name in BY_MODEL:
         raise ConfigError(
             f"filter {name!r} needs a slip model (--slip-model), which terrain calibrate --what odometry finds; "
             "slip-learning finds its own by fixes"
         )
-    assert isinstance(robot, TrackedRobot)
-    return OF_TRACKED[name](robot, slip_model or SlipModel())
+    return OBSERVERS_OF_DRIVE[robot.drive][name](robot, slip_model or SlipModel())

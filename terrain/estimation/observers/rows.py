@@ -1,4 +1,4 @@
-"""What observers take at a tick: the samples of all streams, brought to the ticks of the wheels.
+"""What observers take at a tick: the samples of all streams, brought to the ticks of the wheels; and observers live.
 
 A tick is a sample of the wheels.  Of the IMU a row has the means of the samples since the tick before, or
 the last one for up to :data:`HELD_S`; of the steering the last one.  A fix, a pose or a position of
@@ -11,13 +11,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.feed import TICK_S
-from terrain.records import Array, RunLog
+from terrain.estimation.observers.observer import Observer, ObserverStatus
+from terrain.extension import Correction
+from terrain.records import Array, Reading, RunLog
 from terrain.robots import Robot
 
 ROWS: tuple[str, ...] = (
@@ -71,7 +74,6 @@ class RowFeed:
 
     Attributes
     ----------
-    rows : as given
     dropped : samples left out, as counts by stream and kind: not later than the one before (ten in a row that
         are a second behind are a clock that was set: all begins anew), late or inaccurate fixes, and what
         waited in vain for the wheels
@@ -88,65 +90,63 @@ class RowFeed:
             raise ConfigError(f"channels of 'wheels' are {list(wheels)}: {lacking[0]!r} must be among them")
         self._speeds = [(wheels.index(name), name) for name in robot.rate_channels]
         self._places = {
-            stream: [
-                (k, channels[stream].index(name)) for k, name in enumerate(names) if name in channels[stream]
-            ]
+            stream: [channels[stream].index(name) if name in channels[stream] else None for name in names]
             for stream, names in CHANNELS.items()
             if stream in channels
         }
-        self.rows = rows
-        self._pending: dict[str, list[tuple[float, list[float]]]] = {name: [] for name in self._places}
-        self._last_s = dict.fromkeys(self._places, -math.inf)
-        self._held: dict[str, list[tuple[float, float]]] = {}
+        self._rows = rows
         self._heading = (-math.inf, math.nan)
-        self._n_behind: dict[str, int] = {}
-        self._tick_s = -math.inf
         self.dropped: Counter[str] = Counter()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._pending: dict[str, list[tuple[float, list[float]]]] = {name: [] for name in self._places}
+        self._last_s = dict.fromkeys((*self._places, "wheels"), -math.inf)
+        self._held = {name: [(-math.inf, math.nan)] * len(names) for name, names in CHANNELS.items()}
+        self._n_behind: Counter[str] = Counter()
 
     def push(self, stream: str, time_s: Array, values: Array) -> None:
         """Take samples (k,) and (k, channels) of a stream beside the wheels; others are not looked at."""
         if stream not in self._places:
             return
         for stamp_s, sample in zip(time_s.tolist(), values.tolist(), strict=True):
-            if not math.isfinite(stamp_s) or not stamp_s > self._last_s[stream]:
-                self._behind(stream, stamp_s)
+            if not self._follows(stream, stamp_s):
                 continue
-            self._last_s[stream] = stamp_s
-            known = [math.nan] * len(CHANNELS[stream])
-            for k, column in self._places[stream]:
-                known[k] = sample[column] if math.isfinite(sample[column]) else math.nan
+            known = [math.nan if place is None else sample[place] for place in self._places[stream]]
             waiting = self._pending[stream]
-            waiting.append((stamp_s, known))
+            waiting.append((stamp_s, [value if math.isfinite(value) else math.nan for value in known]))
             if waiting[0][0] < stamp_s - WAITING_S:
                 self.dropped[f"{stream}: no wheels came"] += 1
                 del waiting[0]
 
     def tick(self, time_s: float, wheels: Array) -> Array | None:
         """Return the row (m,) at a sample of the wheels; None where that is not later than the one before."""
-        if not math.isfinite(time_s) or not time_s > self._tick_s:
-            self._behind("wheels", time_s)
+        if not self._follows("wheels", time_s):
             return None
-        self._tick_s, self._n_behind["wheels"] = time_s, 0
+        self._n_behind["wheels"] = 0
         row = dict.fromkeys(ROWS, math.nan)
-        for column, name in self._speeds:
-            row[name] = float(wheels[column])
-        row["steer_front_rad"] = self._last("steering", time_s)[0]
-        row |= zip(_IMU_ROWS, self._mean("imu", time_s), strict=True)
+        row |= {name: float(wheels[column]) for column, name in self._speeds}
+        row["steer_front_rad"] = self._means("steering", time_s, last=True)[0]
+        row |= zip(_IMU_ROWS, self._means("imu", time_s), strict=True)
         speeds = [row[name] for _, name in self._speeds]
         row |= self._fix(time_s, sum(speeds) / len(speeds))
-        return np.array([row[name] for name in self.rows])
+        return np.array([row[name] for name in self._rows])
 
-    def _behind(self, stream: str, stamp_s: float) -> None:
-        """Count a sample that is not later than the one before; many in a row are a clock that was set."""
+    def _follows(self, stream: str, stamp_s: float) -> bool:
+        """Return whether a sample is later than the one before; count it where it is not.
+
+        Many in a row that are far behind are a clock that was set.
+        """
+        before_s = self._last_s[stream]
+        if math.isfinite(stamp_s) and stamp_s > before_s:
+            self._last_s[stream] = stamp_s
+            return True
         self.dropped[f"{stream}: not later than the sample before"] += 1
-        self._n_behind[stream] = self._n_behind.get(stream, 0) + 1 if math.isfinite(stamp_s) else 0
-        before_s = self._tick_s if stream == "wheels" else self._last_s[stream]
-        if self._n_behind[stream] < CLOCK_SET_SAMPLES or before_s - stamp_s < CLOCK_SET_S:
-            return
-        self.dropped["time: clock set"] += 1
-        self._tick_s, self._last_s = -math.inf, dict.fromkeys(self._places, -math.inf)
-        self._pending, self._held = {name: [] for name in self._places}, {}
-        self._n_behind = {}
+        self._n_behind[stream] = self._n_behind[stream] + 1 if math.isfinite(stamp_s) else 0
+        if self._n_behind[stream] >= CLOCK_SET_SAMPLES and before_s - stamp_s >= CLOCK_SET_S:
+            self.dropped["time: clock set"] += 1
+            self._begin()
+        return False
 
     def _taken(self, stream: str, time_s: float) -> list[tuple[float, list[float]]]:
         """Take the samples that came by a time out of those that wait."""
@@ -156,43 +156,34 @@ class RowFeed:
         del waiting[:n]
         return taken
 
-    def _last(self, stream: str, time_s: float) -> list[float]:
-        for stamp_s, known in self._taken(stream, time_s):
-            if not math.isnan(known[0]):
-                self._held[stream] = [(stamp_s, known[0])]
-        return self._standing(stream, time_s)
-
-    def _mean(self, stream: str, time_s: float) -> list[float]:
-        """Return the mean of what is known of each channel since the tick before; else the last known."""
-        taken = self._taken(stream, time_s)
-        means = self._standing(stream, time_s)
-        held = self._held.setdefault(stream, [(-math.inf, math.nan)] * len(CHANNELS[stream]))
-        for k in range(len(means)):
+    def _means(self, stream: str, time_s: float, *, last: bool = False) -> list[float]:
+        """Return mean, or last, of what is known of each channel since the tick before; else the last known, held."""
+        taken, held = self._taken(stream, time_s), self._held[stream]
+        means = []
+        for k in range(len(held)):
             known = [(stamp_s, sample[k]) for stamp_s, sample in taken if not math.isnan(sample[k])]
             if known:
                 held[k] = known[-1]
-                means[k] = sum(value for _, value in known) / len(known)
+            stamp_s, value = held[k]
+            if known and not last:
+                value = sum(value for _, value in known) / len(known)
+            means.append(value if time_s - stamp_s <= HELD_S or (known and not last) else math.nan)
         return means
-
-    def _standing(self, stream: str, time_s: float) -> list[float]:
-        """Return the last sample of each channel while it stands for one that is missing."""
-        held = self._held.get(stream, [(-math.inf, math.nan)] * len(CHANNELS[stream]))
-        return [value if time_s - stamp_s <= HELD_S else math.nan for stamp_s, value in held]
 
     def _known(self, stream: str, time_s: float) -> tuple[float, list[float]] | None:
         """Return the last sample since the tick before that is known, accurate and not late; None without."""
-        found = None
-        for stamp_s, known in self._taken(stream, time_s):
-            needed = known[:2] if stream == "gnss" else known
+        last = None
+        for stamp_s, sample in self._taken(stream, time_s):
+            needed = sample[:2] if stream == "gnss" else sample
             if any(math.isnan(value) for value in needed):
                 continue
             if time_s - stamp_s > LATE_S:
                 self.dropped[f"{stream}: late"] += 1
-            elif stream == "gnss" and known[2] > INACCURATE_M:
+            elif stream == "gnss" and sample[2] > INACCURATE_M:
                 self.dropped["gnss: inaccurate"] += 1
             else:
-                found = (stamp_s, known)
-        return found
+                last = (stamp_s, sample)
+        return last
 
     def _fix(self, time_s: float, speed_mps: float) -> dict[str, float]:
         """Return position and heading of the last fix since the tick before, brought to this one."""
@@ -214,39 +205,141 @@ class RowFeed:
         return {"position_x_m": x, "position_y_m": y, "yaw_rad": yaw}
 
 
-def feed_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> RowFeed:
-    """Return the feed for a whole run, by the channels that it has."""
-    return RowFeed(robot, rows, {name: stream.channels for name, stream in run.streams.items()})
-
-
-def rows_of(run: RunLog, feed: RowFeed) -> tuple[Array, Array]:
-    """Return the times (n,) and rows (n, m) of all ticks of a run; as :func:`ticks`."""
-    found = list(ticks(run, feed))
-    rows = np.array([row for _, row in found]).reshape(len(found), len(feed.rows))
-    return np.array([time_s for time_s, _ in found]), rows
-
-
-def ticks(run: RunLog, feed: RowFeed) -> Iterator[tuple[float, Array]]:
-    """Yield time and row of each tick of a whole run, as they would come live.
+def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Array, dict[str, int]]:
+    """Return times (n,) and rows (n, m) of all ticks of a run, as they would come live, and what was dropped.
 
     Raises
     ------
+    ConfigError
+        if the wheels have no speed that the observer takes.
     DataError
         if the run has no wheels.
     """
     if "wheels" not in run.streams or len(run.streams["wheels"]) == 0:
         raise DataError(f"{run.run_id}: it has no stream wheels")
-    wheels = run.streams["wheels"]
+    feed = RowFeed(robot, rows, {name: stream.channels for name, stream in run.streams.items()})
+    wheels, times, found = run.streams["wheels"], [], []
     others = {name: run.streams[name] for name in CHANNELS if name in run.streams}
-    due_s = wheels.time_s + TICK_S
-    edges = {name: np.searchsorted(stream.time_s, due_s, side="right") for name, stream in others.items()}
+    edges = {
+        name: np.searchsorted(stream.time_s, wheels.time_s + TICK_S, side="right").tolist()
+        for name, stream in others.items()
+    }
     before = dict.fromkeys(others, 0)
     for k, time_s in enumerate(wheels.time_s.tolist()):
         for name, stream in others.items():
-            new = slice(before[name], int(edges[name][k]))
+            new = slice(before[name], edges[name][k])
             if new.start < new.stop:
                 feed.push(name, stream.time_s[new], stream.values[new])
                 before[name] = new.stop
         row = feed.tick(time_s, wheels.values[k])
         if row is not None:
-            yield time_s, row
+            times.append(time_s)
+            found.append(row)
+    return np.array(times), np.array(found).reshape(len(found), len(rows)), dict(feed.dropped)
+
+
+class LiveObserverEstimate(NamedTuple):
+    """What is known at one tick; arrays are the caller's to keep.
+
+    Parameters
+    ----------
+    time_s : stamp of the wheels
+    mean, std, slip, slip_std : as of :class:`~terrain.estimation.observers.observer.ObserverOutput`
+    status : of the estimates
+    """
+
+    time_s: float
+    mean: Array
+    std: Array
+    slip: Array
+    slip_std: Array
+    status: ObserverStatus
+
+
+class LiveObserver:
+    """Slip of a robot from samples as they come; the numbers are those of a whole log.
+
+    Parameters
+    ----------
+    observer : any, before its first step
+    robot : whose it is, corrected
+    channels : names of the columns of the readings of each stream
+    correction : takes the effects of an extended robot off what arrives, see
+        :func:`terrain.extension.correct_live`
+
+    Raises
+    ------
+    ConfigError
+        if the wheels have no speed that the observer takes.
+    """
+
+    too_late = -math.inf, math.nan
+    """Samples that come late are left out, and counted, one by one."""
+
+    filter: None = None
+    """No memory of it is kept over a restart: it starts from its first samples."""
+
+    def __init__(
+        self,
+        observer: Observer,
+        robot: Robot,
+        channels: Mapping[str, tuple[str, ...]],
+        correction: Correction | None = None,
+    ) -> None:
+        self.observer, self._channels, self._correction = observer, channels, correction
+        self.name, self.states = observer.name, observer.states
+        self._feed = RowFeed(robot, observer.rows, channels)
+        self._last_s = math.nan
+        self.latest: LiveObserverEstimate | None = None
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What was not taken so far, as counts by stream and kind."""
+        return dict(self._feed.dropped)
+
+    def step(self, readings: Mapping[str, Reading]) -> list[LiveObserverEstimate]:
+        """Take in what arrived, and return an estimate for each sample of the wheels.
+
+        Parameters
+        ----------
+        readings : by stream; any may be missing, late, repeated or wrong, and streams without names of
+            channels are not looked at
+        """
+        if not isinstance(readings, Mapping):
+            return []
+        arrays = {
+            name: self._arrays(name, reading) for name, reading in readings.items() if name in self._channels
+        }
+        wheels = arrays.pop("wheels", None)
+        for name, samples in arrays.items():
+            if samples is not None:
+                self._feed.push(name, *samples)
+        estimates = []
+        for time_s, sample in () if wheels is None else zip(wheels[0].tolist(), wheels[1], strict=True):
+            row = self._feed.tick(time_s, sample)
+            if row is not None:
+                dt_s = (
+                    0.0 if math.isnan(self._last_s) else max(time_s - self._last_s, 0.0)
+                )  # a clock may be set
+                self._last_s = time_s
+                output = self.observer.step(row, dt_s)
+                self.latest = LiveObserverEstimate(time_s, *output[:4], ObserverStatus(output.status))
+                estimates.append(self.latest)
+        return estimates
+
+    def settle(self, *, all_of_them: bool = False) -> list[LiveObserverEstimate]:
+        """Return nothing: every estimate has settled when it is returned."""
+        return []
+
+    def _arrays(self, name: str, reading: Reading) -> tuple[Array, Array] | None:
+        """Return stamps and values; None, counted, where they are no samples of the stream."""
+        try:
+            time_s, values = (np.asarray(part, dtype=np.float64) for part in reading)
+        except (TypeError, ValueError, OverflowError):
+            time_s = values = np.empty(0)
+        if time_s.ndim != 1 or values.shape != (time_s.size, len(self._channels[name])):
+            self._feed.dropped[f"{name}: unreadable"] += 1
+            return None
+        if self._correction is None:
+            return time_s, values
+        return self._correction(name, self._channels[name], time_s, values)

@@ -13,8 +13,8 @@ Speeds v of the tracks, the mean :math:`\bar v` of their magnitudes, yaw rate w,
 
 - *Longitudinal, straight*: (22), a slip ratio linear in the grade, with the compaction as its intercept.  It
   needs no switch: each track has to overcome them in a turn as well.
-- *Longitudinal, turning*: Endo's law (27), :mod:`~terrain.estimation.observers.endo`, shares what slip is
-  left. D and kappa both vanish with the turn, so that its part falls with the square of it.
+- *Longitudinal, turning*: Endo's law (:func:`slip_imbalance`) shares what slip is left.  D and kappa both vanish with
+  the turn, so that its part falls with the square of it.
 - *Drift in a turn*, this project's: the ground's friction is spent on turning, so that gravity moves the
   robot downhill at a speed in proportion to the yaw rate, by :math:`\lambda_x, \lambda_y`.  On a grade the
   load moves to the rear, and the robot turns about a point that lies :math:`c\, grade` behind its middle.
@@ -44,7 +44,6 @@ from typing import Any
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation.observers.endo import slip_imbalance
 from terrain.kernels import njit
 from terrain.records import Array, read_only
 
@@ -162,6 +161,62 @@ def model_of(vector: Array, **also: Any) -> SlipModel:
     return SlipModel(**first, angle=angle, track_ratio=ratio, **also)
 
 
+PRIOR_STD = np.array([0.3, 0.1, 1.0, 0.3, 1.0, 0.3, 0.2, 0.3, 3.0, 1.0, 1.0, 2.0, 1.0, 0.5, 2.0, 0.5])
+"""Of :data:`PARAMETERS` on unknown ground, wide around the values printed by Yamauchi et al. (converted from
+degrees) and those of sand."""
+
+
+def unknown_ground() -> SlipModel:
+    """Return what is assumed of a ground that was never driven on: wide in every number.
+
+    Examples
+    --------
+    >>> unknown_ground().turning_exponent
+    0.85
+    """
+    return SlipModel(
+        turning_exponent=0.85,
+        track_ratio=1.5,
+        covariance=np.diag(PRIOR_STD**2),
+        slip_std_ratio=0.03,
+        angle_std_rad=0.05,
+        found="unknown ground",
+    )
+
+
+@njit
+def slip_imbalance(speed_left_mps: float, speed_right_mps: float, exponent: float) -> float:
+    r"""Return kappa of Endo's law (27), the right track's part of the slip of a turn less the left one's.
+
+    With the slip speeds :math:`u = v \alpha` (what a track moves faster than the ground under it), (7) and (27) are
+    :math:`u_r - u_l = D` and :math:`\alpha_l / \alpha_r = -\mathrm{sgn}(v_r v_l) |v_r / v_l|^n`.  **Corrected**: (27)
+    is singular where a track stops.  Written in slip speeds the signs cancel, and
+
+    .. math::
+        u_r = D \frac{a}{a + b}, \quad u_l = -D \frac{b}{a + b}, \qquad
+        a = |v_r|^{1 - n},\; b = |v_l|^{1 - n} \;(n \le 1), \quad
+        a = |v_l|^{n - 1},\; b = |v_r|^{n - 1} \;(n > 1),
+
+    regular for all speeds that are not both 0.  The speed of the body needs only
+
+    .. math:: \kappa = \frac{a - b}{a + b} = \tanh\left(\frac{1 - n}{2} \ln \left|\frac{v_r}{v_l}\right|\right),
+
+    one expression for all n, within [-1, 1]: 1 where the left track stands and n < 1, so that the right one takes all
+    of the slip; 0 for n = 1 and for equal speeds, stopped tracks included.
+
+    Examples
+    --------
+    >>> slip_imbalance(0.0, 0.1, 0.85), slip_imbalance(0.1, 0.0, 0.85), round(slip_imbalance(0.05, 0.1, 0.85), 4)
+    (1.0, -1.0, 0.0519)
+    """
+    left, right = abs(speed_left_mps), abs(speed_right_mps)
+    if left == right or exponent == 1.0:
+        return 0.0
+    if left == 0.0 or right == 0.0:
+        return math.copysign(1.0, (1.0 - exponent) * (right - left))
+    return math.tanh(0.5 * (1.0 - exponent) * (math.log(right) - math.log(left)))
+
+
 @njit
 def turn_weight(speed_left_mps: float, speed_right_mps: float) -> float:
     """Return eta, 0 in straight motion and 1 in a tight turn; 0 where both tracks stand.
@@ -227,9 +282,8 @@ def body_velocity(
     yaw_rate_radps: float,
     tilt_rad: tuple[float, float],
     displacement_rad: float,
-    slopes: Array,
-) -> tuple[float, float, float, float]:
-    """Return V_x, V_y, dV_x/dw and dV_y/dw, and write the derivatives (2, N_PARAMETERS) of the first two.
+) -> tuple[float, float]:
+    """Return V_x and V_y.
 
     Parameters
     ----------
@@ -239,26 +293,16 @@ def body_velocity(
     yaw_rate_radps : w, without the gyro's bias
     tilt_rad : roll, pitch
     displacement_rad : yaw since the turn began
-    slopes : (2, N_PARAMETERS); those by the track ratio and the gyro's bias, which act through w, stay 0
-
-    Notes
-    -----
-    dV_y/dw is that at constant beta.
     """
     left, right = speeds_mps
     roll, grade, turning = tilt_rad[0], -tilt_rad[1], abs(yaw_rate_radps)
-    direction = math.copysign(1.0, yaw_rate_radps)
-    kappa, by_exponent = slip_imbalance(left, right, theta[EXPONENT])
-    kept, climbed = 1.0 - theta[COMPACTION], theta[GRADE] * grade
+    kappa = slip_imbalance(left, right, theta[EXPONENT])
+    rolling, climbed = 1.0 - theta[COMPACTION], theta[GRADE] * grade
     mean, half = 0.5 * (left + right), 0.5 * (right - left)
     mean_size, half_size = 0.5 * (abs(left) + abs(right)), 0.5 * (abs(right) - abs(left))
-    lost = kept * half - climbed * half_size - half_track_m * yaw_rate_radps
-    v_x = kept * mean - climbed * mean_size - lost * kappa
+    lost = rolling * half - climbed * half_size - half_track_m * yaw_rate_radps
+    v_x = rolling * mean - climbed * mean_size - lost * kappa
     v_x -= turning * theta[TURN_GRADE] * grade + mean_size * theta[RUN_SLIP]
-    slopes[:] = 0.0
-    slopes[0, EXPONENT], slopes[0, COMPACTION] = -lost * by_exponent, half * kappa - mean
-    slopes[0, GRADE], slopes[0, TURN_GRADE] = grade * (half_size * kappa - mean_size), -turning * grade
-    slopes[0, RUN_SLIP] = -mean_size
     regressors = np.empty(N_ANGLE)
     angle_regressors(
         speeds_mps, yaw_rate_radps, roll, tilt_rad[1], displacement_rad, half_track_m, regressors
@@ -267,18 +311,6 @@ def body_velocity(
     beta = -(1.0 - tight) * math.atan(theta[SIDE] * roll)
     for i in range(N_ANGLE):
         beta += tight * regressors[i] * theta[ANGLE + i]
-    held = min(max(beta, -STEEPEST_RAD), STEEPEST_RAD)
-    tangent, sign = math.tan(held), math.copysign(1.0, v_x)
-    by_beta = abs(v_x) * (1.0 + tangent * tangent) if held == beta else 0.0
-    for i in range(N_PARAMETERS):
-        slopes[1, i] = sign * tangent * slopes[0, i]
-    for i in range(N_ANGLE):
-        slopes[1, ANGLE + i] += by_beta * tight * regressors[i]
-    slopes[1, SIDE] -= by_beta * (1.0 - tight) * roll / (1.0 + (theta[SIDE] * roll) ** 2)
-    slopes[1, TURN_SIDE], slopes[1, TURN_SHIFT] = -turning * roll, yaw_rate_radps * grade
-    slopes[1, RUN_ANGLE] = mean_size
-    v_y = abs(v_x) * tangent - theta[TURN_SIDE] * turning * roll + theta[TURN_SHIFT] * yaw_rate_radps * grade
-    v_y += mean_size * theta[RUN_ANGLE]
-    by_rate = half_track_m * kappa - direction * theta[TURN_GRADE] * grade
-    drift_by_rate = theta[TURN_SHIFT] * grade - direction * theta[TURN_SIDE] * roll
-    return v_x, v_y, by_rate, sign * tangent * by_rate + drift_by_rate
+    v_y = abs(v_x) * math.tan(min(max(beta, -STEEPEST_RAD), STEEPEST_RAD))
+    v_y += theta[TURN_SHIFT] * yaw_rate_radps * grade - theta[TURN_SIDE] * turning * roll
+    return v_x, v_y + mean_size * theta[RUN_ANGLE]

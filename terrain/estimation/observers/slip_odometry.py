@@ -1,47 +1,69 @@
-r"""Slip-compensated odometry of a tracked robot (Yamauchi et al., ROBOMECH Journal 2017).
+r"""Odometry of a tracked robot by a slip model, which fixes correct: one filter, of which five odometries are settings.
 
-State: the pose :math:`x, y, \theta` in the frame of the start, which moves by (5) to (7),
+State: the pose :math:`x, y, \theta`, which moves by (5) to (7) of Yamauchi et al. (ROBOMECH Journal 2017),
 
 .. math:: x' = V_x \cos\theta - V_y \sin\theta, \quad y' = V_x \sin\theta + V_y \cos\theta, \quad \theta' = w,
 
-with the velocity that :mod:`~terrain.estimation.observers.slip_model` makes of the speeds of the tracks, the
-gyro and the tilt; steps are integrated as arcs.  The yaw rate is that of the gyro, or, where it is absent or
-agrees with the tracks within a threshold (gyrodometry), that of the tracks over their effective distance.
+with the velocity that :mod:`~terrain.estimation.observers.slip_model` makes of the speeds of the tracks, the gyro and
+the tilt, along arcs; all parameters of that model, the errors of the run and the bias of the gyro, which do not change
+within a run; and the residuals of V_x and V_y, which do, over their correlation time.  So an error that a whole run has
+in common grows with the distance, and noise with its root.
 
-The covariance is that of the pose and of all parameters p of the model, the errors of the run and the bias
-of the gyro beside them, which do not change within a run:
+====================  ============================  ====================================================
+odometry              slip model                    yaw rate
+====================  ============================  ====================================================
+``encoder-odometry``  none                          of the tracks, over their effective distance
+``gyrodometry``       none                          of the gyro where the two differ by a threshold, which in
+                                                    a slipping turn is always (Borenstein and Feng 1996)
+``endo``              longitudinal slip of turns    of the gyro (Endo et al. 2007)
+``slip-odometry``     identified before             of the gyro
+``slip-learning``     identified while driving      of the gyro
+====================  ============================  ====================================================
 
-.. math::
-    P \leftarrow F P F^T + Q, \qquad
-    F = \begin{pmatrix} F_{pose} & \partial\,step/\partial p \\ 0 & 1 \end{pmatrix}
+The first three know nothing of the slip that they lack: their standard deviations hold the errors assumed in
+:data:`UNKNOWN_SLIP_RATIO` and :data:`UNKNOWN_ANGLE_RAD`, one of each a run.  Without a gyro the tracks stand in.
 
-Q holds the noise of gyro and encoders, and the residuals of the slip model with their correlation time.
-So an error that a whole run has in common grows with the distance, and noise with its root.
+**Learning** (future work of Yamauchi et al.).  The covariance is that of the pose *and* of the parameters, so that a
+fix of the position measures both; fixes may be sparse, and a loop closure is a fix as well.  What is observable:
 
-**Corrected** against the paper: (27) without its singular points, (26) in reverse, (22) by the grade; see
-there.
+- encoders and gyro alone give :math:`D = v_r - v_l - 2 d w`, hence the effective distance of the tracks and,
+  *with n assumed*, the slip of each track; they give neither n nor any slip that both tracks share;
+- positions give the straight slip while driving straight on grades, the side slip on side slopes, and n and
+  the regression (28) in turns, each by what those motions excite;
+- sub-tracks are no part of the model.
+
+A parameter whose standard deviation has not fallen to half of that at the start is not observed: its mean is
+NaN outside, while the filter goes on with what it has.
+
+**Corrected** against the paper: (27) without its singular points, (26) in reverse, (22) by the grade; see there.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from numba import types
 
 from terrain.errors import ConfigError
-from terrain.estimation.observers.arcs import arc_displacement
-from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus
+from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
+from terrain.estimation.observers.observer import (
+    LONGEST_STEP_S,
+    FilterObserver,
+    ObserverOutput,
+    ObserverStatus,
+)
 from terrain.estimation.observers.slip_model import (
     GYRO_BIAS,
     N_MODEL,
     N_PARAMETERS,
+    PARAMETERS,
     RUN_ANGLE,
     RUN_SLIP,
     TRACK_RATIO,
     SlipModel,
     body_velocity,
+    model_of,
     next_displacement,
 )
 from terrain.kernels import njit
@@ -49,32 +71,35 @@ from terrain.records import Array
 from terrain.robots import TrackedRobot
 
 ROWS = ("speed_left_mps", "speed_right_mps", "yaw_rate_radps", "roll_rad", "pitch_rad")
-STATES = (
-    *("position_x_m", "position_y_m", "yaw_rad"),
-    *("speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
-)
+FIX_ROWS = ("position_x_m", "position_y_m", "yaw_rad")
+STATES = (*FIX_ROWS, "speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 SLIPS = ("slip_left_ratio", "slip_right_ratio", "slip_body_rad")
-
-LONGEST_STEP_S = 1.0
-"""Over a longer gap the tracks may have done anything."""
 
 BLIND_MPS = 0.5
 """Of tracks whose speeds are not known: slow robots too may have begun to drive."""
 LOST_M = 1e6
-"""Standard deviation above which a position is not known at all."""
-
+"""Standard deviation above which a position is not known at all; a position beyond is none in a local frame."""
 FASTEST_MPS, FASTEST_RADPS = 20.0, 20.0
 """More than a track or a robot can; such a reading is wrong."""
+TURNING_RADPS = 0.05
+"""Slower, a yaw rate shows nothing of the distance of the tracks."""
+OBSERVED_RATIO = 0.5
+"""Of its standard deviation at the start: a parameter below it is observed."""
+UNKNOWN_SLIP_RATIO, UNKNOWN_ANGLE_RAD = 0.1, 0.1
+"""Slip that odometry without a slip model may miss; assumed, what a grade of 10 degrees does on sand."""
+TRACK_STD_RATIO = 0.2
+"""Of an effective distance of the tracks that was not identified on this ground; assumed."""
+GYRODOMETRY_THRESHOLD_RADPS = 0.01
+"""Above the drift of the gyro and the noise of the encoders, far under what slip makes in a turn."""
 
-N = 3 + N_PARAMETERS
-POSE, VELOCITY, TILT, DISPLACEMENT, STATUS = 0, 3, 6, 8, 9
-BELTS, GROUND, VARIANCE = 10, 12, 14
-THETA = 17
-COVARIANCE = THETA + N_PARAMETERS
-SIZE = COVARIANCE + N * N
-"""Memory: pose, velocity, tilt last known, yaw since the turn began, status, speeds of belts and of the
-ground under them, variances of the velocity, parameters, covariance of pose and
-parameters."""
+FILTER_SETTINGS = FilterSettings(gate_probability=0.999, reopen_after_s=1.0)
+"""One fix in a thousand is left out; after a second of those that are rejected the position begins anew."""
+
+_D = 3 + N_PARAMETERS + 2
+_THETA = slice(3, 3 + N_PARAMETERS)
+_MODEL = slice(3, 3 + N_MODEL)
+_RESIDUALS = slice(_D - 2, _D)
+_KNOWN_STD = 1e-6  # of what is taken as known: a filter has no state without a variance
 
 
 @dataclass(frozen=True)
@@ -89,6 +114,9 @@ class OdometrySettings:
     stand_mps : both tracks slower: the robot stands, or is pushed
     pushed_radps : yaw rate above which a robot on standing tracks is pushed
     min_speed_mps : tracks and ground slower: the slip of the track is NaN
+    fix_std_m, yaw_fix_std_rad : of a position along an axis, and of a heading
+    ratio_std : of the ratio of the tracks' yaw rate and the gyro's, from turn to turn
+    forget_s : time in which a parameter may change by its standard deviation at the start
     """
 
     gyro_threshold_radps: float = 0.0
@@ -98,298 +126,334 @@ class OdometrySettings:
     stand_mps: float = 0.003
     pushed_radps: float = 0.02
     min_speed_mps: float = 0.005
+    fix_std_m: float = 0.02
+    yaw_fix_std_rad: float = 0.02
+    ratio_std: float = 0.1
+    forget_s: float = math.inf
+
+    def __post_init__(self) -> None:
+        above = ("stand_mps", "min_speed_mps", "fix_std_m", "yaw_fix_std_rad", "ratio_std", "forget_s")
+        for name in (item.name for item in fields(self)):
+            value, is_above = getattr(self, name), name in above
+            infinite = value == math.inf and name not in ("gyro_threshold_radps", "forget_s")
+            if not (value > 0.0 or (value == 0.0 and not is_above)) or infinite:
+                accepted = "a number above zero" if is_above else "a number from zero up"
+                raise ConfigError(f"odometry: {name} is {value!r}, {accepted} is required")
 
 
-_HALF, _LENGTH = 0, 1
-_SETTINGS = 2
-(_THRESHOLD, _GYRO_STD, _BIAS_STD, _ENCODER_STD, _STAND, _PUSHED, _MIN_SPEED) = range(
-    _SETTINGS, _SETTINGS + 7
-)
-SLIP_STD, ANGLE_STD, CORRELATION = range(_SETTINGS + 7, _SETTINGS + 10)
-PARAMS_SIZE = _SETTINGS + 10
-
-_F8 = types.float64
-READ_ONLY = types.Array(_F8, 1, "C", readonly=True)
-ANY_ROW = types.Array(_F8, 1, "A", readonly=True)
-STEP = _F8[::1](READ_ONLY, READ_ONLY, ANY_ROW, _F8)
-
-
-def odometry_params(robot: TrackedRobot, model: SlipModel, settings: OdometrySettings) -> Array:
-    """Return the parameters (PARAMS_SIZE,) of a step.
-
-    Raises
-    ------
-    ConfigError
-        if a setting is negative or not a number, or a least speed is 0.
-    """
-    for each in fields(settings):
-        value = getattr(settings, each.name)
-        zero = each.name not in ("stand_mps", "min_speed_mps")
-        valid = value == value and (value >= 0.0 if zero else 0.0 < value < math.inf)
-        if not valid or (value == math.inf and each.name != "gyro_threshold_radps"):
-            accepted = "a number from zero up" if zero else "a number above zero"
-            raise ConfigError(f"odometry: {each.name} is {value!r}, {accepted} is required")
-    geometry = (robot.half_track_m, robot.contact_length_m)
-    residuals = (model.slip_std_ratio, model.angle_std_rad, model.correlation_s)
-    return np.array([*geometry, *astuple(settings), *residuals])
-
-
-def odometry_memory(model: SlipModel, settings: OdometrySettings) -> Array:
-    """Return the memory (SIZE,) at the start: at the origin, with the heading 0."""
-    start = np.zeros(SIZE)
-    start[STATUS] = ObserverStatus.STARTING.value
-    start[THETA : THETA + N_MODEL] = model.vector
-    covariance = start[COVARIANCE:].reshape(N, N)
-    covariance[3 : 3 + N_MODEL, 3 : 3 + N_MODEL] = model.covariance
-    for place, std in (
-        (RUN_SLIP, model.run_slip_std_ratio),
-        (RUN_ANGLE, model.run_angle_std_rad),
-        (GYRO_BIAS, settings.gyro_bias_std_radps),
-    ):
-        covariance[3 + place, 3 + place] = std * std
-    return start
+# Places in `params`: half the distance of the tracks, the correlation time, and as inputs those of a tick.
+_HALF, _CORRELATION, _LEFT, _RIGHT, _GYRO, _ROLL, _PITCH, _DISPLACEMENT = range(8)
+_INPUTS = ("left", "right", "gyro", "roll", "pitch", "displacement")
 
 
 @njit
-def yaw_rate_of(params: Array, theta: Array, row: Array, slopes: Array) -> tuple[float, float, int]:
-    """Return the yaw rate, the variance of its noise and a status; write its derivatives by parameters.
-
-    A gyro that is absent, or faster than a robot can turn, is replaced by the tracks.
-    """
-    by_track = 2.0 * params[_HALF] * theta[TRACK_RATIO]
-    tracks = (row[1] - row[0]) / by_track
-    slopes[:] = 0.0
-    gyro = row[2] - theta[GYRO_BIAS]
-    status = ObserverStatus.OK.value
-    if not abs(row[2]) <= FASTEST_RADPS:
-        if not math.isnan(row[2]):
-            status = ObserverStatus.REJECTED.value
-    elif abs(gyro - tracks) >= params[_THRESHOLD]:
-        slopes[GYRO_BIAS] = -1.0
-        return gyro, params[_GYRO_STD] ** 2, status
-    slopes[TRACK_RATIO] = -tracks / theta[TRACK_RATIO]
-    return tracks, 2.0 * (params[_ENCODER_STD] / by_track) ** 2, status
+def velocity(x: Array, params: Array) -> tuple[float, float, float]:
+    """Return V_x, V_y and w of a state; a gyro that is NaN is not used, and tracks of speed 0 stand."""
+    theta = x[3 : 3 + N_PARAMETERS].copy()
+    theta[RUN_SLIP] += x[_D - 2]
+    theta[RUN_ANGLE] += x[_D - 1]
+    left, right, gyro = params[_LEFT], params[_RIGHT], params[_GYRO]
+    if math.isnan(gyro):
+        rate = (right - left) / (2.0 * params[_HALF] * theta[TRACK_RATIO])
+    else:
+        rate = gyro - theta[GYRO_BIAS]
+    if left == 0.0 and right == 0.0:
+        return 0.0, 0.0, rate
+    tilt = (params[_ROLL], params[_PITCH])
+    v_x, v_y = body_velocity(theta, params[_HALF], (left, right), rate, tilt, params[_DISPLACEMENT])
+    return v_x, v_y, rate
 
 
 @njit
-def _quadratic(covariance: Array, slope: Array) -> float:
-    """Return the variance that parameters of a covariance give a quantity with these derivatives."""
-    total = 0.0
-    for i in range(N_PARAMETERS):
-        if slope[i] != 0.0:
-            for j in range(N_PARAMETERS):
-                total += slope[i] * covariance[3 + i, 3 + j] * slope[j]
-    return total
+def _move(x: Array, dt: float, params: Array, x_next: Array) -> None:
+    """Move along an arc, without error however far the body turns: a chord of sin(w dt / 2) / (w dt / 2)."""
+    v_x, v_y, rate = velocity(x, params)
+    half = 0.5 * rate * dt
+    chord = dt * (1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half)
+    cos, sin = chord * math.cos(x[2] + half), chord * math.sin(x[2] + half)
+    x_next[:] = x
+    x_next[0] += cos * v_x - sin * v_y
+    x_next[1] += sin * v_x + cos * v_y
+    x_next[2] += rate * dt
+    left = math.exp(-dt / params[_CORRELATION])
+    x_next[_D - 2], x_next[_D - 1] = left * x[_D - 2], left * x[_D - 1]
 
 
 @njit
-def _propagate(covariance: Array, moved: tuple[float, float], step_slopes: Array) -> None:
-    """Move the covariance of pose and parameters over a step that moves by (dx, dy)."""
-    by = np.zeros((3, N))
-    by[:, 3:] = step_slopes
-    by[0, 0] = by[1, 1] = by[2, 2] = 1.0
-    by[0, 2], by[1, 2] = -moved[1], moved[0]
-    rows = by @ covariance
-    pose = rows @ by.T
+def _propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
+    differentiate(_move, x, dt, params, x_next, f)
+
+
+@njit
+def _observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
     for i in range(3):
-        covariance[i, 3:] = rows[i, 3:]
-        covariance[3:, i] = rows[i, 3:]
-        for j in range(3):
-            covariance[i, j] = 0.5 * (pose[i, j] + pose[j, i])
+        z_hat[i] = x[i]
+        h[i, i] = 1.0
+    z_hat[3] = x[3 + TRACK_RATIO]
+    h[3, 3 + TRACK_RATIO] = 1.0
 
 
 @njit
-def take_tilt(after: Array, row: Array) -> bool:
-    """Take roll and pitch where they are measured, and return whether; else those last known stay."""
-    if abs(row[3]) <= 0.5 * math.pi and abs(row[4]) <= 0.5 * math.pi:
-        after[TILT], after[TILT + 1] = row[3], row[4]
-        return True
-    return False
+def _velocity_by(x: Array, _dt: float, params: Array, out: Array) -> None:
+    out[0], out[1], out[2] = velocity(x, params)
 
 
 @njit
-def _widen(params: Array, after: Array, covariance: Array, dt_s: float) -> None:
-    """Widen the pose by a motion that was not measured: as fast as the tracks were, or :data:`BLIND_MPS`."""
-    moved = max(abs(after[BELTS]), abs(after[BELTS + 1]), BLIND_MPS) * dt_s
-    for i in range(3):
-        std = math.sqrt(max(covariance[i, i], 0.0))
-        grown, most = (std + moved, LOST_M) if i < 2 else (std + moved / params[_HALF], math.pi)
-        grown = max(min(grown, most), std)
-        covariance[i, i] = grown * grown
+def _velocity_slopes(x: Array, params: Array) -> tuple[Array, Array]:
+    motion, by_x = np.empty(3), np.empty((3, _D))
+    differentiate(_velocity_by, x, 0.0, params, motion, by_x)
+    return motion, by_x
 
 
-@njit
-def advance(params: Array, after: Array, row: Array, dt_s: float) -> None:
-    """Take the measurements of a tick, and move pose and covariance in place."""
-    valid = 0.0 <= dt_s <= LONGEST_STEP_S and abs(row[0]) <= FASTEST_MPS and abs(row[1]) <= FASTEST_MPS
-    covariance = after[COVARIANCE : COVARIANCE + N * N].reshape((N, N))
-    if not valid:
-        after[STATUS] = ObserverStatus.BAD_INPUT.value
-        if 0.0 < dt_s < math.inf:
-            _widen(params, after, covariance, dt_s)
-        return
-    theta = after[THETA : THETA + N_PARAMETERS]
-    rate_slopes, slopes = np.empty(N_PARAMETERS), np.empty((2, N_PARAMETERS))
-    rate, rate_variance, status = yaw_rate_of(params, theta, row, rate_slopes)
-    if not take_tilt(after, row):
-        status = ObserverStatus.PREDICTED.value
-    belts = (row[0], row[1])
-    after[BELTS], after[BELTS + 1] = belts
-    if abs(belts[0]) <= params[_STAND] and abs(belts[1]) <= params[_STAND]:
-        _stand(params, after, covariance, rate, rate_variance, dt_s)
-        return
-    tilt = (after[TILT], after[TILT + 1])
-    v_x, v_y, x_by_rate, y_by_rate = body_velocity(
-        theta, params[_HALF], belts, rate, tilt, after[DISPLACEMENT], slopes
-    )
-    for i in range(N_PARAMETERS):
-        slopes[0, i] += x_by_rate * rate_slopes[i]
-        slopes[1, i] += y_by_rate * rate_slopes[i]
-    after[VELOCITY], after[VELOCITY + 1], after[VELOCITY + 2] = v_x, v_y, rate
-    after[GROUND], after[GROUND + 1] = v_x - params[_HALF] * rate, v_x + params[_HALF] * rate
-    after[DISPLACEMENT] = next_displacement(after[DISPLACEMENT], belts, rate, params[_LENGTH], dt_s)
-    after[STATUS] = status
-    speed = 0.5 * (abs(belts[0]) + abs(belts[1]))
-    slip_variance, side_variance = (params[SLIP_STD] * speed) ** 2, (params[ANGLE_STD] * speed) ** 2
-    encoder_variance = 0.5 * params[_ENCODER_STD] ** 2
-    after[VARIANCE] = _quadratic(covariance, slopes[0]) + slip_variance + encoder_variance
-    after[VARIANCE + 1] = _quadratic(covariance, slopes[1]) + side_variance
-    after[VARIANCE + 2] = _quadratic(covariance, rate_slopes) + rate_variance
-    if dt_s > 0.0:
-        twice = 2.0 * params[CORRELATION] * dt_s
-        noise = (
-            (slip_variance * twice + encoder_variance * dt_s * dt_s),
-            side_variance * twice,
-            rate_variance * dt_s * dt_s,
-        )
-        _move(after, covariance, slopes, rate_slopes, noise, dt_s)
-
-
-@njit
-def _stand(
-    params: Array, after: Array, covariance: Array, rate: float, rate_variance: float, dt_s: float
-) -> None:
-    """Hold the position of a robot whose tracks stand; its heading follows the gyro if it is pushed."""
-    pushed = abs(rate) > params[_PUSHED]
-    after[VELOCITY] = after[VELOCITY + 1] = 0.0
-    after[VELOCITY + 2] = rate if pushed else 0.0
-    after[GROUND] = after[GROUND + 1] = 0.0
-    after[VARIANCE] = after[VARIANCE + 1] = 0.0
-    after[VARIANCE + 2] = rate_variance
-    after[STATUS] = ObserverStatus.PUSHED.value if pushed else ObserverStatus.STANDING.value
-    if pushed:
-        after[POSE + 2] += rate * dt_s
-        covariance[2, 2] += rate_variance * dt_s * dt_s
-
-
-@njit
-def _move(
-    after: Array,
-    covariance: Array,
-    slopes: Array,
-    rate_slopes: Array,
-    noise: tuple[float, float, float],
-    dt_s: float,
-) -> None:
-    """Move the pose along its arc, and its covariance with it; ``noise`` is along, across and of the yaw."""
-    yaw, rate = after[POSE + 2], after[VELOCITY + 2]
-    moved = arc_displacement(yaw, after[VELOCITY], after[VELOCITY + 1], rate, dt_s)
-    cos, sin = math.cos(yaw + 0.5 * rate * dt_s), math.sin(yaw + 0.5 * rate * dt_s)
-    step_slopes = np.empty((3, N_PARAMETERS))
-    for i in range(N_PARAMETERS):
-        step_slopes[0, i] = dt_s * (cos * slopes[0, i] - sin * slopes[1, i])
-        step_slopes[1, i] = dt_s * (sin * slopes[0, i] + cos * slopes[1, i])
-        step_slopes[2, i] = dt_s * rate_slopes[i]
-    _propagate(covariance, moved, step_slopes)
-    covariance[0, 0] += cos * cos * noise[0] + sin * sin * noise[1]
-    covariance[1, 1] += sin * sin * noise[0] + cos * cos * noise[1]
-    covariance[0, 1] += cos * sin * (noise[0] - noise[1])
-    covariance[1, 0] = covariance[0, 1]
-    covariance[2, 2] += noise[2]
-    after[POSE] += moved[0]
-    after[POSE + 1] += moved[1]
-    after[POSE + 2] += rate * dt_s
-
-
-@njit(STEP)
-def odometry_step(params: Array, memory: Array, row: Array, dt_s: float) -> Array:
-    """Return the memory a tick later: as :data:`~terrain.estimation.observers.family.Step`."""
-    after = memory.copy()
-    advance(params, after, row, dt_s)
-    return after
-
-
-@njit(types.Tuple((_F8[::1], _F8[::1], _F8[::1], _F8[::1], types.int64))(READ_ONLY, READ_ONLY))
-def read_odometry(params: Array, memory: Array) -> tuple[Array, Array, Array, Array, int]:
-    """Return states, their standard deviations, slips, theirs, and the status of a memory."""
-    mean, std = memory[: VELOCITY + 3].copy(), np.empty(6)
-    slip, slip_std = np.full(3, np.nan), np.full(3, np.nan)
-    for i in range(3):
-        std[i] = math.sqrt(max(memory[COVARIANCE + i * (N + 1)], 0.0))
-        std[3 + i] = math.sqrt(max(memory[VARIANCE + i], 0.0))
-    status = int(memory[STATUS])
-    if status == ObserverStatus.STARTING.value:
-        return mean, std, slip, slip_std, status
-    for i in range(2):
-        belt, ground = memory[BELTS + i], memory[GROUND + i]
-        fastest = max(abs(belt), abs(ground))
-        if fastest >= params[_MIN_SPEED]:
-            slip[i] = min(max((belt - ground) / fastest, -1.0), 1.0)
-            slip_std[i] = std[3] / fastest
-    v_x, v_y = abs(mean[3]), mean[4]
-    square = v_x * v_x + v_y * v_y
-    if square >= params[_MIN_SPEED] ** 2:
-        slip[2] = math.atan2(v_y, v_x)
-        slip_std[2] = math.hypot(v_x * std[4], v_y * std[3]) / square
-    return mean, std, slip, slip_std, status
-
-
-def odometry_output(params: Array, memory: Array) -> ObserverOutput:
-    """Return what a memory holds: states, slips and their standard deviations."""
-    return ObserverOutput(*read_odometry(params, memory))
-
-
-def slip_odometry_observer(
-    robot: TrackedRobot, model: SlipModel, settings: OdometrySettings | None = None
-) -> Observer:
-    """Return the slip-compensated odometry of a tracked robot.
+class SlipOdometry(FilterObserver):
+    """An odometry of a tracked robot.
 
     Parameters
     ----------
     robot : its tracks
-    model : slip on this ground, as ``terrain calibrate --what odometry`` finds it
+    model : slip on this ground, as ``terrain calibrate --what odometry`` finds it; of ``slip-learning`` what is known
+        before
     settings : noise and limits
+    name : of the table of this module; that of ``slip-learning`` takes fixes
+    slips : those of :data:`SLIPS` that it knows
 
     Raises
     ------
     ConfigError
-        as :func:`odometry_params` does.
+        if it learns, and a parameter of the model has no standard deviation.
 
     Notes
     -----
     Statuses: ``STANDING`` and ``PUSHED`` with both tracks stopped, the pose held or turned by the gyro;
-    ``PREDICTED`` without a tilt, the last one being used; ``REJECTED`` for a yaw rate that cannot be,
-    replaced by that of the tracks; ``BAD_INPUT`` for speeds or times that cannot be, nothing being changed.
+    ``PREDICTED`` without a tilt, the last one being used; ``REJECTED`` for a yaw rate that cannot be, replaced by that
+    of the tracks, and for a fix; ``BAD_INPUT`` for speeds or times that cannot be, the pose being less certain by what
+    may have been driven.  One that learns starts at the first fix with a heading.
 
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> observer = slip_odometry_observer(load_robot("patako"), SlipModel(compaction_slip_ratio=0.1))
-    >>> memory, row = observer.start, np.array([0.1, 0.1, 0.0, 0.0, 0.0])
-    >>> for _ in range(100):
-    ...     memory = observer.step(observer.params, memory, row, 0.01)
-    >>> found = observer.read(observer.params, memory)
-    >>> found.mean[:3].round(3), found.slip.round(2)
+    >>> odometry = SlipOdometry(load_robot("patako"), SlipModel(compaction_slip_ratio=0.1))
+    >>> row = np.array([0.1, 0.1, 0.0, 0.0, 0.0])
+    >>> for _ in range(101):
+    ...     known = odometry.step(row, 0.01)
+    >>> known.mean[:3].round(3), known.slip.round(2)
     (array([0.09, 0.  , 0.  ]), array([0.1, 0.1, 0. ]))
     """
-    settings = settings or OdometrySettings()
-    return Observer(
-        "slip-odometry",
-        STATES,
-        SLIPS,
-        ROWS,
-        odometry_params(robot, model, settings),
-        odometry_memory(model, settings),
-        odometry_step,
-        odometry_output,
+
+    def __init__(
+        self,
+        robot: TrackedRobot,
+        model: SlipModel,
+        settings: OdometrySettings = OdometrySettings(),
+        name: str = "slip-odometry",
+        slips: tuple[str, ...] = SLIPS,
+    ) -> None:
+        self._learns, self._settings, self._model = name == "slip-learning", settings, model
+        self._prior = prior = np.sqrt(np.diag(model.covariance))
+        if self._learns and not (prior > 0.0).all():
+            raise ConfigError(
+                f"slip learning: {PARAMETERS[int(np.argmin(prior))]} has no standard deviation above zero"
+            )
+        self._half_m, self._length_m = robot.half_track_m, robot.contact_length_m
+        correlation_s = max(model.correlation_s, 1e-3)
+        residuals = np.array([model.slip_std_ratio, model.angle_std_rad])
+        errors = (model.run_slip_std_ratio, model.run_angle_std_rad, settings.gyro_bias_std_radps)
+        std = np.maximum([0.0, 0.0, 0.0, *prior, *errors, *residuals], _KNOWN_STD)
+        parameters = [
+            f"parameter_{name}_ratio" for name in (*PARAMETERS, "run_slip", "run_angle", "gyro_bias")
+        ]
+        states = (*FIX_ROWS, *parameters, "residual_slip_ratio", "residual_angle_ratio")
+        filter_model = FilterModel(
+            name=name,
+            states=states,
+            rows=(*FIX_ROWS, "track_ratio"),
+            sensors=(("position", FIX_ROWS[:2]), ("heading", FIX_ROWS[2:]), ("tracks", ("track_ratio",))),
+            propagate=_propagate,
+            observe=_observe,
+            params=np.array([self._half_m, correlation_s]),
+            initial_std=std,
+            initial_mean=np.array([0.0, 0.0, 0.0, *model.vector, *np.zeros(5)]),
+            inputs=_INPUTS,
+            positions=FIX_ROWS[:2],
+            angle_rows=FIX_ROWS[2:],
+        )
+        process = np.zeros(_D)
+        process[_RESIDUALS] = 2.0 * residuals**2 / correlation_s
+        fix_std = (settings.fix_std_m, settings.fix_std_m, settings.yaw_fix_std_rad)
+        noise = Noise(process, np.square([*fix_std, settings.ratio_std]))
+        super().__init__(filter_model, noise, FILTER_SETTINGS)
+        self.filter.cov[_MODEL, _MODEL] += model.covariance - np.diag(prior**2)
+        self.rows = (*ROWS, *FIX_ROWS) if self._learns else ROWS
+        self.states, self.slips = (*STATES, *(PARAMETERS if self._learns else ())), slips
+        self._is_located, self._displacement_rad, self._tilt_rad = not self._learns, 0.0, (0.0, 0.0)
+        self._fastest_mps = BLIND_MPS
+        self._output = self._read(np.zeros(6), 0.0, ObserverStatus.STARTING)
+
+    def step(self, row: Array, dt_s: float) -> ObserverOutput:
+        """Take a row of :attr:`rows`."""
+        left, right, gyro, roll, pitch = row[:5].tolist()
+        if not (0.0 <= dt_s <= LONGEST_STEP_S and abs(left) <= FASTEST_MPS and abs(right) <= FASTEST_MPS):
+            if 0.0 < dt_s < math.inf:
+                self._widen(self._fastest_mps * dt_s)
+            return self._with_pose(ObserverStatus.BAD_INPUT)
+        settings, mean = self._settings, self.filter.mean
+        status, has_tilt = ObserverStatus.OK, abs(roll) <= 0.5 * math.pi and abs(pitch) <= 0.5 * math.pi
+        if has_tilt:
+            self._tilt_rad = roll, pitch
+        by_track = 2.0 * self._half_m * float(mean[3 + TRACK_RATIO])
+        tracks, bias = (right - left) / by_track, float(mean[3 + GYRO_BIAS])
+        if not abs(gyro) <= FASTEST_RADPS:
+            status, gyro = (ObserverStatus.OK if math.isnan(gyro) else ObserverStatus.REJECTED), math.nan
+        by_gyro = abs(gyro - bias - tracks) >= settings.gyro_threshold_radps
+        rate = gyro - bias if by_gyro else tracks
+        variance = (
+            settings.gyro_noise_radps**2 if by_gyro else 2.0 * (settings.encoder_noise_mps / by_track) ** 2
+        )
+        if not has_tilt:
+            status = ObserverStatus.PREDICTED
+        self._fastest_mps = max(abs(left), abs(right), BLIND_MPS)
+        stands = abs(left) <= settings.stand_mps and abs(right) <= settings.stand_mps
+        used = (left, right, gyro if by_gyro else math.nan)
+        if stands:
+            is_pushed = abs(rate) > settings.pushed_radps
+            status = ObserverStatus.PUSHED if is_pushed else ObserverStatus.STANDING
+            used = (0.0, 0.0, used[2] if is_pushed else math.nan)
+            variance = variance if is_pushed else 0.0
+        inputs = np.array([*used, *self._tilt_rad, self._displacement_rad])
+        fix = self._advance(row, dt_s, inputs, variance)
+        if not stands:
+            self._displacement_rad = next_displacement(
+                self._displacement_rad, (left, right), rate, self._length_m, dt_s
+            )
+        if not self._is_located:
+            status = ObserverStatus.STARTING
+        elif fix is not ObserverStatus.OK:
+            status = fix
+        self._output = self._read(inputs, variance, status)
+        return self._output
+
+    @property
+    def learned_model(self) -> SlipModel:
+        """The slip model that was come to, with its covariance and the residuals assumed."""
+        known = {"slip_std_ratio": self._model.slip_std_ratio, "angle_std_rad": self._model.angle_std_rad}
+        covariance = self.filter.cov[_MODEL, _MODEL]
+        return model_of(
+            np.array(self.filter.mean[_MODEL]),
+            covariance=covariance,
+            correlation_s=self._model.correlation_s,
+            found="fixes while driving",
+            **known,
+        )
+
+    def _advance(self, row: Array, dt_s: float, inputs: Array, rate_variance: float) -> ObserverStatus:
+        """Take a tick into the filter: what changed since the one before, fixes and the ratio of the yaw rates."""
+        settings, mean, walk = self._settings, self.filter.mean, np.zeros(_D)
+        z, variance = np.full(4, np.nan), np.array(self.filter.noise.measurement_variance)
+        left, right, gyro = inputs[:3].tolist()
+        moves, cos, sin = left != 0.0 or right != 0.0, math.cos(mean[2]), math.sin(mean[2])
+        walk[2] = rate_variance * dt_s
+        if moves:
+            walk[:2] = 0.5 * settings.encoder_noise_mps**2 * dt_s * np.array([cos * cos, sin * sin])
+        if self._learns:
+            fix = np.where(np.abs(row[5:8]) <= LOST_M, row[5:8], np.nan)
+            if self._is_located:
+                z[:3] = fix
+            tracks = (right - left) / (2.0 * self._half_m)
+            if moves:
+                walk[_MODEL] = self._prior**2 / settings.forget_s
+            if moves and dt_s > 0.0 and abs(gyro) > TURNING_RADPS and gyro * tracks > 0.0:
+                z[3] = tracks / gyro
+                variance[3] *= max(2.0 * self._model.correlation_s / dt_s, 1.0)
+        became = self.advance(dt_s, z, inputs, walk, variance, n_judged=2)
+        if self._learns:
+            mean[3] = min(max(mean[3], 0.0), 3.0)
+            mean[4 : 3 + TRACK_RATIO] = np.clip(mean[4 : 3 + TRACK_RATIO], -100.0, 100.0)
+            mean[3 + TRACK_RATIO] = min(max(mean[3 + TRACK_RATIO], 0.3), 10.0)
+            if not self._is_located and np.isfinite(fix).all():
+                self._is_located = True
+                self.place(slice(0, 3), fix, np.sqrt(variance[:3]))
+        return became
+
+    def _widen(self, moved_m: float) -> None:
+        """Widen the pose by a motion that was not measured: as fast as the tracks were, or :data:`BLIND_MPS`."""
+        cov = self.filter.cov
+        for i, (moved, most) in enumerate(
+            ((moved_m, LOST_M), (moved_m, LOST_M), (moved_m / self._half_m, math.pi))
+        ):
+            std = math.sqrt(cov[i, i])
+            cov[i, i] = max(min(std + moved, most), std) ** 2
+
+    def _with_pose(self, status: ObserverStatus) -> ObserverOutput:
+        """Return what was known, with the uncertainty of the pose as it is."""
+        std = np.array(self._output.std)
+        std[:3] = np.sqrt(self.filter.cov.diagonal()[:3])
+        self._output = self._output._replace(std=std, status=int(status))
+        return self._output
+
+    def _read(self, inputs: Array, rate_variance: float, status: ObserverStatus) -> ObserverOutput:
+        mean, cov, settings = self.filter.mean, self.filter.cov, self._settings
+        motion, by_state = _velocity_slopes(mean, np.concatenate([self.filter.model.params, inputs]))
+        variance = np.einsum("ij,jk,ik->i", by_state, cov, by_state)
+        belts, moves = inputs[:2], bool(inputs[:2].any())
+        variance += np.array([0.5 * settings.encoder_noise_mps**2 * moves, 0.0, rate_variance])
+        std = np.sqrt(np.maximum(np.concatenate([cov.diagonal()[:3], variance]), 0.0))
+        slip, slip_std = np.full(3, np.nan), np.full(3, np.nan)
+        ground = motion[0] + np.array([-self._half_m, self._half_m]) * motion[2]
+        fastest = np.maximum(np.abs(belts), np.abs(ground))
+        square, ahead = motion[0] ** 2 + motion[1] ** 2, abs(motion[0])
+        if moves:
+            known = fastest >= settings.min_speed_mps
+            slip[:2][known] = np.clip((belts - ground)[known] / fastest[known], -1.0, 1.0)
+            slip_std[:2][known] = std[3] / fastest[known]
+            if square >= settings.min_speed_mps**2:
+                slip[2] = math.atan2(motion[1], ahead)
+                slip_std[2] = math.hypot(ahead * std[4], motion[1] * std[3]) / square
+        parameter_std = np.sqrt(cov.diagonal()[_MODEL]) if self._learns else np.empty(0)
+        unknown = parameter_std > OBSERVED_RATIO * self._prior if self._learns else slice(0)
+        parameters = np.array(mean[_MODEL]) if self._learns else np.empty(0)
+        parameters[unknown] = parameter_std[unknown] = np.nan
+        n = len(self.slips)
+        return ObserverOutput(
+            np.concatenate([mean[:3], motion, parameters]),
+            np.concatenate([std, parameter_std]),
+            slip[:n],
+            slip_std[:n],
+            int(status),
+        )
+
+
+def plain_odometry(
+    name: str,
+    robot: TrackedRobot,
+    model: SlipModel = SlipModel(),  # noqa: B008
+    settings: OdometrySettings = OdometrySettings(),
+) -> SlipOdometry:
+    """Return one of the odometries that know no slip, or of turns alone; see the table of this module.
+
+    Parameters
+    ----------
+    name : ``encoder-odometry``, ``gyrodometry`` or ``endo``
+    robot, settings : as of :class:`SlipOdometry`; a threshold of the gyro is that of gyrodometry
+    model : its effective distance of the tracks is that of encoder odometry, its exponent that of Endo's law
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> plain_odometry("encoder-odometry", load_robot("patako"), SlipModel(track_ratio=1.5)).slips
+    ()
+    """
+    covariance = np.zeros((N_MODEL, N_MODEL))
+    covariance[TRACK_RATIO, TRACK_RATIO] = TRACK_STD_RATIO**2
+    threshold = settings.gyro_threshold_radps or GYRODOMETRY_THRESHOLD_RADPS
+    known = SlipModel(
+        turning_exponent=model.turning_exponent if name == "endo" else 1.0,
+        track_ratio=model.track_ratio if name == "encoder-odometry" else 1.0,
+        covariance=covariance,
+        run_slip_std_ratio=UNKNOWN_SLIP_RATIO,
+        run_angle_std_rad=UNKNOWN_ANGLE_RAD,
     )
+    if name != "endo":
+        settings = replace(
+            settings, gyro_threshold_radps=math.inf if name == "encoder-odometry" else threshold
+        )
+    return SlipOdometry(robot, known, settings, name, SLIPS[:2] if name == "endo" else ())

@@ -7,9 +7,8 @@ import pytest
 
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.observers import rows as observer_rows
-from terrain.estimation.observers.family import Observer, ObserverOutput, ObserverStatus, observe
-from terrain.estimation.observers.live import LiveObserver
-from terrain.estimation.observers.rows import CHANNELS, ROWS, RowFeed, feed_of, ticks
+from terrain.estimation.observers.observer import Observer, ObserverOutput, ObserverStatus, observe
+from terrain.estimation.observers.rows import CHANNELS, ROWS, LiveObserver, RowFeed
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.tracked import QUIET, PrescribedSlip, simulate_tracked
@@ -18,9 +17,12 @@ UGV = load_robot("orchard_ugv")
 NAMES = tuple(name for name in ROWS if "rear" not in name and "front" not in name)
 
 
-def rows_of(run, names=NAMES):
-    feed = feed_of(run, UGV, names)
-    return *observer_rows.rows_of(run, feed), feed
+def rows_of(run):
+    return observer_rows.rows_of(run, UGV, NAMES)
+
+
+def feed_of(run):
+    return RowFeed(UGV, NAMES, {name: stream.channels for name, stream in run.streams.items()})
 
 
 def without(run, *names):
@@ -33,7 +35,7 @@ def run():
 
 
 def test_rows_hold_what_sensors_without_noise_measured(run):
-    time_s, rows, feed = rows_of(without(run, "pose"))
+    time_s, rows, dropped = rows_of(without(run, "pose"))
     truth = run.streams["truth"]
     at = np.searchsorted(truth.time_s, time_s - 1e-9)
     assert rows[:, :2] == pytest.approx(np.tile([0.4, 0.6], (len(rows), 1)))
@@ -42,7 +44,7 @@ def test_rows_hold_what_sensors_without_noise_measured(run):
     assert fixed.sum() == len(run.streams["gnss"])
     assert np.isfinite(rows[:, 4]).tolist() == fixed.tolist()
     assert rows[fixed, 2:5] == pytest.approx(truth.values[at[fixed], :3], abs=1e-9)
-    assert not feed.dropped
+    assert not dropped
 
 
 def test_a_fix_between_two_ticks_is_brought_to_the_later_one(run):
@@ -67,26 +69,25 @@ def test_a_sample_that_is_missing_is_held_for_a_while_and_then_unknown(run):
     assert unknown.max() == pytest.approx(2.0, abs=0.021)
 
 
-def counting(rows):
-    """An observer that sums all known measurements and the time: any sample more or less shows."""
+class Counting(Observer):
+    """It sums all known measurements and the time: any sample more or less shows."""
 
-    def step(params, memory, row, dt_s):
-        return memory + np.array([np.nansum(row), dt_s])
+    name, states, slips, rows = "sum", ("sum_m", "time_s"), ("slip_left_ratio",), NAMES
 
-    def read(params, memory):
-        return ObserverOutput(memory, memory, memory[:1], memory[:1], ObserverStatus.OK)
+    def __init__(self):
+        self.sum = np.zeros(2)
 
-    return Observer(
-        "sum", ("sum_m", "time_s"), ("slip_left_ratio",), rows, np.zeros(1), np.zeros(2), step, read
-    )
+    def step(self, row, dt_s):
+        self.sum = self.sum + np.array([np.nansum(row), dt_s])
+        return ObserverOutput(self.sum, self.sum, self.sum[:1], self.sum[:1], ObserverStatus.OK)
 
 
 def test_live_is_the_batch_whatever_comes_together(run):
-    observer, rng = counting(NAMES), np.random.default_rng(3)
+    rng = np.random.default_rng(3)
     time_s, rows, _ = rows_of(run)
-    batch = observe(observer, time_s, rows)
+    batch = observe(Counting(), time_s, rows)
     channels = {name: stream.channels for name, stream in run.streams.items()}
-    live, now, found = LiveObserver(observer, UGV, channels), 0.0, []
+    live, now, found = LiveObserver(Counting(), UGV, channels), 0.0, []
     while now < 7.0:
         later = now + rng.uniform(0.001, 0.3)
         arrived = {}
@@ -104,7 +105,7 @@ def test_live_is_the_batch_whatever_comes_together(run):
 
 def test_samples_that_cannot_be_are_left_out_and_counted(run):
     channels = {name: stream.channels for name, stream in run.streams.items()}
-    live = LiveObserver(counting(NAMES), UGV, channels)
+    live = LiveObserver(Counting(), UGV, channels)
     imu = np.full((1, 9), 0.1)
     assert live.step({"wheels": Reading(np.array([0.0, 0.02]), np.full((2, 2), 0.1))}) != []
     live.step({"imu": Reading(np.array([0.01, 0.01]), np.vstack([imu, imu]))})
@@ -125,7 +126,7 @@ def test_a_log_without_what_the_observer_takes_is_refused(run):
     with pytest.raises(ConfigError, match="'speed_left_mps' must be among them"):
         RowFeed(UGV, NAMES, {"wheels": ("motor_1_radps",)})
     with pytest.raises(DataError, match="has no stream wheels"):
-        list(ticks(without(run, "wheels"), RowFeed(UGV, NAMES, {"wheels": UGV.rate_channels})))
+        rows_of(without(run, "wheels"))
 
 
 def fed(run, change):
@@ -137,7 +138,7 @@ def fed(run, change):
 def test_a_clock_that_is_set_back_begins_anew_and_one_stamp_far_ahead_is_left_behind(run):
     channels = {name: stream.channels for name, stream in run.streams.items()}
     for spoilt in ("back", "ahead"):
-        live, found = LiveObserver(counting(NAMES), UGV, channels), []
+        live, found = LiveObserver(Counting(), UGV, channels), []
         for k, time_s in enumerate(np.arange(0.0, 4.0, 0.02)):
             stamp_s = (
                 time_s - 3600.0 * (spoilt == "back" and k >= 100) + 1e9 * (spoilt == "ahead" and k == 100)
@@ -150,7 +151,7 @@ def test_a_clock_that_is_set_back_begins_anew_and_one_stamp_far_ahead_is_left_be
 
 
 def test_stamps_that_are_no_time_and_channels_that_are_unknown_do_not_take_the_others_along(run):
-    feed = feed_of(run, UGV, NAMES)
+    feed = feed_of(run)
     imu = run.streams["imu"].values[:4].copy()
     imu[1, 2] = np.nan
     feed.push("imu", np.array([0.0, np.inf, 0.005, 0.01]), imu)
@@ -184,14 +185,14 @@ def test_a_pose_that_is_lost_leaves_the_satellites_and_bad_fixes_are_none(run):
 
     _, rows, _ = fed(run, lost)
     assert np.isfinite(rows[:, 2]).sum() == len(run.streams["gnss"])
-    _, rows, feed = fed(run, spoilt("std_position_m", 1.5))
+    _, rows, dropped = fed(run, spoilt("std_position_m", 1.5))
     assert np.isnan(rows[:, 2]).all()
-    assert feed.dropped["gnss: inaccurate"] == len(run.streams["gnss"])
+    assert dropped["gnss: inaccurate"] == len(run.streams["gnss"])
 
 
 @pytest.mark.parametrize(("tick_s", "late"), [(0.35, False), (0.45, True)])
 def test_a_fix_that_waited_long_for_the_wheels_is_left_out_and_counted(run, tick_s, late):
-    feed = feed_of(without(run, "pose"), UGV, NAMES)
+    feed = feed_of(without(run, "pose"))
     for name in ("gnss", "compass"):
         feed.push(name, np.array([0.1]), run.streams[name].values[:1])
     row = feed.tick(tick_s, np.array([0.4, 0.6]))
@@ -200,7 +201,7 @@ def test_a_fix_that_waited_long_for_the_wheels_is_left_out_and_counted(run, tick
 
 
 def test_samples_do_not_pile_up_while_no_wheels_come(run):
-    feed = feed_of(run, UGV, NAMES)
+    feed = feed_of(run)
     for k in range(5000):
         feed.push("imu", np.array([0.01 * k]), np.full((1, 9), 0.1))
     assert feed.dropped["imu: no wheels came"] > 4500

@@ -23,13 +23,14 @@ b is chosen for the smallest factor of the disturbance.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_continuous_lyapunov
 
 from terrain.errors import ConfigError
 from terrain.records import Array
+from terrain.slip import MIN_SPEED_MPS
 
 
 class ErrorBound(NamedTuple):
@@ -59,40 +60,6 @@ def regressor(yaw_rad: float, left_mps: float, right_mps: float, half_track_m: f
     """
     cos, sin, half = 0.5 * math.cos(yaw_rad), 0.5 * math.sin(yaw_rad), 0.5 / half_track_m
     return np.asarray([[cos, cos], [sin, sin], [-half, half]] * np.array([left_mps, right_mps]))
-
-
-def lyapunov(error: Array, eta_error: Array, adaptation: Array) -> float:
-    """Return ``V = (e'e + n~' Lambda^-1 n~) / 2``, which never grows; it needs the true efficiency.
-
-    Corrected: above (13) the paper prints ``e' L^-1 e``, with which V can grow unless L is the identity.
-
-    Parameters
-    ----------
-    error : (3,) e
-    eta_error : (2,) n~
-    adaptation : (2, 2) Lambda
-
-    Examples
-    --------
-    >>> round(lyapunov(np.array([0.1, 0.0, 0.0]), np.array([0.2, 0.0]), np.diag([2.0, 1.0])), 9)
-    0.015
-    """
-    return float(0.5 * (error @ error + eta_error @ np.linalg.solve(adaptation, eta_error)))
-
-
-def excitation(left_mps: float, right_mps: float, half_track_m: float) -> float:
-    """Return the smallest eigenvalue of M'M in m^2/s^2: mu / T of (14) at constant speeds.
-
-    A radian counts as a metre.  ``M'M`` does not depend on the heading: with ``a = (1 + 1/d^2) / 4`` and
-    ``b = (1 - 1/d^2) / 4`` it is ``[[a v_L^2, b v_L v_R], [b v_L v_R, a v_R^2]]``, singular where one stands.
-
-    Examples
-    --------
-    >>> round(excitation(0.6, 0.6, 0.5), 9), excitation(0.6, 0.0, 0.5)
-    (0.18, 0.0)
-    """
-    m = regressor(0.0, left_mps, right_mps, half_track_m)
-    return max(0.0, float(np.linalg.eigvalsh(m.T @ m)[0]))
 
 
 def error_matrix(regressor_body: Array, gain_ps: Array, adaptation: Array, yaw_rate_radps: float) -> Array:
@@ -151,3 +118,39 @@ def _bound_at(a: Array, rate_ps: float) -> ErrorBound:
     overshoot = math.sqrt(eigenvalues[-1] / eigenvalues[0])
     rate = rate_ps + 0.5 / float(eigenvalues[-1])
     return ErrorBound(overshoot, float(rate), float(overshoot / rate))
+
+
+def measured_efficiency(
+    forward_mps: Any,
+    yaw_rate_radps: Any,
+    left_mps: Any,
+    right_mps: Any,
+    half_track_m: float,
+    min_speed_mps: float = MIN_SPEED_MPS,
+) -> Array:
+    """Return the efficiency of the left and the right track, (..., 2), from speeds that are measured.
+
+    (4) and (15): ``n_R = (V_G + d Omega) / v_R``, ``n_L = (V_G - d Omega) / v_L``; NaN of a track that is
+    slower than ``min_speed_mps``.
+
+    Parameters
+    ----------
+    forward_mps : speed over ground along the body, from satellites
+    yaw_rate_radps : of a gyro
+    left_mps, right_mps : circumferential speeds of the tracks
+    half_track_m : d
+    min_speed_mps : of a track
+
+    Examples
+    --------
+    >>> measured_efficiency(0.46, 0.04, [0.4, 0.0], 0.6, half_track_m=0.5)
+    array([[1.1, 0.8], [nan, 0.8]])
+    """
+    forward, turn, left, right = np.broadcast_arrays(
+        *(np.asarray(v, float) for v in (forward_mps, yaw_rate_radps, left_mps, right_mps))
+    )
+    tracks = np.stack([left, right], axis=-1)
+    ground = np.stack([forward - half_track_m * turn, forward + half_track_m * turn], axis=-1)
+    efficiency = np.full(tracks.shape, np.nan)
+    np.divide(ground, tracks, out=efficiency, where=np.abs(tracks) >= min_speed_mps)
+    return efficiency

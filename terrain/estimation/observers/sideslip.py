@@ -1,0 +1,449 @@
+"""Sideslip and cornering stiffness of a car-like robot: one model, of which three observers are settings.
+
+With the speed u of the rear axle along the body (what its wheel measures: u = v cos b_R for the speed v of the
+papers), yaw rate r, lateral velocity w of the centre of mass, steering angle d, wheelbase L, and s the sign of u, the
+slip angles of the axles are::
+
+    tan(d + s b_F) = (w + L_F r) / u      tan(s b_R) = (w - L_R r) / u                               (4)
+
+State: pose of the rear axle, r L / u and w / u, which stay what they are while the robot stands, and the cornering
+stiffness of the axles over the nominal one, their mean and half their difference.  The pose moves by u, r and the
+lateral speed w - L_R r of the rear axle, which are lines 2 and 3 of (2) without a path: (2) is singular where
+1 - c(s) y = 0, and on a straight path both are the same.  Motion follows the slip angles of the moment, or dynamics,
+with the roll a of the slope::
+
+    b' = n                                                                      kinematic (5)
+    r' = (L_R C_R b_R - L_F C_F b_F cos d) / I_z                                dynamic (3)
+    w' = -(C_F b_F cos d + C_R b_R) / m - g sin a - u r
+    C' = n                                                                      while side forces show it
+
+========================  =======  ==========================================
+setting                   motion   measured
+========================  =======  ==========================================
+``sideslip-kinematic``    (5)      fixes of the pose
+``sideslip-dynamic``      (3)      yaw rate, lateral specific force; fixes correct the pose alone
+``sideslip-multi``        (3)      all of them
+========================  =======  ==========================================
+
+The dynamics take a linearly implicit step (1 - h A)^-1 h f: the poles of (r, w), about -2C/(m u), are far faster than
+any tick at low speed.  Below 0.3 m/s they say nothing (an observer that divides by u there diverges, Figs. 5 and 6 of
+Deremetz et al.), and slip angles and C are as they were.  Yaw rate and force show two combinations of w, C_F and C_R;
+the third comes from the stiffness assumed at first, or from fixes.  C is the secant -F/b of a force that saturates,
+and has to follow it down and up again; it is learned only while the lateral specific force u r + g sin a is above a
+bound, and kept within physical limits.
+
+A Kalman filter stands in place of the gains of Deremetz et al. (8), (9), which are in ``examples/papers``.
+
+Sources: Deremetz et al., ICRA 2017; Lenain et al. 2010; Guillet et al. 2014.  Corrected: line 1 of (3) is the moment of
+side forces F = -C b, stable for C > 0 ((1) prints F = C b).  Line 2 prints the sign of the forces and of
+v cos b_R yaw' reversed: it then has an unstable eigenvalue for either sign of C.  Line 3 of (2) is the derivative of
+theta~ (printed: of theta).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError
+from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
+from terrain.estimation.observers.observer import (
+    LONGEST_STEP_S,
+    FilterObserver,
+    ObserverOutput,
+    ObserverStatus,
+)
+from terrain.kernels import njit
+from terrain.records import Array
+from terrain.robots import BicycleRobot
+
+ROWS = (
+    *("speed_rear_mps", "steer_front_rad", "position_x_m", "position_y_m", "yaw_rad"),
+    *("yaw_rate_radps", "roll_rad", "accel_y_mps2"),
+)
+SPEED, STEER, X, Y, YAW, RATE, ROLL, ACCEL = range(8)
+"""Place of each row."""
+
+SLIPS = ("slip_front_rad", "slip_rear_rad")
+
+STANDING_MPS = 0.05
+"""Slower is standing, as in :mod:`terrain.slip`."""
+SLIP_MAX_RAD = 0.5
+"""Bound of a slip angle, beyond any that a tyre's force rises up to."""
+UNKNOWN_STD_RAD = 0.15
+"""A slip that is less certain is not known."""
+LOST_S = 1.0
+"""Longer without a fix the pose is dead reckoning; longer without an IMU the dynamic slip is predicted."""
+C_LOW_NPR, C_HIGH_RATIO = 1000.0, 2.0
+"""Least cornering stiffness of an axle, which at a slip of 0.5 rad carries 500 N; largest over the nominal one."""
+FASTEST_MPS, FASTEST_RADPS, MOST_MPS2 = 60.0, 20.0, 50.0
+"""More than a car, its gyro and its accelerometer measure."""
+POSITION_WALK_M, YAW_WALK_RAD = 0.01, 0.002
+"""Change of the pose within a second beside the motion of the model."""
+SLIP_ERROR_RAD = 0.03
+"""Of a slip angle that no fix corrects: what the pose that is carried on is off by."""
+FIRST_STD = (0.07, 0.05)
+"""Of r L / u and w / u at first: slip angles of three degrees."""
+_GATE_PROBABILITY = 1.0 - 2e-9  # six standard deviations
+_STATES = (
+    *("position_x_m", "position_y_m", "yaw_rad", "turn_ratio", "sideslip_ratio"),
+    *("stiffness_ratio", "stiffness_difference_ratio"),
+)
+
+
+class SideslipSettings(NamedTuple):
+    """Noise of an observer of sideslip, and which of the three it is.
+
+    Parameters
+    ----------
+    by_dynamics, by_fixes, by_imu : see the table of this module
+    position_std_m, yaw_std_rad : of a fix
+    gyro_std_radps, accel_std_mps2 : of yaw rate and lateral specific force
+    imu_ahead_m : of the accelerometer ahead of the rear axle
+    slip_walk_radps : change of a slip angle within a second without dynamics
+    turn_walk_radps2, side_walk_mps2 : what the model lacks of r and w within a second; the lag of a tyre that rolls
+        into its slip is in it, which would otherwise be taken for a softer tyre
+    stiffness_walk_ratio, stiffness_std_ratio : of the nominal cornering stiffness: change within a second, and at first
+    stiffness_correlation : of both, between the axles
+    excited_mps2 : least lateral specific force for learning C
+    slowest_mps : below which there are no dynamics
+    reset_s : time for which fixes have to be rejected before the pose begins anew
+    """
+
+    by_dynamics: bool = True
+    by_fixes: bool = True
+    by_imu: bool = True
+    position_std_m: float = 0.02
+    yaw_std_rad: float = 0.005
+    gyro_std_radps: float = 0.003
+    accel_std_mps2: float = 0.1
+    imu_ahead_m: float = 0.0
+    slip_walk_radps: float = 0.02
+    turn_walk_radps2: float = 0.1
+    side_walk_mps2: float = 4.0
+    stiffness_walk_ratio: float = 0.13
+    stiffness_std_ratio: float = 0.3
+    stiffness_correlation: float = 0.8
+    excited_mps2: float = 1.0
+    slowest_mps: float = 0.3
+    reset_s: float = 1.0
+
+
+SETTINGS = {
+    "sideslip-kinematic": SideslipSettings(by_dynamics=False, by_imu=False),
+    "sideslip-dynamic": SideslipSettings(by_fixes=False),
+    "sideslip-multi": SideslipSettings(),
+}
+"""The three observers by name."""
+
+# Places in `params`: those of the robot, and as inputs those of a tick.
+_BASE, _AHEAD, _BEHIND, _MASS, _INERTIA, _C_FRONT, _C_REAR, _IMU_AHEAD, _BY_FIXES = range(9)
+_SPEED, _STEER, _ROLL, _SPEED_BEFORE, _STEER_BEFORE, _BY_DYNAMICS, _EXCITED = range(9, 16)
+_INPUTS = ("speed", "steer", "roll", "speed_before", "steer_before", "by_dynamics", "is_excited")
+
+
+@njit
+def slip_angles(turn: float, side: float, steer: float, sign: float, params: Array) -> tuple[float, float]:
+    """Return b_F and b_R of r L / u, w / u, the steering angle and the sign of the speed: (4)."""
+    turn = turn / params[_BASE]
+    front = math.atan(side + params[_BEHIND] * turn) - steer
+    return sign * front, sign * math.atan(side - params[_AHEAD] * turn)
+
+
+@njit
+def force_rates(slip_f: float, slip_r: float, mean: float, half: float, params: Array) -> tuple[float, float]:
+    """Return r' and the specific side force of the tyres, of slip angles and stiffness over the nominal one."""
+    front = params[_C_FRONT] * (mean + half) * slip_f * math.cos(params[_STEER])
+    rear = params[_C_REAR] * (mean - half) * slip_r
+    turning = (params[_AHEAD] * rear - params[_BEHIND] * front) / params[_INERTIA]
+    return turning, -(front + rear) / params[_MASS]
+
+
+@njit
+def _motion_after(x: Array, dt: float, params: Array) -> tuple[float, float]:
+    """Return r L / u and w / u a tick later: of the same slip angles, or of the dynamics."""
+    speed, base, steer = params[_SPEED], params[_BASE], params[_STEER]
+    turn, side = x[3], x[4]
+    sign = -1.0 if speed < 0.0 else 1.0
+    if params[_BY_DYNAMICS] == 0.0:
+        slip_f, slip_r = slip_angles(turn, side, params[_STEER_BEFORE], sign, params)
+        rear = math.tan(sign * slip_r)
+        turn = math.tan(min(max(steer + sign * slip_f, -1.4), 1.4)) - rear
+        return turn, rear + params[_AHEAD] * turn / base
+    faster = params[_SPEED_BEFORE] / speed
+    turn, side = faster * turn, faster * side
+    slip_f, slip_r = slip_angles(turn, side, steer, sign, params)
+    turning, force = force_rates(slip_f, slip_r, x[5], x[6], params)
+    pushed = force - GRAVITY_MPS2 * math.sin(params[_ROLL]) - speed * speed * turn / base
+    # A, the derivative of (r', w') by (r, w), through that of the slip angles
+    front_by_w = 1.0 / (abs(speed) * (1.0 + (side + params[_BEHIND] * turn / base) ** 2))
+    rear_by_w = 1.0 / (abs(speed) * (1.0 + (side - params[_AHEAD] * turn / base) ** 2))
+    r_by_front, w_by_front = force_rates(1.0, 0.0, x[5], x[6], params)
+    r_by_rear, w_by_rear = force_rates(0.0, 1.0, x[5], x[6], params)
+    front_by_r, rear_by_r = params[_BEHIND] * front_by_w, -params[_AHEAD] * rear_by_w
+    a = 1.0 - dt * (r_by_front * front_by_r + r_by_rear * rear_by_r)
+    b = -dt * (r_by_front * front_by_w + r_by_rear * rear_by_w)
+    c = -dt * (w_by_front * front_by_r + w_by_rear * rear_by_r - speed)
+    d = 1.0 - dt * (w_by_front * front_by_w + w_by_rear * rear_by_w)
+    per_det = dt / (a * d - b * c)
+    turn += per_det * (d * turning - b * pushed) * base / speed
+    return turn, side + per_det * (a * pushed - c * turning) / speed
+
+
+@njit
+def _move(x: Array, dt: float, params: Array, x_next: Array) -> None:
+    turn, side = _motion_after(x, dt, params)
+    speed, base = params[_SPEED], params[_BASE]
+    mean_turn = 0.5 * (x[3] + turn) / base
+    lateral = speed * (0.5 * (x[4] + side) - params[_AHEAD] * mean_turn)
+    middle = x[2] + 0.5 * dt * speed * mean_turn
+    cos, sin = math.cos(middle), math.sin(middle)
+    x_next[:] = x
+    x_next[0] += dt * (speed * cos - lateral * sin)
+    x_next[1] += dt * (speed * sin + lateral * cos)
+    x_next[2] += dt * speed * mean_turn
+    x_next[3], x_next[4] = turn, side
+
+
+@njit
+def _propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> None:
+    differentiate(_move, x, dt, params, x_next, f)
+    if params[_EXCITED] == 0.0:
+        f[:5, 5:7] = 0.0
+    if params[_BY_FIXES] == 0.0:
+        f[:3, 3:7] = 0.0
+
+
+@njit
+def _measure(x: Array, _dt: float, params: Array, z: Array) -> None:
+    z[:3] = x[:3]
+    z[3] = params[_SPEED] * x[3] / params[_BASE]
+    sign = -1.0 if params[_SPEED] < 0.0 else 1.0
+    slip_f, slip_r = slip_angles(x[3], x[4], params[_STEER], sign, params)
+    turning, force = force_rates(slip_f, slip_r, x[5], x[6], params)
+    z[4] = force - (params[_AHEAD] - params[_IMU_AHEAD]) * turning
+
+
+@njit
+def _observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
+    differentiate(_measure, x, 0.0, params, z_hat, h)
+    if params[_EXCITED] == 0.0:
+        h[:, 5:7] = 0.0
+
+
+class Sideslip(FilterObserver):
+    """An observer of sideslip of a car-like robot.
+
+    Parameters
+    ----------
+    robot : car-like
+    name : one of :data:`SETTINGS`
+    settings : in place of those
+
+    Raises
+    ------
+    ConfigError
+        if a setting is not accepted.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.estimation.observers.observer import observe
+    >>> time_s, slope = np.arange(200) * 0.02, np.full((200, 8), np.nan)
+    >>> slope[:, [0, 1, 5, 6, 7]] = 3.0, 0.0, 0.0, 0.2, 9.81 * np.sin(0.2)  # straight along a slope
+    >>> observe(Sideslip(load_robot("adap2e"), "sideslip-dynamic"), time_s, slope).slip[-1].round(2)
+    array([-0.03, -0.03])
+    """
+
+    slips, rows = SLIPS, ROWS
+
+    def __init__(self, robot: BicycleRobot, name: str, settings: SideslipSettings | None = None) -> None:
+        self.settings = settings = SETTINGS[name] if settings is None else settings
+        for key, value in settings._asdict().items():
+            may_be_zero = key not in (
+                "position_std_m",
+                "yaw_std_rad",
+                "gyro_std_radps",
+                "accel_std_mps2",
+                "reset_s",
+            )
+            if not (0.0 <= value < math.inf or (key == "imu_ahead_m" and abs(value) < math.inf)):
+                raise ConfigError(f"{name}: {key} is {value:g}, a finite number from zero up is required")
+            if value == 0.0 and not may_be_zero:
+                raise ConfigError(f"{name}: {key} is 0, a number above zero is required")
+        if not settings.stiffness_correlation < 1.0:
+            raise ConfigError(
+                f"{name}: stiffness_correlation is {settings.stiffness_correlation:g}, below 1 is required"
+            )
+        self._nominal = np.array([robot.front_cornering_npr, robot.rear_cornering_npr])
+        geometry = (robot.wheelbase_m, robot.com_ahead_m, robot.com_behind_front_m)
+        by_fixes = float(settings.by_fixes)
+        params = (
+            *geometry,
+            robot.mass_kg,
+            robot.yaw_inertia_kgm2,
+            *self._nominal,
+            settings.imu_ahead_m,
+            by_fixes,
+        )
+        axles = np.sqrt(
+            0.5 * np.array([1.0 + settings.stiffness_correlation, 1.0 - settings.stiffness_correlation])
+        )
+        self._stiffness_walk = (settings.stiffness_walk_ratio * axles) ** 2
+        model = FilterModel(
+            name=name,
+            states=_STATES,
+            rows=(*ROWS[X : RATE + 1], ROWS[ACCEL]),
+            sensors=(
+                ("position", ROWS[X:YAW]),
+                ("heading", (ROWS[YAW],)),
+                ("gyro", (ROWS[RATE],)),
+                ("force", (ROWS[ACCEL],)),
+            ),
+            propagate=_propagate,
+            observe=_observe,
+            params=np.array(params),
+            initial_std=np.array(
+                [1e4, 1e4, math.pi, *FIRST_STD, *(settings.stiffness_std_ratio * axles + 1e-6)]
+            ),
+            initial_mean=np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
+            inputs=_INPUTS,
+            references=("position",),
+            positions=_STATES[:2],
+            angle_states=("yaw_rad",),
+            angle_rows=("yaw_rad",),
+        )
+        std = (settings.position_std_m, settings.position_std_m, settings.yaw_std_rad)
+        noise = Noise(np.zeros(7), np.square([*std, settings.gyro_std_radps, settings.accel_std_mps2]))
+        super().__init__(model, noise, FilterSettings(_GATE_PROBABILITY, settings.reset_s))
+        motion = ("yaw_rate_radps", "speed_y_mps", "cornering_front_npr", "cornering_rear_npr")
+        self.states = (*_STATES[:3], *(motion if settings.by_dynamics else ()))
+        self._base_m, self._ahead_m, self._behind_m = geometry
+        self._before: tuple[float, float] | None = None
+        self._roll_rad, self._by_imu_alone = 0.0, settings.by_imu and not settings.by_fixes
+        self._output = self._read(0.0, 0.0, ObserverStatus.STARTING)
+
+    @property
+    def is_started(self) -> bool:
+        """Whether what the slip is seen by was measured: position and heading, or an IMU."""
+        return bool((self.age_s[2:].min() if self._by_imu_alone else self.age_s[:2].max()) < math.inf)
+
+    def step(self, row: Array, dt_s: float) -> ObserverOutput:
+        """Take a row of :data:`ROWS`; a roll that was never measured is that of level ground."""
+        speed, steer, *_, rate, roll, accel = row.tolist()
+        if not (0.0 <= dt_s <= LONGEST_STEP_S and abs(speed) < FASTEST_MPS and abs(steer) < 0.5 * math.pi):
+            return self._hold(ObserverStatus.BAD_INPUT)
+        if abs(roll) < 0.5 * math.pi:
+            self._roll_rad = roll
+        stands, was_started = abs(speed) < STANDING_MPS, self.is_started
+        if stands and self.age_s[:2].max() < math.inf:
+            if was_started and self._output.status == ObserverStatus.STARTING:
+                self._output = self._read(speed, steer, ObserverStatus.STANDING)
+            return self._hold(ObserverStatus.STANDING if was_started else ObserverStatus.STARTING)
+        moves = abs(speed) >= self.settings.slowest_mps
+        z = np.append(row[X:RATE], [math.nan, math.nan])
+        if self.settings.by_imu and moves:
+            z[3] = rate if abs(rate) < FASTEST_RADPS else math.nan
+            z[4] = accel if abs(accel) < MOST_MPS2 else math.nan
+        by_dynamics = self.settings.by_dynamics and moves
+        force = speed * z[3] + GRAVITY_MPS2 * math.sin(self._roll_rad)
+        is_excited = by_dynamics and abs(force) > self.settings.excited_mps2
+        fix = self.advance(
+            dt_s,
+            z,
+            self._inputs(speed, steer, by_dynamics, is_excited),
+            self._walk(stands, speed, is_excited),
+        )
+        self._bound(steer, -1.0 if speed < 0.0 else 1.0)
+        status = (
+            ObserverStatus.UNEXCITED if self.settings.by_dynamics and not is_excited else ObserverStatus.OK
+        )
+        if (self.age_s[2:].min() if self._by_imu_alone else self.age_s[0]) > LOST_S:
+            status = ObserverStatus.PREDICTED
+        if stands:
+            status = ObserverStatus.STANDING
+        if fix is not ObserverStatus.OK:
+            status = fix
+        self._output = self._read(speed, steer, status if was_started else ObserverStatus.STARTING)
+        return self._output
+
+    def _hold(self, status: ObserverStatus) -> ObserverOutput:
+        """Return estimates as they were."""
+        self._output = self._output._replace(status=int(status))
+        return self._output
+
+    def _inputs(self, speed: float, steer: float, by_dynamics: bool, is_excited: bool) -> Array:
+        """Return the inputs of the filter; before the first tick there was no slip."""
+        if self._before is None:
+            self._before = speed, steer
+            self.filter.mean[3:5] = np.array([1.0, self._ahead_m / self._base_m]) * math.tan(steer)
+        speed_before, steer_before = self._before
+        if not by_dynamics or not speed * speed_before > 0.0 or abs(speed_before) < self.settings.slowest_mps:
+            speed_before = speed
+        self._before = speed, steer
+        return np.array(
+            [speed, steer, self._roll_rad, speed_before, steer_before, by_dynamics, is_excited], float
+        )
+
+    def _walk(self, stands: bool, speed: float, is_excited: bool) -> Array:
+        """Return what each state changes by within a second, a variance."""
+        walk, size, settings = np.zeros(7), abs(speed), self.settings
+        if stands:
+            return walk
+        walk[:3] = (POSITION_WALK_M, POSITION_WALK_M, YAW_WALK_RAD)
+        if not settings.by_fixes:
+            walk[:3] += np.array([size, size, size / self._base_m]) * SLIP_ERROR_RAD
+        if settings.by_dynamics and size >= settings.slowest_mps:
+            walk[3:5] = settings.turn_walk_radps2 * self._base_m / size, settings.side_walk_mps2 / size
+        else:
+            arm = math.hypot(self._ahead_m, self._behind_m) / self._base_m
+            walk[3:5] = math.sqrt(2.0) * settings.slip_walk_radps, arm * settings.slip_walk_radps
+        walk = np.square(walk)
+        if is_excited:
+            walk[5:] = self._stiffness_walk
+        return walk
+
+    def _bound(self, steer: float, sign: float) -> None:
+        """Keep slip angles and stiffness within their limits; bounds move the mean, the covariance stays."""
+        mean, base_m = self.filter.mean, self._base_m
+        slips = sign * (np.arctan(self._axles() @ mean[3:5]) - [steer, 0.0])
+        if np.abs(slips).max() > SLIP_MAX_RAD:
+            front, rear = np.tan([steer, 0.0] + sign * np.clip(slips, -SLIP_MAX_RAD, SLIP_MAX_RAD))
+            mean[3:5] = front - rear, rear + self._ahead_m / base_m * (front - rear)
+        axles = np.clip([mean[5] + mean[6], mean[5] - mean[6]], C_LOW_NPR / self._nominal, C_HIGH_RATIO)
+        mean[5:] = axles.mean(), 0.5 * (axles[0] - axles[1])
+
+    def _axles(self) -> Array:
+        """Return the matrix (2, 2) from r L / u and w / u to tan(d + s b_F) and tan(s b_R)."""
+        return np.array([[self._behind_m / self._base_m, 1.0], [-self._ahead_m / self._base_m, 1.0]])
+
+    def _read(self, speed: float, steer: float, status: ObserverStatus) -> ObserverOutput:
+        mean, cov, axles = self.filter.mean, self.filter.cov, self._axles()
+        sign, tangents = -1.0 if speed < 0.0 else 1.0, axles @ mean[3:5]
+        by_motion = axles / (1.0 + tangents**2)[:, None]
+        slip = sign * (np.arctan(tangents) - [steer, 0.0])
+        slip_std = np.sqrt(np.einsum("ij,jk,ik->i", by_motion, cov[3:5, 3:5], by_motion))
+        is_unknown = not self._by_imu_alone and not slip_std.max() < UNKNOWN_STD_RAD
+        if status == ObserverStatus.STARTING or is_unknown:
+            slip, slip_std = np.full(2, np.nan), np.full(2, np.nan)
+        pose, pose_std = np.array(mean[:3]), np.sqrt(cov.diagonal()[:3])
+        unknown = self.age_s[[0, 0, 1]] == np.inf
+        pose[unknown] = pose_std[unknown] = np.nan
+        if not self.settings.by_dynamics:
+            return ObserverOutput(pose, pose_std, slip, slip_std, int(status))
+        per_motion, mixed = np.array([speed / self._base_m, speed]), np.array([[1.0, 1.0], [1.0, -1.0]])
+        motion, motion_std = per_motion * mean[3:5], np.abs(per_motion) * np.sqrt(cov.diagonal()[3:5])
+        if status == ObserverStatus.STARTING:
+            motion, motion_std = np.full(2, np.nan), np.full(2, np.nan)
+        stiffness = self._nominal * (mixed @ mean[5:])
+        stiffness_std = self._nominal * np.sqrt(np.einsum("ij,jk,ik->i", mixed, cov[5:, 5:], mixed))
+        return ObserverOutput(
+            np.concatenate([pose, motion, stiffness]),
+            np.concatenate([pose_std, motion_std, stiffness_std]),
+            slip,
+            slip_std,
+            int(status),
+        )

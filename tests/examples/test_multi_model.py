@@ -1,0 +1,81 @@
+"""The multi-model observer of Deremetz et al. with the gains of the paper: its equations, and what the misprints do."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "terrain" / "estimation" / "observers"))
+
+from multi_model import SECTION_VI, Gains, MultiModel
+from test_sideslip import drive, true_slips
+
+from terrain.estimation.observers.observer import observe
+from terrain.robots import load_robot
+
+ROBOT = load_robot("adap2e")
+
+
+def test_on_a_straight_path_it_is_8_and_9():
+    """With deviations y, theta~ of the path y = 0, integrated at 1 ms without noise."""
+    dt_s, speed, steer, slips = 0.001, 3.0, 0.02, np.array([-0.03, 0.04])
+    gains = Gains(4.0, 5e9, 1e-2, excited_mps2=0.0, instrument=False)
+    base, arm = ROBOT.wheelbase_m, ROBOT.com_ahead_m
+    time_s = np.arange(3000) * dt_s
+    turning = speed * (np.tan(steer + slips[0]) - np.tan(slips[1])) / base
+    yaw, along = turning * time_s, speed / np.cos(slips[1])  # v of the paper: u = v cos b_R is measured
+    x, y = (np.cumsum(along * f(yaw + slips[1])) * dt_s for f in (np.cos, np.sin))
+    rows = np.full((time_s.size, 8), np.nan)
+    rows[:, :2], rows[:, 2], rows[:, 3], rows[:, 4] = (speed, steer), x, y, yaw
+    rows[:, 5:7] = turning, 0.0
+    track = observe(MultiModel(ROBOT, gains), time_s, rows)
+    dev, slip, paper = np.array([y[0], yaw[0]]), np.zeros(2), np.full((time_s.size, 4), np.nan)
+    dyn, stiffness, cos = np.zeros(2), np.full(2, 15000.0), np.cos(steer)
+    axles = np.array([[-arm * cos, arm], [-cos, -1.0]]) / [[ROBOT.yaw_inertia_kgm2], [ROBOT.mass_kg]]
+    for k in range(1, time_s.size):
+        v = speed / np.cos(slip[1])
+        error = np.array([y[k], yaw[k]]) - dev
+        rate = v * np.cos(slip[1]) * (np.tan(steer + slip[0]) - np.tan(slip[1])) / base
+        front, rear = speed / base / np.cos(steer + slip[0]) ** 2, speed / base / np.cos(slip[1]) ** 2
+        jacobian = np.array([[0.0, v * np.cos(yaw[k] + slip[1])], [front, -rear]])
+        dev = dev + dt_s * (np.array([v * np.sin(yaw[k] + slip[1]), rate]) + 15.0 * error)
+        beta = np.arctan((arm * np.tan(slip[0] + steer) + arm * np.tan(slip[1])) / base)  # (4)
+        virtual = v * np.cos(slip[1]) / np.cos(beta) * np.sin(beta)
+        g = axles @ (stiffness * slip) - np.array([0.0, speed * turning])
+        e_dyn = np.array([turning, virtual]) - dyn
+        dyn = dyn + dt_s * (g + 20.0 * e_dyn)
+        change = (
+            gains.slip_gain * jacobian.T @ error + gains.dynamic_slip_ratio * (axles * stiffness).T @ e_dyn
+        )
+        stiffness = stiffness + dt_s * gains.stiffness_gain * (axles * slip).T @ e_dyn
+        stiffness, slip = np.clip(stiffness, 1000.0, 30000.0), slip + dt_s * change
+        paper[k] = *slip, *stiffness
+    assert track.slip[500:] == pytest.approx(paper[500:, :2], abs=0.003)
+    assert track.mean[500:, 5:7] == pytest.approx(paper[500:, 2:], rel=0.03)
+    assert np.ptp(paper[1:, 2:], axis=0).min() > 1000.0
+
+
+def test_printed_signs_send_the_stiffness_to_its_limit():
+    """On a slope: on level ground both signs of line 2 turn, and its steady state is the same."""
+    time_s, rows, truth = drive(5.0, seed=5, roll_rad=0.2)
+    printed, right = (
+        observe(MultiModel(ROBOT, Gains(as_printed=sign)), time_s, rows) for sign in (True, False)
+    )
+    assert printed.mean[:, 5:7].min() == 1000.0
+    errors = [np.sqrt(np.nanmean((track.slip - true_slips(truth)) ** 2)) for track in (printed, right)]
+    assert errors[0] < 2.0 * errors[1]  # the fault hides in the slip
+
+
+def test_printed_regressors_bias_the_stiffness():
+    time_s, rows, truth = drive(4.0, seed=6)
+    excited = (np.abs(truth("accel_y_mps2")) > 1.0) & (time_s > 10.0)
+    secant = -truth("side_rear_n")[excited] / truth("slip_rear_rad")[excited]
+    medians = []
+    for instrument in (True, False):
+        gains = SECTION_VI._replace(stiffness_gain=5e8, instrument=instrument)
+        rear = observe(MultiModel(ROBOT, gains), time_s, rows).state("cornering_rear_npr")[excited]
+        medians.append(np.nanmedian(rear / secant) - 1.0)
+    assert abs(medians[0]) < 0.1
+    assert medians[1] < -0.15
