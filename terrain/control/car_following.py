@@ -84,8 +84,7 @@ class SteeringSettings(NamedTuple):
     #: H over the actuator's time constant, 3 for its response time (95 %); 0 passes the curvature on as it is
     horizon_time_constants: float = 3.0
     #: time constant of a low-pass of the slip angles. The front one has -d in it, at once: fed back without a lag it
-    #: closes a fast loop of gain 1 around actuator and tyres, which swings near the grip's limit even where the slip that
-    #: is estimated has no lag of its own
+    #: closes a fast loop of gain 1 around actuator and tyres, which swings near the limit of the grip
     slip_lag_s: float = 0.4
 
 
