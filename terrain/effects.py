@@ -26,12 +26,6 @@ out where it is unknown::
 
 A parameter that is not there is 0, and its effect absent.  Former names of parameters are read as the present
 ones.
-
-Examples
---------
->>> found = effect_named("gyro_scale")
->>> found.formula, found.parameters[0].inverse.formula
-('gyro = (1 + k) w', '(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)')
 """
 
 from __future__ import annotations
@@ -49,18 +43,14 @@ from terrain.files.documents import check_keys, number
 from terrain.kernels import record
 from terrain.records import Array, read_only
 
-GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING = (
-    "yaw_rate_radps",
-    "speed_x_mps",
-    "speed_y_mps",
-    "accel_x_mps2",
-    "current_a",
-    "turning_current_a",
-    "heading_rate_radps",
+CHANNELS: tuple[str, ...] = (
+    *("yaw_rate_radps", "speed_x_mps", "speed_y_mps", "accel_x_mps2"),
+    *("current_a", "turning_current_a", "heading_rate_radps"),
 )
-CHANNELS: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING)
 """Channels that are compared: gyro, speed over ground of the camera's point, accelerometer, sum of the motor
 currents, right minus left current, and the rate of a heading that no gyro measured (lidar, two antennas)."""
+
+GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING = CHANNELS
 
 MOTION: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y)
 """Channels of the planar motion."""
@@ -94,30 +84,19 @@ class Combine(Enum):
         >>> Combine.OVER.apply(0.3, 1.0), Combine.SUBTRACTED.apply(0.0, 0.1)
         (0.15, -0.1)
         """
-        if self is Combine.ADDED:
-            return number + value
-        if self is Combine.SUBTRACTED:
-            return number - value
+        if self in (Combine.ADDED, Combine.SUBTRACTED):
+            return number + value if self is Combine.ADDED else number - value
         return number * (1.0 + value) if self is Combine.TIMES else number / (1.0 + value)
 
 
 class Home(NamedTuple):
-    """A number of the description that a parameter changes.
+    """A number of the description that a parameter changes."""
 
-    Parameters
-    ----------
-    section : of the description; empty for a number of the robot itself
-    field : in the section
-    combine : how the two are combined
-    scaled_by : field of the same section that the parameter is multiplied by first; empty for none
-    optional : whether the parameter also has its other homes where the description lacks this section
-    """
-
-    section: str
+    section: str  # of the description; empty for a number of the robot itself
     field: str
     combine: Combine
-    scaled_by: str = ""
-    optional: bool = False
+    scaled_by: str = ""  # field of the same section that the parameter is multiplied by first
+    optional: bool = False  # the parameter also has its other homes where the description lacks this section
 
 
 STAMPS = ("stamp",)
@@ -125,81 +104,51 @@ STAMPS = ("stamp",)
 
 
 class Block(NamedTuple):
-    """Samples of a stream that follow on those given before, off which an effect is taken, in place.
-
-    Parameters
-    ----------
-    stream, channels : names
-    time_s, values : (k,), (k, c) as measured
-    start_s : first stamp of the wheels, from which drifts count
-    robot : with its effects, and with those applied to it that have a home
-    memory : of the samples before, of each effect by its name
-    """
+    """Samples of a stream that follow on those given before, off which an effect is taken, in place."""
 
     stream: str
     channels: tuple[str, ...]
-    time_s: Array
-    values: Array
-    start_s: float
-    robot: Any
-    applied: Any
-    memory: dict[str, Any]
+    time_s: Array  # (k,)
+    values: Array  # (k, c) as measured
+    start_s: float  # first stamp of the wheels, from which drifts count
+    robot: Any  # with its effects
+    applied: Any  # the same with those effects applied that have a home
+    memory: dict[str, Any]  # of the samples before
 
 
 class Inverse(NamedTuple):
     """How a parameter is taken off the samples of a log, by :class:`terrain.extension.Correction`.
 
-    Parameters
-    ----------
-    streams : whose samples or stamps change
-    formula : corrected from measured, in the signals of this module
-    columns : beginnings of the channels that change, or :data:`STAMPS`; empty for what takes more than one
-        number a sample
-    combine : how the corrected number follows from the measured one; of all that act on one number, offsets
-        come off before factors
-    without_home : samples change only where the description lacks the section of the parameter's home
-    undo : takes what is more than one number a sample off a block; two parameters may share one
+    Of all that act on one number, offsets come off before factors.
     """
 
-    streams: tuple[str, ...]
-    formula: str
-    columns: tuple[str, ...] = ()
-    combine: Combine = Combine.ADDED
-    without_home: bool = False
+    streams: tuple[str, ...]  # whose samples or stamps change
+    formula: str  # corrected from measured, in the signals of this module
+    columns: tuple[str, ...] = ()  # beginnings of the channels that change, or STAMPS
+    combine: Combine = Combine.ADDED  # how the corrected number follows from the measured one
+    without_home: bool = False  # only where the description lacks the section of the parameter's home
     undo: Callable[[Block, float], None] | None = None
+    """Of what takes more than one number a sample; two parameters may share one."""
 
 
 class Parameter(NamedTuple):
     """A number of the simulation that is 0 where its effect is absent.
 
-    Parameters
-    ----------
-    name : ends in its unit
-    low, high : bounds of the search
-    step : a small change that is still visible, over which sensitivities are taken
-    homes : where the description has it; all of them change together
-    inverse : how it is taken off samples, if it can be
-    one_sided : sensitivities are taken towards the positive side only: a backlash is not negative.  All
-        others are taken to both sides: a delay to one side alone is half a step off, and noise of the wheels
-        looks like it
-    scatter_rank : place in the order in which values that scatter from run to run are drawn, from 1; 0 for a
-        parameter that does not scatter
-    as_percent : pages write it as a percentage
-    is_error : it states the error of something that is there, so that pages write "off by"
-    deprecated : former names, accepted in files and on the command line
+    Sensitivities are taken towards both sides, over ``step``, a small change that is still visible: a delay to one
+    side alone is half a step off, and noise of the wheels looks like it.
     """
 
-    name: str
-    low: float
+    name: str  # ends in its unit
+    low: float  # bounds of the search
     high: float
     step: float
-    homes: tuple[Home, ...] = ()
+    homes: tuple[Home, ...] = ()  # where the description has it; all of them change together
     inverse: Inverse | None = None
-    one_sided: bool = False
-    scatter_rank: int = 0
-    as_percent: bool = False
-    is_error: bool = False
-    deprecated: tuple[str, ...] = ()
+    one_sided: bool = False  # sensitivities towards the positive side only: a backlash is not negative
+    scatter_rank: int = 0  # from 1, place in the order in which values that scatter from run to run are drawn
+    as_percent: bool = False  # pages write it as a percentage
+    is_error: bool = False  # of something that is there, so that pages write "off by"
+    deprecated: tuple[str, ...] = ()  # former names, accepted in files and on the command line
 
     @property
     def unit(self) -> str:
@@ -223,65 +172,39 @@ class Stage(Enum):
 
 
 class Term(NamedTuple):
-    """A value as sentences write it.
-
-    Parameters
-    ----------
-    found, half : value, and half of its interval
-    total : with what the robot has of it already
-    described, extended : number of the description that it changes, without and with it; 0 and the total where
-        there is none
-    note : on the described number, in brackets
-    robot : as it was tested
-    """
+    """A value as sentences write it."""
 
     found: float
-    half: float
-    total: float
-    described: float
-    extended: float
-    note: str
-    robot: Any
+    half: float  # of its interval
+    total: float  # with what the robot has of it already
+    described: float  # number of the description that it changes; 0 where there is none
+    extended: float  # the same with the value, or the total
+    note: str  # on the described number, in brackets
+    robot: Any  # as it was tested
 
 
 class Effect(NamedTuple):
-    """An error that the simulation may have.
+    """An error that the simulation may have."""
 
-    Parameters
-    ----------
-    name : as ``--effect`` and results have it
-    parameters : its numbers
-    formula : in the signals of this module
-    source : of the formula
-    drives : kinds of robots that it applies to
-    channels : of :data:`CHANNELS`, where it is visible: a tenth as clearly over the noise as in the clearest
-    needs : the driving that excites it
-    sensed_only : it changes what sensors measure, and not the motion of the body
-    stage : of the dynamic simulation that it acts in; None where that simulates none of its robots
-    aliases : other names of the same effect, which no log distinguishes from it
-    twins : names of effects that look the same, and the channel that a log needs to distinguish them
-    deprecated : former names, accepted on the command line
-    words : what its values make of the robot, as the object of "with"; by default the number of its home, or the
-        values themselves
-    modifies : name of the effect without which it does nothing; empty for an effect that acts by itself
-    beside : drive, and name of the effect that has to be known before runs of it can show this one
-    """
-
-    name: str
+    name: str  # as --effect and results have it
     parameters: tuple[Parameter, ...]
-    formula: str
+    formula: str  # in the signals of this module
     source: str
-    drives: tuple[str, ...]
-    channels: tuple[str, ...]
-    needs: str
-    sensed_only: bool = False
-    stage: Stage | None = None
-    aliases: tuple[str, ...] = ()
-    twins: tuple[tuple[str, str], ...] = ()
-    deprecated: tuple[str, ...] = ()
+    drives: tuple[str, ...]  # kinds of robots that it applies to
+    channels: tuple[str, ...]  # where it is visible: a tenth as clearly over the noise as in the clearest
+    needs: str  # the driving that excites it
+    sensed_only: bool = False  # it changes what sensors measure, and not the motion of the body
+    stage: Stage | None = None  # where it acts in the dynamic simulation, of the robots that that simulates
+    aliases: tuple[str, ...] = ()  # other names of the same effect, which no log distinguishes from it
+    twins: tuple[
+        tuple[str, str], ...
+    ] = ()  # effects that look the same, and the channel that distinguishes them
+    deprecated: tuple[str, ...] = ()  # former names, accepted on the command line
     words: Callable[[Sequence[Term]], str] | None = None
-    modifies: str = ""
+    """What its values make of the robot, as the object of "with"; by default the number of its home, or the values."""
+    modifies: str = ""  # name of the effect without which it does nothing
     beside: tuple[tuple[str, str], ...] = ()
+    """Drive, and name of the effect that has to be known before runs of it can show this one."""
 
 
 def effect(
@@ -292,14 +215,9 @@ def effect(
     inverse: Inverse | None = None,
     **others: Any,
 ) -> Effect:
-    """Return an effect of one parameter.
+    """Return an effect of one parameter, given by its unit alone: its name is that of the effect, and the unit.
 
-    Parameters
-    ----------
-    name : of the effect
-    parameter : called by its unit alone: its name is that of the effect, and the unit
-    homes, inverse : of the parameter
-    entry, others : fields of :class:`Effect` from the formula on
+    ``entry`` and ``others`` are the fields of :class:`Effect` from the formula on.
     """
     named = parameter._replace(name=f"{name}_{parameter.name}", homes=homes, inverse=inverse)
     return Effect(name, (named,), *entry, **others)
@@ -1337,18 +1255,12 @@ ROUNDING = 1e-5
 
 
 def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict[str, float]:
-    """Return the values of effects by parameter, checked.
-
-    Parameters
-    ----------
-    place : what messages call it
-    values : by parameter
-    drive : of the robot
+    """Return the values of effects by parameter, checked; ``place`` is what messages call them.
 
     Raises
     ------
     ConfigError
-        for a parameter that is unknown or of an effect that does not apply to the robot, or a value that is
+        for a parameter that is unknown or of an effect that does not apply to the drive, or a value that is
         no finite number within its bounds.
     """
     known = parameters_of(drive)
@@ -1365,18 +1277,13 @@ def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict
 
 
 def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, float], Array]:
-    """Return the values of a section by parameter, and their covariance (n, n) in the same order.
+    """Return the values of a section by parameter, and their covariance (n, n) in the same order, NaN without one.
 
     Parameters
     ----------
     place : file and section, as messages name them
     described : what the file holds
     drive : of the robot
-
-    Returns
-    -------
-    values : as :func:`checked_effects` does
-    covariance : NaN where the section has none
 
     Raises
     ------
@@ -1402,10 +1309,7 @@ def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, floa
     entries = _renamed(place, {k: v for k, v in described.items() if k not in NOT_EFFECTS})
     known = parameters_of(drive)
     checked_effects(place, dict.fromkeys((name for name in entries if name not in known), 0.0), drive)
-    values = {
-        name: number(f"{place}: {name}", entry, known[name].unit, -math.inf)
-        for name, entry in entries.items()
-    }
+    values = {n: number(f"{place}: {n}", entry, known[n].unit, -math.inf) for n, entry in entries.items()}
     values = checked_effects(place, values, drive)
     if "covariance" not in described:
         return values, np.full((len(values), len(values)), np.nan)

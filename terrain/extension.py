@@ -49,12 +49,7 @@ AnyRobot = TypeVar("AnyRobot", bound=Robot)
 
 
 def apply_homes(robot: AnyRobot, names: Collection[str] = tuple(PARAMETER)) -> AnyRobot:
-    """Return a robot with those of its effects that have a home in its description applied there.
-
-    Parameters
-    ----------
-    robot : any; without effects it is returned as it is
-    names : parameters that are applied, as far as the robot has them and the section of their home
+    """Return a robot with those of its effects that have a home in its description, and are named, applied there.
 
     Examples
     --------
@@ -77,8 +72,8 @@ def apply_homes(robot: AnyRobot, names: Collection[str] = tuple(PARAMETER)) -> A
 def corrected(robot: AnyRobot) -> AnyRobot:
     """Return the robot that filters take, together with a log that is :func:`corrected_log`.
 
-    Effects with a home in the description are applied there; of the others those are left that have no
-    inverse on samples.  A robot without effects is returned as it is, and so is one that was corrected.
+    Of effects without a home in the description those are left that have no inverse on samples.  A robot that was
+    corrected is returned as it is.
 
     Examples
     --------
@@ -129,13 +124,11 @@ def _apply(robot: AnyRobot, home: Home, value: float) -> AnyRobot:
 
 
 def _without(robot: AnyRobot, names: Collection[str]) -> AnyRobot:
-    kept = [i for i, name in enumerate(robot.effects) if name not in names]
-    if len(kept) == len(robot.effects):
+    rest = [i for i, name in enumerate(robot.effects) if name not in names]
+    if len(rest) == len(robot.effects):
         return robot
-    effects = list(robot.effects.items())
-    return replace(
-        robot, effects=dict(effects[i] for i in kept), effects_cov=robot.effects_cov[np.ix_(kept, kept)]
-    )
+    effects = {n: value for n, value in robot.effects.items() if n not in names}
+    return replace(robot, effects=effects, effects_cov=robot.effects_cov[np.ix_(rest, rest)])
 
 
 OUTSIDE_S = 1.0
@@ -149,12 +142,9 @@ PERCENTILES = (1.0, 99.0)
 
 
 def region_of(runs: Sequence[RunLog], robot: Robot) -> Region:
-    """Return the ranges of wheel speed, yaw rate by the wheels and slope of runs, and their terrains.
+    """Return the ranges of wheel speed, yaw rate by the wheels and slope of runs as measured, and their terrains.
 
-    Parameters
-    ----------
-    runs : of the robot, as measured
-    robot : for its geometry; effects are not applied, so that a run can be judged before it is corrected
+    Effects of the robot are not applied, so that a run can be judged before it is corrected.
 
     Examples
     --------
@@ -172,26 +162,18 @@ def region_of(runs: Sequence[RunLog], robot: Robot) -> Region:
 
 
 def warn_outside(run: RunLog, robot: Robot) -> None:
-    """Warn, in one sentence, where a run leaves the region that the robot's effects were validated in.
-
-    Parameters
-    ----------
-    run : as measured, or simulated
-    robot : nothing is compared where its description has no region
+    """Warn, in one sentence, where a run leaves the region that the robot's effects were validated in, if any.
 
     Warns
     -----
     OutsideRegionWarning
         with the ranges of the run and those validated.
     """
-    if robot.region is None:
-        return
-    beyond = outside(robot.region, region_of([run], robot))
-    if beyond:
-        warn_of(f"run {run.run_id}", robot, beyond)
+    if robot.region is not None and (beyond := outside(robot.region, region_of([run], robot))):
+        _warn_of(f"run {run.run_id}", robot, beyond)
 
 
-def warn_of(drive: str, robot: Robot, beyond: str) -> None:
+def _warn_of(drive: str, robot: Robot, beyond: str) -> None:
     """Warn that a drive leaves the region, ``beyond`` as :func:`terrain.robots.region.outside` returns it."""
     warnings.warn(
         f"{drive} leaves the region that the effects of robot {robot.name} were validated in: {beyond}",
@@ -203,13 +185,7 @@ def warn_of(drive: str, robot: Robot, beyond: str) -> None:
 class RegionMonitor:
     """Warns, once, when a robot that is driven live has been outside its region for :data:`OUTSIDE_S`.
 
-    Parameters
-    ----------
-    robot : whose region it is; without one nothing is compared
-
-    Attributes
-    ----------
-    compares : whether samples are compared: there is a region, and nothing was warned of yet
+    ``compares`` states whether samples are compared: there is a region, and nothing was warned of yet.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -236,7 +212,7 @@ class RegionMonitor:
         if self._outside_s >= OUTSIDE_S and self._robot.region is not None:
             self.compares = False
             now = Region((wheel_speed_mps,) * 2, (yaw_rate_radps,) * 2, None, ())
-            warn_of(f"the drive at {time_s:.1f} s", self._robot, outside(self._robot.region, now))
+            _warn_of(f"the drive at {time_s:.1f} s", self._robot, outside(self._robot.region, now))
 
 
 def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
@@ -253,28 +229,19 @@ def _driven(run: RunLog, robot: Robot) -> tuple[Array, Array, Array]:
     if robot.rate_channels[0].startswith("motor_"):
         rates = rates * (robot.wheel_radius_m / robot.motors.reduction_ratio)
     directions, speed = robot.wheel_directions_rad, rates.mean(axis=1)
-    if isinstance(robot, BicycleRobot):
-        return speed, _turned(run, robot, wheels.time_s, speed), grade
     if robot.steered:
         steering = run.streams.get("steering")
-        if steering is None:
+        if steering is None or not set(robot.steer_channels) <= set(steering.channels):
             return speed, none, grade
-        columns = [
+        angles = [
             np.interp(wheels.time_s, steering.time_s, unwrapped(steering.channel(name))) - zero
-            for name, zero in zip(robot.steer_channels, robot.steering_zeros_rad, strict=True)
+            for name, zero in zip(robot.steer_channels, robot.steering_zeros_rad, strict=False)
         ]
-        directions = np.column_stack(columns)
+        if isinstance(robot, BicycleRobot):
+            return speed, np.asarray(speed * np.tan(angles[0]) / robot.wheelbase_m), grade
+        directions = np.column_stack(angles)
     twist, _ = no_slip_twist(robot.wheel_positions_m, directions, rates, robot.on_omni_wheels)
     return np.hypot(twist[:, 0], twist[:, 1]) if robot.on_omni_wheels else speed, twist[:, 2], grade
-
-
-def _turned(run: RunLog, robot: BicycleRobot, time_s: Array, speed_mps: Array) -> Array:
-    """Return the yaw rate (n,) of a car-like robot without slip; empty without its steering."""
-    steering = run.streams.get("steering")
-    if steering is None or not set(robot.steer_channels) <= set(steering.channels):
-        return np.empty(0)
-    angle = np.interp(time_s, steering.time_s, steering.channel(robot.steer_channels[0]))
-    return np.asarray(speed_mps * np.tan(angle) / robot.wheelbase_m)
 
 
 def _range(values: Array) -> Range | None:
@@ -323,15 +290,8 @@ def correct_live(robot: AnyRobot) -> tuple[AnyRobot, Correction | None]:
 def corrected_log(run: RunLog, robot: Robot) -> RunLog:
     """Return a log as the robot would have written it without the effects that have an inverse on samples.
 
-    Parameters
-    ----------
-    run : a log of the robot, as measured
-    robot : with its effects; without any the log is returned as it is
-
-    Notes
-    -----
     Commands, estimates and labels are left alone; of a simulated truth the wheels' rates become those of
-    wheels of one radius.
+    wheels of one radius.  Without effects the log is returned as it is.
     """
     if not robot.effects:
         return run
@@ -430,24 +390,16 @@ class Origin(StrEnum):
 
 
 class Basis(NamedTuple):
-    """A number of a robot's description that a parameter of an effect changes.
+    """A number of a robot's description that a parameter of an effect changes."""
 
-    Parameters
-    ----------
-    section, field : of the description; the section is empty for a number of the robot itself
-    described : the number as it stands; the neutral one of :attr:`terrain.robots.Robot.completed` where the
-        description lacks the section
-    extended : the number with the parameter's value
-    origin : where the described number comes from
-    written : what the description calls it: of tracks ``sprocket_radius_m`` is the ``wheel_radius_m``
-    """
-
-    section: str
+    section: str  # of the description; empty for a number of the robot itself
     field: str
-    described: float
-    extended: float
+    described: (
+        float  # as it stands; the neutral one of Robot.completed where the description lacks the section
+    )
+    extended: float  # with the parameter's value
     origin: Origin
-    written: str
+    written: str  # what the description calls it: of tracks sprocket_radius_m is the wheel_radius_m
 
     @property
     def name(self) -> str:
@@ -464,18 +416,7 @@ def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, .
     """Return the described numbers that a parameter of an effect changes; none where it has no home.
 
     A lever arm of -0.23 m is relative to the lever arm described: where that one is assumed, so is half of
-    the answer, and only their sum was measured.
-
-    Parameters
-    ----------
-    robot : whose description it is; its own effects are not applied
-    parameter : of :data:`terrain.effects.PARAMETER`
-    value : that was found of it
-
-    Raises
-    ------
-    KeyError
-        if there is no such parameter.
+    the answer, and only their sum was measured.  The robot's own effects are not applied.
 
     Examples
     --------
@@ -488,23 +429,20 @@ def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, .
     """
     before = replace(robot.completed, effects={}, effects_cov=np.empty((0, 0)))
     after = apply_homes(replace(before, effects={parameter: value}, effects_cov=np.full((1, 1), np.nan)))
-    found = []
+    bases = []
     for home in PARAMETER[parameter].homes:
         if home.section and home.section not in before.parts:
             continue
         written = home.field if home.section else robot.spelled.get(home.field, home.field)
-        name = f"{home.section}.{written}" if home.section else written
-        origin = Origin.ASSUMED if name in robot.assumed else Origin.SOURCED
+        parts = (each.parts[home.section] if home.section else each for each in (before, after))
+        described, extended = (float(getattr(part, home.field)) for part in parts)
+        basis = Basis(home.section, home.field, described, extended, Origin.SOURCED, written)
         if home.section and not robot.describes(home.section):
-            origin = Origin.LEFT_OUT
-        described, extended = (_number(each, home.section, home.field) for each in (before, after))
-        found.append(Basis(home.section, home.field, described, extended, origin, written))
-    return tuple(found)
-
-
-def _number(robot: Robot, section: str, field: str) -> float:
-    part: Any = robot.parts[section] if section else robot
-    return float(getattr(part, field))
+            basis = basis._replace(origin=Origin.LEFT_OUT)
+        elif basis.name in robot.assumed:
+            basis = basis._replace(origin=Origin.ASSUMED)
+        bases.append(basis)
+    return tuple(bases)
 
 
 DIGITS = 7
@@ -580,50 +518,39 @@ def _section_lines(
     source: str,
 ) -> list[str]:
     """Return the lines of the section ``effects``."""
-    names = list(values)
     section: dict[str, Any] = {"schema": SCHEMA}
-    for name in names:
+    for name, value in values.items():
         low, high = (float(edge) for edge in intervals.get(name, (math.nan, math.nan)))
-        if not low <= values[name] <= high < math.inf:
-            raise ConfigError(
-                f"effects: {name} is {values[name]:g}, its interval {low:g} to {high:g} must hold it"
-            )
-        section[name] = {
-            "value": _rounded(values[name]),
-            "unit": known[name].unit,
-            "source": source,
-            "interval": [_rounded(low), _rounded(high)],
-        }
-    rows = {
-        row: {column: _rounded(cov[i, j]) for j, column in enumerate(names)} for i, row in enumerate(names)
-    }
+        if not low <= value <= high < math.inf:
+            raise ConfigError(f"effects: {name} is {value:g}, its interval {low:g} to {high:g} must hold it")
+        section[name] = {"value": _rounded(value), "unit": known[name].unit, "source": source}
+        section[name]["interval"] = [_rounded(low), _rounded(high)]
+    rows = [dict(zip(values, map(_rounded, row), strict=True)) for row in cov]
     lines = ["effects:", *(f"  {name}: {_flow(entry)}" for name, entry in section.items())]
     lines += ["  covariance:" if rows else "  covariance: {}"]
-    return lines + [f"    {name}: {_flow(row)}" for name, row in rows.items()]
+    return lines + [f"    {name}: {_flow(row)}" for name, row in zip(values, rows, strict=True)]
 
 
 def _region_lines(region: Region) -> list[str]:
     """Return the lines of the region; a range that was not measured has none."""
-    ranges = {name: value for name, value in region._asdict().items() if value is not None}
-    ranges["terrains"] = list(region.terrains)
-    entries = {
-        name: value if name == "terrains" else [_rounded(edge) for edge in value]
-        for name, value in ranges.items()
+    ranges = {
+        name: [_rounded(edge) for edge in pair]
+        for name, pair in zip(region._fields, region[:3], strict=False)
+        if pair
     }
+    entries: dict[str, Any] = {**ranges, "terrains": list(region.terrains)}
     return ["  region:", *(f"    {name}: {_flow(entry)}" for name, entry in entries.items())]
 
 
 def _without_effects(text: str) -> str:
     """Return the text of a description without its section ``effects``."""
-    kept, inside = [], False
+    lines, inside = [], False
     for line in text.splitlines():
-        if inside and line.strip() and not line.startswith((" ", "#")):
-            inside = False
-        if line.startswith("effects:"):
-            inside = True
+        if line.strip() and not line.startswith((" ", "#")):
+            inside = line.startswith("effects:")
         if not inside:
-            kept.append(line)
-    return "\n".join(kept).rstrip() + "\n"
+            lines.append(line)
+    return "\n".join(lines).rstrip() + "\n"
 
 
 def _rounded(value: float) -> float:
