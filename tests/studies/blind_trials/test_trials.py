@@ -304,7 +304,9 @@ def test_the_cramer_rao_limit_and_the_diagnosis_agree_on_what_can_be_seen(world)
     per_std = norm.isf(TEST_SIZE / 2 / limits.library_size) + norm.ppf(POWER)
     ratios = {}
     modifying = {p.name for e in library_of(robot.drive) if e.modifies for p in e.parameters}
-    assert all(math.isinf(limit.detection_limit) == (limit.name in modifying) for limit in found.detection_limits)
+    assert all(
+        math.isinf(limit.detection_limit) == (limit.name in modifying) for limit in found.detection_limits
+    )
     for limit in found.detection_limits:
         if limit.name in modifying:
             continue

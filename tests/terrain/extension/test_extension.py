@@ -257,7 +257,7 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
 EDGES = {
     "terrain/estimation/estimate.py",
     "terrain/estimation/observers/estimate.py",
-    "terrain/estimation/tuned_noise.py",
+    "terrain/estimation/tuning.py",
     "terrain/slip_learning/learn.py",
     "pipelines/live/windows.py",
     "pipelines/live/classifying.py",
