@@ -236,6 +236,15 @@ def _make_folder(folder: Path) -> None:
                 file.unlink()
 
 
+def inner(function: Callable[..., Any] | None = None, **options: Any) -> Any:
+    """Compile a function that compiled functions call, and nothing else: :func:`njit`, a fifth faster.
+
+    It has no entry for Python: a call from there ends the process.
+    """
+    compiled = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
+    return compiled if function is None else compiled(function)
+
+
 def record(fields: Mapping[str, Any]) -> np.dtype[Any]:
     """Return the type of a record.
 

@@ -56,7 +56,7 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.kernels import filled, njit, numbers, record
+from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE
 from terrain.kinematics.wheels import no_slip_twist, point_velocity
@@ -171,15 +171,15 @@ snow); an engine or wind that shakes the robot by more makes it unknown whether 
 MAX_READING_RADPS = 0.1
 """No gyro has a larger bias: a robot on a turntable is not at rest."""
 
-REPEATED_IMU = np.array([10.0] * 6 + [15.0] * 3)
-"""Repetitions from which on a channel counts as frozen: 0.1 s of a rate, 0.15 s of an attitude."""
+FIRST_IMU, FIRST_CAMERA, FIRST_SPEED, FIRST_WHEEL = 0, 9, 23, 25
+"""Where the channels of the IMU, the camera, its speed in the body's axes and the motors begin among those that may
+freeze."""
 
-REPEATED_CAMERA = np.array([np.inf] * 3 + [20.0] * 4 + [10.0] * 6 + [np.inf])
-"""Of the camera, at 200 Hz: 0.1 s of the quaternion, 0.05 s of a velocity; its position is not used."""
-
-REPEATED_SPEED = np.full(2, 10.0)
-REPEATED_WHEELS = np.full(3, 5.0)
-"""Of the camera's speed in the body's axes, and of the rate of each motor."""
+REPEATED = np.array(
+    [10.0] * 6 + [15.0] * 3 + [np.inf] * 3 + [20.0] * 4 + [10.0] * 6 + [np.inf] + [10.0] * 2 + [5.0] * 3
+)
+"""Repetitions from which on a channel counts as frozen: of the IMU 0.1 s of a rate, 0.15 s of an attitude; of the
+camera, at 200 Hz, 0.1 s of the quaternion, 0.05 s of a velocity (its position is not used); of a motor 0.1 s."""
 
 LONGER, LIVELY = 4.0, 2.0
 """A coarse channel repeats itself by nature: what counts as frozen is four times the longest run that has
@@ -302,12 +302,11 @@ SETTINGS = record(
 )
 """What is constant of a robot's feed."""
 
-_CHANNELS = {"imu_channels": 9, "camera_channels": 14, "speed_channels": 2, "wheel_channels": 3}
 COUNTS = ("not_finite", "frozen", "low_confidence", "no_rotation", "jump")
 FEED = record(
     {name: _sized(LINE, n) for name, n in _SIZES.items()}
     | {"steer_turns": (_TURN, 3), "imu_turns": _TURN, "camera_turns": _TURN, "camera_yaw_0_rad": float}
-    | {name: (CHANNEL, n) for name, n in _CHANNELS.items()}
+    | {"channels": (CHANNEL, REPEATED.size)}
     | {"before": (float, (2, N_CHANNELS)), "last_s": (float, len(STREAMS))}
     | {"gnss_origin_m": (float, 2), "gnss_variance": float}
     | numbers("vibration_square vibration_s tick_s rest_since_s camera_s")
@@ -326,7 +325,7 @@ stream the last stamp taken; positions' origin and variance; what the derived ro
 measured by last; the yaw at the start; the gyro since the last tick, and at rest; and counts of what was left
 out."""
 
-_kernel = njit(error_model="numpy")
+_kernel, _inner = njit(error_model="numpy"), inner(error_model="numpy")
 
 
 def feed_settings(
@@ -409,14 +408,13 @@ def new_feed() -> Array:
         FEED, np.nan, last_s=-np.inf, rate_received_s=-np.inf, steer_received_s=-np.inf, camera_offset_rad=0.0
     )
     feed["gyro_angle_rad"] = feed["gyro_time_s"] = 0.0
-    for name in _CHANNELS:
-        feed[name]["repeated"] = feed[name]["longest"] = 0.0
+    feed["channels"]["repeated"] = feed["channels"]["longest"] = 0.0
     for name in ("imu_yaw_start", "camera_yaw_start"):
         feed[name] = 0
     return feed
 
 
-@_kernel
+@_inner
 def sum_of_jumps(value: float, instant_s: float, line: Any, limit: Any) -> float:
     """Return the sum of a signal's jumps: 0 after one that jumped back, and for a latched one after a gap."""
     step_s, change, before = instant_s - line.raw_s, value - line.raw, line.jumped_by
@@ -436,7 +434,7 @@ def sum_of_jumps(value: float, instant_s: float, line: Any, limit: Any) -> float
     return float(line.jumped_by)
 
 
-@_kernel
+@_inner
 def take(value: float, instant_s: float, came_s: float, line: Any, limit: Any) -> bool:
     """Put a sample behind the low-pass of its signal; return True, and do not, where it jumped."""
     if math.isnan(value):
@@ -460,7 +458,7 @@ def take(value: float, instant_s: float, came_s: float, line: Any, limit: Any) -
     return False
 
 
-@_kernel
+@_inner
 def at_tick(time_s: float, line: Any, limit: Any) -> float:
     """Return a signal's value at a tick, the low-pass run on to it; NaN where too old or given before.
 
@@ -477,18 +475,22 @@ def at_tick(time_s: float, line: Any, limit: Any) -> float:
     return float(line.value + behind)
 
 
-@_kernel
-def repeats(channel: Any, most: float) -> bool:
+@_inner
+def repeats(feed: Any, c: int) -> bool:
     """Say whether a channel has repeated itself for longer than it does by nature."""
-    return bool(channel.repeated >= max(most, LONGER * channel.longest))
+    channel = feed.channels[c]
+    return bool(channel.repeated >= max(REPEATED[c], LONGER * channel.longest))
 
 
-@_kernel
-def _mask_frozen(sample: Array, most: Array, moving: bool, channels: Any) -> Array:
-    """Return a sample (c,) with NaN where a channel is frozen, and count its repetitions."""
+@_inner
+def _mask_frozen(sample: Array, first: int, moving: bool, feed: Any) -> Array:
+    """Return a sample (c,) with NaN where a channel, counted from the first, is frozen; count its repetitions.
+
+    A first place that is a literal would be a type, and a compilation, of its own.
+    """
     masked = sample.copy()
-    for c in range(most.size):
-        channel = channels[c]
+    for c in range(sample.size):
+        channel = feed.channels[first + c]
         if abs(sample[c] - channel.last) <= SAME:
             channel.repeated += 1.0
         elif not np.isnan(sample[c]):
@@ -497,12 +499,12 @@ def _mask_frozen(sample: Array, most: Array, moving: bool, channels: Any) -> Arr
             channel.repeated, channel.began_in_motion = 0.0, moving
         if not np.isnan(sample[c]):
             channel.last = sample[c]
-        if moving and repeats(channel, most[c]):
+        if moving and repeats(feed, first + c):
             masked[c] = np.nan
     return masked
 
 
-@_kernel
+@_inner
 def is_moving(feed: Any) -> bool:
     """Say whether a wheel turns faster than a crawl, by the low-passed speeds."""
     moving = False
@@ -511,7 +513,7 @@ def is_moving(feed: Any) -> bool:
     return bool(moving)
 
 
-@_kernel
+@_inner
 def _unwrap(angle_rad: float, turn: Any) -> float:
     """Return the angle without jumps of a turn."""
     if math.isnan(angle_rad):
@@ -526,7 +528,7 @@ def _unwrap(angle_rad: float, turn: Any) -> float:
     return float(angle_rad + turn.turned_rad)
 
 
-@_kernel
+@_inner
 def _take_steering(sample: Array, came_s: float, settings: Any, feed: Any) -> bool:
     """Steering angles without their zeros; the first one lies within half a turn."""
     jumped = False
@@ -536,7 +538,7 @@ def _take_steering(sample: Array, came_s: float, settings: Any, feed: Any) -> bo
     return bool(jumped)
 
 
-@_kernel
+@_inner
 def _take_imu(sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any) -> bool:
     """Calibrated yaw rate, acceleration of the body without gravity, yaw, and mean square of the vibration.
 
@@ -576,7 +578,7 @@ def _take_imu(sample: Array, instant_s: float, came_s: float, settings: Any, fee
     return bool(jumped)
 
 
-@_kernel
+@_inner
 def _take_odometry(
     sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any, moving: bool
 ) -> bool:
@@ -596,7 +598,7 @@ def _take_odometry(
     if math.isnan(feed.camera_yaw_0_rad):
         feed.camera_yaw_0_rad = yaw
     along, left = r_00 * v_x + r_10 * v_y + r_20 * v_z, r_01 * v_x + r_11 * v_y + r_21 * v_z
-    speed = _mask_frozen(np.array([along, left]), REPEATED_SPEED, moving, feed.speed_channels)
+    speed = _mask_frozen(np.array([along, left]), np.int64(FIRST_SPEED), moving, feed)
     line, turned_by = feed.camera_yaw_rad, feed.camera_yaw_rad.jumped_by
     jumped = take(yaw - feed.camera_yaw_0_rad, instant_s, came_s, line, settings.camera_yaw_rad)
     turned = line.jumped_by != turned_by  # that turns the speeds: they have not jumped themselves
@@ -609,7 +611,7 @@ def _take_odometry(
     return bool(jumped)
 
 
-@_kernel
+@_inner
 def _take_gnss(sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any) -> None:
     """Position from the origin, by default the first one, and speed; the position's variance is kept."""
     std = sample[4]
@@ -626,7 +628,7 @@ def _take_gnss(sample: Array, instant_s: float, came_s: float, settings: Any, fe
         take(sample[2 + i], instant_s, came_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
 
 
-@_kernel
+@_inner
 def take_sample(
     stream: int, sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any
 ) -> None:
@@ -635,17 +637,17 @@ def take_sample(
     if stream == STEERING:
         jumped = _take_steering(sample, came_s, settings, feed)
     elif stream == IMU:
-        sample = _mask_frozen(sample, REPEATED_IMU, moving, feed.imu_channels)
+        sample = _mask_frozen(sample, np.int64(FIRST_IMU), moving, feed)
         jumped = _take_imu(sample, instant_s, came_s, settings, feed)
     elif stream == ODOMETRY:
-        sample = _mask_frozen(sample, REPEATED_CAMERA, moving, feed.camera_channels)
+        sample = _mask_frozen(sample, np.int64(FIRST_CAMERA), moving, feed)
         jumped = _take_odometry(sample, instant_s, came_s, settings, feed, moving)
     else:
         _take_gnss(sample, instant_s, came_s, settings, feed)
     feed.jump[stream] += jumped
 
 
-@_kernel
+@_inner
 def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
     """Write the rates (3,) of the wheels, or the speeds (2,) of the sides."""
     for i in range(3):
@@ -654,11 +656,11 @@ def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
         row.side_mps[0], row.side_mps[1] = wheels[0], wheels[1]
         return
     moving, lively, finite, beyond = is_moving(feed), False, True, False
-    _mask_frozen(wheels, REPEATED_WHEELS, moving, feed.wheel_channels)
+    _mask_frozen(wheels, np.int64(FIRST_WHEEL), moving, feed)
     for i in range(3):
-        lively |= feed.wheel_channels[i].repeated <= LIVELY
+        lively |= feed.channels[FIRST_WHEEL + i].repeated <= LIVELY
     for i in range(3):
-        frozen = moving and lively and repeats(feed.wheel_channels[i], REPEATED_WHEELS[i])
+        frozen = moving and lively and repeats(feed, FIRST_WHEEL + i)
         rate = wheels[i] / settings.reduction_ratio
         known = math.isfinite(rate)
         too_fast = known and abs(rate) > settings.fastest_radps
@@ -669,7 +671,7 @@ def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
     feed.wheels_beyond += beyond
 
 
-@_kernel
+@_inner
 def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     """Write the rows that follow from others."""
     step_s = time_s - feed.tick_s
@@ -740,7 +742,7 @@ def rest_at(time_s: float, left_mps: float, right_mps: float, gyro_radps: float,
     return float(mean_radps)
 
 
-@_kernel
+@_inner
 def take_tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
     """Write the row of a tick but for its yaw, which :func:`refer_yaw` counts from the start.
 
@@ -774,7 +776,7 @@ def take_tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) 
         row.rest_gyro_radps = rest_at(time_s, row.side_mps[0], row.side_mps[1], row.gyro_z_radps, feed)
 
 
-@_kernel
+@_inner
 def _average_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     """Take a tick into the averages of the yaw rows at the start."""
     if math.isnan(feed.start_s):
@@ -794,7 +796,7 @@ def _average_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
             average.mean = average.sum / average.n
 
 
-@_kernel
+@_inner
 def _refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     """Count the yaw rows of a tick from the averages."""
     initial = settings.initial_yaw_rad
@@ -829,8 +831,7 @@ def take_live(stream: int, sample: Array, complete: bool, came_s: float, setting
         if same and n_known > 0:
             feed.frozen[stream] += 1
             for c in range(9 if stream == IMU else 14):
-                channel = feed.imu_channels[c] if stream == IMU else feed.camera_channels[c]
-                channel.repeated += 1.0
+                feed.channels[c if stream == IMU else FIRST_CAMERA + c].repeated += 1.0
             return
     if stream == ODOMETRY and sample[13] < MIN_CONFIDENCE_RATIO:
         feed.low_confidence[stream] += 1
@@ -895,8 +896,7 @@ def forget_times(feed: Any) -> None:
     names |= {"wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3", "gyro_angle_rad", "gyro_time_s"}
     for name in names:
         feed[name] = fresh[name]
-    for name in _CHANNELS:
-        feed[name]["repeated"] = 0.0
+    feed["channels"]["repeated"] = 0.0
 
 
 def measurements(rows: Any) -> Array:

@@ -35,7 +35,7 @@ from scipy.special import chdtri
 
 from terrain.angles import wrapped
 from terrain.errors import ConfigError, DataError, LogError
-from terrain.kernels import filled, njit, record
+from terrain.kernels import filled, inner, njit, record
 from terrain.logs.schema import unit_of
 from terrain.records import ABSENT, GATED, REOPENED, USED, Array, StateTrack, read_only
 
@@ -324,7 +324,7 @@ _WORK = record(
 _SKIP, _START, _STEP, _JUMP = range(4)  # what the clock says of a row
 _UNSOUND = -1  # a use that is never reported
 
-_kernel = njit(error_model="numpy")
+_inner = inner(error_model="numpy")
 
 
 @njit(inline="always")
@@ -347,7 +347,7 @@ def differentiate(function: Any, x: Array, dt: float, params: Array, y: Array, b
     function(x, dt, params, y)
 
 
-@_kernel
+@_inner
 def _follows(time_s: float, last_s: float, pending_s: float, max_gap_s: float) -> int:
     """Return what a stamp would be: 1 taken, -1 taken as that of a clock set back, 0 not taken.
 
@@ -363,7 +363,7 @@ def _follows(time_s: float, last_s: float, pending_s: float, max_gap_s: float) -
     return 0 if step_s <= 0.0 else 1
 
 
-@_kernel
+@_inner
 def _read_stamp(model: Any, state: Any, time_s: float) -> tuple[int, float]:
     """Say what the clock does, and move it."""
     dt = time_s - state.time_s
@@ -380,7 +380,7 @@ def _read_stamp(model: Any, state: Any, time_s: float) -> tuple[int, float]:
     return kind, dt
 
 
-@_kernel
+@_inner
 def _copy(d: int, p: Array, x: Array, p_to: Array, x_to: Array) -> None:
     """Copy a covariance and a state."""
     for i in range(d):
@@ -389,7 +389,7 @@ def _copy(d: int, p: Array, x: Array, p_to: Array, x_to: Array) -> None:
             p_to[i, j] = p[i, j]
 
 
-@_kernel
+@_inner
 def _predict(model: Any, state: Any, work: Any, dt: float, params: Array, propagate: Any) -> None:
     """x_next = f(x, dt), and P <- F P F' + Q dt, symmetric to the last bit."""
     d, p, f, fp = model.n_states, state.p, work.f, work.fp
@@ -411,7 +411,7 @@ def _predict(model: Any, state: Any, work: Any, dt: float, params: Array, propag
             p[k, i] = total
 
 
-@_kernel
+@_inner
 def _reset_covariance(model: Any, state: Any, chosen: Array) -> None:
     """Put the covariance of the chosen states back to P0, or leave it where it is wider; uncorrelated."""
     p = state.p
@@ -424,7 +424,7 @@ def _reset_covariance(model: Any, state: Any, chosen: Array) -> None:
             p[i, i] = variance
 
 
-@_kernel
+@_inner
 def _step(model: Any, state: Any, work: Any, dt: float, walk: Array, params: Array, propagate: Any) -> None:
     """Predict; where that leads out of this world, begin anew but for positions that do not."""
     d, x, p = model.n_states, state.x, state.p
@@ -449,7 +449,7 @@ def _step(model: Any, state: Any, work: Any, dt: float, walk: Array, params: Arr
             state.rejected_s[k] += dt
 
 
-@_kernel
+@_inner
 def _predict_over_gap(model: Any, state: Any, work: Any, dt: float, params: Array, propagate: Any) -> None:
     """Reset all covariances but those of the positions, which grow by what the speeds may have been."""
     d = model.n_states
@@ -468,7 +468,7 @@ def _predict_over_gap(model: Any, state: Any, work: Any, dt: float, params: Arra
         state.rejected_s[k] = -1.0
 
 
-@_kernel
+@_inner
 def _choose_states(model: Any, state: Any, work: Any, k: int) -> None:
     """Mark the states that the rejection of sensor k is put down to.
 
@@ -492,7 +492,7 @@ def _choose_states(model: Any, state: Any, work: Any, k: int) -> None:
             return
 
 
-@_kernel
+@_inner
 def _innovation(model: Any, state: Any, work: Any, i: int) -> tuple[float, float]:
     """Write g = P h' of row i; return its innovation after what was conditioned on before, and h P h'."""
     d, h, g, nu, spread = model.n_states, work.h[i], work.g, work.nu[i], 0.0
@@ -508,7 +508,7 @@ def _innovation(model: Any, state: Any, work: Any, i: int) -> tuple[float, float
     return nu, spread
 
 
-@_kernel
+@_inner
 def _condition_on(model: Any, state: Any, work: Any, nu: float, spread: float, r: float) -> bool:
     """Condition dx and P on one row; return False, and leave them, where that leads out of this world.
 
@@ -536,7 +536,7 @@ def _condition_on(model: Any, state: Any, work: Any, nu: float, spread: float, r
     return True
 
 
-@_kernel
+@_inner
 def _take_rows(model: Any, state: Any, work: Any, z: Array, variance: Array, k: int) -> int:
     """Write the innovations of a sensor's rows that measured something; return how many did."""
     n_rows = 0
@@ -554,7 +554,7 @@ def _take_rows(model: Any, state: Any, work: Any, z: Array, variance: Array, k: 
     return n_rows
 
 
-@_kernel
+@_inner
 def _condition_on_sensor(model: Any, state: Any, work: Any, z: Array, variance: Array, k: int) -> None:
     """Condition on all rows of a sensor, or on none: gate it, or reopen it once it was rejected for long."""
     n_rows = _take_rows(model, state, work, z, variance, k)
@@ -642,7 +642,7 @@ class _Columns(NamedTuple):
     taken: Array
 
 
-@_kernel
+@njit(error_model="numpy")
 def _take(
     model: Any,
     state: Any,

@@ -24,16 +24,9 @@ from typing import Any
 
 import numpy as np
 
-from terrain.estimation.feed import (
-    REPEATED_CAMERA,
-    REPEATED_IMU,
-    REPEATED_SPEED,
-    REPEATED_WHEELS,
-    is_moving,
-    repeats,
-)
+from terrain.estimation.feed import FIRST_CAMERA, FIRST_SPEED, FIRST_WHEEL, is_moving, repeats
 from terrain.estimation.filter import FilterModel
-from terrain.kernels import filled, njit, record
+from terrain.kernels import filled, inner, njit, record
 from terrain.records import ABSENT, GATED, REOPENED, Array
 from terrain.robots import Robot
 
@@ -114,7 +107,7 @@ MEMORY = record(
 accelerometer along and across, the camera's last speeds and their instant; the sample of the wheels, and how
 often it repeated itself."""
 
-_kernel = njit(error_model="numpy")
+_inner = inner(error_model="numpy")
 
 
 class HealthMonitor:
@@ -168,7 +161,7 @@ class HealthMonitor:
         return dict(zip(SENSORS, health, strict=True))
 
 
-@_kernel
+@_inner
 def _compare(time_s: float, row: Any, bias_mps2: Array, motion: Array, memory: Any) -> bool:
     """Say whether camera and accelerometer disagree; ``motion`` is the speed (2,) and the yaw rate."""
     step_s, apart = time_s - memory.seen_s, memory.apart_mps
@@ -188,19 +181,19 @@ def _compare(time_s: float, row: Any, bias_mps2: Array, motion: Array, memory: A
     return bool(abs(apart[0]) > DISAGREES_MPS or abs(apart[1]) > DISAGREES_MPS)
 
 
-@_kernel
+@_inner
 def _or_infinite(since_s: float) -> float:
     return np.inf if math.isnan(since_s) else since_s
 
 
-@_kernel
+@_inner
 def _received(line: Any, sensor: int, received_s: Array, jumped_s: Array) -> None:
     """Write when a signal of a sensor was taken last, and since when it has jumped and not jumped back."""
     received_s[sensor] = line.came_s
     jumped_s[sensor] = min(_or_infinite(line.jumping_s), _or_infinite(line.jumped_s))
 
 
-@_kernel
+@_inner
 def _when_received(feed: Any, received_s: Array, jumped_s: Array) -> None:
     """Write when each sensor (13,) was taken last, and since when its value has jumped, infinite where it has not."""
     jumped_s[:] = np.inf
@@ -217,7 +210,7 @@ def _when_received(feed: Any, received_s: Array, jumped_s: Array) -> None:
     jumped_s[_SEEN] = min(jumped_s[_SEEN], _or_infinite(feed.camera_speed_mps[1].jumped_s))
 
 
-@_kernel
+@_inner
 def _status(i: int, age_s: float, jumping_s: float, use: int, settings: Any, memory: Any) -> int:
     """Return the health of a sensor by what came of it, and by what the filter made of it.
 
@@ -239,23 +232,23 @@ def _status(i: int, age_s: float, jumping_s: float, use: int, settings: Any, mem
     return max(status, Health.REOPENED.value) if use == REOPENED else status
 
 
-@_kernel
+@_inner
 def _mark_frozen(feed: Any, health: Array) -> None:
     """Mark the sensors of frozen channels, of wheels aside."""
     for c in range(9):  # rates, forces, roll, pitch, yaw
         sensor = (-1, -1, _GYRO, _ACCEL, _ACCEL, -1, _TILT, _TILT, _YAW)[c]
-        if sensor >= 0 and repeats(feed.imu_channels[c], REPEATED_IMU[c]):
+        if sensor >= 0 and repeats(feed, c):
             health[sensor] = Health.FROZEN.value
     for c in range(3, 12):  # quaternion, velocity, turning about the vertical
         sensor = _SEEN_YAW if c < 7 else (_SEEN if c < 10 else _SEEN_TURN)
-        if c not in (8, 10) and repeats(feed.camera_channels[c], REPEATED_CAMERA[c]):
+        if c not in (8, 10) and repeats(feed, FIRST_CAMERA + c):
             health[sensor] = Health.FROZEN.value
     for c in range(2):
-        if repeats(feed.speed_channels[c], REPEATED_SPEED[c]):
+        if repeats(feed, FIRST_SPEED + c):
             health[_SEEN] = Health.FROZEN.value
 
 
-@_kernel
+@_inner
 def _mark_stuck(rates: Array, speed_mps: float, row: Any, feed: Any, memory: Any) -> None:
     """Mark the wheels that are frozen: their rate repeats itself, or all that the wheels measure does.
 
@@ -263,13 +256,13 @@ def _mark_stuck(rates: Array, speed_mps: float, row: Any, feed: Any, memory: Any
     """
     for i in range(3):
         left_out = math.isnan(row.wheel_radps[i]) and math.isfinite(rates[i])
-        stuck = left_out and repeats(feed.wheel_channels[i], REPEATED_WHEELS[i])
+        stuck = left_out and repeats(feed, FIRST_WHEEL + i)
         stuck |= memory.n_repeated >= N_STUCK and (rates[i] != 0.0 or speed_mps > AT_REST_MPS)
         if stuck:
             memory.health[_WHEEL + i] = Health.FROZEN.value
 
 
-@_kernel
+@njit(error_model="numpy")
 def _judge(
     time_s: float, wheels: Array, rates: Array, row: Any, feed: Any, state: Any, settings: Any, memory: Any
 ) -> None:

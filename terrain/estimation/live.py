@@ -214,7 +214,7 @@ class _Queue:
 
     def push(self, time_s: Array, values: Array, last_s: float) -> None:
         """Queue samples; ``last_s`` is the stamp of the last that was taken out."""
-        samples = values[:, self._columns]
+        samples = np.ascontiguousarray(values[:, self._columns])  # one layout: one compiled form
         samples[:, self._is_lacking] = np.nan
         finite = np.isfinite(samples)
         samples[~finite] = np.nan

@@ -37,6 +37,9 @@ MAX_STEPS = 25
 WIDEST_SCALE = 1e4
 """No variance is scaled up or down by more than this."""
 
+AT_END = 0.1
+"""A scale that is so near to that, as a logarithm, is at its bound: the likelihood is flat there."""
+
 CLEAR_DROP = 2.0
 """A scale twice or half as large has to cost this much log likelihood, as an error of two standard deviations
 does; otherwise the runs say nothing on it."""
@@ -154,7 +157,7 @@ def tune_noise(
         shift = math.log(2) * np.eye(len(members))[i]
         drop = after - max(likelihood(fit.value + shift), likelihood(fit.value - shift))
         status[name] = TuningStatus.FOUND if drop > CLEAR_DROP else TuningStatus.NOT_EXCITED
-        if fit.at_bound[i]:
+        if abs(fit.value[i]) > widest - AT_END:
             status[name] = TuningStatus.AT_BOUND
     scales = dict(zip(members, np.exp(fit.value).tolist(), strict=True))
     before = likelihood(np.zeros(len(members)))

@@ -99,7 +99,7 @@ def _slip(
     if not np.array_equal(track.time_s, table.time_s):
         raise DataError("the track and the measurements are not on one clock: filter this table")
     places = _places(robot, track.states, from_encoders)
-    wheel_speed = robot.wheel_speeds_mps(table.columns(list(robot.wheel_rows)))
+    wheel_speed = np.ascontiguousarray(robot.wheel_speeds_mps(table.columns(robot.wheel_rows)))
     std_mps = wheel_speed_scatter_mps(robot) if wheel_speed_std_mps is None else wheel_speed_std_mps
     slip = np.empty((track.time_s.size, 2, len(robot.wheels)))
     positions = np.array(robot.wheel_positions_m)
@@ -159,10 +159,10 @@ def _slips(
     """
     n_wheels = positions_m.shape[0]
     states, slopes = np.empty(5, np.int64), np.empty(5)
-    states[:3] = places[:3]
     for k in range(mean.shape[0] * n_wheels):
         n, i = k // n_wheels, k % n_wheels
         state = mean[n]
+        states[0], states[1], states[2] = places[0], places[1], places[2]
         states[3], states[4] = places[3 + i], places[3 + n_wheels + i]
         x, y = positions_m[i, 0], positions_m[i, 1]
         across = state[states[1]] if states[1] >= 0 else 0.0
@@ -174,7 +174,7 @@ def _slips(
         wheel_speed = ground + state[states[4]] if in_state else wheel_speed_mps[n, i]
         traction = abs(wheel_speed) >= abs(ground)
         fastest = wheel_speed if traction else ground
-        slip[n, :, i] = np.nan
+        slip[n, 0, i] = slip[n, 1, i] = np.nan
         if not (abs(fastest) >= MIN_SPEED_MPS and np.isfinite(wheel_speed)):
             continue
         size, sign = abs(fastest), np.sign(fastest)

@@ -71,7 +71,7 @@ import numpy as np
 from terrain.errors import ConfigError
 from terrain.estimation.feed import CAMERA_ROWS, DERIVED_ROWS, GNSS_ROWS, UNSEEN_AFTER_S, MeasurementTable
 from terrain.estimation.filter import FilterModel, Noise
-from terrain.kernels import njit
+from terrain.kernels import inner, njit
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array
 from terrain.robots import Robot, SwerveRobot, as_drive
@@ -223,7 +223,7 @@ def propagate(x: Array, dt: float, params: Array, x_next: Array, f: Array) -> No
         f[_OFFSET, _BIAS] = dt
 
 
-@njit
+@inner
 def _scale(state: int, ratio: float, x: Array, x_next: Array, f: Array) -> None:
     x_next[state] = ratio * x[state]
     f[state, state] = ratio
@@ -276,13 +276,13 @@ def observe(x: Array, params: Array, z_hat: Array, h: Array) -> None:
         _observe_gnss(x, params[_ANTENNA_X], params[_ANTENNA_Y], row, z_hat, h)
 
 
-@njit
+@inner
 def _add(row: int, state: int, x: Array, z_hat: Array, h: Array) -> None:
     z_hat[row] += x[state]
     h[row, state] = 1.0
 
 
-@njit
+@inner
 def _observe_gnss(x: Array, antenna_x: float, antenna_y: float, row: int, z_hat: Array, h: Array) -> None:
     """Position and velocity of the antenna in the world."""
     cos, sin = math.cos(x[_YAW]), math.sin(x[_YAW])

@@ -16,6 +16,9 @@ from terrain.estimation.feed import (
     CHANGE_S,
     CRAWL_MPS,
     DERIVED_ROWS,
+    FIRST_CAMERA,
+    FIRST_SPEED,
+    FIRST_WHEEL,
     FIX_STD_M,
     FLOAT_STD_M,
     GAP_PERIODS,
@@ -30,10 +33,7 @@ from terrain.estimation.feed import (
     MAX_RATE_FACTOR,
     MOVING_MPS,
     PASSING,
-    REPEATED_CAMERA,
-    REPEATED_IMU,
-    REPEATED_SPEED,
-    REPEATED_WHEELS,
+    REPEATED,
     REST_ACCEL_MPS2,
     REST_AFTER_S,
     REST_SEEN_MPS,
@@ -316,7 +316,7 @@ def plain_table(run, robot, causal, initial_yaw_rad):
             imu_s, accel_z = time_s, plain_vertical(stream, time_s, robot, signals)
         if name == "odometry":
             for row in CAMERA_ROWS[:2]:
-                frozen = plain_frozen(signals[row], REPEATED_SPEED[0], moving(came_s))
+                frozen = plain_frozen(signals[row], REPEATED[FIRST_SPEED], moving(came_s))
                 signals[row] = np.where(frozen, np.nan, signals[row])
             yaw = signals["camera_yaw_rad"]
             sums = plain_sums(time_s, yaw, *JUMPS["camera_yaw_rad"])
@@ -350,7 +350,7 @@ def plain_wheels(clock, motor_radps, rates, robot):
     for _ in range(3):  # motion follows from the rates that are left, and is known one tick later
         counts = np.column_stack([plain_counts(column) for column in motor_radps.T])
         lively = (counts <= 2).any(axis=1)
-        frozen = [plain_frozen(v, REPEATED_WHEELS[0], moving) for v in motor_radps.T]
+        frozen = [plain_frozen(v, REPEATED[FIRST_WHEEL + 0], moving) for v in motor_radps.T]
         kept = np.where(np.column_stack(frozen) & lively[:, None], np.nan, rates)
         once, _, _ = plain_moving(clock, kept * robot.wheel_radius_m)
         moving = np.append(False, (np.abs(once[:-1]) > MOVING_MPS).any(axis=1))
@@ -370,7 +370,7 @@ def plain_counts(value):
 
 def plain_lives(name, stream, moving):
     """Leave out the channels of an IMU or a camera that repeat themselves in motion."""
-    most = {"imu": REPEATED_IMU, "odometry": REPEATED_CAMERA}.get(name)
+    most = {"imu": REPEATED, "odometry": REPEATED[FIRST_CAMERA:]}.get(name)
     if most is None:
         return stream
     values = np.array(stream.values)
