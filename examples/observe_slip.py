@@ -9,7 +9,8 @@ from terrain.estimation.observers.choice import make_observer
 from terrain.estimation.observers.rows import LiveObserver
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
-from terrain.simulation.tracked import Slope, Stretch, simulate_tracked
+from terrain.simulation.run import simulate
+from terrain.simulation.tracked import Slope, Stretch
 from terrain.terramechanics.soil import load_soil
 
 
@@ -18,7 +19,7 @@ def observe(seed: int = 1) -> list[tuple[str, float, float]]:
     robot = load_robot("orchard_ugv")
     ground = [Stretch(load_soil("grass"), 5.0), Stretch(load_soil("dry_sand"))]
     speeds = np.full((1500, 2), 0.5)  # m/s of the left and the right track at 50 Hz
-    run = simulate_tracked(robot, ground, speeds, seed, slope=Slope(0.2))
+    run = simulate(robot, speeds, ground, seed, slope=Slope(0.2))
     channels = {name: stream.channels for name, stream in run.streams.items()}
     observer, found = LiveObserver(make_observer("tracked", robot), robot, channels), []
     for sample in replay(run):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.control.paths import ReferencePath, path_from_curvature
-from terrain.simulation.car import CarDrive, Ground, SpeedProfile, level_ground
+from terrain.simulation.car import CarDrive, Ground, level_ground
 
 GRIP_RATIO = 0.7
 """Of soil and grass; assumed."""
@@ -32,7 +32,7 @@ class Course(NamedTuple):
         """Return the drive along the course at a speed, with stops (distance in m, time in s)."""
         stood_s = sum(seconds for _, seconds in stops)
         longest_s = 3.0 * self.path.length_m / speed_mps + 20.0 + stood_s
-        return CarDrive(self.ground, SpeedProfile(speed_mps, stops), longest_s, self.path.start)
+        return CarDrive(speed_mps, stops, longest_s, self.path.start)
 
 
 def _along(parts: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from terrain.estimation.observers.observer import Observer
 from terrain.estimation.observers.sideslip import C_LOW_NPR, SETTINGS, Sideslip
 from terrain.records import Array
 from terrain.robots import BicycleRobot, as_drive, load_robot
-from terrain.simulation.car import simulate_car
+from terrain.simulation.run import simulate
 
 RUNS, FEW_RUNS = 5, 2
 """Drives that a figure is a mean of, and the number with ``quick``."""
@@ -83,7 +83,7 @@ def follow(course: str, speed_mps: float, variant: str, seed: int, soft: bool = 
     driven = robot
     if soft:
         driven = replace(robot, front_cornering_npr=SOFT_FRONT_NPR, rear_cornering_npr=SOFT_REAR_NPR)
-    run = simulate_car(driven, drive, follower, np.random.default_rng(seed))
+    run = simulate(driven, drive, along.ground, seed, run_id="car", controller=follower)
     return followed_drive(run, along.path, follower.ticks)
 
 

@@ -22,8 +22,9 @@ from terrain.estimation.observers.rows import rows_of
 from terrain.estimation.observers.tracked import TrackedObserver, TrackedSettings
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
+from terrain.simulation.run import simulate
+from terrain.simulation.scenario import RATE_HZ as COMMANDS_HZ
 from terrain.simulation.tracked import (
-    COMMANDS_HZ,
     LEVEL,
     NOISY,
     QUIET,
@@ -33,7 +34,6 @@ from terrain.simulation.tracked import (
     TrackedSensors,
     drive,
     rut_depth,
-    simulate_tracked,
     tracks_on,
 )
 from terrain.terramechanics.soil import Soil, load_soil
@@ -122,7 +122,7 @@ def observed(
     lost_s : between which times there is no fix
     """
     robot = orchard_ugv()
-    run = simulate_tracked(robot, ground, speeds_mps, seed, sensors=sensors)
+    run = simulate(robot, speeds_mps, ground, seed, sensors=sensors)
     streams = {name: stream for name, stream in run.streams.items() if name != "pose"}
     run = replace(run, streams=streams)
     observer = TrackedObserver(robot, settings)

@@ -48,7 +48,8 @@ from terrain.estimation.observers.slip_model import (
 from terrain.estimation.observers.slip_odometry import OBSERVED_RATIO, SlipOdometry, plain_odometry
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
-from terrain.simulation.tracked import PrescribedSlip, Slope, simulate_tracked
+from terrain.simulation.run import simulate
+from terrain.simulation.tracked import PrescribedSlip, Slope
 from terrain.terramechanics.soil import Soil, load_soil, scattered
 from terrain.terramechanics.traction import bekker_pressure, mobilised_ratio, plate_sinkage
 
@@ -94,7 +95,7 @@ def patako() -> TrackedRobot:
     return as_drive(TrackedRobot, load_robot(ROBOT), "{name} is no tracked robot")
 
 
-def simulate(
+def log_of(
     run: Run, soil: Soil | None = None, duration_s: float = 10.0, robot: TrackedRobot | None = None
 ) -> RunLog:
     """Return a log; a turn ends near 90 degrees, a straight run after ``duration_s``."""
@@ -107,7 +108,7 @@ def simulate(
     ground = scattered(soil or load_soil(SAND), np.random.default_rng([run.seed, 7]))
     slope = Slope(math.radians(run.slope_deg), run.uphill_rad)
     name = f"{run.slope_deg:g}deg_{run.rate_dps:g}dps_{run.seed}"
-    return simulate_tracked(robot, ground, belts, run.seed, slope=slope, run_id=name)
+    return simulate(robot, belts, ground, run.seed, slope=slope, run_id=name)
 
 
 def repeats_of(trial: Trial) -> int:
@@ -208,7 +209,7 @@ def straight_slip(trial: Trial) -> Finding:
     """Fit (22) and (26) to runs up and across slopes."""
     slopes = STRAIGHT_DEG[::2] + STRAIGHT_DEG[-1:] if trial.quick else STRAIGHT_DEG
     driven = straight_runs(trial.seed, 3, slopes)
-    samples = slip_samples([simulate(run) for run in driven], patako())
+    samples = slip_samples([log_of(run) for run in driven], patako())
 
     def chosen(which: Callable[[Run], bool]) -> SlipSamples:
         return samples.where(np.array([which(run) for run in driven])[samples.run])
@@ -296,8 +297,8 @@ def turning_law(trial: Trial) -> Finding:
     driven = turning_runs(trial.seed, repeats_of(trial), (UPHILL,))
     first = 1_000_000 * (trial.seed + 1) + 300_000
     on_floor = [Run(0.0, rate, UPHILL, first + k) for k, rate in enumerate(RATES_DPS * 3)]
-    sand = slip_samples([simulate(run) for run in driven], robot).turning
-    floor = slip_samples([simulate(run, load_soil(FIRM)) for run in on_floor], robot).turning
+    sand = slip_samples([log_of(run) for run in driven], robot).turning
+    floor = slip_samples([log_of(run, load_soil(FIRM)) for run in on_floor], robot).turning
 
     def exponent(samples: SlipSamples, found: Callable[[SlipSamples], float]) -> Numbers:
         """Return n, and its interval by drawing runs with replacement."""
@@ -377,9 +378,7 @@ def _hidden(trial: Trial) -> Numbers:
             half = robot.half_track_m * w
             steps = int(50 * (1.0 + 0.5 * np.pi / w / (1.0 - HIDDEN_LOSS)))
             belts = np.tile([SPEED_MPS - half, SPEED_MPS + half], (steps, 1))
-            runs.append(
-                simulate_tracked(robot, ground, belts, np.random.SeedSequence([trial.seed, place, k]))
-            )
+            runs.append(simulate(robot, belts, ground, np.random.SeedSequence([trial.seed, place, k])))
         errors[f"n = {n:g}"] = fit_turning(slip_samples(runs, robot).turning, robot.half_track_m).exponent - n
     return Numbers(max(errors.values(), key=abs), beside=errors)
 
@@ -390,7 +389,7 @@ def _hidden(trial: Trial) -> Numbers:
 def slip_angle(trial: Trial) -> Finding:
     """Fit (28) as printed to turns uphill on four slopes, and look at what it is worth."""
     robot, driven = patako(), turning_runs(trial.seed, repeats_of(trial), (UPHILL,))
-    samples = slip_samples([simulate(run) for run in driven], robot).turning
+    samples = slip_samples([log_of(run) for run in driven], robot).turning
     x, angle = angle_columns(samples, robot.half_track_m)
     y = np.degrees(angle)
     found = fit_runs(x, y, samples.run, REGRESSORS)
@@ -464,7 +463,7 @@ def train(trial: Trial, uphill_rad: Sequence[float], *, drift: bool) -> Trained:
     """Identify the slip model on runs of experiments I and II."""
     repeats, robot = repeats_of(trial), patako()
     driven = turning_runs(trial.seed, repeats, uphill_rad) + straight_runs(trial.seed, max(repeats, 2))
-    runs = [simulate(run) for run in driven]
+    runs = [log_of(run) for run in driven]
     found = identify_slip_model(runs, robot, drift=drift)
     turning = slip_samples(runs, robot).turning
     return Trained(found, fit_turning(turning, robot.half_track_m, grade=False))
@@ -472,7 +471,7 @@ def train(trial: Trial, uphill_rad: Sequence[float], *, drift: bool) -> Trained:
 
 def driven(run: Run) -> Driven:
     """Return a run with the rows of an odometry."""
-    log = simulate(run)
+    log = log_of(run)
     return Driven(log, *odometry_rows(log, patako()))
 
 
@@ -585,7 +584,7 @@ def _angles(runs: Sequence[Run]) -> Numbers:
     """Return the true slip angles after a quarter turn, beside those at the start and of a low robot."""
 
     def ends(run: Run, robot: TrackedRobot) -> tuple[float, float]:
-        truth = simulate(run, robot=robot).streams["truth"]
+        truth = log_of(run, robot=robot).streams["truth"]
         angle, yaw = np.degrees(truth.channel("slip_body_rad")), np.unwrap(truth.channel("yaw_rad"))
         quarter = int(np.argmax(yaw >= 0.5 * np.pi)) or len(yaw) - 1
         return float(angle[np.searchsorted(truth.time_s, 1.0)]), float(angle[quarter])
@@ -662,7 +661,7 @@ def online(trial: Trial) -> Finding:
     repeats, robot, seed = repeats_of(trial), patako(), trial.seed
     runs = turning_runs(seed, repeats, (UPHILL, DOWNHILL)) + straight_runs(seed, max(repeats, 2))
     order = np.random.default_rng(seed).permutation(len(runs))
-    learned = learn([simulate(runs[k]) for k in order])
+    learned = learn([log_of(runs[k]) for k in order])
     offline = train(trial, (UPHILL, DOWNHILL), drift=True)
     methods = odometries(offline) | {"online": partial(SlipOdometry, robot, learned.model)}
     errors = {

@@ -29,7 +29,8 @@ from terrain.errors import ConfigError
 from terrain.estimation.observers.observer import ObserverStatus
 from terrain.files.atomic import atomic_write
 from terrain.robots import BicycleRobot, as_drive, load_robot
-from terrain.simulation.car import CarDrive, Ground, SpeedProfile, simulate_car
+from terrain.simulation.car import CarDrive, Ground
+from terrain.simulation.run import simulate
 from terrain.status import StatusCode
 
 if TYPE_CHECKING:
@@ -160,8 +161,8 @@ def drive_along(
     longest_s = 2.0 * path.length_m / speed_mps + 30.0 + STAND_S * len(stops)
     x, y, heading = path.start
     start = (x - settings.offset * np.sin(heading), y + settings.offset * np.cos(heading), heading)
-    drive = CarDrive(ground, SpeedProfile(speed_mps, stops), longest_s, start)
-    log = simulate_car(robot, drive, follower, np.random.default_rng(settings.first_seed))
+    drive = CarDrive(speed_mps, stops, longest_s, start)
+    log = simulate(robot, drive, ground, settings.first_seed, run_id="car", controller=follower)
     return followed_drive(log, path, follower.ticks), follower.ticks
 
 

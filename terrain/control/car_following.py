@@ -363,7 +363,7 @@ _NO_GRIP = Grip(math.nan, math.nan)
 
 
 class CarFollower:
-    """Controller of a drive along a path, for :func:`terrain.simulation.car.simulate_car`.
+    """Controller of a drive along a path, for :func:`terrain.simulation.car.run_car`.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from terrain.errors import ConfigError
 from terrain.records import Command, Label, RunLog, Sample
 from terrain.robots import Robot
 from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
-from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.run import simulate
 from terrain.simulation.scenario import RATE_HZ, SCENARIOS, Patch, Scenario, make_scenario
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 

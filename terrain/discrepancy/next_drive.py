@@ -50,7 +50,6 @@ from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 from terrain.signals import low_pass
-from terrain.simulation.planar.model import TRUTH
 from terrain.simulation.planar.motion import move
 from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
 
@@ -294,9 +293,9 @@ def _signals(
     measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
     grade = roll = level
     if grade_deg:
-        driven = wheel_speed_mps, steer_rad, level, level, np.zeros((0, 3))
+        driven = wheel_speed_mps, steer_rad, level, level
         flat = move(simulation.planar, simulation.vector, dt_s, *driven)
-        yaw = np.cumsum(flat[:, TRUTH.index("yaw_rate_radps")]) / CLOCK_HZ
+        yaw = np.cumsum(flat["yaw_rate_radps"]) / CLOCK_HZ
         steepness = math.tan(math.radians(grade_deg))
         ahead, left = steepness * np.cos(yaw), -steepness * np.sin(yaw)
         grade, roll = np.arctan(ahead / np.hypot(1.0, left)), np.arctan(left)

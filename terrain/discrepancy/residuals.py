@@ -18,9 +18,9 @@ from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SENSED_ONLY, STEPS
 from terrain.errors import DataError
 from terrain.kernels import njit
 from terrain.records import Array
-from terrain.simulation.planar.model import Planar
-from terrain.simulation.planar.motion import move
-from terrain.simulation.planar.replay import replay, sense, undone
+from terrain.robots import BicycleRobot
+from terrain.simulation.planar.motion import Planar, move
+from terrain.simulation.planar.replay import corrected_inputs, replay, sense
 
 CUTOFF_HZ = 2.5
 """Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz."""
@@ -188,17 +188,17 @@ def rows_of(
     instruments = wheel_speed
     if math.isfinite(low_pass.instrument_cutoff_hz):
         instruments = _decimated(wheel_speed, _window(low_pass.instrument_cutoff_hz, 1.0 / dt), 1)
-    true_wheel_speed, true_grade, true_roll = undone(planar, vector, dt, instruments, grade, roll)
-    truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll, np.zeros((0, 3)))
+    true_wheel_speed, true_grade, true_roll = corrected_inputs(planar, vector, dt, instruments, grade, roll)
+    truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll)
     points, sensed, spans = _evaluation_points(vector, parameters)
     inputs = steer, grade, roll, truth, holes, *window
     now = _predictions(planar, points[:1], sensed[:1], dt, wheel_speed, *inputs)[0, kept]
     both = _predictions(planar, points[1:], sensed[1:], dt, instruments, *inputs)[:, kept]
     change = (both[::2] - both[1::2]) / spans[:, None, None]
     speed, turn, sideways = _rolled(planar, instruments, steer)
-    force = truth[:, 4] / (GRAVITY_MPS2 * planar.mass_kg)
+    force = truth["force_n"] / (GRAVITY_MPS2 * planar.robot.mass_kg)
     driven = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, force, sideways])
-    phase = np.cumsum(instruments, axis=0) * (dt / planar.radius_m)
+    phase = np.cumsum(instruments, axis=0) * (dt / planar.robot.wheel_radius_m)
     at = low_pass.taps.size // 2 + low_pass.every * np.arange(n_rows)[kept]
     shown = decimate(np.ascontiguousarray(measured), holes, *window)[kept]
     driven = np.column_stack([decimate(driven, known[:, :0], *window)[kept], phase[at]])
@@ -207,12 +207,13 @@ def rows_of(
 
 def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Array, Array]:
     """Return speed, turn and sideways speed (n,) of wheels, as :data:`INPUTS` has them."""
-    speed = wheel_speed.mean(axis=1)
-    if planar.omni:
-        ahead, left, turn = planar.to_rolled @ wheel_speed.T
-        return ahead, 2.0 * planar.wheel_distance_m * turn, left
-    if planar.bicycle:
-        return speed, speed * np.tan(steer[:, 0]) * (planar.track_m / planar.wheelbase_m), 0.0 * speed
+    speed, robot = wheel_speed.mean(axis=1), planar.robot
+    if robot.on_omni_wheels:
+        rollers = planar.params[0]
+        ahead, left, turn = rollers["to_rolled"] @ wheel_speed.T
+        return ahead, 2.0 * rollers["wheel_distance_m"] * turn, left
+    if isinstance(robot, BicycleRobot):
+        return speed, speed * np.tan(steer[:, 0]) * (robot.track_m / robot.wheelbase_m), 0.0 * speed
     return speed, wheel_speed[:, -1] - wheel_speed[:, 0], np.zeros_like(speed)
 
 
@@ -241,7 +242,6 @@ def _evaluation_points(vector: Array, parameters: Sequence[str]) -> tuple[Array,
     return points, sensed, points[1 + 2 * rows, at] - points[2 + 2 * rows, at]
 
 
-@njit
 def _predictions(
     planar: Planar,
     points: Array,

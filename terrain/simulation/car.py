@@ -1,31 +1,31 @@
-"""Drives of a car-like robot: an extended dynamic bicycle in steps of a millisecond, and the log of a run.
+"""An extended dynamic bicycle in steps of a millisecond, and one run of a car-like robot with its controller.
 
-At each tick of the wheels (50 Hz) a controller gets what the sensors measured and the speed that the drive
-asks for, and commands a steering angle and a speed; the simulator knows no controller.  Sensors are as on the
-robot of Deremetz et al. 2017: receiver and IMU above the middle of the rear axle.
+At each tick of the wheels (50 Hz) a controller gets what the sensors measured and the speed that the drive asks for,
+and commands a steering angle and a speed; the plant knows no controller.  Sensors are as on the robot of Deremetz et
+al. 2017: receiver and IMU above the middle of the rear axle.
 
-With the speed u of the rear axle along the body, the lateral velocity w of the centre of mass, the yaw rate
-r, the steering angle d and the roll a of the ground (left side up positive)::
+With the speed u of the rear axle along the body, the lateral velocity w of the centre of mass, the yaw rate r, the
+steering angle d and the roll a of the ground (left side up positive)::
 
     x' = u cos(yaw) - (w - L_R r) sin(yaw)        m w' = F_F cos d + F_R - m g sin a - m u r
     y' = u sin(yaw) + (w - L_R r) cos(yaw)        I_z r' = L_F F_F cos d - L_R F_R
     F = -mu N (1 - exp(-C |b| / (mu N))) sgn b    N_F = m g cos a L_R / L,  N_R = m g cos a L_F / L
     l t' = v_side - |v_ahead| t,  b = atan t      for each wheel, with the relaxation length l
 
-The side force saturates at the grip mu times the load, less what the drive takes of the friction circle.  The
-slip angle b of a tyre follows its contact over the relaxation length: at rest the tyre is a spring, nothing
-is divided by a speed, and static friction holds the robot on a slope without creep.  A damping of the
-carcass, which fades above 0.5 m/s, brings it to rest.  Speed follows its command at a bounded acceleration
-and reaches 0 exactly; the steering is a dead time, a first-order lag, and limits of rate and angle.
+The side force saturates at the grip mu times the load, less what the drive takes of the friction circle.  The slip
+angle b of a tyre follows its contact over the relaxation length: at rest the tyre is a spring, nothing is divided by
+a speed, and static friction holds the robot on a slope without creep.  A damping of the carcass, which fades above
+0.5 m/s, brings it to rest.  Speed follows its command at a bounded acceleration and reaches 0 exactly; the steering
+is a dead time, a first-order lag, and limits of rate and angle.
 
-The dynamics are (3) of Deremetz et al. 2017 with the sign of line 2 corrected, and forces that saturate
-instead of (1).  Relaxation: Pacejka, Tyre and Vehicle Dynamics, chapter 7.
+The dynamics are (3) of Deremetz et al. 2017 with the sign of line 2 corrected, and forces that saturate instead of (1).
+Relaxation: Pacejka, Tyre and Vehicle Dynamics, chapter 7.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,15 +35,14 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kernels import filled, njit, numbers, record
 from terrain.logs.schema import GNSS_CHANNELS
-from terrain.records import Array, RunLog, Stream
-from terrain.robots import BicycleRobot
-from terrain.simulation.sensors import BODY_TRUTH, white_imu
+from terrain.records import Array, Label, Stream
+from terrain.robots import BicycleRobot, Robot, as_drive
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.sensors import BODY, over_ground, truth_stream, white_imu
 from terrain.slip import slip_angle
 
-STEP_S = 0.001
-"""Length of a step."""
-LONGEST_DELAY_S = 0.3
-"""Of the dead time of the steering."""
+STEP_S, LONGEST_DELAY_S = 0.001, 0.3
+"""Length of a step, and the longest dead time of the steering."""
 
 TICK_S, FIX_S, TRUTH_S = 0.02, 0.1, 0.01
 """Times between ticks of wheels and steering, between fixes, and between rows of the IMU and of the truth."""
@@ -54,12 +53,7 @@ CAR_ROWS: tuple[str, ...] = (
 )
 """Rows (8,) of :attr:`CarSample.measured`, as observers of sideslip take them."""
 
-TRUTH_CHANNELS: tuple[str, ...] = (
-    *BODY_TRUTH,
-    *("slip_front_rad", "slip_rear_rad", "side_front_n", "side_rear_n", "steer_front_rad", "distance_m"),
-)
-"""Channels of the stream ``truth``: ``speed_y_mps``, ``accel_x_mps2`` and the specific force ``accel_y_mps2``
-are of the centre of mass, the pose and ``speed_x_mps`` of the rear axle; slip is NaN at rest."""
+_MEASURED = ("speed_mps", "steer_rad", *CAR_ROWS[2:7])
 
 CAR = record(
     numbers(
@@ -79,8 +73,8 @@ CAR_BODY = record(
     )
 )
 """Pose of the rear axle, speed along the body, lateral velocity of the centre of mass, yaw rate, steering angle,
-distance travelled, roll; acceleration along the body, lateral specific force of the centre of mass; slip angle of
-the tyres' carcass and side force of the axles; rates."""
+distance travelled, roll; acceleration along the body, lateral specific force of the centre of mass; slip angle of the
+tyres' carcass and side force of the axles; rates."""
 
 CAR_STATE = record({"body": CAR_BODY, "place": int, "commands_rad": (float, round(LONGEST_DELAY_S / STEP_S))})
 """A body, and the commands of the steering that are still to come."""
@@ -134,13 +128,7 @@ _FADE_MPS = 0.5
 
 
 def car_record(robot: BicycleRobot, settings: PlantSettings) -> Array:
-    """Return the parameters of :func:`advance`, (1,) of :data:`CAR`.
-
-    Raises
-    ------
-    ConfigError
-        if a setting is out of its range.
-    """
+    """Return the parameters of :func:`advance`, (1,) of :data:`CAR`; ``ConfigError`` for a setting out of its range."""
     if not 0.0 <= settings.steering_delay_s <= LONGEST_DELAY_S:
         raise ConfigError(
             f"steering_delay_s is {settings.steering_delay_s:g}, 0 to {LONGEST_DELAY_S:g} s is accepted"
@@ -149,9 +137,9 @@ def car_record(robot: BicycleRobot, settings: PlantSettings) -> Array:
         raise ConfigError(
             "acceleration and relaxation length above zero, and a damping from zero, are needed"
         )
-    described = {name: getattr(robot, name) for name in CAR.names or () if hasattr(robot, name)}
-    given = {name: value for name, value in settings._asdict().items() if name in (CAR.names or ())}
-    return filled(CAR, **described, **given, delay_steps=round(settings.steering_delay_s / STEP_S))
+    parts, names = (robot, settings), CAR.names or ()
+    described = {name: getattr(part, name) for part in parts for name in names if hasattr(part, name)}
+    return filled(CAR, **described, delay_steps=round(settings.steering_delay_s / STEP_S))
 
 
 def ground_grid(ground: Ground) -> Array:
@@ -260,16 +248,7 @@ def step(car: Any, grid: Array, state: Any, steer_command: float, speed_command:
 def advance(
     car: Array, grid: Array, state: Array, steer_rad: float, speed_mps: float, rows: Array, each: int
 ) -> None:
-    """Advance the state in place by steps under constant commands.
-
-    Parameters
-    ----------
-    car : of :func:`car_record`
-    grid : of :func:`ground_grid`
-    state : (1,) of :data:`CAR_STATE`
-    steer_rad, speed_mps : commanded
-    rows : (k,) of :data:`CAR_BODY` that is filled with the body after every ``each`` steps
-    each : steps a row
+    """Advance the state in place under constant commands; the rows (k,) are the body after every ``each`` steps.
 
     Examples
     --------
@@ -298,17 +277,21 @@ class SensorNoise(NamedTuple):
     yaw_rad: float = 0.005
 
 
-class SpeedProfile(NamedTuple):
-    """Speed along a drive.
+class CarDrive(NamedTuple):
+    """How a car is driven.
 
     Parameters
     ----------
     speed_mps : away from stops
     stops : (distance travelled in m, time to stand in s) of each, in their order
+    duration_s : longest time
+    start : (x in m, y in m, yaw in rad) of the rear axle at rest
     """
 
     speed_mps: float
     stops: tuple[tuple[float, float], ...] = ()
+    duration_s: float = 60.0
+    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class CarSample(NamedTuple):
@@ -318,7 +301,7 @@ class CarSample(NamedTuple):
     ----------
     time_s : of the tick
     measured : (8,) of :data:`CAR_ROWS`; NaN where a sensor gave nothing at this tick
-    speed_desired_mps : by the profile, stops included
+    speed_desired_mps : by the drive, stops included
     """
 
     time_s: float
@@ -337,25 +320,8 @@ class CarCommand(NamedTuple):
 Controller = Callable[[CarSample], CarCommand]
 
 
-class CarDrive(NamedTuple):
-    """Where and how a car drives.
-
-    Parameters
-    ----------
-    ground : along the drive
-    profile : of its speed
-    duration_s : longest time
-    start : (x in m, y in m, yaw in rad) of the rear axle at rest
-    """
-
-    ground: Ground
-    profile: SpeedProfile
-    duration_s: float = 60.0
-    start: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
 def open_loop(time_s: Array, steer_rad: Array) -> Controller:
-    """Return a controller that plays a steering angle (n,) over time (n,), at the speed of the profile.
+    """Return a controller that plays a steering angle (n,) over time (n,), at the speed of the drive.
 
     Examples
     --------
@@ -369,13 +335,13 @@ def open_loop(time_s: Array, steer_rad: Array) -> Controller:
 
 
 class _Stops:
-    """The desired speed of a profile, of what was driven so far."""
+    """The desired speed of a drive, of what was driven so far."""
 
-    def __init__(self, profile: SpeedProfile, acceleration_mps2: float) -> None:
-        self._profile, self._brakes, self._next, self._stood_s = profile, acceleration_mps2, 0, 0.0
+    def __init__(self, drive: CarDrive, acceleration_mps2: float) -> None:
+        self._drive, self._brakes, self._next, self._stood_s = drive, acceleration_mps2, 0, 0.0
 
     def desired(self, distance_m: float, speed_mps: float) -> float:
-        stops = self._profile.stops
+        stops = self._drive.stops
         if self._next < len(stops):
             where_m, stand_s = stops[self._next]
             if distance_m + speed_mps**2 / (2 * self._brakes) >= where_m:
@@ -383,60 +349,54 @@ class _Stops:
                 if self._stood_s <= stand_s:
                     return 0.0
                 self._next, self._stood_s = self._next + 1, 0.0
-        return self._profile.speed_mps
+        return self._drive.speed_mps
 
 
-def simulate_car(
-    robot: BicycleRobot,
+def run_car(
+    robot: Robot,
     drive: CarDrive,
+    ground: Ground,
+    seed: int | np.random.SeedSequence,
+    *,
+    conditions: Conditions,
+    effects: Mapping[str, float],
     controller: Controller,
-    rng: np.random.Generator,
     noise: SensorNoise = SensorNoise(),  # noqa: B008
     settings: PlantSettings = PlantSettings(),  # noqa: B008
-    run_id: str = "car",
-) -> RunLog:
-    """Drive, and return the log with its truth.
+) -> tuple[dict[str, Stream], tuple[Label, ...]]:
+    """Return streams and labels of a drive, for :func:`terrain.simulation.run.simulate`, which describes the rest.
 
-    Parameters
-    ----------
-    robot : car-like
-    drive : ground, speed, duration and start
-    controller : called at each tick
-    rng : of the noise
-    noise : of the sensors
-    settings : of the plant
-    run_id : of the log
+    Noise of the ticks is drawn at first, so that it is the same for all controllers.
 
     Raises
     ------
     ConfigError
-        if settings, ground or profile are not accepted, or the controller commands no finite numbers.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> drive = CarDrive(level_ground(), SpeedProfile(2.0), duration_s=3.0)
-    >>> straight = open_loop(np.zeros(1), np.zeros(1))
-    >>> run = simulate_car(load_robot("adap2e"), drive, straight, np.random.default_rng(1))
-    >>> sorted(run.streams)
-    ['commands', 'compass', 'gnss', 'imu', 'steering', 'truth', 'wheels']
+        if settings, ground or speed are not accepted, there are conditions or effects, or the controller commands no
+        finite numbers.
     """
-    car, grid = car_record(robot, settings), ground_grid(drive.ground)
-    profile = drive.profile
-    if not 0.0 <= profile.speed_mps <= robot.speed_max_mps:
+    robot = as_drive(BicycleRobot, robot, "robot {name}: drive {drive!r} is no car for this ground")
+    if effects or conditions != Conditions():
         raise ConfigError(
-            f"speed is {profile.speed_mps:g} m/s, 0 to {robot.speed_max_mps:g} is the robot's range"
+            f"robot {robot.name}: on ground along its drive it has neither conditions nor effects"
         )
-    stops, state = _Stops(profile, settings.acceleration_mps2), initial_state(*drive.start)
+    car, grid, rng = car_record(robot, settings), ground_grid(ground), np.random.default_rng(seed)
+    if not 0.0 <= drive.speed_mps <= robot.speed_max_mps:
+        raise ConfigError(
+            f"speed is {drive.speed_mps:g} m/s, 0 to {robot.speed_max_mps:g} is the robot's range"
+        )
+    stops, state = _Stops(drive, settings.acceleration_mps2), initial_state(*drive.start)
     per_tick, n_ticks = round(TICK_S / TRUTH_S), max(2, int(drive.duration_s / TICK_S))
     rows, steps = np.empty(1 + n_ticks * per_tick, CAR_BODY), round(TRUTH_S / STEP_S)
     body = state["body"][0]
     body["roll_rad"] = grid[0, 1]
     rows[0] = body
-    ticks, commands = _Measured(rng, noise, n_ticks, robot.com_ahead_m), np.empty((n_ticks, 2))
+    std = [noise.speed_mps, noise.steer_rad, noise.position_m, noise.position_m, noise.yaw_rad]
+    std += [noise.gyro_radps, noise.tilt_rad, noise.accel_mps2]
+    measured, commands = rng.standard_normal((n_ticks, len(CAR_ROWS))) * std, np.empty((n_ticks, 2))
     for k in range(n_ticks):
         desired = stops.desired(float(body["distance_m"]), float(body["speed_mps"]))
-        asked = controller(CarSample(k * TICK_S, ticks.measure(k, body), desired))
+        row = _measure(measured[k], body, robot, fixed=k % round(FIX_S / TICK_S) == 0)
+        asked = controller(CarSample(k * TICK_S, row, desired))
         if not np.isfinite(asked[:2]).all():
             raise ConfigError(f"the controller commands {asked[:2]} after {k * TICK_S:.2f} s")
         commands[k] = asked[:2]
@@ -445,115 +405,81 @@ def simulate_car(
         if asked.finished and k:
             n_ticks = k + 1
             break
-    time_s, measured = np.arange(n_ticks) * TICK_S, ticks.rows[:n_ticks]
-    rows = rows[: n_ticks * per_tick]
-    fixed = np.isfinite(measured[:, 2])
+    time_s, measured, rows = np.arange(n_ticks) * TICK_S, measured[:n_ticks], rows[: n_ticks * per_tick]
+    fixed, at_rear = np.isfinite(measured[:, 2]), _rear_axle(rows, robot)
+    speeds = over_ground(at_rear[::per_tick][fixed])
+    speeds += rng.standard_normal(speeds.shape) * noise.position_m / FIX_S
+    known = np.ones((len(speeds), 1))
+    fixes = np.column_stack([measured[fixed, 2:4], speeds, noise.position_m * known, known])
     streams = {
         "wheels": Stream(time_s, measured[:, :1], ("speed_rear_mps",)),
         "steering": Stream(time_s, measured[:, 1:2], ("angle_front_rad",)),
-        "gnss": _gnss(time_s[fixed], measured[fixed], rows[::per_tick][fixed], robot, noise, rng),
+        "gnss": Stream(time_s[fixed], fixes, GNSS_CHANNELS),
         "compass": Stream(time_s[fixed], measured[fixed, 4:5], ("yaw_rad",)),
-        "imu": _imu(rows, measured, per_tick, robot, noise, rng),
+        "imu": _imu(rows, measured, robot, noise, rng),
         "commands": Stream(time_s, commands[:n_ticks], ("steer_front_rad", "speed_x_mps")),
-        "truth": _truth(rows, robot),
+        "truth": _truth(rows, at_rear, robot),
     }
-    return RunLog(run_id, robot.name, streams, source="terrain.simulation.car")
+    return streams, ()
 
 
-class _Measured:
-    """Samples at the ticks; noise is drawn at first, so that it is the same for all controllers."""
-
-    def __init__(
-        self, rng: np.random.Generator, noise: SensorNoise, n_ticks: int, com_ahead_m: float
-    ) -> None:
-        std = [noise.speed_mps, noise.steer_rad, noise.position_m, noise.position_m, noise.yaw_rad]
-        std += [noise.gyro_radps, noise.tilt_rad, noise.accel_mps2]
-        self.rows, self._ahead = rng.standard_normal((n_ticks, len(CAR_ROWS))) * std, com_ahead_m
-
-    def measure(self, tick: int, body: Array) -> Array:
-        row = self.rows[tick]
-        names = [
-            "speed_mps",
-            "steer_rad",
-            "position_x_m",
-            "position_y_m",
-            "yaw_rad",
-            "yaw_rate_radps",
-            "roll_rad",
-        ]
-        row += (*(body[name] for name in names), _lateral(body, self._ahead))
-        if body["speed_mps"] == 0.0:
-            row[0] = 0.0  # the encoder of a wheel that stands counts nothing
-        row[4] = wrapped(float(row[4]))
-        if tick % round(FIX_S / TICK_S):
-            row[2:5] = np.nan
-        return np.array(row)
+def _measure(row: Array, body: Array, robot: BicycleRobot, fixed: bool) -> Array:
+    """Add what is measured of a body to the noise of a tick, and return a copy of it."""
+    row += (*(body[name] for name in _MEASURED), _lateral(body, robot))
+    if body["speed_mps"] == 0.0:
+        row[0] = 0.0  # the encoder of a wheel that stands counts nothing
+    row[4] = wrapped(float(row[4]))
+    if not fixed:
+        row[2:5] = np.nan
+    return np.array(row)
 
 
-def _lateral(rows: Array, com_ahead_m: float) -> Array:
+def _lateral(rows: Array, robot: BicycleRobot) -> Array:
     """Return the lateral specific force above the rear axle."""
-    return np.asarray(rows["accel_y_mps2"] - com_ahead_m * rows["yaw_accel_radps2"])
+    return np.asarray(rows["accel_y_mps2"] - robot.com_ahead_m * rows["yaw_accel_radps2"])
 
 
-def _rear_velocity(rows: Array, robot: BicycleRobot) -> Array:
-    """Return the velocity (n, 2) of the rear axle, ahead and to the left."""
-    left = rows["side_speed_mps"] - robot.com_ahead_m * rows["yaw_rate_radps"]
-    return np.column_stack([rows["speed_mps"], left])
+def _rear_axle(rows: Array, robot: BicycleRobot) -> Array:
+    """Return the body (n,) at the rear axle, of :data:`~terrain.simulation.sensors.BODY`."""
+    body = np.zeros(len(rows), BODY)
+    for name in set(BODY.names or ()) & set(CAR_BODY.names or ()):
+        body[name] = rows[name]
+    body["speed_x_mps"] = rows["speed_mps"]
+    body["speed_y_mps"] = rows["side_speed_mps"] - robot.com_ahead_m * rows["yaw_rate_radps"]
+    return body
 
 
-def _truth(rows: Array, robot: BicycleRobot) -> Stream:
-    ahead, left = _rear_velocity(rows, robot).T
-    at_front, steer = left + robot.wheelbase_m * rows["yaw_rate_radps"], rows["steer_rad"]
+def _truth(rows: Array, at_rear: Array, robot: BicycleRobot) -> Stream:
+    """Return the truth; pose and speed ahead are of the rear axle, all else of the centre of mass, slip NaN at rest."""
+    ahead, left, steer = at_rear["speed_x_mps"], at_rear["speed_y_mps"], rows["steer_rad"]
+    at_front = left + robot.wheelbase_m * rows["yaw_rate_radps"]
     cos, sin = np.cos(steer), np.sin(steer)
-    columns = [
-        *(rows["position_x_m"], rows["position_y_m"], wrapped(rows["yaw_rad"]), rows["roll_rad"]),
-        *(0.0 * ahead, ahead, rows["side_speed_mps"], rows["yaw_rate_radps"]),
-        *(rows["accel_x_mps2"], rows["accel_y_mps2"]),
-        slip_angle(ahead * cos + at_front * sin, at_front * cos - ahead * sin),
-        slip_angle(ahead, left),
-        *(rows["side_front_n"], rows["side_rear_n"], steer, rows["distance_m"]),
-    ]
-    return Stream(np.arange(len(rows)) * TRUTH_S, np.column_stack(columns), TRUTH_CHANNELS)
+    columns = {
+        "yaw_rad": wrapped(rows["yaw_rad"]),
+        "speed_y_mps": rows["side_speed_mps"],
+        "slip_front_rad": slip_angle(ahead * cos + at_front * sin, at_front * cos - ahead * sin),
+        "slip_rear_rad": slip_angle(ahead, left),
+        **{name: rows[name] for name in ("side_front_n", "side_rear_n")},
+        "steer_front_rad": steer,
+        "distance_m": rows["distance_m"],
+    }
+    return truth_stream(np.arange(len(rows)) * TRUTH_S, at_rear, columns)
 
 
 def _imu(
-    rows: Array,
-    measured: Array,
-    per_tick: int,
-    robot: BicycleRobot,
-    noise: SensorNoise,
-    rng: np.random.Generator,
+    rows: Array, measured: Array, robot: BicycleRobot, noise: SensorNoise, rng: np.random.Generator
 ) -> Stream:
     """Return gyro, specific force and attitude; at the ticks they are what the controller got."""
     std = np.repeat([noise.gyro_radps, noise.accel_mps2, noise.tilt_rad], 3)
     none, turn, roll = np.zeros(len(rows)), rows["yaw_rate_radps"], rows["roll_rad"]
-    lateral = _lateral(rows, robot.com_ahead_m) - GRAVITY_MPS2 * np.sin(roll)
-    accel = np.column_stack([rows["accel_x_mps2"] - rows["side_speed_mps"] * turn, lateral])
+    lateral = _lateral(rows, robot) - GRAVITY_MPS2 * np.sin(roll)
     drawn = white_imu(
         np.arange(len(rows)) * TRUTH_S,
         np.column_stack([rows["roll_rate_radps"], none, turn]),
-        accel,
+        np.column_stack([rows["accel_x_mps2"] - rows["side_speed_mps"] * turn, lateral]),
         np.column_stack([roll, none, rows["yaw_rad"]]),
         rng.standard_normal((len(rows), 9)) * std,
     )
     values = np.array(drawn.values)
-    values[::per_tick, [2, 6, 4]] = measured[:, 5:]
+    values[:: round(TICK_S / TRUTH_S), [2, 6, 4]] = measured[:, 5:]
     return Stream(drawn.time_s, values, drawn.channels)
-
-
-def _gnss(
-    time_s: Array,
-    measured: Array,
-    rows: Array,
-    robot: BicycleRobot,
-    noise: SensorNoise,
-    rng: np.random.Generator,
-) -> Stream:
-    """Return fixes: positions as the controller got them, velocity over ground, their accuracy."""
-    ahead, left = _rear_velocity(rows, robot).T
-    cos, sin = np.cos(rows["yaw_rad"]), np.sin(rows["yaw_rad"])
-    velocity = np.column_stack([cos * ahead - sin * left, sin * ahead + cos * left])
-    velocity += rng.standard_normal(velocity.shape) * noise.position_m / FIX_S
-    known = np.ones((len(rows), 1))
-    values = np.column_stack([measured[:, 2:4], velocity, noise.position_m * known, known])
-    return Stream(time_s, values, GNSS_CHANNELS)

@@ -1,4 +1,4 @@
-"""What differs from run to run on one terrain: load, slope, tyres, roughness, play."""
+"""What differs from run to run on one terrain: load, slope, tyres, roughness, play; and faults of sensors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ _ANY = (-math.inf, math.inf, "a finite number")
 _ABOVE_ZERO = (1e-6, math.inf, "a number above zero")
 _FROM_ZERO = (0.0, math.inf, "a number from zero up")
 _SLOPE = (-1.0, 1.0, "a gradient from -1 to 1")
-_PLAY = (0.0, 0.5, "an angle from 0 to 0.5 rad")
 
 _RANGES: dict[str, tuple[float, float, str]] = {
     "payload_kg": _FROM_ZERO,
@@ -27,7 +26,7 @@ _RANGES: dict[str, tuple[float, float, str]] = {
     "radius_factors": _ABOVE_ZERO,
     "roughness_factor": _FROM_ZERO,
     "field_length_m": _ABOVE_ZERO,
-    "leg_backlash_rad": _PLAY,
+    "leg_backlash_rad": (0.0, 0.5, "an angle from 0 to 0.5 rad"),
 }
 
 
@@ -35,12 +34,14 @@ _RANGES: dict[str, tuple[float, float, str]] = {
 class Conditions:
     """Conditions of one run; the defaults are level and nominal.
 
+    All plants have load and slope, tracks an even one; tyres, roughness, variation and play are those of the dynamic
+    plant alone.
+
     Parameters
     ----------
     payload_kg, payload_m : load, and where it lies (x, y) from the empty robot's centre of mass, body axes
     grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
-    undulation_ratio, undulation_length_m : a gradient along world x that changes along the path; its wave
-        length
+    undulation_ratio, undulation_length_m : a gradient along world x that changes along the path; its wave length
     radius_factors : (3,) true rolling radius of each wheel over the nominal one
     roughness_factor : roughness over that of the soil's description
     field_length_m : over which length the terrain changes along the path
@@ -49,8 +50,7 @@ class Conditions:
     Raises
     ------
     ConfigError
-        if a number is not finite, a load or a roughness below zero, a length or a radius not above it, the
-        ground steeper than 1 along an axis, or the leg's play beyond half a radian.
+        for a number that is not finite or out of its range.
     """
 
     payload_kg: float = 0.0
@@ -64,12 +64,11 @@ class Conditions:
     leg_backlash_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            low, high, desired = _RANGES[item.name]
+        for name, (low, high, desired) in _RANGES.items():
+            value = getattr(self, name)
             for number in value if isinstance(value, tuple) else (value,):
                 if not (math.isfinite(number) and low <= number <= high):
-                    raise ConfigError(f"conditions: {item.name} is {value!r}, {desired} is required")
+                    raise ConfigError(f"conditions: {name} is {value!r}, {desired} is required")
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,15 +112,17 @@ def draw_conditions(
     grade = np.array(nominal.grade_ratio) + normal(spread.grade_std_ratio, 2)
     radius = np.array(nominal.radius_factors) * (1.0 + normal(spread.radius_std_ratio, 3))
     offset = np.array(nominal.payload_m) + rng.uniform(-spread.payload_offset_m, spread.payload_offset_m, 2)
+    payload_kg = nominal.payload_kg + float(rng.uniform(0.0, spread.payload_max_kg))
+    undulation = nominal.undulation_ratio + float(normal(spread.undulation_std_ratio, 1)[0])
+    rougher = float(np.exp(normal(spread.roughness_log_std_ratio, 1)[0]))
     return Conditions(
-        payload_kg=nominal.payload_kg + float(rng.uniform(0.0, spread.payload_max_kg)),
+        payload_kg=payload_kg,
         payload_m=(float(offset[0]), float(offset[1])),
         grade_ratio=(float(grade[0]), float(grade[1])),
-        undulation_ratio=nominal.undulation_ratio + float(normal(spread.undulation_std_ratio, 1)[0]),
+        undulation_ratio=undulation,
         undulation_length_m=spread.undulation_length_m,
         radius_factors=(float(radius[0]), float(radius[1]), float(radius[2])),
-        roughness_factor=nominal.roughness_factor
-        * float(np.exp(normal(spread.roughness_log_std_ratio, 1)[0])),
+        roughness_factor=nominal.roughness_factor * rougher,
         field_length_m=spread.field_length_m,
         leg_backlash_rad=nominal.leg_backlash_rad,
     )

@@ -1,23 +1,22 @@
 """Faults of sensors in a closed loop: a catalogue, one entry a fault, and the bus that applies one.
 
-A fault acts on readings, on their stamps, and on when they arrive.  It is a function of a sample and of what
-has to be remembered from sample to sample, :class:`Memory`; the motion and the sensors' own arrays are not
-touched, so that a drive with a fault differs from one without by what the controller makes of it alone.  A
-:data:`Change` is given arrays of its own, which it may write to, and returns what arrives of them.
+A fault acts on the readings of its streams, on their stamps, and on when they arrive.  It is a :data:`Change`: a
+function of a reading and of what has to be remembered from step to step, :class:`StreamMemory`; the motion and the
+sensors' own arrays are not touched, so that a drive with a fault differs from one without by what the controller makes
+of it alone.
 
-Magnitudes are those at which a fault matters for slip control at 1 m/s: an error of 0.3 m/s in the speed over
-ground is 30 % of slip, one of 20 % in a motor's rate 17 %; the others are several times what a sensor that
-works shows (``sensors`` of a robot's description), and none is so large that a limit of range would find it.
+Magnitudes are those at which a fault matters for slip control at 1 m/s: an error of 0.3 m/s in the speed over ground is
+30 % of slip, one of 20 % in a motor's rate 17 %; the others are several times what a sensor that works shows
+(``sensors`` of a robot's description), and none is so large that a limit of range would find it.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
-from itertools import pairwise
 
 import numpy as np
 
@@ -29,16 +28,23 @@ from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import Robot
 from terrain.simulation.sensors import TILT_NOISE_RAD
 
-STREAMS: tuple[str, ...] = ("wheels", "steering", "imu", "odometry")
+_CHANNELS: Mapping[str, tuple[str, ...]] = {
+    "wheels": WHEELS_CHANNELS,
+    "steering": STEERING_CHANNELS,
+    "imu": IMU_CHANNELS,
+    "odometry": CAMERA_CHANNELS,
+}
+
+STREAMS: tuple[str, ...] = tuple(_CHANNELS)
 """Streams that faults act on; ``odometry`` is the camera's."""
 
 
 class Nature(Enum):
     """What a fault makes of the streams that it touches, which decides what a controller has to do.
 
-    ``DEAD`` and ``LYING`` streams carry no information or a wrong one: no correction may be based on them.
-    With a ``TOLERABLE`` fault the streams still carry the motion, and the controller has to go on.  With a
-    ``DEGRADED`` one it may do either.
+    ``DEAD`` and ``LYING`` streams carry no information or a wrong one: no correction may be based on them.  With a
+    ``TOLERABLE`` fault the streams still carry the motion, and the controller has to go on.  With a ``DEGRADED`` one it
+    may do either.
     """
 
     DEAD = "dead"
@@ -65,11 +71,9 @@ class StreamMemory:
     pending: list[tuple[float, Reading]] = field(default_factory=list)
 
 
-Memory = dict[str, StreamMemory]
-"""What is remembered, by stream."""
-
-Action = Callable[[Sample, Memory], Sample]
-"""From what the sensors gave at a step to what arrives."""
+Change = Callable[[Reading, StreamMemory, float], Reading | None]
+"""From what a stream gave at a step, in arrays that it may write to and maybe none, and the time of the step, to what
+arrives of it; None for nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +86,8 @@ class SensorFault:
     about : what it does, in one sentence
     streams : that it touches
     nature : what it makes of them
-    action : what it does to a sample
+    change : what it does to each of them
+    clock_s : by how much the clock of the whole robot is shifted: all stamps, and that of the step
     """
 
     name: str
@@ -90,7 +95,8 @@ class SensorFault:
     about: str
     streams: tuple[str, ...]
     nature: Nature
-    action: Action
+    change: Change
+    clock_s: float = 0.0
 
 
 class FaultyBus:
@@ -110,9 +116,9 @@ class FaultyBus:
 
     Examples
     --------
-    >>> lost = SensorFault("lost", "loss", "", ("imu",), Nature.DEAD, lambda s, _: s._replace(readings={}))
+    >>> gone = SensorFault("gone", "loss", "", ("imu",), Nature.DEAD, lost)
     >>> arrived = []
-    >>> bus = FaultyBus(lambda sample: arrived.append(sorted(sample.readings)), lost, 1.0, 2.0, seed=0)
+    >>> bus = FaultyBus(lambda sample: arrived.append(sorted(sample.readings)), gone, 1.0, 2.0, seed=0)
     >>> for time_s in (0.98, 1.0, 2.0):
     ...     bus(Sample(time_s, np.zeros(3), {"imu": Reading(np.array([time_s]), np.zeros((1, 9)))}))
     >>> arrived
@@ -130,11 +136,9 @@ class FaultyBus:
         if not (math.isfinite(start_s) and end_s > start_s):
             raise ConfigError(f"fault {fault.name}: acts from {start_s!r} to {end_s!r} s, start before end")
         self._controller, self._fault, self._start_s, self._end_s = controller, fault, start_s, end_s
-        drawn = np.random.SeedSequence([seed, zlib.crc32(fault.name.encode())]).spawn(len(STREAMS))
-        self._memory = {
-            stream: StreamMemory(np.random.default_rng(each))
-            for stream, each in zip(STREAMS, drawn, strict=True)
-        }
+        seeds = np.random.SeedSequence([seed, zlib.crc32(fault.name.encode())]).spawn(len(STREAMS))
+        memories = (StreamMemory(np.random.default_rng(drawn)) for drawn in seeds)
+        self._memory = dict(zip(STREAMS, memories, strict=True))
 
     def __call__(self, sample: Sample) -> Command:
         """Return the controller's command for what arrives of a sample."""
@@ -143,29 +147,43 @@ class FaultyBus:
                 if name in sample.readings:
                     memory.last = sample.readings[name].values[-1].copy()
         elif sample.time_s < self._end_s:
-            sample = self._fault.action(sample, self._memory)
+            sample = self._changed(sample)
         else:
-            sample = released(sample, self._memory)
+            sample = self._released(sample)
         return self._controller(sample)
 
+    def _changed(self, sample: Sample) -> Sample:
+        readings, shift_s = {}, self._fault.clock_s
+        for name in dict.fromkeys((*sample.readings, *self._fault.streams)):
+            given = sample.readings.get(name, _NOTHING)
+            if name in self._fault.streams:
+                memory, time_s = (
+                    self._memory[name],
+                    given.time_s + shift_s if shift_s else given.time_s.copy(),
+                )
+                changed = self._fault.change(Reading(time_s, given.values.copy()), memory, sample.time_s)
+                memory.n_samples += len(given.time_s)
+                given = _NOTHING if changed is None else changed
+            if given.time_s is None or len(given.time_s):
+                readings[name] = given
+        return sample._replace(readings=readings, time_s=sample.time_s + shift_s)
 
-def released(sample: Sample, memory: Memory) -> Sample:
-    """Return a sample with all that was held back before it, which is held back no more."""
-    readings = dict(sample.readings)
-    for stream, remembered in memory.items():
-        if remembered.pending:
-            held = [reading for _, reading in remembered.pending]
-            readings[stream] = joined([*held, *([readings[stream]] if stream in readings else [])])
-            remembered.pending.clear()
-    return sample._replace(readings=readings)
+    def _released(self, sample: Sample) -> Sample:
+        """Return a sample with all that was held back before it, which is held back no more."""
+        readings = dict(sample.readings)
+        for stream, memory in self._memory.items():
+            if memory.pending:
+                held = [reading for _, reading in memory.pending]
+                readings[stream] = _joined([*held, *([readings[stream]] if stream in readings else [])])
+                memory.pending.clear()
+        return sample._replace(readings=readings)
 
 
-def joined(readings: list[Reading]) -> Reading:
-    """Return readings, one at least, as one, in their order."""
-    return Reading(
-        np.concatenate([reading.time_s for reading in readings]),
-        np.concatenate([reading.values for reading in readings]),
-    )
+_NOTHING = Reading(np.empty(0), np.empty((0, 0)))
+
+
+def _joined(readings: Sequence[Reading]) -> Reading:
+    return Reading(*(np.concatenate(parts) for parts in zip(*readings, strict=True)))
 
 
 EVERY = 10
@@ -177,145 +195,117 @@ _QUATERNION = slice(
 )
 _VELOCITY = slice(CAMERA_CHANNELS.index("velocity_x_mps"), CAMERA_CHANNELS.index("velocity_z_mps") + 1)
 
-Change = Callable[[Reading, StreamMemory], Reading | None]
-"""From what a stream gave at a step to what arrives of it; None for nothing."""
 
-
-def on(streams: Sequence[str], change: Change) -> Action:
-    """Return the action that changes the readings of streams, and nothing else."""
-
-    def act(sample: Sample, memory: Memory) -> Sample:
-        readings = {}
-        for name, reading in sample.readings.items():
-            given: Reading | None = reading
-            if name in streams:
-                given = change(Reading(reading.time_s.copy(), reading.values.copy()), memory[name])
-                memory[name].n_samples += len(reading.time_s)
-            if given is not None:
-                readings[name] = given
-        return sample._replace(readings=readings)
-
-    return act
-
-
-def lost(reading: Reading, memory: StreamMemory) -> None:
+def lost(reading: Reading, memory: StreamMemory, now_s: float) -> None:
     """Let nothing arrive."""
+
+
+def written(write: Callable[[Array, StreamMemory], object]) -> Change:
+    """Let a function write to all values (k, c)."""
+
+    def change(reading: Reading, memory: StreamMemory, now_s: float) -> Reading:
+        if len(reading.time_s):
+            write(reading.values, memory)
+        return reading
+
+    return change
+
+
+def stamped(offset_s: float, chosen: bool = False) -> Change:
+    """Add a time to all stamps, or to each tenth; a time that is not finite takes their place."""
+
+    def change(reading: Reading, memory: StreamMemory, now_s: float) -> Reading:
+        at = _chosen(len(reading.time_s), memory) if chosen else slice(None)
+        reading.time_s[at] += offset_s
+        return reading
+
+    return change
+
+
+def shaped(shape: Callable[[Reading], Reading]) -> Change:
+    """Give something of another shape or type in place of a reading."""
+    return lambda reading, memory, now_s: shape(reading) if len(reading.time_s) else None
+
+
+def late(delay_s: float, jitter_s: float = 0.0) -> Change:
+    """Deliver each sample a time after its stamp, and up to ``jitter_s`` later by chance; in their order."""
+
+    def change(reading: Reading, memory: StreamMemory, now_s: float) -> Reading | None:
+        for row in _rows(reading):
+            due_s = float(row.time_s[0]) + delay_s
+            due_s += float(memory.rng.uniform(0.0, jitter_s)) if jitter_s else 0.0
+            before_s = memory.pending[-1][0] if memory.pending else -math.inf
+            memory.pending.append((max(due_s, before_s), row))
+        n_due = sum(due_s <= now_s + _SLACK_S for due_s, _ in memory.pending)
+        arrives = [row for _, row in memory.pending[:n_due]]
+        del memory.pending[:n_due]
+        return _joined(arrives) if arrives else None
+
+    return change
+
+
+def out_of_order(reading: Reading, memory: StreamMemory, now_s: float) -> Reading | None:
+    """Deliver of each two samples the later one first."""
+    arrives = []
+    for row in _rows(reading):
+        if memory.pending:
+            arrives += [row, memory.pending.pop()[1]]
+        else:
+            memory.pending.append((float(row.time_s[0]), row))
+    return _joined(arrives) if arrives else None
+
+
+def _rows(reading: Reading) -> list[Reading]:
+    """Return the samples of a reading one by one."""
+    return [Reading(reading.time_s[i : i + 1], reading.values[i : i + 1]) for i in range(len(reading.time_s))]
+
+
+def _last_values(values: Array, memory: StreamMemory) -> Array:
+    """Return the last values (c,) before the fault; without any, the first during it."""
+    if memory.last is None:
+        memory.last = values[0].copy()
+    return memory.last
+
+
+def _chosen(n: int, memory: StreamMemory) -> Array:
+    """Return which of n samples are each tenth of those that the fault has acted on."""
+    return np.asarray((memory.n_samples + np.arange(n)) % EVERY == EVERY - 1)
 
 
 def frozen(columns: Sequence[int] | slice = slice(None)) -> Change:
     """Repeat the last values before the fault; stamps go on."""
 
-    def change(reading: Reading, memory: StreamMemory) -> Reading:
-        last = _last_values(reading, memory)
-        reading.values[:, columns] = last[columns]
-        return reading
+    def write(values: Array, memory: StreamMemory) -> None:
+        values[:, columns] = _last_values(values, memory)[columns]
 
-    return change
-
-
-def written(write: Callable[[Array], object]) -> Change:
-    """Let a function write to all values (k, c)."""
-
-    def change(reading: Reading, memory: StreamMemory) -> Reading:
-        write(reading.values)
-        return reading
-
-    return change
+    return written(write)
 
 
 def offset(columns: Sequence[int], amount: float) -> Change:
     """Add a number to channels."""
 
-    def write(values: Array) -> None:
+    def write(values: Array, memory: StreamMemory) -> None:
         values[:, columns] += amount
 
     return written(write)
 
 
-def scaled(columns: Sequence[int], factor: float) -> Change:
-    """Multiply channels by a number."""
+def filled(value: float, chosen: bool = False) -> Change:
+    """Replace all values by one, or those of each tenth sample."""
 
-    def write(values: Array) -> None:
-        values[:, columns] *= factor
+    def write(values: Array, memory: StreamMemory) -> None:
+        values[_chosen(len(values), memory) if chosen else slice(None)] = value
 
     return written(write)
-
-
-def filled(value: float) -> Change:
-    """Replace all values by one."""
-    return written(lambda values: values.fill(value))
-
-
-def filled_at_times(value: float) -> Change:
-    """Replace all values of each tenth sample by one."""
-
-    def change(reading: Reading, memory: StreamMemory) -> Reading:
-        reading.values[_chosen(reading, memory)] = value
-        return reading
-
-    return change
 
 
 def noisy(std: Array) -> Change:
     """Add white noise with standard deviations (c,) to the channels."""
 
-    def change(reading: Reading, memory: StreamMemory) -> Reading:
-        reading.values[:] += std * memory.rng.standard_normal(reading.values.shape)
-        return reading
+    def write(values: Array, memory: StreamMemory) -> None:
+        values += std * memory.rng.standard_normal(values.shape)
 
-    return change
-
-
-def shifted_stamps(offset_s: float) -> Change:
-    """Add a time to all stamps; a time that is not finite takes their place."""
-
-    def change(reading: Reading, memory: StreamMemory) -> Reading:
-        return reading._replace(time_s=reading.time_s + offset_s)
-
-    return change
-
-
-def shifted_at_times(offset_s: float) -> Change:
-    """Add a time to the stamp of each tenth sample."""
-
-    def change(reading: Reading, memory: StreamMemory) -> Reading:
-        reading.time_s[_chosen(reading, memory)] += offset_s
-        return reading
-
-    return change
-
-
-def duplicated(reading: Reading, memory: StreamMemory) -> Reading:
-    """Let each sample arrive twice."""
-    return Reading(np.repeat(reading.time_s, 2), np.repeat(reading.values, 2, axis=0))
-
-
-def as_text(reading: Reading, memory: StreamMemory) -> Reading:
-    """Give words in place of the values."""
-    return reading._replace(values=np.full(reading.values.shape, "unknown"))
-
-
-def as_nothing(reading: Reading, memory: StreamMemory) -> Reading:
-    """Give None in place of stamps and values."""
-    return Reading(None, None)  # type: ignore[arg-type]
-
-
-def as_ragged(reading: Reading, memory: StreamMemory) -> Reading:
-    """Give a list whose rows have different lengths."""
-    rows = [[0.0] * (1 + k) for k in range(len(reading.time_s) + 1)]
-    return reading._replace(values=rows)  # type: ignore[arg-type]
-
-
-def of_other_width(n_columns: int) -> Change:
-    """Give the samples of another robot, with that number of columns; those that are added are 0."""
-
-    def change(reading: Reading, memory: StreamMemory) -> Reading:
-        values = np.zeros((len(reading.time_s), n_columns))
-        kept = min(n_columns, reading.values.shape[1])
-        values[:, :kept] = reading.values[:, :kept]
-        return reading._replace(values=values)
-
-    return change
+    return written(write)
 
 
 def camera_forward(values: Array) -> Array:
@@ -343,141 +333,70 @@ def camera_forward(values: Array) -> Array:
 def camera_speed_offset(amount_mps: float) -> Change:
     """Add to the camera's forward speed, wherever the robot is heading."""
 
-    def write(values: Array) -> None:
+    def write(values: Array, memory: StreamMemory) -> None:
         values[:, _VELOCITY] += amount_mps * camera_forward(values)
 
     return written(write)
 
 
-def camera_speed_frozen(reading: Reading, memory: StreamMemory) -> Reading:
+def _freeze_camera_speed(values: Array, memory: StreamMemory) -> None:
     """Repeat the camera's last forward speed before the fault; all else goes on."""
-    last = _last_values(reading, memory)[None, :]
+    last = _last_values(values, memory)[None, :]
     held_mps = float((last[:, _VELOCITY] * camera_forward(last)).sum())
-    forward = camera_forward(reading.values)
-    speed_mps = (reading.values[:, _VELOCITY] * forward).sum(axis=1)
-    reading.values[:, _VELOCITY] += (held_mps - speed_mps)[:, None] * forward
-    return reading
+    forward = camera_forward(values)
+    speed_mps = (values[:, _VELOCITY] * forward).sum(axis=1)
+    values[:, _VELOCITY] += (held_mps - speed_mps)[:, None] * forward
 
 
 def camera_turned(angle_rad: float) -> Change:
     """Turn the camera's orientation to the left about the vertical; its velocity stays."""
     w, up = math.cos(angle_rad / 2), math.sin(angle_rad / 2)
 
-    def change(reading: Reading, memory: StreamMemory) -> Reading:
-        x, y, z, scalar = reading.values[:, _QUATERNION].T.copy()  # y is up
-        reading.values[:, _QUATERNION] = np.column_stack(
+    def write(values: Array, memory: StreamMemory) -> None:
+        x, y, z, scalar = values[:, _QUATERNION].T.copy()  # y is up
+        values[:, _QUATERNION] = np.column_stack(
             [w * x + up * z, w * y + up * scalar, w * z - up * x, w * scalar - up * y]
         )
-        return reading
 
-    return change
-
-
-def late(stream: str, delay_s: float, jitter_s: float = 0.0) -> Action:
-    """Deliver each sample a time after its stamp, and up to ``jitter_s`` later by chance; in their order."""
-
-    def act(sample: Sample, memory: Memory) -> Sample:
-        remembered = memory[stream]
-        readings = dict(sample.readings)
-        for row in _rows(readings.pop(stream, None)):
-            due_s = float(row.time_s[0]) + delay_s
-            due_s += float(remembered.rng.uniform(0.0, jitter_s)) if jitter_s else 0.0
-            before_s = remembered.pending[-1][0] if remembered.pending else -math.inf
-            remembered.pending.append((max(due_s, before_s), row))
-        n_due = sum(due_s <= sample.time_s + _SLACK_S for due_s, _ in remembered.pending)
-        if n_due:
-            readings[stream] = joined([row for _, row in remembered.pending[:n_due]])
-            del remembered.pending[:n_due]
-        return sample._replace(readings=readings)
-
-    return act
+    return written(write)
 
 
-def out_of_order(stream: str) -> Action:
-    """Deliver of each two samples the later one first."""
-
-    def act(sample: Sample, memory: Memory) -> Sample:
-        pending = memory[stream].pending
-        readings, arrived = dict(sample.readings), []
-        for row in _rows(readings.pop(stream, None)):
-            if pending:
-                arrived += [row, pending.pop()[1]]
-            else:
-                pending.append((float(row.time_s[0]), row))
-        if arrived:
-            readings[stream] = joined(arrived)
-        return sample._replace(readings=readings)
-
-    return act
+def _text(reading: Reading) -> Reading:
+    return reading._replace(values=np.full(reading.values.shape, "unknown"))
 
 
-def shifted_clock(offset_s: float) -> Action:
-    """Shift the clock of the whole robot: all stamps, and that of the step."""
-
-    def act(sample: Sample, memory: Memory) -> Sample:
-        readings = {
-            name: reading._replace(time_s=reading.time_s + offset_s)
-            for name, reading in sample.readings.items()
-        }
-        return sample._replace(time_s=sample.time_s + offset_s, readings=readings)
-
-    return act
+def _ragged(reading: Reading) -> Reading:
+    rows = [[0.0] * (1 + k) for k in range(len(reading.time_s) + 1)]
+    return reading._replace(values=rows)  # type: ignore[arg-type]
 
 
-def _last_values(reading: Reading, memory: StreamMemory) -> Array:
-    """Return the last values (c,) before the fault; without any, the first during it."""
-    if memory.last is None:
-        memory.last = reading.values[0].copy()
-    return memory.last
+def _of_width(n_columns: int) -> Change:
+    """Give the samples of another robot, with that number of columns; those that are added are 0."""
 
+    def shape(reading: Reading) -> Reading:
+        values = np.zeros((len(reading.time_s), n_columns))
+        kept = min(n_columns, reading.values.shape[1])
+        values[:, :kept] = reading.values[:, :kept]
+        return reading._replace(values=values)
 
-def _chosen(reading: Reading, memory: StreamMemory) -> Array:
-    """Return which samples (k,) are each tenth of those that the fault has acted on."""
-    place = memory.n_samples + np.arange(len(reading.time_s))
-    return np.asarray(place % EVERY == EVERY - 1)
-
-
-def _rows(reading: Reading | None) -> list[Reading]:
-    """Return the samples of a reading one by one."""
-    if reading is None:
-        return []
-    return [
-        Reading(reading.time_s[i:j].copy(), reading.values[i:j].copy())
-        for i, j in pairwise(range(len(reading.time_s) + 1))
-    ]
+    return shaped(shape)
 
 
 SPEED_STEP_MPS, MOTOR_FACTOR, PITCH_STEP_RAD, YAW_STEP_RAD = 0.3, 1.2, 0.2, 0.3
 GYRO_STEP_RADPS, ACCEL_STEP_MPS2, STEERING_STEP_RAD = 0.1, 2.0, 0.1
-NOISE_FACTOR = 10.0
-SPIKE = 1e6
+NOISE_FACTOR, SPIKE = 10.0, 1e6
 LATE_S: tuple[float, ...] = (0.03, 0.1, 0.15)
-BEHIND_S = 0.03
-JITTER_S = 0.06
+BEHIND_S, JITTER_S = 0.03, 0.06
 EITHER = (
-    "freeze_steering",
-    "freeze_steering_1",
-    "zeros_steering",
-    "step_yaw",
-    "late_100ms_wheels",
-    "late_150ms_wheels",
+    *("freeze_steering", "freeze_steering_1", "zeros_steering", "step_yaw"),
+    *("late_100ms_wheels", "late_150ms_wheels"),
 )
-"""Faults of which a controller may be right to go on, or to stop correcting: steering that repeats itself or
-reads zero tells the truth on a straight drive; a heading of the IMU that was set is no slip; wheels that come
-so late are too slow for a control of slip."""
-
-FUTURE_S: Mapping[str, float] = {"1s": 1.0, "1h": 3600.0}
-CLOCK_STEPS_S: Mapping[str, float] = {"forward": 3600.0, "back": -3600.0}
+"""Faults of which a controller may be right to go on, or to stop correcting: steering that repeats itself or reads zero
+tells the truth on a straight drive; a heading of the IMU that was set is no slip; wheels that come so late are too slow
+for a control of slip."""
 
 OTHER_WIDTH: Mapping[str, int] = {"wheels": 4, "steering": 4, "imu": 6, "odometry": 3}
 """Number of columns of another robot's streams: one with four wheels, and sensors that report less."""
-
-_CHANNELS: Mapping[str, tuple[str, ...]] = {
-    "wheels": WHEELS_CHANNELS,
-    "steering": STEERING_CHANNELS,
-    "imu": IMU_CHANNELS,
-    "odometry": CAMERA_CHANNELS,
-}
 
 
 def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
@@ -494,15 +413,101 @@ def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:
     >>> faults["step_camera_speed"].streams, faults["step_camera_speed"].nature.value
     (('odometry',), 'lying')
     """
-    parts = (
-        *(_losses(), _freezes(), _steps(), _bad_values(), _noises(robot), _bad_shapes()),
-        *(_late(), _bad_stamps(), _clock_steps()),
-    )
-    return {
-        fault.name: replace(fault, nature=Nature.DEGRADED) if fault.name in EITHER else fault
-        for part in parts
-        for fault in part
-    }
+    dead, lying, tolerable, degraded = Nature
+    faults: dict[str, SensorFault] = {}
+
+    def add(
+        name: str,
+        about: str,
+        stream: str,
+        nature: Nature,
+        change: Change,
+        kind: str = "",
+        clock_s: float = 0.0,
+    ) -> None:
+        streams = STREAMS if stream == "all" else (stream,)
+        nature = degraded if name in EITHER else nature
+        kind = kind or name.partition("_")[0]
+        faults[name] = SensorFault(name, kind, about, streams, nature, change, clock_s)
+
+    def each(kind: str, about: str, nature: Nature, change: Change, group: str = "") -> None:
+        for stream in STREAMS:
+            add(f"{kind}_{stream}", f"{stream}: {about}", stream, nature, change, group or kind)
+
+    each("loss", "no sample arrives", dead, lost)
+    add("loss_all", "no sample of any stream arrives", "all", dead, lost)
+    each("freeze", "all values repeat, stamps go on", dead, frozen())
+    add("freeze_all", "all values of all streams repeat", "all", dead, frozen())
+    held = written(_freeze_camera_speed)
+    add("freeze_camera_speed", "the forward speed repeats", "odometry", dead, held)
+    turning = frozen(_columns("odometry", "quaternion"))
+    add("freeze_camera_orientation", "the orientation repeats", "odometry", dead, turning)
+    for i in (1, 2, 3):
+        rate = frozen(_columns("wheels", f"motor_{i}"))
+        add(f"freeze_motor_{i}", f"the rate of motor {i} repeats", "wheels", dead, rate)
+    for name in ("gyro", "accel", "pitch"):
+        add(f"freeze_{name}", f"{name} repeats", "imu", dead, frozen(_columns("imu", name)))
+    angle = frozen(_columns("steering", "angle_1"))
+    add("freeze_steering_1", "steering angle 1 repeats", "steering", dead, angle)
+
+    for name, sign, word in (("", 1.0, "more"), ("_down", -1.0, "less")):
+        about = f"forward speed {SPEED_STEP_MPS:g} m/s {word}"
+        change = camera_speed_offset(sign * SPEED_STEP_MPS)
+        add(f"step_camera_speed{name}", about, "odometry", lying, change)
+    about = f"orientation turned to the left by {YAW_STEP_RAD:g} rad"
+    add("step_camera_yaw", about, "odometry", lying, camera_turned(YAW_STEP_RAD))
+
+    def faster(values: Array, memory: StreamMemory) -> None:
+        values[:, _columns("wheels", "motor_1")] *= MOTOR_FACTOR
+
+    add("step_motor_1", f"rate of motor 1 times {MOTOR_FACTOR:g}", "wheels", lying, written(faster))
+    for stream, start, name, amount, unit in (
+        ("imu", "pitch", "pitch", PITCH_STEP_RAD, "rad"),
+        ("imu", "yaw", "yaw", YAW_STEP_RAD, "rad"),
+        ("imu", "gyro_z", "gyro", GYRO_STEP_RADPS, "rad/s"),
+        ("imu", "accel_x", "accel", ACCEL_STEP_MPS2, "m/s^2"),
+        ("steering", "angle_1", "steering_1", STEERING_STEP_RAD, "rad"),
+    ):
+        change = offset(_columns(stream, start), amount)
+        add(f"step_{name}", f"{name} {amount:g} {unit} more", stream, lying, change)
+
+    tenth = f"of each {EVERY} samples one has values of"
+    each("nan", "all values are NaN", dead, filled(math.nan))
+    each("nan_some", f"{tenth} NaN", tolerable, filled(math.nan, chosen=True))
+    each("inf", "all values are infinite", dead, filled(math.inf))
+    each("minus_inf", "all values are -inf", dead, filled(-math.inf))
+    each("spikes", f"{tenth} {SPIKE:g}", tolerable, filled(SPIKE, chosen=True))
+    each("zeros", "all values are 0", lying, filled(0.0))
+    for stream, std in noise_std(robot).items():
+        about = f"{stream}: noise {NOISE_FACTOR:g} times the described one is added"
+        add(f"noise_{stream}", about, stream, degraded, noisy(NOISE_FACTOR * std))
+
+    each("text", "words in place of values", dead, shaped(_text))
+    nothing = shaped(lambda reading: Reading(None, None))  # type: ignore[arg-type]
+    each("none", "None in place of stamps and values", dead, nothing)
+    each("ragged", "rows of different lengths", dead, shaped(_ragged))
+    for stream, width in OTHER_WIDTH.items():
+        about = f"{stream}: samples of another robot, with {width} columns"
+        add(f"width_{stream}", about, stream, dead, _of_width(width))
+
+    for delay_s in LATE_S:
+        ms = f"{1000 * delay_s:g}"
+        each(f"late_{ms}ms", f"samples arrive {ms} ms after their stamps", tolerable, late(delay_s), "late")
+    about = f"samples arrive up to {1000 * JITTER_S:g} ms after their stamps, by chance"
+    each("jitter", about, tolerable, late(0.0, JITTER_S))
+    each("disorder", "of each two samples the later one arrives first", tolerable, out_of_order)
+    twice = shaped(lambda reading: Reading(*(np.repeat(part, 2, axis=0) for part in reading)))
+    each("duplicates", "each sample arrives twice", tolerable, twice)
+    each("behind", f"stamps are {1000 * BEHIND_S:g} ms behind", tolerable, stamped(-BEHIND_S))
+    each("stampless", "all stamps are NaN", dead, stamped(math.nan))
+    for text, ahead_s in (("1s", 1.0), ("1h", 3600.0)):
+        about = f"of each {EVERY} samples one is stamped {ahead_s:g} s ahead"
+        each(f"future_{text}", about, tolerable, stamped(ahead_s, chosen=True), "future")
+    for text, step_s in (("forward", 3600.0), ("back", -3600.0)):
+        each(f"clock_{text}", f"its clock steps by {step_s:g} s", tolerable, stamped(step_s), "clock")
+        about = f"the clocks of all streams and of the steps step by {step_s:g} s"
+        add(f"clock_{text}_all", about, "all", degraded, written(lambda values, memory: None), clock_s=step_s)
+    return faults
 
 
 def select_faults(catalogue: Mapping[str, SensorFault], names: Sequence[str]) -> list[SensorFault]:
@@ -523,93 +528,8 @@ def select_faults(catalogue: Mapping[str, SensorFault], names: Sequence[str]) ->
     return [fault for fault in catalogue.values() if not names or fault.name in names or fault.kind in names]
 
 
-def _of_each(kind: str, about: str, nature: Nature, made: Change) -> Iterable[SensorFault]:
-    """Return a fault for each stream; ``{}`` in the text is the stream."""
-    for stream in STREAMS:
-        yield SensorFault(
-            f"{kind}_{stream}", kind, about.format(stream), (stream,), nature, on((stream,), made)
-        )
-
-
-def _one(name: str, about: str, stream: str, nature: Nature, made: Change) -> SensorFault:
-    return SensorFault(name, name.partition("_")[0], about, (stream,), nature, on((stream,), made))
-
-
 def _columns(stream: str, *starts: str) -> list[int]:
     return [i for i, channel in enumerate(_CHANNELS[stream]) if channel.startswith(starts)]
-
-
-def _losses() -> Iterable[SensorFault]:
-    yield from _of_each("loss", "{}: no sample arrives", Nature.DEAD, lost)
-    yield SensorFault(
-        "loss_all", "loss", "no sample of any stream arrives", STREAMS, Nature.DEAD, on(STREAMS, lost)
-    )
-
-
-def _freezes() -> Iterable[SensorFault]:
-    dead = Nature.DEAD
-    yield from _of_each("freeze", "{}: all values repeat, stamps go on", dead, frozen())
-    yield SensorFault(
-        "freeze_all", "freeze", "all values of all streams repeat", STREAMS, dead, on(STREAMS, frozen())
-    )
-    yield _one("freeze_camera_speed", "the forward speed repeats", "odometry", dead, camera_speed_frozen)
-    yield _one(
-        "freeze_camera_orientation",
-        "the orientation repeats",
-        "odometry",
-        dead,
-        frozen(_columns("odometry", "quaternion")),
-    )
-    for i in (1, 2, 3):
-        columns = _columns("wheels", f"motor_{i}")
-        yield _one(f"freeze_motor_{i}", f"the rate of motor {i} repeats", "wheels", dead, frozen(columns))
-    for name in ("gyro", "accel", "pitch"):
-        yield _one(f"freeze_{name}", f"{name} repeats", "imu", dead, frozen(_columns("imu", name)))
-    columns = _columns("steering", "angle_1")
-    yield _one("freeze_steering_1", "steering angle 1 repeats", "steering", dead, frozen(columns))
-
-
-def _steps() -> Iterable[SensorFault]:
-    lying, speed = Nature.LYING, SPEED_STEP_MPS
-    for name, sign, word in (("", 1.0, "more"), ("_down", -1.0, "less")):
-        about = f"forward speed {speed:g} m/s {word}"
-        made = camera_speed_offset(sign * speed)
-        yield _one(f"step_camera_speed{name}", about, "odometry", lying, made)
-    about = f"orientation turned to the left by {YAW_STEP_RAD:g} rad"
-    yield _one("step_camera_yaw", about, "odometry", lying, camera_turned(YAW_STEP_RAD))
-    made = scaled(_columns("wheels", "motor_1"), MOTOR_FACTOR)
-    yield _one("step_motor_1", f"rate of motor 1 times {MOTOR_FACTOR:g}", "wheels", lying, made)
-    for stream, start, name, amount, unit in (
-        ("imu", "pitch", "pitch", PITCH_STEP_RAD, "rad"),
-        ("imu", "yaw", "yaw", YAW_STEP_RAD, "rad"),
-        ("imu", "gyro_z", "gyro", GYRO_STEP_RADPS, "rad/s"),
-        ("imu", "accel_x", "accel", ACCEL_STEP_MPS2, "m/s^2"),
-        ("steering", "angle_1", "steering_1", STEERING_STEP_RAD, "rad"),
-    ):
-        made = offset(_columns(stream, start), amount)
-        yield _one(f"step_{name}", f"{name} {amount:g} {unit} more", stream, lying, made)
-
-
-def _bad_values() -> Iterable[SensorFault]:
-    yield from _of_each("nan", "{}: all values are NaN", Nature.DEAD, filled(math.nan))
-    tenth = f"{{}}: of each {EVERY} samples one has "
-    yield from _of_each("nan_some", tenth + "values of NaN", Nature.TOLERABLE, filled_at_times(math.nan))
-    yield from _of_each("inf", "{}: all values are infinite", Nature.DEAD, filled(math.inf))
-    yield from _of_each("minus_inf", "{}: all values are -inf", Nature.DEAD, filled(-math.inf))
-    yield from _of_each("spikes", f"{tenth}values of {SPIKE:g}", Nature.TOLERABLE, filled_at_times(SPIKE))
-    yield from _of_each("zeros", "{}: all values are 0", Nature.LYING, filled(0.0))
-
-
-def _noises(robot: Robot) -> Iterable[SensorFault]:
-    for stream, std in noise_std(robot).items():
-        yield SensorFault(
-            f"noise_{stream}",
-            "noise",
-            f"{stream}: noise {NOISE_FACTOR:g} times the described one is added",
-            (stream,),
-            Nature.DEGRADED,
-            on((stream,), noisy(NOISE_FACTOR * std)),
-        )
 
 
 def noise_std(robot: Robot) -> dict[str, Array]:
@@ -618,69 +538,13 @@ def noise_std(robot: Robot) -> dict[str, Array]:
     A rotation by a small angle changes a quaternion's vector part by half of it; the confidence has none.
     """
     _, _, _, camera, sensors = robot.equipment
-    wheels, imu, seen = (
-        [sensors.motor_std_radps] * 3 + [sensors.current_std_a] * 3,
-        [sensors.gyro_std_radps] * 3 + [sensors.accel_std_mps2] * 3 + [TILT_NOISE_RAD] * 2,
-        [camera.position_std_m] * 3 + [camera.yaw_std_rad / 2] * 3 + [0.0],
-    )
-    imu += [sensors.yaw_std_rad]
+    imu = [sensors.gyro_std_radps] * 3 + [sensors.accel_std_mps2] * 3 + [TILT_NOISE_RAD] * 2
+    seen = [camera.position_std_m] * 3 + [camera.yaw_std_rad / 2] * 3 + [0.0]
     seen += [camera.speed_std_mps] * 3 + [camera.yaw_rate_std_radps] * 3 + [0.0]
-    steering = [sensors.steering_std_rad] * 3
-    given = {"wheels": wheels, "steering": steering, "imu": imu, "odometry": seen}
-    return {stream: np.array(given[stream]) for stream in STREAMS}
-
-
-def _bad_shapes() -> Iterable[SensorFault]:
-    yield from _of_each("text", "{}: words in place of values", Nature.DEAD, as_text)
-    yield from _of_each("none", "{}: None in place of stamps and values", Nature.DEAD, as_nothing)
-    yield from _of_each("ragged", "{}: rows of different lengths", Nature.DEAD, as_ragged)
-    for stream in STREAMS:
-        made = of_other_width(OTHER_WIDTH[stream])
-        about = f"{stream}: samples of another robot, with {OTHER_WIDTH[stream]} columns"
-        yield _one(f"width_{stream}", about, stream, Nature.DEAD, made)
-
-
-def _arriving(name: str, about: str, stream: str, action: Action) -> SensorFault:
-    kind = name.partition("_")[0]
-    return SensorFault(name, kind, f"{stream}: {about}", (stream,), Nature.TOLERABLE, action)
-
-
-def _late() -> Iterable[SensorFault]:
-    for delay_s in LATE_S:
-        text = f"{1000 * delay_s:g}ms"
-        for stream in STREAMS:
-            about = f"samples arrive {1000 * delay_s:g} ms after their stamps"
-            yield _arriving(f"late_{text}_{stream}", about, stream, late(stream, delay_s))
-    for stream in STREAMS:
-        about = f"samples arrive up to {1000 * JITTER_S:g} ms after their stamps, by chance"
-        yield _arriving(f"jitter_{stream}", about, stream, late(stream, 0.0, JITTER_S))
-    for stream in STREAMS:
-        about = "of each two samples the later one arrives first"
-        yield _arriving(f"disorder_{stream}", about, stream, out_of_order(stream))
-    yield from _of_each("duplicates", "{}: each sample arrives twice", Nature.TOLERABLE, duplicated)
-    about = f"{{}}: stamps are {1000 * BEHIND_S:g} ms behind"
-    yield from _of_each("behind", about, Nature.TOLERABLE, shifted_stamps(-BEHIND_S))
-
-
-def _bad_stamps() -> Iterable[SensorFault]:
-    yield from _of_each("stampless", "{}: all stamps are NaN", Nature.DEAD, shifted_stamps(math.nan))
-    for text, ahead_s in FUTURE_S.items():
-        for stream in STREAMS:
-            about = f"{stream}: of each {EVERY} samples one is stamped {ahead_s:g} s ahead"
-            made = shifted_at_times(ahead_s)
-            yield _one(f"future_{text}_{stream}", about, stream, Nature.TOLERABLE, made)
-
-
-def _clock_steps() -> Iterable[SensorFault]:
-    for text, step_s in CLOCK_STEPS_S.items():
-        for stream in STREAMS:
-            about, made = f"{stream}: its clock steps by {step_s:g} s", shifted_stamps(step_s)
-            yield _one(f"clock_{text}_{stream}", about, stream, Nature.TOLERABLE, made)
-        yield SensorFault(
-            f"clock_{text}_all",
-            "clock",
-            f"the clocks of all streams and of the steps step by {step_s:g} s",
-            STREAMS,
-            Nature.DEGRADED,
-            shifted_clock(step_s),
-        )
+    std = {
+        "wheels": [sensors.motor_std_radps] * 3 + [sensors.current_std_a] * 3,
+        "steering": [sensors.steering_std_rad] * 3,
+        "imu": [*imu, sensors.yaw_std_rad],
+        "odometry": seen,
+    }
+    return {stream: np.array(values) for stream, values in std.items()}

@@ -1,17 +1,19 @@
-"""One simulated run by names: robot, terrain, scenario and number in, a run log out.
+"""All simulated runs: one by objects (:func:`simulate`), one by names (:func:`simulate_run`), and what is learned from.
 
-This entry picks the plant by the robot's drive: swerve robots are simulated by the dynamic plant
-(:mod:`terrain.simulation.dynamic.simulate`), tracked ones on ground that shears by the forces under their
-tracks (:mod:`terrain.simulation.tracked`), all others, and whatever has effects, by the planar one
-(:mod:`terrain.simulation.planar.run`).
+A plant goes with the ground that it is given: soils by the terrains of a scenario are driven by the dynamic plant of
+swerve robots (:mod:`terrain.simulation.dynamic.run`), a planar ground by the planar one of any wheeled robot
+(:mod:`terrain.simulation.planar.run`), a soil that shears, or prescribed slip, by tracks
+(:mod:`terrain.simulation.tracked`), and ground along a drive by a car with its controller
+(:mod:`terrain.simulation.car`).  By names, swerve robots are simulated by the dynamic plant, tracked ones on ground
+that shears by their tracks, all others, and whatever has effects, by the planar plant.
 
 **Bench**: a simulated IMU, held still in six positions in turn (Danzi, AgriMaRo thesis, 3.3.3).
 
 **Slip**: drives that take the wheels through a range of slips, for learning the curve of a terrain.  Each covers a
 part: *starts* at several accelerations, down to a step of the command in which the wheels spin and the robot
 accelerates through the whole curve; *climbs* over terrain that rises and falls, slowly; *sweeps* in which one wheel
-of the long side turns ever faster than the robot drives and the others hold it back: they show the curve on
-terrain so hard that no start would, without load transfer and slowly.
+of the long side turns ever faster than the robot drives and the others hold it back: they show the curve on terrain
+so hard that no start would, without load transfer and slowly.
 """
 
 from __future__ import annotations
@@ -19,9 +21,8 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
@@ -30,39 +31,120 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import NUISANCES, PARAMETER, SENSED_ONLY
 from terrain.errors import ConfigError
 from terrain.extension import warn_outside
-from terrain.kinematics.commands import wheel_motion
+from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, RunLog, Sample, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot, load_robot
-from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
-from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.planar.model import planar_ground
+from terrain.simulation import car
+from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults, draw_conditions, load_spread
+from terrain.simulation.dynamic.run import run_dynamic
+from terrain.simulation.planar.model import Ground, planar_ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import Hills, simulate_planar
+from terrain.simulation.planar.run import run_planar
 from terrain.simulation.scenario import RATE_HZ, Patch, Scenario, make_scenario
-from terrain.simulation.sensors import Gnss, imu_samples, is_lost, with_raw_fixes
-from terrain.simulation.tracked import COMMANDS_HZ, Slope, simulate_tracked
+from terrain.simulation.sensors import Gnss, draw_imu_errors, imu_values, is_lost
+from terrain.simulation.tracked import TrackedGround, run_tracked
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"
 """A path over all terrains, in place of the name of one."""
 
-BENCH = "six_positions"
-"""Word for the IMU alone on a bench, in place of a scenario."""
-
-BENCH_TERRAIN = "bench"
-"""The terrain that goes with it."""
+BENCH, BENCH_TERRAIN = "six_positions", "bench"
+"""Word for the IMU alone on a bench, in place of a scenario, and the terrain that goes with it."""
 
 SLIP = "slip"
 """Word for drives that take the wheels through their slips, for ``terrain learn-slip``."""
 
 
-class Setup(NamedTuple):
-    """Conditions, faults of the sensors, receiver and effects of a run."""
+def simulate(
+    robot: Robot,
+    drive: Scenario | Array | car.CarDrive,
+    ground: Mapping[str, Soil] | Ground | TrackedGround | car.Ground,
+    seed: int | np.random.SeedSequence,
+    *,
+    run_id: str = "run",
+    conditions: Conditions | None = None,
+    faults: Faults = NO_FAULTS,
+    effects: Mapping[str, float] | None = None,
+    **options: Any,
+) -> RunLog:
+    """Drive a robot on a ground, and return what its loggers wrote with the truth beside it.
 
-    conditions: Conditions
-    faults: Faults
-    gnss: Gnss | None
-    effects: Mapping[str, float]
+    Parameters
+    ----------
+    robot : the dynamic and the planar plant need all sections of a swerve robot; of other robots those that are missing
+        do not act
+    drive : a scenario, or for the planar plant twists (n, 3), for tracks speeds (n, 2) of left and right, at 50 Hz; of
+        a car its speed, stops and start
+    ground : soils by the terrain names of the scenario (dynamic plant); a planar ground (planar plant); a soil that
+        shears, prescribed slip, or stretches of them (tracks); a ground along the drive (car)
+    seed : of everything that is drawn; the same seed gives the same log, and a sequence is not advanced
+    run_id : name of the run
+    conditions : load, slope, tyres, roughness; level and nominal by default
+    faults : faults of the sensors
+    effects : parameters of :mod:`terrain.effects` that act on this robot and its sensors, beside those of its
+        description or in place of them; the commands and the log do not contain them
+    options : of the plant: :func:`~terrain.simulation.dynamic.run.run_dynamic` (gnss, controller, command_delay_s),
+        :func:`~terrain.simulation.planar.run.run_planar` (scatter, noise, outside, heading, fixes, terrain, step_s),
+        :func:`~terrain.simulation.tracked.run_tracked` (slope, yaw_rad, sensors),
+        :func:`~terrain.simulation.car.run_car` (controller, noise, settings)
+
+    Returns
+    -------
+    RunLog
+        streams wheels, imu, commands and truth, and steering where there is any; odometry (of a swerve robot the pose
+        of a tracking camera, of others the speed of the camera's point in body axes), pose (of cameras around the
+        field), gnss and compass; and control, the status of a controller.  An omni robot has wheels, pose, commands
+        and truth.  None that was lost throughout.  Labels where a ground has a name.
+
+    Raises
+    ------
+    ConfigError
+        if robot, ground and drive do not go together, the robot lacks a section, is tipped over by its load or has
+        numbers so far out of scale that its motion cannot be integrated, a sensor is faster than the plant's steps, a
+        terrain of the scenario has no soil, or an effect or option does not apply or is out of its bounds.
+    DataError
+        if a command is not one finite number a wheel, or its status not numbers by names that end in a unit, the same
+        names throughout.
+
+    Examples
+    --------
+    >>> robot = load_robot("agrimaro")
+    >>> straight = make_scenario("straight", robot, ["grass"], 5.0)
+    >>> run = simulate(robot, straight, {"grass": load_soil("grass")}, seed=0)
+    >>> sorted(run.streams), run.terrains
+    (['commands', 'imu', 'odometry', 'steering', 'truth', 'wheels'], ('grass',))
+    >>> twist = np.zeros((501, 3))
+    >>> twist[50:, 0] = 0.5
+    >>> run = simulate(load_robot("husky"), twist, Ground(), 0, effects={"wheel_radius_ratio": -0.1})
+    >>> run.streams["wheels"].values[-1, :2].round(3), run.streams["odometry"].values[-1].round(3)
+    (array([0.5, 0.5]), array([0.443, 0.   ]))
+    >>> run = simulate(load_robot("patako"), np.full((200, 2), 0.05), load_soil("dry_sand"), 0)
+    >>> sorted(run.streams), float(run.streams["truth"].channel("speed_x_mps")[-1].round(3))
+    (['commands', 'compass', 'gnss', 'imu', 'pose', 'truth', 'wheels'], 0.05)
+    """
+    plant: Any
+    if isinstance(ground, Mapping):
+        plant, source = run_dynamic, f"simulated, {getattr(drive, 'name', '')}"
+        options["faults"] = faults
+    elif isinstance(ground, Ground):
+        plant, source = run_planar, "simulated, planar"
+    elif isinstance(ground, car.Ground):
+        plant, source = car.run_car, "terrain.simulation.car"
+    else:
+        plant, source = run_tracked, "simulated, tracked"
+    options |= {"conditions": conditions or Conditions(), "effects": effects or {}}
+    streams, labels = plant(robot, drive, ground, seed, **options)
+    if faults.camera_lost_s:
+        streams = {name: _seen(name, stream, faults) for name, stream in streams.items()}
+    return RunLog(run_id, robot.name, {n: s for n, s in streams.items() if len(s) > 1}, labels, source)
+
+
+def _seen(name: str, stream: Stream, faults: Faults) -> Stream:
+    """Return a stream without the samples of a camera that is lost; a closed loop has lost them already."""
+    if name not in ("odometry", "pose"):
+        return stream
+    kept = ~is_lost(stream.time_s, faults.camera_lost_s)
+    return Stream(stream.time_s[kept], stream.values[kept], stream.channels)
 
 
 def simulate_run(
@@ -79,24 +161,22 @@ def simulate_run(
     gnss: Gnss | None = None,
     effects: Mapping[str, float] | None = None,
 ) -> RunLog:
-    """Return one simulated run.
+    """Return one simulated run by names.
 
-    What is drawn depends on ``seed``, ``terrain``, ``scenario`` and ``number`` alone: a run is the same
-    whatever is simulated beside it.
+    What is drawn depends on ``seed``, ``terrain``, ``scenario`` and ``number`` alone: a run is the same whatever is
+    simulated beside it.
 
     Parameters
     ----------
     robot : swerve robot with all sections, or another robot with all but steering; or its name or YAML file
     terrain : name of a soil or path of its YAML file, or ``course`` for all soils in one run
-    scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU
-        alone, for calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions
+    scenario : name of a scenario; ``course`` goes with the terrain ``course``, ``six_positions`` (the IMU alone, for
+        calibration) with ``bench``; ``slip`` sweeps the slip of the wheels under varied conditions
     seed, number : of what is drawn
     duration_s : length; the scenario's own by default
     vary : draw soil, slope, load, tyres and roughness for this run by ``data/soils`` and ``data/spread``
-    conditions : nominal conditions
-    faults : faults of the sensors
+    conditions, faults, effects : as :func:`simulate` has them, conditions about which they vary
     gnss : receiver on board, if any
-    effects : parameters of :mod:`terrain.effects` that act
 
     Raises
     ------
@@ -127,95 +207,41 @@ def simulate_run(
     if (terrain == COURSE) != (scenario == COURSE):
         raise ConfigError("terrain 'course' and scenario 'course' go together: give both or neither")
     soils = {soil.name: soil for soil in map(load_soil, soil_names() if terrain == COURSE else (terrain,))}
-    names = list(soils)
-    terrain = terrain if terrain == COURSE else names[0]
+    terrain = terrain if terrain == COURSE else next(iter(soils))
     key = [seed, zlib.crc32(terrain.encode()), zlib.crc32(scenario.encode()), number]
     drawn, driven, simulated = np.random.SeedSequence(key).spawn(3)
     if vary:
         rng = np.random.default_rng(drawn)
         soils = {name: scattered(soil, rng) for name, soil in soils.items()}
         conditions = draw_conditions(load_spread(), rng, conditions)
-    run_id, planar = run_id_of(terrain, scenario, number), not isinstance(robot, SwerveRobot)
+    planar = not isinstance(robot, SwerveRobot)
     if planar and terrain == COURSE:
         raise ConfigError(f"robot {robot.name}: scenario {COURSE!r} is for swerve robots")
     drive_seed = int(driven.generate_state(1)[0])
-    drive = make_scenario(scenario, robot, names, duration_s, seed=drive_seed)
-    setup = Setup(conditions or Conditions(), faults or Faults(), gnss, effects or {})
-    if (
-        isinstance(robot, TrackedRobot)
-        and soils[terrain].law == "janosi"
-        and not {**robot.effects, **setup.effects}
-    ):
-        run = _tracked_run(robot, soils[terrain], drive.twist, simulated, run_id, setup)
-    elif planar:
-        run = _planar_run(robot, soils[terrain], drive.twist, simulated, run_id, setup, vary)
-    else:
-        run = simulate(robot, drive, soils, simulated, run_id=run_id, **setup._asdict())
+    drive = make_scenario(scenario, robot, list(soils), duration_s, seed=drive_seed)
+    ground: Mapping[str, Soil] | Ground | Soil = soils
+    options: dict[str, Any] = {"gnss": gnss}
+    effects = effects or {}
+    if planar:
+        ground, options = soils[terrain], {}
+        if not isinstance(robot, TrackedRobot) or ground.law != "janosi" or {**robot.effects, **effects}:
+            ground, options = planar_ground(robot, ground), _noise_of_run(robot, vary)
+            if gnss is not None:
+                raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
+    options |= {"conditions": conditions, "faults": faults or NO_FAULTS, "effects": effects}
+    run_id = run_id_of(terrain, scenario, number)
+    run = simulate(robot, drive, ground, simulated, run_id=run_id, **options)
     warn_outside(run, robot)
     return run
 
 
-def _tracked_run(
-    robot: TrackedRobot, soil: Soil, twist: Array, seed: np.random.SeedSequence, run_id: str, setup: Setup
-) -> RunLog:
-    """Return a run on an even slope, without undulations; a receiver is always on board."""
-    conditions = setup.conditions
-    ahead, left = conditions.grade_ratio
-    slope = Slope(math.atan(math.hypot(ahead, left)), math.atan2(left, ahead))
-    loaded = replace(robot, mass_kg=robot.mass_kg + conditions.payload_kg)
-    speeds = wheel_motion(robot, twist, 1.0 / COMMANDS_HZ).wheel_speed_mps
-    return _without_camera(
-        simulate_tracked(loaded, soil, speeds, seed, slope=slope, run_id=run_id), setup.faults
-    )
-
-
-def _planar_run(
-    robot: Robot,
-    soil: Soil,
-    twist: Array,
-    seed: np.random.SeedSequence,
-    run_id: str,
-    setup: Setup,
-    vary: bool,
-) -> RunLog:
-    """Return a run of the planar simulation; the scatter of its sensors does not depend on ``vary``."""
-    conditions, faults, gnss, effects = setup
-    if gnss is not None:
-        raise ConfigError(f"robot {robot.name}: its simulation has no receiver, leave gnss out")
+def _noise_of_run(robot: Robot, vary: bool) -> dict[str, Any]:
+    """Return what a run of the planar plant draws; the scatter of its sensors does not depend on ``vary``."""
     scatter = load_scatter()
     if not vary:
         fixed = (name for name in NUISANCES if name in PARAMETER and name not in SENSED_ONLY)
         scatter = scatter._replace(**dict.fromkeys(fixed, 0.0))
-    load = conditions.payload_kg / robot.mass_kg
-    run = simulate_planar(
-        robot,
-        twist,
-        seed,
-        ground=planar_ground(robot, soil),
-        effects={**effects, "payload_ratio": effects.get("payload_ratio", 0.0) + load},
-        scatter=scatter,
-        hills=Hills(conditions.grade_ratio, conditions.undulation_ratio, conditions.undulation_length_m),
-        noise=load_noise(),
-        run_id=run_id,
-        terrain=soil.name,
-    )
-    if isinstance(robot, BicycleRobot):
-        run = replace(run, streams=with_raw_fixes(run, np.random.default_rng(seed.spawn(1)[0])))
-    return _without_camera(run, faults)
-
-
-def _without_camera(run: RunLog, faults: Faults) -> RunLog:
-    """Return the run without the samples of the lost camera."""
-    if not faults.camera_lost_s:
-        return run
-    name = "odometry" if "odometry" in run.streams else "pose"
-    seen = run.streams[name]
-    kept = ~is_lost(seen.time_s, faults.camera_lost_s)
-    left = Stream(seen.time_s[kept], seen.values[kept], seen.channels)
-    streams = {**run.streams, name: left}
-    if len(left) < 2:
-        del streams[name]
-    return RunLog(run.run_id, run.robot, streams, run.labels, run.source)
+    return {"scatter": scatter, "noise": load_noise(), "fixes": isinstance(robot, BicycleRobot)}
 
 
 def _check_slip(
@@ -232,21 +258,8 @@ def _check_slip(
         raise ConfigError(
             f"scenario {SLIP!r} draws its conditions: leave duration, grade, payload and gnss out"
         )
-    if faults not in (None, Faults()):
+    if faults not in (None, NO_FAULTS):
         raise ConfigError(f"scenario {SLIP!r} has no faults on purpose: leave the camera's loss out")
-
-
-def _bench(robot: Robot, terrain: str, seed: int, number: int, duration_s: float | None) -> RunLog:
-    """Return the log of an IMU that is held still in six positions, for ``terrain calibrate``."""
-    if terrain != BENCH_TERRAIN:
-        raise ConfigError(
-            f"scenario {BENCH!r} is done on a bench: give the terrain {BENCH_TERRAIN!r}, not {terrain!r}"
-        )
-    hold_s = 5.0 if duration_s is None else duration_s / len(POSITIONS) - TURN_S
-    key = np.random.SeedSequence([seed, zlib.crc32(BENCH.encode()), number])
-    return six_positions_log(
-        robot, key, hold_s=hold_s, run_id=run_id_of(terrain, scenario=BENCH, number=number)
-    )
 
 
 def run_id_of(terrain: str, scenario: str, number: int) -> str:
@@ -260,11 +273,9 @@ def run_id_of(terrain: str, scenario: str, number: int) -> str:
     return f"{terrain}_{number:02d}" if terrain == scenario else f"{terrain}_{scenario}_{number:02d}"
 
 
-TURN_S = 1.5
-"""Time by hand from one position to the next; assumed."""
-
-CROOKED_RAD = 0.03
-"""Standard deviation of how far a position is from its axis; assumed."""
+TURN_S, CROOKED_RAD = 1.5, 0.03
+"""Time by hand from one position to the next, and standard deviation of how far a position is from its axis;
+assumed."""
 
 POSITIONS = (
     # turns about body axes that bring one axis up after the other: z, -z, x, -x, y, -y
@@ -278,36 +289,32 @@ POSITIONS = (
 """Roll and pitch of the six positions."""
 
 
+def _bench(robot: Robot, terrain: str, seed: int, number: int, duration_s: float | None) -> RunLog:
+    if terrain != BENCH_TERRAIN:
+        raise ConfigError(
+            f"scenario {BENCH!r} is done on a bench: give the terrain {BENCH_TERRAIN!r}, not {terrain!r}"
+        )
+    hold_s = 5.0 if duration_s is None else duration_s / len(POSITIONS) - TURN_S
+    key = np.random.SeedSequence([seed, zlib.crc32(BENCH.encode()), number])
+    return six_positions_log(robot, key, hold_s=hold_s, run_id=run_id_of(terrain, BENCH, number))
+
+
 def six_positions_log(
     robot: Robot, seed: int | np.random.SeedSequence, *, hold_s: float = 5.0, run_id: str = "bench"
 ) -> RunLog:
     """Return the log of an IMU alone, held still in six positions and turned by hand between them.
 
-    Parameters
-    ----------
-    robot : with all sections
-    seed : of everything that is drawn; the same seed gives the same log
-    hold_s : time in each position
-    run_id : name of the run
-
-    Returns
-    -------
-    RunLog
-        the stream imu with the channels of a driven run, without labels.
+    It has the stream imu with the channels of a driven run, without labels.  As in a driven run, each power-on has
+    biases of its own about those of the description.  At rest the specific force is ``g`` times the vertical in body
+    axes; what the hand accelerates is left out.
 
     Raises
     ------
     ConfigError
         if ``hold_s`` is not above zero, or a section of the robot's description is missing.
 
-    Notes
-    -----
-    As in a driven run, each power-on has biases of its own about those of the description.  At rest the
-    specific force is ``g`` times the vertical in body axes; what the hand accelerates is left out.
-
     Examples
     --------
-    >>> from terrain.robots import load_robot
     >>> run = six_positions_log(load_robot("agrimaro"), seed=0, hold_s=2.0)
     >>> sorted(run.streams), len(run.streams["imu"])
     (['imu'], 1950)
@@ -329,27 +336,21 @@ def six_positions_log(
     force = now.inv().apply([0.0, 0.0, GRAVITY_MPS2])
     rate = (now.inv() * soon).as_rotvec() / period_s
     turned = now.as_matrix()
-    roll, pitch = (
-        np.arctan2(turned[:, 2, 1], turned[:, 2, 2]),
-        -np.arcsin(np.clip(turned[:, 2, 0], -1.0, 1.0)),
-    )
+    roll = np.arctan2(turned[:, 2, 1], turned[:, 2, 2])
+    pitch = -np.arcsin(np.clip(turned[:, 2, 0], -1.0, 1.0))
     yaw = np.arctan2(turned[:, 1, 0], turned[:, 0, 0])
     tilt = np.column_stack([roll, pitch])
-    imu = imu_samples(sensors, time_s, force, rate, tilt, np.unwrap(yaw) - yaw[0], rng)
-    return RunLog(run_id, robot.name, {"imu": imu}, source="simulated, six positions on a bench")
+    errors = draw_imu_errors(sensors, n, rng)
+    values = imu_values(errors, slice(None), force, rate, tilt, np.unwrap(yaw) - yaw[0])
+    streams = {"imu": Stream(time_s, values, IMU_CHANNELS)}
+    return RunLog(run_id, robot.name, streams, source="simulated, six positions on a bench")
 
 
-SWEEP_SLIP = 0.75
-"""Largest slip of the swept wheel."""
-
-SWEEP_S = 6.0
-"""From no slip to the largest and back."""
+SWEEP_SLIP, SWEEP_S, STEADY_S = 0.75, 6.0, 3.0
+"""Largest slip of the swept wheel, time from no slip to the largest and back, and time before the first sweep."""
 
 SWEEP_SPEED_MPS = 0.8
 """Of a sweep: the swept wheel stays within its motor's speed up to a slip of 0.6."""
-
-STEADY_S = 3.0
-"""Before the first sweep."""
 
 
 class Drive(NamedTuple):
@@ -364,11 +365,7 @@ class Drive(NamedTuple):
 
 
 LEARNING_DRIVES: tuple[Drive, ...] = (
-    Drive("sweep", 1.0, SWEEP_SPEED_MPS, 40.0),
-    Drive("sweep", 1.0, SWEEP_SPEED_MPS, 40.0),
-    Drive("sweep", 1.0, SWEEP_SPEED_MPS, 40.0),
-    Drive("sweep", 1.0, SWEEP_SPEED_MPS, 40.0),
-    Drive("sweep", 1.0, SWEEP_SPEED_MPS, 40.0),
+    *(Drive("sweep", 1.0, SWEEP_SPEED_MPS, 40.0),) * 5,
     Drive("starts", 1.5, 1.2),
     Drive("starts", 40.0, 1.8),
     Drive("climb", 2.0, 1.2, 30.0, 0.1, 0.08),
@@ -379,30 +376,14 @@ LEARNING_DRIVES: tuple[Drive, ...] = (
 def learning_runs(
     robot: Robot, terrain: str, seed: int, drives: tuple[Drive, ...] = LEARNING_DRIVES
 ) -> list[RunLog]:
-    """Return one run a drive, with soil, load, slope, tyres and roughness drawn for each.
-
-    Parameters
-    ----------
-    robot : swerve robot with all sections
-    terrain : name of a soil or path of its YAML file
-    seed : of everything that is drawn
-    drives : one a run
-    """
+    """Return one run a drive of a swerve robot, with soil, load, slope, tyres and roughness drawn for each."""
     return [learning_run(robot, terrain, seed, number, drive) for number, drive in enumerate(drives, start=1)]
 
 
 def learning_run(
     robot: Robot, terrain: str, seed: int, number: int, drive: Drive | None = None, run_id: str | None = None
 ) -> RunLog:
-    """Return one run.
-
-    Parameters
-    ----------
-    robot, terrain, seed : as for :func:`learning_runs`
-    number : from 1 on
-    drive : by default those of :data:`LEARNING_DRIVES` in turn
-    run_id : named after terrain, drive and number by default
-    """
+    """Return one run, ``number`` from 1 on; its drive is by default one of :data:`LEARNING_DRIVES` in turn."""
     if drive is None:
         drive = LEARNING_DRIVES[(number - 1) % len(LEARNING_DRIVES)]
     nominal = load_soil(terrain)

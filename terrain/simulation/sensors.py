@@ -1,23 +1,24 @@
-"""Sensors of simulated robots: errors, low-pass, latency, quantisation and loss.
+"""Sensors of simulated robots: what a logger writes of a body's rows, with errors, latency, quantisation and loss.
 
-Each sensor follows the recorded motion at :data:`STEP_S`, adds its errors (low-pass, latency, bias, noise,
-quantisation, loss) and writes one stream.  A stamp is the time at which the sample arrived; its content is older
-by the sensor's latency.  All random numbers are drawn when a sensor is made.  After that it follows the motion in
-blocks of any length: a run in one block and a run tick by tick give the same bytes.
+A plant writes the motion of a body row by row (:data:`BODY` and what else it has); sensors read these rows alone.  A
+stamp is the time at which a sample arrived; its content is older by the sensor's latency.
 
-A sample of an IMU is ``scale x + bias + noise`` of each quantity ``x`` (:func:`imu_values`).  The plants differ in
-the errors that they draw (:class:`ImuErrors`): the dynamic plant draws biases anew for each power-on and lets
-those of the gyro walk (:func:`draw_imu_errors`); the planar one adds coloured vibration while the robot moves
-(:mod:`terrain.simulation.planar.run`).
+Those of a closed loop (:class:`Sensor`) follow the rows at :data:`STEP_S`.  All random numbers are drawn when a sensor
+is made; after that it follows the motion in blocks of any length: a run in one block and a run tick by tick give the
+same bytes.
+
+A sample of an IMU is ``scale x + bias + noise`` of each quantity ``x`` (:func:`imu_values`).  The plants differ in the
+errors that they draw (:class:`ImuErrors`): the dynamic plant draws biases anew for each power-on and lets those of the
+gyro walk (:func:`draw_imu_errors`), the planar one adds coloured vibration while the robot moves
+(:mod:`terrain.simulation.planar.run`), and those of tracks and of the car white noise (:func:`white_imu`).
 """
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -29,13 +30,21 @@ from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera
 from terrain.kinematics.wheels import point_velocity
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
-from terrain.records import Array, Reading, RunLog, Stream
+from terrain.records import Array, Reading, Stream
 from terrain.robots import Robot, Sensors
 from terrain.simulation.conditions import Faults
 
 STEP_S = 0.001
-"""Step of the record and of the dynamic plant, whose fastest mode is that of the contact, near 170 rad/s: a
-sixth of a radian a step."""
+"""Step of the rows in a closed loop and of the dynamic plant, whose fastest mode is that of the contact, near
+170 rad/s: a sixth of a radian a step."""
+
+BODY = record(
+    numbers(
+        "position_x_m position_y_m yaw_rad roll_rad pitch_rad speed_x_mps speed_y_mps yaw_rate_radps accel_x_mps2 "
+        "accel_y_mps2"
+    )
+)
+"""What every plant writes of its body, and every log has as its truth."""
 
 WHEEL_ROW = record(
     numbers(
@@ -43,19 +52,28 @@ WHEEL_ROW = record(
         "reported_radps patch_ratio side_n"
     )
 )
-"""A wheel.  Steering angles are true headings in the body; traction and side force are those of the contact,
-along the wheel and to its left, so that it takes up ``traction (w r - v_along) - side v_across``."""
+"""A wheel.  Steering angles are true headings in the body; traction and side force are those of the contact, along the
+wheel and to its left, so that it takes up ``traction (w r - v_along) - side v_across``."""
 
 BODY_ROW = record(
-    numbers(
-        "position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps accel_x_mps2 "
-        "accel_y_mps2 grade_x_ratio grade_y_ratio ride_z_mps2 ride_roll_rad ride_pitch_rad "
-        "ride_roll_radps2 ride_pitch_radps2 path_m leg_rad"
+    dict.fromkeys(BODY.names or (), float)
+    | numbers(
+        "grade_x_ratio grade_y_ratio ride_z_mps2 ride_roll_rad ride_pitch_rad ride_roll_radps2 ride_pitch_radps2 "
+        "path_m leg_rad"
     )
     | {"wheels": (WHEEL_ROW, 3), "encoder_rad": (float, 3)}
 )
-"""What is recorded each step at the body's origin, of each wheel, and of the angles that encoders see, which
-differ from the headings where a linkage or a leg has play."""
+"""What the dynamic plant writes each step at the body's origin, of each wheel, and of the angles that encoders see,
+which differ from the headings where a linkage or a leg has play."""
+
+
+def generators(seed: int | np.random.SeedSequence, purposes: Sequence[str]) -> dict[str, np.random.Generator]:
+    """Return a generator for each purpose: one sensor more or less does not change the others."""
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    return {
+        purpose: np.random.default_rng(np.random.SeedSequence(root.entropy, spawn_key=(*root.spawn_key, i)))
+        for i, purpose in enumerate(purposes)
+    }
 
 
 class Motion:
@@ -63,33 +81,30 @@ class Motion:
 
     Parameters
     ----------
-    record : (n,) of :data:`BODY_ROW` for :func:`terrain.simulation.dynamic.step.advance` to write
+    record : (n,) of :data:`BODY_ROW` for a plant to write, all but the tilt
     n_rows : rows that are written; all by default
 
     Attributes
     ----------
-    tilt_rad : (n, 2) roll and pitch of the body: the slope and the ride over it
+    up : (n, 3) the vertical in the axes of the body
     """
 
     def __init__(self, record: Array, n_rows: int | None = None) -> None:
         self.record = record
-        self.tilt_rad = np.empty((len(record), 2))
+        self.up = np.empty((len(record), 3))
         self.n_rows = 0
         self.grow(len(record) if n_rows is None else n_rows)
 
     def grow(self, n_rows: int) -> None:
-        """Take note that so many rows are written."""
-        new = slice(self.n_rows, n_rows)
-        rows = self.record[new]
+        """Take note that so many rows are written, and add roll and pitch: the slope and the ride over it."""
+        rows, up = self.record[self.n_rows : n_rows], self.up[self.n_rows : n_rows]
         grade_x, grade_y = rows["grade_x_ratio"], rows["grade_y_ratio"]
         # up is (grade_x, grade_y, 1) = (-sin pitch, sin roll cos pitch, cos roll cos pitch)
-        self.tilt_rad[new, 0] = np.arctan(grade_y) + rows["ride_roll_rad"]
-        self.tilt_rad[new, 1] = -np.arctan(grade_x / np.hypot(1.0, grade_y)) + rows["ride_pitch_rad"]
+        rows["roll_rad"] = roll = np.arctan(grade_y) + rows["ride_roll_rad"]
+        rows["pitch_rad"] = pitch = -np.arctan(grade_x / np.hypot(1.0, grade_y)) + rows["ride_pitch_rad"]
+        up[:, 0], up[:, 1] = -np.sin(pitch), np.sin(roll) * np.cos(pitch)
+        up[:, 2] = np.cos(roll) * np.cos(pitch)
         self.n_rows = n_rows
-
-    def wheel(self, name: str) -> Array:
-        """Return one quantity (n, 3) of the wheels."""
-        return np.asarray(self.record["wheels"][name])
 
     def at(self, rate_hz: float, latency_s: float = 0.0) -> tuple[Array, Array]:
         """Stamps (k,) of a sensor of that rate, and the rows (k,) it measures."""
@@ -97,21 +112,33 @@ class Motion:
         return time_s, np.maximum(np.round((time_s - latency_s) / STEP_S).astype(int), 0)
 
 
-class Sensor(ABC):
+class Sensor:
     """One sensor of one run, and the samples it has written so far.
 
     Parameters
     ----------
     motion : the recorded motion; its last rows may not be written yet
     channels : of its stream
-    time_s : (n,) when its samples arrive
-    rows : (n,) of the motion that the samples measure, none later than the sample
+    stamps : (n,) when its samples arrive, and (n,) rows of the motion that they measure, none later than the sample
+    write : from samples (k), their rows (k,) and low-passed signals there to their values (k, channels)
+    signals : writes signals (m, c) of the motion's rows from a first one on, and their low-pass; none by default
+    ahead : rows beyond its own that a signal needs
     """
 
-    def __init__(self, motion: Motion, channels: tuple[str, ...], time_s: Array, rows: Array) -> None:
-        self.motion, self.channels, self.time_s, self.rows = motion, channels, time_s, rows
-        self.values = np.empty((len(time_s), len(channels)))
-        self._logged = (time_s.view(), self.values.view())
+    def __init__(
+        self,
+        motion: Motion,
+        channels: tuple[str, ...],
+        stamps: tuple[Array, Array],
+        write: Callable[[slice, Array, Array], Array],
+        signals: tuple[Callable[[int, Array], None], LowPass] | None = None,
+        ahead: int = 0,
+    ) -> None:
+        self.motion, self.channels, (self.time_s, self.rows) = motion, channels, stamps
+        self.values = np.empty((len(self.time_s), len(channels)))
+        self._write, self._signals, self._ahead = write, signals, ahead
+        self._first, self._seen = 0, np.empty((0, 0))
+        self._logged = (self.time_s.view(), self.values.view())
         for array in self._logged:
             array.flags.writeable = False
         self._n_written = self._n_given = 0
@@ -123,10 +150,19 @@ class Sensor(ABC):
 
     def update(self) -> None:
         """Write the samples of all rows of the motion that are written."""
-        end = self._filter()
+        n_rows = self.motion.n_rows
+        end = max(n_rows - self._ahead, min(n_rows, 1))
+        if self._signals is not None:
+            fill, low_pass = self._signals
+            self._first += len(self._seen)
+            self._seen = np.empty((end - self._first, low_pass.n))
+            fill(self._first, self._seen)
+            low_pass(self._seen)
         new = slice(self._n_written, int(self.rows.searchsorted(end)))
         if new.start < new.stop:
-            self._write(new, self.rows[new])
+            rows = self.rows[new]
+            seen = self._seen if self._signals is None else self._seen[rows - self._first]
+            self.values[new] = self._write(new, rows, seen)
             self._n_written = new.stop
 
     def arrived(self, time_s: float) -> Reading | None:
@@ -139,13 +175,33 @@ class Sensor(ABC):
         """Return all samples, once the motion is complete."""
         return Stream(*self._logged, self.channels)
 
-    def _filter(self) -> int:
-        """Filter the new rows; return the number of rows that samples can be written of."""
-        return self.motion.n_rows
 
-    @abstractmethod
-    def _write(self, new: slice, rows: Array) -> None:
-        """Write the samples ``new``, which measure the motion's ``rows``."""
+class LowPass:
+    """First-order low-passes of several quantities, started at rest at the first values.
+
+    Called with values (n, c) at :data:`STEP_S`, they filter them in place and keep their state.
+    """
+
+    def __init__(self, time_constants_s: Sequence[float]) -> None:
+        self.n = len(time_constants_s)
+        self._keep = np.array([math.exp(-STEP_S / tau) if tau > 0.0 else 0.0 for tau in time_constants_s])
+        self._start: Array | None = None
+        self._state = np.zeros(self.n)
+
+    def __call__(self, values: Array) -> None:
+        """Filter values (n, c) in place."""
+        if len(values):
+            self._start = values[0].copy() if self._start is None else self._start
+            _low_pass(values, self._keep, self._start, self._state)
+
+
+@njit
+def _low_pass(values: Array, keep: Array, start: Array, state: Array) -> None:
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            if keep[j] > 0.0:
+                state[j] = keep[j] * state[j] + (1.0 - keep[j]) * (values[i, j] - start[j])
+                values[i, j] = state[j] + start[j]
 
 
 def is_lost(time_s: Array, intervals_s: Sequence[tuple[float, float]]) -> Array:
@@ -162,34 +218,6 @@ def is_lost(time_s: Array, intervals_s: Sequence[tuple[float, float]]) -> Array:
     return lost
 
 
-class LowPass:
-    """First-order low-passes of several quantities, started at rest at the first values.
-
-    Called with values (n, c) at :data:`STEP_S`, they filter them in place and keep their state.
-    """
-
-    def __init__(self, time_constants_s: list[float]) -> None:
-        self._keep = np.array([math.exp(-STEP_S / tau) if tau > 0.0 else 0.0 for tau in time_constants_s])
-        self._start: Array | None = None
-        self._state = np.zeros(len(time_constants_s))
-
-    def __call__(self, values: Array) -> Array:
-        """Filter values (n, c) in place, and return them."""
-        if len(values):
-            self._start = values[0].copy() if self._start is None else self._start
-            _low_pass(values, self._keep, self._start, self._state)
-        return values
-
-
-@njit
-def _low_pass(values: Array, keep: Array, start: Array, state: Array) -> None:
-    for i in range(values.shape[0]):
-        for j in range(values.shape[1]):
-            if keep[j] > 0.0:
-                state[j] = keep[j] * state[j] + (1.0 - keep[j]) * (values[i, j] - start[j])
-                values[i, j] = state[j] + start[j]
-
-
 STANDSTILL_RADPS = 1e-3
 """Motor rate below which the Hall sensors count no step."""
 
@@ -199,41 +227,37 @@ def add_rate_noise(rate: Array, noise: Array, standstill: float) -> Array:
     return np.asarray(rate + noise * (np.abs(rate) > standstill))
 
 
-class WheelSensor(Sensor):
-    """Motor rates after the motor driver's low-pass on quantised Hall steps, and motor currents.
+def wheel_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> Sensor:
+    """Return motor rates after the motor driver's low-pass on quantised Hall steps, and motor currents.
 
     Of the robot's effects it applies motor_drift, current_offset and the scales of the encoders.
     """
+    motors, sensors, effects = robot.equipment.motors, robot.equipment.sensors, robot.effects
+    time_s, rows = motion.at(sensors.wheels_rate_hz)
+    scales = np.array([1.0 + effects.get(f"wheel_scale_{i}_ratio", 0.0) for i in (1, 2, 3)])
+    reduction = motors.reduction_ratio / scales
+    per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
+    motor_noise = sensors.motor_std_radps * rng.standard_normal((len(rows), 3))
+    current_noise = sensors.current_std_a * rng.standard_normal((len(rows), 3))
+    warm = 1.0 + effects.get("motor_drift_ratio", 0.0) * time_s[:, None] / 60.0
+    offset_a = effects.get("current_offset_a", 0.0)
 
-    def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
-        motors, sensors = robot.equipment.motors, robot.equipment.sensors
-        super().__init__(motion, WHEELS_CHANNELS, *motion.at(sensors.wheels_rate_hz))
-        n = len(self.rows)
-        scales = np.array([1.0 + robot.effects.get(f"wheel_scale_{i}_ratio", 0.0) for i in (1, 2, 3)])
-        self._reduction = motors.reduction_ratio / scales
-        self._per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
-        self._motor_noise = sensors.motor_std_radps * rng.standard_normal((n, 3))
-        self._current_noise = sensors.current_std_a * rng.standard_normal((n, 3))
-        self._warm = 1.0 + robot.effects.get("motor_drift_ratio", 0.0) * self.time_s[:, None] / 60.0
-        self._offset_a = robot.effects.get("current_offset_a", 0.0)
-        self._reported, self._torque = motion.wheel("reported_radps"), motion.wheel("torque_nm")
+    def write(new: slice, rows: Array, _: Array) -> Array:
+        wheels = motion.record["wheels"][rows]
+        rates = add_rate_noise(wheels["reported_radps"] * reduction, motor_noise[new], STANDSTILL_RADPS)
+        current_a = wheels["torque_nm"] / per_amp_nm * warm[new] + offset_a + current_noise[new]
+        return np.hstack([rates, current_a])
 
-    def _write(self, new: slice, rows: Array) -> None:
-        motor = self._reported[rows] * self._reduction
-        self.values[new, :3] = add_rate_noise(motor, self._motor_noise[new], STANDSTILL_RADPS)
-        current = self._torque[rows] / self._per_amp_nm * self._warm[new] + self._offset_a
-        self.values[new, 3:] = current + self._current_noise[new]
+    return Sensor(motion, WHEELS_CHANNELS, (time_s, rows), write)
 
 
 def encoder_angle(steer_rad: Array, zeros_rad: Array, noise_rad: Array | float, step_rad: float) -> Array:
-    """Return the angles (n, wheels) that absolute encoders report.
+    """Return the angles (n, wheels) that absolute encoders report: in whole steps, where a step is not 0.
 
     Parameters
     ----------
     steer_rad : (n, wheels) angles of the steering
     zeros_rad : (wheels,) angles that encoders report at 0
-    noise_rad : (n, wheels), or one number
-    step_rad : of the encoder; 0 does not quantise
     """
     angle = steer_rad + zeros_rad + noise_rad
     if step_rad > 0.0:
@@ -241,23 +265,21 @@ def encoder_angle(steer_rad: Array, zeros_rad: Array, noise_rad: Array | float, 
     return np.asarray(wrapped(angle))
 
 
-class SteeringSensor(Sensor):
-    """Absolute encoders: whole steps a turn (Gray code errs by one at most), with their zero offset.
+def steering_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> Sensor:
+    """Return absolute encoders: whole steps a turn (Gray code errs by one at most), with their zero offset.
 
-    The third one sits below the hinge of its leg and does not measure its swing; none measures the linkage to
-    its wheel.
+    The third one sits below the hinge of its leg and does not measure its swing; none measures the linkage to its
+    wheel.
     """
+    sensors = robot.sensors
+    stamps = motion.at(sensors.steering_rate_hz)
+    zeros, step_rad = robot.steering_zeros_rad, 2 * math.pi / sensors.steering_steps_ratio
+    noise = sensors.steering_std_rad * rng.standard_normal((len(stamps[0]), 3))
 
-    def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
-        sensors = robot.sensors
-        super().__init__(motion, STEERING_CHANNELS, *motion.at(sensors.steering_rate_hz))
-        self._zeros = robot.steering_zeros_rad
-        self._step_rad = 2 * math.pi / sensors.steering_steps_ratio
-        self._noise = sensors.steering_std_rad * rng.standard_normal((len(self.rows), 3))
+    def write(new: slice, rows: Array, _: Array) -> Array:
+        return encoder_angle(motion.record["encoder_rad"][rows], zeros, noise[new], step_rad)
 
-    def _write(self, new: slice, rows: Array) -> None:
-        steer = self.motion.record["encoder_rad"][rows]
-        self.values[new] = encoder_angle(steer, self._zeros, self._noise[new], self._step_rad)
+    return Sensor(motion, STEERING_CHANNELS, stamps, write)
 
 
 IMU_BANDWIDTH_HZ = {"accel": 62.5, "gyro": 47.0}
@@ -267,20 +289,13 @@ TILT_NOISE_RAD = 0.001
 """Sample noise of the fused roll and pitch; assumed."""
 
 
-class ImuCalibration(NamedTuple):
-    """Scales (3,) of the accelerometer, and biases (3,) of accelerometer and gyro, by axis."""
-
-    accel_scale_ratio: Array
-    accel_bias_mps2: Array
-    gyro_bias_radps: Array
-
-
-def described_calibration(sensors: Sensors) -> ImuCalibration:
-    """Return the scales and biases of a robot's description."""
+def described_calibration(sensors: Sensors) -> tuple[Array, Array, Array]:
+    """Return a description's scales (3,) of the accelerometer, and biases (3,) of accelerometer and gyro, by axis."""
     patterns = ("accel_scale_{}_ratio", "accel_bias_{}_mps2", "gyro_bias_{}_radps")
-    return ImuCalibration(
-        *(np.array([getattr(sensors, pattern.format(axis)) for axis in "xyz"]) for pattern in patterns)
+    scale, accel, gyro = (
+        np.array([getattr(sensors, pattern.format(axis)) for axis in "xyz"]) for pattern in patterns
     )
+    return scale, accel, gyro
 
 
 class ImuErrors(NamedTuple):
@@ -291,12 +306,9 @@ class ImuErrors(NamedTuple):
     accel_scale_ratio : (3,) factor on the specific force
     yaw_scale_ratio : factor on yaw rate and fused yaw
     rate_bias_radps, rate_noise_radps : (n, 3) of the gyro
-    accel_bias_mps2 : (3,) of the accelerometer
-    accel_noise_mps2 : (n, 3)
-    tilt_bias_rad : (2,) of the fused roll and pitch
-    tilt_noise_rad : (n, 2)
-    yaw_bias_rad : (n,) of the fused yaw, which sums the errors of the yaw rate
-    yaw_noise_rad : (n,)
+    accel_bias_mps2, accel_noise_mps2 : (3,) and (n, 3) of the accelerometer
+    tilt_bias_rad, tilt_noise_rad : (2,) and (n, 2) of the fused roll and pitch
+    yaw_bias_rad, yaw_noise_rad : (n,) of the fused yaw, which sums the errors of the yaw rate
     """
 
     accel_scale_ratio: Array
@@ -314,15 +326,7 @@ class ImuErrors(NamedTuple):
 def draw_imu_errors(
     sensors: Sensors, n: int, rng: np.random.Generator, gyro_scale_ratio: float = 0.0
 ) -> ImuErrors:
-    """Return the errors of one power-on: biases drawn about those described, the gyro's as random walks.
-
-    Parameters
-    ----------
-    sensors : scales, biases and noise
-    n : number of samples
-    rng : source of all that is drawn
-    gyro_scale_ratio : relative error of the yaw gyro's scale
-    """
+    """Return the errors of n samples of one power-on: biases about those described, the gyro's as random walks."""
     scale, accel_bias, gyro_bias = described_calibration(sensors)
     accel_bias = accel_bias + sensors.accel_bias_std_mps2 * rng.standard_normal(3)
     gyro_bias = gyro_bias + sensors.gyro_bias_std_radps * rng.standard_normal(3)
@@ -333,8 +337,6 @@ def draw_imu_errors(
     gyro_noise = sensors.gyro_std_radps * rng.standard_normal((n, 3))
     mounting = sensors.tilt_std_rad * rng.standard_normal(2)
     tilt_noise = TILT_NOISE_RAD * rng.standard_normal((n, 2))
-    drift = np.concatenate([[0.0], np.cumsum(bias[1:, 2]) * period_s])
-    yaw_noise = sensors.yaw_std_rad * rng.standard_normal(n)
     return ImuErrors(
         accel_scale_ratio=scale,
         yaw_scale_ratio=1.0 + gyro_scale_ratio,
@@ -344,8 +346,8 @@ def draw_imu_errors(
         accel_noise_mps2=accel_noise,
         tilt_bias_rad=mounting,
         tilt_noise_rad=tilt_noise,
-        yaw_bias_rad=drift,
-        yaw_noise_rad=yaw_noise,
+        yaw_bias_rad=np.concatenate([[0.0], np.cumsum(bias[1:, 2]) * period_s]),
+        yaw_noise_rad=sensors.yaw_std_rad * rng.standard_normal(n),
     )
 
 
@@ -357,7 +359,6 @@ def imu_values(
     Parameters
     ----------
     errors : of all n samples
-    which : k of the n samples
     force_mps2, rate_radps : (k, 3) specific force and body rates, behind the sensor's own low-pass
     tilt_rad : (k, 2) roll and pitch
     yaw_rad : (k,) from the start of the run
@@ -373,81 +374,31 @@ def imu_values(
     return values
 
 
-class ImuSensor(Sensor):
-    """IMU without magnetometer above the body's origin, at the height of the centre of mass.
+def imu_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> tuple[Sensor, Array]:
+    """Return an IMU without magnetometer, and the true bias (n,) of its yaw gyro at each stamp.
 
-    The specific force is acceleration minus gravity: +g on z at rest, ``+g sin`` on x with the nose up.
-    Rates are those of the body: turning on an even slope shows no roll rate.  They are central differences of
-    the attitude, so the latency is one step at least; in the first row, which has no row before it, the rates
-    of roll and pitch are 0.  Of the robot's effects it applies gyro_scale, also to the fused yaw.
+    It sits above the body's origin, at the height of the centre of mass.  The specific force is acceleration minus
+    gravity: +g on z at rest, ``+g sin`` on x with the nose up.  Rates are those of the body: turning on an even slope
+    shows no roll rate.  They are central differences of the attitude, so the latency is one step at least; in the first
+    row, which has no row before it, the rates of roll and pitch are 0.  Of the robot's effects it applies gyro_scale,
+    also to the fused yaw.
     """
+    sensors, height_m, record = robot.equipment.sensors, robot.equipment.body.com_height_m, motion.record
+    stamps = motion.at(sensors.imu_rate_hz, max(sensors.imu_latency_s, STEP_S))
+    errors = draw_imu_errors(sensors, len(stamps[0]), rng, robot.effects.get("gyro_scale_ratio", 0.0))
+    cutoffs_hz = [IMU_BANDWIDTH_HZ[name] for name in ("accel", "accel", "accel", "gyro", "gyro", "gyro")]
+    low_pass = LowPass([1 / (2 * math.pi * cutoff_hz) for cutoff_hz in cutoffs_hz])
 
-    def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator) -> None:
-        sensors, body = robot.equipment.sensors, robot.equipment.body
-        stamps = motion.at(sensors.imu_rate_hz, max(sensors.imu_latency_s, STEP_S))
-        super().__init__(motion, IMU_CHANNELS, *stamps)
-        self._com_height_m = body.com_height_m
-        gyro_scale_ratio = robot.effects.get("gyro_scale_ratio", 0.0)
-        self._errors = draw_imu_errors(sensors, len(self.rows), rng, gyro_scale_ratio)
-        self._up = np.empty((len(motion.record), 3))
-        cutoffs_hz = [IMU_BANDWIDTH_HZ[name] for name in ("accel", "accel", "accel", "gyro", "gyro", "gyro")]
-        self._low_pass = LowPass([1 / (2 * math.pi * cutoff_hz) for cutoff_hz in cutoffs_hz])
-        self._n_up, self._first, self._filtered = 0, 0, np.empty((0, 6))
+    def fill(first: int, out: Array) -> None:
+        _force_and_rates(record, motion.up, first, height_m, out)
 
-    @property
-    def yaw_bias_radps(self) -> Array:
-        """True bias (n,) of its yaw gyro at each stamp."""
-        return self._errors.rate_bias_radps[:, 2]
+    def write(new: slice, rows: Array, seen: Array) -> Array:
+        at = record[rows]
+        tilt = np.column_stack([at["roll_rad"], at["pitch_rad"]])
+        return imu_values(errors, new, seen[:, :3], seen[:, 3:], tilt, at["yaw_rad"] - record["yaw_rad"][0])
 
-    def _filter(self) -> int:
-        motion, up = self.motion, self._up
-        new = slice(self._n_up, motion.n_rows)
-        roll, pitch = motion.tilt_rad[new].T
-        up[new, 0] = -np.sin(pitch)
-        up[new, 1] = np.sin(roll) * np.cos(pitch)
-        up[new, 2] = np.cos(roll) * np.cos(pitch)
-        self._n_up = motion.n_rows
-        first = self._first + len(self._filtered)
-        end = max(motion.n_rows - 1, min(motion.n_rows, 1))
-        force_and_rates = np.empty((end - first, 6))
-        _force_and_rates(motion.record, up, first, self._com_height_m, force_and_rates)
-        self._first, self._filtered = first, self._low_pass(force_and_rates)
-        return end
-
-    def _write(self, new: slice, rows: Array) -> None:
-        filtered = self._filtered[rows - self._first]
-        yaw = self.motion.record["yaw_rad"]
-        self.values[new] = imu_values(
-            self._errors,
-            new,
-            filtered[:, :3],
-            filtered[:, 3:],
-            self.motion.tilt_rad[rows],
-            yaw[rows] - yaw[0],
-        )
-
-
-def imu_samples(
-    sensors: Sensors,
-    time_s: Array,
-    force_mps2: Array,
-    rate_radps: Array,
-    tilt_rad: Array,
-    yaw_rad: Array,
-    rng: np.random.Generator,
-) -> Stream:
-    """Return the samples of an IMU over a whole motion.
-
-    Parameters
-    ----------
-    sensors : scales, biases and noise
-    time_s : (n,) evenly spaced
-    force_mps2, rate_radps, tilt_rad, yaw_rad : as :func:`imu_values` takes them
-    rng : source of biases and noise
-    """
-    errors = draw_imu_errors(sensors, len(time_s), rng)
-    values = imu_values(errors, slice(None), force_mps2, rate_radps, tilt_rad, yaw_rad)
-    return Stream(time_s, values, IMU_CHANNELS)
+    sensor = Sensor(motion, IMU_CHANNELS, stamps, write, (fill, low_pass), ahead=1)
+    return sensor, errors.rate_bias_radps[:, 2]
 
 
 def white_imu(
@@ -464,9 +415,8 @@ def white_imu(
     noise : (n, 9) in the order of ``IMU_CHANNELS``
     """
     roll, pitch, _ = attitude_rad.T
-    level = np.cos(pitch)
     force = np.column_stack([-np.sin(pitch), np.sin(roll), np.cos(roll)]) * GRAVITY_MPS2
-    force[:, 1:] *= level[:, None]
+    force[:, 1:] *= np.cos(pitch)[:, None]
     force[:, :2] += accel_mps2
     values = np.hstack([rate_radps, force, attitude_rad]) + noise
     values[:, 8] = wrapped(values[:, 8])
@@ -495,73 +445,57 @@ JUMP_SAMPLES = 4
 """Number of samples with a wrong speed at a relocalisation of the camera; assumed."""
 
 YAW_ERROR, VELOCITY_ERROR, RATE_ERROR, N_ERRORS = 0, 1, 4, 7
-"""First columns of a camera's errors: of yaw, velocity and rate, both in the camera's axes; and their
-number."""
+"""First columns of a camera's errors: of yaw, velocity and rate, both in the camera's axes; and their number."""
+
+_SEEN = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "roll_rad", "pitch_rad", "yaw_rad")
 
 
-class CameraSensor(Sensor):
-    """Tracking camera in its own frames: drifting pose, noisy speed, dropouts and relocalisation jumps.
+def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults: Faults) -> Sensor:
+    """Return a tracking camera in its own frames: drifting pose, noisy speed, dropouts and relocalisation jumps.
 
-    Without noise its samples are those of :func:`terrain.kinematics.camera.odometry_stream`; lost samples are
-    left out.  Of the robot's effects it applies camera_yaw.
+    Without noise its samples are those of :func:`terrain.kinematics.camera.odometry_stream`; lost samples are left out.
+    Of the robot's effects it applies camera_yaw.
     """
+    camera, record = robot.equipment.camera, motion.record
+    time_s, rows = motion.at(camera.rate_hz, camera.latency_s)
+    n = len(rows)
+    yaw_noise = camera.yaw_std_rad * rng.standard_normal(n)
+    drift = camera.speed_std_mps * rng.standard_normal((n, 2)).cumsum(axis=0) / camera.rate_hz
+    position_noise = camera.position_std_m * rng.standard_normal((n, 2))
+    speed_noise = camera.speed_std_mps * rng.standard_normal((n, 3))  # in the camera's axes
+    lost = is_lost(time_s, faults.camera_lost_s)
+    chance = rng.random((n, 2)) * camera.rate_hz
+    lengths = rng.exponential(camera.dropout_length_s, n)
+    jumps, jumped = camera.jump_std_m * rng.standard_normal((n, 2)), np.zeros((n, 2))
+    if faults.by_chance:
+        for i in np.flatnonzero(chance[:, 0] < camera.dropout_rate_hz):
+            lost |= (time_s >= time_s[i]) & (time_s < time_s[i] + lengths[i])
+        for i in np.flatnonzero(chance[:, 1] < camera.jump_rate_hz):
+            jumped[i:] += jumps[i]
+            shown = to_camera(np.append(jumps[i], 0.0)) * camera.rate_hz / JUMP_SAMPLES
+            speed_noise[i : i + JUMP_SAMPLES] += shown
+    rate_noise = camera.yaw_rate_std_radps * rng.standard_normal((n, 3))
+    drift, position_noise, jumped = drift[~lost], position_noise[~lost], jumped[~lost]
+    errors = np.column_stack([yaw_noise, speed_noise, rate_noise])[~lost]
+    lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
+    mounting_rad, yaw_noise_0 = robot.effects.get("camera_yaw_rad", 0.0), yaw_noise[0] if n else 0.0
 
-    def __init__(self, motion: Motion, robot: Robot, rng: np.random.Generator, faults: Faults) -> None:
-        camera = robot.equipment.camera
-        time_s, rows = motion.at(camera.rate_hz, camera.latency_s)
-        n = len(rows)
-        yaw_noise = camera.yaw_std_rad * rng.standard_normal(n)
-        drift = camera.speed_std_mps * rng.standard_normal((n, 2)).cumsum(axis=0) / camera.rate_hz
-        position_noise = camera.position_std_m * rng.standard_normal((n, 2))
-        speed_noise = camera.speed_std_mps * rng.standard_normal((n, 3))  # in the camera's axes
-        lost = is_lost(time_s, faults.camera_lost_s)
-        chance = rng.random((n, 2)) * camera.rate_hz
-        lengths = rng.exponential(camera.dropout_length_s, n)
-        jumps = camera.jump_std_m * rng.standard_normal((n, 2))
-        jumped = np.zeros((n, 2))
-        if faults.by_chance:
-            for i in np.flatnonzero(chance[:, 0] < camera.dropout_rate_hz):
-                lost |= (time_s >= time_s[i]) & (time_s < time_s[i] + lengths[i])
-            for i in np.flatnonzero(chance[:, 1] < camera.jump_rate_hz):
-                jumped[i:] += jumps[i]
-                speed_noise[i : i + JUMP_SAMPLES] += (
-                    to_camera(np.append(jumps[i], 0.0)) * camera.rate_hz / JUMP_SAMPLES
-                )
-        rate_noise = camera.yaw_rate_std_radps * rng.standard_normal((n, 3))
-        self._drift, self._position_noise, self._jumped = drift[~lost], position_noise[~lost], jumped[~lost]
-        self._errors = np.column_stack([yaw_noise, speed_noise, rate_noise])[~lost]
-        self._lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
-        self._mounting_rad = robot.effects.get("camera_yaw_rad", 0.0)
-        self._yaw_noise_0 = yaw_noise[0] if n else 0.0
-        self._low_pass = LowPass([camera.time_constant_s] * 6)
-        self._first, self._seen = 0, np.empty((0, 6))
-        super().__init__(motion, CAMERA_CHANNELS, time_s[~lost], rows[~lost])
+    def fill(first: int, out: Array) -> None:
+        for i, name in enumerate(_SEEN):
+            out[:, i] = record[name][first : first + len(out)]
 
-    def _filter(self) -> int:
-        motion, first = self.motion, self._first + len(self._seen)
-        seen = np.empty((motion.n_rows - first, 6))
-        new = motion.record[first : motion.n_rows]
-        for i, name in enumerate(("speed_x_mps", "speed_y_mps", "yaw_rate_radps")):
-            seen[:, i] = new[name]
-        seen[:, 3:5] = motion.tilt_rad[first : motion.n_rows]
-        seen[:, 5] = new["yaw_rad"]
-        self._first, self._seen = first, self._low_pass(seen)
-        return motion.n_rows
-
-    def _write(self, new: slice, rows: Array) -> None:
-        record = self.motion.record
+    def write(new: slice, rows: Array, seen: Array) -> Array:
         place = np.column_stack([record["position_x_m"][rows], record["position_y_m"][rows]])
-        position = place + self._drift[new] + self._position_noise[new] + self._jumped[new]
-        camera_samples(
-            position,
-            self._seen[rows - self._first],
-            self._errors[new],
-            self._lever_m,
-            record["yaw_rad"][0] + self._yaw_noise_0,
-            self.values[new],
-        )
-        if self._mounting_rad:
-            turn_camera(self.values[new], self.channels, self._mounting_rad)
+        position = place + drift[new] + position_noise[new] + jumped[new]
+        values = np.empty((len(rows), len(CAMERA_CHANNELS)))
+        yaw_0 = record["yaw_rad"][0] + yaw_noise_0
+        camera_samples(position, seen, errors[new], lever_m, yaw_0, values)
+        if mounting_rad:
+            turn_camera(values, CAMERA_CHANNELS, mounting_rad)
+        return values
+
+    low_pass = LowPass([camera.time_constant_s] * len(_SEEN))
+    return Sensor(motion, CAMERA_CHANNELS, (time_s[~lost], rows[~lost]), write, (fill, low_pass))
 
 
 @njit
@@ -625,8 +559,8 @@ def _rotated(
 class Gnss:
     """An RTK receiver with its antenna above the body's origin.
 
-    Fix to 2 cm and 10 Hz: thesis 5.1.1.  A float solution of half a metre, the latency of the radio link, the
-    accuracy of the Doppler speed and how long a fix lasts are assumed.
+    Fix to 2 cm and 10 Hz: thesis 5.1.1.  A float solution of half a metre, the latency of the radio link, the accuracy
+    of the Doppler speed and how long a fix lasts are assumed.
     """
 
     rate_hz: float = 10.0
@@ -638,109 +572,77 @@ class Gnss:
     float_length_s: float = 5.0
 
 
-class GnssSensor(Sensor):
-    """RTK positions and speeds in the world frame, with stretches of float."""
+def gnss_sensor(motion: Motion, receiver: Gnss, rng: np.random.Generator, faults: Faults) -> Sensor:
+    """Return RTK positions and speeds in the world frame, with stretches of float."""
+    time_s, rows = motion.at(receiver.rate_hz, receiver.latency_s)
+    n, record = len(rows), motion.record
+    fixed, state = np.empty(n, dtype=bool), True
+    leave = rng.random(n) * receiver.rate_hz
+    for i in range(n):
+        state = state != bool(leave[i] < 1 / (receiver.fix_length_s if state else receiver.float_length_s))
+        fixed[i] = state
+    std = np.where(fixed, receiver.fix_std_m, receiver.float_std_m)
+    position_noise = std[:, None] * rng.standard_normal((n, 2))
+    noise = np.column_stack([position_noise, receiver.speed_std_mps * rng.standard_normal((n, 2))])
+    kept = ~is_lost(time_s, faults.gnss_lost_s)
+    noise, quality = noise[kept], np.column_stack([std, fixed])[kept]
 
-    def __init__(self, motion: Motion, receiver: Gnss, rng: np.random.Generator, faults: Faults) -> None:
-        time_s, rows = motion.at(receiver.rate_hz, receiver.latency_s)
-        n = len(rows)
-        fixed = np.empty(n, dtype=bool)
-        state = True
-        leave = rng.random(n) * receiver.rate_hz
-        for i in range(n):
-            length_s = receiver.fix_length_s if state else receiver.float_length_s
-            state = state != bool(leave[i] < 1 / length_s)
-            fixed[i] = state
-        std = np.where(fixed, receiver.fix_std_m, receiver.float_std_m)
-        position_noise = std[:, None] * rng.standard_normal((n, 2))
-        noise = np.column_stack([position_noise, receiver.speed_std_mps * rng.standard_normal((n, 2))])
-        kept = ~is_lost(time_s, faults.gnss_lost_s)
-        super().__init__(motion, GNSS_CHANNELS, time_s[kept], rows[kept])
-        self._noise, self._quality = noise[kept], np.column_stack([std, fixed])[kept]
+    def write(new: slice, rows: Array, _: Array) -> Array:
+        at = record[rows]
+        place = np.column_stack([at["position_x_m"], at["position_y_m"]])
+        return np.hstack([np.hstack([place, over_ground(at)]) + noise[new], quality[new]])
 
-    def _write(self, new: slice, rows: Array) -> None:
-        record, noise = self.motion.record, self._noise[new]
-        yaw, along, across = (record[name][rows] for name in ("yaw_rad", "speed_x_mps", "speed_y_mps"))
-        self.values[new, 0] = record["position_x_m"][rows] + noise[:, 0]
-        self.values[new, 1] = record["position_y_m"][rows] + noise[:, 1]
-        self.values[new, 2] = along * np.cos(yaw) - across * np.sin(yaw) + noise[:, 2]
-        self.values[new, 3] = along * np.sin(yaw) + across * np.cos(yaw) + noise[:, 3]
-        self.values[new, 4:] = self._quality[new]
+    return Sensor(motion, GNSS_CHANNELS, (time_s[kept], rows[kept]), write)
+
+
+def over_ground(rows: Array) -> Array:
+    """Return the velocity (n, 2) in the world of rows that have those of :data:`BODY`."""
+    cos, sin = np.cos(rows["yaw_rad"]), np.sin(rows["yaw_rad"])
+    ahead, left = rows["speed_x_mps"], rows["speed_y_mps"]
+    return np.column_stack([ahead * cos - left * sin, ahead * sin + left * cos])
 
 
 RAW_HZ, RAW_STD_M, COMPASS_STD_RAD = 10.0, 0.02, 0.0087
-"""Rate and noise of raw fixes (Deremetz et al., ICRA 2017, section VI), and of a compass (half a degree,
-assumed)."""
+"""Rate and noise of raw fixes (Deremetz et al., ICRA 2017, section VI), and of a compass (half a degree, assumed)."""
 
 SPEED_FACTOR_PS = 1.5
 """Noise of a velocity over that of the position, as the Doppler speed of the other receiver."""
 
 
 def raw_fixes(
-    time_s: Array, pose: Array, velocity_mps: Array, std: tuple[float, float], rng: np.random.Generator
+    time_s: Array,
+    rows: Array,
+    rng: np.random.Generator,
+    std_m: float = RAW_STD_M,
+    std_rad: float = COMPASS_STD_RAD,
 ) -> dict[str, Stream]:
-    """Return the streams ``gnss`` and ``compass``.
-
-    Parameters
-    ----------
-    time_s : (n,) stamps
-    pose : (n, 3) position of the body's origin and heading
-    velocity_mps : (n, 2) of it in the axes of the body
-    std : of a position in m, one axis, and of a heading in rad
-    rng : source of the noise
-    """
-    n, (position_m, heading_rad) = len(time_s), std
-    cos, sin = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-    ahead, left = velocity_mps.T
-    over_ground = np.column_stack([ahead * cos - left * sin, ahead * sin + left * cos])
+    """Return the streams ``gnss`` and ``compass`` of rows (n,) that have those of :data:`BODY`, at stamps (n,)."""
+    n, place = len(time_s), np.column_stack([rows["position_x_m"], rows["position_y_m"]])
     fixes = np.column_stack(
         [
-            pose[:, :2] + position_m * rng.standard_normal((n, 2)),
-            over_ground + SPEED_FACTOR_PS * position_m * rng.standard_normal((n, 2)),
-            np.full(n, position_m),
+            place + std_m * rng.standard_normal((n, 2)),
+            over_ground(rows) + SPEED_FACTOR_PS * std_m * rng.standard_normal((n, 2)),
+            np.full(n, std_m),
             np.ones(n),
         ]
     )
-    heading = wrapped(pose[:, 2] + heading_rad * rng.standard_normal(n))
+    heading = wrapped(rows["yaw_rad"] + std_rad * rng.standard_normal(n))
     return {
         "gnss": Stream(time_s, fixes, GNSS_CHANNELS),
         "compass": Stream(time_s, heading[:, None], ("yaw_rad",)),
     }
 
 
-def with_raw_fixes(run: RunLog, rng: np.random.Generator) -> dict[str, Stream]:
-    """Return the streams of a simulated run with raw fixes of its truth.
-
-    Parameters
-    ----------
-    run : with the stream truth
-    rng : source of the noise
-    """
-    truth = run.streams["truth"]
-    at_s = np.arange(truth.time_s[0], truth.time_s[-1] + 1e-9, 1.0 / RAW_HZ)
-    rows = np.searchsorted(truth.time_s, at_s - 1e-9)
-    columns = ("position_x_m", "position_y_m", "yaw_rad", "speed_x_mps", "speed_y_mps")
-    pose = np.column_stack([truth.channel(name)[rows] for name in columns])
-    std = RAW_STD_M, COMPASS_STD_RAD
-    return {**run.streams, **raw_fixes(at_s, pose[:, :3], pose[:, 3:], std, rng)}
-
-
 TRUTH_HZ = 100.0
 """Rate of the stream: a compromise with the size of files."""
 
-BODY_TRUTH = (
-    *("position_x_m", "position_y_m", "yaw_rad", "roll_rad", "pitch_rad"),
-    *("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2"),
-)
-"""Channels of the body."""
+GYRO_BIAS = "gyro_bias_z_radps"
+"""Channel of the true bias of the yaw gyro."""
 
 _WHEEL_TRUTH = (
     *("wheel_radps", "steer_rad", "slip_ratio", "slip_angle_rad", "normal_n", "traction_n", "torque_nm"),
     *("sinkage_m", "side_n"),
 )
-
-GYRO_BIAS = "gyro_bias_z_radps"
-"""Channel of the true bias of the yaw gyro."""
 
 
 def wheel_channels(quantity: str, wheels: Sequence[str]) -> tuple[str, ...]:
@@ -755,13 +657,18 @@ def wheel_channels(quantity: str, wheels: Sequence[str]) -> tuple[str, ...]:
     return tuple(f"{name}_{wheel}_{unit}" for wheel in wheels)
 
 
-def truth_stream(motion: Motion, gyro_bias_radps: Array, gyro_time_s: Array) -> Stream:
-    """Return the recorded motion at :data:`TRUTH_HZ`; a slip that is never defined has no channel."""
-    time_s, rows = motion.at(TRUTH_HZ)
-    tilt = dict(zip(("roll_rad", "pitch_rad"), motion.tilt_rad.T, strict=True))
-    columns = {name: tilt[name] if name in tilt else motion.record[name] for name in BODY_TRUTH}
+def truth_stream(time_s: Array, rows: Array, more: Mapping[str, Any]) -> Stream:
+    """Return the truth of rows (n,) that have those of :data:`BODY`, and more channels or others (n,) by name."""
+    columns = {name: rows[name] for name in BODY.names or ()} | dict(more)
+    return Stream(time_s, np.column_stack(list(columns.values())), tuple(columns))
+
+
+def wheels_truth(motion: Motion, gyro_bias_radps: Array, gyro_time_s: Array) -> Stream:
+    """Return the truth of a motion at :data:`TRUTH_HZ`; a slip that is never defined has no channel."""
+    time_s, at = motion.at(TRUTH_HZ)
+    rows = motion.record[at]
+    columns: dict[str, Array] = {}
     for quantity in _WHEEL_TRUTH:
-        columns |= zip(wheel_channels(quantity, "123"), motion.wheel(quantity).T, strict=True)
-    kept = {name: column[rows] for name, column in columns.items() if np.isfinite(column[rows]).any()}
-    kept[GYRO_BIAS] = np.interp(time_s, gyro_time_s, gyro_bias_radps)
-    return Stream(time_s, np.column_stack(list(kept.values())), tuple(kept))
+        columns |= zip(wheel_channels(quantity, "123"), rows["wheels"][quantity].T, strict=True)
+    columns = {name: column for name, column in columns.items() if np.isfinite(column).any()}
+    return truth_stream(time_s, rows, columns | {GYRO_BIAS: np.interp(time_s, gyro_time_s, gyro_bias_radps)})

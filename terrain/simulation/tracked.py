@@ -1,8 +1,8 @@
-r"""Tracked robots on an even slope: forces under two tracks, or slip that is prescribed, and the log of a run.
+r"""Tracks on an even slope: forces under two tracks, or slip that is prescribed, and one run of them.
 
-Speeds of the tracks go in, an ordinary run log with its truth comes out.  The belts follow the commanded speeds
-with a lag; the motion is that on soils or with prescribed slip, one after the other; sensors add noise.  Poses are
-those of cameras around the field, positions of satellites are raw, and a compass shows the heading.
+The belts follow the commanded speeds with a lag; the motion is that on soils or with prescribed slip, one after the
+other; sensors add noise.  Poses are those of cameras around the field, positions of satellites are raw, and a compass
+shows the heading.
 
 **Forces.** A body moves by :math:`(V_x, V_y, w)`; a track at :math:`y = \pm d` with the belt speed v touches
 down at its front, :math:`x = l/2`, where v > 0, and at its rear where v < 0.  An element that lies :math:`\xi` behind
@@ -63,34 +63,38 @@ Yamauchi (29).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kernels import filled, njit, numbers, record
+from terrain.kinematics.commands import wheel_motion
 from terrain.logs.schema import POSE_CHANNELS
-from terrain.records import Array, Label, RunLog, Stream
-from terrain.robots import TrackedRobot
+from terrain.records import Array, Label, Stream
+from terrain.robots import Robot, TrackedRobot, as_drive
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.scenario import RATE_HZ, Scenario
 from terrain.simulation.sensors import (
-    BODY_TRUTH,
+    BODY,
     COMPASS_STD_RAD,
     GYRO_BIAS,
     RAW_HZ,
     RAW_STD_M,
+    generators,
     raw_fixes,
+    truth_stream,
     wheel_channels,
     white_imu,
 )
 from terrain.slip import slip_angle, slip_ratio
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import compaction_resistance, plate_sinkage
-
-COMMANDS_HZ, WHEELS_HZ = 50.0, 50.0
-"""Rates of the commands and of the wheels' logger."""
 
 STEP_S = 0.01
 """From step to step; no sensor is sampled faster."""
@@ -104,14 +108,9 @@ NUDGE = 1e-7
 ELEMENTS = 16
 """Elements along a track: forces are within 1 % of those of 200."""
 
-CREEP_MPS = 1e-3
-"""Belt speed that a stopped track counts as having."""
-
-SLIDING_MPS = 1e-5
-"""Sliding speed below which friction has no direction of its own."""
-
-ROLLING_MPS = 2e-3
-"""Speed over which resistances against motion take their full size."""
+CREEP_MPS, SLIDING_MPS, ROLLING_MPS = 1e-3, 1e-5, 2e-3
+"""Belt speed that a stopped track counts as having, sliding speed below which friction has no direction of its own, and
+speed over which resistances against motion take their full size."""
 
 UNIT_WEIGHT_NPM3 = 15000.0
 """Of loose dry sand: 14 to 16 kN/m^3 (Terzaghi, Peck and Mesri, Soil Mechanics in Engineering Practice)."""
@@ -142,6 +141,25 @@ class PrescribedSlip(NamedTuple):
     turning_exponent: float = 1.0
 
 
+class Stretch(NamedTuple):
+    """A soil that shears, or the slip itself, and the distance travelled on it; a run's last one goes on for ever."""
+
+    ground: Soil | PrescribedSlip
+    length_m: float = math.inf
+
+
+TrackedGround = Soil | PrescribedSlip | Sequence[Stretch]
+
+
+class Slope(NamedTuple):
+    """An even slope: its angle against the horizontal, and the heading of uphill in its plane; level by default."""
+
+    angle_rad: float = 0.0
+    uphill_rad: float = 0.0
+
+
+LEVEL = Slope()
+
 TRACKS = record(
     numbers(
         "half_m length_m width_m height_m mass_kg inertia_kgm2 area_m2 cohesion_pa tan_friction "
@@ -151,30 +169,13 @@ TRACKS = record(
     | dict.fromkeys(PrescribedSlip._fields, float)
     | {"sheared": bool}
 )
-"""A robot on a ground: its numbers, those of a soil that is sheared or of prescribed slip, and the distance
-travelled at which the ground ends."""
+"""A robot on a ground: its numbers, those of a soil that is sheared or of prescribed slip, and the distance travelled
+at which the ground ends."""
 
 STATE = record(
     numbers("position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps heap_m2 travelled_m")
 )
 """Pose in the plane of the slope, twist, cross-section of the heap beside the inner track, and distance."""
-
-
-class Slope(NamedTuple):
-    """An even slope, level by default.
-
-    Parameters
-    ----------
-    angle_rad : against the horizontal
-    uphill_rad : heading of uphill in the plane of the slope
-    """
-
-    angle_rad: float = 0.0
-    uphill_rad: float = 0.0
-
-
-LEVEL = Slope()
-"""No slope."""
 
 
 @njit
@@ -183,9 +184,6 @@ def tilt_at(angle_rad: float, uphill_rad: float, yaw_rad: float) -> tuple[float,
 
     Examples
     --------
-    >>> grade, roll = tilt_at(0.2, 0.0, 0.0)
-    >>> round(grade, 6), abs(round(roll, 6))
-    (0.2, 0.0)
     >>> grade, roll = tilt_at(0.2, math.pi / 2, 0.0)  # uphill is to the left: the left side is up
     >>> abs(round(grade, 6)), round(roll, 6)
     (0.0, 0.2)
@@ -206,8 +204,8 @@ def tracks_on(
     Parameters
     ----------
     robot : its yaw inertia is that of an even plate over the tracks
-    ground : a soil that shears, without Bekker's numbers no rut is pressed and nothing is pushed aside; or the
-        slip itself
+    ground : a soil that shears, without Bekker's numbers no rut is pressed and nothing is pushed aside; or the slip
+        itself
     until_m : distance travelled at which the ground ends
     bulldozing_ratio : factor on what sides push; 0 for none
 
@@ -224,37 +222,35 @@ def tracks_on(
     array([0.1965])
     """
     across_m = robot.track_m + robot.track_width_m
-    tracks = filled(
-        TRACKS,
-        half_m=robot.half_track_m,
-        length_m=robot.contact_length_m,
-        width_m=robot.track_width_m,
-        height_m=robot.com_height_m,
-        mass_kg=robot.mass_kg,
-        inertia_kgm2=robot.mass_kg * (robot.contact_length_m**2 + across_m**2) / 12.0,
-        area_m2=robot.contact_length_m * robot.track_width_m,
-        until_m=until_m,
-    )
+    of_robot = {
+        "half_m": robot.half_track_m,
+        "length_m": robot.contact_length_m,
+        "width_m": robot.track_width_m,
+        "height_m": robot.com_height_m,
+        "mass_kg": robot.mass_kg,
+        "inertia_kgm2": robot.mass_kg * (robot.contact_length_m**2 + across_m**2) / 12.0,
+        "area_m2": robot.contact_length_m * robot.track_width_m,
+        "until_m": until_m,
+    }
     if isinstance(ground, PrescribedSlip):
-        for name, value in ground._asdict().items():
-            tracks[name] = value
-        return tracks
+        return filled(TRACKS, **of_robot, **ground._asdict())
     if ground.law != "janosi":
         raise ConfigError(
             f"soil {ground.name!r} has the law {ground.law!r}: a tracked robot is simulated on ground that "
             "shears, the law 'janosi'"
         )
-    tracks["sheared"] = True
-    tracks["cohesion_pa"], tracks["tan_friction"] = ground.cohesion_pa, math.tan(ground.friction_angle_rad)
-    tracks["shear_modulus_m"], tracks["rolling_ratio"] = (
-        ground.shear_modulus_m,
-        ground.rolling_resistance_ratio,
-    )
-    tracks["passive_ratio"] = math.tan(math.pi / 4 + ground.friction_angle_rad / 2) ** 2
+    of_soil = {
+        "sheared": True,
+        "cohesion_pa": ground.cohesion_pa,
+        "tan_friction": math.tan(ground.friction_angle_rad),
+        "shear_modulus_m": ground.shear_modulus_m,
+        "rolling_ratio": ground.rolling_resistance_ratio,
+        "passive_ratio": math.tan(math.pi / 4 + ground.friction_angle_rad / 2) ** 2,
+    }
     if math.isfinite(ground.kphi_npmn2):
-        tracks["kc_npmn1"], tracks["kphi_npmn2"] = ground.kc_npmn1, ground.kphi_npmn2
-        tracks["exponent_ratio"], tracks["bulldozing_ratio"] = ground.sinkage_exponent_ratio, bulldozing_ratio
-    return tracks
+        of_soil |= {"kc_npmn1": ground.kc_npmn1, "kphi_npmn2": ground.kphi_npmn2}
+        of_soil |= {"exponent_ratio": ground.sinkage_exponent_ratio, "bulldozing_ratio": bulldozing_ratio}
+    return filled(TRACKS, **of_robot, **of_soil)
 
 
 @njit
@@ -516,7 +512,7 @@ def step(tracks: Any, slope: Array, state: Any, belt_mps: Array, after: Any, dt_
 
 
 @njit
-def drive(tracks: Array, slope: Array, belt_mps: Array, states: Array, dt_s: float) -> None:
+def drive_tracks(tracks: Array, slope: Array, belt_mps: Array, states: Array, dt_s: float) -> None:
     """Write all states of a drive but the first, which is its start.
 
     Parameters
@@ -563,72 +559,45 @@ class TrackedSensors(NamedTuple):
 
 
 NOISY = TrackedSensors()
-"""Ordinary sensors."""
 
 QUIET = TrackedSensors(**{name: 0.0 for name in TrackedSensors._fields if not name.endswith("_hz")})
 """Sensors without noise, and belts without a lag."""
 
 
-class Stretch(NamedTuple):
-    """A stretch of one ground.
-
-    Parameters
-    ----------
-    ground : a soil that shears, or the slip itself
-    length_m : distance travelled on it; the last one of a run goes on for ever
-    """
-
-    ground: Soil | PrescribedSlip
-    length_m: float = math.inf
-
-
-def simulate_tracked(
-    robot: TrackedRobot,
-    ground: Soil | PrescribedSlip | Sequence[Stretch],
-    track_speed_mps: Array,
+def run_tracked(
+    robot: Robot,
+    drive: Scenario | Array,
+    ground: TrackedGround,
     seed: int | np.random.SeedSequence,
     *,
-    slope: Slope = LEVEL,
+    conditions: Conditions,
+    effects: Mapping[str, float],
+    slope: Slope | None = None,
     yaw_rad: float = 0.0,
     sensors: TrackedSensors = NOISY,
-    run_id: str = "run",
-) -> RunLog:
-    """Drive the tracks of a robot and return what its loggers wrote, with the truth beside it.
+) -> tuple[dict[str, Stream], tuple[Label, ...]]:
+    """Return streams and labels of a drive, for :func:`terrain.simulation.run.simulate`, which describes the rest.
 
     Parameters
     ----------
-    robot : tracked
+    drive : a scenario, or commanded speeds (n, 2) of the left and the right track at 50 Hz, from rest
     ground : one for the whole run, or stretches of several
-    track_speed_mps : (n, 2) commanded speeds of the left and the right track at 50 Hz, from rest
-    seed : of the noise; the same gives the same bytes
-    slope : an even one, level by default
+    conditions : load, and the gradient of an even slope where no ``slope`` is given; there are no undulations
     yaw_rad : heading at the start, in the plane of the slope
     sensors : rates and noise; :data:`QUIET` has none
-    run_id : of the run; its label is the soil's name
-
-    Returns
-    -------
-    RunLog
-        streams wheels (speeds of the tracks), imu, pose (cameras around the field), gnss and compass,
-        commands and truth, with ``slip_left_ratio``, ``slip_right_ratio`` by each track's own middle, and
-        the slip angle of the body ``slip_body_rad``
-
-    Raises
-    ------
-    ConfigError
-        if speeds are not (n, 2) finite numbers, a soil does not shear, or no stretch is given.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> from terrain.terramechanics.soil import load_soil
-    >>> run = simulate_tracked(load_robot("patako"), load_soil("dry_sand"), np.full((200, 2), 0.05), 0)
-    >>> sorted(run.streams)
-    ['commands', 'compass', 'gnss', 'imu', 'pose', 'truth', 'wheels']
-    >>> round(float(run.streams["truth"].values[-1, BODY_TRUTH.index("speed_x_mps")]), 3)
-    0.05
     """
-    commands = np.asarray(track_speed_mps, dtype=float)
+    tracked = as_drive(TrackedRobot, robot, "robot {name}: drive {drive!r} has no tracks for this ground")
+    if effects:
+        raise ConfigError(
+            f"robot {robot.name}: on tracks that shear, no effects are simulated: leave them out"
+        )
+    tracked = replace(tracked, mass_kg=robot.mass_kg + conditions.payload_kg)
+    if slope is None:
+        ahead, left = conditions.grade_ratio
+        slope = Slope(math.atan(math.hypot(ahead, left)), math.atan2(left, ahead))
+    if isinstance(drive, Scenario):
+        drive = wheel_motion(tracked, drive.twist, 1.0 / RATE_HZ).wheel_speed_mps
+    commands = np.asarray(drive, dtype=float)
     if commands.ndim != 2 or commands.shape[1] != 2 or len(commands) < 2 or not np.isfinite(commands).all():
         raise ConfigError(
             f"track_speed_mps has shape {commands.shape}, (n, 2) finite numbers with two rows are required"
@@ -636,100 +605,51 @@ def simulate_tracked(
     stretches = [Stretch(ground)] if isinstance(ground, Soil | PrescribedSlip) else list(ground)
     if not stretches:
         raise ConfigError("ground: no stretch is given, one at least is required")
-    belts = _followed(commands, sensors.belt_lag_s)
+    every, lag_s = round(1.0 / (RATE_HZ * STEP_S)), sensors.belt_lag_s
+    belts = np.repeat(commands, every, axis=0)[: (len(commands) - 1) * every + 1]
+    if lag_s > 0.0:
+        keep = math.exp(-STEP_S / lag_s)
+        belts = np.vstack([np.zeros((1, 2)), lfilter([1.0 - keep], [1.0, -keep], belts[1:], axis=0)])
     ends_m = np.cumsum([length_m for _, length_m in stretches])
-    tracks = np.concatenate(
-        [tracks_on(robot, part.ground, end_m) for part, end_m in zip(stretches, ends_m, strict=True)]
-    )
+    tracks = [tracks_on(tracked, part.ground, end_m) for part, end_m in zip(stretches, ends_m, strict=True)]
     states = np.zeros(len(belts), STATE)
     states["yaw_rad"][0] = yaw_rad
-    drive(tracks, np.array(slope), belts, states, STEP_S)
-    rngs = [np.random.default_rng(child) for child in np.random.SeedSequence(_entropy(seed)).spawn(5)]
-    bias_radps = sensors.gyro_bias_radps * rngs[0].standard_normal()
-    tilt = np.array([tilt_at(slope.angle_rad, slope.uphill_rad, yaw) for yaw in states["yaw_rad"]])
-    every = round(1.0 / (WHEELS_HZ * STEP_S))
-    wheels = belts[::every] + sensors.encoder_mps * rngs[1].standard_normal((len(belts[::every]), 2))
-    streams = {
-        "wheels": Stream(np.arange(len(wheels)) / WHEELS_HZ, wheels, robot.rate_channels),
-        "imu": _imu(states, tilt, bias_radps, sensors, rngs[2]),
-        "pose": _pose(states, sensors, rngs[3]),
-        **_satellites(states, sensors, rngs[4]),
-        "commands": Stream(np.arange(len(commands)) / COMMANDS_HZ, commands, robot.rate_channels),
-        "truth": _truth(robot, states, tilt, belts, bias_radps),
-    }
-    return RunLog(
-        run_id, robot.name, streams, _labels(stretches, ends_m, states), source="simulated, tracked"
-    )
-
-
-def _entropy(seed: int | np.random.SeedSequence) -> list[int]:
-    """Return the words of a seed; a sequence is left as it is."""
-    sequence = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
-    return [int(word) for word in sequence.generate_state(4)]
-
-
-def _followed(commands: Array, lag_s: float) -> Array:
-    """Return the speeds of the belts (m, 2) at every step: those commanded, with a lag."""
-    every = round(1.0 / (COMMANDS_HZ * STEP_S))
-    belts = np.repeat(commands, every, axis=0)[: (len(commands) - 1) * every + 1]
-    keep = math.exp(-STEP_S / lag_s) if lag_s > 0.0 else 0.0
-    followed = np.empty_like(belts)
-    followed[0] = 0.0 if lag_s > 0.0 else belts[0]
-    for k in range(1, len(belts)):
-        followed[k] = keep * followed[k - 1] + (1.0 - keep) * belts[k]
-    return followed
-
-
-def _labels(stretches: Sequence[Stretch], ends_m: Array, states: Array) -> tuple[Label, ...]:
-    """Return the soils by time; slip that is prescribed has no name."""
-    which = np.minimum(np.searchsorted(ends_m, states["travelled_m"], side="right"), len(stretches) - 1)
-    labels = []
-    for k, (ground, _) in enumerate(stretches):
-        steps = np.flatnonzero(which == k)
-        if steps.size and isinstance(ground, Soil):
-            labels.append(Label(float(steps[0] * STEP_S), float(steps[-1] * STEP_S), ground.name))
-    return tuple(label for label in labels if label.end_s > label.start_s)
-
-
-def _imu(
-    states: Array, tilt: Array, bias_radps: float, sensors: TrackedSensors, rng: np.random.Generator
-) -> Stream:
-    """Return gyro, specific force and attitude; on an even slope the body turns about its z axis alone."""
-    n, turn = len(states), states["yaw_rate_radps"]
-    noise = [
-        std * rng.standard_normal((n, k)) for std, k in ((sensors.gyro_radps, 3), (sensors.accel_mps2, 3))
-    ]
-    noise += [std * rng.standard_normal((n, k)) for std, k in ((sensors.tilt_rad, 2), (sensors.yaw_rad, 1))]
-    rate = np.column_stack([np.zeros((n, 2)), turn + bias_radps])
-    accel = np.column_stack(_acceleration(states))
-    yaw = states["yaw_rad"] - states["yaw_rad"][0] + bias_radps * STEP_S * np.arange(n)
-    attitude = np.column_stack([tilt[:, 1], -tilt[:, 0], yaw])
-    return white_imu(np.arange(n) * STEP_S, rate, accel, attitude, np.hstack(noise))
-
-
-def _acceleration(states: Array) -> tuple[Array, Array]:
-    v_x, v_y, turn = states["speed_x_mps"], states["speed_y_mps"], states["yaw_rate_radps"]
-    return np.gradient(v_x, STEP_S) - turn * v_y, np.gradient(v_y, STEP_S) + turn * v_x
-
-
-def _poses(states: Array) -> Array:
-    """Return position and heading (n, 3)."""
-    return np.column_stack([states[name] for name in ("position_x_m", "position_y_m", "yaw_rad")])
-
-
-def _pose(states: Array, sensors: TrackedSensors, rng: np.random.Generator) -> Stream:
-    rows, time_s = _samples(len(states), sensors.pose_hz)
+    drive_tracks(np.concatenate(tracks), np.array(slope), belts, states, STEP_S)
+    body = _body(states, slope)
+    root = seed if isinstance(seed, np.random.SeedSequence) else np.random.SeedSequence(seed)
+    words = [int(word) for word in root.generate_state(4)]
+    rngs = generators(np.random.SeedSequence(words), ("bias", "wheels", "imu", "pose", "gnss"))
+    bias_radps = sensors.gyro_bias_radps * rngs["bias"].standard_normal()
+    wheels = belts[::every] + sensors.encoder_mps * rngs["wheels"].standard_normal((len(commands), 2))
+    at, time_s = _samples(len(body), sensors.pose_hz)
     std = np.array([sensors.pose_m, sensors.pose_m, sensors.pose_rad])
-    seen = _poses(states[rows]) + std * rng.standard_normal((len(rows), 3))
-    seen[:, 2] = wrapped(seen[:, 2])
-    return Stream(time_s, seen, POSE_CHANNELS)
+    poses = np.column_stack([body[name][at] for name in POSE_CHANNELS])
+    poses += std * rngs["pose"].standard_normal(poses.shape)
+    poses[:, 2] = wrapped(poses[:, 2])
+    fixed, fix_s = _samples(len(body), sensors.gnss_hz)
+    clock_s = np.arange(len(commands)) / RATE_HZ
+    streams = {
+        "wheels": Stream(clock_s, wheels, robot.rate_channels),
+        "imu": _imu(body, bias_radps, sensors, rngs["imu"]),
+        "pose": Stream(time_s, poses, POSE_CHANNELS),
+        **raw_fixes(fix_s, body[fixed], rngs["gnss"], sensors.gnss_m, sensors.compass_rad),
+        "commands": Stream(clock_s, commands, robot.rate_channels),
+        "truth": _truth(tracked, body, states["heap_m2"], belts, bias_radps),
+    }
+    return streams, _labels(stretches, ends_m, states)
 
 
-def _satellites(states: Array, sensors: TrackedSensors, rng: np.random.Generator) -> dict[str, Stream]:
-    rows, time_s = _samples(len(states), sensors.gnss_hz)
-    at, std = states[rows], (sensors.gnss_m, sensors.compass_rad)
-    velocity = np.column_stack([at["speed_x_mps"], at["speed_y_mps"]])
-    return raw_fixes(time_s, _poses(at), velocity, std, rng)
+def _body(states: Array, slope: Slope) -> Array:
+    """Return the body (n,) at each step, of :data:`~terrain.simulation.sensors.BODY`."""
+    body = np.zeros(len(states), BODY)
+    for name in set(BODY.names or ()) & set(STATE.names or ()):
+        body[name] = states[name]
+    grade, body["roll_rad"] = np.array([tilt_at(*slope, yaw) for yaw in states["yaw_rad"]]).T
+    body["pitch_rad"] = -grade
+    v_x, v_y, turn = states["speed_x_mps"], states["speed_y_mps"], states["yaw_rate_radps"]
+    body["accel_x_mps2"] = np.gradient(v_x, STEP_S) - turn * v_y
+    body["accel_y_mps2"] = np.gradient(v_y, STEP_S) + turn * v_x
+    return body
 
 
 def _samples(n: int, rate_hz: float) -> tuple[Array, Array]:
@@ -742,18 +662,37 @@ def _samples(n: int, rate_hz: float) -> tuple[Array, Array]:
     return rows, rows * STEP_S
 
 
-def _truth(robot: TrackedRobot, states: Array, tilt: Array, belts: Array, bias_radps: float) -> Stream:
-    x, y, yaw, v_x, v_y, turn, heap, _ = (states[name] for name in STATE.names or ())
-    grade, roll = tilt.T
+def _imu(body: Array, bias_radps: float, sensors: TrackedSensors, rng: np.random.Generator) -> Stream:
+    """Return gyro, specific force and attitude; on an even slope the body turns about its z axis alone."""
+    n, yaw = len(body), body["yaw_rad"]
+    sizes = [(sensors.gyro_radps, 3), (sensors.accel_mps2, 3), (sensors.tilt_rad, 2), (sensors.yaw_rad, 1)]
+    noise = np.hstack([std * rng.standard_normal((n, k)) for std, k in sizes])
+    rate = np.column_stack([np.zeros((n, 2)), body["yaw_rate_radps"] + bias_radps])
+    accel = np.column_stack([body["accel_x_mps2"], body["accel_y_mps2"]])
+    drifted = yaw - yaw[0] + bias_radps * STEP_S * np.arange(n)
+    attitude = np.column_stack([body["roll_rad"], body["pitch_rad"], drifted])
+    return white_imu(np.arange(n) * STEP_S, rate, accel, attitude, noise)
+
+
+def _labels(stretches: Sequence[Stretch], ends_m: Array, states: Array) -> tuple[Label, ...]:
+    """Return the soils by time; slip that is prescribed has no name."""
+    which = np.minimum(np.searchsorted(ends_m, states["travelled_m"], side="right"), len(stretches) - 1)
+    labels = []
+    for k, (ground, _) in enumerate(stretches):
+        steps = np.flatnonzero(which == k)
+        if steps.size > 1 and isinstance(ground, Soil):
+            labels.append(Label(float(steps[0] * STEP_S), float(steps[-1] * STEP_S), ground.name))
+    return tuple(labels)
+
+
+def _truth(robot: TrackedRobot, body: Array, heap_m2: Array, belts: Array, bias_radps: float) -> Stream:
+    """Return the truth with the slip of each track by its own middle, and the slip angle of the body."""
+    v_x, v_y, turn = body["speed_x_mps"], body["speed_y_mps"], body["yaw_rate_radps"]
     along = v_x[:, None] - turn[:, None] * robot.wheel_positions_m[:, 1]
-    columns = [
-        *(x, y, wrapped(yaw), roll, -grade, v_x, v_y, turn, *_acceleration(states)),
-        belts / robot.wheel_radius_m,
-        slip_ratio(belts, along, min_speed_mps=0.005),
-        slip_angle(v_x, v_y, min_speed_mps=0.005),
-        np.full(len(states), bias_radps),
-        heap,
-    ]
-    tracks = (*wheel_channels("wheel_radps", robot.wheels), *wheel_channels("slip_ratio", robot.wheels))
-    channels = (*BODY_TRUTH, *tracks, "slip_body_rad", GYRO_BIAS, "heap_m2")
-    return Stream(np.arange(len(states)) * STEP_S, np.column_stack(columns), channels)
+    columns: dict[str, Any] = {"yaw_rad": wrapped(body["yaw_rad"])}
+    slips = slip_ratio(belts, along, min_speed_mps=0.005)
+    for quantity, values in (("wheel_radps", belts / robot.wheel_radius_m), ("slip_ratio", slips)):
+        columns |= zip(wheel_channels(quantity, robot.wheels), values.T, strict=True)
+    columns["slip_body_rad"] = slip_angle(v_x, v_y, min_speed_mps=0.005)
+    columns |= {GYRO_BIAS: np.full(len(body), bias_radps), "heap_m2": heap_m2}
+    return truth_stream(np.arange(len(body)) * STEP_S, body, columns)

@@ -3,7 +3,7 @@
 import pytest
 
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.run import simulate
 from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 

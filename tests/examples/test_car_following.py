@@ -24,7 +24,8 @@ from terrain.control.car_following import (
 )
 from terrain.control.paths import path_from_curvature
 from terrain.robots import load_robot
-from terrain.simulation.car import Ground, level_ground, side_force, simulate_car
+from terrain.simulation.car import Ground, level_ground, side_force
+from terrain.simulation.run import simulate
 
 ROBOT = load_robot("adap2e")
 SEEDS = (0, 1, 2)
@@ -44,7 +45,7 @@ def lateral_errors(run, path):
 def follow(course_name, speed_mps, source, seed):
     course, stops = (slope_course()[0], ()) if course_name == "slope" else (stop_course(), STOP)
     follower = CarFollower(ROBOT, course.path, source)
-    run = simulate_car(ROBOT, course.drive(speed_mps, stops), follower, np.random.default_rng(seed))
+    run = simulate(ROBOT, course.drive(speed_mps, stops), course.ground, seed, controller=follower)
     return follower, run, lateral_errors(run, course.path)
 
 
@@ -136,7 +137,7 @@ def test_robot_stops_when_fixes_are_lost():
         return follower(sample)
 
     drive = Course(path, level_ground()).drive(3.0)._replace(duration_s=14.0)
-    run = simulate_car(ROBOT, drive, without_fixes, np.random.default_rng(0))
+    run = simulate(ROBOT, drive, level_ground(), 0, controller=without_fixes)
     speed = run.streams["truth"]
     assert (speed.channel("speed_x_mps")[speed.time_s > 6.0 + LOST_STOP_S + 2.5] == 0.0).all()
     assert (speed.channel("speed_x_mps")[(speed.time_s > 3.0) & (speed.time_s < 8.5)] == 3.0).all()
@@ -146,5 +147,5 @@ def test_an_offset_is_kept_to_the_left():
     path = path_from_curvature(np.array([0.0, 50.0]), np.zeros(2))
     follower = CarFollower(ROBOT, path, SlipSource.MULTI, SteeringSettings(offset_m=1.0))
     ground = Ground(np.zeros(1), np.array([0.7]), np.array([0.15]))
-    run = simulate_car(ROBOT, Course(path, ground).drive(3.0), follower, np.random.default_rng(0))
+    run = simulate(ROBOT, Course(path, ground).drive(3.0), ground, 0, controller=follower)
     assert lateral_errors(run, path)[-100:, 1] == pytest.approx(1.0, abs=0.05)

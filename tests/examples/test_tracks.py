@@ -11,7 +11,8 @@ from scipy.integrate import quad
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.tracked import QUIET, Slope, simulate_tracked
+from terrain.simulation.run import simulate
+from terrain.simulation.tracked import QUIET, Slope
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import bekker_pressure, janosi_force, mobilised_ratio
 
@@ -70,7 +71,7 @@ def test_beyond_reach_there_is_no_slip_and_hard_ground_is_refused():
 def test_it_is_the_slip_of_the_simulated_robot():
     belts = np.full((400, 2), 0.05)
     for grade in (0.0, 0.15, 0.3):
-        run = simulate_tracked(ROBOT, SAND, belts, 0, slope=Slope(grade), sensors=QUIET)
+        run = simulate(ROBOT, belts, SAND, 0, slope=Slope(grade), sensors=QUIET)
         slip = 1 - run.streams["truth"].channel("speed_x_mps")[-1] / 0.05
         # the simulated pressure moves to the rear on a grade, where the soil has been sheared further
         assert slip == pytest.approx(track_balance(ROBOT, SAND, grade).slip_ratio, rel=0.2, abs=0.002)

@@ -25,7 +25,8 @@ from terrain.errors import DataError
 from terrain.estimation.observers.slip_model import PARAMETERS
 from terrain.identify import Parameter, identify
 from terrain.robots import load_robot
-from terrain.simulation.tracked import LEVEL, PrescribedSlip, Slope, simulate_tracked
+from terrain.simulation.run import simulate
+from terrain.simulation.tracked import LEVEL, PrescribedSlip, Slope
 from terrain.terramechanics.soil import load_soil
 
 ROBOT = load_robot("patako")
@@ -39,13 +40,13 @@ def turns(ground, seed, rates_dps=(10, 20, 30), slope=LEVEL, speed_mps=0.05):
         w = math.radians(rate) * (1 if (k + seed) % 2 == 0 else -1)
         n = int(50 * (1.0 + math.pi / 2 / abs(w) / 0.65))
         belts = np.tile([speed_mps - D * w, speed_mps + D * w], (n, 1))
-        runs.append(simulate_tracked(ROBOT, ground, belts, seed * 100 + k, slope=slope))
+        runs.append(simulate(ROBOT, belts, ground, seed * 100 + k, slope=slope))
     return runs
 
 
 def straights(ground, seed, slopes_rad=(0.0, 0.1, 0.2, 0.3)):
     return [
-        simulate_tracked(ROBOT, ground, np.full((400, 2), 0.05), seed * 100 + k, slope=Slope(slope, up))
+        simulate(ROBOT, np.full((400, 2), 0.05), ground, seed * 100 + k, slope=Slope(slope, up))
         for k, (slope, up) in enumerate((s, u) for s in slopes_rad for u in (0.0, math.pi / 2))
     ]
 

@@ -29,11 +29,10 @@ from terrain.identify import Parameter, half_width, identify
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array, Label, RunLog, Stream, TargetStatus
 from terrain.robots import description_file, load_robot
-from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.omni import steady_twist
-from terrain.simulation.run import learning_runs, six_positions_log
+from terrain.simulation.run import learning_runs, simulate, six_positions_log
 from terrain.simulation.scenario import make_scenario
-from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
+from terrain.simulation.tracked import PrescribedSlip
 from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio
 from terrain.slip_learning.forces import RunBins
 from terrain.slip_learning.learn import learn_terrain, terrain_runs
@@ -190,7 +189,7 @@ def tracked_arcs(robot, given, n=12, seed=0, **sensors):
     rng, runs = np.random.default_rng(seed), []
     for k in range(n):
         belts = np.tile(rng.uniform(-0.15, 0.15, 2), (401, 1))
-        runs.append(simulate_tracked(robot, given, belts, 100 * seed + k, run_id=f"run_{k}", **sensors))
+        runs.append(simulate(robot, belts, given, 100 * seed + k, run_id=f"run_{k}", **sensors))
     return runs
 
 

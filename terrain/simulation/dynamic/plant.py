@@ -1,45 +1,41 @@
-"""A swerve robot on its terrain: the records of its dynamic simulation, and how stiff its contacts may be.
+"""A swerve robot on its terrain: the records of the dynamic plant, and how stiff its contacts may be.
 
 Effects of the robot (:mod:`terrain.effects`) act where a real robot would have them:
 
 - **wheel_radius, one_sided_radius**: true radii of the wheels, of which the commands know nothing;
-- **steering_delay, steering_backlash, steering_offset_i**: between the encoder, which the steering motor
-  obeys, and the wheel: ``wheel(t) = play(encoder(t - T)) + d0``;
-- **force_slip, shear_slip**: a creep of the contact on top of the ground's own slip.  Its deflection follows
-  ``du/dt = (w r - v) - max(|w r|, |v|) (u / sigma + c f)`` with ``f = 3 F_i / W``, so that it settles
-  where slip is that of the ground plus ``c f``, and no equation has to be solved for a force;
-  of a shear curve ``c f`` is bent as in :func:`~terrain.simulation.contact.shear_slip`, up to the
-  wheel's own limit.  A negative creep leaves a tenth of the ground's slip: no contact is stiffer than ten
-  times it;
+- **steering_delay, steering_backlash, steering_offset_i**: between the encoder, which the steering motor obeys, and the
+  wheel: ``wheel(t) = play(encoder(t - T)) + d0``;
+- **force_slip, shear_slip**: a creep of the contact on top of the ground's own slip.  Its deflection follows ``du/dt
+  = (w r - v) - max(|w r|, |v|) (u / sigma + c f)`` with ``f = 3 F_i / W``, so that it settles where slip is that of
+  the ground plus ``c f``, and no equation has to be solved for a force; of a shear curve ``c f`` is bent as in
+  :func:`~terrain.simulation.contact.shear_slip`, up to the wheel's own limit.  A negative creep leaves a tenth of the
+  ground's slip: no contact is stiffer than ten times it;
 - **side_hill_slip**: the ground goes by sideways: wheels roll without side force where they drift downhill by
   ``c ph |v|``;
-- **rolling_resistance, slip_resistance, viscous_drag**: more resistance at each axle, by its load, its slip
-  and its share of the speed; what is less than none is none.
+- **rolling_resistance, slip_resistance, viscous_drag**: more resistance at each axle, by its load, its slip and its
+  share of the speed; what is less than none is none.
 
-How stiff a contact may be for the steps of the integration: beyond that it pushes the robot by itself.  A wheel
-of inertia I and radius r on a contact of stiffness ``K = (dF/ds) / sigma``, with the deflection u, the relaxation
-length sigma and the damping T, :data:`terrain.simulation.contact.DEFLECTION_DAMPING_S`::
+How stiff a contact may be for the steps of the integration: beyond that it pushes the robot by itself.  A wheel of
+inertia I and radius r on a contact of stiffness ``K = (dF/ds) / sigma``, with the deflection u, the relaxation length
+sigma and the damping T, :data:`terrain.simulation.contact.DEFLECTION_DAMPING_S`::
 
     F = K (u + T x)        x = w r - v        du/dt = x        dx/dt = -k u - k T x
 
-with ``k = K (r^2 / I + 1 / m)`` and m the mass of the body.  ``step.step`` steps the rate first, and the
-deflection with the new rate::
+with ``k = K (r^2 / I + 1 / m)`` and m the mass of the body.  ``step.step`` steps the rate first, and the deflection
+with the new rate::
 
     x' = x - dt k (u + T x)        u' = u + dt x'
 
-The characteristic polynomial is ``z^2 - (2 - dt k T - dt^2 k) z + 1 - dt k T``.  By Jury's criterion its
-roots are inside the unit circle where ``4 - 2 dt k T - dt^2 k > 0``, that is::
+The characteristic polynomial is ``z^2 - (2 - dt k T - dt^2 k) z + 1 - dt k T``.  By Jury's criterion its roots are
+inside the unit circle where ``4 - 2 dt k T - dt^2 k > 0``, that is ``k < 4 / (dt (dt + 2 T))``.  The decay of the
+deflection with the distance rolled only widens this.  Beyond the limit a wheel's rate changes its sign from step to
+step and grows until the contact slides.  Its force then jumps between the friction limits of the load, which for a
+large mass exceed what the motors can give by orders of magnitude.
 
-    k < 4 / (dt (dt + 2 T))
-
-The decay of the deflection with the distance rolled only widens this.  Beyond the limit a wheel's rate
-changes its sign from step to step and grows until the contact slides.  Its force then jumps between the
-friction limits of the load, which for a large mass exceed what the motors can give by orders of magnitude.
-
-Three contacts share the body: the largest eigenvalue of all of them together is at most the largest of the
-wheels' own plus the trace of the body's, ``sum K_i (2 / m + rho_i^2 / I_z)``, with rho_i the distance of a
-wheel from the centre of mass.  A tyre as a spring k_t with a damper c under a corner of mass m_i is stepped
-alike, and is stable where ``dt^2 k_t + 2 dt c < 4 m_i``.
+Three contacts share the body: the largest eigenvalue of all of them together is at most the largest of the wheels' own
+plus the trace of the body's, ``sum K_i (2 / m + rho_i^2 / I_z)``, with rho_i the distance of a wheel from the centre of
+mass.  A tyre as a spring k_t with a damper c under a corner of mass m_i is stepped alike, and is stable where
+``dt^2 k_t + 2 dt c < 4 m_i``.
 """
 
 from __future__ import annotations
@@ -98,16 +94,15 @@ PLANT = record(
         "yields": bool,
         "effects": EFFECTS,
         **numbers(
-            "com_height_m mass_kg yaw_inertia_kgm2 wheel_inertia_kgm2 relaxation_m contact_length_m "
-            "ride_stiffness_npm ride_damping_nspm torque_max_nm speed_max_radps torque_time_constant_s "
-            "friction_nm speed_gain speed_integral estimate_time_constant_s hall_steps "
-            "report_time_constant_s steer_rate_max_radps steer_accel_max_radps2 backlash_rad "
-            "leg_backlash_rad undulation_ratio undulation_length_m weight_n"
+            "mass_kg weight_n com_height_m yaw_inertia_kgm2 wheel_inertia_kgm2 relaxation_length_m contact_length_m "
+            "tyre_stiffness_npm tyre_damping_nspm torque_max_nm speed_max_radps torque_time_constant_s friction_nm "
+            "speed_gain_nmspr speed_integral_nmpr speed_estimate_time_constant_s encoder_time_constant_s hall_steps "
+            "rate_max_radps accel_max_radps2 dead_band_rad leg_backlash_rad undulation_ratio undulation_length_m"
         ),
     }
 )
-"""All numbers of one simulated run that do not change while it is driven; whether effects act in the linkages of
-the steering and where wheels touch the ground, and all effects."""
+"""All numbers of one run that do not change while it is driven, by their names in the robot's description and in the
+conditions; whether effects act in the linkages of the steering and where wheels touch the ground, and all effects."""
 
 WHEEL_STATE = record(
     numbers(
@@ -203,13 +198,7 @@ def _patches(
 
 
 def make_plant(robot: Robot, conditions: Conditions) -> Array:
-    """Return the plant of a robot with its load, (1,) of :data:`PLANT`.
-
-    Parameters
-    ----------
-    robot : with sections body, motors, steering and sensors; of its effects those listed above act, and a
-        payload
-    conditions : load, slope, tyres and the backlash of the third leg
+    """Return the plant of a robot with all sections and its load, (1,) of :data:`PLANT`.
 
     Raises
     ------
@@ -217,6 +206,8 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
         if the load takes the centre of mass out of the triangle of the wheels.
     """
     body, motors, steering, _, sensors = robot.equipment
+    parts = (steering, body, motors, sensors, conditions)  # a torque is that of the motors
+    described = {n: getattr(part, n) for part in parts for n in PLANT.names or () if hasattr(part, n)}
     effects = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
     mass_kg = robot.mass_kg * (1.0 + effects["payload_ratio"]) + conditions.payload_kg
     half = 0.5 * effects["one_sided_radius_ratio"]
@@ -224,43 +215,22 @@ def make_plant(robot: Robot, conditions: Conditions) -> Array:
     offset_m = conditions.payload_kg / mass_kg * np.asarray(conditions.payload_m)
     com_m = np.array([body.com_x_m, body.com_y_m]) + offset_m
     load_fraction, load_per_moment = _load_shares(robot, conditions, com_m)
-    return filled(
-        PLANT,
-        wheels_m=robot.wheel_positions_m,
-        com_m=com_m,
-        com_height_m=body.com_height_m,
-        mass_kg=mass_kg,
-        yaw_inertia_kgm2=body.yaw_inertia_kgm2 * mass_kg / robot.mass_kg,
-        radius_m=robot.wheel_radius_m * np.array(conditions.radius_factors) * rolling,
-        wheel_inertia_kgm2=body.wheel_inertia_kgm2,
-        relaxation_m=body.relaxation_length_m,
-        contact_length_m=body.contact_length_m,
-        ride_stiffness_npm=body.tyre_stiffness_npm,
-        ride_damping_nspm=body.tyre_damping_nspm,
-        load_fraction=load_fraction,
-        load_per_force_ratio=-body.com_height_m * load_per_moment,
-        torque_max_nm=motors.torque_max_nm,
-        speed_max_radps=motors.speed_max_radps,
-        torque_time_constant_s=motors.torque_time_constant_s,
-        friction_nm=motors.friction_nm,
-        speed_gain=motors.speed_gain_nmspr,
-        speed_integral=motors.speed_integral_nmpr,
-        estimate_time_constant_s=motors.speed_estimate_time_constant_s,
-        hall_steps=sensors.hall_steps_ratio * motors.reduction_ratio / (2 * math.pi),
-        report_time_constant_s=sensors.encoder_time_constant_s,
-        steer_rate_max_radps=steering.rate_max_radps,
-        steer_accel_max_radps2=steering.accel_max_radps2,
-        backlash_rad=steering.dead_band_rad,
-        leg_backlash_rad=conditions.leg_backlash_rad,
-        grade_ratio=conditions.grade_ratio,
-        undulation_ratio=conditions.undulation_ratio,
-        undulation_length_m=conditions.undulation_length_m,
-        linked=any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE)),
-        steer_offset_rad=[effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
-        yields=any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT)),
-        weight_n=robot.mass_kg * GRAVITY_MPS2,
-        effects=vector_of(effects).view(EFFECTS),
-    )
+    of_robot = {
+        "wheels_m": robot.wheel_positions_m,
+        "com_m": com_m,
+        "mass_kg": mass_kg,
+        "weight_n": robot.mass_kg * GRAVITY_MPS2,
+        "yaw_inertia_kgm2": body.yaw_inertia_kgm2 * mass_kg / robot.mass_kg,
+        "radius_m": robot.wheel_radius_m * np.array(conditions.radius_factors) * rolling,
+        "load_fraction": load_fraction,
+        "load_per_force_ratio": -body.com_height_m * load_per_moment,
+        "hall_steps": sensors.hall_steps_ratio * motors.reduction_ratio / (2 * math.pi),
+        "linked": any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE)),
+        "steer_offset_rad": [effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
+        "yields": any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT)),
+        "effects": vector_of(effects).view(EFFECTS),
+    }
+    return filled(PLANT, **(described | of_robot))
 
 
 def _load_shares(robot: Robot, conditions: Conditions, com_m: Array) -> tuple[Array, Array]:
@@ -298,7 +268,7 @@ def contact_ratio(plant: Array, profile: TerrainProfile) -> float:
     rates_ps2 = []
     for ground in profile.patches["ground"]:  # the thrust over its slip is steepest at the start of the curve
         slope_n = np.array([wheel_ground(ground, load, _SMALL_SLIP, 0.0)[0] for load in load_n]) / _SMALL_SLIP
-        stiffness_npm = slope_n / robot["relaxation_m"]
+        stiffness_npm = slope_n / robot["relaxation_length_m"]
         rates_ps2.append((stiffness_npm * spin).max() + (stiffness_npm * body).sum())
     return float(max(rates_ps2)) / CONTACT_LIMIT_PS2
 
@@ -307,33 +277,26 @@ def tyre_ratio(plant: Array) -> float:
     """Return how stiff and damped the tyres are over their limit: unstable from 1 on."""
     robot = plant[0]
     corner_kg = robot["mass_kg"] * float(robot["load_fraction"].min())
-    damped = STEP_S * robot["ride_stiffness_npm"] + 2.0 * robot["ride_damping_nspm"]
+    damped = STEP_S * robot["tyre_stiffness_npm"] + 2.0 * robot["tyre_damping_nspm"]
     return float(STEP_S * damped / 4.0 / corner_kg)
 
 
 def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
-    """Refuse a plant whose contacts or tyres are too stiff for the steps of the integration.
-
-    Parameters
-    ----------
-    plant, profile : of a robot on its terrain
-    name : of the robot
+    """Refuse a robot on its terrain whose contacts or tyres are too stiff for the steps of the integration.
 
     Raises
     ------
     ConfigError
-        if the contacts, with :data:`LOAD_MARGIN_RATIO`, or the tyres are beyond their limit, or a number of
-        them is not finite.
+        if the contacts, with :data:`LOAD_MARGIN_RATIO`, or the tyres are beyond their limit, or not finite.
     """
     steps = f"robot {name}: its motion cannot be integrated in steps of {STEP_S:g} s: "
     mass_kg = plant["mass_kg"][0]
-    contact = LOAD_MARGIN_RATIO * contact_ratio(plant, profile)
+    contact, tyre = LOAD_MARGIN_RATIO * contact_ratio(plant, profile), tyre_ratio(plant)
     if not contact <= 1.0:
         raise ConfigError(
             f"{steps}under {mass_kg:g} kg the contacts are {contact:.3g} times too stiff for the "
             "inertia of wheels and yaw; reduce mass or load, or raise these inertias"
         )
-    tyre = tyre_ratio(plant)
     if not tyre <= 1.0:
         raise ConfigError(
             f"{steps}with {mass_kg:g} kg the tyres are {tyre:.3g} times too stiff or too damped; raise "

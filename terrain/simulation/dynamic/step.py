@@ -185,13 +185,13 @@ def _wheel_force(
     )
     w.ride_mps2 = ride_n / (plant.mass_kg * plant.load_fraction[i])
     normal_n = max(normal_n + ride_n, 0.0)
-    rate_x = wheel_speed - along - fastest / plant.relaxation_m * w.deflection_x_m
-    rate_y = -across - fastest / plant.relaxation_m * w.deflection_y_m
+    rate_x = wheel_speed - along - fastest / plant.relaxation_length_m * w.deflection_x_m
+    rate_y = -across - fastest / plant.relaxation_length_m * w.deflection_y_m
     if plant.yields:
-        rate_x -= w.creep_ratio * fastest / plant.relaxation_m * w.deflection_x_m
+        rate_x -= w.creep_ratio * fastest / plant.relaxation_length_m * w.deflection_x_m
         rate_y -= plant.effects.side_hill_slip_ratio * math.atan(grade_y) * abs(along)
-    slip_x = (w.deflection_x_m + DEFLECTION_DAMPING_S * rate_x) / plant.relaxation_m
-    slip_y = (w.deflection_y_m + DEFLECTION_DAMPING_S * rate_y) / plant.relaxation_m
+    slip_x = (w.deflection_x_m + DEFLECTION_DAMPING_S * rate_x) / plant.relaxation_length_m
+    slip_y = (w.deflection_y_m + DEFLECTION_DAMPING_S * rate_y) / plant.relaxation_length_m
     thrust, side, resistance, sinkage = wheel_ground(ground, normal_n, min(max(slip_x, -1.0), 1.0), slip_y)
     cell = min(max(int(state.path_m / FIELD_STEP_M), 0), profile.field.shape[2] - 1)  # a NaN is no place
     thrust *= profile.field[0, i, cell]
@@ -207,11 +207,11 @@ def _wheel_force(
     pull = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS)
     drive_wheel(plant, w, command_radps, thrust * radius_m, dt)
     # the contact follows with the wheel's new rate: semi-implicit
-    rate_x = w.rate_radps * radius_m - along - fastest / plant.relaxation_m * w.deflection_x_m
-    limit = plant.relaxation_m
+    rate_x = w.rate_radps * radius_m - along - fastest / plant.relaxation_length_m * w.deflection_x_m
+    limit = plant.relaxation_length_m
     deflection = w.deflection_x_m + dt * rate_x
     if plant.yields:  # implicit: a contact that creeps fast is stiff
-        deflection /= 1.0 + dt * (w.creep_ratio * fastest / plant.relaxation_m)
+        deflection /= 1.0 + dt * (w.creep_ratio * fastest / plant.relaxation_length_m)
     w.deflection_x_m = min(max(deflection, -limit), limit)
     w.deflection_y_m = min(max(w.deflection_y_m + dt * rate_y, -limit), limit)
     out.wheel_radps = wheel_speed / radius_m  # of this instant, as the slip is
@@ -325,7 +325,7 @@ def ride_over(
     contact_rate = (w.road_m - w.contact_m) * min(2.0 * speed / plant.contact_length_m, 1.0 / dt)
     w.contact_m += dt * contact_rate
     mass_kg = plant.mass_kg * plant.load_fraction[i]
-    force_n = plant.ride_stiffness_npm * (w.contact_m - w.ride_m) + plant.ride_damping_nspm * (
+    force_n = plant.tyre_stiffness_npm * (w.contact_m - w.ride_m) + plant.tyre_damping_nspm * (
         contact_rate - w.ride_mps
     )
     w.ride_mps += dt * force_n / mass_kg
@@ -339,15 +339,15 @@ def steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
     error = command_rad - w.steer_motor_rad
     # the rate from which the motor can still stop in time
     desired = math.copysign(
-        min(math.sqrt(2 * plant.steer_accel_max_radps2 * abs(error)), plant.steer_rate_max_radps), error
+        min(math.sqrt(2 * plant.accel_max_radps2 * abs(error)), plant.rate_max_radps), error
     )
     if abs(error) < 1e-4:
         desired = error / dt
-    change = plant.steer_accel_max_radps2 * dt
+    change = plant.accel_max_radps2 * dt
     w.steer_motor_radps += min(max(desired - w.steer_motor_radps, -change), change)
     w.steer_motor_rad += dt * w.steer_motor_radps
     w.steer_rad = min(
-        max(w.steer_rad, w.steer_motor_rad - plant.backlash_rad), w.steer_motor_rad + plant.backlash_rad
+        max(w.steer_rad, w.steer_motor_rad - plant.dead_band_rad), w.steer_motor_rad + plant.dead_band_rad
     )
 
 
@@ -372,17 +372,17 @@ def drive_wheel(plant: Any, w: Any, command_radps: float, load_nm: float, dt: fl
     """Speed loop, motor and wheel; then the rate that the motor driver reports."""
     command = min(max(command_radps, -plant.speed_max_radps), plant.speed_max_radps)
     error = command - w.estimate_radps
-    desired = plant.speed_gain * error + w.integral_nm
+    desired = plant.speed_gain_nmspr * error + w.integral_nm
     torque = min(max(desired, -plant.torque_max_nm), plant.torque_max_nm)
     if torque == desired or desired * error < 0.0:
-        w.integral_nm += dt * plant.speed_integral * error
+        w.integral_nm += dt * plant.speed_integral_nmpr * error
     w.torque_nm += (torque - w.torque_nm) * min(dt / max(plant.torque_time_constant_s, dt), 1.0)
     friction = plant.friction_nm * math.tanh(w.rate_radps / 0.1)
     w.rate_radps += dt * (w.torque_nm - friction - load_nm) / plant.wheel_inertia_kgm2
     w.angle_rad += dt * w.rate_radps
-    lag = min(dt / max(plant.estimate_time_constant_s, dt), 1.0)
+    lag = min(dt / max(plant.speed_estimate_time_constant_s, dt), 1.0)
     w.estimate_radps += (w.rate_radps - w.estimate_radps) * lag
     count = math.floor(w.angle_rad * plant.hall_steps)
     seen = (count - w.hall_count) / plant.hall_steps / dt
     w.hall_count = count
-    w.reported_radps += (seen - w.reported_radps) * min(dt / max(plant.report_time_constant_s, dt), 1.0)
+    w.reported_radps += (seen - w.reported_radps) * min(dt / max(plant.encoder_time_constant_s, dt), 1.0)

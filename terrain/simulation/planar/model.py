@@ -1,86 +1,74 @@
-"""The planar simulation: from wheels, steering and tilt to motion, currents and what sensors show of them.
+"""The planar plant: from wheels, steering and tilt to the motion of a body, in whole signals.
 
 One body for all wheeled robots, fed either with what a simulated drive does to the wheels or with what a log
-records of them; whatever is wrong about it is a parameter of :mod:`terrain.effects`, 0 where
-absent.
+records of them; whatever is wrong about it is a parameter of :mod:`terrain.effects`, 0 where absent.
 
 - **kinematics** without slip: of a swerve robot the least-squares twist of its wheels' velocities, of a
   skid-steer robot ``u = (v_r + v_l)/2``, ``w = (v_r - v_l)/B``;
 - **force**: ``F = m (1 + p) (dv/dt + g sin th) + R``, with the resistance ``R`` of rolling, drag, slip and
   scrub against the motion, and ``f = F / (m g)``;
-- **slip**: ``v = u - |u| s(f)``, ``s = c f`` and a shear curve.  Of a skid-steer robot it acts along x, and
-  with the inertia in ``F`` that is a low-pass of time constant ``|u| c m (1 + p) / (m g)``; of a swerve robot
-  it is a twist of three parts, along, across with what the roll asks for, and turning, of a contact that
-  springs.  Both are stepped exactly for inputs that run straight from sample to sample, so that the answer
-  hardly depends on the step;
-- **omni robots**: each wheel pulls along its direction by its own load and slip, its rollers resist across
-  it (:mod:`~terrain.simulation.planar.omni`), and each motor's current is that of its wheel;
-- **currents**: their sum is ``F r`` along the wheels' mean heading and the motors' friction over the torque
-  that an ampere gives at the wheel; of a skid-steer robot also the difference of the sides, from yaw inertia
-  and scrub;
-- **turning** of a skid-steer robot: its wheels' yaw rate and speed are reduced by turning slip and turn drag,
-  lateral acceleration makes its track act narrower, and it slips sideways by ``T dv_y/dt + v_y = -c v w``;
-- **car-like robots** turn by the linear single-track model
-  (:mod:`~terrain.simulation.planar.motion`), and have no currents;
-- **sensors**: gyro, accelerometer and camera with bias, scale, mounting, latency and their logger's clock.
+- **slip**: ``v = u - |u| s(f)``, ``s = c f`` and a shear curve, stepped exactly for inputs that run straight from
+  sample to sample, so that the answer hardly depends on the step;
+- **currents**: their sum is ``F r`` along the wheels' mean heading and the motors' friction over the torque that an
+  ampere gives at the wheel.
 
-Load transfer and roughness are left out: what they do to a log is noise here.  Sources stand with the
-effects.
+A drive is a :class:`Drive`: the record of its numbers on a ground, and the kernel of its motion
+(:mod:`~terrain.simulation.planar.skid`, :mod:`~terrain.simulation.planar.swerve`,
+:mod:`~terrain.simulation.planar.omni`, :mod:`~terrain.simulation.planar.bicycle`); what all share of the motion is in
+:mod:`~terrain.simulation.planar.motion`, sensors without noise, and both together over a log, in
+:mod:`~terrain.simulation.planar.replay`.
 
-This module holds what all of it shares: the terrain, the robot's numbers on it, the columns of a motion, and
-signals (n,) at even steps with their rates, delays and play.  Motion is in
-:mod:`~terrain.simulation.planar.motion` and :mod:`~terrain.simulation.planar.omni`, sensors without noise,
-and both together over a log, in :mod:`~terrain.simulation.planar.replay`.
+Load transfer and roughness are left out: what they do to a log is noise here.  Sources stand with the effects.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kernels import njit
-from terrain.kinematics.wheels import rolling_matrix, velocity_matrix
+from terrain.kernels import filled, njit, numbers, record
 from terrain.records import Array
-from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot
+from terrain.robots import Robot, SwerveRobot
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import equilibrium_slip, ground_record, wheel_ground
 
-TRUTH: tuple[str, ...] = (
-    "speed_x_mps",
-    "speed_y_mps",
-    "yaw_rate_radps",
-    "accel_x_mps2",
-    "force_n",
-    "current_a",
-    "turning_current_a",
-    "slip_ratio",
+TRUTH = record(
+    numbers(
+        "speed_x_mps speed_y_mps yaw_rate_radps accel_x_mps2 force_n current_a turning_current_a slip_ratio"
+    )
 )
-"""What the body does, before any sensor: speeds of the body's origin, specific force along x, traction,
-currents of motors as described, and slip; traction and slip are those along x, of an omni robot the slip of
-the body along what its wheels roll, and the sum of its currents' magnitudes."""
+"""What the body does, before any sensor: speeds of the body's origin, specific force along x, traction, currents of
+motors as described, and slip; traction and slip are those along x, of an omni robot the slip of the body along what
+its wheels roll, and the sum of its currents' magnitudes."""
 
-N_TRUTH = len(TRUTH)
-VX, VY, W, AX, FORCE, AMPS, TURNING_AMPS, SLIP = range(N_TRUTH)
-"""Their columns."""
+N_SLIPS = 101
+_SLIPS = np.linspace(0.0, 1.0, N_SLIPS)
 
-SWERVE_WHEELS = 3
+BODY = record(
+    numbers(
+        "track_m radius_m mass_kg rotating_kg yaw_inertia_kgm2 nm_per_a friction_nm lever_x_m lever_y_m latency_s "
+        "imu_latency_s imu_lag_s encoder_lag_s com_x_m com_y_m grip_ratio rolling_ratio scrub_ratio load_ratio "
+        "effective_ratio"
+    )
+    | {"soft_ratio": (float, N_SLIPS), "n_wheels": int, "seen_from_above": bool}
+)
+"""Numbers that every drive has: of the robot, of its sensors' latencies, and of its ground, with the slip over the
+traction at slips evenly spaced from 0 to 1; whether a camera above the field measures its poses."""
 
 IMU_LAG_S = 0.003
 """Lag of a swerve robot's IMU behind its latency: bandwidths of 47 and 62.5 Hz (Bosch BNO055 data sheet)."""
 
 SCRUB_SHARE = 0.4
-"""Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the
-distance."""
+"""Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the distance."""
 
 WIDTH_RATIO, CONTACT_RATIO = 0.6, 0.6
-"""Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has
-no section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6."""
-
-_SLIPS = np.linspace(0.0, 1.0, 101)
+"""Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has no
+section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6."""
 
 _MORE = 1.01
 """Load for which growth with load is taken."""
@@ -95,12 +83,11 @@ class Ground(NamedTuple):
     grip_ratio : largest traction over weight, of the shear curve
     rolling_ratio : resistance over weight
     scrub_ratio : resistance to turning of a skid-steer robot, over weight
-    thrust_ratio : traction over weight at slips evenly spaced from 0 to 1, which takes the place of
-        ``slip_ratio``; without any the thrust curve is straight
+    thrust_ratio : traction over weight at slips evenly spaced from 0 to 1, which takes the place of ``slip_ratio``;
+        without any the thrust curve is straight
     load_ratio : by how much the traction at a slip grows with a load, as a share of the load's own share
+    effective_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides over bumps
     roller_ratio : friction of the rollers of omni wheels over the load, at a speed across of the wheels' own
-    effective_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides
-        over bumps
     """
 
     slip_ratio: float = 0.3
@@ -116,14 +103,9 @@ class Ground(NamedTuple):
 def planar_ground(robot: Robot, soil: Soil) -> Ground:
     """Return what a soil is to a robot that carries its weight on all tyres alike.
 
-    The thrust curve is that of one tyre with its share of the weight; ``slip_ratio`` is its chord through the
-    slip at which the robot drives steadily on the level.  How thrust grows with load is taken there, too.
-    Rollers of omni wheels turn freely where the soil does not say what it does to them.
-
-    Parameters
-    ----------
-    robot : a tyre that it does not describe has :data:`WIDTH_RATIO` and :data:`CONTACT_RATIO`
-    soil : the ground
+    The thrust curve is that of one tyre with its share of the weight; ``slip_ratio`` is its chord through the slip at
+    which the robot drives steadily on the level.  How thrust grows with load is taken there, too.  Rollers of omni
+    wheels turn freely where the soil does not say what it does to them.
 
     Raises
     ------
@@ -150,154 +132,82 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
     thrust_n = wheel_ground(ground, normal_n, max(slip, 1e-3), 0.0)[0]
     more_n = wheel_ground(ground, _MORE * normal_n, max(slip, 1e-3), 0.0)[0]
     thrusts = [wheel_ground(ground, normal_n, float(s), 0.0)[0] / normal_n for s in _SLIPS]
-    grip = max(thrusts)
     return Ground(
         slip_ratio=max(slip, 1e-3) * normal_n / thrust_n,
-        grip_ratio=grip,
+        grip_ratio=max(thrusts),
         rolling_ratio=wheel_ground(ground, normal_n, slip, 0.0)[2] / normal_n,
-        scrub_ratio=SCRUB_SHARE * grip,
+        scrub_ratio=SCRUB_SHARE * max(thrusts),
         thrust_ratio=tuple(thrusts),
         load_ratio=(more_n / thrust_n - 1.0) / (_MORE - 1.0),
         roller_ratio=float(np.nan_to_num(soil.roller_friction_ratio)),
     )
 
 
-class Planar(NamedTuple):
-    """Numbers of a robot on a ground, as the kernels take them."""
+class Drive(NamedTuple):
+    """What a drive is made of: all that is to be written for a new one.
 
-    n_wheels: int
-    to_twist: Array
-    track_m: float
-    radius_m: float
-    mass_kg: float
-    rotating_kg: float
-    yaw_inertia_kgm2: float
-    nm_per_a: float
-    friction_nm: float
-    lever_x_m: float
-    lever_y_m: float
-    latency_s: float
-    imu_latency_s: float
-    imu_lag_s: float
-    encoder_lag_s: float
-    slip_ratio: float
-    soft_ratio: Array
-    grip_ratio: float
-    rolling_ratio: float
-    scrub_ratio: float
-    load_ratio: float
-    effective_ratio: float
-    com_x_m: float
-    com_y_m: float
-    arm_ratio: Array
-    spread_m: float
-    relaxation_m: float
-    omni: bool
-    along: Array
-    across: Array
-    to_rolled: Array
-    wheel_load_ratio: Array
-    wheel_distance_m: float
-    roller_ratio: float
-    tracked: bool
-    bicycle: bool
-    wheelbase_m: float
-    com_ahead_m: float
-    front_cornering_npr: float
-    rear_cornering_npr: float
+    Parameters
+    ----------
+    record : of its numbers, with the field ``body`` of :data:`BODY`
+    numbers : from a robot and a ground to its other fields by name
+    move : the kernel, from that record (1,), the vector of effects, the step in s, wheel speeds and steering
+        (n, wheels), grade and roll (n,), and the disturbance (n, 3) or (0, 3) to rows (n,) of :data:`TRUTH`
+    drifts : whether the body goes sideways by what the ground adds, and on a side hill
+    """
+
+    record: np.dtype[Any]
+    numbers: Callable[[Robot, Ground], Mapping[str, Any]]
+    move: Callable[..., Array]
+    drifts: bool = True
 
 
-def make_planar(robot: Robot, ground: Ground) -> Planar:
-    """Return the planar simulation of a robot on a ground.
+def body_numbers(robot: Robot, ground: Ground) -> Array:
+    """Return what a robot and a ground are to every drive, (1,) of :data:`BODY`.
 
-    What a description leaves out does not act: without motors a traction of 1 N counts as 1 A, without a
-    camera the speed is that of the body's origin, without delay.
+    What a description leaves out does not act: without motors a traction of 1 N counts as 1 A, without a camera the
+    speed is that of the body's origin, without delay.
     """
     complete = robot.completed
     motors, camera, body, sensors = complete.motors, complete.camera, complete.body, complete.sensors
-    n_motors = len(robot.wheels)
-    car = robot if isinstance(robot, BicycleRobot) else None
-    com_m = np.array([body.com_x_m, body.com_y_m])
-    arm_m = robot.wheel_positions_m - com_m
-    spread_m = float(np.sqrt((arm_m**2).sum(axis=1).mean()))
-    return Planar(
-        n_wheels=len(robot.wheels),
-        to_twist=np.ascontiguousarray(np.linalg.pinv(velocity_matrix(robot.wheel_positions_m))),
+    n = len(robot.wheels)
+    return filled(
+        BODY,
+        n_wheels=n,
         track_m=robot.track_m,
         radius_m=robot.wheel_radius_m,
         mass_kg=robot.mass_kg,
-        rotating_kg=n_motors * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
-        yaw_inertia_kgm2=car.yaw_inertia_kgm2 if car else body.yaw_inertia_kgm2,
+        rotating_kg=n * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
+        yaw_inertia_kgm2=body.yaw_inertia_kgm2,
         nm_per_a=motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio,
-        friction_nm=n_motors * motors.friction_nm,
+        friction_nm=n * motors.friction_nm,
         lever_x_m=camera.lever_x_m,
         lever_y_m=camera.lever_y_m,
         latency_s=camera.latency_s + camera.time_constant_s,
         imu_latency_s=sensors.imu_latency_s,
         imu_lag_s=IMU_LAG_S if isinstance(robot, SwerveRobot) else 0.0,
         encoder_lag_s=sensors.encoder_time_constant_s,
-        slip_ratio=ground.slip_ratio,
+        com_x_m=body.com_x_m,
+        com_y_m=body.com_y_m,
         soft_ratio=_slip_per_traction(ground),
         grip_ratio=ground.grip_ratio,
         rolling_ratio=ground.rolling_ratio,
         scrub_ratio=ground.scrub_ratio if robot.skids else 0.0,
         load_ratio=ground.load_ratio,
         effective_ratio=ground.effective_ratio,
-        com_x_m=float(com_m[0]),
-        com_y_m=float(com_m[1]),
-        arm_ratio=np.ascontiguousarray(arm_m / spread_m),
-        spread_m=spread_m,
-        relaxation_m=body.relaxation_length_m,
-        **_omni_wheels(robot, arm_m, ground),
-        tracked=isinstance(robot, TrackedRobot),
-        bicycle=car is not None,
-        wheelbase_m=robot.wheelbase_m,
-        com_ahead_m=car.com_ahead_m if car else 0.0,
-        front_cornering_npr=car.front_cornering_npr if car else 0.0,
-        rear_cornering_npr=car.rear_cornering_npr if car else 0.0,
+        seen_from_above=robot.on_omni_wheels,
     )
 
 
-def _omni_wheels(robot: Robot, arm_m: Array, ground: Ground) -> dict[str, Any]:
-    """Return what omni wheels at arms (wheels, 2) from the centre of mass do; zeros of other robots.
-
-    ``along`` and ``across`` (wheels, 3) give the speed of each wheel's centre along and across its direction
-    for a twist of the centre of mass, ``to_rolled`` (3, wheels) the twist of the body without slip.
-    """
-    if not robot.on_omni_wheels:
-        n, none = len(robot.wheels), np.zeros((len(robot.wheels), 3))
-        return {
-            "omni": False,
-            "along": none,
-            "across": none,
-            "to_rolled": np.zeros((3, n)),
-            "wheel_load_ratio": np.zeros(n),
-            "wheel_distance_m": 0.0,
-            "roller_ratio": 0.0,
-        }
-    direction = robot.wheel_directions_rad
-    moments = np.vstack([np.ones(len(arm_m)), arm_m.T])
-    return {
-        "omni": True,
-        "along": np.ascontiguousarray(rolling_matrix(arm_m, direction)),
-        "across": np.ascontiguousarray(rolling_matrix(arm_m, direction + np.pi / 2)),
-        "to_rolled": np.ascontiguousarray(np.linalg.pinv(rolling_matrix(robot.wheel_positions_m, direction))),
-        "wheel_load_ratio": np.linalg.pinv(moments) @ np.array([1.0, 0.0, 0.0]),
-        "wheel_distance_m": float(np.hypot(*robot.wheel_positions_m[0])),
-        "roller_ratio": ground.roller_ratio,
-    }
-
-
 def _slip_per_traction(ground: Ground) -> Array:
-    """Return slip over traction at slips evenly spaced from 0 to 1."""
+    """Return slip over traction at slips (N_SLIPS,) evenly spaced from 0 to 1."""
     thrust = np.array(ground.thrust_ratio)
     if thrust.size < 4:
-        return np.full(2, ground.slip_ratio)
+        return np.full(N_SLIPS, ground.slip_ratio)
     slip = np.linspace(0.0, 1.0, thrust.size)
     ratio = np.empty(thrust.size)
     ratio[1:] = slip[1:] / thrust[1:]
     ratio[0] = 2.0 * ratio[1] - ratio[2]
-    return ratio
+    return ratio if thrust.size == N_SLIPS else np.interp(_SLIPS, slip, ratio)
 
 
 @njit
@@ -333,6 +243,7 @@ def delayed(values: Array, late: float, rate: float) -> Array:
     """
     n = values.size
     out = np.empty(n)
+    first = last = n
     if rate == 0.0:  # the same weights everywhere but at the ends
         whole = math.floor(-late)
         x = -late - whole
@@ -346,13 +257,9 @@ def delayed(values: Array, late: float, rate: float) -> Array:
             out[first:last] += c * values[i + 1 : i + 1 + m] + d * values[i + 2 : i + 2 + m]
         else:
             first = last = n
-        for k in range(first):
-            out[k] = _between(values, k - late)
-        for k in range(last, n):
-            out[k] = _between(values, k - late)
-        return out
     for k in range(n):
-        out[k] = _between(values, k - late - rate * k)
+        if k < first or k >= last:
+            out[k] = _between(values, k - late - rate * k)
     return out
 
 
@@ -396,9 +303,40 @@ def lagged(values: Array, tau_s: float, dt: float) -> Array:
 
 
 @njit
-def play(angle: Array, half: float) -> None:
-    """Let an angle follow itself through a play of half width ``half``, from the middle; in place."""
-    follower = angle[0]
-    for k in range(angle.size):
-        follower = min(max(follower, angle[k] - half), angle[k] + half)
-        angle[k] = follower
+def steered(angle: Array, delay_s: float, backlash_rad: float, dt: float) -> Array:
+    """Return the angle (n,) of a wheel behind the delay of its linkage and a play of half a width, from its middle."""
+    if delay_s != 0.0:
+        angle = delayed(angle, delay_s / dt, 0.0)
+    if backlash_rad > 0.0:
+        follower = angle[0]
+        for k in range(angle.size):
+            follower = min(max(follower, angle[k] - backlash_rad), angle[k] + backlash_rad)
+            angle[k] = follower
+    return angle
+
+
+@njit
+def decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, float]:
+    """Return ``a, b`` of ``exp(A dt) = a 1 + b A`` of a matrix (2, 2) that does not grow.
+
+    Where roots are close to each other, two cosines are series: they take no more time than a square root.
+    """
+    x = (half_trace * half_trace - determinant) * dt * dt
+    if x > 4.0:
+        root = math.sqrt(x)
+        quick = half_trace * dt - root
+        slow = math.exp(determinant * dt * dt / quick)
+        quick = math.exp(quick)
+        both, b = 0.5 * (slow + quick), 0.5 * (slow - quick) / root * dt
+    else:
+        both = b = math.exp(half_trace * dt)
+        if x < -4.0:
+            root = math.sqrt(-x)
+            both *= math.cos(root)
+            b *= math.sin(root) / root * dt
+        else:
+            both *= 1.0 + x / 2.0 * (1.0 + x / 12.0 * (1.0 + x / 30.0 * (1.0 + x / 56.0 * (1.0 + x / 90.0))))
+            b *= dt * (
+                1.0 + x / 6.0 * (1.0 + x / 20.0 * (1.0 + x / 42.0 * (1.0 + x / 72.0 * (1.0 + x / 110.0))))
+            )
+    return both - half_trace * b, b

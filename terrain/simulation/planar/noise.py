@@ -1,7 +1,7 @@
-"""Noise of a run of the planar simulation: scatter of parameters, and coloured noise.
+"""Noise of a run of the planar simulation: scatter of parameters, coloured noise, and the simulation's own error.
 
-Coloured noise is ``x_k = a x_(k-1) + sqrt(1 - a^2) std e_k`` with ``a = exp(-dt / tau)``; every second sample
-of it is again such a noise.
+Coloured noise is ``x_k = a x_(k-1) + sqrt(1 - a^2) std e_k`` with ``a = exp(-dt / tau)``; every second sample of it is
+again such a noise.  The numbers travel with the package, in ``data/spread/planar.yaml``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0
 
 
 class Scatter(NamedTuple):
-    """Standard deviations of what differs from run to run by itself; ``data/spread/planar.yaml``."""
+    """Standard deviations of what differs from run to run by itself."""
 
     gyro_bias_radps: float
     accel_bias_mps2: float
@@ -39,8 +39,8 @@ class Scatter(NamedTuple):
 class Noise(NamedTuple):
     """Noise of a run: standard deviations, and ``*_s`` the time over which it forgets itself.
 
-    All but white noise is that of a robot fast enough; at the speed ``moving_mps`` it has half its size, and
-    at rest none.
+    All but white noise is that of a robot fast enough; at the speed ``moving_mps`` it has half its size, and at rest
+    none.
     """
 
     along_ratio: float
@@ -71,13 +71,7 @@ class Noise(NamedTuple):
 
 
 def load_scatter() -> Scatter:
-    """Return the scatter that travels with the package.
-
-    Examples
-    --------
-    >>> load_scatter().gyro_bias_radps
-    0.002
-    """
+    """Return the scatter that travels with the package."""
     return Scatter(**_numbers("scatter", Scatter._fields))
 
 
@@ -110,13 +104,7 @@ class ModelError(NamedTuple):
 
 
 def load_model_error() -> ModelError:
-    """Return the simulation's own error; ``data/spread/planar.yaml`` says how it was measured.
-
-    Examples
-    --------
-    >>> load_model_error().common["motor_constant_ratio"]
-    0.024
-    """
+    """Return the simulation's own error; ``data/spread/planar.yaml`` says how it was measured."""
     common, varied, scatter = (
         _numbers(part, tuple(_described()[part]))
         for part in ("model_error", "varied_error", "varied_scatter")
@@ -144,14 +132,7 @@ def _numbers(part: str, names: tuple[str, ...]) -> dict[str, float]:
 
 @njit
 def coloured(white: Array, std: Array, tau_s: Array, dt: float) -> Array:
-    """Return noise (c, n) of given size and memory from white noise (c, n) of size 1.
-
-    Parameters
-    ----------
-    white : (c, n)
-    std, tau_s : (c,)
-    dt : from sample to sample in s
-    """
+    """Return noise (c, n) of sizes and memories (c,) from white noise (c, n) of size 1, sampled every ``dt`` s."""
     out = np.empty_like(white)
     for i in range(white.shape[0]):
         keep = math.exp(-dt / tau_s[i])

@@ -3,8 +3,9 @@ import pytest
 
 from pipelines.explain.explain import explain
 from terrain.robots import load_robot
+from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.run import simulate
 
 HIDDEN = {"camera_yaw_rad": 0.04}
 HUSKY = load_robot("husky")
@@ -17,8 +18,8 @@ def simulated(i, robot=HUSKY, effects=HIDDEN, terrain="field"):
     twist = np.column_stack([ahead, np.zeros_like(ahead), 0.5 * np.sin(0.9 * time_s + 0.3 * i)])
     twist[:50] *= np.linspace(0, 1, 50)[:, None]
     about = {"run_id": f"{robot.name}_{i}", "terrain": terrain}
-    return simulate_planar(
-        robot, twist, i, effects=effects, scatter=load_scatter(), noise=load_noise(), **about
+    return simulate(
+        robot, twist, Ground(), i, effects=effects, scatter=load_scatter(), noise=load_noise(), **about
     )
 
 

@@ -18,9 +18,11 @@ from terrain.errors import ConfigError, TerrainError
 from terrain.extension import extended_yaml
 from terrain.logs.write import write_run
 from terrain.robots import description_file, load_robot
+from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise
-from terrain.simulation.planar.run import COMMANDS_HZ, DRIVE_S, simulate_planar
-from terrain.simulation.run import simulate_run
+from terrain.simulation.planar.run import DRIVE_S
+from terrain.simulation.run import simulate, simulate_run
+from terrain.simulation.scenario import RATE_HZ as COMMANDS_HZ
 from terrain.slip_learning.learn import terrain_runs
 
 HUSKY = load_robot("husky")
@@ -123,7 +125,9 @@ def test_runs_that_cannot_be_compared_are_refused(a_run):
     keep = ("speed_left_mps", "speed_right_mps")
     only = type(wheels)(wheels.time_s, np.column_stack([wheels.channel(name) for name in keep]), keep)
     about = {"noise": load_noise(), "terrain": "field"}
-    standing = [simulate_planar(HUSKY, np.zeros((400, 3)), i, run_id=f"stand_{i}", **about) for i in range(3)]
+    standing = [
+        simulate(HUSKY, np.zeros((400, 3)), Ground(), i, run_id=f"stand_{i}", **about) for i in range(3)
+    ]
     mower = [replace(run, robot="mower") for run in runs]
     for refused, sentence in (
         ([replace(run, streams={"wheels": only}) for run in runs], "none of its channels is simulated"),

@@ -30,7 +30,7 @@ from terrain.logs.run_topics import APART, DEAD_STREAM, SHORT_STREAM
 from terrain.logs.samples import BAD_TIME, DEAD_CHANNEL
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.run import simulate
 from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 

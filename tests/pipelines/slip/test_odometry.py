@@ -9,7 +9,8 @@ from terrain.errors import ConfigError, DataError
 from terrain.estimation.observers.slip_model_file import read_slip_model
 from terrain.logs.write import write_run
 from terrain.robots import load_robot
-from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
+from terrain.simulation.run import simulate
+from terrain.simulation.tracked import PrescribedSlip
 
 
 def judged(folder, **also):
@@ -22,7 +23,7 @@ def turns(tmp_path_factory):
     given = PrescribedSlip(slip_ratio=0.1, turning_loss_ratio=0.5, turning_exponent=0.6)
     for k in range(6):
         belts = np.tile(rng.uniform(-0.1, 0.15, 2), (501, 1))
-        write_run(simulate_tracked(load_robot("patako"), given, belts, k, run_id=f"run_{k}"), folder)
+        write_run(simulate(load_robot("patako"), belts, given, k, run_id=f"run_{k}"), folder)
     return folder
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
-from terrain.simulation.planar.run import Hills
+from terrain.simulation.conditions import Conditions
 
 DURATION_S = 60.0
 """Length of a run."""
@@ -36,7 +36,7 @@ class Drives(NamedTuple):
     """Drives of a trial: twists and hills of each run, and for how long is driven before the log begins."""
 
     twists: tuple[Array, ...]
-    hills: tuple[Hills, ...]
+    hills: tuple[Conditions, ...]
     lead_s: float = 0.0
 
 
@@ -45,10 +45,13 @@ def rich_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURAT
     return Drives(tuple(_mixed_drive(rng, duration_s) for _ in range(n_runs)), rich_hills(rng, n_runs))
 
 
-def rich_hills(rng: np.random.Generator, n_runs: int) -> tuple[Hills, ...]:
+def rich_hills(rng: np.random.Generator, n_runs: int) -> tuple[Conditions, ...]:
     """Return slopes of all directions that undulate, one a run."""
     return tuple(
-        Hills((rng.normal(0.0, 0.04), rng.normal(0.0, 0.04)), abs(rng.normal(0.0, 0.03)))
+        Conditions(
+            grade_ratio=(rng.normal(0.0, 0.04), rng.normal(0.0, 0.04)),
+            undulation_ratio=abs(rng.normal(0.0, 0.03)),
+        )
         for _ in range(n_runs)
     )
 
@@ -64,7 +67,7 @@ def poor_drives(rng: np.random.Generator, n_runs: int, duration_s: float = DURAT
         phase = rng.uniform(0.0, 2 * math.pi)
         twist[:, 2] = 0.01 * np.sin(2 * math.pi * time_s / 20.0 + phase) * (time_s > 5.0)
         twists.append(twist)
-    return Drives(tuple(twists), tuple(Hills() for _ in range(n_runs)))
+    return Drives(tuple(twists), tuple(Conditions() for _ in range(n_runs)))
 
 
 def car_drives(
@@ -112,7 +115,9 @@ def command_drives(rng: np.random.Generator, robot: Robot, n_runs: int) -> Drive
             desired[first:] = rng.uniform(-fastest_mps, fastest_mps, 2)
         left, right = _limit_rate(desired, COMMAND_MPS2).T
         twists.append(np.column_stack([(left + right) / 2, np.zeros(n), (right - left) / robot.track_m]))
-    hills = tuple(Hills(tuple(rng.normal(0.0, COMMAND_GRADE_RATIO, 2).tolist())) for _ in range(n_runs))
+    hills = tuple(
+        Conditions(grade_ratio=tuple(rng.normal(0.0, COMMAND_GRADE_RATIO, 2).tolist())) for _ in range(n_runs)
+    )
     return Drives(tuple(twists), hills, LEAD_S)
 
 

@@ -33,9 +33,10 @@ from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.held import CHANNELS as TWIST_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import Scatter, load_noise, load_scatter
-from terrain.simulation.planar.run import Hills, simulate_planar
-from terrain.simulation.run import simulate_run
+from terrain.simulation.run import simulate, simulate_run
 
 
 class Row(StrEnum):
@@ -264,18 +265,19 @@ def hidden_runs(
     each = [effects] * len(drives.twists) if isinstance(effects, Mapping) else effects
     runs = []
     for i, (twist, hills, own) in enumerate(zip(drives.twists, drives.hills, each, strict=True)):
-        run = simulate_planar(
+        run = simulate(
             robot,
             twist,
+            Ground(),
             np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)),
             effects=own,
             scatter=scatter,
             noise=noise,
-            hills=hills,
             outside=outside,
             heading=heading,
             run_id=f"run_{i + 1:02d}",
             terrain="ground",
+            conditions=hills,
         )
         shown = {name: stream for name, stream in run.streams.items() if name not in ("truth", "commands")}
         rate = own.get("clock_rate_ratio", 0.0)
@@ -519,7 +521,7 @@ def drives_of(runs: Sequence[RunLog]) -> Drives:
     """Return the commanded twists of runs on level ground."""
     axes = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
     twists = [np.column_stack([run.streams["commands"].channel(axis) for axis in axes]) for run in runs]
-    return Drives(tuple(twists), tuple(Hills() for _ in runs))
+    return Drives(tuple(twists), tuple(Conditions() for _ in runs))
 
 
 # -- Faults written into logs: a sign, a unit, or two channels in each other's place, in all runs ----------

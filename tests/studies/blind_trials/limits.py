@@ -39,10 +39,11 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import ConfigError
+from terrain.kinematics.wheels import velocity_matrix
 from terrain.records import Array, RunLog, Stream
-from terrain.robots import Robot
-from terrain.simulation.planar.model import SWERVE_WHEELS, Ground, Planar, make_planar
-from terrain.simulation.planar.motion import move
+from terrain.robots import BicycleRobot, Robot, SwerveRobot
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.motion import Planar, make_planar, move
 from terrain.simulation.planar.noise import (
     CAMERA_HZ,
     IMU_HZ,
@@ -55,7 +56,8 @@ from terrain.simulation.planar.noise import (
     load_scatter,
 )
 from terrain.simulation.planar.replay import sense
-from terrain.simulation.planar.run import simulate_planar, with_silent_parts
+from terrain.simulation.planar.run import with_silent_parts
+from terrain.simulation.run import simulate
 
 TEST_SIZE = 0.02
 """Size of the test over the whole library, to which limits refer."""
@@ -192,7 +194,7 @@ def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> L
     lead = round(drives.lead_s * STEP_HZ)
     for twist, hills in zip(drives.twists, drives.hills, strict=True):
         gram = _gram(
-            robot, planar, noise, simulate_planar(robot, twist, 0, hills=hills), every, sensing, lead
+            robot, planar, noise, simulate(robot, twist, Ground(), 0, conditions=hills), every, sensing, lead
         )
         inner = np.linalg.inv(gram[np.ix_(free, free)] + np.diag(1.0 / std**2))
         left = gram - gram[:, free] @ inner @ gram[free]
@@ -280,17 +282,21 @@ def _density(noise: Noise, robot: Robot, planar: Planar, channel: str, f: Array,
     wheel_speed = noise_psd(noise, robot, planar, WHEEL_SPEED, f, pace)
     lag_s = robot.completed.sensors.encoder_time_constant_s
     wheel_speed = wheel_speed * (1.0 + (2 * math.pi * f * lag_s) ** 2)  # the lag is undone
-    n = 1 if planar.bicycle else planar.n_wheels
+    body, n = planar.body[0], 1 if isinstance(robot, BicycleRobot) else len(robot.wheels)
     mean, rate = wheel_speed / n, (2 * math.pi * f) ** 2
     if channel in (GYRO, HEADING):
-        turn = 2.0 / planar.track_m**2 if robot.skids else np.sum(planar.to_twist[2] ** 2) / 2
+        turn = (
+            2.0 / robot.track_m**2
+            if robot.skids
+            else np.sum(np.linalg.pinv(velocity_matrix(robot.wheel_positions_m))[2] ** 2) / 2
+        )
         return own + wheel_speed * turn
     if channel == SPEED_X:
         return own + mean
     if channel == ACCEL:
         return own + mean * rate
     if channel == CURRENT:
-        return own + mean * rate * (planar.mass_kg * planar.radius_m / planar.nm_per_a) ** 2
+        return own + mean * rate * (body["mass_kg"] * body["radius_m"] / body["nm_per_a"]) ** 2
     return own
 
 
@@ -408,13 +414,13 @@ class _Spectra(NamedTuple):
         return self._turning(f, IMU_HZ) + vibration + white_psd(f, sensors.gyro_std_radps, IMU_HZ)
 
     def speed_ahead(self, f: Array) -> Array:
-        turning = self._turning(f, CAMERA_HZ) * self.planar.lever_y_m**2
+        turning = self._turning(f, CAMERA_HZ) * self.planar.body["lever_y_m"][0] ** 2
         return self._seen(f) + _folded(self._along, f) + turning
 
     def speed_sideways(self, f: Array) -> Array:
         noise = self.noise
         sideways = coloured_psd(f, noise.across_ratio * self.speed_mps, noise.across_s, CAMERA_HZ)
-        return self._seen(f) + sideways + self._turning(f, CAMERA_HZ) * self.planar.lever_x_m**2
+        return self._seen(f) + sideways + self._turning(f, CAMERA_HZ) * self.planar.body["lever_x_m"][0] ** 2
 
     def accel(self, f: Array) -> Array:
         sensors, noise = self.robot.sensors, self.noise
@@ -422,8 +428,8 @@ class _Spectra(NamedTuple):
         return vibration + self._along_rate(f) + white_psd(f, sensors.accel_std_mps2, IMU_HZ)
 
     def current(self, f: Array) -> Array:
-        planar = self.planar
-        amps_per_accel = planar.mass_kg * planar.radius_m / planar.nm_per_a
+        body = self.planar.body[0]
+        amps_per_accel = body["mass_kg"] * body["radius_m"] / body["nm_per_a"]
         return self.turning_current(f) + amps_per_accel**2 * _folded(self._along_rate, f)
 
     def turning_current(self, f: Array) -> Array:
@@ -459,13 +465,13 @@ class _Spectra(NamedTuple):
 
     def _along(self, f: Array) -> Array:
         """Return the density of the speed ahead, at the IMU's rate."""
-        noise, planar = self.noise, self.planar
-        lag = self.speed_mps * planar.slip_ratio / GRAVITY_MPS2
+        noise, slip_ratio = self.noise, self.planar.body["soft_ratio"][0, 0]
+        lag = self.speed_mps * slip_ratio / GRAVITY_MPS2
         terrain = coloured_psd(f, noise.along_ratio * self.speed_mps, noise.along_s, IMU_HZ)
-        if planar.n_wheels != SWERVE_WHEELS:
+        if not isinstance(self.robot, SwerveRobot):
             return terrain * lag_gain(f, lag, IMU_HZ)
         w = 2.0 * math.pi * f  # a contact with a relaxation length swings
-        sprung = w**2 * planar.relaxation_m * planar.slip_ratio / GRAVITY_MPS2
+        sprung = w**2 * self.robot.completed.body.relaxation_length_m * slip_ratio / GRAVITY_MPS2
         return np.asarray(terrain / ((1.0 - sprung) ** 2 + (w * lag) ** 2))
 
     def _along_rate(self, f: Array) -> Array:

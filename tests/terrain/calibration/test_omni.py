@@ -14,7 +14,7 @@ from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.run import simulate
 
 ROBOT = load_robot("robotino")
 NM_PER_A = 0.0514 * 16 * 0.75
@@ -40,11 +40,11 @@ def drives(n=18, ratio=0.5, terrain="carpet"):
         twist[25:] = 0.2 * np.cos(angle), 0.2 * np.sin(angle), 0.0
         ground = Ground(slip_ratio=1.5, rolling_ratio=0.0, roller_ratio=ratio / 1.5)
         effects = {"wheel_radius_ratio": -0.06}
-        run = simulate_planar(
+        run = simulate(
             HIDDEN,
             twist,
+            ground,
             i,
-            ground=ground,
             effects=effects,
             noise=load_noise(),
             run_id=f"{terrain}_{i}",

@@ -8,10 +8,10 @@ from terrain.discrepancy.signals import signals_of
 from terrain.effects import CHANNELS, effect_named, vector_of
 from terrain.estimation.estimate import enriched, estimate_run
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground, make_planar
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.motion import make_planar
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.run import simulate_planar
-from terrain.simulation.run import simulate_run
+from terrain.simulation.run import simulate, simulate_run
 
 TEXT = """name: mule
 drive: skid_steer
@@ -34,7 +34,7 @@ def test_a_simulated_run_has_no_currents_and_turns_as_its_geometry_says(robot):
     twist = np.zeros((501, 3))
     twist[50:, 0], twist[50:, 2] = 0.6, 0.4
     ground = Ground(slip_ratio=1e-9, rolling_ratio=0.0, scrub_ratio=0.0)
-    streams = simulate_planar(robot, twist, 0, ground=ground).streams
+    streams = simulate(robot, twist, ground, 0).streams
     assert streams["wheels"].channels == ("speed_left_mps", "speed_right_mps")
     left, right = streams["wheels"].values[-1]
     assert right - left == pytest.approx(0.4 * 1.08, abs=1e-6)

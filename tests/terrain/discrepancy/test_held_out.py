@@ -28,8 +28,9 @@ from terrain.effects import CHANNELS, GYRO
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog
 from terrain.robots import load_robot
+from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.run import simulate
 
 HUSKY = load_robot("husky")
 LONGER = {"wheel_radius_ratio": 0.03}
@@ -42,7 +43,9 @@ TWIST = np.column_stack(
 
 def signals(n, effects):
     options = {"effects": effects, "scatter": load_scatter(), "noise": load_noise()}
-    return [signals_of(simulate_planar(HUSKY, TWIST, i, run_id=f"r{i}", **options), HUSKY) for i in range(n)]
+    return [
+        signals_of(simulate(HUSKY, TWIST, Ground(), i, run_id=f"r{i}", **options), HUSKY) for i in range(n)
+    ]
 
 
 @pytest.fixture(scope="module")

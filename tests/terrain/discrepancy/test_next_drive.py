@@ -13,18 +13,20 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.verdict import Limit, NextDrive
 from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise
-from terrain.simulation.planar.run import Hills, simulate_planar
+from terrain.simulation.run import simulate
 from terrain.simulation.scenario import make_scenario
 
 HUSKY, AGRIMARO = (simulation_of(load_robot(name)) for name in ("husky", "agrimaro"))
 
 
 def drives(simulation, name, grade_deg=0.0, seeds=range(3)):
-    robot, hills = simulation.robot, Hills((np.tan(np.radians(grade_deg)), 0.0))
+    robot, hills = simulation.robot, Conditions(grade_ratio=(np.tan(np.radians(grade_deg)), 0.0))
     twists = [make_scenario(name, robot, "grass", speed_mps=0.6, seed=seed).twist for seed in seeds]
     return [
-        simulate_planar(robot, twist, seed, hills=hills, noise=load_noise(), run_id=f"{seed}")
+        simulate(robot, twist, Ground(), seed, noise=load_noise(), run_id=f"{seed}", conditions=hills)
         for seed, twist in zip(seeds, twists, strict=True)
     ]
 

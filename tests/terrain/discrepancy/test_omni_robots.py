@@ -16,7 +16,7 @@ from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.run import simulate
 
 ROBOT = load_robot("robotino")
 CARPET = Ground(slip_ratio=0.8, rolling_ratio=0.03, roller_ratio=0.3)
@@ -35,7 +35,7 @@ def driven(hidden, ground=CARPET, n=16, turns=True, seed=0):
             twist[k : k + 110] = speed * np.cos(angle), speed * np.sin(angle), turn
         ramp = np.cumsum(np.clip(np.diff(twist, axis=0, prepend=0.0), -9.0, 9.0), axis=0)
         about = {"run_id": f"carpet_{i:02d}", "terrain": "carpet", "noise": load_noise()}
-        run = simulate_planar(ROBOT, ramp, 1000 * seed + i, ground=ground, effects=hidden, **about)
+        run = simulate(ROBOT, ramp, ground, 1000 * seed + i, effects=hidden, **about)
         runs.append(with_wheel_speeds(run, ROBOT))
     return runs
 

@@ -23,9 +23,11 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SPEED_X, STEPS, vector_of
 from terrain.errors import DataError
 from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.run import Hills, simulate_planar
+from terrain.simulation.run import simulate
 
 ROBOTS = {"husky": load_robot("husky"), "agrimaro": load_robot("agrimaro")}
 HIDDEN = {
@@ -53,8 +55,14 @@ def drive(robot, effects):
     twist = np.column_stack([speed, np.zeros_like(t), 0.3 * np.sin(1.1 * t)]) * start[:, None]
     if robot is ROBOTS["agrimaro"]:
         twist[:, 0] += 0.7 * start  # where it stops, its steering turns in no time
-    return simulate_planar(
-        robot, twist, 1, effects=effects, hills=Hills((0.05, 0.02), 0.02), heading=robot is ROBOTS["husky"]
+    return simulate(
+        robot,
+        twist,
+        Ground(),
+        1,
+        effects=effects,
+        heading=robot is ROBOTS["husky"],
+        conditions=Conditions(grade_ratio=(0.05, 0.02), undulation_ratio=0.02),
     )
 
 
@@ -192,7 +200,7 @@ def test_noise_of_the_wheels_is_not_attributed_to_a_mass_or_a_motor():
     time_s = np.arange(2001) / 50
     twist = np.zeros((time_s.size, 3))
     twist[:, 0] = np.clip(0.5 * time_s, 0.0, 0.7)
-    runs = [simulate_planar(robot, twist, seed, noise=load_noise(), run_id=str(seed)) for seed in range(6)]
+    runs = [simulate(robot, twist, Ground(), seed, noise=load_noise(), run_id=str(seed)) for seed in range(6)]
     signals, simulation = [signals_of(run, robot) for run in runs], Simulation(robot)
     low_pass = low_pass_of(signals)
     off = {}

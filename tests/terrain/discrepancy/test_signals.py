@@ -11,7 +11,9 @@ from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SP
 from terrain.errors import DataError
 from terrain.records import Label, Stream
 from terrain.robots import load_robot
-from terrain.simulation.planar.run import Hills, simulate_planar
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.run import simulate
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 
@@ -21,7 +23,15 @@ def drive(robot, **options):
     twist = np.column_stack([0.4 * np.sin(0.8 * t), np.zeros_like(t), 0.3 * np.sin(1.1 * t)])
     if robot is AGRIMARO:
         twist[:, 1] = 0.2 * np.sin(0.5 * t)
-    return simulate_planar(robot, twist, 1, hills=Hills((0.05, 0.0), 0.02), terrain="grass", **options)
+    return simulate(
+        robot,
+        twist,
+        Ground(),
+        1,
+        terrain="grass",
+        conditions=Conditions(grade_ratio=(0.05, 0.0), undulation_ratio=0.02),
+        **options,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +115,7 @@ def test_current_magnitudes_get_the_sign_of_their_wheel_and_signed_ones_stay():
     # on the spot: the sides turn against each other, and both motors drive
     t = np.arange(1001) / 50
     twist = np.column_stack([np.zeros_like(t), np.zeros_like(t), 0.8 * np.minimum(t, 1.0)])
-    run = simulate_planar(HUSKY, twist, 1, terrain="grass")
+    run = simulate(HUSKY, twist, Ground(), 1, terrain="grass")
     wheels = run.streams["wheels"]
     values = np.array(wheels.values)
     at = [wheels.channels.index(f"current_{side}_a") for side in ("left", "right")]

@@ -15,7 +15,8 @@ from terrain.errors import DataError
 from terrain.extension import region_of
 from terrain.records import RunLog
 from terrain.robots import load_robot
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.run import simulate
 
 CAR, MARMOTTE, PATAKO = (load_robot(name) for name in ("adap2e", "marmotte", "patako"))
 
@@ -38,7 +39,7 @@ def test_drives_of_a_car_keep_to_what_it_can_and_part_stiffness_from_a_slide_on_
 
 
 def test_a_log_of_a_car_has_one_wheel_a_region_and_no_columns_to_exchange():
-    run = simulate_planar(CAR, np.tile((1.0, 0.0, 0.2), (501, 1)), 0)
+    run = simulate(CAR, np.tile((1.0, 0.0, 0.2), (501, 1)), Ground(), 0)
     region = region_of([run], CAR)
     assert region.wheel_speed_mps[1] == pytest.approx(1.0, abs=1e-3)
     assert region.yaw_rate_radps[1] == pytest.approx(0.2, abs=1e-3)

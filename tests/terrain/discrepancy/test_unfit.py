@@ -17,9 +17,10 @@ from terrain.effects import CHANNELS, GYRO, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import Hills, simulate_planar
+from terrain.simulation.run import simulate
 from terrain.simulation.scenario import make_scenario
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
@@ -28,10 +29,16 @@ ODD = 2
 """Which of the runs has the fault."""
 
 
-def drive(robot=HUSKY, seed=0, name="survey", **options):
+def drive(robot=HUSKY, seed=0, name="survey", ground=None, **options):
     twist = make_scenario(name, robot, "grass", 40.0, 0.6, seed=seed).twist
-    about = {"hills": Hills((0.04, 0.02), 0.03), "run_id": f"run_{seed}", "terrain": "grass"}
-    return simulate_planar(robot, twist, seed, scatter=load_scatter(), noise=load_noise(), **about, **options)
+    about = {
+        "conditions": Conditions(grade_ratio=(0.04, 0.02), undulation_ratio=0.03),
+        "run_id": f"run_{seed}",
+        "terrain": "grass",
+    }
+    return simulate(
+        robot, twist, ground or Ground(), seed, scatter=load_scatter(), noise=load_noise(), **about, **options
+    )
 
 
 def edited(run, change, **channels):
@@ -132,7 +139,7 @@ def of_sides(left_mps, right_mps):
     """Return a run of which the speeds of left and right are given over time, without its start from rest."""
     rate_radps = (right_mps - left_mps) / HUSKY.track_m
     twist = np.column_stack([(left_mps + right_mps) / 2, np.zeros_like(left_mps), rate_radps])
-    run = simulate_planar(HUSKY, twist, ODD, scatter=load_scatter(), run_id=f"run_{ODD}", terrain="grass")
+    run = simulate(HUSKY, twist, Ground(), ODD, scatter=load_scatter(), run_id=f"run_{ODD}", terrain="grass")
     wheels = run.streams["wheels"]
     driven = wheels.time_s > 2.0
     later = Stream(wheels.time_s[driven], wheels.values[driven], wheels.channels)
@@ -202,7 +209,7 @@ def runs_of(n, scatter, other=None):
         twist[:75] *= np.linspace(0.0, 1.0, 75)[:, None]
         track = (1.0 + TRACK) * np.exp(scatter * rng.standard_normal()) - 1.0
         about = {"effects": {"effective_track_ratio": (other or {}).get(i, track)}, "run_id": f"run_{i:02d}"}
-        runs.append(simulate_planar(HUSKY, twist, i, noise=load_noise(), **about))
+        runs.append(simulate(HUSKY, twist, Ground(), i, noise=load_noise(), **about))
     return runs
 
 

@@ -37,7 +37,8 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.robots import TrackedRobot, load_robot
-from terrain.simulation.planar.model import Ground, make_planar
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.motion import make_planar
 from terrain.simulation.planar.noise import load_scatter
 from terrain.simulation.planar.replay import replay
 
@@ -194,7 +195,7 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit, Value
 from terrain.extension import Correction, corrected
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.simulate import _built
+from terrain.simulation.dynamic.run import _built
 
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"
 for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_ONLY, effects.ONE_SIDED,

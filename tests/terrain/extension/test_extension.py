@@ -25,9 +25,8 @@ from terrain.extension import (
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.planar.model import planar_ground
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.run import simulate
 from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 
@@ -179,7 +178,7 @@ def test_a_pose_of_a_camera_whose_scale_and_angle_are_off_comes_back():
     effects = {"camera_scale_ratio": -0.08, "camera_yaw_rad": 0.05}
     drive = make_scenario("crab", OMNI, "tiles", 20.0)
     ground = planar_ground(OMNI, load_soil("tiles"))
-    clean, run = (simulate_planar(OMNI, drive.twist, 0, ground=ground, effects=e) for e in ({}, effects))
+    clean, run = (simulate(OMNI, drive.twist, ground, 0, effects=e) for e in ({}, effects))
     back = corrected_log(run, replace(OMNI, effects=effects)).streams["pose"]
     assert np.abs(run.streams["pose"].values - clean.streams["pose"].values).max() > 0.04
     np.testing.assert_allclose(back.values, clean.streams["pose"].values, atol=1e-9)

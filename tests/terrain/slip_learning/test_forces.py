@@ -8,8 +8,7 @@ from terrain.estimation.feed import on_clock
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
-from terrain.simulation.dynamic.simulate import simulate
-from terrain.simulation.run import Drive, SlipSweep, scenario_of, simulate_run
+from terrain.simulation.run import Drive, SlipSweep, scenario_of, simulate, simulate_run
 from terrain.slip_learning.forces import (
     body_balance,
     contact_slip,

@@ -7,7 +7,8 @@ from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.signals import DelayStatus
-from terrain.simulation.planar.run import simulate_planar
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.run import simulate
 from terrain.slip_learning.ground_changes import slip_step
 from terrain.slip_learning.measured import (
     estimate_delay,
@@ -91,7 +92,7 @@ def test_the_stated_std_of_a_slip_covers_its_error(make_omni_run, robotino):
 def test_skid_steer_slip_is_measured_against_a_speed_over_ground():
     twist = np.zeros((800, 3))
     twist[50:, 0] = 0.8
-    run = simulate_planar(HUSKY, twist, 0, effects={"force_slip_ratio": 2.0, "wheel_radius_ratio": -0.1})
+    run = simulate(HUSKY, twist, Ground(), 0, effects={"force_slip_ratio": 2.0, "wheel_radius_ratio": -0.1})
     found = measured_slip(run, HUSKY)
     truth = run.streams["truth"]
     true = 1.0 - np.median(truth.channel("speed_x_mps")[1000:]) / 0.8

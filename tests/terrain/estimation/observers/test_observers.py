@@ -23,7 +23,8 @@ from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.tracked import PrescribedSlip, simulate_tracked
+from terrain.simulation.run import simulate
+from terrain.simulation.tracked import PrescribedSlip
 
 UGV, CAR, HUSKY = (load_robot(name) for name in ("orchard_ugv", "adap2e", "husky"))
 ROBOTS = {name: UGV if name in observers_of(UGV) else CAR for name in OBSERVERS}
@@ -36,7 +37,7 @@ def made(name):
 
 @pytest.fixture(scope="module")
 def straight():
-    return simulate_tracked(UGV, PrescribedSlip(0.85, 0.85), np.tile([0.6, 0.6], (1001, 1)), 0)
+    return simulate(UGV, np.tile([0.6, 0.6], (1001, 1)), PrescribedSlip(0.85, 0.85), 0)
 
 
 @ANY

@@ -11,7 +11,8 @@ from terrain.estimation.observers.observer import Observer, ObserverOutput, Obse
 from terrain.estimation.observers.rows import CHANNELS, ROWS, LiveObserver, RowFeed
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.tracked import QUIET, PrescribedSlip, simulate_tracked
+from terrain.simulation.run import simulate
+from terrain.simulation.tracked import QUIET, PrescribedSlip
 
 UGV = load_robot("orchard_ugv")
 NAMES = tuple(name for name in ROWS if "rear" not in name and "front" not in name)
@@ -31,7 +32,7 @@ def without(run, *names):
 
 @pytest.fixture(scope="module")
 def run():
-    return simulate_tracked(UGV, PrescribedSlip(0.9, 0.8), np.tile([0.4, 0.6], (301, 1)), 0, sensors=QUIET)
+    return simulate(UGV, np.tile([0.4, 0.6], (301, 1)), PrescribedSlip(0.9, 0.8), 0, sensors=QUIET)
 
 
 def test_rows_hold_what_sensors_without_noise_measured(run):

@@ -16,11 +16,9 @@ from terrain.simulation.car import (
     CAR_ROWS,
     CarCommand,
     CarDrive,
-    SensorNoise,
-    SpeedProfile,
     level_ground,
-    simulate_car,
 )
+from terrain.simulation.run import simulate
 
 ROBOT = load_robot("adap2e")
 ANY = pytest.mark.parametrize("name", SETTINGS)
@@ -40,8 +38,8 @@ def drive(speed_mps=5.0, seed=0, roll_rad=0.0, stops=(), seconds=30.0):
         rows.append(sample.measured)
         return CarCommand(float(np.interp(sample.time_s, time_s, angles)), sample.speed_desired_mps)
 
-    car = CarDrive(level_ground(0.7, roll_rad), SpeedProfile(speed_mps, stops), seconds)
-    truth = simulate_car(ROBOT, car, controller, np.random.default_rng(seed), SensorNoise()).streams["truth"]
+    car, ground = CarDrive(speed_mps, stops, seconds), level_ground(0.7, roll_rad)
+    truth = simulate(ROBOT, car, ground, seed, controller=controller).streams["truth"]
     return np.arange(len(rows)) * TICK_S, np.array(rows), lambda name: truth.channel(name)[::2]
 
 

@@ -33,7 +33,8 @@ from terrain.estimation.observers.slip_odometry import (
     plain_odometry,
 )
 from terrain.robots import load_robot
-from terrain.simulation.tracked import QUIET, PrescribedSlip, Slope, simulate_tracked
+from terrain.simulation.run import simulate
+from terrain.simulation.tracked import QUIET, PrescribedSlip, Slope
 
 ROBOT = load_robot("patako")
 D = ROBOT.half_track_m
@@ -177,7 +178,7 @@ def test_the_pose_is_the_integral_of_5_to_7():
 def test_given_slip_is_followed_to_the_millimetre(slope):
     given, belts = PrescribedSlip(1.0, 1.0, 0.1, 0.3, 0.4, 0.35, 0.8), np.tile([0.08, 0.1], (700, 1))
     belts[300:] = (0.1, 0.1)
-    run = simulate_tracked(ROBOT, given, belts, 0, slope=slope, sensors=QUIET)
+    run = simulate(ROBOT, belts, given, 0, slope=slope, sensors=QUIET)
     truth = run.streams["truth"]
     own = [truth.channel(name)[::2][:-1] for name in ROWS[2:]]
     model = SlipModel(0.8, 0.1, 0.3, 0.0, 0.4, angle=np.array([0, 0, 0, 0, -0.4, 0, 0, 0]))
@@ -325,7 +326,7 @@ def course(laps):
 
 @pytest.mark.parametrize(("seed", "every"), [(0, 1), (2, 20)])
 def test_hidden_slip_comes_back_within_its_stated_error(seed, every):
-    run = simulate_tracked(ROBOT, HIDDEN, course(40), seed, slope=Slope(0.2, 0.7))
+    run = simulate(ROBOT, course(40), HIDDEN, seed, slope=Slope(0.2, 0.7))
     odometry, _, known = learning(run, every)
     for name in (name for name in TRUE if every == 1 or name != "turning_exponent"):  # n needs more
         mean, std = known[name]
@@ -343,11 +344,11 @@ def test_what_is_not_excited_stays_unknown():
     def blind(rows):
         rows[:, 5:] = np.nan
 
-    _, track, known = learning(simulate_tracked(ROBOT, HIDDEN, course(6), 3), change=blind)
+    _, track, known = learning(simulate(ROBOT, course(6), HIDDEN, 3), change=blind)
     assert (track.status == ObserverStatus.STARTING).all()
     assert [name for name, (mean, _) in known.items() if np.isfinite(mean)] == ["track_ratio"]
     assert known["track_ratio"][0] == pytest.approx(1 / (0.65 * 0.92), abs=0.1)
-    _, _, known = learning(simulate_tracked(ROBOT, HIDDEN, np.tile([0.2, 0.2], (1500, 1)), 4))
+    _, _, known = learning(simulate(ROBOT, np.tile([0.2, 0.2], (1500, 1)), HIDDEN, 4))
     assert abs(known["compaction_slip_ratio"][0] - 0.08) < 3 * known["compaction_slip_ratio"][1]
     for name in ("turning_exponent", "grade_slip_ratio", "side_slip_ratio", "angle_roll_rad", "track_ratio"):
         assert np.isnan(known[name][0])
@@ -358,7 +359,7 @@ def test_jumps_are_rejected_and_a_lasting_one_resets_the_pose_only():
         rows[400, 5:7] += 5.0  # one fix of 10 Hz
         rows[800:, 5] += 3.0
 
-    run = simulate_tracked(ROBOT, HIDDEN, course(4), 5)
+    run = simulate(ROBOT, course(4), HIDDEN, 5)
     _, track, _ = learning(run, change=jumps)
     assert track.status[400] == ObserverStatus.REJECTED
     assert (track.status[800:890:5] == ObserverStatus.REJECTED).sum() == 10

@@ -1,4 +1,3 @@
-import dataclasses
 import math
 from typing import NamedTuple
 
@@ -7,8 +6,6 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.errors import ConfigError
-from terrain.kinematics.commands import wheel_commands
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions
 from terrain.simulation.contact import DEFLECTION_DAMPING_S
@@ -24,7 +21,6 @@ from terrain.simulation.dynamic.plant import (
     tyre_ratio,
     uniform_profile,
 )
-from terrain.simulation.dynamic.simulate import simulate
 from terrain.simulation.dynamic.step import (
     LEG_FRICTION_NM,
     LEG_RATE_RADPS,
@@ -34,7 +30,6 @@ from terrain.simulation.dynamic.step import (
     advance,
     settle,
 )
-from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import BODY_ROW, STEP_S, Motion
 from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import equilibrium_slip, friction_limit, wheel_ground
@@ -42,18 +37,9 @@ from terrain.terramechanics.traction import equilibrium_slip, friction_limit, wh
 ROBOT = load_robot("agrimaro")
 GEOMETRY = ROBOT.wheel_radius_m, ROBOT.body.tyre_width_m, ROBOT.body.contact_length_m
 SUBSTEPS = 20
-SOILS = ("tiles", "asphalt", "grass", "tilled_loam", "snow")
-STICKY = Soil(
-    "sticky",
-    "magic",
-    0.0,
-    0.0,
-    0.0,
-    stiffness_ratio=30.0,
-    shape_ratio=1.6,
-    peak_friction_ratio=1.5,
-    curvature_ratio=0.5,
-)
+SOILS = ("asphalt", "grass", "tilled_loam")
+CURVE = {"stiffness_ratio": 30.0, "shape_ratio": 1.6, "peak_friction_ratio": 1.5, "curvature_ratio": 0.5}
+STICKY = Soil("sticky", "magic", 0.0, 0.0, 0.0, **CURVE)
 
 
 class Driven(NamedTuple):
@@ -80,7 +66,7 @@ def plant_of(*soils, roughness_m3=0.0, starts_m=(0.0,), backlash_rad=0.0, com_he
     if com_height_m is not None:
         ratio = plant.load_per_force_ratio * com_height_m / plant.com_height_m
         plant = plant.changed(com_height_m=com_height_m, load_per_force_ratio=ratio)
-    return plant.changed(backlash_rad=backlash_rad)
+    return plant.changed(dead_band_rad=backlash_rad)
 
 
 def drive(plant, wheel_radps, steer_rad=None, seed=None, settled=False, substeps=SUBSTEPS):
@@ -96,6 +82,10 @@ def drive(plant, wheel_radps, steer_rad=None, seed=None, settled=False, substeps
     return Motion(rows)
 
 
+def wheels(motion):
+    return motion.record["wheels"]
+
+
 def ramp(duration_s, radps=5.0, rise_s=1.0):
     """Return equal wheel commands (n, 3) that rise to a rate in that time."""
     return np.repeat(
@@ -109,7 +99,7 @@ def smoothly(plant, wheel_radps):
 
 
 def steady_slip(plant, radps=5.0, duration_s=10.0):
-    return drive(plant, ramp(duration_s, radps), settled=True).wheel("slip_ratio")[-1]
+    return wheels(drive(plant, ramp(duration_s, radps), settled=True))["slip_ratio"][-1]
 
 
 def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer_0=0.0):
@@ -133,13 +123,13 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         normal_g = GRAVITY_MPS2 / math.sqrt(1 + grade @ grade)
 
         error = steer_rad[k // substeps] - motor
-        desired = np.sign(error) * np.sqrt(2 * plant.steer_accel_max_radps2 * abs(error))
-        desired = np.clip(desired, -plant.steer_rate_max_radps, plant.steer_rate_max_radps)
+        desired = np.sign(error) * np.sqrt(2 * plant.accel_max_radps2 * abs(error))
+        desired = np.clip(desired, -plant.rate_max_radps, plant.rate_max_radps)
         desired = np.where(abs(error) < 1e-4, error / dt_s, desired)
-        most = plant.steer_accel_max_radps2 * dt_s
+        most = plant.accel_max_radps2 * dt_s
         motor_rate = motor_rate + np.clip(desired - motor_rate, -most, most)
         motor = motor + dt_s * motor_rate
-        steer = np.clip(steer, motor - plant.backlash_rad, motor + plant.backlash_rad)
+        steer = np.clip(steer, motor - plant.dead_band_rad, motor + plant.dead_band_rad)
 
         heading = steer + np.array([0.0, 0.0, leg])
         ahead = np.array([np.cos(heading), np.sin(heading)])
@@ -163,7 +153,7 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         )
         contact_rate = (road - contact) * np.minimum(2 * rolled / plant.contact_length_m, 1 / dt_s)
         contact = contact + dt_s * contact_rate
-        ride_n = plant.ride_stiffness_npm * (contact - ride) + plant.ride_damping_nspm * (
+        ride_n = plant.tyre_stiffness_npm * (contact - ride) + plant.tyre_damping_nspm * (
             contact_rate - ride_rate
         )
         ride_rate = ride_rate + dt_s * ride_n / (mass * plant.load_fraction)
@@ -174,9 +164,9 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         normal = np.maximum(np.linalg.solve(balance, [mass * normal_g, *arms]) + ride_n, 0.0)
 
         def creep(wheel_speed, along=along, across=across, fastest=fastest, deflection=deflection):
-            return np.array([wheel_speed - along, -across]) - fastest / plant.relaxation_m * deflection
+            return np.array([wheel_speed - along, -across]) - fastest / plant.relaxation_length_m * deflection
 
-        slip = (deflection + DEFLECTION_DAMPING_S * creep(wheel_speed)) / plant.relaxation_m
+        slip = (deflection + DEFLECTION_DAMPING_S * creep(wheel_speed)) / plant.relaxation_length_m
         got = np.array(
             [
                 wheel_ground(grounds[patch[i]], normal[i], np.clip(slip[0, i], -1, 1), slip[1, i])
@@ -190,38 +180,24 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         moment = (x * force[1] - y * force[0]).sum()
 
         lag = wheel_radps[k // substeps].clip(-plant.speed_max_radps, plant.speed_max_radps) - estimate
-        asked = plant.speed_gain * lag + integral
+        asked = plant.speed_gain_nmspr * lag + integral
         free = (abs(asked) <= plant.torque_max_nm) | (asked * lag < 0)
-        integral = integral + np.where(free, dt_s * plant.speed_integral * lag, 0.0)
+        integral = integral + np.where(free, dt_s * plant.speed_integral_nmpr * lag, 0.0)
         asked = np.clip(asked, -plant.torque_max_nm, plant.torque_max_nm)
         torque = torque + (asked - torque) * dt_s / plant.torque_time_constant_s
         rest = torque - plant.friction_nm * np.tanh(rate / 0.1) - thrust * plant.radius_m
-        rows.append(
-            [
-                *v,
-                yaw,
-                turn,
-                path,
-                *rate,
-                *heading,
-                *normal,
-                *(wheel_speed - along),
-                *torque,
-                *ride,
-                *reported,
-                *patch,
-            ]
-        )
+        body = [*v, yaw, turn, path]
+        rows.append([*body, *rate, *heading, *normal, *torque, *ride, *reported, *patch])
         rate = rate + dt_s * rest / plant.wheel_inertia_kgm2
-        estimate = estimate + (rate - estimate) * dt_s / plant.estimate_time_constant_s
+        estimate = estimate + (rate - estimate) * dt_s / plant.speed_estimate_time_constant_s
         angle = angle + dt_s * rate
         seen = np.floor(angle * plant.hall_steps) - count
         count = count + seen
         reported = (
-            reported + (seen / plant.hall_steps / dt_s - reported) * dt_s / plant.report_time_constant_s
+            reported + (seen / plant.hall_steps / dt_s - reported) * dt_s / plant.encoder_time_constant_s
         )
         slide = creep(rate * plant.radius_m)
-        deflection = np.clip(deflection + dt_s * slide, -plant.relaxation_m, plant.relaxation_m)
+        deflection = np.clip(deflection + dt_s * slide, -plant.relaxation_length_m, plant.relaxation_length_m)
 
         leg_nm = -plant.wheels_m[2, 1] * force[0, 2]
         if abs(leg_nm) > LEG_FRICTION_NM:
@@ -233,7 +209,7 @@ def reference(plant, wheel_radps, steer_rad, substeps, noise, dt_s=STEP_S, steer
         yaw = yaw + dt_s * turn
         path = path + dt_s * math.hypot(v[0] + turn * plant.com_m[1], v[1] - turn * plant.com_m[0])
     names = ("speed_x", "speed_y", "yaw", "turn", "path")
-    wheels = ("rate", "steer", "normal", "sliding", "torque", "ride", "reported", "patch")
+    wheels = ("rate", "steer", "normal", "torque", "ride", "reported", "patch")
     table = np.array(rows)
     return {name: table[:, i] for i, name in enumerate(names)} | {
         name: table[:, 5 + 3 * i : 8 + 3 * i] for i, name in enumerate(wheels)
@@ -282,8 +258,10 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
         ("torque_nm", "torque", 1e-7),
         ("patch_ratio", "patch", 0),
     ):
-        np.testing.assert_allclose(motion.wheel(name), plain[twin], rtol=0, atol=atol, err_msg=name)
-    np.testing.assert_allclose(motion.wheel("reported_radps")[:-1], plain["reported"][1:], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(wheels(motion)[name], plain[twin], rtol=0, atol=atol, err_msg=name)
+    np.testing.assert_allclose(
+        wheels(motion)["reported_radps"][:-1], plain["reported"][1:], rtol=0, atol=1e-7
+    )
     # acceleration at the origin is what its speed does
     turn, along, across = (motion.record[name] for name in ("yaw_rate_radps", "speed_x_mps", "speed_y_mps"))
     recorded = [motion.record[name][:-1] for name in ("accel_x_mps2", "accel_y_mps2")]
@@ -296,34 +274,16 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     np.testing.assert_allclose(motion.record["ride_pitch_rad"], pitch, rtol=0, atol=1e-9)
 
 
-def test_a_drive_in_two_parts_is_one_drive():
-    plant = plant_of(
-        load_soil("grass"),
-        roughness_m3=1e-3,
-        grade_ratio=(0.05, 0.02),
-        backlash_rad=0.02,
-        leg_backlash_rad=0.02,
-    )
-    rng = np.random.default_rng(0)
-    wheel, steer, noise = 5 * rng.random((20, 3)), 0.3 * rng.random((20, 3)), rng.standard_normal((400, 3))
-    whole, parts = np.zeros(400, BODY_ROW), np.zeros(400, BODY_ROW)
-    one, two = start_state(np.zeros(3)), start_state(np.zeros(3))
-    advance(*plant, one, wheel, steer, SUBSTEPS, noise, whole)
-    for part in range(20):
-        rows = slice(part * SUBSTEPS, (part + 1) * SUBSTEPS)
-        advance(
-            *plant, two, wheel[part : part + 1], steer[part : part + 1], SUBSTEPS, noise[rows], parts[rows]
-        )
-    assert one.tobytes() == two.tobytes()
-    assert whole.tobytes() == parts.tobytes()
-
-
 def test_a_straight_start_is_that_of_the_equations_integrated_by_scipy():
     """With the centre of mass on the ground no load is transferred: one wheel stands for all."""
     soil = load_soil("grass")
     plant = plant_of(soil, com_height_m=0.0)
     load_n = plant.mass_kg * GRAVITY_MPS2 / 3
-    radius, sigma, ground = ROBOT.wheel_radius_m, plant.relaxation_m, plant.profile.patches["ground"][0]
+    radius, sigma, ground = (
+        ROBOT.wheel_radius_m,
+        plant.relaxation_length_m,
+        plant.profile.patches["ground"][0],
+    )
 
     def change(t, state):
         v, rate, deflection, torque, integral, estimate = state
@@ -337,9 +297,9 @@ def test_a_straight_start_is_that_of_the_equations_integrated_by_scipy():
             3 * (thrust - resistance * math.tanh(v / ROLLING_SPEED_MPS)) / plant.mass_kg,
             (torque - plant.friction_nm * math.tanh(rate / 0.1) - thrust * radius) / plant.wheel_inertia_kgm2,
             creep,
-            (plant.speed_gain * lag + integral - torque) / plant.torque_time_constant_s,
-            plant.speed_integral * lag,
-            (rate - estimate) / plant.estimate_time_constant_s,
+            (plant.speed_gain_nmspr * lag + integral - torque) / plant.torque_time_constant_s,
+            plant.speed_integral_nmpr * lag,
+            (rate - estimate) / plant.speed_estimate_time_constant_s,
         ]
 
     exact = solve_ivp(
@@ -350,29 +310,14 @@ def test_a_straight_start_is_that_of_the_equations_integrated_by_scipy():
     motion = drive(plant, wheel, substeps=1)
     v, rate = exact.sol(np.arange(len(motion.record)) * STEP_S)[:2]
     assert np.abs(motion.record["speed_x_mps"] - v).max() < 0.004
-    assert np.abs(motion.wheel("wheel_radps") - rate[:, None]).max() < 0.03
+    assert np.abs(wheels(motion)["wheel_radps"] - rate[:, None]).max() < 0.03
     assert np.abs(motion.record["speed_y_mps"]).max() < 1e-9
     late = np.arange(len(motion.record)) * STEP_S > 2.5
     assert np.abs(motion.record["speed_x_mps"] - v)[late].max() < 3e-5
 
 
-def test_half_the_step_changes_little():
-    plant = plant_of(load_soil("firm_soil_gravel"), grade_ratio=(0.03, 0.03))
-    wheel = ramp(2.0)
-    steer = np.repeat(0.3 * np.sin(np.arange(100) / 15)[:, None], 3, axis=1) * [-1.0, 1.0, 0.0]
-    runs = [
-        reference(plant, wheel, steer, n, np.zeros((100 * n, 3)), 0.02 / n) for n in (SUBSTEPS, 2 * SUBSTEPS)
-    ]
-    for name, atol in (("speed_x", 3e-3), ("speed_y", 3e-3), ("turn", 5e-3), ("path", 2e-3), ("rate", 0.04)):
-        coarse, fine = runs[0][name], runs[1][name][::2]
-        assert np.abs(coarse - fine).max() < atol, name
-        assert np.abs(fine).max() > 10 * atol or name == "speed_y", name
-
-
-@pytest.mark.parametrize(
-    "name", ["asphalt", "tiles", "snow", "grass", "firm_soil_gravel", "clay", "dry_sand"]
-)
-@pytest.mark.parametrize("grade", [0.0, 0.03, -0.03])
+@pytest.mark.parametrize("name", ["asphalt", "grass", "clay", "dry_sand"])
+@pytest.mark.parametrize("grade", [0.0, 0.03])
 def test_steady_slip_is_that_at_which_a_wheel_pulls_its_share_of_the_hill(name, grade):
     soil = load_soil(name)
     plant = plant_of(soil, grade_ratio=(grade, 0.0), com_height_m=0.0)
@@ -381,57 +326,13 @@ def test_steady_slip_is_that_at_which_a_wheel_pulls_its_share_of_the_hill(name, 
     np.testing.assert_allclose(steady_slip(plant, duration_s=15.0), expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", ["grass", "clay", "dry_sand", "tilled_loam"])
-def test_slip_rises_with_the_hill_and_on_soil_that_yields_with_the_load(name):
-    soil = load_soil(name)
-    down, level, up = (steady_slip(plant_of(soil, grade_ratio=(g, 0.0))).mean() for g in (-0.04, 0.0, 0.04))
-    assert down < level - 0.01 < level + 0.01 < up
-    loaded = steady_slip(plant_of(soil, payload_kg=30.0)).mean()
-    if name == "grass":
-        assert loaded > level  # its cohesion does not grow with the load
-    else:
-        assert loaded > level + 0.002
-
-
-def test_loads_are_those_of_the_balance_of_moments():
-    grade = np.array([0.06, -0.04])
-    plant = plant_of(load_soil("tiles"), grade_ratio=tuple(grade), payload_kg=20.0, payload_m=(0.05, 0.1))
-    wheel, steer = ramp(4.0, 6.0), np.tile([-0.2, 0.2, 0.0], (200, 1))
-    motion = drive(plant, wheel, steer, settled=True)
-    normal = motion.wheel("normal_n")
-    yaw, turn = motion.record["yaw_rad"], motion.record["yaw_rate_radps"]
-    assert np.ptp(yaw) > 0.5
-    mass, g = 110.0, GRAVITY_MPS2 / math.sqrt(1 + grade @ grade)
-    com = np.array([0.0, -0.252]) + 20 / 110 * np.array([0.05, 0.1])
-    np.testing.assert_allclose(normal.sum(axis=1), mass * g, rtol=1e-12)
-    # acceleration of the centre of mass from the speeds alone
-    v = np.column_stack(
-        [motion.record["speed_x_mps"] - turn * com[1], motion.record["speed_y_mps"] + turn * com[0]]
-    )
-    accel = np.diff(v, axis=0) / STEP_S + turn[:-1, None] * np.column_stack([-v[:-1, 1], v[:-1, 0]])
-    c, s = np.cos(yaw[1:]), np.sin(yaw[1:])  # a load is that of the force of the step before
-    pushed = accel + g * np.column_stack([c * grade[0] + s * grade[1], -s * grade[0] + c * grade[1]])
-    arm_x = (normal @ ROBOT.wheel_positions_m[:, 0]) / mass
-    arm_y = (normal @ ROBOT.wheel_positions_m[:, 1]) / mass
-    np.testing.assert_allclose(arm_x[1:-1], g * com[0] - 0.5 * pushed[:-1, 0], atol=1e-9)
-    np.testing.assert_allclose(arm_y[1:-1], g * com[1] - 0.5 * pushed[:-1, 1], atol=1e-9)
-
-
-def test_a_steady_start_lightens_the_front_wheel_by_m_a_h_over_the_wheelbase():
-    motion = drive(plant_of(STICKY), ramp(3.0, 9.0, rise_s=4.5))  # 2 rad/s2, 0.4 m/s2
-    rear, front, third = motion.wheel("normal_n")[-1000:].mean(axis=0)  # commands come in steps of 20 ms
-    assert motion.record["accel_x_mps2"][-1000:].mean() == pytest.approx(0.4, rel=5e-3)
-    assert rear - front == pytest.approx(2 * 90.0 * 0.4 * 0.5 / 1.015, rel=5e-3)
-    assert third == pytest.approx(90.0 * GRAVITY_MPS2 / 3, rel=1e-3)
-
-
 def test_at_rest_on_the_level_nothing_at_all_happens():
     motion = drive(
         plant_of(load_soil("grass"), roughness_m3=1e-3, backlash_rad=0.02), np.zeros((100, 3)), seed=0
     )
     assert len({row.tobytes() for row in motion.record}) == 1
-    assert np.isnan(motion.wheel("slip_ratio")).all()
-    assert np.isnan(motion.wheel("slip_angle_rad")).all()
+    assert np.isnan(wheels(motion)["slip_ratio"]).all()
+    assert np.isnan(wheels(motion)["slip_angle_rad"]).all()
     plant = plant_of(load_soil("grass"))
     state = start_state(np.zeros(3))
     settle(*plant, state)
@@ -456,7 +357,7 @@ def test_a_robot_at_rest_on_a_slope_of_5_degrees_does_not_move(name, uphill_rad)
     assert np.abs(motion.record["accel_x_mps2"]).max() < 0.02
     assert np.abs(motion.record["accel_y_mps2"]).max() < 0.02
     np.testing.assert_allclose(
-        motion.wheel("normal_n").sum(axis=1), 90 * GRAVITY_MPS2 * math.cos(math.radians(5.0))
+        wheels(motion)["normal_n"].sum(axis=1), 90 * GRAVITY_MPS2 * math.cos(math.radians(5.0))
     )
 
 
@@ -475,66 +376,16 @@ def test_mirrored_commands_give_mirrored_motion():
         advance(*plant, state, *args, SUBSTEPS, np.ascontiguousarray(noise[:, order]), rows)
         motions.append(Motion(rows))
     there, mirrored = motions
-    for name, sign in (
-        ("position_x_m", -1),
-        ("position_y_m", 1),
-        ("yaw_rad", -1),
-        ("speed_x_mps", -1),
-        ("yaw_rate_radps", -1),
-        ("accel_y_mps2", 1),
-        ("ride_z_mps2", 1),
-        ("ride_roll_rad", 1),
-        ("ride_pitch_rad", -1),
-    ):
-        np.testing.assert_allclose(
-            mirrored.record[name], sign * there.record[name], rtol=0, atol=1e-7, err_msg=name
-        )
-    for name, sign in (
-        ("wheel_radps", -1),
-        ("steer_rad", -1),
-        ("normal_n", 1),
-        ("slip_ratio", -1),
-        ("torque_nm", -1),
-    ):
-        np.testing.assert_allclose(
-            mirrored.wheel(name), sign * there.wheel(name)[:, swap], rtol=0, atol=1e-4, err_msg=name
-        )
-
-
-@pytest.mark.parametrize(
-    "twist",
-    [(0.8, 0.0, 0.0), (-0.6, 0.0, 0.3), (0.0, 0.5, 0.0), (0.4, -0.3, -0.2), (0.0, 0.0, 0.6), (0.5, 0.2, 0.5)],
-)
-def test_without_slip_the_twist_is_the_commanded_one(twist):
-    plant = plant_of(STICKY, com_height_m=0.0)
-    desired = np.tile(twist, (300, 1)) * np.minimum(np.arange(300) / 75, 1.0)[:, None]
-    _, wheel, steer = wheel_commands(ROBOT.wheel_positions_m, 0.2, 10.0, 2.0, 0.02, desired, np.zeros(3))
-    motion = drive(plant, wheel, steer)
-    reached = [motion.record[name][-1] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")]
-    np.testing.assert_allclose(reached, twist, atol=5e-3)
-    np.testing.assert_allclose(motion.wheel("slip_ratio")[-1], 0.0, atol=6e-3)
-
-
-def test_motor_work_equals_kinetic_potential_and_dissipated_energy():
-    soil, grade = load_soil("grass"), 0.05
-    plant = plant_of(soil, grade_ratio=(grade, 0.0))
-    motion = drive(plant, np.vstack([ramp(4.0), ramp(2.0, -3.0), ramp(2.0)]), settled=True)
-    rate, thrust = motion.wheel("wheel_radps"), motion.wheel("traction_n")
-    along = (
-        motion.record["speed_x_mps"][:, None]
-        - motion.record["yaw_rate_radps"][:, None] * ROBOT.wheel_positions_m[:, 1]
+    body = "yaw_rad speed_x_mps yaw_rate_radps ride_pitch_rad"
+    body = dict.fromkeys(body.split(), -1) | dict.fromkeys(
+        ["accel_y_mps2", "ride_z_mps2", "ride_roll_rad"], 1
     )
-    resistance = soil.rolling_resistance_ratio * motion.wheel("normal_n") * np.tanh(along / ROLLING_SPEED_MPS)
-    given = (motion.wheel("torque_nm") * rate).sum() * STEP_S
-    friction = (plant.friction_nm * np.tanh(rate / 0.1) * rate).sum() * STEP_S
-    rolling = (resistance * along).sum() * STEP_S
-    slipping = (thrust * (0.2 * rate - along)).sum() * STEP_S
-    lifted = 90 * GRAVITY_MPS2 * grade / math.hypot(1, grade) * motion.record["position_x_m"][-1]
-    speed = motion.record["speed_x_mps"][-1]
-    stored = 0.5 * 90 * speed**2 + 0.5 * plant.wheel_inertia_kgm2 * (rate[-1] ** 2).sum()
-    assert min(friction, rolling, slipping, stored) > 1.0
-    assert given == pytest.approx(stored + lifted + friction + rolling + slipping, rel=5e-3)
-    assert given > lifted + friction + rolling
+    for name, sign in body.items():
+        twin = sign * there.record[name]
+        np.testing.assert_allclose(mirrored.record[name], twin, rtol=0, atol=1e-7, err_msg=name)
+    for name, sign in {"wheel_radps": -1, "steer_rad": -1, "normal_n": 1, "slip_ratio": -1}.items():
+        twin = sign * wheels(there)[name][:, swap]
+        np.testing.assert_allclose(wheels(mirrored)[name], twin, rtol=0, atol=1e-4, err_msg=name)
 
 
 @pytest.mark.parametrize("leg_backlash_rad", [0.0, 0.03])
@@ -546,17 +397,19 @@ def test_motor_work_in_curves_is_dissipated_by_lateral_slip_too(leg_backlash_rad
     motion = drive(plant, ramp(8.0, 7.0), steer, settled=True)
     turn, heading, rate = (
         motion.record["yaw_rate_radps"],
-        motion.wheel("steer_rad"),
-        motion.wheel("wheel_radps"),
+        wheels(motion)["steer_rad"],
+        wheels(motion)["wheel_radps"],
     )
     x, y = ROBOT.wheel_positions_m.T
     centre_x = motion.record["speed_x_mps"][:, None] - turn[:, None] * y
     centre_y = motion.record["speed_y_mps"][:, None] + turn[:, None] * x
     along = np.cos(heading) * centre_x + np.sin(heading) * centre_y
     across = -np.sin(heading) * centre_x + np.cos(heading) * centre_y
-    thrust, side = motion.wheel("traction_n"), motion.wheel("side_n")
-    resistance = soil.rolling_resistance_ratio * motion.wheel("normal_n") * np.tanh(along / ROLLING_SPEED_MPS)
-    given = (motion.wheel("torque_nm") * rate).sum() * STEP_S
+    thrust, side = wheels(motion)["traction_n"], wheels(motion)["side_n"]
+    resistance = (
+        soil.rolling_resistance_ratio * wheels(motion)["normal_n"] * np.tanh(along / ROLLING_SPEED_MPS)
+    )
+    given = (wheels(motion)["torque_nm"] * rate).sum() * STEP_S
     friction = (plant.friction_nm * np.tanh(rate / 0.1) * rate).sum() * STEP_S
     rolling = (resistance * along).sum() * STEP_S
     slipping = (thrust * (0.2 * rate - along)).sum() * STEP_S
@@ -576,7 +429,7 @@ def test_the_third_leg_swings_to_where_its_wheel_is_pushed_and_no_further():
     motion = smoothly(plant, desired)
     leg, heading, t = (
         motion.record["leg_rad"],
-        motion.wheel("steer_rad"),
+        wheels(motion)["steer_rad"],
         np.arange(len(motion.record)) * STEP_S,
     )
     assert np.abs(np.diff(leg)).max() <= LEG_RATE_RADPS * STEP_S * (1 + 1e-9)
@@ -590,14 +443,6 @@ def test_the_third_leg_swings_to_where_its_wheel_is_pushed_and_no_further():
     assert not heading[:, :2].any()
 
 
-def test_a_leg_that_is_hardly_pushed_stays_where_it_is():
-    slow = 0.5 * LEG_FRICTION_NM / 0.756 / 30.0  # half of what moves it, on a third of the mass
-    plant = plant_of(STICKY, leg_backlash_rad=0.03, com_height_m=0.0)
-    motion = smoothly(plant, slow / 0.2 * np.arange(4000) * STEP_S)
-    assert motion.record["speed_x_mps"][-1] == pytest.approx(4.0 * slow, rel=0.1)
-    assert not motion.record["leg_rad"].any()
-
-
 @pytest.mark.parametrize("name", ["snow", "grass"])
 def test_the_ground_gives_no_more_than_friction(name):
     soil, grade = load_soil(name), np.array([0.05, 0.1])
@@ -609,7 +454,7 @@ def test_the_ground_gives_no_more_than_friction(name):
     )
     motion = drive(plant, wheel, steer)
     normal, turn, yaw = (
-        motion.wheel("normal_n"),
+        wheels(motion)["normal_n"],
         motion.record["yaw_rate_radps"],
         motion.record["yaw_rad"][:-1],
     )
@@ -619,8 +464,8 @@ def test_the_ground_gives_no_more_than_friction(name):
         if soil.law == "magic"
         else friction_limit(normal, area, soil.cohesion_pa, tan)
     )
-    assert (np.abs(motion.wheel("traction_n")) <= limit * (1 + 1e-12)).all()
-    assert (np.abs(motion.wheel("torque_nm")) <= plant.torque_max_nm).all()
+    assert (np.abs(wheels(motion)["traction_n"]) <= limit * (1 + 1e-12)).all()
+    assert (np.abs(wheels(motion)["torque_nm"]) <= plant.torque_max_nm).all()
     v = np.column_stack([motion.record["speed_x_mps"] - turn * plant.com_m[1], motion.record["speed_y_mps"]])
     accel = np.diff(v, axis=0) / STEP_S + turn[:-1, None] * np.column_stack([-v[:-1, 1], v[:-1, 0]])
     c, s = np.cos(yaw), np.sin(yaw)
@@ -633,23 +478,15 @@ def test_the_ground_gives_no_more_than_friction(name):
     assert pushed.max() > 0.5 * most.max()  # it was driven near the limit
 
 
-def test_a_slope_beyond_friction_is_not_climbed():
-    snow = load_soil("snow")
-    assert drive(plant_of(snow, grade_ratio=(0.2, 0.0)), ramp(6.0)).record["position_x_m"][-1] > 2.0
-    beyond = drive(plant_of(snow, grade_ratio=(0.32, 0.0)), ramp(6.0))
-    assert beyond.record["speed_x_mps"][-1] < 0.0
-    assert (beyond.wheel("slip_ratio")[-1] > 0.9).all()
-
-
 def test_the_speed_loop_reaches_its_speed_and_does_not_wind_up():
     motion = drive(plant_of(STICKY), np.full((200, 3), 30.0))  # three times what it can
-    torque, rate = motion.wheel("torque_nm"), motion.wheel("wheel_radps")
+    torque, rate = wheels(motion)["torque_nm"], wheels(motion)["wheel_radps"]
     assert 59.0 < torque.max() <= 60.0
     assert rate.max() < 12.0
     np.testing.assert_allclose(rate[-1], 10.0, atol=0.02)
     # too weak for the hill it rolls back for two seconds; commanded backward, it follows at once
     weak = plant_of(STICKY, grade_ratio=(0.05, 0.0)).changed(torque_max_nm=2.0)
-    torque = drive(weak, np.vstack([np.full((100, 3), 5.0), np.full((20, 3), -9.0)])).wheel("torque_nm")
+    torque = wheels(drive(weak, np.vstack([np.full((100, 3), 5.0), np.full((20, 3), -9.0)])))["torque_nm"]
     np.testing.assert_allclose(torque[500:2000], 2.0, rtol=1e-6)
     assert (torque[2100:] < -1.9).all()
 
@@ -658,7 +495,7 @@ def test_steering_keeps_its_limits_overshoots_nothing_and_hangs_in_its_play():
     steer = np.tile([1.2, -0.7, 0.05], (100, 1))
     steer[60:] = 0.0
     motion = drive(plant_of(load_soil("tiles"), backlash_rad=0.02), np.zeros((100, 3)), steer)
-    angle = motion.wheel("steer_rad")
+    angle = wheels(motion)["steer_rad"]
     assert np.abs(np.diff(angle, axis=0)).max() <= 2.0944 * STEP_S * (1 + 1e-9)
     assert np.abs(np.diff(angle[:1150, 0], n=2)).max() < 2.1 * STEP_S  # it picks the wheel up, no more
     # it stops short by the backlash in both directions
@@ -668,28 +505,6 @@ def test_steering_keeps_its_limits_overshoots_nothing_and_hangs_in_its_play():
     # fastest move: the rate limit and two ramps, but for the last hundredth
     fastest_s = 1.2 / 2.0944 + 2.0944 / 20 - math.sqrt(2 * 0.01 / 20)
     assert np.flatnonzero(angle[:, 0] > 1.17)[0] * STEP_S == pytest.approx(fastest_s, abs=0.005)
-
-
-def test_each_wheel_changes_terrain_at_its_own_position():
-    plant = plant_of(load_soil("tiles"), load_soil("grass"), starts_m=(0.0, 2.0))
-    motion = drive(plant, ramp(5.0))
-    patch, path = motion.wheel("patch_ratio"), motion.record["path_m"]
-    crossed = [path[np.flatnonzero(patch[:, i])[0]] for i in range(3)]
-    np.testing.assert_allclose(crossed, [2.5075, 1.4925, 2.0], atol=2e-3)
-    assert (np.diff(patch, axis=0) >= 0).all()
-    assert motion.wheel("slip_ratio")[-1].mean() > 0.1 > motion.wheel("slip_ratio")[2000].mean()
-
-
-def test_hall_steps_show_at_low_speed_and_give_the_rate_in_the_mean():
-    crawl = drive(plant_of(load_soil("tiles")), ramp(10.0, 0.05))
-    reported, rate = crawl.wheel("reported_radps")[5000:], crawl.wheel("wheel_radps")[5000:]
-    steps = np.diff(reported, axis=0).max(axis=0)
-    np.testing.assert_allclose(steps, 2 * math.pi / 900 / 0.05, rtol=0.02)  # one step through the low-pass
-    assert reported.std() > 0.5 * rate.mean()
-    fast = drive(plant_of(load_soil("tiles")), ramp(6.0, 5.0))
-    reported, rate = fast.wheel("reported_radps")[3000:], fast.wheel("wheel_radps")[3000:]
-    np.testing.assert_allclose(reported.mean(axis=0), rate.mean(axis=0), rtol=1e-3)
-    assert np.abs(reported - rate).max() < 2 * math.pi / 900 / 0.05
 
 
 @pytest.mark.parametrize("speed_mps", [0.5, 1.6])
@@ -719,30 +534,6 @@ def test_vibration_is_that_of_the_spectrum_of_the_road(speed_mps):
     np.testing.assert_allclose(rougher.record["ride_z_mps2"], 2 * smooth, rtol=0.02, atol=0.02 * smooth.std())
 
 
-def test_a_larger_wheel_is_faster():
-    motion = drive(plant_of(STICKY, radius_factors=(1.02,) * 3), ramp(4.0))
-    assert motion.record["speed_x_mps"][-1] == pytest.approx(1.02, abs=1e-3)
-
-
-def test_an_unloaded_wheel_exerts_no_force():
-    plant = plant_of(STICKY, payload_kg=60.0, payload_m=(0.0, 0.37))  # nearly over the line of wheels 1 and 2
-    assert plant.load_fraction[2] < 0.15
-    steer = np.tile([0.4, -0.4, 0.0], (150, 1))
-    motion = drive(plant, ramp(3.0, 9.0) * [1.0, 1.0, 0.4], steer)
-    normal = motion.wheel("normal_n")
-    assert normal[:, 2].min() == 0.0
-    assert (motion.wheel("traction_n")[normal[:, 2] == 0.0, 2] == 0.0).all()
-    for name in BODY_ROW["wheels"].base.names:
-        assert name.startswith("slip") or np.isfinite(motion.wheel(name)).all()
-
-
-def test_a_load_that_tips_it_over_is_refused():
-    with pytest.raises(
-        ConfigError, match=r"payload of 200 kg at \(0, 0.6\) m .* tips it over: wheel 3 would carry"
-    ):
-        plant_of(STICKY, payload_kg=200.0, payload_m=(0.0, 0.6))
-
-
 def loaded(plant, ratio):
     """The plant with a mass, and the yaw inertia that goes with it, that brings its contacts to a ratio."""
     low, high = 1.0, 1e6
@@ -764,7 +555,7 @@ def driven(plant, duration_s=6.0, seed=None):
 
 def change_of_rate_radps(motion):
     """The largest change of a wheel's rate from step to step in the last half second."""
-    return np.abs(np.diff(motion.wheel("wheel_radps")[-500:], axis=0)).max()
+    return np.abs(np.diff(wheels(motion)["wheel_radps"][-500:], axis=0)).max()
 
 
 def test_the_roots_of_the_step_are_on_the_unit_circle_at_the_limit():
@@ -783,19 +574,6 @@ def test_wheels_roll_evenly_below_the_limit_and_change_their_sign_above_it(soil)
     assert change_of_rate_radps(driven(loaded(plant, 1.07))) > 0.4
 
 
-def test_the_inertia_of_yaw_counts():
-    """A mass without the inertia that goes with it turns by its side forces: it is refused, and rightly."""
-    plant = plant_of(load_soil("tiles"))
-    slim = plant.changed(mass_kg=600.0, yaw_inertia_kgm2=0.01)
-    assert contact_ratio(*slim) > 1.0 > contact_ratio(*slim.changed(yaw_inertia_kgm2=200.0))
-    slim_turns, stout_turns = (
-        np.abs(driven(one, 2.0).record["yaw_rate_radps"]).max()
-        for one in (slim, slim.changed(yaw_inertia_kgm2=200.0))
-    )
-    assert stout_turns < 0.01
-    assert not slim_turns < 1.0  # or NaN
-
-
 @pytest.mark.parametrize("soil", SOILS)
 def test_what_is_accepted_gains_no_momentum_that_the_motors_did_not_give(soil):
     """On ground as rough as a field, at the largest mass that is accepted."""
@@ -804,8 +582,8 @@ def test_what_is_accepted_gains_no_momentum_that_the_motors_did_not_give(soil):
     )
     check_step(*plant, "agrimaro")
     motion = driven(plant, seed=3)
-    push_ns = STEP_S * np.cumsum((motion.wheel("torque_nm") / plant.radius_m).sum(axis=1))
-    spin_ns = (plant.wheel_inertia_kgm2 * motion.wheel("wheel_radps") / plant.radius_m).sum(axis=1)
+    push_ns = STEP_S * np.cumsum((wheels(motion)["torque_nm"] / plant.radius_m).sum(axis=1))
+    spin_ns = (plant.wheel_inertia_kgm2 * wheels(motion)["wheel_radps"] / plant.radius_m).sum(axis=1)
     momentum_ns = plant.mass_kg * motion.record["speed_x_mps"]
     # what resists only takes from it
     assert (momentum_ns <= push_ns - spin_ns + 0.01 * plant.mass_kg).all()
@@ -814,29 +592,12 @@ def test_what_is_accepted_gains_no_momentum_that_the_motors_did_not_give(soil):
 
 def test_a_light_robot_on_stiff_tyres_is_refused():
     plant = plant_of(load_soil("grass"))
-    limit_kg = STEP_S * (STEP_S * plant.ride_stiffness_npm + 2 * plant.ride_damping_nspm) / 4
+    limit_kg = STEP_S * (STEP_S * plant.tyre_stiffness_npm + 2 * plant.tyre_damping_nspm) / 4
     for factor, accepted in ((0.99, False), (1.01, True)):
         mass_kg = factor * limit_kg / plant.load_fraction.min()
         light = plant.changed(mass_kg=mass_kg)
         assert (tyre_ratio(light.plant) < 1.0) == accepted
         motion = driven(light.changed(roughness_m3=1e-6), 2.0, seed=4)
-        load_n = motion.wheel("normal_n")
+        load_n = wheels(motion)["normal_n"]
         even = np.isfinite(load_n).all() and load_n.max() < 100 * mass_kg * GRAVITY_MPS2
         assert even == accepted
-
-
-@pytest.mark.parametrize(
-    ("changes", "conditions", "why"),
-    [
-        ({"mass_kg": 1e5}, {}, "contacts are"),
-        ({"mass_kg": 2e4}, {}, "contacts are"),
-        ({"mass_kg": 0.1}, {}, "tyres are"),
-        ({}, {"payload_kg": 1e5}, "contacts are"),
-    ],
-)
-def test_a_mass_out_of_scale_is_refused_in_one_sentence(changes, conditions, why):
-    robot = dataclasses.replace(ROBOT, **changes)
-    scenario = make_scenario("straight", robot, ["tiles"], 4.0)
-    with pytest.raises(ConfigError, match=f"cannot be integrated in steps of 0.001 s: .* {why}") as refused:
-        simulate(robot, scenario, {"tiles": load_soil("tiles")}, 0, conditions=Conditions(**conditions))
-    assert "\n" not in str(refused.value)

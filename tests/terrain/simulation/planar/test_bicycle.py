@@ -11,27 +11,29 @@ from scipy.interpolate import CubicSpline
 from terrain.constants import GRAVITY_MPS2
 from terrain.discrepancy.signals import signals_of
 from terrain.effects import CHANNELS, GYRO, SPEED_X, SPEED_Y, library_of, vector_of
-from terrain.extension import apply_homes, corrected_log
-from terrain.records import RunLog, Stream
+from terrain.extension import apply_homes
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import VX, VY, Ground, W, make_planar
-from terrain.simulation.planar.motion import LEAST_RATIO, move
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.planar.bicycle import LEAST_RATIO
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.motion import make_planar, move
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.run import Hills, simulate_planar
+from terrain.simulation.run import simulate
 
 CAR = replace(load_robot("adap2e"), com_ahead_m=0.5, front_cornering_npr=12000.0, rear_cornering_npr=18000.0)
 FREE = Ground(slip_ratio=0.0, rolling_ratio=0.0)
 DT = 0.01
-STILL = np.zeros((0, 3))
+VX, VY, W = range(3)
 
 
 def moved(speed, steer, roll=0.0, values=None, robot=CAR, dt=DT, grade=0.0, ground=FREE):
-    """Return the motion (n, ...) of speeds and angles (n,)."""
+    """Return the twist (n, 3) at speeds and angles (n,)."""
     n = len(speed)
     angles = np.column_stack([np.broadcast_to(steer, n), np.zeros(n)])
     tilt = [np.ascontiguousarray(np.broadcast_to(each, n), dtype=float) for each in (grade, roll)]
     wheels = np.ascontiguousarray(np.asarray(speed, dtype=float)[:, None])
-    return move(make_planar(robot, ground), vector_of(values or {}), dt, wheels, angles, *tilt, STILL)
+    out = move(make_planar(robot, ground), vector_of(values or {}), dt, wheels, angles, *tilt)
+    return np.column_stack([out[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
 
 
 def understeer(robot, added=0.0):
@@ -154,14 +156,9 @@ def test_effects_are_other_numbers_of_the_robot():
     "values",
     [
         {},
-        {"understeer_s2pm": 0.04},
-        {"cornering_stiffness_ratio": -0.3},
-        {"steering_offset_front_rad": 0.03},
-        {"steering_delay_s": 0.12},
-        {"encoder_lag_s": 0.1},
-        {"clock_offset_s": 0.1},
-        {"side_hill_slip_ratio": 0.3},
-        {"lever_x_m": 0.4, "lever_y_m": -0.2},
+        {"understeer_s2pm": 0.04, "cornering_stiffness_ratio": -0.3, "steering_offset_front_rad": 0.03},
+        {"steering_delay_s": 0.12, "encoder_lag_s": 0.1, "clock_offset_s": 0.1},
+        {"side_hill_slip_ratio": 0.3, "lever_x_m": 0.4, "lever_y_m": -0.2},
     ],
     ids=lambda values: next(iter(values), "none"),
 )
@@ -169,7 +166,7 @@ def test_a_replay_of_a_log_is_the_run(values):
     t = 0.02 * np.arange(1001)
     speed, turn = 1.5 * np.sin(0.5 * t) ** 2, 0.3 * np.sin(0.9 * t)
     twist = np.column_stack([speed, np.zeros_like(t), speed * turn])
-    run = simulate_planar(CAR, twist, 0, effects=values, hills=Hills((0.05, 0.05)), ground=FREE)
+    run = simulate(CAR, twist, FREE, 0, effects=values, conditions=Conditions(grade_ratio=(0.05, 0.05)))
     signals = signals_of(run, CAR)
     assert signals.wheel_speed_mps.shape[1] == signals.steer_rad.shape[1] == 1
     inputs = signals.wheel_speed_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad
@@ -179,26 +176,3 @@ def test_a_replay_of_a_log_is_the_run(values):
         c = CHANNELS.index(channel)
         off = (shown[:, c] - signals.measured[:, c])[50:-50]
         assert np.sqrt(np.mean(off**2)) < std, channel
-
-
-def test_its_log_has_the_streams_of_a_car_and_none_of_currents():
-    run = simulate_planar(CAR, np.tile([1.0, 0.0, 0.2], (101, 1)), 0)
-    assert run.streams["wheels"].channels == ("speed_rear_mps",)
-    assert run.streams["steering"].channels == ("angle_front_rad",)
-    assert run.streams["odometry"].channels == ("speed_x_mps", "speed_y_mps")
-    truth = run.streams["truth"]
-    assert truth.channel("steer_front_rad")[-1] == pytest.approx(math.atan(CAR.wheelbase_m * 0.2), abs=1e-3)
-
-
-def test_offset_and_backlash_of_the_steering_are_taken_off_a_log():
-    effects = {"steering_offset_front_rad": 0.05, "steering_backlash_rad": 0.02}
-    angle = 0.2 * np.sin(np.arange(50) / 5.0)
-    run = RunLog(
-        "a", CAR.name, {"steering": Stream(np.arange(50) / 50.0, angle[:, None], CAR.steer_channels)}
-    )
-    found = corrected_log(run, replace(CAR, effects=effects)).streams["steering"].values[:, 0]
-    follower, expected = angle[0] + 0.05, []
-    for each in angle + 0.05:
-        follower = min(max(follower, each - 0.02), each + 0.02)
-        expected.append(follower)
-    np.testing.assert_allclose(found, expected, atol=1e-12)

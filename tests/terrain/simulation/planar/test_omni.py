@@ -1,3 +1,5 @@
+"""Omni robots in the planar plant: the balance of forces, its differential equation, and measured slip."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -10,16 +12,12 @@ from terrain.extension import apply_homes
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.robots import load_robot
-from terrain.simulation.contact import softness
-from terrain.simulation.planar.model import AMPS, SLIP, VX, VY, Ground, W, make_planar, planar_ground
-from terrain.simulation.planar.motion import move
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.motion import make_planar, move
 from terrain.simulation.planar.noise import load_noise
 from terrain.simulation.planar.omni import ROLLING_MPS, SUBSTEPS, currents_of, steady_twist
-from terrain.simulation.planar.run import simulate_planar
-from terrain.simulation.run import simulate_run
-from terrain.simulation.scenario import make_scenario
+from terrain.simulation.run import simulate
 from terrain.slip_learning.measured import measured_slip
-from terrain.terramechanics.soil import load_soil, soil_from
 
 ROBOT = load_robot("robotino")
 PLACE = ROBOT.wheel_positions_m, ROBOT.wheel_directions_rad
@@ -35,16 +33,17 @@ def centred(robot):
 
 def moved(robot, ground, wheels, p=NONE, grade=0.0, dt=DT):
     n = len(wheels)
-    return move(
-        make_planar(robot, ground),
-        p,
-        dt,
-        wheels,
-        np.zeros((n, 3)),
-        np.full(n, grade),
-        np.zeros(n),
-        np.zeros((0, 3)),
-    )
+    return move(make_planar(robot, ground), p, dt, wheels, np.zeros((n, 3)), np.full(n, grade), np.zeros(n))
+
+
+def twists(truth):
+    return np.column_stack([truth[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
+
+
+def numbers_of(robot, ground):
+    """Return the plant's numbers of omni wheels, and those of every drive."""
+    params = make_planar(robot, ground).params[0]
+    return params, params["body"]
 
 
 def wheels_for(twist, n=300):
@@ -57,9 +56,9 @@ def heading_to(direction_rad, speed_mps=0.2):
 
 @pytest.mark.parametrize("twist", [(0.2, 0.1, 0.0), (0.0, -0.3, 0.0), (0.1, 0.0, 0.8)])
 def test_without_friction_of_rollers_or_resistance_the_body_moves_as_its_wheels_roll(twist):
-    steady = moved(centred(ROBOT), CARPET._replace(roller_ratio=0.0), wheels_for(twist))[-1]
+    steady = twists(moved(centred(ROBOT), CARPET._replace(roller_ratio=0.0), wheels_for(twist)))[-1]
     spin = abs(twist[2] * twist[0])  # a turn takes a force to the inside, and slip with it
-    np.testing.assert_allclose(steady[[VX, VY, W]], twist, atol=1e-9 + spin * CARPET.slip_ratio)
+    np.testing.assert_allclose(steady, twist, atol=1e-9 + spin * CARPET.slip_ratio)
 
 
 @pytest.mark.parametrize("ratio", [0.04, 0.25, 0.8])
@@ -67,37 +66,15 @@ def test_without_friction_of_rollers_or_resistance_the_body_moves_as_its_wheels_
 def test_steady_motion_is_that_of_the_balance_of_forces(ratio, direction_rad):
     wheels = wheels_for(heading_to(direction_rad))
     ground = CARPET._replace(roller_ratio=ratio / SOFT)
-    load = make_planar(ROBOT, ground).wheel_load_ratio
+    load = numbers_of(ROBOT, ground)[0]["wheel_load_ratio"]
     assert load.sum() == pytest.approx(1.0)
     np.testing.assert_allclose(load @ PLACE[0], [ROBOT.body.com_x_m, ROBOT.body.com_y_m], atol=1e-12)
     expected = steady_twist(wheels[-1:], *PLACE, load, ratio)[0]
-    found = moved(ROBOT, ground, wheels)[-1, [VX, VY, W]]
+    found = twists(moved(ROBOT, ground, wheels))[-1]
     # rollers turn the robot, which takes a force to the inside, and slip with it
     inside = 2.0 * CARPET.slip_ratio * abs(expected[2]) * np.hypot(*expected[:2]) / 9.8
     np.testing.assert_allclose(found[:2], expected[:2], atol=1e-4 + 0.2 * inside)
     assert found[2] == pytest.approx(expected[2], abs=1e-4 + inside / ROBOT.wheel_distance_m)
-
-
-def test_slip_depends_on_the_direction_and_not_on_the_speed():
-    slips = np.array(
-        [
-            [moved(ROBOT, CARPET, wheels_for(heading_to(a, speed)))[-1, SLIP] for speed in (0.2, 0.4)]
-            for a in np.radians([0.0, 30.0, 60.0, 90.0])
-        ]
-    )
-    np.testing.assert_allclose(slips[:, 0], slips[:, 1], atol=2e-3)
-    assert np.ptp(slips[:, 0]) > 0.05
-
-
-def test_with_equal_loads_a_third_of_a_turn_changes_nothing():
-    for angle in (0.2, 1.1):
-        one, other = (
-            moved(centred(ROBOT), CARPET, wheels_for(heading_to(angle + more)))[-1]
-            for more in (0.0, 2 * np.pi / 3)
-        )
-        assert one[SLIP] == pytest.approx(other[SLIP], abs=1e-9)
-        turned = complex(one[VX], one[VY]) * np.exp(2j * np.pi / 3)
-        np.testing.assert_allclose([other[VX], other[VY]], [turned.real, turned.imag], atol=1e-12)
 
 
 def starting(n=60):
@@ -105,63 +82,30 @@ def starting(n=60):
     return ramp * np.array([0.15, 0.1, 0.6]) @ rolling_matrix(*PLACE).T
 
 
-def law(planar, u, twist, stiff, rolling):
-    """Forces and moment on the centre of mass, by the module's equation."""
-    load = planar.wheel_load_ratio[:, None]
-    v = planar.along @ twist
-    drag = rolling * planar.mass_kg * 9.80665 * v / np.hypot(v, ROLLING_MPS)
-    force = stiff * (u - v)[:, None] * planar.along - drag[:, None] * planar.along
-    resists = planar.roller_ratio * planar.mass_kg * 9.80665 / speed_of(planar, u, twist)
-    force -= resists * (planar.across @ twist)[:, None] * planar.across
-    return (load * force).sum(axis=0)
-
-
-def speed_of(planar, u, twist):
-    fastest = max((u**2).mean(), ((planar.along @ twist) ** 2).mean())
-    return np.sqrt(fastest + ROLLING_MPS**2)
-
-
-def test_the_kernel_is_the_plain_form_of_its_implicit_steps():
-    ground = CARPET._replace(rolling_ratio=0.02)
-    planar, wheels = make_planar(ROBOT, ground), starting()
-    masses = np.array([planar.mass_kg, planar.mass_kg, planar.yaw_inertia_kgm2])
-    weight, step, twist, size, last = planar.mass_kg * 9.80665, DT / SUBSTEPS, np.zeros(3), 0.0, wheels[0]
-    load, out = planar.wheel_load_ratio, []
-    for row in wheels:
-        for part in range(1, SUBSTEPS + 1):
-            u = last + (row - last) * part / SUBSTEPS
-            speed = speed_of(planar, u, twist)
-            stiff = weight / softness(planar.soft_ratio, size) / speed
-            drag = planar.rolling_ratio * weight / np.hypot(planar.along @ twist, ROLLING_MPS)
-            balance = (planar.along.T * (load * (stiff + drag))) @ planar.along
-            balance += (planar.across.T * (load * planar.roller_ratio * weight / speed)) @ planar.across
-            turning = planar.mass_kg * twist[2] * np.array([twist[1], -twist[0], 0.0])
-            driven = planar.along.T @ (load * stiff * u)
-            twist = np.linalg.solve(
-                np.diag(masses / step) + balance, masses / step * twist + turning + driven
-            )
-            size = min(np.sqrt(((u - planar.along @ twist) ** 2).mean()) / speed, 1.0)
-        last = row
-        out.append([twist[0] + twist[2] * planar.com_y_m, twist[1] - twist[2] * planar.com_x_m, twist[2]])
-    np.testing.assert_allclose(moved(ROBOT, ground, wheels)[:, [VX, VY, W]], out, atol=1e-12)
-
-
 def test_a_start_is_that_of_the_differential_equation():
-    """The other route: an integrator that chooses its own steps."""
-    ground = CARPET._replace(rolling_ratio=0.02)
-    planar, wheels = make_planar(ROBOT, ground), starting()
-    masses = np.array([planar.mass_kg, planar.mass_kg, planar.yaw_inertia_kgm2])
-    time_s = DT * np.arange(len(wheels))
+    """The other route: an integrator that chooses its own steps, and the module's equation."""
+    ground, wheels = CARPET._replace(rolling_ratio=0.02), starting()
+    rollers, body = numbers_of(ROBOT, ground)
+    along, across, load = rollers["along"], rollers["across"], rollers["wheel_load_ratio"][:, None]
+    mass, time_s = body["mass_kg"], DT * np.arange(len(wheels))
+    weight = mass * 9.80665
 
     def rate(t, twist):
         u = np.array([np.interp(t, time_s, column) for column in wheels.T])
-        stiff = planar.mass_kg * 9.80665 / planar.soft_ratio[0] / speed_of(planar, u, twist)
+        v = along @ twist
+        speed = np.sqrt(max((u**2).mean(), (v**2).mean()) + ROLLING_MPS**2)
+        pull = weight / SOFT / speed * (u - v) - 0.02 * weight * v / np.hypot(v, ROLLING_MPS)
+        force = (
+            pull[:, None] * along
+            - rollers["roller_ratio"] * weight / speed * (across @ twist)[:, None] * across
+        )
         turning = np.array([twist[2] * twist[1], -twist[2] * twist[0], 0.0])
-        return law(planar, u, twist, stiff, planar.rolling_ratio) / masses + turning
+        return (load * force).sum(axis=0) / [mass, mass, body["yaw_inertia_kgm2"]] + turning
 
     twist = solve_ivp(rate, (0.0, time_s[-1]), np.zeros(3), "BDF", time_s, rtol=1e-7, atol=1e-9).y
-    expected = [twist[0] + twist[2] * planar.com_y_m, twist[1] - twist[2] * planar.com_x_m, twist[2]]
-    found = moved(ROBOT, ground, wheels)[:, [VX, VY, W]]
+    com = body["com_x_m"], body["com_y_m"]
+    expected = [twist[0] + twist[2] * com[1], twist[1] - twist[2] * com[0], twist[2]]
+    found = twists(moved(ROBOT, ground, wheels))
     step_s = DT / SUBSTEPS  # implicit steps are late by up to one
     fastest = np.abs(np.gradient(expected, DT, axis=1)).max(axis=1)
     assert (np.abs(found - np.transpose(expected)).max(axis=0) < 1.2 * step_s * fastest).all()
@@ -174,55 +118,17 @@ def test_currents_are_those_of_friction_where_nothing_resists_and_grow_with_the_
     direction = wheels[-1] / np.hypot(wheels[-1], ROLLING_MPS)
     motors = ROBOT.motors
     per_a = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
-    each = currents_of(planar, NONE, DT, wheels, free)[-1]
+    each = currents_of(planar.params, NONE, DT, wheels, free)[-1]
     np.testing.assert_allclose(each, motors.friction_nm / per_a * direction, atol=1e-9)
     held = moved(centred(ROBOT), CARPET, wheels)
-    assert held[-1, AMPS] > free[-1, AMPS] + 0.5
-
-
-def test_motors_give_the_power_that_slip_and_rollers_take():
-    planar, wheels = make_planar(ROBOT, CARPET), wheels_for((0.2, 0.15, 0.0))
-    truth = moved(ROBOT, CARPET, wheels)
-    twist = truth[-1, [VX, VY, W]]
-    twist = twist + twist[2] * np.array([-planar.com_y_m, planar.com_x_m, 0.0])
-    friction = planar.friction_nm / 3 * wheels[-1] / np.hypot(wheels[-1], ROLLING_MPS)
-    torque = currents_of(planar, NONE, DT, wheels, truth)[-1] * planar.nm_per_a - friction
-    u, v, across = wheels[-1], planar.along @ twist, planar.across @ twist
-    scale = (
-        planar.wheel_load_ratio * planar.mass_kg * 9.80665 / CARPET.slip_ratio / speed_of(planar, u, twist)
-    )
-    lost = (scale * ((u - v) ** 2 + SOFT * CARPET.roller_ratio * across**2)).sum()
-    assert (torque / planar.radius_m * u).sum() == pytest.approx(lost, rel=1e-3)
-
-
-def test_up_a_slope_the_body_slips_more_and_payload_changes_nothing_on_the_level():
-    wheels = wheels_for((0.2, 0.0, 0.0))
-    level, up = (moved(ROBOT, CARPET, wheels, grade=grade)[-1, SLIP] for grade in (0.0, 0.05))
-    assert up == pytest.approx(level + 0.05 * SOFT / (1 + SOFT * CARPET.roller_ratio), abs=0.03)
-    assert up > level + 0.02
-    loaded = moved(ROBOT, CARPET, wheels, vector_of({"payload_ratio": 0.5}))[-1, SLIP]
-    assert loaded == pytest.approx(level, abs=1e-6)
+    assert held["current_a"][-1] > free["current_a"][-1] + 0.5
 
 
 def driven(direction_rad, seed=0, ground=CARPET, speed_mps=0.2, seconds=6.0, effects=None):
     twist = np.zeros((int(50 * seconds) + 1, 3))
     twist[25:] = heading_to(direction_rad, speed_mps)
-    run = simulate_planar(
-        ROBOT, twist, seed, ground=ground, noise=load_noise(), terrain="carpet", effects=effects
-    )
+    run = simulate(ROBOT, twist, ground, seed, noise=load_noise(), terrain="carpet", effects=effects)
     return with_wheel_speeds(run, ROBOT)
-
-
-def test_a_run_has_the_streams_of_a_measured_one_and_the_truth_and_the_same_bytes_by_seed():
-    run, again, other = driven(1.0), driven(1.0), driven(1.0, seed=1)
-    assert set(run.streams) == {"wheels", "pose", "commands", "truth"}
-    assert run.streams["pose"].channels == ("position_x_m", "position_y_m", "yaw_rad")
-    names = [f"motor_{i}_radps" for i in (1, 2, 3)] + [f"current_{i}_a" for i in (1, 2, 3)]
-    assert set(names) < set(run.streams["wheels"].channels)
-    for name, stream in run.streams.items():
-        assert stream.values.tobytes() == again.streams[name].values.tobytes()
-    assert (run.streams["pose"].values != other.streams["pose"].values).any()
-    assert all((run.streams["wheels"].channel(f"current_{i}_a") >= 0.0).all() for i in (1, 2, 3))
 
 
 @pytest.mark.parametrize("direction_rad", [0.3, 2.0, 5.1])
@@ -261,8 +167,10 @@ def test_an_effect_with_a_home_moves_the_robot_as_that_description_does(values):
         moved(ROBOT, CARPET, wheels, vector_of(values)),
         moved(described, CARPET, radius * wheels),
     )
-    np.testing.assert_allclose(effect[:, [VX, VY, W]], expected[:, [VX, VY, W]], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(effect[10:, AMPS], expected[10:, AMPS], rtol=0.02)  # rotors: by the rate
+    np.testing.assert_allclose(twists(effect), twists(expected), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        effect["current_a"][10:], expected["current_a"][10:], rtol=0.02
+    )  # rotors: by the rate
 
 
 def test_what_the_ground_adds_to_the_motion_is_in_no_current():
@@ -271,44 +179,11 @@ def test_what_the_ground_adds_to_the_motion_is_in_no_current():
     rough = load_noise()._replace(along_ratio=0.05, across_ratio=0.05, yaw_radps=0.05)
     twist = np.zeros((301, 3))
     twist[25:] = heading_to(0.4)
-    one, other = (
-        simulate_planar(ROBOT, twist, 3, ground=CARPET, noise=noise).streams for noise in (quiet, rough)
-    )
+    one, other = (simulate(ROBOT, twist, CARPET, 3, noise=noise).streams for noise in (quiet, rough))
     moved_by = np.abs(one["truth"].channel("speed_y_mps") - other["truth"].channel("speed_y_mps"))
     assert moved_by.max() > 0.002
     for i in (1, 2, 3):
         name = f"current_{i}_a"
         np.testing.assert_allclose(one["wheels"].channel(name), other["wheels"].channel(name), atol=1e-9)
     with pytest.raises(ConfigError, match="stick_slip_a is not simulated of robot robotino"):
-        simulate_planar(ROBOT, twist, 3, ground=CARPET, outside={"stick_slip_a": 1.0})
-
-
-def test_scenarios_take_an_omni_robot_sideways_at_a_speed_of_its_own():
-    crab = make_scenario("crab", ROBOT, "tiles")
-    assert np.abs(crab.twist[:, 1]).max() > 0.1
-    assert np.abs(make_scenario("straight", ROBOT, "tiles").twist[:, 0]).max() == pytest.approx(0.94 / 3)
-    run = simulate_run(ROBOT, "tiles", "crab", 3)
-    assert "pose" in run.streams
-    with pytest.raises(ConfigError, match="scenario 'course' is"):
-        make_scenario("course", ROBOT, ["tiles", "grass"])
-
-
-def test_a_soil_says_what_it_does_to_rollers():
-    assert planar_ground(ROBOT, load_soil("tiles")).roller_ratio == 0.0
-    entry = {"unit": "ratio", "source": "test"}
-    values = {
-        "rolling_resistance_ratio": 0.01,
-        "slip_sinkage_ratio": 0.0,
-        "stiffness_ratio": 1.0,
-        "shape_ratio": 1.3,
-        "peak_friction_ratio": 0.5,
-        "curvature_ratio": 0.5,
-        "roller_friction_ratio": 0.4,
-    }
-    described = {name: {"value": value, **entry} for name, value in values.items()}
-    described |= {"name": "carpet", "law": "magic"}
-    described["roughness_m3"] = {"value": 4e-6, "unit": "m3", "source": "test"}
-    assert planar_ground(ROBOT, soil_from("carpet.yaml", described)).roller_ratio == 0.4
-    described["roller_friction_ratio"]["value"] = -0.1
-    with pytest.raises(ConfigError, match=r"carpet.yaml: roller_friction_ratio.*-0.1"):
-        soil_from("carpet.yaml", described)
+        simulate(ROBOT, twist, CARPET, 3, outside={"stick_slip_a": 1.0})

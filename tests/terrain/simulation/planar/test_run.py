@@ -1,3 +1,5 @@
+"""Runs of the planar plant: a replay is the run, truth and tilt, and noise of the stated density."""
+
 import math
 from dataclasses import replace
 
@@ -19,23 +21,22 @@ from terrain.effects import (
     vector_of,
 )
 from terrain.errors import ConfigError
-from terrain.kinematics.camera import CHANNELS as POSE_CHANNELS
 from terrain.kinematics.camera import body_motion
-from terrain.kinematics.logged_wheels import wheel_and_ground_speed
-from terrain.logs.schema import IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.robots import load_robot
 from terrain.signals import low_passed
-from terrain.simulation.planar.model import Ground, make_planar, planar_ground
+from terrain.simulation.conditions import Conditions
+from terrain.simulation.planar.model import Ground, planar_ground
+from terrain.simulation.planar.motion import make_planar
 from terrain.simulation.planar.noise import load_noise, load_scatter
 from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.run import Hills, simulate_planar
+from terrain.simulation.run import simulate
 from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 ROBOTS = [HUSKY, AGRIMARO]
 NAMES = ["husky", "agrimaro"]
-HILLS = Hills((0.04, -0.03), 0.04)
+HILLS = Conditions(grade_ratio=(0.04, -0.03), undulation_ratio=0.04)
 NOISE, SCATTER = load_noise(), load_scatter()
 
 
@@ -96,11 +97,13 @@ EFFECTS = [
     {},
     {"wheel_radius_ratio": 0.05, "force_slip_ratio": 0.3, "payload_ratio": 0.2},
     {"clock_offset_s": 0.07, "camera_latency_s": 0.05},
-    {"clock_offset_s": -0.26},
-    {"imu_latency_s": 0.16, "current_offset_a": 0.7},
-    {"clock_rate_ratio": 0.002},
-    {"encoder_lag_s": 0.12},
-    {"pitch_offset_rad": 0.03, "roll_offset_rad": -0.02, "side_hill_slip_ratio": 1.0},
+    {"clock_rate_ratio": 0.002, "encoder_lag_s": 0.12, "imu_latency_s": 0.16, "current_offset_a": 0.7},
+    {
+        "clock_offset_s": -0.26,
+        "pitch_offset_rad": 0.03,
+        "roll_offset_rad": -0.02,
+        "side_hill_slip_ratio": 1.0,
+    },
     {"gyro_scale_ratio": 0.1, "gyro_bias_radps": 0.02, "lever_y_m": 0.2, "camera_yaw_rad": 0.1},
 ]
 
@@ -112,8 +115,8 @@ EFFECTS = [
 )
 def test_a_replay_with_the_same_effects_reproduces_the_log(robot, values):
     ground = Ground()
-    run = simulate_planar(
-        robot, drive(robot), 3, ground=ground, effects=values, hills=HILLS, heading=robot is not AGRIMARO
+    run = simulate(
+        robot, drive(robot), ground, 3, effects=values, heading=robot is not AGRIMARO, conditions=HILLS
     )
     measured, expected = logged(run, robot), replayed(run, robot, values, ground)
     if "lidar" not in run.streams:
@@ -128,76 +131,11 @@ def test_a_replay_with_the_same_effects_reproduces_the_log(robot, values):
     assert abs((measured - expected)[span].mean(axis=0)).max() < 0.01
 
 
-def test_an_effect_that_the_replay_lacks_is_left_over():
-    run = simulate_planar(HUSKY, drive(HUSKY), 0, effects={"effective_track_ratio": 0.5})
-    left = logged(run, HUSKY) - replayed(run, HUSKY, {}, Ground())
-    assert np.std(left[:, CHANNELS.index(GYRO)]) > 0.3 * np.std(logged(run, HUSKY)[:, CHANNELS.index(GYRO)])
-
-
-def test_streams_are_those_of_the_robot():
-    given = {"noise": NOISE, "scatter": SCATTER, "terrain": "grass", "run_id": "a", "heading": True}
-    run = simulate_planar(HUSKY, drive(HUSKY), 0, **given)
-    assert {name: stream.channels for name, stream in run.streams.items() if name not in ("truth",)} == {
-        "wheels": ("speed_left_mps", "speed_right_mps", "current_left_a", "current_right_a"),
-        "imu": IMU_CHANNELS,
-        "odometry": ("speed_x_mps", "speed_y_mps"),
-        "lidar": ("yaw_rate_radps",),
-        "commands": (
-            *("speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
-            *("wheel_left_radps", "wheel_right_radps"),
-        ),
-    }
-    assert (run.run_id, run.robot, run.labels) == ("a", "husky", ((0.0, 60.0, "grass"),))
-    run = simulate_planar(AGRIMARO, drive(AGRIMARO), 0, noise=NOISE)
-    assert run.streams["wheels"].channels == WHEELS_CHANNELS
-    assert run.streams["steering"].channels == STEERING_CHANNELS
-    assert run.streams["odometry"].channels == POSE_CHANNELS
-    assert run.labels == ()
-    for name, stream in run.streams.items():
-        assert stream.rate_hz == pytest.approx(100.0 if name in ("imu", "truth") else 50.0), name
-        assert stream.time_s[[0, -1]] == pytest.approx([0.0, 60.0])
-        assert np.isfinite(stream.values[:, [not c.startswith("slip") for c in stream.channels]]).all()
-
-
-@pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_the_same_seed_gives_the_same_bytes_and_a_cause_leaves_other_sensors_alone(robot):
-    def bytes_of(seed, **options):
-        run = simulate_planar(robot, drive(robot), seed, noise=NOISE, scatter=SCATTER, hills=HILLS, **options)
-        return {name: stream.values.tobytes() for name, stream in run.streams.items()}
-
-    plain, sequence = bytes_of(5), np.random.SeedSequence(5)
-    assert plain == bytes_of(5) == bytes_of(sequence) == bytes_of(sequence)
-    assert all(plain[name] != other for name, other in bytes_of(6).items() if name != "commands")
-    spiked = bytes_of(5, outside={"stick_slip_a": 3.0})
-    assert [name for name in plain if spiked[name] != plain[name]] == ["wheels"]
-    assert {name: value for name, value in bytes_of(5, heading=True).items() if name != "lidar"} == plain
-    heavy = bytes_of(5, effects={"motor_constant_ratio": 0.1})
-    assert [name for name in plain if heavy[name] != plain[name]] == ["wheels"]
-
-
-@pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_commands_are_followed_and_truth_adds_up(robot):
-    twist = steady(0.6, 20.0, 0.25)
-    run = simulate_planar(robot, twist, 0, ground=Ground(slip_ratio=0.0))
-    truth = run.streams["truth"]
-    for name, desired in (("speed_x_mps", 0.6), ("speed_y_mps", 0.0), ("yaw_rate_radps", 0.25)):
-        assert truth.channel(name)[-1] == pytest.approx(desired, abs=1e-3)
-    yaw = truth.channel("yaw_rad")
-    np.testing.assert_allclose(np.gradient(yaw, 0.01), truth.channel("yaw_rate_radps"), atol=2e-3)
-    radius = 0.6 / 0.25
-    assert np.ptp(truth.channel("position_y_m")) == pytest.approx(2 * radius, rel=0.05)
-    wheel_speed, ground = wheel_and_ground_speed(truth, robot)
-    np.testing.assert_allclose(wheel_speed[-1], ground[-1], atol=1e-3)
-    slipping = simulate_planar(robot, steady(0.6, 20.0), 0, ground=Ground(slip_ratio=1.0, rolling_ratio=0.1))
-    slips = [slipping.streams["truth"].channel(f"slip_{wheel}_ratio")[-1] for wheel in robot.wheels]
-    assert slips == pytest.approx([0.1] * len(slips), abs=1e-3)
-
-
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
 def test_true_slip_is_that_of_the_radii_that_the_wheels_have(robot):
     free = Ground(slip_ratio=0.0, rolling_ratio=0.0)
     radii = {"wheel_radius_ratio": 0.05, "one_sided_radius_ratio": 0.04}
-    truth = simulate_planar(robot, steady(0.6, 20.0), 0, ground=free, effects=radii).streams["truth"]
+    truth = simulate(robot, steady(0.6, 20.0), free, 0, effects=radii).streams["truth"]
     slips = np.array([truth.channel(f"slip_{wheel}_ratio")[-1] for wheel in robot.wheels])
     # wheels of a swerve robot that disagree cannot all roll; the nominal radius would tell -0.05 of all
     assert np.abs(slips).max() < (0.02 if robot is AGRIMARO else 1e-6)
@@ -207,7 +145,7 @@ def test_true_slip_is_that_of_the_radii_that_the_wheels_have(robot):
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
 def test_tilt_follows_the_heading_and_gravity_the_tilt(robot):
     twist = steady(0.5, 40.0, 0.3)
-    run = simulate_planar(robot, twist, 0, hills=Hills((0.1, 0.0)), ground=Ground(slip_ratio=0.0))
+    run = simulate(robot, twist, Ground(slip_ratio=0.0), 0, conditions=Conditions(grade_ratio=(0.1, 0.0)))
     truth, imu = run.streams["truth"], run.streams["imu"]
     yaw = truth.channel("yaw_rad")
     np.testing.assert_allclose(np.tan(truth.channel("roll_rad")), -0.1 * np.sin(yaw), atol=1e-9)
@@ -218,9 +156,9 @@ def test_tilt_follows_the_heading_and_gravity_the_tilt(robot):
     np.testing.assert_allclose(imu.channel("accel_x_mps2")[200:], up[200:], atol=0.01 * shift)
     side = turn * v + GRAVITY_MPS2 * np.sin(truth.channel("roll_rad"))
     np.testing.assert_allclose(imu.channel("accel_y_mps2")[200:], side[200:], atol=0.01 * shift)
-    undulation = simulate_planar(robot, steady(0.8, 120.0), 4, hills=Hills(undulation_ratio=0.05)).streams[
-        "truth"
-    ]
+    undulation = simulate(
+        robot, steady(0.8, 120.0), Ground(), 4, conditions=Conditions(undulation_ratio=0.05)
+    ).streams["truth"]
     for name in ("roll_rad", "pitch_rad"):
         tilt = undulation.channel(name)
         assert tilt.min() < 0.0 < tilt.max()
@@ -231,7 +169,7 @@ def test_every_run_scatters_by_itself():
     still = np.zeros((101, 3))
     biases = []
     for seed in range(150):
-        imu = simulate_planar(HUSKY, still, seed, scatter=SCATTER).streams["imu"]
+        imu = simulate(HUSKY, still, Ground(), seed, scatter=SCATTER).streams["imu"]
         biases.append(
             [imu.channel(name).mean() for name in ("gyro_z_radps", "accel_x_mps2", "pitch_rad", "roll_rad")]
         )
@@ -242,7 +180,7 @@ def test_every_run_scatters_by_itself():
         SCATTER.roll_offset_rad,
     ]
     np.testing.assert_allclose(np.std(biases, axis=0), std, rtol=0.25)
-    assert (simulate_planar(HUSKY, still, 0).streams["imu"].values[:, 2] == 0).all()
+    assert (simulate(HUSKY, still, Ground(), 0).streams["imu"].values[:, 2] == 0).all()
 
 
 def density(values, rate_hz):
@@ -271,7 +209,7 @@ def test_noise_of_every_channel_has_the_stated_density(robot):
     fine = replace(robot.sensors, hall_steps_ratio=20 * robot.sensors.hall_steps_ratio)
     robot, twist = robot.with_parts(sensors=fine), steady(speed, 1500.0)
     noisy, quiet = (
-        noisy_signals(robot, simulate_planar(robot, twist, 7, noise=noise, ground=ground, heading=True))
+        noisy_signals(robot, simulate(robot, twist, ground, 7, noise=noise, heading=True))
         for noise in (NOISE, None)
     )
     for name, (values, rate_hz) in noisy.items():
@@ -286,18 +224,18 @@ def test_encoders_lag_as_described_and_read_zero_at_rest():
     lag_s = AGRIMARO.sensors.encoder_time_constant_s
     twist = drive(AGRIMARO)
     slow, at_once = (
-        simulate_planar(robot, twist, 0).streams["wheels"] for robot in (AGRIMARO, quick(AGRIMARO))
+        simulate(robot, twist, Ground(), 0).streams["wheels"] for robot in (AGRIMARO, quick(AGRIMARO))
     )
     expected = low_passed(at_once.time_s, at_once.values[:, 0], lag_s, 0.1)
     np.testing.assert_allclose(slow.values[:, 0], expected, atol=0.02 * np.abs(expected).max())
-    still = simulate_planar(AGRIMARO, np.zeros((101, 3)), 0, noise=NOISE, scatter=SCATTER)
+    still = simulate(AGRIMARO, np.zeros((101, 3)), Ground(), 0, noise=NOISE, scatter=SCATTER)
     assert (still.streams["wheels"].values[:, :3] == 0).all()
 
 
 @pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
 def test_eccentric_wheels_ripple_once_a_turn_unseen_by_the_encoders(robot):
     run, plain = (
-        simulate_planar(robot, steady(0.5, 60.0), 1, outside=outside)
+        simulate(robot, steady(0.5, 60.0), Ground(), 1, outside=outside)
         for outside in ({"wheel_eccentricity_ratio": 0.05}, {})
     )
     np.testing.assert_array_equal(run.streams["wheels"].values[:, :2], plain.streams["wheels"].values[:, :2])
@@ -313,7 +251,9 @@ def test_eccentric_wheels_ripple_once_a_turn_unseen_by_the_encoders(robot):
 def test_stick_slip_spikes_the_current_while_the_wheels_crawl_and_only_then():
     for speed, spikes in ((0.15, True), (0.5, False), (0.0, False)):
         run, plain = (
-            simulate_planar(HUSKY, steady(speed, 60.0), 1, outside={"stick_slip_a": size}).streams["wheels"]
+            simulate(HUSKY, steady(speed, 60.0), Ground(), 1, outside={"stick_slip_a": size}).streams[
+                "wheels"
+            ]
             for size in (4.0, 0.0)
         )
         more = (run.values - plain.values)[100:, 2:].sum(axis=1)
@@ -322,15 +262,9 @@ def test_stick_slip_spikes_the_current_while_the_wheels_crawl_and_only_then():
             assert 0.1 < (more > 3.9).mean() < 0.4
 
 
-def test_effects_of_the_description_act_where_none_is_given():
-    robot = replace(HUSKY, effects={"gyro_bias_radps": 0.01, "accel_bias_mps2": 0.1})
-    imu = simulate_planar(robot, np.zeros((101, 3)), 0, effects={"gyro_bias_radps": 0.02}).streams["imu"]
-    np.testing.assert_allclose(imu.values[:, 2:4], np.tile([0.02, 0.1], (201, 1)))
-
-
 def test_on_a_soil_the_robot_slips_as_the_soil_has_it():
     ground = planar_ground(AGRIMARO, load_soil("grass"))
-    truth = simulate_planar(AGRIMARO, steady(0.6, 20.0), 0, ground=ground).streams["truth"]
+    truth = simulate(AGRIMARO, steady(0.6, 20.0), ground, 0).streams["truth"]
     assert truth.channel("slip_1_ratio")[-1] == pytest.approx(0.1255, abs=0.001)  # Danzi, 7.2.3
     with pytest.raises(ConfigError, match="gets stuck on terrain 'clay'"):
         planar_ground(replace(HUSKY, mass_kg=2000.0), load_soil("clay"))
@@ -341,9 +275,9 @@ def test_on_a_soil_the_robot_slips_as_the_soil_has_it():
     [
         (AGRIMARO.without("camera"), {}, "no section 'camera'"),
         (AGRIMARO.without("steering"), {}, "no section 'steering'"),
-        (HUSKY, {"twist": np.zeros((5, 2))}, r"twist has shape \(5, 2\)"),
-        (HUSKY, {"twist": np.full((5, 3), np.nan)}, "finite numbers"),
-        (HUSKY, {"twist": np.ones((5, 3))}, "sideways, which needs steered wheels"),
+        (HUSKY, {"drive": np.zeros((5, 2))}, r"twist has shape \(5, 2\)"),
+        (HUSKY, {"drive": np.full((5, 3), np.nan)}, "finite numbers"),
+        (HUSKY, {"drive": np.ones((5, 3))}, "sideways, which needs steered wheels"),
         (HUSKY, {"effects": {"magic_ratio": 1.0}}, "magic_ratio is 1.0"),
         (HUSKY, {"outside": {"magic_ratio": 1.0}}, "magic_ratio is 1.0"),
         (HUSKY, {"outside": {"stick_slip_a": math.inf}}, "stick_slip_a is inf"),
@@ -353,18 +287,7 @@ def test_on_a_soil_the_robot_slips_as_the_soil_has_it():
 )
 def test_impossible_inputs_are_refused_in_one_sentence(robot, options, message):
     with pytest.raises(ConfigError, match=message) as error:
-        simulate_planar(robot, **{"twist": np.zeros((5, 3)), "seed": 0} | options)
+        simulate(robot, **{"drive": np.zeros((5, 3)), "ground": Ground(), "seed": 0} | options)
     assert "\n" not in str(error.value)
     with pytest.raises(ConfigError, match="noise of channel 'x'"):
         noise_psd(NOISE, HUSKY, make_planar(HUSKY, Ground()), "x", np.ones(1), 0.5)
-
-
-@pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
-def test_a_finer_step_changes_little(robot):
-    coarse, fine = (
-        simulate_planar(robot, drive(robot), 2, hills=HILLS, effects={"force_slip_ratio": 0.3}, step_s=step_s)
-        for step_s in (0.01, 0.0025)
-    )
-    a, b = logged(coarse, robot), logged(fine, robot)
-    for c, channel in enumerate(CHANNELS[:-1]):
-        assert np.std(a[:, c] - b[:, c]) <= 0.02 * np.std(b[:, c]) + 1e-9, channel

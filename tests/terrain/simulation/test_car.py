@@ -1,4 +1,4 @@
-"""Plant of a car-like robot: laws, an independent integration, rest on a slope, and bad settings."""
+"""The car: laws, an independent integration, rest on a slope, stops, what a controller is given, bad settings."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from terrain.errors import ConfigError
 from terrain.kernels import is_finite
 from terrain.robots import load_robot
 from terrain.simulation import car
+from terrain.simulation.run import simulate
 
 ROBOT = load_robot("adap2e")
 
@@ -130,3 +131,43 @@ def test_settings_that_cannot_be_are_refused():
     for bad in ({"steering_delay_s": 1.0}, {"relaxation_m": 0.0}, {"acceleration_mps2": -1.0}):
         with pytest.raises(ConfigError):
             car.car_record(ROBOT, car.PlantSettings(**bad))
+
+
+WEAVE = car.open_loop(np.arange(0.0, 30.0, 0.1), 0.1 * np.sin(np.arange(0.0, 30.0, 0.1)))
+STOPS = car.CarDrive(3.0, ((15.0, 2.0),), duration_s=20.0)
+
+
+def run(controller=WEAVE, drive=STOPS, ground=None):
+    return simulate(ROBOT, drive, ground or car.level_ground(0.7, 0.1), 3, controller=controller)
+
+
+def test_specific_force_of_a_robot_at_rest_on_a_slope_is_gravity():
+    log = run(drive=car.CarDrive(0.0, duration_s=4.0), ground=car.level_ground(0.7, 0.2))
+    accel = log.streams["imu"].values[200:, 3:6].mean(axis=0)
+    assert accel == pytest.approx(GRAVITY_MPS2 * np.array([0.0, np.sin(0.2), np.cos(0.2)]), abs=0.05)
+    assert np.isnan(log.streams["truth"].channel("slip_rear_rad")[200:]).all()
+
+
+def test_robot_stops_where_its_drive_says_for_as_long_and_a_controller_is_given_what_is_logged():
+    seen = []
+
+    def controller(sample):
+        seen.append(sample.measured)
+        return WEAVE(sample)
+
+    log = run(controller)
+    truth, rows = log.streams["truth"], np.array(seen)
+    stands = (truth.channel("speed_x_mps") == 0.0) & (truth.time_s > 1.0)
+    assert truth.channel("distance_m")[stands] == pytest.approx(15.0, abs=0.1)
+    assert stands.sum() / 100 == pytest.approx(2.0, abs=0.1)
+    assert (log.streams["wheels"].values[stands[::2], 0] == 0.0).all()
+    assert rows[:, 0] == pytest.approx(log.streams["wheels"].values[:, 0])
+    assert rows[:, 5] == pytest.approx(log.streams["imu"].channel("gyro_z_radps")[::2])
+    assert rows[::5, 2] == pytest.approx(log.streams["gnss"].channel("position_x_m"))
+
+
+def test_commands_that_are_no_numbers_and_speeds_beyond_the_robot_are_refused():
+    with pytest.raises(ConfigError, match="controller commands"):
+        run(lambda sample: car.CarCommand(float("nan"), 1.0))
+    with pytest.raises(ConfigError, match="range"):
+        run(drive=car.CarDrive(20.0))

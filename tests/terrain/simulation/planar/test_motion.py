@@ -1,3 +1,5 @@
+"""The planar plant of skid-steer and swerve robots: kinematics, slip, forces and sensors against their formulas."""
+
 import math
 from dataclasses import replace
 
@@ -12,27 +14,19 @@ from terrain.effects import (
     CURRENT,
     GYRO,
     HEADING,
-    LIBRARY,
     SPEED_X,
     SPEED_Y,
     TURNING_CURRENT,
-    effect_named,
-    library_of,
     vector_of,
 )
 from terrain.kinematics.commands import inverse
 from terrain.robots import load_robot
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
-from terrain.simulation.planar.model import TRUTH, Ground, delayed, lagged, make_planar
-from terrain.simulation.planar.motion import (
-    ENDO_POWER,
-    ROLLING_MPS,
-    SLIDING_RADPS,
-    STANDSTILL_MPS,
-    direction,
-    move,
-)
+from terrain.simulation.planar.model import Ground
+from terrain.simulation.planar.motion import make_planar, move
 from terrain.simulation.planar.replay import replay, sense
+from terrain.simulation.planar.skid import ENDO_POWER, SLIDING_RADPS, STANDSTILL_MPS, direction
+from terrain.simulation.planar.swerve import ROLLING_MPS
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 ROBOTS = {"skid_steer": HUSKY, "swerve": AGRIMARO}
@@ -102,34 +96,6 @@ def test_the_wheels_of_a_twist_move_the_robot_by_that_twist(twist):
 
 
 @pytest.mark.parametrize("drive", ROBOTS)
-def test_an_effect_shows_most_where_the_library_says(drive):
-    robot = still(ROBOTS[drive])
-    wheel_speed, steer, grade, roll = rich(robot)
-    inputs = (make_planar(robot, Ground()), DT, wheel_speed, steer, grade, roll)
-
-    def shown(values):
-        return replay(inputs[0], vector_of(values), *inputs[1:])
-
-    size = shown({}).std(axis=0) + 1e-9
-    for effect in LIBRARY:
-        carrier = {p.name: 0.25 for p in effect_named(effect.modifies).parameters} if effect.modifies else {}
-        values = {p.name: 10 * p.step for p in effect.parameters}
-        change = np.sqrt(((shown(carrier | values) - shown(carrier)) ** 2).mean(axis=0)) / size
-        # yaw rate and heading, both currents and both speeds stand for each other; what shifts a speed in
-        # time shifts its slope, and most where friction turns about
-        alike = {GYRO: HEADING, CURRENT: TURNING_CURRENT, SPEED_X: SPEED_Y}
-        if effect.name == "clock_rate" or any(p.unit == "s" for p in effect.parameters):
-            alike[GYRO] = ACCEL
-        described = np.isin(CHANNELS, [*effect.channels, *(alike.get(c, c) for c in effect.channels)])
-        if effect not in library_of(drive):
-            assert (change == 0).all(), effect.name
-            continue
-        assert change[described].max() > 1e-3, effect.name
-        # through force and slip some of everything is everywhere
-        assert (change[~described] <= 0.8 * change[described].max() + 1e-9).all(), (effect.name, change)
-
-
-@pytest.mark.parametrize("drive", ROBOTS)
 @pytest.mark.parametrize(
     "values", [{}, {"force_slip_ratio": 0.5, "turning_slip_ratio": 0.3, "payload_ratio": 0.5}]
 )
@@ -160,6 +126,10 @@ def test_slip_follows_its_equation_of_force():
     for c in ({"force_slip_ratio": 0.6}, {"force_slip_ratio": 0.6, "shear_slip_ratio": 0.0}):
         free = replayed(still(HUSKY), c, np.column_stack([u, u]), grade=grade, ground=FREE, dt=dt)
         np.testing.assert_allclose(free[SPEED_X], shown[SPEED_X])
+
+
+def twists(truth):
+    return np.column_stack([truth[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
 
 
 def a_contact_for_each_wheel(robot, ground, wheel_speed, steer, dt):
@@ -199,11 +169,11 @@ def test_three_wheels_that_slip_each_by_itself_move_as_one_twist_that_slips():
     each = a_contact_for_each_wheel(robot, ground, wheel_speed, steer, dt)
     level = np.zeros(n)
     planar = make_planar(robot, ground)
-    one = move(planar, vector_of({}), dt, wheel_speed, steer, level, level, np.zeros((0, 3)))[:, :3]
+    one = twists(move(planar, vector_of({}), dt, wheel_speed, steer, level, level))
     lost = np.abs(each - twist)[1000:].mean(axis=0)
     assert (np.abs(one - each)[1000:].mean(axis=0) < 0.1 * lost).all()
     coarse = [np.ascontiguousarray(x[::40]) for x in (wheel_speed, steer, level)]
-    coarse = move(planar, vector_of({}), 40 * dt, *coarse, coarse[-1], np.zeros((0, 3)))[:, :3]
+    coarse = twists(move(planar, vector_of({}), 40 * dt, *coarse, coarse[-1]))
     assert (np.abs(coarse - one[::40])[25:].mean(axis=0) < 0.01 * lost).all()
 
 
@@ -222,18 +192,6 @@ def test_a_bent_thrust_curve_slips_by_its_inverse_and_a_load_presses_as_much_as_
                 still(robot), {"payload_ratio": 0.5}, at_rate([0.5] * n), grade=grade, ground=ground
             )
             assert loaded[SPEED_X][-1] == pytest.approx(shown, rel=1e-6)
-
-
-def test_a_tilt_of_effective_ratio_0_takes_no_traction_but_shows_in_the_accelerometer():
-    without_tilt = Ground(effective_ratio=0.0)
-    for robot in ROBOTS.values():
-        wheel_speed = at_rate([0.5] * len(robot.wheels))
-        level, tilted = (
-            replayed(still(robot), {}, wheel_speed, grade=g, roll=g, ground=without_tilt) for g in (0.0, 0.1)
-        )
-        for channel in (SPEED_X, SPEED_Y, CURRENT):
-            np.testing.assert_allclose(tilted[channel], level[channel])
-        assert tilted[ACCEL][-1] - level[ACCEL][-1] == pytest.approx(GRAVITY_MPS2 * math.sin(0.1))
 
 
 def test_shear_slip_is_the_inverse_of_its_curve_and_starts_with_slope_one():
@@ -332,14 +290,6 @@ def test_side_slip_builds_up_as_inertia_against_friction():
     assert not alone[SPEED_Y].any()
 
 
-def test_a_lag_is_exact_for_a_ramp_and_nothing_without_a_time_constant():
-    ramp = 0.3 * DT * np.arange(N)
-    exact = 0.3 * (TIME_S - 0.25 * (1.0 - np.exp(-TIME_S / 0.25)))
-    np.testing.assert_allclose(lagged(ramp, 0.25, DT), exact, atol=1e-12)
-    np.testing.assert_array_equal(lagged(ramp, 0.0, DT), ramp)
-    np.testing.assert_allclose(lagged(ramp, 1e-6, DT), ramp, atol=1e-6)
-
-
 def test_the_scale_of_an_encoder_is_that_of_its_wheel():
     robot = still(AGRIMARO)
     twist = np.array([0.5, 0.1, 0.2])
@@ -359,14 +309,6 @@ def test_the_scale_of_an_encoder_is_that_of_its_wheel():
     every = replayed(robot, sides, at_rate(rolled), at_rate(steer))
     one_sided = replayed(robot, {"one_sided_radius_ratio": 0.06}, at_rate(rolled), at_rate(steer))
     np.testing.assert_allclose(every[GYRO], one_sided[GYRO], rtol=1e-12)
-
-
-@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
-def test_each_motor_has_the_offset_of_its_current(robot):
-    wheel_speed = at_rate([0.5] * len(robot.wheels))
-    plain, shown = (replayed(robot, values, wheel_speed) for values in ({}, {"current_offset_a": 0.5}))
-    np.testing.assert_allclose(shown[CURRENT], plain[CURRENT] + 0.5 * len(robot.wheels))
-    np.testing.assert_array_equal(shown[TURNING_CURRENT], plain[TURNING_CURRENT])
 
 
 def test_steering_effects_match_their_formulas():
@@ -458,7 +400,7 @@ def test_forces_and_currents_balance(robot):
         shown = replayed(
             still(robot), values, at_rate([speed] * len(robot.wheels)), grade=grade, ground=ground
         )
-        pull_n = shown[CURRENT][-1] * planar.nm_per_a / planar.radius_m - friction_n
+        pull_n = shown[CURRENT][-1] * planar.body["nm_per_a"][0] / robot.wheel_radius_m - friction_n
         return pull_n, shown[SPEED_X][-1] / speed, shown[ACCEL][-1]
 
     pull, share, accel = steady()
@@ -484,7 +426,7 @@ def test_forces_and_currents_balance(robot):
 def test_turning_takes_current_of_the_difference_of_the_sides():
     ground = Ground(scrub_ratio=0.2)
     planar = make_planar(HUSKY, ground)
-    n_per_a = planar.nm_per_a / planar.radius_m
+    n_per_a = planar.body["nm_per_a"][0] / HUSKY.wheel_radius_m
     weight = HUSKY.mass_kg * GRAVITY_MPS2
     for sign in (1.0, -1.0):
         spot = replayed(HUSKY, {"scrub_ratio": 0.1}, at_rate([-0.3 * sign, 0.3 * sign]), ground=ground)
@@ -492,7 +434,7 @@ def test_turning_takes_current_of_the_difference_of_the_sides():
         assert spot[CURRENT][-1] == pytest.approx(0.0, abs=1e-9)
     spin = 0.4 / TIME_S[-1]
     speeding = replayed(HUSKY, {}, skid(HUSKY, np.full(N, 0.6), spin * TIME_S))
-    moment = planar.yaw_inertia_kgm2 * spin
+    moment = planar.body["yaw_inertia_kgm2"][0] * spin
     assert speeding[TURNING_CURRENT][N // 2] * n_per_a == pytest.approx(2 * moment / HUSKY.track_m)
 
 
@@ -507,29 +449,10 @@ def test_standing_wheels_give_no_motion_and_no_current(drive):
     assert on_a_slope[CURRENT][-1] > 0.0  # motors hold it
 
 
-def test_the_ground_disturbs_speeds_by_shares_and_the_yaw_rate_as_it_is():
-    planar, p = make_planar(still(AGRIMARO), FREE), vector_of({})
-    wheel_speed, steer, level = at_rate([0.5] * 3), np.zeros((N, 3)), np.zeros(N)
-    push = np.column_stack([np.full(N, 0.02), np.full(N, 0.03), np.full(N, 0.01)])
-    pushed = dict(zip(TRUTH, move(planar, p, DT, wheel_speed, steer, level, level, push).T, strict=True))
-    assert pushed["speed_x_mps"][-1] == pytest.approx(0.5 * 0.98)
-    assert pushed["speed_y_mps"][-1] == pytest.approx(0.5 * 0.98 * 0.03)
-    assert pushed["yaw_rate_radps"][-1] == pytest.approx(0.01)
-
-
-def test_a_delay_holds_its_ends_and_whole_samples_are_a_shift():
-    x = np.sin(0.3 * np.arange(50))
-    np.testing.assert_array_equal(delayed(x, 3.0, 0.0)[3:], x[:-3])
-    np.testing.assert_array_equal(delayed(x, 3.0, 0.0)[:3], x[0])
-    np.testing.assert_array_equal(delayed(x, -2.0, 0.0)[-2:], x[-1])
-    back = delayed(delayed(x, 4.0, 0.002), -4.0, -0.002)
-    np.testing.assert_allclose(back[8:-8], x[8:-8], atol=0.02)
-
-
 def test_sensors_that_are_right_show_the_truth():
     planar, p = make_planar(still(HUSKY), Ground()), vector_of({})
     wheel_speed, steer, grade, roll = rich(HUSKY)
-    truth = move(planar, p, DT, wheel_speed, steer, grade, roll, np.zeros((0, 3)))
+    truth = move(planar, p, DT, wheel_speed, steer, grade, roll)
     shown = sense(planar, p, DT, truth)
     for channel, name in (
         (GYRO, "yaw_rate_radps"),
@@ -540,4 +463,4 @@ def test_sensors_that_are_right_show_the_truth():
         (TURNING_CURRENT, "turning_current_a"),
         (HEADING, "yaw_rate_radps"),
     ):
-        np.testing.assert_array_equal(shown[:, CHANNELS.index(channel)], truth[:, TRUTH.index(name)])
+        np.testing.assert_array_equal(shown[:, CHANNELS.index(channel)], truth[name])

@@ -18,7 +18,7 @@ from terrain.kinematics.wheels import no_slip_twist
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.contact import shear_slip
-from terrain.simulation.dynamic.simulate import simulate
+from terrain.simulation.run import simulate
 from terrain.simulation.scenario import make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import load_soil
@@ -317,13 +317,6 @@ def test_a_hidden_effect_shows_with_its_sign_and_size(name):
         assert not corrected(robot).effects
 
 
-def test_both_arms_of_a_lever_show():
-    effects = parameters("lever_arm", (0.1, -0.07))
-    clean = driven("spot_turn", "tiles", LEVEL)
-    run = driven("spot_turn", "tiles", LEVEL, tuple(effects.items()))
-    assert lever(1)(run, ROBOT) - lever(1)(clean, ROBOT) == pytest.approx(0.07, rel=0.1)
-
-
 @pytest.mark.parametrize(
     "slip", [{"force_slip_ratio": 3.0}, {"shear_slip_ratio": 3.0}, {"force_slip_ratio": -0.3}]
 )
@@ -364,16 +357,6 @@ def test_absent_effects_leave_every_byte():
     for name, stream in one.streams.items():
         assert stream.time_s.tobytes() == other.streams[name].time_s.tobytes()
         assert stream.values.tobytes() == other.streams[name].values.tobytes()
-
-
-def test_effects_of_the_description_act_and_others_come_on_top():
-    extended = replace(ROBOT, effects={"gyro_bias_radps": 0.05, "camera_yaw_rad": 0.1})
-    drive = make_scenario("straight", ROBOT, "tiles", 10.0)
-    soils = {"tiles": load_soil("tiles")}
-    run = simulate(extended, drive, soils, 0, effects={"camera_yaw_rad": 0.0})
-    same = simulate(ROBOT, drive, soils, 0, effects={"gyro_bias_radps": 0.05})
-    for name, stream in run.streams.items():
-        np.testing.assert_array_equal(stream.values, same.streams[name].values)
 
 
 def test_only_the_other_logger_has_its_own_clock():

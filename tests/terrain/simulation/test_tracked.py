@@ -9,12 +9,19 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from terrain.constants import GRAVITY_MPS2
+from terrain.errors import ConfigError
 from terrain.kernels import filled
 from terrain.robots import load_robot
+from terrain.simulation.run import simulate
 from terrain.simulation.tracked import (
+    QUIET,
     STATE,
+    PrescribedSlip,
+    Slope,
+    Stretch,
     _residual,
-    drive,
+    drive_tracks,
+    slipped_twist,
     tilt_at,
     track_forces,
     track_loads,
@@ -24,7 +31,7 @@ from terrain.simulation.tracked import (
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import compaction_resistance, mobilised_ratio, plate_sinkage
 
-PATAKO, SAND = load_robot("patako"), load_soil("dry_sand")
+UGV, PATAKO, SAND = load_robot("orchard_ugv"), load_robot("patako"), load_soil("dry_sand")
 FIRM = replace(SAND, rolling_resistance_ratio=0.0, kc_npmn1=math.nan, kphi_npmn2=math.nan)
 """Sand that shears and neither resists nor is pressed."""
 
@@ -43,7 +50,7 @@ def steady(soil, belts, slope_rad=0.0, uphill_rad=0.0, seconds=1.0, robot=PATAKO
 
 def driven(belt_mps, soil, slope, dt_s, robot=PATAKO):
     states = np.zeros(len(belt_mps), STATE)
-    drive(tracks_on(robot, soil), np.array(slope), belt_mps, states, dt_s)
+    drive_tracks(tracks_on(robot, soil), np.array(slope), belt_mps, states, dt_s)
     return states
 
 
@@ -113,20 +120,6 @@ def test_a_climb_slips_as_the_balance_of_forces_asks(slope_deg):
     assert abs(v_y) + abs(w) < 1e-9
 
 
-def test_gravity_sets_the_side_slip_of_both_directions():
-    up_left = math.pi / 2
-    ahead, back = (steady(SAND, [v, v], 0.2, up_left) for v in (0.1, -0.1))
-    assert ahead[1] < -1e-4
-    assert back[1] < -1e-4
-    assert ahead[1] == pytest.approx(back[1], rel=0.05)
-
-
-def test_a_robot_that_turns_loses_a_part_of_the_difference_of_its_tracks():
-    v_x, _, w = steady(SAND, [-0.05, 0.05], seconds=0.3)
-    assert abs(v_x) < 1e-4
-    assert 0.5 * 0.1 / PATAKO.track_m < w < 0.9 * 0.1 / PATAKO.track_m
-
-
 def test_a_robot_at_rest_stays_on_a_slope():
     assert np.abs(steady(SAND, [0.0, 0.0], math.radians(15.0), 0.7, seconds=5.0)).max() < 1e-4
 
@@ -159,3 +152,52 @@ def test_any_step_gives_the_same_motion():
         return list(driven(belts, SAND, [0.2, 0.5], dt)[-1])[:5]
 
     assert after(0.01) == pytest.approx(after(0.0025), abs=1e-3)
+
+
+def test_prescribed_slip_moves_the_robot_as_the_paper_states():
+    run = simulate(UGV, np.tile([0.4, 0.6], (501, 1)), PrescribedSlip(1.1, 0.8), 0, sensors=QUIET)
+    truth, pose = run.streams["truth"], run.streams["pose"]
+    assert truth.channel("speed_x_mps")[1:] == pytest.approx(np.full(1000, (0.44 + 0.48) / 2))
+    assert truth.channel("yaw_rate_radps")[1:] == pytest.approx(np.full(1000, 0.48 - 0.44))
+    assert truth.channel("slip_right_ratio")[-1] == pytest.approx(0.2)
+    assert truth.channel("slip_left_ratio")[-1] == pytest.approx(-0.1 / 1.1)
+    radius = 0.46 / 0.04
+    assert pose.channel("position_y_m")[-1] == pytest.approx(radius * (1 - math.cos(0.4)), rel=1e-3)
+
+
+@pytest.mark.parametrize("power", [0.5, 1.0, 1.5])
+@pytest.mark.parametrize("belts", [(0.02, 0.1), (-0.03, 0.1), (0.05, -0.2)])
+def test_prescribed_turning_slip_is_endos_law_and_continuous_where_a_track_stops(power, belts):
+    left, right = belts
+    slip = PrescribedSlip(turning_loss_ratio=0.3, turning_exponent=power)
+    tracks = tracks_on(replace(PATAKO, track_m=0.4), slip)[0]
+    v_x, _, w = slipped_twist(tracks, *belts, 0.0, 0.0)
+    slip_left, slip_right = 1 - (v_x - 0.2 * w) / left, 1 - (v_x + 0.2 * w) / right
+    assert slip_left / slip_right == pytest.approx(-np.sign(left * right) * abs(right / left) ** power)
+    assert w == pytest.approx(0.7 * (right - left) / 0.4)
+    at = np.array(slipped_twist(tracks, 0.0, right, 0.0, 0.0))
+    assert slipped_twist(tracks, 1e-12, right, 0.0, 0.0) == pytest.approx(at, abs=2e-6)
+
+
+def test_soil_changes_where_a_stretch_ends_and_labels_say_so():
+    ground = [Stretch(load_soil("tilled_loam"), 2.0), Stretch(SAND)]
+    run = simulate(UGV, np.full((1001, 2), 0.3), ground, 0, slope=Slope(0.2), sensors=QUIET)
+    assert [label.terrain for label in run.labels] == ["tilled_loam", "dry_sand"]
+    truth = run.streams["truth"]
+    slip, at = truth.channel("slip_left_ratio"), round(run.labels[0].end_s * 100)
+    assert abs(truth.channel("position_x_m")[at] - 2.0) < 0.01
+    assert abs(slip[at + 100 :].mean() - slip[100 : at - 50].mean()) > 0.002
+
+
+@pytest.mark.parametrize(
+    ("ground", "speeds", "message"),
+    [
+        (load_soil("asphalt"), np.zeros((5, 2)), "soil 'asphalt' has the law 'magic'"),
+        (PrescribedSlip(), np.zeros((5, 3)), "track_speed_mps has shape"),
+        (PrescribedSlip(), np.full((5, 2), np.nan), "finite numbers"),
+        ([], np.zeros((5, 2)), "no stretch is given"),
+    ],
+)
+def test_what_cannot_be_driven_is_refused_in_one_sentence(ground, speeds, message):
+    with pytest.raises(ConfigError, match=message):
+        simulate(PATAKO, speeds, ground, 0)

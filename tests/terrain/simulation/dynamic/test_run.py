@@ -1,0 +1,396 @@
+"""Runs of the dynamic plant: slip as in the field, a truth that agrees with itself, and a loop that is the log."""
+
+import dataclasses
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from terrain.errors import ConfigError, DataError
+from terrain.logs.read import read_run
+from terrain.logs.write import write_run
+from terrain.records import Command
+from terrain.robots import load_robot
+from terrain.simulation.conditions import Conditions, Faults
+from terrain.simulation.dynamic.plant import make_plant, start_state, uniform_profile
+from terrain.simulation.dynamic.run import Drive
+from terrain.simulation.dynamic.step import advance, settle
+from terrain.simulation.run import simulate
+from terrain.simulation.scenario import Scenario, make_scenario
+from terrain.simulation.sensors import BODY_ROW, Gnss
+from terrain.terramechanics.soil import Scatter, load_soil, soil_names
+
+ROBOT = load_robot("agrimaro")
+SOILS = {name: load_soil(name) for name in soil_names()}
+HILLY = Conditions(
+    payload_kg=15.0,
+    payload_m=(0.1, -0.1),
+    grade_ratio=(0.05, -0.03),
+    undulation_ratio=0.02,
+    radius_factors=(1.01, 0.99, 1.0),
+)
+
+
+def with_part(section, **changes):
+    return ROBOT.with_parts(**{section: dataclasses.replace(getattr(ROBOT, section), **changes)})
+
+
+def run_of(scenario, terrain, seed=0, duration_s=None, **options):
+    drive = (
+        scenario if isinstance(scenario, Scenario) else make_scenario(scenario, ROBOT, terrain, duration_s)
+    )
+    return simulate(ROBOT, drive, SOILS, seed, **options)
+
+
+@lru_cache
+def straight(terrain, seed):
+    """Return the run of thesis 7.2.3: from rest at 1 m/s2 to 1 m/s."""
+    return run_of("straight", terrain, seed, 15.0)
+
+
+def wheels_of(stream, pattern):
+    return np.column_stack([stream.channel(pattern.format(i)) for i in (1, 2, 3)])
+
+
+@pytest.mark.parametrize(
+    ("terrain", "low", "high"),
+    [("tiles", -0.01, 0.01), ("grass", 0.116, 0.135), ("firm_soil_gravel", 0.122, 0.146)],
+)
+def test_steady_slip_is_the_one_measured_in_the_field(terrain, low, high):
+    truth = straight(terrain, 0).streams["truth"]
+    steady = truth.time_s > 5.0
+    assert low < wheels_of(truth, "slip_{}_ratio")[steady].mean() < high
+
+
+def test_a_start_slips_most_on_gravel_then_on_grass_then_on_tiles():
+    peaks = []
+    for terrain in ("tiles", "grass", "firm_soil_gravel"):
+        truth = straight(terrain, 0).streams["truth"]
+        start = (truth.channel("speed_x_mps") > 0.2) & (truth.time_s < 3.0)
+        slip = wheels_of(truth, "slip_{}_ratio")[start].mean(axis=1)
+        peaks.append(slip.max())
+        assert peaks[-1] > 2 * np.mean(wheels_of(truth, "slip_{}_ratio")[truth.time_s > 5.0])
+    assert peaks[0] < 0.05 < 0.25 < peaks[1] < peaks[2] - 0.03 < 0.6
+
+
+def test_the_truth_agrees_with_itself():
+    """Slip, slip angle and acceleration once more, from the positions and speeds beside them."""
+    run = run_of("complex", "grass", 3, conditions=HILLY)
+    truth = run.streams["truth"]
+    t = truth.time_s
+    v = np.column_stack([truth.channel("speed_x_mps"), truth.channel("speed_y_mps")])
+    turn, yaw = truth.channel("yaw_rate_radps"), truth.channel("yaw_rad")
+    steer, radius = wheels_of(truth, "steer_{}_rad"), 0.2 * np.array(HILLY.radius_factors)
+    centre = v[:, :, None] + turn[:, None, None] * np.array(
+        [-ROBOT.wheel_positions_m[:, 1], ROBOT.wheel_positions_m[:, 0]]
+    )
+    along = np.cos(steer) * centre[:, 0] + np.sin(steer) * centre[:, 1]
+    across = -np.sin(steer) * centre[:, 0] + np.cos(steer) * centre[:, 1]
+    wheel_speed = radius * wheels_of(truth, "wheel_{}_radps")
+    fastest = np.maximum(abs(wheel_speed), abs(along))
+    slip = wheels_of(truth, "slip_{}_ratio")
+    known = fastest >= 0.051
+    np.testing.assert_allclose(slip[known], ((wheel_speed - along) / fastest)[known], atol=1e-9)
+    assert np.isnan(slip[fastest < 0.049]).all()
+    angle = wheels_of(truth, "slip_angle_{}_rad")
+    moving = np.hypot(along, across) > 0.051
+    np.testing.assert_allclose(angle[moving], np.arctan2(across, abs(along))[moving], atol=1e-9)
+    # central differences over 20 ms: within what the acceleration changes in that time
+    accel = np.gradient(v, t, axis=0) + turn[:, None] * np.column_stack([-v[:, 1], v[:, 0]])
+    true_accel = np.column_stack([truth.channel("accel_x_mps2"), truth.channel("accel_y_mps2")])
+    assert np.sqrt(((accel - true_accel) ** 2).mean()) < 0.05 * true_accel.std()
+    c, s = np.cos(yaw), np.sin(yaw)
+    world = np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]])
+    moved = np.cumsum(0.5 * (world[1:] + world[:-1]) * np.diff(t)[:, None], axis=0)
+    place = np.column_stack([truth.channel("position_x_m"), truth.channel("position_y_m")])
+    np.testing.assert_allclose(moved, place[1:] - place[0], atol=5e-3)
+    assert np.ptp(place, axis=0).min() > 1.0
+    mass_n = 105.0 * 9.80665
+    assert wheels_of(truth, "normal_{}_n").sum(axis=1).mean() == pytest.approx(mass_n, rel=0.01)
+
+
+@pytest.mark.parametrize("added", ["camera", "gnss"])
+def test_an_added_fault_or_sensor_changes_no_other_stream(added):
+    options = {
+        "camera": {"faults": Faults(camera_lost_s=((1.0, 3.0),), by_chance=False)},
+        "gnss": {"gnss": Gnss(), "faults": Faults(gnss_lost_s=((2.0, 3.0),))},
+    }[added]
+    plain, changed = (run_of("straight", "grass", 5, 6.0, **given) for given in ({}, options))
+    assert ("gnss" in changed.streams) == (added == "gnss")
+    assert (len(plain.streams["odometry"]) > len(changed.streams["odometry"])) == (added == "camera")
+    for name in ("wheels", "steering", "imu", "commands", "truth"):
+        np.testing.assert_array_equal(plain.streams[name].values, changed.streams[name].values)
+
+
+def test_labels_cover_stretches_with_all_wheels_on_one_terrain():
+    time_s = np.arange(601) / 50
+    twist = np.column_stack([np.minimum(time_s, 1.0), np.zeros((601, 2))])
+    patches = ((0.0, "tiles"), (3.0, "grass"), (6.0, "snow"))
+    run = simulate(ROBOT, Scenario("mine", 50.0, time_s, twist, patches), SOILS, 1)
+    truth = run.streams["truth"]
+    x = (
+        truth.channel("position_x_m")[:, None]
+        + ROBOT.wheel_positions_m[:, 0] * np.cos(truth.channel("yaw_rad"))[:, None]
+    )
+    under = np.searchsorted([3.0, 6.0], x, side="right")
+    assert run.terrains == ("tiles", "grass", "snow")
+    for number, label in enumerate(run.labels):
+        inside = (truth.time_s >= label.start_s) & (truth.time_s < label.end_s)
+        alone = (under == number).all(axis=1)
+        # the robot drifts by centimetres: distance travelled is not quite x
+        assert (inside != alone).sum() <= 3
+    ends = [label.end_s for label in run.labels]
+    starts = [label.start_s for label in run.labels]
+    assert starts[0] == 0.0
+    assert all(
+        start > end + 0.9 for start, end in zip(starts[1:], ends[:-1], strict=True)
+    )  # 1.015 m at 1 m/s
+
+
+def test_a_ground_that_is_crossed_in_a_moment_gets_no_label():
+    time_s = np.arange(501) / 50
+    twist = np.column_stack([np.minimum(time_s, 1.0), np.zeros((501, 2))])
+    drive = Scenario("mine", 50.0, time_s, twist, ((0.0, "tiles"), (3.0, "asphalt"), (4.3, "snow")))
+    assert simulate(ROBOT, drive, SOILS, 1).terrains == ("tiles", "snow")
+
+
+def test_terrain_varies_along_the_path_as_soil_and_conditions_state(monkeypatch):
+    plants = []
+
+    def noted(plant, profile, state, wheel, steer, substeps, noise, rows):
+        plants.append(profile)
+        rows[:] = np.zeros(1, rows.dtype)
+
+    monkeypatch.setattr("terrain.simulation.dynamic.run.advance", noted)
+    rough = Scatter("friction_angle_rad", 0.0, 0.3), Scatter("rolling_resistance_ratio", 0.0, 0.5)
+    soils = {
+        "tiles": dataclasses.replace(SOILS["tiles"], scatter=()),
+        "rough": dataclasses.replace(SOILS["grass"], scatter=rough),
+    }
+    time_s = np.arange(20_001) / 50
+    drive = Scenario("mine", 50.0, time_s, np.zeros((len(time_s), 3)), ((0.0, "tiles"), (100.0, "rough")))
+    simulate(ROBOT, drive, soils, 0, conditions=Conditions(roughness_factor=3.0, field_length_m=1.0))
+    (plant,) = plants
+    assert plant.field.shape[2] * 0.1 > 0.2 * 10.0 * time_s[-1]  # as far as it can come
+    np.testing.assert_allclose(plant.patches["roughness_m3"], [12e-6, 3 * soils["rough"].roughness_m3])
+    assert (plant.field[:, :, :1000] == 1.0).all()
+    field = plant.field[:, :, 1000:]
+    n_apart = field.shape[2] * 0.1 / (2 * 1.0)
+    for factors, ratio in zip(field, (0.3, 0.5), strict=True):
+        np.testing.assert_allclose(factors.mean(axis=1), 1.0, atol=4.5 * ratio / math.sqrt(n_apart))
+        np.testing.assert_allclose(np.log(factors).std(axis=1), ratio, rtol=0.15)
+        unit = (np.log(factors) - np.log(factors).mean(axis=1, keepdims=True)) / ratio
+        np.testing.assert_allclose((unit[:, :-10] * unit[:, 10:]).mean(axis=1), math.exp(-1.0), atol=0.15)
+    apart = np.corrcoef(np.log(field).reshape(6, -1)) - np.eye(6)
+    assert np.abs(apart).max() < 4.5 / math.sqrt(n_apart)  # wheels and kinds each for themselves
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"robot": load_robot("husky")}, "robot husky: drive 'skid_steer' is not simulated"),
+        ({"robot": ROBOT.without("camera")}, "robot agrimaro: .* no section 'camera'"),
+        ({"ground": {"tiles": SOILS["tiles"]}}, "scenario straight: terrain 'grass' has no soil"),
+        ({"conditions": Conditions(payload_kg=300.0, payload_m=(0.6, 0.0))}, "tips it over: wheel 1 would"),
+        (
+            {"drive": Scenario("odd", 60.0, np.arange(9) / 60, np.zeros((9, 3)), ((0.0, "grass"),))},
+            "divide 1000",
+        ),
+        (
+            {"conditions": Conditions(payload_kg=1e5)},
+            "cannot be integrated in steps of 0.001 s: .*contacts are",
+        ),
+        ({"robot": dataclasses.replace(ROBOT, mass_kg=0.1)}, "cannot be integrated .*tyres are"),
+        ({"robot": with_part("body", yaw_inertia_kgm2=1e-9)}, "its motion cannot be integrated"),
+        ({"robot": with_part("sensors", imu_rate_hz=1e9)}, "sensors: imu_rate_hz is 1e[+]09, at most 1000"),
+        ({"robot": with_part("motors", speed_max_radps=1e6)}, "km of terrain are simulated at most"),
+        *(
+            ({"command_delay_s": s}, "a time from 0 to 0.5 s is required")
+            for s in (-0.01, 0.51, math.nan, "soon")
+        ),
+    ],
+)
+def test_invalid_simulations_are_refused_in_one_sentence(changed, message):
+    drive = make_scenario("straight", ROBOT, "grass", 4.0)
+    with pytest.raises(ConfigError, match=message) as error:
+        simulate(**{"robot": ROBOT, "drive": drive, "ground": SOILS, "seed": 0} | changed)
+    assert "\n" not in str(error.value)
+
+
+STAND = Command(np.zeros(3), np.zeros(3), np.zeros(3), {})
+
+
+class Listener:
+    """A controller that keeps what it is given and asks another one what to do."""
+
+    def __init__(self, controller):
+        self.controller, self.samples = controller, []
+
+    def __call__(self, sample):
+        self.samples.append(sample)
+        return self.controller(sample)
+
+    def received(self, stream):
+        given = [sample.readings[stream] for sample in self.samples if stream in sample.readings]
+        return np.concatenate([r.time_s for r in given]), np.vstack([r.values for r in given])
+
+
+def kinematic(sample):
+    """Command the wheel speeds of the desired twist, with the steering straight ahead."""
+    wheel = np.full(3, sample.twist[0] / 0.2) + sample.twist[2] * np.array([0.0, 0.0, 0.756 / 0.2])
+    steer = np.array([-1.0, 1.0, 0.0]) * math.atan2(0.5075 * sample.twist[2], max(sample.twist[0], 0.1))
+    return Command(wheel, steer, sample.twist, {})
+
+
+@pytest.mark.parametrize(
+    ("scenario", "terrain", "options"),
+    [
+        (
+            "complex",
+            "grass",
+            {"conditions": HILLY, "gnss": Gnss(rate_hz=7.0), "faults": Faults(gnss_lost_s=((3.0, 5.0),))},
+        ),
+        ("straight", "tiles", {"faults": Faults(camera_lost_s=((2.0, 3.51), (4.0, 4.001)))}),
+        ("course", ["tiles", "snow", "grass"], {"duration_s": 25.0}),
+    ],
+)
+def test_the_readings_of_a_controller_equal_the_log(scenario, terrain, options, tmp_path):
+    listener = Listener(kinematic)
+    run = run_of(scenario, terrain, 3, controller=listener, **options)
+    drive = make_scenario(scenario, ROBOT, terrain, options.get("duration_s"))
+    ticks_s = np.array([sample.time_s for sample in listener.samples])
+    np.testing.assert_array_equal(ticks_s, drive.time_s)
+    np.testing.assert_array_equal([sample.twist for sample in listener.samples], drive.twist)
+    sensed = set(run.streams) - {"commands", "truth"}
+    assert set().union(*(sample.readings for sample in listener.samples)) == sensed
+    for name in sensed:
+        stream = run.streams[name]
+        time_s, values = listener.received(name)
+        n = np.searchsorted(
+            stream.time_s, ticks_s[-1], side="right"
+        )  # after the last tick no controller runs
+        assert time_s.tobytes() == stream.time_s[:n].tobytes()
+        assert values.tobytes() == stream.values[:n].tobytes()
+        for before_s, sample in zip([-1.0, *ticks_s[:-1]], listener.samples, strict=True):
+            stamps = sample.readings[name].time_s if name in sample.readings else np.empty(0)
+            assert ((stamps > before_s) & (stamps <= sample.time_s)).all()
+    assert all(len(sample.readings["wheels"].time_s) == 1 for sample in listener.samples)
+    for start_s, end_s in options.get("faults", Faults()).camera_lost_s:
+        inside = [s for s in listener.samples if start_s + 0.02 <= s.time_s < end_s]
+        assert not any("odometry" in sample.readings for sample in inside)
+    truth = run.streams["truth"]
+    for label in run.labels:
+        for sample in listener.samples:
+            if label.start_s <= sample.time_s < label.end_s:
+                assert sample.terrain == label.terrain
+    known = [sample.terrain for sample in listener.samples]
+    assert (("" in known) and len(set(known)) > 2) == (scenario == "course")
+    assert read_run(write_run(run, tmp_path)).streams["truth"].channels == truth.channels
+
+
+@pytest.mark.parametrize("delay", [1, 33, 500])
+def test_pieces_between_commands_are_the_drive_in_which_each_step_has_its_own(delay):
+    rng = np.random.default_rng(delay)
+    soil = SOILS["clay"]
+    conditions = Conditions(
+        payload_kg=10.0, payload_m=(0.1, 0.0), grade_ratio=(0.03, 0.02), leg_backlash_rad=0.02
+    )
+    plant, profile = make_plant(ROBOT, conditions), uniform_profile(ROBOT, soil, roughness_m3=1e-4)
+    n, substeps = 60, 20
+    wheel, steer = 4 * rng.random((n, 3)), 0.3 * rng.standard_normal((n, 3))
+    noise = rng.standard_normal((n * substeps, 3))
+    start = start_state(np.zeros(3))
+    settle(plant, profile, start)
+    one, other = start.copy(), start.copy()
+    pieces, whole = np.zeros(n * substeps, BODY_ROW), np.zeros(n * substeps, BODY_ROW)
+    drive = Drive(plant, profile, one, noise, pieces)
+    for k in range(n):
+        assert drive.until(k * substeps + 1)
+        drive.command(k * substeps + delay, wheel[k], steer[k])
+    assert drive.until(n * substeps)
+    tick = (np.arange(n * substeps) - delay) // substeps
+    held_wheel, held_steer = (np.where(tick[:, None] >= 0, rows[tick], 0.0) for rows in (wheel, steer))
+    advance(plant, profile, other, held_wheel, held_steer, 1, noise, whole)
+    assert one.tobytes() == other.tobytes()
+    assert pieces.tobytes() == whole.tobytes()
+
+
+@pytest.mark.parametrize("delay_s", [0, np.float64(0.123), 0.5])
+def test_wheels_stand_until_the_first_command_arrives(delay_s):
+    def at_once(sample):
+        return STAND._replace(wheel_radps=np.full(3, 3.0), steer_rad=np.full(3, 0.2))
+
+    run = run_of("stand", "tiles", controller=at_once, duration_s=2.0, command_delay_s=delay_s)
+    truth = run.streams["truth"]
+    turning = truth.time_s[np.abs(wheels_of(truth, "wheel_{}_radps")).max(axis=1) > 0]
+    assert delay_s < turning[0] <= delay_s + 0.02
+    assert (run.streams["commands"].values[:, 3:6] == 3.0).all()  # as decided, not as delayed
+    np.testing.assert_allclose(wheels_of(truth, "wheel_{}_radps")[-1], 3.0, atol=0.1)
+    np.testing.assert_allclose(wheels_of(truth, "steer_{}_rad")[-1], 0.2, atol=0.025)
+
+
+def test_leg_backlash_deflects_the_robot_unseen_by_the_steering_encoder():
+    runs = [
+        run_of(
+            "starts", "grass", seed=1, duration_s=20.0, conditions=Conditions(leg_backlash_rad=backlash_rad)
+        )
+        for backlash_rad in (0.0, 0.03)
+    ]
+    firm, loose = (run.streams["truth"] for run in runs)
+    assert np.abs(firm.channel("steer_3_rad")).max() <= ROBOT.steering.dead_band_rad
+    leg = loose.channel("steer_3_rad") - firm.channel("steer_3_rad")  # it steers straight ahead in both
+    assert np.abs(leg).max() == pytest.approx(0.03, abs=1e-9)
+    assert np.ptp(leg) == pytest.approx(0.06, abs=1e-9)
+    np.testing.assert_array_equal(runs[0].streams["steering"].values, runs[1].streams["steering"].values)
+    drift_m = loose.channel("position_y_m") - firm.channel("position_y_m")
+    assert np.abs(drift_m).max() > 0.02  # it goes off to the side
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"wheel_radps": np.zeros(2)}, "wheel_radps of its command at 1.02 s is .*, 3 finite numbers"),
+        ({"wheel_radps": np.array([0.0, math.nan, 0.0])}, "wheel_radps of its command at 1.02 s"),
+        ({"steer_rad": [0.0, math.inf, 0.0]}, "steer_rad of its command at 1.02 s"),
+        ({"steer_rad": "left"}, "steer_rad of its command at 1.02 s is 'left'"),
+        ({"twist": np.zeros((3, 1))}, "twist of its command at 1.02 s"),
+        ({"status": {}}, "at 1.02 s has nothing, that of the first has gain_ratio: the same names"),
+        ({"status": {"gain_ratio": 1.0, "more_ratio": 1.0}}, "at 1.02 s has gain_ratio, more_ratio, that of"),
+        ({"status": {"gain_ratio": "high"}}, "status of its command at 1.02 s: could not convert"),
+        ({"status": None}, "status of its command at 1.02 s"),
+    ],
+)
+def test_an_invalid_command_is_refused_with_its_time(changed, message):
+    def controller(sample):
+        command = STAND._replace(status={"gain_ratio": math.nan})
+        return command._replace(**changed) if sample.time_s > 1.01 else command
+
+    with pytest.raises(DataError, match=message) as error:
+        run_of("straight", "grass", controller=controller, duration_s=4.0)
+    assert "\n" not in str(error.value)
+
+
+def test_a_controller_sees_nothing_of_a_motion_that_blows_up():
+    listener = Listener(lambda sample: kinematic(sample)._replace(status={"gain_ratio": 1.0}))
+    with pytest.raises(ConfigError, match="its motion cannot be integrated"):
+        simulate(
+            with_part("motors", friction_nm=1e9),
+            make_scenario("arc", ROBOT, "grass", 5.0),
+            SOILS,
+            0,
+            controller=listener,
+        )
+    for sample in listener.samples:
+        assert all(np.isfinite(reading.values).all() for reading in sample.readings.values())
+
+
+def test_a_status_is_a_stream_whose_names_have_units():
+    def controller(sample):
+        return STAND._replace(status={"gain_ratio": 2.0 * sample.time_s})
+
+    control = run_of("straight", "grass", controller=controller, duration_s=4.0).streams["control"]
+    assert control.channels == ("gain_ratio",)
+    np.testing.assert_array_equal(control.values[:, 0], 2.0 * control.time_s)
+    with pytest.raises(DataError, match="status of its command at 0 s: channel 'mood' does not end in"):
+        run_of("straight", "grass", controller=lambda _: STAND._replace(status={"mood": 1.0}), duration_s=4.0)
