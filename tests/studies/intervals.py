@@ -147,13 +147,15 @@ def skid_run(radius_m, track_m, lidar_s, wheels_s, seed, terrain="asphalt", slip
     return RunLog(f"run_{seed:03d}", "warthog", streams, labels, session=session)
 
 
-def drawn_runs(law, theta, rng, n=6, noise=0.01, run_std=0.1, offset_std=0.003, reach=0.6):
-    """Return bins of runs whose factor, offset and shape differ as runs do."""
+def drawn_runs(
+    law, theta, rng, n=6, noise=0.01, run_std=0.1, offset_std=0.003, reach=0.6, offset=0.0, tilt=0.0
+):
+    """Return bins of runs whose factor and offset differ as runs do, and that share an offset and a tilt a slip."""
     runs = []
     for number in range(n):
         slip = np.linspace(0.005, reach * rng.uniform(0.8, 1.0), 18)
-        factor = np.exp(run_std * rng.standard_normal())
-        mu = factor * traction_ratio(law, theta, slip + offset_std * rng.standard_normal())
+        factor = np.exp(run_std * rng.standard_normal()) * (1.0 + tilt * slip)
+        mu = factor * traction_ratio(law, theta, slip + offset + offset_std * rng.standard_normal())
         mu = mu + noise * rng.standard_normal(len(mu))
         runs.append(RunBins(f"run {number}", slip, np.full(18, 0.003), mu, np.full(18, noise)))
     return runs
@@ -298,12 +300,15 @@ def _odometry(seed: int) -> Iterator[Interval]:
 
 
 def _slip_curve(seed: int) -> Iterator[Interval]:
+    """Runs that share the errors that the interval of a peak states: of the radius, and of the curve's tilt."""
     for name, law, theta, rho in (
         ("sand", "janosi", (0.6, 0.16), 0.1),
         ("snow", "magic", (5.0, 2.0, 0.3, 1.0), 0.04),
     ):
         rng = np.random.default_rng(seed)
-        runs = drawn_runs(law, theta, rng)
+        whole = net_peak(lambda s: traction_ratio(law, theta, s) - rho, 0.0, 0.6).slip_ratio  # noqa: B023
+        offset, tilt = rng.standard_normal(2) * (SYSTEMATIC_SLIP_STD, SHAPE_STD_RATIO / whole)
+        runs = drawn_runs(law, theta, rng, offset=offset, tilt=tilt)
         curve = learn_curve(runs, Resistances(np.full(len(runs), rho), np.full(len(runs), 0.01)), rng, 60)
         true = net_peak(lambda s: traction_ratio(law, theta, s) - rho, *curve.slip_range)  # noqa: B023
         yield Interval(f"peak_{name}", *curve.peak_interval, true.slip_ratio)
