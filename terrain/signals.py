@@ -125,6 +125,25 @@ class Pair(NamedTuple):
         )
 
 
+def agreement(measured: Array, reference: Array) -> tuple[Array, Array]:
+    """Return correlation about zero and gain (c,) of columns (n, c) over their reference, of rows where both are known.
+
+    The correlation counts the level of a steady motion.  They are 0 and NaN where the reference, or both, is 0.
+
+    Examples
+    --------
+    >>> agreement(np.array([[2.0], [-4.0], [np.nan]]), np.array([[1.0], [-2.0], [3.0]]))
+    (array([1.]), array([2.]))
+    """
+    known = np.isfinite(measured) & np.isfinite(reference)
+    m, p = np.where(known, measured, 0.0), np.where(known, reference, 0.0)
+    product, power = (m * p).sum(axis=0), (p * p).sum(axis=0)
+    norm = np.sqrt(power * (m * m).sum(axis=0))
+    none = np.full(len(power), np.nan)
+    correlation = np.divide(product, norm, out=np.zeros(len(norm)), where=norm > 0.0)
+    return correlation, np.divide(product, power, out=none, where=power > 0.0)
+
+
 def low_pass(values: Array, step_s: float, time_constant_s: float, at_first: bool = False) -> Array:
     """Return values (n, ...) at even steps behind a first-order low-pass, which starts at 0 or at the first value.
 

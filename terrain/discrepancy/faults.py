@@ -2,7 +2,7 @@
 
 A fault is a linear map of columns (:class:`Change`): a sign that is turned, columns that are exchanged, another unit,
 an offset.  The right reading of logs is one under which every channel follows what the wheels predict, with a gain
-above zero (:func:`gains_of`), of a size that robots and effects reach, without an offset that no bias has.  The
+above zero (:class:`Agreement`), of a size that robots and effects reach, without an offset that no bias has.  The
 simulation may be wrong: a fault is what no effect of the catalogue does.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from itertools import combinations
@@ -26,6 +26,7 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.records import Array
 from terrain.robots import Robot
+from terrain.signals import agreement
 
 # -- How each run responds to its wheels: measured beside predicted on one clock, and the gain between them --
 
@@ -101,48 +102,51 @@ def responses_of(
     return tuple(responses)
 
 
-def fits(response: Response) -> tuple[Array, Array]:
-    """Return correlation about zero of each channel (channels,), and twice the log-likelihood that it gains.
+class Agreement(NamedTuple):
+    """How channels (..., channels) follow what the wheels predict.
 
-    Both are 0 where the prediction is too small to ask for.  The accelerometer's is about its mean, since
-    its bias is large.
+    Parameters
+    ----------
+    correlation : about zero, of the accelerometer about its mean, since its bias is large; 0 where the prediction
+        is too small to ask for
+    likelihood : twice the logarithm that they gain by following with a gain above zero
+    gain : about zero, of the accelerometer that of its acceleration, beside gravity and a bias; NaN where unknown
     """
-    n, m, p = _known_pairs(response)
-    if n[A]:
-        known = np.isfinite(response.measured[:, A]) & np.isfinite(response.predicted[:, A])
-        for values in (m, p):
-            values[:, A] -= np.where(known, values[:, A].sum() / n[A], 0.0)
-    power = (p * p).sum(axis=0)
-    asked = np.sqrt(power / np.maximum(n, 1)) > np.array([LEAST[c] for c in range(len(CHANNELS))])
-    norm = np.sqrt(power * (m * m).sum(axis=0))
-    correlation = np.divide((m * p).sum(axis=0), norm, out=np.zeros(len(n)), where=asked & (norm > 0))
-    ahead = np.clip(correlation, 0.0, MAX_FIT)
-    n_independent = n * min(response.period_s * INDEPENDENT_HZ, 1.0)
-    return correlation, -n_independent * np.log1p(-(ahead**2))
+
+    correlation: Array
+    likelihood: Array
+    gain: Array
+
+
+def agreement_of(responses: Sequence[Response]) -> Agreement:
+    """Return how the channels of runs (runs, channels) follow the wheels."""
+    return Agreement(*map(np.array, zip(*map(_agreement, responses), strict=True)))
 
 
 def gains_of(response: Response) -> tuple[Array, Array]:
-    """Return the gain of each channel (channels,) about zero, and its correlation; NaN and 0 where unknown.
+    """Return the gain of each channel (channels,), and its correlation; see :class:`Agreement`."""
+    run = _agreement(response)
+    return run.gain, run.correlation
 
-    The accelerometer's is that of its acceleration, beside gravity and a bias.
-    """
-    correlation = fits(response)[0]
-    _, m, p = _known_pairs(response)
-    power = (p * p).sum(axis=0)
-    gain = np.divide((m * p).sum(axis=0), power, out=np.full(len(power), np.nan), where=correlation != 0.0)
+
+def _agreement(response: Response) -> Agreement:
+    measured, predicted = response.measured.copy(), response.predicted.copy()
+    known = np.isfinite(measured) & np.isfinite(predicted)
+    n, rows = known.sum(axis=0), known[:, A]
+    climb, accel = response.climb_mps2[rows], measured[rows, A]
+    basis = np.column_stack([predicted[rows, A] - climb, climb, np.ones(climb.size)])
+    for values in (measured, predicted) if n[A] else ():
+        values[:, A] -= values[rows, A].mean()
+    power = np.where(known, predicted, 0.0) ** 2
+    asked = np.sqrt(power.sum(axis=0) / np.maximum(n, 1)) > np.array([LEAST[c] for c in range(len(CHANNELS))])
+    correlation, gain = agreement(measured, predicted)
+    correlation = np.where(asked, correlation, 0.0)
+    gain[correlation == 0.0] = np.nan
     if correlation[A] != 0.0:
-        rows = np.isfinite(response.measured[:, A]) & np.isfinite(response.predicted[:, A])
-        climb = response.climb_mps2[rows]
-        basis = np.column_stack([p[rows, A] - climb, climb, np.ones(climb.size)])
         varies = np.std(basis[:, 0]) > 0.5 * LEAST[A]
-        gain[A] = np.linalg.lstsq(basis, m[rows, A], rcond=None)[0][0] if varies else np.nan
-    return gain, correlation
-
-
-def _known_pairs(response: Response) -> tuple[Array, Array, Array]:
-    """Return how many rows of each channel are known, and both sides (m, channels), 0 where either is not."""
-    known = np.isfinite(response.measured) & np.isfinite(response.predicted)
-    return known.sum(axis=0), *(np.where(known, x, 0.0) for x in (response.measured, response.predicted))
+        gain[A] = np.linalg.lstsq(basis, accel, rcond=None)[0][0] if varies else np.nan
+    n_independent = n * min(response.period_s * INDEPENDENT_HZ, 1.0)
+    return Agreement(correlation, -n_independent * np.log1p(-(np.clip(correlation, 0.0, MAX_FIT) ** 2)), gain)
 
 
 # -- A fault: what is wrong with a column, in words, with its repair ------------------------------------------
@@ -421,12 +425,10 @@ def candidate_changes(robot: Robot) -> Changes:
     return (*changes, *(Change(sign, Column.WHEELS, -1.0, wheel) for wheel in (-1, *each)))
 
 
-def reading_of(change: Change, before: Sequence[Response], after: Sequence[Response]) -> Reading:
+def reading_of(change: Change, before: Agreement, after: Agreement) -> Reading:
     """Return what a change makes of runs."""
-    was, now = ([fits(run) for run in runs] for runs in (before, after))
-    old, new = (np.array([correlation for correlation, _ in fitted]) for fitted in (was, now))
-    gain = np.array([b[1].sum() - a[1].sum() for a, b in zip(was, now, strict=True)])
-    keys = list(FOLLOWERS)
+    keys, old, new = list(FOLLOWERS), before.correlation, after.correlation
+    gain = after.likelihood.sum(axis=1) - before.likelihood.sum(axis=1)
     turned = (old < TURNED) & (new > RIGHT)
     asked = old != 0.0  # what a run does not show cannot be wrong in it
     mended = (asked & (turned | ((new - old > RISE) & (new > CLEAR))))[:, keys].any(axis=1)
@@ -450,29 +452,28 @@ def _best_reading(readings: Sequence[Reading]) -> tuple[Reading, list[Reading]] 
     return near[0], near[1:]
 
 
-def _runs_with(reading: Reading, responses: Sequence[Response]) -> list[int]:
+def _runs_with(reading: Reading, ids: Sequence[str], old: Array) -> list[int]:
     """Return the runs that have a fault: those that it suits, and of their sessions those that cannot say.
 
-    A run that drives straight measures no sign of a gyro; it has that of the others.
+    A run that drives straight measures no sign of a gyro; it has that of the others.  ``old`` are the correlations
+    (runs, channels) without the change.
     """
-    session = [session_of(run.run_id) for run in responses]
+    session = [session_of(run_id) for run_id in ids]
     has = set(np.flatnonzero(reading.suits).tolist())
-    old = np.array([fits(run)[0] for run in responses])
     shift = np.median(np.abs(reading.correlation - old)[reading.mends], axis=0)
     shows = [c for c in FOLLOWERS if shift[c] > RISE]
     for name in {session[i] for i in has}:
-        members = [i for i in range(len(responses)) if session[i] == name]
+        members = [i for i in range(len(ids)) if session[i] == name]
         asked = [i for i in members if (np.abs(old[i, shows]) > RIGHT).any()]
         if all(i in has for i in asked):
             has |= set(members)
     return sorted(has)
 
 
-def _gain_sentence(best: Reading, responses: Sequence[Response], shown: Sequence[int]) -> str:
+def _gain_sentence(best: Reading, before: Agreement, shown: Sequence[int]) -> str:
     """Return how a sign or exchange is seen: the gains of the channels that it turns."""
-    gains, old = (np.array(each) for each in zip(*(gains_of(responses[i]) for i in shown), strict=True))
-    rise = best.correlation[list(shown)] - old
-    asked = (old != 0.0) & np.isfinite(gains)
+    gains, old = before.gain[shown], before.correlation[shown]
+    rise, asked = best.correlation[shown] - old, (old != 0.0) & np.isfinite(gains)
     words = []
     for c in FOLLOWERS:
         on = asked[:, c]
@@ -549,7 +550,8 @@ GAIN_WORDS = {
 
 def unit_faults(responses: Sequence[Response], robot: Robot) -> tuple[Fault, ...]:
     """Return columns whose unit is not that of their name, in all runs or in some of them."""
-    gain, fit = (np.array(each)[:, list(KEYS)] for each in zip(*map(gains_of, responses), strict=True))
+    follows = agreement_of(responses)
+    gain, fit = follows.gain[:, list(KEYS)], follows.correlation[:, list(KEYS)]
     clear = np.isfinite(gain) & (gain > 0) & (np.abs(fit) > MIN_FIT)
     logs = np.log(np.where(clear, gain, np.nan))
     informed = np.flatnonzero(clear.any(axis=1)).tolist()
@@ -771,17 +773,16 @@ class _Logs(NamedTuple):
     def responses(self) -> tuple[Response, ...]:
         return responses_of(self.rows, self.latencies, self.shift)
 
-    def tried(self, change: Change, before: Sequence[Response], places: Iterable[int]) -> Reading:
+    def tried(self, change: Change, before: Agreement, places: Sequence[int]) -> Reading:
         """Return what a change makes of the runs at some places."""
-        after = list(before)
-        for i in places:
-            shift, one = self.shift, slice(i, i + 1)
-            own = (
-                None
-                if shift is None
-                else Shift(shift.lag_s[one], shift.std_s[one], shift.rate, shift.lost[one])
-            )
-            (after[i],) = responses_of([self.changed_rows(change, i)], self.latencies, own)
+        shift = self.shift
+        if shift is not None:
+            at = list(places)
+            shift = Shift(shift.lag_s[at], shift.std_s[at], shift.rate, shift.lost[at])
+        changed = responses_of([self.changed_rows(change, i) for i in places], self.latencies, shift)
+        after = Agreement(*(each.copy() for each in before))
+        for own, each in zip(after, agreement_of(changed), strict=True):
+            own[list(places)] = each
         return reading_of(change, before, after)
 
 
@@ -819,18 +820,18 @@ def _turned(logs: _Logs) -> Fault | None:
     Readings that are as good are mirror images, left for right or ahead for back: the change of fewest columns is
     taken, and the diagnosis is that of either but for the side.
     """
-    responses, robot = logs.responses(), logs.simulation.robot
-    fit = np.array([fits(run)[0] for run in responses])[:, list(FOLLOWERS)]
+    before, robot = agreement_of(logs.responses()), logs.simulation.robot
+    fit = before.correlation[:, list(FOLLOWERS)]
     suspects = np.flatnonzero(((fit != 0.0) & (fit < RIGHT)).any(axis=1)).tolist()
     if not suspects:
         return None
-    found = _best_reading([logs.tried(change, responses, suspects) for change in candidate_changes(robot)])
+    found = _best_reading([logs.tried(change, before, suspects) for change in candidate_changes(robot)])
     if found is None:
         return None
-    change, rivals = found[0].change, found[1]
-    best = logs.tried(change, responses, range(len(responses)))
-    has, every = _runs_with(best, responses), [run.run_id for run in responses]
-    seen = _gain_sentence(best, responses, [i for i in has if best.mends[i]])
+    change, rivals, every = found[0].change, found[1], [run.run_id for run in logs.rows]
+    best = logs.tried(change, before, range(len(every)))
+    has = _runs_with(best, every, before.correlation)
+    seen = _gain_sentence(best, before, [i for i in has if best.mends[i]])
     what, repair = _fault_words(change, robot)
     if rivals:
         words = " or ".join(_fault_words(rival.change, robot)[0] for rival in rivals)

@@ -35,6 +35,7 @@ from terrain.logs.clock import yaw_rate_pair
 from terrain.logs.samples import BEYOND, MAX_MAGNITUDE
 from terrain.logs.schema import NO_FEATURES, signal_set_of, unit_of
 from terrain.records import Array, RunLog, Stream
+from terrain.signals import agreement
 
 GAP_PERIODS = 1.5
 """An interval of this many median periods has lost at least one sample."""
@@ -325,14 +326,12 @@ def _turns(run: RunLog, scale: Scale) -> Check:
         return judged(math.nan, (True, UNKNOWN, "yaw rate: too few samples of gyro and wheels together"))
     fits = []  # likeness at a shift, slope of the gyro over the wheels, and the larger of both rates
     for shift_s in np.linspace(-MAX_SHIFT_S, MAX_SHIFT_S, N_SHIFTS):
-        gyro = found[0].at(found[0].time_s + shift_s)
-        there = np.isfinite(gyro)
-        gyro, wheels = gyro[there], found[0].measured[there]
-        power = float(gyro @ gyro), float(wheels @ wheels)
-        if there.sum() >= max(MIN_YAW_RATES, 0.5 * there.size) and min(power) > 0.0:
-            product = float(gyro @ wheels)
-            rate_radps = math.sqrt(max(power) / len(gyro))
-            fits.append((product / math.sqrt(power[0] * power[1]), product / power[1], rate_radps))
+        both = np.column_stack([found[0].at(found[0].time_s + shift_s), found[0].measured])
+        there = both[np.isfinite(both[:, 0])]
+        power = (there**2).sum(axis=0)
+        if len(there) >= max(MIN_YAW_RATES, 0.5 * len(both)) and power.min() > 0.0:
+            like, slope = (float(each[0]) for each in agreement(there[:, :1], there[:, 1:]))
+            fits.append((like, slope, math.sqrt(power.max() / len(there))))
     if not fits:
         return judged(math.nan, (True, UNKNOWN, "yaw rate: gyro and wheels hardly overlap"))
     likeness, ratio, rate_radps = max(fits, key=lambda fit: abs(fit[0]))

@@ -17,6 +17,7 @@ from terrain.discrepancy.faults import (
     AMPS,
     KEYS,
     A,
+    Agreement,
     Change,
     Column,
     Fault,
@@ -284,18 +285,17 @@ def test_one_run_alone_and_a_run_without_rows_are_no_special_case():
     assert_allclose(left.measured[:, 1:], run.measured[:, 1:])
 
 
-def test_a_reading_mends_no_channel_that_a_run_does_not_show(monkeypatch):
+def test_a_reading_mends_no_channel_that_a_run_does_not_show():
     """Straight ahead a gyro says nothing; with a wheel turned the simulation turns, and its noise may fit."""
-    monkeypatch.setattr("terrain.discrepancy.faults.fits", lambda run: run)
     change = Change(SIGN, Column.WHEELS, -1.0, 2)
 
-    def fitted(gyro, likelihood):
-        correlation = np.zeros(len(CHANNELS))
-        correlation[[G, X]] = gyro, 0.9
-        return correlation, np.array([likelihood])
+    def following(gyro, likelihood):
+        correlation = np.zeros((1, len(CHANNELS)))
+        correlation[0, [G, X]] = gyro, 0.9
+        return Agreement(correlation, np.array([[likelihood]]), correlation)
 
-    after = [fitted(0.98, 100.0)]
-    unasked, asked = (reading_of(change, [fitted(gyro, 0.0)], after) for gyro in (0.0, 0.1))
+    after = following(0.98, 100.0)
+    unasked, asked = (reading_of(change, following(gyro, 0.0), after) for gyro in (0.0, 0.1))
     assert (unasked.mends.tolist(), asked.mends.tolist()) == ([False], [True])
 
 
