@@ -43,28 +43,20 @@ from terrain.files.documents import check_keys, number
 from terrain.kernels import record
 from terrain.records import Array, read_only
 
+#: Channels that are compared: gyro, speed over ground of the camera's point, accelerometer, sum of the motor
+#: currents, right minus left current, and the rate of a heading that no gyro measured (lidar, two antennas).
 CHANNELS: tuple[str, ...] = (
     *("yaw_rate_radps", "speed_x_mps", "speed_y_mps", "accel_x_mps2"),
     *("current_a", "turning_current_a", "heading_rate_radps"),
 )
-"""Channels that are compared: gyro, speed over ground of the camera's point, accelerometer, sum of the motor
-currents, right minus left current, and the rate of a heading that no gyro measured (lidar, two antennas)."""
 
 GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING = CHANNELS
 
-MOTION: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y)
-"""Channels of the planar motion."""
-
+MOTION: tuple[str, ...] = (GYRO, SPEED_X, SPEED_Y)  #: Channels of the planar motion.
 SKID, TRACKED, SWERVE, OMNI, BICYCLE = "skid_steer", "tracked", "swerve", "omni", "bicycle"
-SKIDDING = (SKID, TRACKED)
-"""Drives that turn by a difference of their sides."""
-
-BOTH = (*SKIDDING, SWERVE)
-"""Drives of wheels that do not roll across, but for cars."""
-
-WITH_IMU = (*BOTH, BICYCLE)
-"""Drives whose logs have an IMU."""
-
+SKIDDING = (SKID, TRACKED)  #: Drives that turn by a difference of their sides.
+BOTH = (*SKIDDING, SWERVE)  #: Drives of wheels that do not roll across, but for cars.
+WITH_IMU = (*BOTH, BICYCLE)  #: Drives whose logs have an IMU.
 EVERY = (*WITH_IMU, OMNI)
 
 
@@ -92,15 +84,14 @@ class Combine(Enum):
 class Home(NamedTuple):
     """A number of the description that a parameter changes."""
 
-    section: str  # of the description; empty for a number of the robot itself
+    section: str  #: of the description; empty for a number of the robot itself
     field: str
     combine: Combine
-    scaled_by: str = ""  # field of the same section that the parameter is multiplied by first
-    optional: bool = False  # the parameter also has its other homes where the description lacks this section
+    scaled_by: str = ""  #: field of the same section that the parameter is multiplied by first
+    optional: bool = False  #: the parameter also has its other homes where the description lacks this section
 
 
-STAMPS = ("stamp",)
-"""In place of channels: the stamps of the samples."""
+STAMPS = ("stamp",)  #: In place of channels: the stamps of the samples.
 
 
 class Block(NamedTuple):
@@ -108,12 +99,12 @@ class Block(NamedTuple):
 
     stream: str
     channels: tuple[str, ...]
-    time_s: Array  # (k,)
-    values: Array  # (k, c) as measured
-    start_s: float  # first stamp of the wheels, from which drifts count
-    robot: Any  # with its effects
-    applied: Any  # the same with those effects applied that have a home
-    memory: dict[str, Any]  # of the samples before
+    time_s: Array  #: (k,)
+    values: Array  #: (k, c) as measured
+    start_s: float  #: first stamp of the wheels, from which drifts count
+    robot: Any  #: with its effects
+    applied: Any  #: the same with those effects applied that have a home
+    memory: dict[str, Any]  #: of the samples before
 
 
 class Inverse(NamedTuple):
@@ -122,11 +113,11 @@ class Inverse(NamedTuple):
     Of all that act on one number, offsets come off before factors.
     """
 
-    streams: tuple[str, ...]  # whose samples or stamps change
-    formula: str  # corrected from measured, in the signals of this module
-    columns: tuple[str, ...] = ()  # beginnings of the channels that change, or STAMPS
-    combine: Combine = Combine.ADDED  # how the corrected number follows from the measured one
-    without_home: bool = False  # only where the description lacks the section of the parameter's home
+    streams: tuple[str, ...]  #: whose samples or stamps change
+    formula: str  #: corrected from measured, in the signals of this module
+    columns: tuple[str, ...] = ()  #: beginnings of the channels that change, or STAMPS
+    combine: Combine = Combine.ADDED  #: how the corrected number follows from the measured one
+    without_home: bool = False  #: only where the description lacks the section of the parameter's home
     undo: Callable[[Block, float], None] | None = None
     """Of what takes more than one number a sample; two parameters may share one."""
 
@@ -138,17 +129,19 @@ class Parameter(NamedTuple):
     side alone is half a step off, and noise of the wheels looks like it.
     """
 
-    name: str  # ends in its unit
-    low: float  # bounds of the search
+    name: str  #: ends in its unit
+    low: float  #: bounds of the search
     high: float
     step: float
-    homes: tuple[Home, ...] = ()  # where the description has it; all of them change together
+    homes: tuple[Home, ...] = ()  #: where the description has it; all of them change together
     inverse: Inverse | None = None
-    one_sided: bool = False  # sensitivities towards the positive side only: a backlash is not negative
-    scatter_rank: int = 0  # from 1, place in the order in which values that scatter from run to run are drawn
-    as_percent: bool = False  # pages write it as a percentage
-    is_error: bool = False  # of something that is there, so that pages write "off by"
-    deprecated: tuple[str, ...] = ()  # former names, accepted in files and on the command line
+    one_sided: bool = False  #: sensitivities towards the positive side only: a backlash is not negative
+    scatter_rank: int = (
+        0  #: from 1, place in the order in which values that scatter from run to run are drawn
+    )
+    as_percent: bool = False  #: pages write it as a percentage
+    is_error: bool = False  #: of something that is there, so that pages write "off by"
+    deprecated: tuple[str, ...] = ()  #: former names, accepted in files and on the command line
 
     @property
     def unit(self) -> str:
@@ -175,34 +168,34 @@ class Term(NamedTuple):
     """A value as sentences write it."""
 
     found: float
-    half: float  # of its interval
-    total: float  # with what the robot has of it already
-    described: float  # number of the description that it changes; 0 where there is none
-    extended: float  # the same with the value, or the total
-    note: str  # on the described number, in brackets
-    robot: Any  # as it was tested
+    half: float  #: of its interval
+    total: float  #: with what the robot has of it already
+    described: float  #: number of the description that it changes; 0 where there is none
+    extended: float  #: the same with the value, or the total
+    note: str  #: on the described number, in brackets
+    robot: Any  #: as it was tested
 
 
 class Effect(NamedTuple):
     """An error that the simulation may have."""
 
-    name: str  # as --effect and results have it
+    name: str  #: as --effect and results have it
     parameters: tuple[Parameter, ...]
-    formula: str  # in the signals of this module
+    formula: str  #: in the signals of this module
     source: str
-    drives: tuple[str, ...]  # kinds of robots that it applies to
-    channels: tuple[str, ...]  # where it is visible: a tenth as clearly over the noise as in the clearest
-    needs: str  # the driving that excites it
-    sensed_only: bool = False  # it changes what sensors measure, and not the motion of the body
-    stage: Stage | None = None  # where it acts in the dynamic simulation, of the robots that that simulates
-    aliases: tuple[str, ...] = ()  # other names of the same effect, which no log distinguishes from it
+    drives: tuple[str, ...]  #: kinds of robots that it applies to
+    channels: tuple[str, ...]  #: where it is visible: a tenth as clearly over the noise as in the clearest
+    needs: str  #: the driving that excites it
+    sensed_only: bool = False  #: it changes what sensors measure, and not the motion of the body
+    stage: Stage | None = None  #: where it acts in the dynamic simulation, of the robots that that simulates
+    aliases: tuple[str, ...] = ()  #: other names of the same effect, which no log distinguishes from it
     twins: tuple[
         tuple[str, str], ...
     ] = ()  # effects that look the same, and the channel that distinguishes them
-    deprecated: tuple[str, ...] = ()  # former names, accepted on the command line
+    deprecated: tuple[str, ...] = ()  #: former names, accepted on the command line
     words: Callable[[Sequence[Term]], str] | None = None
     """What its values make of the robot, as the object of "with"; by default the number of its home, or the values."""
-    modifies: str = ""  # name of the effect without which it does nothing
+    modifies: str = ""  #: name of the effect without which it does nothing
     beside: tuple[tuple[str, str], ...] = ()
     """Drive, and name of the effect that has to be known before runs of it can show this one."""
 
@@ -225,15 +218,14 @@ def effect(
 
 # -- Words: what a value makes of the robot -------------------------------------------------------------------
 
-EXAMPLE_RADPS, EXAMPLE_MPS = 0.5, 1.0
-"""The turn and the speed at which losses that grow with them are stated."""
-
-FAST_RADPS, FAST_MPS = 1.0, 2.0
-"""The same of what fast turns do."""
-
+EXAMPLE_RADPS, EXAMPLE_MPS = (
+    0.5,
+    1.0,
+)  #: The turn and the speed at which losses that grow with them are stated.
+FAST_RADPS, FAST_MPS = 1.0, 2.0  #: The same of what fast turns do.
+#: Yaw rate from which the wheels mostly slide sideways, and below which they mostly deflect; of a Warthog on asphalt
+#: and gravel.
 SLIDING_RADPS = 1.0
-"""Yaw rate from which the wheels mostly slide sideways, and below which they mostly deflect; of a Warthog on
-asphalt and gravel."""
 
 
 def rounded(value: float, half: float) -> str:
@@ -558,9 +550,13 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
     ),
 )
 
-OTHER_LOGGER = ("imu", "odometry", "gnss", "lidar")
-"""Streams that are not stamped by the logger of the wheels."""
-
+OTHER_LOGGER = (
+    "imu",
+    "odometry",
+    "gnss",
+    "lidar",
+)  #: Streams that are not stamped by the logger of the wheels.
+#: They change what a log holds of a motion; most of them nothing else.
 SENSORS: tuple[Effect, ...] = (
     effect(
         "gyro_bias",
@@ -711,7 +707,6 @@ SENSORS: tuple[Effect, ...] = (
         stage=Stage.DESCRIPTION,
     ),
 )
-"""They change what a log holds of a motion; most of them nothing else."""
 
 SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
     effect(
@@ -942,7 +937,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
 )
 
 LAW = "this project's; docs/measured_slip.md has how it holds on measured runs"
-
+#: What makes omni robots slip, and what looks like it.
 OMNI_WHEELS: tuple[Effect, ...] = (
     effect(
         "roller_friction",
@@ -997,10 +992,9 @@ OMNI_WHEELS: tuple[Effect, ...] = (
         sensed_only=True,
     ),
 )
-"""What makes omni robots slip, and what looks like it."""
 
 SINGLE_TRACK = "linear single-track model: Rajamani, Vehicle Dynamics and Control"
-
+#: What makes a car-like robot turn otherwise than its wheels point.
 CAR: tuple[Effect, ...] = (
     effect(
         "steering_offset_front",
@@ -1039,8 +1033,7 @@ CAR: tuple[Effect, ...] = (
         homes=(Home("", "front_cornering_npr", Combine.TIMES), Home("", "rear_cornering_npr", Combine.TIMES)),
     ),
 )
-"""What makes a car-like robot turn otherwise than its wheels point."""
-
+#: Every known effect.  The order is no ranking, but results list effects in it.
 LIBRARY: tuple[Effect, ...] = (
     *WHEELS_AND_STEERING,
     *SENSORS,
@@ -1050,40 +1043,31 @@ LIBRARY: tuple[Effect, ...] = (
     *OMNI_WHEELS,
     *CAR,
 )
-"""Every known effect.  The order is no ranking, but results list effects in it."""
-
+#: Errors of the measured tilt.  They belong to no effect, and are only ever estimated run by run.
 TILT_OFFSETS: tuple[Parameter, ...] = (
     Parameter("pitch_offset_rad", -math.inf, math.inf, 0.005, scatter_rank=3),
     Parameter("roll_offset_rad", -math.inf, math.inf, 0.005, scatter_rank=4),
 )
-"""Errors of the measured tilt.  They belong to no effect, and are only ever estimated run by run."""
-
+#: Parameters of the library by name.
 PARAMETER: dict[str, Parameter] = {p.name: p for effect in LIBRARY for p in effect.parameters}
-"""Parameters of the library by name."""
-
+#: Physical limits of each parameter of the library.
 BOUNDS: dict[str, tuple[float, float]] = {name: (p.low, p.high) for name, p in PARAMETER.items()}
-"""Physical limits of each parameter of the library."""
-
+#: Change of a parameter over which its sensitivity is taken.
 STEPS: dict[str, float] = {p.name: p.step for p in (*PARAMETER.values(), *TILT_OFFSETS)}
-"""Change of a parameter over which its sensitivity is taken."""
-
+#: Parameters that scatter from run to run, in the order in which they are drawn.
 NUISANCES: tuple[str, ...] = tuple(
     p.name
     for p in sorted((*PARAMETER.values(), *TILT_OFFSETS), key=lambda p: p.scatter_rank)
     if p.scatter_rank
 )
-"""Parameters that scatter from run to run, in the order in which they are drawn."""
-
+#: Parameters that change what sensors measure, and not the motion of the body.
 SENSED_ONLY: tuple[str, ...] = tuple(
     p.name for effect in LIBRARY if effect.sensed_only for p in effect.parameters
 )
-"""Parameters that change what sensors measure, and not the motion of the body."""
-
+#: Parameters whose sensitivity is taken towards the positive side only.
 ONE_SIDED: tuple[str, ...] = tuple(name for name, p in PARAMETER.items() if p.one_sided)
-"""Parameters whose sensitivity is taken towards the positive side only."""
-
+#: Former names of parameters, and the present ones.
 DEPRECATED: dict[str, str] = {old: p.name for p in PARAMETER.values() for old in p.deprecated}
-"""Former names of parameters, and the present ones."""
 
 
 def effect_named(name: str) -> Effect:
@@ -1216,14 +1200,15 @@ def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:
     return acting
 
 
-PARAMETERS: tuple[str, ...] = (*PARAMETER, *(p.name for p in TILT_OFFSETS))
-"""Order of the numbers in the vector."""
-
-INDEX: dict[str, int] = {name: i for i, name in enumerate(PARAMETERS)}
-"""Place of each parameter in the vector."""
-
+PARAMETERS: tuple[str, ...] = (
+    *PARAMETER,
+    *(p.name for p in TILT_OFFSETS),
+)  #: Order of the numbers in the vector.
+INDEX: dict[str, int] = {
+    name: i for i, name in enumerate(PARAMETERS)
+}  #: Place of each parameter in the vector.
+#: The vector as a record: ``vector.view(EFFECTS)[0]`` has the parameters by name.
 EFFECTS = record(dict.fromkeys(PARAMETERS, float))
-"""The vector as a record: ``vector.view(EFFECTS)[0]`` has the parameters by name."""
 
 
 def vector_of(values: Mapping[str, float]) -> Array:
@@ -1244,14 +1229,13 @@ def vector_of(values: Mapping[str, float]) -> Array:
     return vector
 
 
-SCHEMA = 1
-"""Version of the section that is read and written."""
-
+SCHEMA = 1  #: Version of the section that is read and written.
+#: Keys of the section that name no parameter; the region is read by :mod:`terrain.robots.region`.
 NOT_EFFECTS = ("schema", "covariance", "region")
-"""Keys of the section that name no parameter; the region is read by :mod:`terrain.robots.region`."""
 
-ROUNDING = 1e-5
-"""A covariance is written with seven digits: correlations may miss symmetry and sign by as much."""
+ROUNDING = (
+    1e-5  #: A covariance is written with seven digits: correlations may miss symmetry and sign by as much.
+)
 
 
 def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict[str, float]:

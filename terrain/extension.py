@@ -44,8 +44,7 @@ from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Region, Robot, description_file, robot_from
 from terrain.robots.region import Range, outside, widened
 
-AnyRobot = TypeVar("AnyRobot", bound=Robot)
-"""What is corrected keeps its drive."""
+AnyRobot = TypeVar("AnyRobot", bound=Robot)  #: What is corrected keeps its drive.
 
 
 def apply_homes(robot: AnyRobot, names: Collection[str] = tuple(PARAMETER)) -> AnyRobot:
@@ -131,14 +130,14 @@ def _without(robot: AnyRobot, names: Collection[str]) -> AnyRobot:
     return replace(robot, effects=effects, effects_cov=robot.effects_cov[np.ix_(rest, rest)])
 
 
+#: Time outside after which a live drive is: shorter ones, as of a bump, are in the percentiles' tails.
 OUTSIDE_S = 1.0
-"""Time outside after which a live drive is: shorter ones, as of a bump, are in the percentiles' tails."""
 
-MAX_STEP_S = 0.1
-"""Longest time that a live sample stands for: after a gap nothing is known of what was driven."""
-
+MAX_STEP_S = (
+    0.1  #: Longest time that a live sample stands for: after a gap nothing is known of what was driven.
+)
+#: Edges of a range: single samples, as of a start or a wheel that spun, are not what was validated.
 PERCENTILES = (1.0, 99.0)
-"""Edges of a range: single samples, as of a start or a wheel that spun, are not what was validated."""
 
 
 def region_of(runs: Sequence[RunLog], robot: Robot) -> Region:
@@ -392,14 +391,14 @@ class Origin(StrEnum):
 class Basis(NamedTuple):
     """A number of a robot's description that a parameter of an effect changes."""
 
-    section: str  # of the description; empty for a number of the robot itself
+    section: str  #: of the description; empty for a number of the robot itself
     field: str
     described: (
         float  # as it stands; the neutral one of Robot.completed where the description lacks the section
     )
-    extended: float  # with the parameter's value
+    extended: float  #: with the parameter's value
     origin: Origin
-    written: str  # what the description calls it: of tracks sprocket_radius_m is the wheel_radius_m
+    written: str  #: what the description calls it: of tracks sprocket_radius_m is the wheel_radius_m
 
     @property
     def name(self) -> str:
@@ -445,8 +444,7 @@ def basis_of(robot: Robot, parameter: str, value: float = 0.0) -> tuple[Basis, .
     return tuple(bases)
 
 
-DIGITS = 7
-"""Significant digits that a file has of each number."""
+DIGITS = 7  #: Significant digits that a file has of each number.
 
 
 def extended_yaml(

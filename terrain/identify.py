@@ -30,40 +30,29 @@ from scipy.optimize import least_squares
 from terrain.bootstrap import LEVEL
 from terrain.records import Array
 
+#: Standard deviation with the measurements over that of the prior, below which they identify a parameter.
 IDENTIFIED_RATIO = 0.5
-"""Standard deviation with the measurements over that of the prior, below which they identify a parameter."""
 
-EDGE = 1e-3
-"""In units of the search: a value so near to its bound stands at it."""
-
+EDGE = 1e-3  #: In units of the search: a value so near to its bound stands at it.
+#: Least weight of a nominal value, over that of a unit of the search: where nothing that is measured depends on a
+#: parameter, a search by trust regions would stop anywhere.
 REGULAR = 1e-6
-"""Least weight of a nominal value, over that of a unit of the search: where nothing that is measured depends on a
-parameter, a search by trust regions would stop anywhere."""
 
-UNSEEN = 1e-6
-"""Part of a parameter in directions of no curvature from which on it is not identified."""
-
+UNSEEN = 1e-6  #: Part of a parameter in directions of no curvature from which on it is not identified.
 _Candidate = TypeVar("_Candidate")
 
 
 class Parameter(NamedTuple):
-    """A number that is identified.
+    """A number that is identified."""
 
-    Parameters
-    ----------
-    name : ends in its unit
-    nominal : where the search begins, and the mean of its prior
-    low, high : bounds
-    prior_std : standard deviation of the prior; infinite of none
-    step : size of a usual change, the unit of the search; by default that of the prior, or 1
-    """
-
-    name: str
-    nominal: float
-    low: float = -math.inf
+    name: str  #: ends in its unit
+    nominal: float  #: where the search begins, and the mean of its prior
+    low: float = -math.inf  #: bounds
     high: float = math.inf
-    prior_std: float = math.inf
-    step: float = math.nan
+    prior_std: float = math.inf  #: standard deviation of the prior; infinite of none
+    step: float = (
+        math.nan
+    )  #: size of a usual change, the unit of the search; by default that of the prior, or 1
 
     @property
     def unit(self) -> float:
@@ -74,29 +63,17 @@ class Parameter(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Parameters that were identified.
+    """Parameters that were identified."""
 
-    Parameters
-    ----------
-    parameters : k of them
-    value, cov : (k,) and (k, k)
-    interval : (2, k) lower and upper ends, 95 %
-    identified : (k,) whether the measurements narrow the prior to less than half, away from a bound
-    at_bound : (k,)
-    influence : (G, k) :math:`u_g`, what each cluster moves the values by; (0, k) without clusters
-    residual : (n,) of the measurements, at the values
-    cost : half of the sum that is minimised
-    """
-
-    parameters: tuple[Parameter, ...]
-    value: Array
+    parameters: tuple[Parameter, ...]  #: k of them
+    value: Array  #: (k,) and (k, k)
     cov: Array
-    interval: Array
-    identified: Array
-    at_bound: Array
-    influence: Array
-    residual: Array
-    cost: float
+    interval: Array  #: (2, k) lower and upper ends, 95 %
+    identified: Array  #: (k,) whether the measurements narrow the prior to less than half, away from a bound
+    at_bound: Array  #: (k,)
+    influence: Array  #: (G, k) :math:`u_g`, what each cluster moves the values by; (0, k) without clusters
+    residual: Array  #: (n,) of the measurements, at the values
+    cost: float  #: half of the sum that is minimised
 
     @property
     def std(self) -> Array:

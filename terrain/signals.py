@@ -25,30 +25,20 @@ from terrain.bootstrap import bootstrap_rows
 from terrain.kernels import njit
 from terrain.records import Array
 
+#: A peak elsewhere is no rival if it leaves so much more of the variance, relative; absolute is an argument.
 RIVAL_MARGIN = 0.15
-"""A peak elsewhere is no rival if it leaves so much more of the variance, relative; absolute is an argument."""
 
-MEMORY_S = 2.0
-"""Assumed correlation time of what a fit leaves."""
-
-MAX_STEPS, CONVERGED_S = 12, 0.003
-"""Of least squares."""
-
-MIN_ROWS = 30
-"""Samples of a pair, below which nothing is fitted."""
-
-MIN_SUPPORT = 30
-"""Finite samples, below which a signal is not laid out on a grid."""
-
-EDGE_SIGMAS = 3.0
-"""So close to an end or a gap, in widths of the low-pass, it has too little to average: not used."""
-
-MAX_GAP_SIGMAS = 3.0
-"""Across a longer gap, in widths of the low-pass, nothing is interpolated."""
-
-MAX_SEARCH_SAMPLES = 1500
-"""A search looks at this many instants of a long run; least squares at all of them."""
-
+MEMORY_S = 2.0  #: Assumed correlation time of what a fit leaves.
+MAX_STEPS, CONVERGED_S = 12, 0.003  #: Of least squares.
+MIN_ROWS = 30  #: Samples of a pair, below which nothing is fitted.
+MIN_SUPPORT = 30  #: Finite samples, below which a signal is not laid out on a grid.
+EDGE_SIGMAS = (
+    3.0  #: So close to an end or a gap, in widths of the low-pass, it has too little to average: not used.
+)
+MAX_GAP_SIGMAS = 3.0  #: Across a longer gap, in widths of the low-pass, nothing is interpolated.
+MAX_SEARCH_SAMPLES = (
+    1500  #: A search looks at this many instants of a long run; least squares at all of them.
+)
 N_DRAWS = 200
 
 
@@ -95,23 +85,14 @@ class Delay(NamedTuple):
 
 
 class Pair(NamedTuple):
-    """A sampled signal beside its reference.
+    """A sampled signal beside its reference."""
 
-    Parameters
-    ----------
-    time_s : (n,) of the samples, from the first point of the grid
-    measured : (n,) NaN where a sample is missing
-    step_s : of the grid
-    reference, slope : (m,) on the grid, and its derivative; NaN where nothing supports it
-    middle_s : time about which a rate stretches
-    """
-
-    time_s: Array
-    measured: Array
-    step_s: float
-    reference: Array
+    time_s: Array  #: (n,) of the samples, from the first point of the grid
+    measured: Array  #: (n,) NaN where a sample is missing
+    step_s: float  #: of the grid
+    reference: Array  #: (m,) on the grid, and its derivative; NaN where nothing supports it
     slope: Array
-    middle_s: float
+    middle_s: float  #: time about which a rate stretches
 
     def at(self, time_s: Array) -> Array:
         """Return the reference at some times; NaN outside."""

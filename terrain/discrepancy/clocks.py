@@ -25,76 +25,51 @@ from terrain.records import Array
 from terrain.signals import MIN_ROWS, Delay, DelayFit, DelayStatus, Pair, common_delay, delay, refine_delay
 from terrain.simulation.planar.replay import replay
 
+#: Loggers of a run are started together, the wheels' first.  The other sign is that of wheels that are late: they are
+#: averaged, sent a few times a second, held, and queued, which adds up to less than a second.
 MIN_LAG_S, MAX_LAG_S = -1.0, 2.0
-"""Loggers of a run are started together, the wheels' first.  The other sign is that of wheels that are late:
-they are averaged, sent a few times a second, held, and queued, which adds up to less than a second."""
-
+#: Bound of a second search that only finds that a clock is out of reach, in runs of twice that length.
 FAR_LAG_S = 10.0
-"""Bound of a second search that only finds that a clock is out of reach, in runs of twice that length."""
 
-LAG_STEP_S = 0.1
-"""Of the coarse search: what a robot does takes longer."""
-
+LAG_STEP_S = 0.1  #: Of the coarse search: what a robot does takes longer.
 LAGS_S = np.arange(MIN_LAG_S, MAX_LAG_S + 1e-9, LAG_STEP_S)
 
-RATES = (0.0, -0.01, 0.01, -0.02, 0.02)
-"""Of the coarse search, up to the bounds of ``clock_rate``."""
-
+RATES = (0.0, -0.01, 0.01, -0.02, 0.02)  #: Of the coarse search, up to the bounds of ``clock_rate``.
+#: Where half of the channels reach it, no other rate is tried: least squares finds it from there.
 CLEAR_CORRELATION = 0.9
-"""Where half of the channels reach it, no other rate is tried: least squares finds it from there."""
 
-RATE_STEP = 0.002
-"""Rates that differ by less are one to the coarse search."""
-
-FINE_S = 0.02
-"""Grid on which what is expected is laid out; straight lines between."""
-
+RATE_STEP = 0.002  #: Rates that differ by less are one to the coarse search.
+FINE_S = 0.02  #: Grid on which what is expected is laid out; straight lines between.
+#: Channels that measure the clock: the tilt of the accelerometer is on its own clock, and the lateral motion of a
+#: skid-steer robot is in none of its wheels.
 CLOCKED = (GYRO, SPEED_X, HEADING)
-"""Channels that measure the clock: the tilt of the accelerometer is on its own clock, and the lateral motion
-of a skid-steer robot is in none of its wheels."""
 
-MIN_EXCITATION = 0.02
-"""Standard deviation (rad/s, m/s) of the prediction, below which a channel measures no clock."""
-
-MIN_CORRELATION = 0.7
-"""Least correlation at the best shift."""
-
+MIN_EXCITATION = (
+    0.02  #: Standard deviation (rad/s, m/s) of the prediction, below which a channel measures no clock.
+)
+MIN_CORRELATION = 0.7  #: Least correlation at the best shift.
+#: A peak elsewhere is no rival if it leaves so much more of the variance, beside the relative margin.
 RIVAL_FLOOR = 0.02
-"""A peak elsewhere is no rival if it leaves so much more of the variance, beside the relative margin."""
 
-SAME_PEAK_S = 0.5
-"""Two shifts closer than this are of one peak."""
-
-MAX_STD_S = 0.1
-"""Largest standard deviation of a clock that is used."""
-
+SAME_PEAK_S = 0.5  #: Two shifts closer than this are of one peak.
+MAX_STD_S = 0.1  #: Largest standard deviation of a clock that is used.
+#: A clock is not used if that ratio of its information comes from so short a time: from one event.
 EVENT_S, EVENT_RATIO = 3.0, 0.7
-"""A clock is not used if that ratio of its information comes from so short a time: from one event."""
 
-FURTHEST = 1.5
-"""A rate is refused that is so many times out of the bounds."""
-
+FURTHEST = 1.5  #: A rate is refused that is so many times out of the bounds.
 SEARCH: dict[str, Any] = {"rate_max": FURTHEST * max(RATES), "event": (EVENT_S, EVENT_RATIO)}
 
 
 class Shift(NamedTuple):
-    """How far what IMU and camera saw is behind the wheels.
+    """How far what IMU and camera saw is behind the wheels."""
 
-    Parameters
-    ----------
-    lag_s, std_s : (runs, len(CLOCKED)) at the middle of each run; NaN where a channel measures none
-    rate : common to all runs
-    lost : (runs,) whether nothing fits within the search, and something well out of it
-    """
-
-    lag_s: Array
+    lag_s: Array  #: (runs, len(CLOCKED)) at the middle of each run; NaN where a channel measures none
     std_s: Array
-    rate: float
-    lost: Array
+    rate: float  #: common to all runs
+    lost: Array  #: (runs,) whether nothing fits within the search, and something well out of it
 
 
-_Pairs = dict[tuple[int, int], Pair]
-"""By run and place in CLOCKED."""
+_Pairs = dict[tuple[int, int], Pair]  #: By run and place in CLOCKED.
 
 
 def shifts_of(info: Evidence) -> Shift:
@@ -206,58 +181,44 @@ def _fits_further(pair: Pair, rate: float) -> bool:
 
 FINE_LAGS_S = np.arange(MIN_LAG_S, MAX_LAG_S + 1e-9, FINE_S)
 
-EDGE_S = MAX_LAG_S + 10 * FINE_S
-"""Before and after a run its first and last prediction are held: commands are."""
-
+EDGE_S = (
+    MAX_LAG_S + 10 * FINE_S
+)  #: Before and after a run its first and last prediction are held: commands are.
+#: Window of half a second over the prediction: encoders that are read a few times a second are held, and the
+#: likelihood of a lag has kinks where edges meet samples.
 SMOOTH = np.hanning(27)[1:-1] / np.hanning(27).sum()
-"""Window of half a second over the prediction: encoders that are read a few times a second are held, and the
-likelihood of a lag has kinks where edges meet samples."""
 
-MIN_KNOWN = 10
-"""Samples of a channel in a run, below which gain and constant leave nothing to compare."""
-
-INDEPENDENT_HZ = 5.0
-"""Samples a second that count as independent: what a robot does changes within 2 Hz."""
-
-MIN_RUNS = 3
-"""Least number of runs for a standard deviation."""
-
+MIN_KNOWN = 10  #: Samples of a channel in a run, below which gain and constant leave nothing to compare.
+INDEPENDENT_HZ = 5.0  #: Samples a second that count as independent: what a robot does changes within 2 Hz.
+MIN_RUNS = 3  #: Least number of runs for a standard deviation.
+#: Twice the log-likelihood that a lag has to gain over the median of all lags, to be one: a channel that follows the
+#: wheels gains hundreds, one that does not follows them nowhere.
 MIN_GAIN = 30.0
-"""Twice the log-likelihood that a lag has to gain over the median of all lags, to be one: a channel that
-follows the wheels gains hundreds, one that does not follows them nowhere."""
 
-MIN_STD_S = 0.002
-"""A tenth of the grid's step: runs that agree to less are limited by it."""
-
+MIN_STD_S = 0.002  #: A tenth of the grid's step: runs that agree to less are limited by it.
+#: A search starts from a lag beyond so many standard deviations, and beyond the second: what is less, a search that
+#: is linear about no lag finds by itself and names by its shape, and slip that follows the traction looks like 0.08
+#: s.
 SIGMAS, GROSS_S = 3.0, 0.1
-"""A search starts from a lag beyond so many standard deviations, and beyond the second: what is less, a
-search that is linear about no lag finds by itself and names by its shape, and slip that follows the traction
-looks like 0.08 s."""
 
-SHAPE_GAIN = 10.0
-"""Twice the log-likelihood by which a delay has to fit better than a low-pass of the encoders."""
-
+SHAPE_GAIN = (
+    10.0  #: Twice the log-likelihood by which a delay has to fit better than a low-pass of the encoders.
+)
 UNKNOWN = (math.nan, math.nan)
 
 
 class Latencies(NamedTuple):
-    """Lags of all channels behind what the wheels predict, and their parts.
+    """Lags of all channels behind what the wheels predict, and their parts."""
 
-    Parameters
-    ----------
-    channels : by name of :data:`CLOCKED`, those of which a lag is measured, over what the simulation has of it
-        already; negative where the wheels are late
-    clock : of the earlier of IMU and camera behind the wheels, and its standard deviation (s); NaN if unknown
-    imu : of the IMU behind that; NaN where it is not measured, or where a delay of the yaw motion looks the same
-    camera : of the camera behind that; NaN where it is not measured
-    is_delay : whether the wheels are late by a delay, and not by a low-pass of their encoders
-    """
-
+    #: by name of :data:`CLOCKED`, those of which a lag is measured, over what the simulation has of it already;
+    #: negative where the wheels are late
     channels: Mapping[str, Delay]
+    #: of the earlier of IMU and camera behind the wheels, and its standard deviation (s); NaN if unknown
     clock: tuple[float, float]
+    #: of the IMU behind that; NaN where it is not measured, or where a delay of the yaw motion looks the same
     imu: tuple[float, float]
-    camera: tuple[float, float]
-    is_delay: bool
+    camera: tuple[float, float]  #: of the camera behind that; NaN where it is not measured
+    is_delay: bool  #: whether the wheels are late by a delay, and not by a low-pass of their encoders
 
     def starting_values(self) -> dict[str, float]:
         """Return parameters by which a search may start, of what is significant; none where nothing is late.
@@ -272,8 +233,8 @@ class Latencies(NamedTuple):
         return values
 
 
+#: Channels of a run beside what is expected of them, and how many of their samples are independent.
 _RunPairs = dict[str, tuple[Pair, float]]
-"""Channels of a run beside what is expected of them, and how many of their samples are independent."""
 
 
 def latencies_of(signals: Sequence[Signals], simulation: Simulation, seed: int = 0) -> Latencies:

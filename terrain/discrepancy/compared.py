@@ -18,42 +18,26 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
-STRETCH_S = 20.0
-"""Length of the stretch that is drawn large."""
-
-STRETCH_STEP_S = 1.0
-"""Distance of the stretches among which it is chosen."""
-
+STRETCH_S = 20.0  #: Length of the stretch that is drawn large.
+STRETCH_STEP_S = 1.0  #: Distance of the stretches among which it is chosen.
+#: Quantile of the residuals' size at which the example is chosen, among runs and among stretches of a run.
 EXAMPLE_QUANTILE = 0.8
-"""Quantile of the residuals' size at which the example is chosen, among runs and among stretches of a run."""
 
-MIN_SPREAD = 0.01
-"""Range of an input in its own unit, below which no dependence can be seen."""
+MIN_SPREAD = 0.01  #: Range of an input in its own unit, below which no dependence can be seen.
 
 
 class ComparedRun(NamedTuple):
-    """A run beside the simulation, low-pass filtered, faults repaired.
+    """A run beside the simulation, low-pass filtered, faults repaired."""
 
-    Parameters
-    ----------
-    run_id, terrain : of the run
-    held_out : whether it was held out of the diagnosis
-    time_s : (m,)
-    pace_mps : (m,) speed of the wheels, with which noise grows
-    measured, before : (m, channels)
-    after : (m, channels) with the causes built in; None where none was named
-    inputs : (m,) of the simulation, by the names of :data:`terrain.discrepancy.residuals.INPUTS`, and
-        ``time_s``
-    """
-
-    run_id: str
+    run_id: str  #: of the run
     terrain: str
-    held_out: bool
-    time_s: Array
-    pace_mps: Array
-    measured: Array
+    held_out: bool  #: whether it was held out of the diagnosis
+    time_s: Array  #: (m,)
+    pace_mps: Array  #: (m,) speed of the wheels, with which noise grows
+    measured: Array  #: (m, channels)
     before: Array
-    after: Array | None
+    after: Array | None  #: (m, channels) with the causes built in; None where none was named
+    #: (m,) of the simulation, by the names of :data:`terrain.discrepancy.residuals.INPUTS`, and ``time_s``
     inputs: Mapping[str, Array]
 
     def part(self, start_s: float, end_s: float) -> ComparedRun:
@@ -190,21 +174,13 @@ def without_levels(noise: Noise, runs: Sequence[ComparedRun]) -> Noise:
 # -- Statistics of residuals: their spectra, and their means over bins of an input and over runs -----------
 
 N_BINS = 6
-
+#: Part of an input's values beyond the outer bins on either side: outliers would stretch all of them.
 TAIL_RATIO = 0.01
-"""Part of an input's values beyond the outer bins on either side: outliers would stretch all of them."""
 
-MIN_IN_BIN = 3
-"""Least rows of a run in a bin for a mean."""
-
-SEGMENT_ROWS = 64
-"""Longest segment of a spectrum: some 10 s."""
-
-MIN_SEGMENT_ROWS = 8
-"""Shortest segment of a spectrum."""
-
-COVARIANCE_ROWS = 8192
-"""Grid of the spectrum from which the covariance of coloured noise is taken."""
+MIN_IN_BIN = 3  #: Least rows of a run in a bin for a mean.
+SEGMENT_ROWS = 64  #: Longest segment of a spectrum: some 10 s.
+MIN_SEGMENT_ROWS = 8  #: Shortest segment of a spectrum.
+COVARIANCE_ROWS = 8192  #: Grid of the spectrum from which the covariance of coloured noise is taken.
 
 
 class BinnedMeans(NamedTuple):

@@ -30,26 +30,21 @@ from terrain.signals import agreement
 
 # -- How each run responds to its wheels: measured beside predicted on one clock, and the gain between them --
 
+#: Columns of the channels.
 G, X, Y, A, AMPS, T, H = (
     CHANNELS.index(name) for name in (GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING)
 )
-"""Columns of the channels."""
-
+#: Channels that follow the wheels whatever the effects are: of a lateral speed, a lever arm sets the sign.
 MOTION = (G, X, H)
-"""Channels that follow the wheels whatever the effects are: of a lateral speed, a lever arm sets the sign."""
 
-FOLLOWERS = (*MOTION, A, AMPS, T)
-"""Channels whose gain is above zero, whatever the effects are."""
-
+FOLLOWERS = (*MOTION, A, AMPS, T)  #: Channels whose gain is above zero, whatever the effects are.
+#: Channel that measures the clock of a channel; currents are on that of the wheels.
 CLOCK_OF = {G: GYRO, X: SPEED_X, Y: SPEED_X, A: GYRO, H: HEADING}
-"""Channel that measures the clock of a channel; currents are on that of the wheels."""
-
+#: Root mean square of a prediction (rad/s, m/s, m/s^2, A) from which a run is asked for its response: several times
+#: the bias and noise of the sensors.
 LEAST = {G: 0.1, X: 0.08, Y: 0.03, A: 0.1, AMPS: 0.5, T: 0.5, H: 0.1}
-"""Root mean square of a prediction (rad/s, m/s, m/s^2, A) from which a run is asked for its response: several
-times the bias and noise of the sensors."""
 
-MAX_FIT = 0.9999
-"""Largest correlation that counts: beyond it the noise of the sensors decides."""
+MAX_FIT = 0.9999  #: Largest correlation that counts: beyond it the noise of the sensors decides.
 
 
 class Response(NamedTuple):
@@ -103,18 +98,13 @@ def responses_of(
 
 
 class Agreement(NamedTuple):
-    """How channels (..., channels) follow what the wheels predict.
+    """How channels (..., channels) follow what the wheels predict."""
 
-    Parameters
-    ----------
-    correlation : about zero, of the accelerometer about its mean, since its bias is large; 0 where the prediction
-        is too small to ask for
-    likelihood : twice the logarithm that they gain by following with a gain above zero
-    gain : about zero, of the accelerometer that of its acceleration, beside gravity and a bias; NaN where unknown
-    """
-
+    #: about zero, of the accelerometer about its mean, since its bias is large; 0 where the prediction is too small
+    #: to ask for
     correlation: Array
-    likelihood: Array
+    likelihood: Array  #: twice the logarithm that they gain by following with a gain above zero
+    #: about zero, of the accelerometer that of its acceleration, beside gravity and a bias; NaN where unknown
     gain: Array
 
 
@@ -151,9 +141,9 @@ def _agreement(response: Response) -> Agreement:
 
 # -- A fault: what is wrong with a column, in words, with its repair ------------------------------------------
 
+#: A fault of a logger is in that ratio of the runs at the least: units and zeros are set once, and a run in a hundred
+#: that is off is one whose sensor failed, which is no reason to repair it.
 MIN_FAULTY_RATIO = 0.05
-"""A fault of a logger is in that ratio of the runs at the least: units and zeros are set once, and a run in a
-hundred that is off is one whose sensor failed, which is no reason to repair it."""
 
 
 class FaultKind(StrEnum):
@@ -190,6 +180,8 @@ class _Kind(NamedTuple):
     largest: float = math.inf
 
 
+#: By column; wheel speeds are the inputs of the simulation.  The largest offset is half more than the bounds of the
+#: catalogue's biases, and for a heading rate and a speed, which have none, as much and a slow robot's speed.
 KINDS = {
     Column.GYRO: _Kind((G,), "gyro_z_radps", "rad/s", {"deg/s": DEG, "rpm": RPM}, 0.3),
     Column.HEADING: _Kind((H,), "yaw_rate_radps", "rad/s", {"deg/s": DEG, "rpm": RPM}, 0.3),
@@ -199,32 +191,21 @@ KINDS = {
     Column.WHEELS: _Kind((), "the wheel speeds", "", {"deg/s": DEG, "rpm": RPM, "km/h": KMH, "mm/s": MILLI}),
     Column.SIDES: _Kind((), "the wheel speeds and currents", "", {}),
 }
-"""By column; wheel speeds are the inputs of the simulation.  The largest offset is half more than the bounds of the
-catalogue's biases, and for a heading rate and a speed, which have none, as much and a slow robot's speed."""
 
-NOT_IN_MAPPINGS = ("mm/s",)
-"""Units that a mapping file has no word for; there the scale is changed."""
+NOT_IN_MAPPINGS = ("mm/s",)  #: Units that a mapping file has no word for; there the scale is changed.
 
 
 class Change(NamedTuple):
-    """What makes a log right again: a linear map of its columns.
+    """What makes a log right again: a linear map of its columns."""
 
-    Parameters
-    ----------
-    kind, column : what is changed, and how
-    factor : by which samples are multiplied; 1 for columns that are exchanged, NaN for one that is left out,
-        since readings of it cannot be distinguished
-    wheel : which wheel alone; -1 for all
-    offset : that is added
-    pair : wheels that are exchanged
-    """
-
-    kind: FaultKind
+    kind: FaultKind  #: what is changed, and how
     column: Column
+    #: by which samples are multiplied; 1 for columns that are exchanged, NaN for one that is left out, since readings
+    #: of it cannot be distinguished
     factor: float = 1.0
-    wheel: int = -1
-    offset: float = 0.0
-    pair: tuple[int, int] = (0, 1)
+    wheel: int = -1  #: which wheel alone; -1 for all
+    offset: float = 0.0  #: that is added
+    pair: tuple[int, int] = (0, 1)  #: wheels that are exchanged
 
     @property
     def of_wheels(self) -> bool:
@@ -370,45 +351,34 @@ def _unit_words(change: Change) -> tuple[str, str]:
 # which are then simulated again.  Under the right one all channels follow the wheels, each with a gain above
 # zero; the likelihood that a reading gains is summed over the runs that it mends.
 
+#: A channel does not follow the wheels below the first correlation about zero, and does over the second.  Of measured
+#: runs, those that slip hardly fall below 0.8.
 TURNED, RIGHT = 0.3, 0.7
-"""A channel does not follow the wheels below the first correlation about zero, and does over the second.  Of
-measured runs, those that slip hardly fall below 0.8."""
-
+#: A channel that half follows the wheels, as one wheel's do, is mended if its correlation rises by the first and to
+#: over the second.
 RISE, CLEAR = 0.25, 0.95
-"""A channel that half follows the wheels, as one wheel's do, is mended if its correlation rises by the first
-and to over the second."""
 
-LOSS = 0.1
-"""Largest loss of correlation of any other channel under a reading that mends one."""
-
+LOSS = 0.1  #: Largest loss of correlation of any other channel under a reading that mends one.
+#: Twice the log-likelihood that a reading has to gain in a run: odds of e^10, over a score of readings and hundreds
+#: of runs.
 GAIN = 20.0
-"""Twice the log-likelihood that a reading has to gain in a run: odds of e^10, over a score of readings and
-hundreds of runs."""
-
+#: Readings whose gains differ by less, or by less than that ratio, cannot be distinguished.
 TIE, TIE_RATIO = 10.0, 0.03
-"""Readings whose gains differ by less, or by less than that ratio, cannot be distinguished."""
 
 WORDS = dict(zip(CHANNELS, ("gyro", "speed", "lateral speed", "accelerometer", "sum of the currents",
                             "difference of the currents", "heading rate"), strict=True))  # fmt: skip
 
 
 class Reading(NamedTuple):
-    """What a change makes of runs.
+    """What a change makes of runs."""
 
-    Parameters
-    ----------
-    change : tried
-    correlation : (runs, channels) under it
-    gain : (runs,) of twice the log-likelihood
-    mends : (runs,) whether a channel follows the wheels that did not, and none is worse
-    suits : (runs,) whether the gain is as clear and none is worse; a channel may have followed before
-    """
-
-    change: Change
-    correlation: Array
-    gain: Array
-    mends: Array
-    suits: Array
+    change: Change  #: tried
+    correlation: Array  #: (runs, channels) under it
+    gain: Array  #: (runs,) of twice the log-likelihood
+    mends: Array  #: (runs,) whether a channel follows the wheels that did not, and none is worse
+    suits: (
+        Array  #: (runs,) whether the gain is as clear and none is worse; a channel may have followed before
+    )
 
 
 def candidate_changes(robot: Robot) -> Changes:
@@ -492,50 +462,39 @@ def _gain_sentence(best: Reading, before: Agreement, shown: Sequence[int]) -> st
 # The logarithms of the gains have a prior: what robots and effects do to them.  A reading of the logs in which
 # a column is in another unit costs a fixed evidence, and is taken where the gains cost more without it.
 
-MIN_FIT = 0.7
-"""Correlation about zero from which a gain is used: of a run that hardly responds it says nothing."""
-
+MIN_FIT = (
+    0.7  #: Correlation about zero from which a gain is used: of a run that hardly responds it says nothing.
+)
+#: Gain of the yaw rate, mean of its logarithm and standard deviations to below and above: skid-steer robots have an
+#: effective track of 1 to 2.5 times the nominal one (Mandow et al., IROS 2007), and the bounds of the catalogue,
+#: which are gains of 0.2 and 2, are within three; a swerve robot turns as its wheels do.
 SKID_TURN, SWERVE_TURN = (math.log(0.75), 0.5, 0.35), (0.0, 0.2, 0.2)
-"""Gain of the yaw rate, mean of its logarithm and standard deviations to below and above: skid-steer robots
-have an effective track of 1 to 2.5 times the nominal one (Mandow et al., IROS 2007), and the bounds of the
-catalogue, which are gains of 0.2 and 2, are within three; a swerve robot turns as its wheels do."""
-
+#: Gain of the speed: a wheel radius may be off by 30 %, and slip takes up to a half, within three and a half standard
+#: deviations.
 SPEED_GAIN = (-0.08, 0.2)
-"""Gain of the speed: a wheel radius may be off by 30 %, and slip takes up to a half, within three and a half
-standard deviations."""
-
+#: Of gyro over heading rate: the catalogue's bound of a gyro's scale is within three standard deviations.
 GYRO_SPREAD = 0.12
-"""Of gyro over heading rate: the catalogue's bound of a gyro's scale is within three standard deviations."""
 
-ACCEL_SPREAD = 0.25
-"""Of the accelerometer over the speed: it sees bumps too."""
-
+ACCEL_SPREAD = 0.25  #: Of the accelerometer over the speed: it sees bumps too.
+#: Of the currents: constants of motors and the resistance of a terrain are known to a factor of 10.
 CURRENT_GAIN = (0.7, 1.2)
-"""Of the currents: constants of motors and the resistance of a terrain are known to a factor of 10."""
 
-COST = 16.0
-"""Evidence that a unit has to bring, in minus twice the log-likelihood: four standard deviations."""
-
-LEFT = 9.0
-"""Cost of the gains under the right reading, at most: three standard deviations."""
-
-UNIT_TIE = 1.5
-"""Readings whose costs differ by less cannot be distinguished: their odds are within 2."""
-
-MIN_USUAL_RATIO = 0.2
-"""Ratio of runs without a fault, from which they are what the others are compared with."""
-
+COST = (
+    16.0  #: Evidence that a unit has to bring, in minus twice the log-likelihood: four standard deviations.
+)
+LEFT = 9.0  #: Cost of the gains under the right reading, at most: three standard deviations.
+UNIT_TIE = 1.5  #: Readings whose costs differ by less cannot be distinguished: their odds are within 2.
+MIN_USUAL_RATIO = (
+    0.2  #: Ratio of runs without a fault, from which they are what the others are compared with.
+)
+#: A run of another unit than the others agrees with them after its repair: within so many times their scatter, the
+#: second at the least and the first at the most, in the logarithm.  Where its motion would be too small it is the
+#: second, since a run may slip or stall, by any factor.
 NEAR, TIGHT, SCATTERS = 0.35, 0.1, 3.0
-"""A run of another unit than the others agrees with them after its repair: within so many times their
-scatter, the second at the least and the first at the most, in the logarithm.  Where its motion would be too
-small it is the second, since a run may slip or stall, by any factor."""
-
+#: Correlation of the channels of such a run, if it is another unit and nothing that changes over a run.
 CLEAR_FIT = 0.95
-"""Correlation of the channels of such a run, if it is another unit and nothing that changes over a run."""
 
-KEYS = (G, X, A, AMPS, H)
-"""Channels that have a gain, in the order of the columns of logarithms."""
-
+KEYS = (G, X, A, AMPS, H)  #: Channels that have a gain, in the order of the columns of logarithms.
 _PLACE = {c: i for i, c in enumerate(KEYS)}
 _MOTION = [_PLACE[c] for c in (G, X, A, H)]
 
@@ -698,9 +657,7 @@ def _unit_fault(
 
 # -- Constant offsets of sensors that no bias of the catalogue reaches: sensors not zeroed, or turned ------
 
-SIGMAS = 4.0
-"""An offset is over the largest by so many standard deviations."""
-
+SIGMAS = 4.0  #: An offset is over the largest by so many standard deviations.
 MIN_ROWS = 10
 
 
@@ -741,8 +698,8 @@ def _offset(run: Response, c: int) -> tuple[float, float]:
 
 # -- Faults of channels of all runs: signs, exchanged columns and units, before any cause is searched ------
 
+#: Signs and exchanges that are searched one after the other; logs with more are no logs of this robot.
 MAX_FAULTS = 4
-"""Signs and exchanges that are searched one after the other; logs with more are no logs of this robot."""
 
 
 class _Logs(NamedTuple):

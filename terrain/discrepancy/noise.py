@@ -15,47 +15,36 @@ from scipy.optimize import nnls
 from terrain.kernels import njit
 from terrain.records import Array
 
+#: Least ratio of the mean square that is attributed to noise at rest: starts of a robot are simulated less well than
+#: the noise at rest suggests.
 FLOOR = 0.2
-"""Least ratio of the mean square that is attributed to noise at rest: starts of a robot are simulated less
-well than the noise at rest suggests."""
 
-ORDER = 6
-"""Of the autoregression: about a second at the rate of the rows."""
-
-ORDERS = (ORDER, 3, 1)
-"""Orders that are tried: a channel with many holes has few stretches that fill a long one."""
-
+ORDER = 6  #: Of the autoregression: about a second at the rate of the rows.
+ORDERS = (
+    ORDER,
+    3,
+    1,
+)  #: Orders that are tried: a channel with many holes has few stretches that fill a long one.
+#: The order of noise without memory, with which a fit starts: a memory that is fitted to a residual full of levels
+#: would weigh levels down to nothing, and they would never be fitted.
 WHITE = (0,)
-"""The order of noise without memory, with which a fit starts: a memory that is fitted to a residual full of
-levels would weigh levels down to nothing, and they would never be fitted."""
-
+#: Correlation time of the noise at the most: ground and vibration forget themselves within a second or a metre, and
+#: what lasts longer is a level that wants a cause.
 LONGEST_MEMORY_S = 1.0
-"""Correlation time of the noise at the most: ground and vibration forget themselves within a second or a
-metre, and what lasts longer is a level that wants a cause."""
 
-WHOLE_RATIO = 0.7
-"""Ratio of the rows of the shortest order that a longer one has to keep."""
-
-
+WHOLE_RATIO = 0.7  #: Ratio of the rows of the shortest order that a longer one has to keep.
+#: Factors by which the poles of an autoregression are drawn in, from none, until its memory is short enough.
 SHRINKS = np.linspace(1.0, 0.0, 51)
-"""Factors by which the poles of an autoregression are drawn in, from none, until its memory is short
-enough."""
 
 
 class Noise(NamedTuple):
-    """Noise of each channel.
+    """Noise of each channel."""
 
-    Parameters
-    ----------
-    growth : (channels, 3) coefficients of ``s(v)^2``, in the square of the channel's unit
-    filters : (channels, ORDER + 1) whitens: ``e_k = sum_i filters[i] x_(k-i)`` has the variance 1; NaN where
-        a channel was never measured
-    std : (channels,) of the noise behind the low-pass, in the channel's unit
-    """
-
-    growth: Array
+    growth: Array  #: (channels, 3) coefficients of ``s(v)^2``, in the square of the channel's unit
+    #: (channels, ORDER + 1) whitens: ``e_k = sum_i filters[i] x_(k-i)`` has the variance 1; NaN where a channel was
+    #: never measured
     filters: Array
-    std: Array
+    std: Array  #: (channels,) of the noise behind the low-pass, in the channel's unit
 
     def size(self, speed_mps: Array) -> Array:
         """Return ``s`` (m, channels) at speeds (m,) of the wheels, forward or backward."""

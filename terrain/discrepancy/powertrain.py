@@ -35,37 +35,22 @@ from terrain.kernels import njit, record
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
-STEP_S = 0.02
-"""Of the simulated powertrain; a fifth of the shortest delays that robots have."""
-
-MIN_RUNS = 5
-"""Fewer do not tell an error from the scatter between runs."""
-
-FOLDS = 5
-"""Into which runs are dealt, to be left out of a fit one after the other."""
-
-DRAWS = 1000
-"""Bootstrap samples of runs."""
-
+STEP_S = 0.02  #: Of the simulated powertrain; a fifth of the shortest delays that robots have.
+MIN_RUNS = 5  #: Fewer do not tell an error from the scatter between runs.
+FOLDS = 5  #: Into which runs are dealt, to be left out of a fit one after the other.
+DRAWS = 1000  #: Bootstrap samples of runs.
+#: Of the squared error, that a part removes of the runs fitted; less is not worth a number, whatever its
+#: significance: a thousandth of 0.1 rad/s rms is 3 mrad/s.
 MIN_GAIN_RATIO = 0.002
-"""Of the squared error, that a part removes of the runs fitted; less is not worth a number, whatever its
-significance: a thousandth of 0.1 rad/s rms is 3 mrad/s."""
-
+#: A part of a usual size has to change the squared error by so many standard deviations to be visible.
 EXCITED_SIGMAS = 3.0
-"""A part of a usual size has to change the squared error by so many standard deviations to be visible."""
-
+#: What the grid leaves open of delay and time constant, whatever the number of runs: commands that change with the
+#: grid answer alike to all delays within a step.
 GRID_ROOM_S = STEP_S
-"""What the grid leaves open of delay and time constant, whatever the number of runs: commands that change with the
-grid answer alike to all delays within a step."""
 
-SCALE_TOLERANCE = 0.1
-"""Gains further from 1 than that: the commands are no wheel speeds."""
-
-TOLERANCE = 1e-4
-"""A fit ends where a step reduces the squared error by less, relative to it."""
-
-LIMIT_STARTS = (0.3, 0.5, 0.7, 0.9)
-"""Ratios of the largest measured speed, from which fits of limits start."""
+SCALE_TOLERANCE = 0.1  #: Gains further from 1 than that: the commands are no wheel speeds.
+TOLERANCE = 1e-4  #: A fit ends where a step reduces the squared error by less, relative to it.
+LIMIT_STARTS = (0.3, 0.5, 0.7, 0.9)  #: Ratios of the largest measured speed, from which fits of limits start.
 
 
 class _Kind(NamedTuple):
@@ -111,8 +96,8 @@ KINDS = {
 NAMES = tuple(KINDS)
 OF_TWO_SIDES = ("difference_gain_ratio", "common_limit_radps", "difference_limit_radps")
 ABSENT = np.array([kind.absent for kind in KINDS.values()])
+#: Values (len(NAMES),) of all parts as kernels take them: ``values.view(VALUES)[0]``.
 VALUES = record(dict.fromkeys(NAMES, float))
-"""Values (len(NAMES),) of all parts as kernels take them: ``values.view(VALUES)[0]``."""
 
 
 class PartStatus(Enum):
@@ -144,24 +129,19 @@ class Part(NamedTuple):
 
 
 class Powertrain(NamedTuple):
-    """From commanded to measured wheel speeds.
+    """From commanded to measured wheel speeds."""
 
-    Parameters
-    ----------
-    parts : in the order of :data:`NAMES`; without those of two sides where a robot has not just two
-    rms_before_radps, rms_after_radps : measured minus commanded, and minus predicted of runs left out of the fit
-    reduction : of the squared error of these runs, over that of the commands, with its 95 % interval over runs
-    hold_s : period at which new wheel speeds are logged
-    reason : why nothing of it is known; empty where it is
-    """
-
+    #: in the order of :data:`NAMES`; without those of two sides where a robot has not just two
     parts: tuple[Part, ...] = ()
-    rms_before_radps: float = math.nan
+    rms_before_radps: float = (
+        math.nan
+    )  #: measured minus commanded, and minus predicted of runs left out of the fit
     rms_after_radps: float = math.nan
+    #: of the squared error of these runs, over that of the commands, with its 95 % interval over runs
     reduction: tuple[float, float, float] = (math.nan, math.nan, math.nan)
-    hold_s: float = math.nan
+    hold_s: float = math.nan  #: period at which new wheel speeds are logged
     n_runs: int = 0
-    reason: str = ""
+    reason: str = ""  #: why nothing of it is known; empty where it is
 
     @property
     def found(self) -> tuple[Part, ...]:
@@ -205,26 +185,15 @@ class Powertrain(NamedTuple):
 
 
 class Traces(NamedTuple):
-    """All runs on one grid.
+    """All runs on one grid."""
 
-    Parameters
-    ----------
-    area_rad : (m, wheels) integrals of the commands from the start of each run
-    first : (runs + 1,) rows of each run in the grid
-    start_radps : (runs, wheels) first measured wheel speeds
-    run : (n,) number of the run of each sample
-    place : (n,) of each sample in the grid of its run, in steps
-    measured : (n, wheels) wheel speeds
-    new : (n, wheels) 1 where a sample of a wheel is new, else 0
-    """
-
-    area_rad: Array
-    first: Array
-    start_radps: Array
-    run: Array
-    place: Array
-    measured: Array
-    new: Array
+    area_rad: Array  #: (m, wheels) integrals of the commands from the start of each run
+    first: Array  #: (runs + 1,) rows of each run in the grid
+    start_radps: Array  #: (runs, wheels) first measured wheel speeds
+    run: Array  #: (n,) number of the run of each sample
+    place: Array  #: (n,) of each sample in the grid of its run, in steps
+    measured: Array  #: (n, wheels) wheel speeds
+    new: Array  #: (n, wheels) 1 where a sample of a wheel is new, else 0
 
 
 def powertrain_of(

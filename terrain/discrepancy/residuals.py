@@ -22,82 +22,55 @@ from terrain.robots import BicycleRobot
 from terrain.simulation.planar.motion import Planar, move
 from terrain.simulation.planar.replay import corrected_inputs, replay, sense
 
-CUTOFF_HZ = 2.5
-"""Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz."""
-
-INPUT_CUTOFFS = 2.4
-"""Cut-off of the inputs of the simulation, over that of the common low-pass."""
-
+CUTOFF_HZ = (
+    2.5  #: Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz.
+)
+INPUT_CUTOFFS = 2.4  #: Cut-off of the inputs of the simulation, over that of the common low-pass.
+#: Cut-off of the wheel speeds that serve as instruments of the sensitivities, over that of the common low-pass: see
+#: :func:`rows_of`.
 INSTRUMENT_CUTOFF_RATIO = 0.6
-"""Cut-off of the wheel speeds that serve as instruments of the sensitivities, over that of the common
-low-pass: see :func:`rows_of`."""
 
-SAME_CLOCK = 0.05
-"""Ratio by which the runs' clocks may differ: one window serves all of them."""
-
-CLOCKS_PER_CUTOFF = 10.0
-"""Rate of the replay's clock over the cut-off of the common low-pass."""
-
-ROWS_PER_CUTOFF = 2.5
-"""Rows a second over the cut-off: the low-pass is down by 50 dB at half the rate of the rows."""
-
-TAPS_PER_CUTOFF = 2.4
-"""Half length of the low-pass times its cut-off."""
-
-MIN_KNOWN = 0.75
-"""Ratio of the low-pass's weight that has to be known for a row, where a channel has holes."""
-
-SETTLE_S = 0.5
-"""Start and end of a run left out, beside those of the low-pass: the replay starts in steady motion."""
-
+SAME_CLOCK = 0.05  #: Ratio by which the runs' clocks may differ: one window serves all of them.
+CLOCKS_PER_CUTOFF = 10.0  #: Rate of the replay's clock over the cut-off of the common low-pass.
+ROWS_PER_CUTOFF = (
+    2.5  #: Rows a second over the cut-off: the low-pass is down by 50 dB at half the rate of the rows.
+)
+TAPS_PER_CUTOFF = 2.4  #: Half length of the low-pass times its cut-off.
+MIN_KNOWN = 0.75  #: Ratio of the low-pass's weight that has to be known for a row, where a channel has holes.
+SETTLE_S = (
+    0.5  #: Start and end of a run left out, beside those of the low-pass: the replay starts in steady motion.
+)
+#: A shorter run may have its one change of command at its start, which is kept if it is in steady motion.
 SHORT_S = 10.0
-"""A shorter run may have its one change of command at its start, which is kept if it is in steady motion."""
-
+#: Steady motion: for so long no wheel's speed and no steering changes by more than that.
 STEADY_S, STEADY_MPS, STEADY_RAD = 0.25, 0.05, 0.02
-"""Steady motion: for so long no wheel's speed and no steering changes by more than that."""
 
 
 class LowPass(NamedTuple):
-    """A symmetric window, and the rate of its output.
+    """A symmetric window, and the rate of its output."""
 
-    Parameters
-    ----------
-    taps : on the clock of the replay
-    every : samples of that clock a row
-    rate_hz, cutoff_hz : of the rows, and of the window
-    inputs_every : samples of the signals' clock a sample of the replay's; 0 where that clock is too slow for
-        a window of its own in between
-    instrument_cutoff_hz : cut-off of the wheel speeds that serve as instruments of the sensitivities, see
-        :func:`rows_of`; infinite for those of the prediction
-    """
-
-    taps: Array
-    every: int
-    rate_hz: float
+    taps: Array  #: on the clock of the replay
+    every: int  #: samples of that clock a row
+    rate_hz: float  #: of the rows, and of the window
     cutoff_hz: float
+    #: samples of the signals' clock a sample of the replay's; 0 where that clock is too slow for a window of its own
+    #: in between
     inputs_every: int
+    #: cut-off of the wheel speeds that serve as instruments of the sensitivities, see :func:`rows_of`; infinite for
+    #: those of the prediction
     instrument_cutoff_hz: float
 
 
 class Rows(NamedTuple):
-    """A low-pass filtered run, row by row.
+    """A low-pass filtered run, row by row."""
 
-    Parameters
-    ----------
-    run_id, terrain : of the run
-    time_s : (m,) from the start of the run
-    measured, predicted : (m, channels)
-    sensitivity : (parameters, m, channels) change of the prediction per change of each parameter
-    inputs : (m, len(INPUTS) - 1 + wheels) inputs of the simulation, for probes of the residual
-    """
-
-    run_id: str
+    run_id: str  #: of the run
     terrain: str
-    time_s: Array
-    measured: Array
+    time_s: Array  #: (m,) from the start of the run
+    measured: Array  #: (m, channels)
     predicted: Array
-    sensitivity: Array
-    inputs: Array
+    sensitivity: Array  #: (parameters, m, channels) change of the prediction per change of each parameter
+    inputs: Array  #: (m, len(INPUTS) - 1 + wheels) inputs of the simulation, for probes of the residual
 
     @property
     def residual(self) -> Array:
@@ -111,14 +84,14 @@ class Rows(NamedTuple):
         return np.maximum(speed, 0.5 * np.abs(self.inputs[:, 1]))
 
 
+#: Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt, traction over weight, 0,
+#: and how far the wheels have turned: a column for each of them.  Of an omni robot speed, turn and sideways are those
+#: that its wheels would roll ahead, in place (twice the speed of a wheel) and to the left; of a car-like robot turn
+#: is the difference of its rear wheels.
 INPUTS: tuple[str, ...] = (
     *("speed_mps", "turn_mps", "steer_rad", "grade_rad", "roll_rad"),
     *("force_ratio", "sideways_mps", "wheel_phase_rad"),
 )
-"""Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt, traction over
-weight, 0, and how far the wheels have turned: a column for each of them.  Of an omni robot speed, turn and
-sideways are those that its wheels would roll ahead, in place (twice the speed of a wheel) and to the left; of
-a car-like robot turn is the difference of its rear wheels."""
 
 
 def low_pass_of(signals: Sequence[Signals]) -> LowPass:

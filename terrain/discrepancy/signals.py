@@ -19,54 +19,42 @@ from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
 from terrain.slip_learning.measured import travelled
 
-MAX_RATE_HZ = 50.0
-"""Clock of the replay, unless the wheels are logged slower."""
-
-MAX_GAP_PERIODS = 3.5
-"""Longest hole of a stream that is bridged by a straight line, in its own periods."""
-
-MIN_LENGTH_S = 4.0
-"""Of a shorter run nothing is left once filters have settled."""
-
+MAX_RATE_HZ = 50.0  #: Clock of the replay, unless the wheels are logged slower.
+MAX_GAP_PERIODS = 3.5  #: Longest hole of a stream that is bridged by a straight line, in its own periods.
+MIN_LENGTH_S = 4.0  #: Of a shorter run nothing is left once filters have settled.
+#: A camera speed is a jump of its map if it differs from the median over the first before and after by the second,
+#: and by so many times the usual deviation.
 JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
-"""A camera speed is a jump of its map if it differs from the median over the first before and after by the
-second, and by so many times the usual deviation."""
 
-BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
-"""A wheel turns backward if it is faster than that on at least so many samples."""
-
+BACKWARD_MPS, MIN_BACKWARD = (
+    0.02,
+    5,
+)  #: A wheel turns backward if it is faster than that on at least so many samples.
+#: Least norm of the mean of the wheels' unit vectors at which the sum of currents measures traction: wheels within 18
+#: degrees of each other.
 PARALLEL = 0.95
-"""Least norm of the mean of the wheels' unit vectors at which the sum of currents measures traction: wheels
-within 18 degrees of each other."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Signals:
-    """A run on one clock.
+    """A run on one clock."""
 
-    Parameters
-    ----------
-    run_id, terrain : of the run; the terrain is empty where it has no label or several
-    dt_s : period of the clock
-    start_s : first instant on the run's own clock
-    wheel_speed_mps : (n, wheels) wheel speeds with the nominal radius, of a car-like robot (n, 1) that of
-        the rear axle; NaN where a logger was silent
-    steer_rad : (n, steered wheels) steering angles, zeros taken off; (n, wheels) zeros of a robot without
-    grade_rad, roll_rad : (n,) measured tilt, uphill and left side up positive; 0 where none is measured
-    measured : (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
-    session : that the run is part of; empty where that is not known
-    """
-
-    run_id: str
+    run_id: str  #: of the run; the terrain is empty where it has no label or several
     terrain: str
-    dt_s: float
-    start_s: float
+    dt_s: float  #: period of the clock
+    start_s: float  #: first instant on the run's own clock
+    #: (n, wheels) wheel speeds with the nominal radius, of a car-like robot (n, 1) that of the rear axle; NaN where a
+    #: logger was silent
     wheel_speed_mps: Array
-    steer_rad: Array
-    grade_rad: Array
+    steer_rad: (
+        Array  #: (n, steered wheels) steering angles, zeros taken off; (n, wheels) zeros of a robot without
+    )
+    grade_rad: Array  #: (n,) measured tilt, uphill and left side up positive; 0 where none is measured
     roll_rad: Array
-    measured: Array
-    session: str = ""
+    measured: (
+        Array  #: (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
+    )
+    session: str = ""  #: that the run is part of; empty where that is not known
 
     def __post_init__(self) -> None:
         for name in ("wheel_speed_mps", "steer_rad", "grade_rad", "roll_rad", "measured"):

@@ -29,48 +29,39 @@ from terrain.errors import DataError
 from terrain.records import RunLog, Stream
 from terrain.signals import DelayStatus, Pair, delay, smooth_on_grid
 
-MIN_SAMPLES = 30
-"""Fewer samples of the slower stream tell no correlation from chance."""
-
+MIN_SAMPLES = 30  #: Fewer samples of the slower stream tell no correlation from chance.
+#: Width of the low-pass under fast streams: no robot turns faster, and a finer search only takes longer.
 MIN_SIGMA_S = 0.1
-"""Width of the low-pass under fast streams: no robot turns faster, and a finer search only takes longer."""
-
+#: A stream that lasts this many times as long as its samples do is mostly gap, and is not compared.
 MAX_GAP_SHARE = 20.0
-"""A stream that lasts this many times as long as its samples do is mostly gap, and is not compared."""
-
+#: Grid of the smooth gyro, in steps a period of the slower stream: fine enough for straight lines between.
 MIN_GYRO_STEPS = 8
-"""Grid of the smooth gyro, in steps a period of the slower stream: fine enough for straight lines between."""
-
+#: The loggers of a run are started together; the published runs that tell it differ by up to 1.7 s.
 MAX_OFFSET_S = 2.0
-"""The loggers of a run are started together; the published runs that tell it differ by up to 1.7 s."""
-
+#: A sampling rate that is stated and not measured may be off by a few per cent (the published BorealTC files of one
+#: run differ in length by up to 4 %); a quartz is 1000 times better.
 MAX_RATE = 0.05
-"""A sampling rate that is stated and not measured may be off by a few per cent (the published BorealTC files
-of one run differ in length by up to 4 %); a quartz is 1000 times better."""
 
 MIN_YAW_RATE_STD_RADPS = 0.02
 """Spread of the wheel difference over the track that counts as turning.
 
 Two steps of an encoder that resolves 0.008 m/s, on a track of 0.57 m, come to 0.03 rad/s."""
 
+#: The gain must stand this far above its own error; the best of many shifts of mere noise reaches 4.
 MIN_GAIN_SIGMAS = 6.0
-"""The gain must stand this far above its own error; the best of many shifts of mere noise reaches 4."""
-
+#: Below this most of what the gyro sees is not in the wheels, and the model of one gain does not hold.
 MIN_CORRELATION = 0.5
-"""Below this most of what the gyro sees is not in the wheels, and the model of one gain does not hold."""
-
+#: With a larger standard deviation the rate is indistinguishable from that of any stated sampling rate.
 RATE_KNOWN = 0.01
-"""With a larger standard deviation the rate is indistinguishable from that of any stated sampling rate."""
-
+#: Share of the variance by which a rival must be worse even when the best peak explains nearly everything.
 RIVAL_FLOOR = 0.05
-"""Share of the variance by which a rival must be worse even when the best peak explains nearly everything."""
 
-SAME_PEAK_SIGMAS = 4.0
-"""Two peaks of the grid that lie closer than this many widths of the low-pass are one."""
-
+SAME_PEAK_SIGMAS = (
+    4.0  #: Two peaks of the grid that lie closer than this many widths of the low-pass are one.
+)
+#: Between the clocks of wheels and IMU: in more, a robot that begins to turn is seen to turn without wheels, and the
+#: effective track is wrong by as much as its turns are short.
 MAX_APART_S = 0.1
-"""Between the clocks of wheels and IMU: in more, a robot that begins to turn is seen to turn without wheels,
-and the effective track is wrong by as much as its turns are short."""
 
 
 class ClockEstimate(NamedTuple):

@@ -32,62 +32,46 @@ from terrain.logs.samples import MAX_MAGNITUDE
 from terrain.logs.schema import signal_set_of
 from terrain.records import Array, Label, RunLog, Stream
 
-N_PEAKS = 16
-"""Peaks of a fingerprint: 42 comparisons, of which some 30 are independent."""
-
-LAGS = (1, 2, 3)
-"""A peak is compared with so many that follow it."""
-
+N_PEAKS = 16  #: Peaks of a fingerprint: 42 comparisons, of which some 30 are independent.
+LAGS = (1, 2, 3)  #: A peak is compared with so many that follow it.
+#: Standard deviation of the low-pass filter: some five peaks a second, whatever the sampling rate.
 SMOOTHING_S = 0.04
-"""Standard deviation of the low-pass filter: some five peaks a second, whatever the sampling rate."""
-
+#: Signal sets whose channels are measured; what a filter makes of them adds nothing.
 MEASURED_SETS = ("imu", "wheels", "currents")
-"""Signal sets whose channels are measured; what a filter makes of them adds nothing."""
-
+#: Heights that differ by less than this part of the channel's standard deviation are those of a periodic signal or of
+#: noise in the last digit, which repeats from run to run.
 MIN_SPREAD_RATIO = 0.1
-"""Heights that differ by less than this part of the channel's standard deviation are those of a periodic
-signal or of noise in the last digit, which repeats from run to run."""
-
+#: Different heights of a stretch: channels that go back and forth between a few values repeat themselves.
 MIN_LEVELS = 10
-"""Different heights of a stretch: channels that go back and forth between a few values repeat themselves."""
 
-MIN_DISTINCT = 64
-"""Values that a stream must have taken for its bytes to identify it."""
-
-
+MIN_DISTINCT = 64  #: Values that a stream must have taken for its bytes to identify it.
+#: Of the heights of two stretches whose order agrees already; copies rounded to a tenth of the standard deviation of
+#: their channel are above 0.995.
 MIN_CORRELATION = 0.99
-"""Of the heights of two stretches whose order agrees already; copies rounded to a tenth of the standard
-deviation of their channel are above 0.995."""
-
+#: Clocks of two copies may run at rates that differ by less than this; those of loggers differ by 4 %.
 MAX_RATE_RATIO = 1.1
-"""Clocks of two copies may run at rates that differ by less than this; those of loggers differ by 4 %."""
-
+#: Fingerprints that must agree in their offset; three are one more peak each, not three times the time.
 MIN_STRETCHES = 3
-"""Fingerprints that must agree in their offset; three are one more peak each, not three times the time."""
-
+#: Equal fingerprints without their heights: 21 peaks of one channel, or fewer of several.  Of 10000 runs of noise of
+#: one kind, some hundred pairs agree in so many by chance.
 MIN_EQUAL = 6
-"""Equal fingerprints without their heights: 21 peaks of one channel, or fewer of several.  Of 10000 runs of
-noise of one kind, some hundred pairs agree in so many by chance."""
-
+#: Fingerprints of one overlap agree in their offset within this, and a tenth of the time between them.
 OFFSET_TOLERANCE_S = 0.3
-"""Fingerprints of one overlap agree in their offset within this, and a tenth of the time between them."""
 
-MAX_HOLE_S = 15.0
-"""An overlap may lose its fingerprints for so long, as at a standstill, and is one overlap still."""
-
-EDGE_S = 1.5
-"""An overlap that reaches so close to the end of a run reaches its end: the first peaks come later."""
-
+MAX_HOLE_S = (
+    15.0  #: An overlap may lose its fingerprints for so long, as at a standstill, and is one overlap still.
+)
+EDGE_S = (
+    1.5  #: An overlap that reaches so close to the end of a run reaches its end: the first peaks come later.
+)
 N_FILES = 32
+#: 2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of Computer
+#: Programming 3, section 6.4).
 SPREADING = np.uint64(0x9E3779B97F4A7C15)
-"""2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of
-Computer Programming 3, section 6.4)."""
-
+#: A peak of a channel of a run; ``spread`` is that of the channel.
 PEAK = np.dtype([("run", int), ("time_s", float), ("height", float), ("spread", float), ("period_s", float)])
-"""A peak of a channel of a run; ``spread`` is that of the channel."""
-
+#: A fingerprint, the time of its first peak, and the run.
 PRINT = np.dtype([("code", "<i8"), ("time_s", "<f8"), ("run", "<i4")])
-"""A fingerprint, the time of its first peak, and the run."""
 
 
 # -- Fingerprints ---------------------------------------------------------------------------------------------
@@ -298,17 +282,11 @@ def _span(run: RunLog) -> tuple[float, float]:
 
 
 class RunPrint(NamedTuple):
-    """What of a run shows whether another one may hold a stretch of it.
+    """What of a run shows whether another one may hold a stretch of it."""
 
-    Parameters
-    ----------
-    codes, time_s : (n,) fingerprints of peaks whose heights vary, and the times of their first peaks
-    digest : of the fastest stream; empty where its samples may repeat
-    """
-
-    codes: Array
+    codes: Array  #: (n,) fingerprints of peaks whose heights vary, and the times of their first peaks
     time_s: Array
-    digest: bytes
+    digest: bytes  #: of the fastest stream; empty where its samples may repeat
 
 
 def run_print(run: RunLog) -> RunPrint:
@@ -379,14 +357,9 @@ class PrintFiles:
 
 # -- One run of those that share a stretch --------------------------------------------------------------------
 
-PART_GAP_S = 1.0
-"""Between two parts of a merged run; far longer than the gaps that a window may have."""
-
-LABEL_MARGIN_S = 2.0
-"""Labels are compared this far inside of a stretch, whose ends are known to a second."""
-
-MAX_SHOWN = 3
-"""Pairs that a refusal names."""
+PART_GAP_S = 1.0  #: Between two parts of a merged run; far longer than the gaps that a window may have.
+LABEL_MARGIN_S = 2.0  #: Labels are compared this far inside of a stretch, whose ends are known to a second.
+MAX_SHOWN = 3  #: Pairs that a refusal names.
 
 
 class DistinctRuns(NamedTuple):

@@ -25,25 +25,21 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from terrain.records import Array
 
-SIGMA_S = 0.2
-"""Width of the low-pass under which signals are compared: lags of 0.1 s and vibration hardly matter."""
-
+SIGMA_S = (
+    0.2  #: Width of the low-pass under which signals are compared: lags of 0.1 s and vibration hardly matter.
+)
+#: Under it no sign is read from a signal.  Measured, of eleven sessions and recordings: 0.4 to 0.9 along x and y (0.3
+#: of a Marmotte along x, on snow), 0.95 to 1.00 of the gyro.
 MIN_CORRELATION = 0.2
-"""Under it no sign is read from a signal.  Measured, of eleven sessions and recordings: 0.4 to 0.9 along x
-and y (0.3 of a Marmotte along x, on snow), 0.95 to 1.00 of the gyro."""
 
-MIN_GYRO_CORRELATION = 0.5
-"""The gyro has no slip in it, and agrees with wheels of its own robot by far more."""
-
-MIN_SAMPLES = 200
-"""Ten seconds at 20 Hz: fewer show no sign."""
-
-MIN_SIGN_GRAVITY_MPS2 = 5.0
-"""Half of gravity: less along z is no upright IMU, nor one upside down."""
-
+MIN_GYRO_CORRELATION = (
+    0.5  #: The gyro has no slip in it, and agrees with wheels of its own robot by far more.
+)
+MIN_SAMPLES = 200  #: Ten seconds at 20 Hz: fewer show no sign.
+MIN_SIGN_GRAVITY_MPS2 = 5.0  #: Half of gravity: less along z is no upright IMU, nor one upside down.
+#: Yaw rate for each m/s of difference of the sides, in rad/m: the inverse of the track, which is wider than 0.1 m.
+#: 57 times as much is a gyro in degrees.
 MAX_TURN_PER_M = 10.0
-"""Yaw rate for each m/s of difference of the sides, in rad/m: the inverse of the track, which is wider than
-0.1 m.  57 times as much is a gyro in degrees."""
 
 TURNED = "imu axes turned"
 GYRO_TURNED = "yaw rates with their sign turned"
@@ -51,16 +47,10 @@ GYRO_IN_DEGREES = "yaw rates in deg/s"
 
 
 class ImuAxes(NamedTuple):
-    """Factors that bring an IMU into the robot's axes.
+    """Factors that bring an IMU into the robot's axes."""
 
-    Parameters
-    ----------
-    accel : signs of the accelerometer's axes, x, y and z
-    gyro_z : sign of the yaw rate, times the radian of a degree where it is in deg/s
-    """
-
-    accel: tuple[float, float, float]
-    gyro_z: float
+    accel: tuple[float, float, float]  #: signs of the accelerometer's axes, x, y and z
+    gyro_z: float  #: sign of the yaw rate, times the radian of a degree where it is in deg/s
 
     def gyro(self) -> tuple[float, float, float]:
         """Return the factors of the gyro's axes."""
@@ -148,14 +138,10 @@ def _correlation(one: Array, other: Array) -> float:
     return float(np.corrcoef(one, other)[0, 1])
 
 
-MIN_MOVING_RADPS = 0.05
-"""Slower wheels stand."""
-
-MIN_CURRENT_A = 1.0
-"""Smaller currents show no sign."""
-
+MIN_MOVING_RADPS = 0.05  #: Slower wheels stand.
+MIN_CURRENT_A = 1.0  #: Smaller currents show no sign.
+#: A wheel that stands turns, if at all, as it does within so long of that: it starts, or has just stopped.
 SENSE_S = 0.5
-"""A wheel that stands turns, if at all, as it does within so long of that: it starts, or has just stopped."""
 
 NO_SIGN = "currents without a sign"
 POWER_SIGN = "currents turned from the sign of the power"

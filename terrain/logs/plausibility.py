@@ -37,17 +37,14 @@ from terrain.logs.schema import NO_FEATURES, signal_set_of, unit_of
 from terrain.records import Array, RunLog, Stream
 from terrain.signals import agreement
 
-GAP_PERIODS = 1.5
-"""An interval of this many median periods has lost at least one sample."""
-
+GAP_PERIODS = 1.5  #: An interval of this many median periods has lost at least one sample.
+#: A gyro or accelerometer shows its noise in the last digit even at rest: on 69 published Husky runs it never holds a
+#: value for more than 2 samples, so 20 (0.2 s at 100 Hz) are a fault.
 STUCK_IMU_SAMPLES = 20
-"""A gyro or accelerometer shows its noise in the last digit even at rest: on 69 published Husky runs it never
-holds a value for more than 2 samples, so 20 (0.2 s at 100 Hz) are a fault."""
-
+#: A wheel speed may hold one value for a whole run of steady driving, and a current rest at its floor.  They are
+#: stuck when the same quantity at another wheel changes so often meanwhile; on the published runs it changes at most
+#: 7 times.
 STUCK_SIBLING_CHANGES = 20
-"""A wheel speed may hold one value for a whole run of steady driving, and a current rest at its floor.  They
-are stuck when the same quantity at another wheel changes so often meanwhile; on the published runs
-it changes at most 7 times."""
 
 IMU_QUANTITIES = ("gyro", "accel")
 
@@ -157,23 +154,15 @@ OK, UNKNOWN, DOUBTFUL, IMPLAUSIBLE = Level
 
 
 class Check(NamedTuple):
-    """One respect in which a run was judged.
+    """One respect in which a run was judged."""
 
-    Parameters
-    ----------
-    check : what was judged: ``gravity``, ``yaw rate``, ``wheel speed``, ``sampling``, ``values``,
-        ``channel names``, ``constant channels``, ``overlap``
-    level : how plausible it is
-    place : stream or channel that it is about
-    measured : the figure that was judged; NaN where there is none
-    sentence : what was measured, and what is expected
-    """
-
+    #: what was judged: ``gravity``, ``yaw rate``, ``wheel speed``, ``sampling``, ``values``, ``channel names``,
+    #: ``constant channels``, ``overlap``
     check: str
-    level: Level
-    place: str
-    measured: float
-    sentence: str
+    level: Level  #: how plausible it is
+    place: str  #: stream or channel that it is about
+    measured: float  #: the figure that was judged; NaN where there is none
+    sentence: str  #: what was measured, and what is expected
 
 
 class Scale(NamedTuple):
@@ -185,11 +174,8 @@ class Scale(NamedTuple):
 
 UNKNOWN_ROBOT = Scale()
 
-MIN_SAMPLES = 5
-"""Fewer show no rate."""
-
-Case = tuple[bool | np.bool_, Level, str]
-"""Whether it holds, how plausible a run is then, and why."""
+MIN_SAMPLES = 5  #: Fewer show no rate.
+Case = tuple[bool | np.bool_, Level, str]  #: Whether it holds, how plausible a run is then, and why.
 
 
 def _first(check: str, place: str, measured: float, *cases: Case) -> Check:
@@ -228,25 +214,20 @@ def judge(run: RunLog, scale: Scale = UNKNOWN_ROBOT) -> tuple[Check, ...]:
 
 # -- Gravity: what an accelerometer measures on Earth ---------------------------------------------------------
 
+#: Mean specific force over gravity: scale errors of cheap accelerometers are 3 %, and over 6 s of rough driving
+#: measured runs reach 0.93 to 1.085.
 GRAVITY_RATIO = (0.9, 1.1)
-"""Mean specific force over gravity: scale errors of cheap accelerometers are 3 %, and over 6 s of rough
-driving measured runs reach 0.93 to 1.085."""
-
+#: Beyond, no driving explains it: the mean acceleration of a run is that of its change of speed.
 IMPLAUSIBLE_GRAVITY_RATIO = (0.8, 1.2)
-"""Beyond, no driving explains it: the mean acceleration of a run is that of its change of speed."""
-
+#: Less is an accelerometer without gravity, as some fusing IMUs report it: of use for vibration, not for tilt, so
+#: that it is doubtful.
 NO_GRAVITY_RATIO = 0.2
-"""Less is an accelerometer without gravity, as some fusing IMUs report it: of use for vibration, not for
-tilt, so that it is doubtful."""
 
-UPRIGHT_RATIO = 0.9
-"""Least part of the mean specific force along z, a tilt of 26 degrees; measured runs reach 0.97."""
-
-TILTED_RATIO = 0.7
-"""Less is a tilt of 45 degrees: another axis points up."""
-
-MIN_GRAVITY_S = 1.0
-"""Over shorter runs a brake is as large as gravity."""
+UPRIGHT_RATIO = (
+    0.9  #: Least part of the mean specific force along z, a tilt of 26 degrees; measured runs reach 0.97.
+)
+TILTED_RATIO = 0.7  #: Less is a tilt of 45 degrees: another axis points up.
+MIN_GRAVITY_S = 1.0  #: Over shorter runs a brake is as large as gravity.
 
 
 def _gravity(run: RunLog) -> Check:
@@ -290,27 +271,20 @@ def _within(value: float, bounds: tuple[float, float]) -> bool:
 
 # -- Yaw rate: the gyro beside the turn of a left and a right wheel -------------------------------------------
 
-MAX_SHIFT_S = 1.5
-"""Two loggers that were started by hand are apart by up to this on the published runs."""
-
+MAX_SHIFT_S = 1.5  #: Two loggers that were started by hand are apart by up to this on the published runs.
 N_SHIFTS = 31
-
+#: Root mean square of the yaw rate, of gyro or wheels, below which offsets are as large as the turns.
 MIN_TURN_RADPS = 0.1
-"""Root mean square of the yaw rate, of gyro or wheels, below which offsets are as large as the turns."""
-
+#: Cosine of the angle between both signals from which a slope and a sign mean something.  It counts the level of a
+#: steady turn, which a correlation does not, and which does not depend on the shift.
 MIN_LIKENESS = 0.8
-"""Cosine of the angle between both signals from which a slope and a sign mean something.  It counts the level
-of a steady turn, which a correlation does not, and which does not depend on the shift."""
 
-MAX_OTHER_LIKENESS = 0.3
-"""A regular to and fro is like both signs at some shift: then none is certain."""
-
+MAX_OTHER_LIKENESS = 0.3  #: A regular to and fro is like both signs at some shift: then none is certain.
+#: Yaw rate over that of wheels that do not slip.  Measured runs of four robots reach 0.12 (a Husky on snow) to 1.0;
+#: two of 200 dig in and hardly turn (0.03, 0.05), so that less is doubtful and no more.
 TURN_RATIO = (0.1, 1.5)
-"""Yaw rate over that of wheels that do not slip.  Measured runs of four robots reach 0.12 (a Husky on snow)
-to 1.0; two of 200 dig in and hardly turn (0.03, 0.05), so that less is doubtful and no more."""
-
+#: Nothing turns a robot faster than its wheels by so much; degrees make it 20 to 60.
 MAX_IMPLAUSIBLE_TURN_RATIO = 8.0
-"""Nothing turns a robot faster than its wheels by so much; degrees make it 20 to 60."""
 
 
 def _turns(run: RunLog, scale: Scale) -> Check:
@@ -358,12 +332,11 @@ def _turns(run: RunLog, scale: Scale) -> Check:
 
 # -- Wheel speed: what a robot reaches ------------------------------------------------------------------------
 
+#: Of off-road robots without a described top speed; from the first on doubtful, then implausible.
 MAX_SPEED_MPS = (12.0, 50.0)
-"""Of off-road robots without a described top speed; from the first on doubtful, then implausible."""
-
+#: Wheel speed over the described top speed: downhill, or with noise, up to 1.1; in km/h 3.6, which another gear may
+#: explain; in rad/s 3.3 (a wheel of 0.3 m) to 6.
 MAX_OVERSPEED = (1.5, 5.0)
-"""Wheel speed over the described top speed: downhill, or with noise, up to 1.1; in km/h 3.6, which another
-gear may explain; in rad/s 3.3 (a wheel of 0.3 m) to 6."""
 
 SPEED_QUANTILE = 0.99
 
@@ -395,22 +368,19 @@ def _speeds(run: RunLog, scale: Scale) -> Check:
 
 # -- Sampling, names, values, constants, overlap --------------------------------------------------------------
 
+#: Of any sensor of a vehicle; milliseconds read as seconds make 10 Hz 0.01 Hz, the reverse 10 kHz.
 RATE_HZ = (0.5, 1e4)
-"""Of any sensor of a vehicle; milliseconds read as seconds make 10 Hz 0.01 Hz, the reverse 10 kHz."""
-
+#: Of a run: shorter holds nothing to classify, longer than two nights is no single recording.
 DURATION_S = (0.5, 2 * 24 * 3600.0)
-"""Of a run: shorter holds nothing to classify, longer than two nights is no single recording."""
-
+#: Largest magnitudes, in SI units, that sensors of a vehicle report: gyros to 4000 deg/s, accelerometers to 40 g.
 DOUBTFUL_VALUES: dict[str, float] = {"gyro": 70.0, "accel": 400.0, "current": 1000.0, "speed": 50.0}
-"""Largest magnitudes, in SI units, that sensors of a vehicle report: gyros to 4000 deg/s, accelerometers to
-40 g."""
 
-MIN_CONSTANT_S = 10.0
-"""A current may rest at 0, and a quantised speed at one step, throughout a command of 6 s."""
-
+MIN_CONSTANT_S = (
+    10.0  #: A current may rest at 0, and a quantised speed at one step, throughout a command of 6 s.
+)
+#: Common part of the streams over the longest: below the first doubtful, below the second implausible; the published
+#: runs reach 0.9.
 MIN_OVERLAP_RATIO = (0.5, 0.1)
-"""Common part of the streams over the longest: below the first doubtful, below the second implausible; the
-published runs reach 0.9."""
 
 
 def _sampling(name: str, stream: Stream) -> Check:
@@ -436,20 +406,18 @@ def _sampling(name: str, stream: Stream) -> Check:
     )
 
 
+#: Unit of each quantity that features are made of by name.
 FEATURE_UNITS: dict[str, str] = {"gyro": "radps", "accel": "mps2", "speed": "mps", "current": "a"}
-"""Unit of each quantity that features are made of by name."""
-
+#: Quantities that logs have and no feature is made of.
 OTHER_QUANTITIES = (
     "motor angle roll pitch yaw voltage position velocity quaternion rate std fix confidence torque temperature "
     "wheel steer status force load sinkage slip traction side normal heading power pressure magnetic height tick pulse"
 )
-"""Quantities that logs have and no feature is made of."""
 
 AXES = ("x", "y", "z")
-
+#: Similarity (:mod:`difflib`) from which a name is taken for a misspelt one: two letters that changed places in
+#: ``gyor`` make 0.75, and no two known quantities are nearer than 0.67.
 NEAR = 0.75
-"""Similarity (:mod:`difflib`) from which a name is taken for a misspelt one: two letters that changed places
-in ``gyor`` make 0.75, and no two known quantities are nearer than 0.67."""
 
 
 def check_names(name: str, stream: Stream) -> list[Check]:
@@ -568,8 +536,7 @@ def _overlap(run: RunLog) -> Check:
 
 # -- Sentences on many runs -----------------------------------------------------------------------------------
 
-MAX_NAMED = 3
-"""A sentence that concerns many runs is written for so many, and counted for the others."""
+MAX_NAMED = 3  #: A sentence that concerns many runs is written for so many, and counted for the others.
 
 
 def worst(checks: Sequence[Check]) -> Level:
