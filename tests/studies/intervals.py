@@ -33,7 +33,14 @@ from terrain.simulation.planar.omni import steady_twist
 from terrain.simulation.run import learning_runs, simulate, six_positions_log
 from terrain.simulation.scenario import make_scenario
 from terrain.simulation.tracked import PrescribedSlip
-from terrain.slip_learning.curve import Resistances, learn_curve, net_peak, traction_ratio
+from terrain.slip_learning.curve import (
+    SHAPE_STD_RATIO,
+    SYSTEMATIC_SLIP_STD,
+    Resistances,
+    learn_curve,
+    net_peak,
+    traction_ratio,
+)
 from terrain.slip_learning.forces import RunBins
 from terrain.slip_learning.learn import learn_terrain, terrain_runs
 from terrain.slip_learning.rollers import roller_findings
