@@ -1,11 +1,25 @@
+"""A right filter is consistent, its innovations are white, and noise that is off is found where it is."""
+
 import numpy as np
 import pytest
 
 from terrain.errors import DataError
-from terrain.estimation.consistency import consistency_report, nees, sample_from_model
-from terrain.estimation.filter import FilterModel, Noise, run_filter
+from terrain.estimation.consistency import (
+    consistency_report,
+    innovations,
+    lagged_slip,
+    nees,
+    sample_from_model,
+    true_states,
+)
+from terrain.estimation.filter import FilterModel, FilterSettings, Noise, run_filter
+from terrain.estimation.models.swerve import default_noise, make_filter
 from terrain.kernels import njit
-from terrain.records import StateTrack
+from terrain.kinematics.logged_wheels import wheel_and_ground_speed
+from terrain.records import RunLog, StateTrack, Stream
+from terrain.robots import load_robot
+from terrain.signals import low_passed
+from terrain.simulation.run import simulate_run
 
 DT_S = 0.05
 
@@ -106,17 +120,106 @@ def test_nees_is_the_squared_error_over_its_covariance_with_angles_wrapped():
         nees(track, truth, ["yaw_rad"])
 
 
-def test_drawn_samples_have_the_requested_moments():
-    walk = np.array([[1e-4, 0.0, 0.0], [0.0, 0.04, -0.01], [0.0, -0.01, 0.01]])  # correlated
-    noise = Noise(walk, SAMPLE, np.array([1e-2, 0.04, 0.09]))
-    starts, steps, errors = [], [], []
-    for seed in range(200):
-        _, truth, z = turned(seed, 50, noise)
-        starts.append(truth[0])
-        steps.append(np.diff(truth[:, 1:], axis=0))
-        errors.append(z[:, 1] - truth[:, 1] - truth[:, 2])
-    np.testing.assert_allclose(np.var(starts, axis=0), [1e-2, 0.04, 0.09], rtol=0.35)
-    np.testing.assert_allclose(np.cov(np.concatenate(steps).T), walk[1:, 1:] * DT_S, atol=2e-4)
-    assert np.var(np.concatenate(errors)) == pytest.approx(SAMPLE[1], rel=0.06)
-    np.testing.assert_array_equal(turned(7, 50)[2], turned(7, 50)[2])
-    assert np.abs(turned(1)[1][:, 0]).max() <= np.pi
+ROBOT = load_robot("agrimaro")
+
+
+def filtered(seed=0):
+    model = make_filter("vio15", ROBOT)
+    noise = default_noise("vio15", ROBOT)
+    time_s, _, drawn = sample_from_model(model, noise, 1500, 0.02, np.random.default_rng(seed))
+    z = np.array(drawn)
+    z[200:250, model.rows.index("camera_speed_x_mps")] = np.nan
+    track = run_filter(model, noise, time_s, z, FilterSettings(gate_probability=1.0))
+    return model, track, innovations(model, noise, track, z)
+
+
+def test_scaled_innovations_have_unit_variance_and_no_memory():
+    _, _, found = filtered()
+    scaled = np.column_stack([value / std for value, std in found.values()])[50:]
+    assert np.isnan([value[0] for value, _ in found.values()]).all()
+    for column in scaled.T:
+        column = column[np.isfinite(column)]
+        assert abs(column.var() - 1.0) < 5 * np.sqrt(2 / column.size)
+        assert abs(np.mean(column[1:] * column[:-1])) < 5 / np.sqrt(column.size)
+
+
+def test_the_first_sensor_of_a_step_has_the_square_that_the_filter_kept():
+    model, track, found = filtered()
+    _, rows = model.sensors[0]  # conditioned on first: its prediction is that of the step
+    assert len(rows) == 1
+    value, std = found[rows[0]]
+    np.testing.assert_allclose((value / std)[1:] ** 2, track.nis[1:, 0], rtol=1e-6, atol=1e-9)
+
+
+def test_the_first_row_after_a_gap_has_no_innovation():
+    model, noise = make_filter("vio15", ROBOT), default_noise("vio15", ROBOT)
+    time_s, _, z = sample_from_model(model, noise, 400, 0.02, np.random.default_rng(1))
+    time_s = np.where(np.arange(400) < 200, time_s, time_s + 6.0)
+    track = run_filter(model, noise, time_s, z)
+    found = innovations(model, noise, track, z[np.searchsorted(time_s, track.time_s)])
+    after = int(np.flatnonzero(np.diff(track.time_s) > 1.0)[0]) + 1
+    for value, std in found.values():
+        assert np.isnan([value[after], std[after]]).all()
+        assert np.isfinite(value[after + 1 :]).all()
+
+
+STATES = ("yaw_rad", "speed_x_mps", "steer_2_rad", "gyro_bias_radps", "slip_speed_3_mps", "effective_track_m")
+
+
+@pytest.fixture(scope="module")
+def run():
+    return simulate_run(ROBOT, "grass", "arc", 0, duration_s=10.0)
+
+
+def empty_track(states, time_s):
+    n, d = len(time_s), len(states)
+    none = np.zeros((n, 1))
+    return StateTrack(
+        time_s,
+        np.zeros((n, d)),
+        np.tile(np.eye(d), (n, 1, 1)),
+        states,
+        none,
+        none,
+        none,
+        ("s",),
+        np.zeros(n),
+        0.0,
+    )
+
+
+def test_truth_passes_the_low_pass_of_the_filter_inputs(run):
+    time_s = np.arange(0.5, 9.0, 0.02)
+    truth = run.streams["truth"]
+    found = true_states(run, empty_track(STATES, time_s), ROBOT, 0.05)
+    speed = low_passed(truth.time_s, truth.channel("speed_x_mps"), 0.05, 1.0)
+    np.testing.assert_allclose(found[:, 1], np.interp(time_s, truth.time_s, speed), atol=1e-9)
+    plain = true_states(run, empty_track(STATES, time_s), ROBOT, 0.0)
+    rising = (time_s > 1.3) & (time_s < 1.7)
+    lag_s = (plain - found)[rising, 1].mean() / np.gradient(plain[rising, 1], time_s[rising]).mean()
+    assert lag_s == pytest.approx(0.05, abs=0.01)
+    assert found[0, 0] == pytest.approx(0.0, abs=0.02)
+    assert np.isnan(found[:, 5]).all()  # there is no true effective track
+
+
+def test_slip_behind_the_low_pass_is_the_slip_where_driving_is_steady(run):
+    truth = run.streams["truth"]
+    slip, ground = lagged_slip(truth, ROBOT, 0.05)
+    np.testing.assert_array_equal(lagged_slip(truth, ROBOT, 0.0)[1], wheel_and_ground_speed(truth, ROBOT)[1])
+    steady = (truth.time_s > 4.0) & (truth.time_s < 7.0)
+    true_slip = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
+    assert np.abs(slip[steady].mean(axis=0) - true_slip[steady].mean(axis=0)).max() < 0.002
+    assert np.isnan(slip[truth.time_s < 0.9]).all()  # it stands
+    assert (ground[steady] > 0.5).all()
+
+
+def test_a_run_without_truth_gives_none_and_an_extra_wheel_is_refused(run):
+    streams = {name: stream for name, stream in run.streams.items() if name != "truth"}
+    track = empty_track(("speed_x_mps",), np.arange(0.0, 1.0, 0.1))
+    assert true_states(RunLog("a", "agrimaro", streams), track, ROBOT, 0.05) is None
+    nothing = Stream(
+        run.streams["truth"].time_s, np.full((len(run.streams["truth"]), 1), np.nan), ("speed_x_mps",)
+    )
+    assert np.isnan(true_states(RunLog("a", "agrimaro", {"truth": nothing}), track, ROBOT, 0.05)).all()
+    with pytest.raises(DataError, match="slip_speed_4_mps"):
+        true_states(run, empty_track(("slip_speed_4_mps",), np.arange(0.0, 1.0, 0.1)), ROBOT, 0.05)

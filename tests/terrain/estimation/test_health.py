@@ -159,11 +159,3 @@ def test_sound_sensors_stay_fresh_by_a_filter_without_biases():
     found = np.array([seen.health for sample in samples() for seen in estimator.step(sample.readings)])
     assert len(found) > 600
     assert (found == Health.FRESH).all()
-
-
-def test_a_stop_at_once_on_hard_ground_is_gated_for_a_moment_only():
-    """From 1 m/s within 0.2 s: a change of the acceleration that the filter takes for none."""
-    time_s, found = clean(STOP, "tiles")
-    gated = (found[time_s > 0.5] > Health.LATE).any(axis=1)
-    assert gated.sum() * 0.02 < 0.5
-    assert set(found[time_s > 0.5][gated].ravel()) <= {Health.FRESH, Health.REOPENED, Health.GATED}

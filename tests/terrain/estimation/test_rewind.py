@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrain.estimation.live import N_STEPS, REWIND_S, LiveFilter
+from terrain.estimation.live import REWIND_S, LiveFilter
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
@@ -94,29 +94,6 @@ def assert_same(estimator, expected):
     assert counts == expected_counts
     for one, other in zip(estimator._history._memories, expected._history._memories, strict=True):
         assert one.tobytes() == other.tobytes()
-
-
-def shifted(steps, by_s):
-    return [
-        (time_s + by_s, {name: Reading(r.time_s + by_s, r.values) for name, r in readings.items()})
-        for time_s, readings in steps
-    ]
-
-
-def test_late_samples_after_a_clock_was_set_back_are_taken_among_those_of_the_new_time():
-    late = shifted(delayed({"imu": [3] * N_MIXED}), -50.0)
-    estimator, expected = (drive([*in_order(), *after]) for after in (late, shifted(in_order(), -50.0)))
-    assert estimator.dropped["came late"] > 0
-    assert_same(estimator, expected)
-
-
-def test_without_wheels_samples_do_not_pile_up():
-    estimator, imu = LiveFilter(ROBOT), samples()[50].readings["imu"]
-    for k in range(N_STEPS + 50):
-        time_s = imu.time_s + k * PERIOD_S
-        assert not estimator.step({"imu": Reading(time_s, imu.values)}, float(time_s[-1]))
-    assert len(estimator._history._samples) == N_STEPS
-    assert len(estimator.step(samples()[50].readings, samples()[50].time_s)) == 1
 
 
 @cache

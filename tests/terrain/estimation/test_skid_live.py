@@ -90,14 +90,6 @@ def test_live_equals_batch_where_the_robot_is_stuck():
     assert interval.end_s == pytest.approx(16.0, abs=0.6)
 
 
-@pytest.mark.parametrize("rate_hz", [7.0, 211.0])
-def test_how_samples_are_bundled_does_not_matter(rate_hz):
-    _, plain = live(log())
-    _, bundled = live(log(), rate_hz)
-    for name in ("mean", "std", "rows", "motion"):
-        np.testing.assert_array_equal(column(bundled, name), column(plain, name))
-
-
 def test_live_equals_batch_on_measured_snow(datasets_dir):
     for run in load_runs(datasets_dir / "borealtc"):
         if run.run_id not in ("SNOW_03", "SNOW_05", "SNOW_14"):
@@ -158,20 +150,6 @@ def test_nothing_that_arrives_raises_or_makes_an_estimate_infinite(arrivals):
         estimator.step({"wheels": Reading(np.array([estimate_s]), WHEELS[None])})
         estimate_s += 0.02
     assert np.isfinite(estimator.latest.mean).all()
-
-
-@pytest.mark.parametrize("readings", [None, [], "wheels", {}, {"camera": 1}])
-def test_what_is_no_reading_gives_no_estimate(readings):
-    assert LiveFilter(HUSKY, "skid").step(readings) == []
-
-
-def test_what_was_wrong_is_counted():
-    estimator = LiveFilter(HUSKY, "skid")
-    for wrong in WRONG:
-        estimator.step({"wheels": wrong, "imu": wrong})
-    counted = estimator.dropped
-    assert counted["wheels: unreadable"] > 5
-    assert counted["imu: unreadable"] > 5
 
 
 def test_memory_does_not_grow_while_the_wheels_are_silent():

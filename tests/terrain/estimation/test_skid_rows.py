@@ -47,17 +47,6 @@ def test_the_gyro_row_is_the_mean_since_the_last_tick():
     assert abs(sampled - heading) > 1.0
 
 
-def test_a_spike_and_a_gap_of_the_gyro_are_not_averaged():
-    gyro = 0.1 + NOISE
-    gyro[1500] = 30.0
-    kept = (GYRO_S < 20.0) | (GYRO_S > 25.0)
-    time_s, mean, rest = rows_of(run_of(gyro[kept], 0.5, GYRO_S[kept]))
-    np.testing.assert_allclose(mean[np.isfinite(mean)], 0.1, atol=0.002)
-    assert np.isnan(mean[(time_s > 20.3) & (time_s < 24.9)]).all()
-    assert np.isfinite(mean[(time_s < 20.0) | (time_s > 25.2)]).all()
-    assert np.isnan(rest).all()
-
-
 def test_rest_gives_the_mean_of_each_second():
     bias_radps = 0.03
     _, _, rest = rows_of(run_of(bias_radps + NOISE))

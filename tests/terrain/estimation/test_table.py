@@ -2,8 +2,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +21,6 @@ from terrain.signals import low_passed
 
 ROBOT = load_robot("agrimaro")
 HUSKY = load_robot("husky")
-GYRO_BIAS = 0.003
 NOISE = 1e-4
 """On all of camera and IMU: small, so that answers are plain; never none, so that nothing is frozen."""
 
@@ -153,14 +150,6 @@ def test_ideal_sensors_give_the_motion():
     np.testing.assert_allclose(table.gnss_variance[fresh, 0], 0.02**2)
 
 
-def test_columns_come_in_the_order_of_a_model():
-    table = measurement_table(RUN, bare())
-    swapped = rows_of(table, "gyro_z_radps", "wheel_2_radps")
-    np.testing.assert_array_equal(swapped, table.z[:, [5, 1]])
-    with pytest.raises(DataError, match="no measurement 'wheel_left_mps'; this robot gives wheel_1_radps, "):
-        table.columns(["gyro_z_radps", "wheel_left_mps"])
-
-
 @pytest.mark.parametrize(("roll", "pitch"), [(0.0, -0.3), (0.2, 0.0), (0.25, 0.2), (-0.1, -0.15)])
 def test_a_robot_at_rest_on_a_slope_does_not_accelerate(roll, pitch):
     run = turning_run(1.0, rate=1e-9, speed=0.0, roll=roll, pitch=pitch)
@@ -173,32 +162,6 @@ def test_a_robot_at_rest_on_a_slope_does_not_accelerate(roll, pitch):
     assert np.sign(force[1]) == np.sign(roll) or abs(roll) < 1e-9
     accel = rows_of(measurement_table(run, bare()), "accel_x_mps2", "accel_y_mps2")
     assert np.abs(accel).max() < 6 * NOISE * GRAVITY_MPS2
-
-
-def test_described_sensor_errors_are_subtracted():
-    robot = bare(
-        sensors={
-            "gyro_bias_z_radps": GYRO_BIAS,
-            "accel_bias_x_mps2": 0.05,
-            "accel_scale_x_ratio": 1.02,
-            "accel_bias_y_mps2": -0.1,
-            "accel_scale_y_ratio": 0.97,
-        },
-        steering={"zero_1_rad": 0.3, "zero_2_rad": -2.0, "zero_3_rad": 2.5},
-    )
-
-    def raw(time_s, values, channels):
-        for axis, scale, bias in (("x", 1.02, 0.05), ("y", 0.97, -0.1)):
-            values[:, channels.index(f"accel_{axis}_mps2")] *= scale
-            values[:, channels.index(f"accel_{axis}_mps2")] += bias
-        values[:, channels.index("gyro_z_radps")] += GYRO_BIAS
-        return time_s, values
-
-    def with_zeros(time_s, values, _):
-        return time_s, np.angle(np.exp(1j * (values + np.array([0.3, -2.0, 2.5]))))
-
-    run = change(change(RUN, "imu", raw), "steering", with_zeros)
-    np.testing.assert_allclose(measurement_table(run, robot).z, measurement_table(RUN, bare()).z, atol=1e-9)
 
 
 # the low-pass
@@ -231,32 +194,6 @@ def test_low_pass_solves_its_equation_on_any_stamps(tau):
     np.testing.assert_allclose(
         low_passed(time_s, value, tau, 0.05), plain_low_pass(time_s, value, tau, 0.05), atol=1e-6
     )
-
-
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    tau=st.floats(1e-3, 0.2),
-    gain=st.floats(-3, 3),
-    split=st.integers(1, 49),
-)
-def test_laws_of_the_low_pass(seed, tau, gain, split):
-    rng = np.random.default_rng(seed)
-    time_s = np.cumsum(rng.uniform(1e-4, 0.03, 50))
-    a, b = rng.standard_normal((2, 50))
-    far = np.inf
-
-    def smooth(value, time=time_s):
-        return low_passed(time, value, tau, far)
-
-    np.testing.assert_allclose(smooth(a + gain * b), smooth(a) + gain * smooth(b), atol=1e-9)  # linear
-    np.testing.assert_allclose(smooth(np.full(50, gain)), gain, atol=1e-12)  # keeps what stands
-    late = time_s[-1] - time_s[0]
-    ramp = smooth(time_s - time_s[0])
-    assert late - ramp[-1] == pytest.approx(tau * -np.expm1(-late / tau), rel=1e-6)  # delays a ramp by tau
-    # a sample that lies on the line between its neighbours changes nothing
-    time_2 = np.insert(time_s, split, time_s[split - 1 : split + 1].mean())
-    a_2 = np.insert(a, split, a[split - 1 : split + 1].mean())
-    np.testing.assert_allclose(np.delete(smooth(a_2, time_2), split), smooth(a), atol=1e-9)
 
 
 def test_all_signals_share_the_delay_of_the_encoders():
@@ -393,32 +330,6 @@ def test_camera_samples_of_low_confidence_are_dropped():
     assert np.isnan(rows_of(table, *CAMERA_ROWS)[(table.time_s > 2.03) & (table.time_s < 3)]).all()
 
 
-@pytest.mark.parametrize("stream", ["odometry", "imu"])
-def test_a_sensor_that_repeats_itself_is_frozen(stream):
-    def freeze(start, end):
-        def edit(time_s, values, _):
-            rows = (time_s >= start) & (time_s < end)
-            values[rows] = values[rows.argmax()]
-            return time_s, values
-
-        return edit
-
-    rows = CAMERA_ROWS if stream == "odometry" else ("gyro_z_radps", "accel_x_mps2", "imu_yaw_rad")
-    n_hz = 200 if stream == "odometry" else 100
-    table = measurement_table(change(RUN, stream, freeze(2.0, 3.0)), bare())
-    assert table.dropped == {f"{stream}: frozen": n_hz - 1}
-    frozen = (table.time_s > 2.04) & (table.time_s < 3.0)
-    assert np.isnan(rows_of(table, *rows)[frozen]).all()
-    assert np.isfinite(rows_of(table, *rows)[~frozen & (table.time_s < 2.0)]).all()
-    shorter = measurement_table(change(RUN, stream, freeze(2.0, 2.2)), bare())
-    assert shorter.dropped == {}  # a few equal samples may be a slow motor driver
-
-    stopped = change(RUN, "wheels", set_rows(lambda t: t > 1, 0.0))
-    stopped = change(stopped, "steering", set_rows(lambda t: t > 1, 0.1))
-    dropped = measurement_table(stopped, bare()).dropped
-    assert not any(kind.endswith("frozen") for kind in dropped)  # wheels may stand still
-
-
 def test_a_jump_is_taken_out_before_the_low_pass_smears_it():
     plain = measurement_table(RUN, bare())
     relocalised = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 2.02), 3.0, "velocity_z_mps"))
@@ -435,20 +346,6 @@ def test_a_jump_is_taken_out_before_the_low_pass_smears_it():
     back = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 3.0), 3.0, "velocity_z_mps"))
     table = measurement_table(back, bare())
     assert np.isfinite(rows_of(table, "camera_speed_x_mps")[table.time_s > 3.05]).all()
-
-
-def test_a_jump_of_the_camera_s_heading_is_taken_off():
-    def turned(time_s, values, channels):
-        late, q = time_s >= 3.0, [channels.index(f"quaternion_{a}_ratio") for a in "xyzw"]
-        # the camera's y axis points down: a turn to the left about it is negative
-        values[np.ix_(late, q)] = (
-            Rotation.from_euler("y", 0.3) * Rotation.from_quat(values[np.ix_(late, q)])
-        ).as_quat()
-        return time_s, values
-
-    plain, table = measurement_table(RUN, bare()), measurement_table(change(RUN, "odometry", turned), bare())
-    yaw = rows_of(table, "camera_yaw_rad") - rows_of(plain, "camera_yaw_rad")
-    assert np.nanmax(np.abs(yaw)) < 0.01
 
 
 def test_stamps_that_do_not_increase_cost_their_sample_only():
@@ -482,75 +379,6 @@ def test_a_clock_that_starts_anew_keeps_the_longer_part():
 
 
 # yaw and position of the start
-
-
-def test_yaw_and_position_are_counted_from_the_start_in_the_world_frame():
-    run = turning_run(yaw_0=1.2)
-    table = measurement_table(run, bare(), initial_yaw_rad=1.2, gnss_latency_s=0.0)
-    t = table.time_s
-    for row in ("imu_yaw_rad", "camera_yaw_rad"):
-        np.testing.assert_allclose(rows_of(table, row)[:, 0], 1.2 + 0.4 * t, atol=1e-3)
-    gnss = rows_of(table, *GNSS_ROWS)[::5]
-    yaw = 1.2 + 0.4 * t[::5]
-    np.testing.assert_allclose(gnss[:, 2:], 0.5 * np.column_stack([np.cos(yaw), np.sin(yaw)]), atol=1e-9)
-    walked = 1.25 * np.column_stack([np.sin(yaw) - np.sin(1.2), np.cos(1.2) - np.cos(yaw)])
-    np.testing.assert_allclose(gnss[:, :2], walked, atol=1e-9)
-
-
-def test_heading_at_the_start_is_that_of_the_robot_while_it_stands():
-    rng = np.random.default_rng(1)
-    noise_rad = 0.01
-    offsets = []
-    for seed in range(20):
-        run = turning_run(3.0, rate=1e-6, speed=0.0, seed=seed)
-        run = change(run, "wheels", set_rows(lambda t: t > 1.5, 25.0))
-        run = change(run, "imu", lambda t, v, c: (t, v + noise_rad * rng.standard_normal(v.shape)))
-        table = measurement_table(run, bare())
-        offsets.append(np.mean(rows_of(table, "imu_yaw_rad")[table.time_s > 1.0]))
-    # 51 samples at the start and 99 after it: 0.0017; by one sample it would be 0.01
-    assert np.std(offsets) < 0.0017 * 1.6
-
-
-def test_a_camera_that_missed_a_turn_takes_the_yaw_of_the_imu():
-    def late(time_s, values, _):
-        return time_s[time_s > 3.0], values[time_s > 3.0]
-
-    run = change(RUN, "odometry", late)
-    table = measurement_table(run, bare(), initial_yaw_rad=0.5)
-    seen = table.time_s > 3.0
-    np.testing.assert_allclose(
-        rows_of(table, "camera_yaw_rad")[seen, 0], 0.5 + 0.4 * table.time_s[seen], atol=1e-3
-    )
-    alone = measurement_table(without(run, "imu"), bare())
-    assert np.nanmin(rows_of(alone, "camera_yaw_rad")) == pytest.approx(0.0, abs=1e-3)
-
-
-def test_a_camera_that_was_lost_through_a_turn_comes_back_on_the_right_one():
-    run = turning_run(10.0, rate=1.0)
-
-    def lose(time_s, values, _):
-        kept = (time_s < 2.0) | (time_s > 6.0)  # four radians unseen
-        return time_s[kept], values[kept]
-
-    table = measurement_table(change(run, "odometry", lose), bare())
-    seen = np.isfinite(rows_of(table, "camera_yaw_rad")[:, 0])
-    np.testing.assert_allclose(rows_of(table, "camera_yaw_rad")[seen, 0], table.time_s[seen], atol=0.03)
-
-
-def test_gnss_without_a_fix_has_a_larger_variance_and_is_late():
-    def float_first(time_s, values, channels):
-        values[time_s < 1.0, channels.index("fix_ratio")] = 0.0
-        values[time_s > 4.0, channels.index("std_position_m")] = 0.1
-        return time_s + 0.2, values
-
-    table = measurement_table(change(RUN, "gnss", float_first), bare(), gnss_latency_s=0.2)
-    t, position = table.time_s, rows_of(table, "gnss_position_x_m")[:, 0]
-    known = np.isfinite(position)
-    std = np.sqrt(table.gnss_variance)
-    np.testing.assert_allclose(std[known & (t < 0.99), 0], 0.5)
-    np.testing.assert_allclose(std[known & (t > 0.99) & (t < 4.01), 0], 0.02)
-    np.testing.assert_allclose(std[known & (t > 4.01), 0], 0.1)
-    np.testing.assert_allclose(position[known], 1.25 * (np.sin(0.4 * t) - np.sin(0.4))[known], atol=1e-9)
 
 
 # robots that skid, bad input
@@ -606,13 +434,6 @@ def test_logs_without_a_clock_are_refused():
 def test_invalid_options_are_refused(options, message):
     with pytest.raises(ConfigError, match=message):
         measurement_table(RUN, ROBOT, **options)
-
-
-def test_a_robot_has_to_describe_the_sensors_it_is_asked_of():
-    with pytest.raises(ConfigError, match="no section 'camera'"):
-        measurement_table(RUN, ROBOT.without("camera"))
-    blind = ROBOT.without("camera")
-    assert measurement_table(without(RUN, "odometry"), blind).time_s.size == 300
 
 
 def test_a_causal_table_does_not_depend_on_later_samples():

@@ -1,6 +1,5 @@
 """Noise by vibration and by what wheels do, held sensors, rest, and the offset of the IMU's yaw."""
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from terrain.estimation.feed import DERIVED_ROWS, REST_AFTER_S, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, HELD_S, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.live import LiveFilter
-from terrain.estimation.models.swerve import Schedule, default_noise, make_filter, scheduled
+from terrain.estimation.models.swerve import Schedule, default_noise, make_filter
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.replay import replay
 from terrain.logs.schema import IMU_CHANNELS
@@ -44,46 +43,6 @@ def schedule_of(model, noise):
         return [part[0] for part in Schedule(model, rows)(np.array(z)[None], noise.measurement_variance)]
 
     return of_row
-
-
-def test_the_schedule_of_a_tick_is_that_of_a_table():
-    """With derived rows that are unknown, too, and without a camera."""
-    model, noise, table = parts()
-    z, rng = np.array(table.z), np.random.default_rng(0)
-    unknown = rng.random((len(z), len(DERIVED_ROWS))) < 0.05
-    places = [table.rows.index(row) for row in DERIVED_ROWS]
-    z[:, places] = np.where(unknown, np.nan, z[:, places])
-    varied, inputs = scheduled(model, noise, replace(table, z=z))
-    for n, row in enumerate(z):
-        for part, expected in zip(
-            schedule_of(model, noise)(row),
-            (varied.measurement_variance[n], varied.walk_variance[n], inputs[n]),
-            strict=True,
-        ):
-            np.testing.assert_array_equal(part, expected)
-    assert np.ptp(varied.walk_variance, axis=0).max() > 0.0
-
-
-def test_slip_walks_more_where_it_shakes_where_wheels_accelerate_and_less_without_a_camera():
-    model, noise, table = parts()
-    slip = model.states.index("slip_speed_1_mps")
-    turn = model.states.index("yaw_rate_radps")
-    names = list(table.rows)
-
-    def walk(**rows):
-        z = np.zeros(len(names))
-        for row, value in rows.items():
-            z[names.index(row)] = value
-        return schedule_of(model, noise)(z)[1]
-
-    still, shaken, unseen = walk(), walk(vibration_mps2=1.0), walk(vibration_mps2=1.0, camera_age_s=1.0)
-    assert still[slip] == 0.0
-    assert shaken[slip] == pytest.approx(9.0 * unseen[slip])
-    assert shaken[slip] > 0.0
-    changing = walk(wheel_1_change_m2ps3=1.0)
-    assert changing[slip] > 0.0
-    assert changing[model.states.index("slip_speed_2_mps")] == 0.0
-    assert changing[turn] > 0.0
 
 
 def gated_until(name, amount, duration_s=4.0):

@@ -92,18 +92,6 @@ def test_gaps_and_a_clock_set_back_start_anew():
     assert (motion(-0.2, 0.2, 0.0, time_s=back)[first : first + 5] == Motion.UNKNOWN).all()
 
 
-def test_a_short_loss_of_the_gyro_changes_nothing_and_a_long_one_ends_it():
-    lost = during(10.0, 10.4) | during(20.0, 23.0)
-    found = motion(-0.2, 0.2, 0.0, ~lost)
-    assert (found[during(10.0, 10.4)] == Motion.STUCK).all()
-    assert (found[during(20.7, 24.0)] == Motion.UNKNOWN).all()
-    assert len(stuck_intervals(TIME_S, found)) == 2
-
-
-def test_no_track_has_no_interval():
-    assert stuck_intervals(np.empty(0), motion(0.1, 0.1, 0.0, time_s=np.empty(0))) == ()
-
-
 # measured runs
 
 
