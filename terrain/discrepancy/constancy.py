@@ -34,14 +34,9 @@ GROWS_RATIO, GROWTH = 0.25, 2.0
 """Nor is one that is apart by the first and grows along runs by the second: a cause that starts from nothing,
 as warmth and the rate of a clock do, has 0.54 between its thirds, and grows five times."""
 
-CAVEAT_RATIO = 0.05
-"""A value that differs by more than that ratio is given with what it depends on."""
-
-CERTAIN_P = 1e-5
-"""Chance of differences between groups by noise, below which they are stated."""
-
-MIN_HALF_RUNS = 3
-"""Least number of runs in half of them."""
+CAVEAT_RATIO = 0.05  #: A value that differs by more than that ratio is given with what it depends on
+CERTAIN_P = 1e-5  #: Chance of differences between groups by noise, below which they are stated
+MIN_HALF_RUNS = 3  #: Least number of runs in half of them
 
 THIRDS, HALVES = (
     ("first third", "second third", "last third"),
@@ -191,8 +186,7 @@ def part_values(info: Evidence, causes: Sequence[Cause]) -> tuple[PartValues, ..
 # for variances that are estimated themselves; the standard deviation between sessions beyond these variances is
 # that of DerSimonian and Laird (Controlled Clinical Trials 1986).
 
-MIN_RUNS = 3
-"""Least number of runs of a session: fewer do not show their scatter."""
+MIN_RUNS = 3  #: Least number of runs of a session: fewer do not show their scatter
 
 SHOWN_RATIO = 1e-4
 """A session shows a parameter if that ratio of its information is its own beside the others."""

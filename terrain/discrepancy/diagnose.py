@@ -55,20 +55,17 @@ from terrain.effects import BOUNDS, CHANNELS, Effect, effect_named
 from terrain.errors import DataError
 from terrain.records import Array, RunLog
 
-MIN_RUNS = 3
-"""Least number of runs: with fewer none is left to validate a fit."""
+MIN_RUNS = 3  #: Least number of runs: with fewer none is left to validate a fit
 
 BLIND_RATIO = 0.05
 """Ratio of the library that may be not excited before the verdict ``none`` becomes ``not_excited``."""
 
-MAX_WITHDRAWN = 6
-"""Most causes that are withdrawn one after the other."""
+MAX_WITHDRAWN = 6  #: Most causes that are withdrawn one after the other
 
 ENTANGLED = 0.97
 """Correlation of fitted values above which two causes are ambiguous: a collinearity index of 6."""
 
-POWER_Z = 1.28
-"""Added to the threshold, so that nine in ten are detected."""
+POWER_Z = 1.28  #: Added to the threshold, so that nine in ten are detected
 
 
 def diagnose(
@@ -264,8 +261,7 @@ def _named_and_ambiguous(fit: CauseFit) -> tuple[list[Effect], list[tuple[str, .
 
 # -- What is done to runs before causes are searched: faults repaired, lags known, unfit runs excluded -----
 
-REST_MPS = 0.02
-"""Fastest that a wheel turns, by its sensor's noise, in a run that does not drive."""
+REST_MPS = 0.02  #: Fastest that a wheel turns, by its sensor's noise, in a run that does not drive
 
 
 class Prepared(NamedTuple):

@@ -27,17 +27,13 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.effects import BOUNDS, CHANNELS, INDEX
 from terrain.records import Array
 
-N_BLOCKS = 3
-"""Time blocks of a run; they serve as clusters where runs are few."""
-
-N_PROBES = 4
-"""Of the inputs that are taken out before the noise is estimated, for each channel."""
+N_BLOCKS = 3  #: Time blocks of a run; they serve as clusters where runs are few
+N_PROBES = 4  #: Of the inputs that are taken out before the noise is estimated, for each channel
 
 PRIOR_STD = {name: 0.5 * max(abs(low), high) for name, (low, high) in BOUNDS.items()}
 """Prior of a parameter while the whole library is freed to estimate the noise."""
 
-UNKNOWN_STD = 1e-6
-"""Prior of one that is not in the library: it stays where it is."""
+UNKNOWN_STD = 1e-6  #: Prior of one that is not in the library: it stays where it is
 
 
 class Statistics(NamedTuple):
@@ -397,8 +393,7 @@ def move_point(point: Array, names: Sequence[str], change: Array) -> Array:
 # as some runs more, and are the least: a few runs that happen to be alike do not show that a robot never
 # varies.
 
-PRIOR_RUNS = 4.0
-"""What was assumed counts as so many runs: enough that three runs do not deny it."""
+PRIOR_RUNS = 4.0  #: What was assumed counts as so many runs: enough that three runs do not deny it
 
 TAIL_DOF = 4.0
 """Degrees of freedom of deviations from run to run: few enough for a run in twenty that is far out."""

@@ -28,13 +28,11 @@ from terrain.estimation.estimate import Estimate, estimate_run, summarize
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
 
-HOLD_OUT_FROM, HOLD_OUT_EVERY = 6, 4
-"""With so many runs or more, one in every so many is held out."""
+HOLD_OUT_FROM, HOLD_OUT_EVERY = 6, 4  #: With so many runs or more, one in every so many is held out
 
 N_BOOTSTRAP = 2000
 
-MIN_JUDGED = 3
-"""Least number of runs among which an unfit one can be found."""
+MIN_JUDGED = 3  #: Least number of runs among which an unfit one can be found
 
 
 def split_runs(runs: Sequence[RunLog], hold_out: int | None, seed: int) -> tuple[list[RunLog], list[RunLog]]:
@@ -370,8 +368,7 @@ LAGS = (-2, -1, 1, 2)
 """Rows by which inputs are taken later and earlier: a third of a second at the rate of a 50 Hz log, where any
 sensor may be the late one."""
 
-LEAST_RANGE = 1e-6
-"""Spread of a column that counts as constant."""
+LEAST_RANGE = 1e-6  #: Spread of a column that counts as constant
 
 
 class ChannelReference(NamedTuple):

@@ -57,29 +57,17 @@ DEFAULT_SOIL, HARD_SOIL, NEXT_RUNS = "grass", "tiles", 8
 """Of the command that simulates the next drive: a soil, one for robots that get stuck on it, and as many runs
 as the blind trials have."""
 
-GRADES_DEG = (0.0, 6.0)
-"""Level, and a slope that every robot here climbs."""
-
-LONGEST_S = 40.0
-"""Longest part of a scenario that is simulated."""
-
-CLOCK_HZ = RATE_HZ / 2
-"""Of the replay: half the rate of the commands is five times what they hold."""
-
-FOLLOW_S = 0.1
-"""Lag of wheels and steering behind their commands; assumed."""
+GRADES_DEG = (0.0, 6.0)  #: Level, and a slope that every robot here climbs
+LONGEST_S = 40.0  #: Longest part of a scenario that is simulated
+CLOCK_HZ = RATE_HZ / 2  #: Of the replay: half the rate of the commands is five times what they hold
+FOLLOW_S = 0.1  #: Lag of wheels and steering behind their commands; assumed
 
 SEPARABLE_INDEX = 10.0
 """Collinearity index above which two effects are not distinguished, whatever the amplitude."""
 
-EXACT_INDEX = 100.0
-"""Above it two effects count as one."""
-
-MIN_IMPROVEMENT_RATIO = 1.5
-"""Least improvement by a drive that is suggested."""
-
-Z_SHOWN = Z_EFFECT + 1.28
-"""Expected evidence with which nine drives in ten exceed the threshold."""
+EXACT_INDEX = 100.0  #: Above it two effects count as one
+MIN_IMPROVEMENT_RATIO = 1.5  #: Least improvement by a drive that is suggested
+Z_SHOWN = Z_EFFECT + 1.28  #: Expected evidence with which nine drives in ten exceed the threshold
 
 TYPICAL_STD = {
     GYRO: 0.01,

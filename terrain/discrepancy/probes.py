@@ -18,8 +18,7 @@ from terrain.discrepancy.selection import pooled_variance, z_of, z_of_t
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
-Z_PROBE = 4.5
-"""Evidence that a probe needs: 7e-6, of some two hundred."""
+Z_PROBE = 4.5  #: Evidence that a probe needs: 7e-6, of some two hundred
 
 BLOCK_S = 5.0
 """Length of the blocks of a run that count as independent: several times what the noise remembers."""
@@ -29,16 +28,12 @@ RUN_RATIO = 2.0
 the residual depends on is then one more thing that differs from run to run (MacKinnon, Nielsen and Webb,
 Journal of Econometrics 2023)."""
 
-CRAWL_MPS = 0.2
-"""Scale of speed of the probe of crawling."""
+CRAWL_MPS = 0.2  #: Scale of speed of the probe of crawling
 
 STANDSTILL_MPS = 0.05
 
-HARMONICS = (1, 2)
-"""Of a wheel's angle: an eccentric wheel, an oval one."""
-
-PLACEBOS = (0.63, 1.37, 1.63)
-"""Multiples of a wheel's angle that nothing on a wheel repeats with."""
+HARMONICS = (1, 2)  #: Of a wheel's angle: an eccentric wheel, an oval one
+PLACEBOS = (0.63, 1.37, 1.63)  #: Multiples of a wheel's angle that nothing on a wheel repeats with
 
 
 TILT_INPUTS = ("grade", "roll", "grade |speed|", "roll |speed|")

@@ -40,8 +40,7 @@ MAX_REFITS, SETTLED = 12, 0.3
 """Most relinearisations of the selected causes, and the ratio of its standard deviation below which a step
 ends them."""
 
-RIVAL_REFITS = 3
-"""Most relinearisations of a rival."""
+RIVAL_REFITS = 3  #: Most relinearisations of a rival
 
 
 class Nearby(NamedTuple):
@@ -293,8 +292,7 @@ MAX_CAUSES = 8
 """Most causes of a diagnosis: with more the simulation is of another robot.  Lags of two sensors, track, side
 slip, drag, and a wrong lever arm are six."""
 
-MAX_STEPS = 12
-"""Most steps of the search, successful or not."""
+MAX_STEPS = 12  #: Most steps of the search, successful or not
 
 MUCH_GAIN, CLOSE_GAIN, MAX_FITTED = 200.0, 0.3, 6
 """Gain above which the best candidates are compared by nonlinear fits: those with that ratio of the best
@@ -303,8 +301,7 @@ one's gain, so many at most."""
 Z_PAIR = 4.6
 """Evidence that each of two effects needs beside the other, if neither is significant alone: 4e-6."""
 
-ALIKE = 0.99
-"""Two effects whose sensitivities correlate more are not taken for a pair."""
+ALIKE = 0.99  #: Two effects whose sensitivities correlate more are not taken for a pair
 
 
 class CauseFit(NamedTuple):

@@ -15,17 +15,13 @@ from terrain.discrepancy.evidence import Evidence, partial_information
 from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
 
-Z_EFFECT = 4.0
-"""Evidence an effect needs, as a standard normal number: 6e-5, times a library of 26."""
-
-EXCITED_RATIO = 0.1
-"""An effect counts as not excited if its detection limit exceeds this ratio of its bound."""
+Z_EFFECT = 4.0  #: Evidence an effect needs, as a standard normal number: 6e-5, times a library of 26
+EXCITED_RATIO = 0.1  #: An effect counts as not excited if its detection limit exceeds this ratio of its bound
 
 TRUST_DOF = 8.0
 """Degrees of freedom of the noise found by whitening, beside those of the scatter between clusters."""
 
-MIN_CLUSTERS = 6
-"""With fewer runs, their time blocks are the clusters."""
+MIN_CLUSTERS = 6  #: With fewer runs, their time blocks are the clusters
 
 N_BOOTSTRAP = 1000
 

@@ -13,20 +13,14 @@ from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.records import Array
 
-CLEAR_STDS = 3.0
-"""A factor or a level is stated where it is off by so many standard deviations over runs."""
+CLEAR_STDS = 3.0  #: A factor or a level is stated where it is off by so many standard deviations over runs
 
 OUTLIER_STDS = 3.0
 """Distance of a run from the others, in their standard deviations, beyond which it is far out."""
 
-LEAST_OFF = 0.03
-"""Least ratio by which a factor is off: below it a sentence has nothing to state."""
-
-EXPLAINS = 0.15
-"""Least part of the absolute residual that a factor or a level has to remove, to describe it."""
-
-LEVEL_RATIO = 0.3
-"""Least ratio of the residual's root mean square that a level has to be."""
+LEAST_OFF = 0.03  #: Least ratio by which a factor is off: below it a sentence has nothing to state
+EXPLAINS = 0.15  #: Least part of the absolute residual that a factor or a level has to remove, to describe it
+LEVEL_RATIO = 0.3  #: Least ratio of the residual's root mean square that a level has to be
 
 APART_STDS, APART_RATIO = 4.0, 0.05
 """Terrains differ if their factors are so many standard deviations apart, the two furthest of several, and by

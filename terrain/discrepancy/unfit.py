@@ -38,8 +38,7 @@ FROZEN_S, CLIPPED_S, CLIPPED_RATIO = 2.0, 1.0, 0.03
 """A channel is frozen if it is constant for the first at a time, and clipped if it is at its extreme for the
 second in all and the third of a run, while the prediction varies."""
 
-MARGIN_S = 0.6
-"""Tolerance of the time at which a predicted change arrives."""
+MARGIN_S = 0.6  #: Tolerance of the time at which a predicted change arrives
 
 FROZEN_RANGE, CLIPPED_SPREAD = 0.5, 0.1
 """Of what is expected meanwhile: range and spread over its spread in the run."""
@@ -250,8 +249,7 @@ FOLLOWS = 0.85
 """Correlation about zero of a channel with its prediction, from which a run shows the common response: a body
 that sticks and comes free follows its wheels less."""
 
-MIN_RUNS = 3
-"""Least number of runs that show it."""
+MIN_RUNS = 3  #: Least number of runs that show it
 
 STALLED_RATIO, NOMINAL_RATIO = 0.25, 0.05
 """Ratio of the common response below which a body stalls, and of the prediction where none is known: slip
@@ -261,8 +259,7 @@ STALLED_S, STRETCH_S, ALL_RATIO = 2.0, 1.0, 0.8
 """A run stalls that does so for the first in all, or for the third of the time that it should move, in
 stretches of the second at the least, and far longer than the others."""
 
-FLOOR = {G: 0.02, H: 0.02, X: 0.015}
-"""What sensors measure of a body at rest (rad/s, m/s)."""
+FLOOR = {G: 0.02, H: 0.02, X: 0.015}  #: What sensors measure of a body at rest (rad/s, m/s)
 
 STRAIGHT_RADPS, MIN_STRAIGHT = 0.02, 10
 """Of rows in which no turn is predicted, and so many at the least, the median of the gyro is its bias."""
@@ -273,15 +270,13 @@ own error, times one plus the second over their number, since few runs measure t
 gains at most one set of 500 has such a run.  It is off by the third, too, in the logarithm: radii of one
 robot differ by less."""
 
-MIN_COMPARED = 6
-"""Of fewer runs with a gain, one in a hundred sets has such a run."""
+MIN_COMPARED = 6  #: Of fewer runs with a gain, one in a hundred sets has such a run
 
 INNER, INNER_SIGMAS = 2 / 3, 0.967
 """Scatter comes from that ratio of the runs, the nearest to the median, and what it is of a normal law: the
 rest may be of other robots."""
 
-MIN_SCATTER = 0.02
-"""Scatter of a robot's runs at the least, in the logarithm."""
+MIN_SCATTER = 0.02  #: Scatter of a robot's runs at the least, in the logarithm
 
 MAX_ODD_RATIO = 1 / 3
 """More runs than that are no outliers: runs then differ in groups, which is for the diagnosis to say."""

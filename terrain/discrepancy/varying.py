@@ -24,27 +24,20 @@ from terrain.discrepancy.verdict import RunGroup, Varying
 from terrain.effects import BOUNDS, CHANNELS, INDEX, Effect
 from terrain.records import Array
 
-Z_VARIES = 4.5
-"""Evidence of a difference between runs, as of a probe: of some thirty effects."""
-
-Z_NEAR = 3.0
-"""Evidence of an effect that may be what varies instead of one whose evidence is enough."""
-
-VARIES_RATIO = 0.5
-"""A named value that scatters by more than that ratio of itself is no value of all runs."""
+Z_VARIES = 4.5  #: Evidence of a difference between runs, as of a probe: of some thirty effects
+Z_NEAR = 3.0  #: Evidence of an effect that may be what varies instead of one whose evidence is enough
+VARIES_RATIO = 0.5  #: A named value that scatters by more than that ratio of itself is no value of all runs
 
 TWO_GROUPS_RATIO = 0.15
 """Part of the scatter that two groups leave: a uniform distribution, cut in its middle, leaves 0.25."""
 
-MIN_GROUP = 2
-"""Least number of runs in a group."""
+MIN_GROUP = 2  #: Least number of runs in a group
 
 OUT_STDS, OUT_SCATTERS, OUT_RATIO = 3.0, 0.25, 0.2
 """A run's value is out of its bounds by so many standard deviations and scatters, and the ratio of the runs
 that may be: a rogue or two, and less than a group of eight runs."""
 
-LEAST_RATIO = 1e-4
-"""Least scatter of a parameter of which none is assumed, over the prior of its value."""
+LEAST_RATIO = 1e-4  #: Least scatter of a parameter of which none is assumed, over the prior of its value
 
 NEAR_RATIO, N_STEPS = 0.2, 3
 """Effects whose loss is behind by that ratio of the best one's gain are compared by nonlinear fits of so many
@@ -298,8 +291,7 @@ def _two_groups(best: _RunValues, run_ids: Sequence[str]) -> tuple[RunGroup, ...
 # Minus twice the log-likelihood is, up to a constant, ``sum |r - X x|^2 - b'(G + D^-1) b + log det(1 + G D)``:
 # what a parameter costs that may differ from run to run is the last term.
 
-EM_STEPS = 30
-"""Enough from a start that is not far too small: variances then fall to where they belong."""
+EM_STEPS = 30  #: Enough from a start that is not far too small: variances then fall to where they belong
 
 
 class MixedFit(NamedTuple):
@@ -369,8 +361,7 @@ def fit_mixed(
 # it is spread evenly from none.  So where the values of single runs scatter by ``s``, a mean over runs of up to
 # ``sqrt(3) s`` is what conditions explain, up to what they are known to make; the rest is news.
 
-MEAN_PER_SCATTER = math.sqrt(3.0)
-"""Mean over standard deviation of what is spread evenly from none."""
+MEAN_PER_SCATTER = math.sqrt(3.0)  #: Mean over standard deviation of what is spread evenly from none
 
 
 def with_conditions(problem: Problem, info: Evidence) -> Problem:

@@ -16,8 +16,7 @@ AGREE_P = 0.01
 """Probability below which sessions of one terrain do not agree: of some six values of a diagnosis, hardly
 any by chance."""
 
-INTERVAL_T = 2.36
-"""Half a 95 % interval in standard deviations: t with the 7 degrees that eight runs give."""
+INTERVAL_T = 2.36  #: Half a 95 % interval in standard deviations: t with the 7 degrees that eight runs give
 
 
 class Verdict(StrEnum):

@@ -20,8 +20,7 @@ NEAR_BOUND = 0.02
 """A value closer to a bound than that ratio of the range, or of twice the bound where the other is further
 from 0, is no value: the search would have gone on."""
 
-WORSE_RATIO = 1.1
-"""A cause is withdrawn that makes the square of a channel larger by more than that."""
+WORSE_RATIO = 1.1  #: A cause is withdrawn that makes the square of a channel larger by more than that
 
 PROBE_RATIO, PROBE_ALIKE = 0.5, 0.3
 """A cause is withdrawn if an input of its channel gains that ratio of its own gain beside it, and looks like

@@ -11,11 +11,8 @@ from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 from terrain.simulation.conditions import Conditions
 
-DURATION_S = 60.0
-"""Length of a run."""
-
-STEP_HZ = 50.0
-"""Rate of the commanded twists."""
+DURATION_S = 60.0  #: Length of a run
+STEP_HZ = 50.0  #: Rate of the commanded twists
 
 COMMAND_S, LEAD_S, HOLD_S = 6.0, 2.0, 0.3
 """Length of a run that is one command, of the drive before its log begins, and for how long the command

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -40,83 +41,55 @@ from terrain.simulation.run import simulate, simulate_run
 
 
 class Row(StrEnum):
-    """What is hidden in the runs of a trial.
+    """What is hidden in the runs of a trial."""
 
-    ``NONE``: nothing.  ``STRONG``: one effect of 3 times its detection limit.  ``LADDER``: one effect of 0.1
-    to 10 times its limit.  ``FOUND``: each effect in turn, around its limit.  ``TWO``: two effects.
-    ``OUTSIDE``: something that is not in the library.  ``POOR``: one effect, with drives that excite little.
-
-    What measured runs have besides, see :mod:`studies.blind_trials.trial`.  ``GROSS``: one effect of 20
-    to 100 times its limit.  ``SHORT``: one effect in 80 runs of 6 s.  ``LATE``: a logger is late, beside one
-    effect.  ``SCATTERED``: an effect that differs from run to run.  ``STALLED``: runs whose body is at rest,
-    beside one effect.  ``HALF``: an effect in half of the runs.  ``SENSOR_LATE``: one sensor is late.
-    ``FAULT``: a sign, a unit or an order written into the log.  ``DYNAMIC``: runs of the dynamic simulation,
-    half of the trials with nothing hidden.  ``KNOWN``: a skid-steer robot of which the effective track is far
-    off, in 80 runs of 6 s.
-
-    Robots of other drives, none of which logs currents.  ``TRACKED``, ``CAR``: each effect in turn, of 3
-    times its limit; nothing in every fifth trial.
-    """
-
-    NONE = "none"
-    STRONG = "strong"
-    LADDER = "ladder"
-    FOUND = "found"
-    TWO = "two"
-    OUTSIDE = "outside"
-    POOR = "poor"
-    GROSS = "gross"
-    SHORT = "short"
-    LATE = "late"
-    SCATTERED = "scattered"
-    STALLED = "stalled"
-    HALF = "half"
-    SENSOR_LATE = "sensor_late"
-    FAULT = "fault"
-    DYNAMIC = "dynamic"
-    KNOWN = "known"
+    NONE = "none"  #: nothing
+    STRONG = "strong"  #: one effect of 3 times its detection limit
+    LADDER = "ladder"  #: one effect of 0.1 to 10 times its limit
+    FOUND = "found"  #: each effect in turn, around its limit
+    TWO = "two"  #: two effects
+    OUTSIDE = "outside"  #: something that is not in the library
+    POOR = "poor"  #: one effect, with drives that excite little
+    # What measured runs have besides, see :mod:`studies.blind_trials.trial`.
+    GROSS = "gross"  #: one effect of 20 to 100 times its limit
+    SHORT = "short"  #: one effect in 80 runs of 6 s
+    LATE = "late"  #: a logger is late, beside one effect
+    SCATTERED = "scattered"  #: an effect that differs from run to run
+    STALLED = "stalled"  #: runs whose body is at rest, beside one effect
+    HALF = "half"  #: an effect in half of the runs
+    SENSOR_LATE = "sensor_late"  #: one sensor is late
+    FAULT = "fault"  #: a sign, a unit or an order written into the log
+    DYNAMIC = "dynamic"  #: runs of the dynamic simulation, half of the trials with nothing hidden
+    KNOWN = "known"  #: a skid-steer robot of which the effective track is far off, in 80 runs of 6 s
+    # Robots of other drives, none of which logs currents: each effect in turn, nothing in every fifth trial.
     TRACKED = "tracked"
     CAR = "car"
 
 
-DRIVE_ROWS = (Row.TRACKED, Row.CAR)
-"""Rows of drives whose robots log no currents."""
-
-ROBOTS = ("agrimaro", "husky")
-"""Trials take them in turn."""
-
+DRIVE_ROWS = (Row.TRACKED, Row.CAR)  #: of drives whose robots log no currents
+ROBOTS = ("agrimaro", "husky")  #: trials take them in turn
 ROBOTS_OF_ROW = {
     Row.SHORT: ROBOTS[1:],
     Row.KNOWN: ROBOTS[1:],
     Row.DYNAMIC: ROBOTS[:1],
     Row.TRACKED: ("patako", "marmotte"),
     Row.CAR: ("adap2e",),
-}
-"""Robots of rows that have others."""
+}  #: robots of rows that have others
+SHORT_RUNS = 80  #: number of runs where a run is one command of 6 s
 
-SHORT_RUNS = 80
-"""Number of runs where a run is one command of 6 s."""
-
-STRONG = 3.0
-"""Amplitude over the detection limit, of an effect that has to be named."""
-
-CLIP_RATIO = 0.9
-"""Ratio of the bounds of an effect, beyond which none is hidden."""
-
-LADDER = (0.1, 10.0)
-"""Range of amplitudes over the limit, in row ``ladder``."""
-
-FOUND_LADDER = (0.5, 6.5)
-"""Range of amplitudes over the limit, in row ``found``."""
-
+STRONG = 3.0  #: amplitude over the detection limit, of an effect that has to be named
+CLIP_RATIO = 0.9  #: ratio of the bounds of an effect, beyond which none is hidden
+LADDER, FOUND_LADDER = (0.1, 10.0), (0.5, 6.5)  #: ranges of amplitudes over the limit, in these rows
 OUTSIDE = ("wheel_eccentricity", "motor_drift", "stick_slip", "clock_rate")
 """Hidden in row ``outside``: two effects that no library has, and two whose entry is taken out."""
-
-ECCENTRICITY_RATIO, STICK_SLIP_A = (0.01, 0.04), (5.0, 20.0)
+OUTSIDE_SIZES = {"wheel_eccentricity_ratio": (0.01, 0.04), "stick_slip_a": (5.0, 20.0)}
 """Ranges of the amplitudes of what no library has: a wheel's centre 2 to 8 mm off, spikes of a few ampere."""
+ENTRY_TAKEN_OUT = (3.0, 10.0)  #: range over the limit, of those whose entry is taken out
 
-ENTRY_TAKEN_OUT = (3.0, 10.0)
-"""Range over the limit, of those whose entry is taken out."""
+TRACK, TRACK_RATIO = (
+    "effective_track",
+    "effective_track_ratio",
+)  #: what scatters as well on a skid-steer robot
 
 
 class Case(NamedTuple):
@@ -130,24 +103,14 @@ class Case(NamedTuple):
 
 
 class Hidden(NamedTuple):
-    """What is hidden in the runs of a trial.
+    """What is hidden in the runs of a trial."""
 
-    Parameters
-    ----------
-    effects : values by parameter, of effects of the catalogue
-    causes : names of the effects that the diagnosis may and should name
-    over_limit : amplitude over the detection limit; 0 where nothing of the catalogue is hidden
-    outside : name of what is hidden and not in the library; empty for none
-    library : effects that the diagnosis may name
-    outside_values : values by parameter, of what no library has
-    """
-
-    effects: dict[str, float]
-    causes: tuple[str, ...]
-    over_limit: float
-    outside: str
-    library: tuple[Effect, ...]
-    outside_values: dict[str, float]
+    library: tuple[Effect, ...]  #: effects that the diagnosis may name
+    effects: Mapping[str, float] = MappingProxyType({})  #: values by parameter, of effects of the catalogue
+    causes: tuple[str, ...] = ()  #: names of the effects that the diagnosis may and should name
+    over_limit: float = 0.0  #: amplitude over the detection limit; 0 where nothing of the catalogue is hidden
+    outside: str = ""  #: name of what is hidden and not in the library
+    outside_values: Mapping[str, float] = MappingProxyType({})  #: values by parameter, of what no library has
 
 
 def cases_of(row: Row, n: int, seed: int, n_runs: int) -> list[Case]:
@@ -161,33 +124,34 @@ def cases_of(row: Row, n: int, seed: int, n_runs: int) -> list[Case]:
 
 
 def draw_hidden(case: Case, robot: Robot, limits: Limits | None, rng: np.random.Generator) -> Hidden:
-    """Draw what a trial hides.
-
-    Parameters
-    ----------
-    limits : of the trial's drives; None where nothing is to be hidden
-    """
+    """Draw what a trial hides; nothing without the ``limits`` of its drives."""
     library = library_of(robot.drive)
     if limits is None:
-        return Hidden({}, (), 0.0, "", library, {})
+        return Hidden(library)
+    turn = case.number // len(ROBOTS)
     if case.row is Row.OUTSIDE:
-        return _draw_outside(case, limits, library, rng)
+        return _draw_outside(OUTSIDE[turn % len(OUTSIDE)], limits, library, rng)
     acting = [effect for effect in library if not effect.modifies]  # the others do nothing alone
     if case.row is Row.FOUND:
-        effect = acting[(case.number // len(ROBOTS)) % len(acting)]
-        over = float(math.exp(rng.uniform(*np.log(FOUND_LADDER))))
-        return Hidden(values_of(effect, limits, over, rng), (effect.name,), over, "", library, {})
+        effect = acting[turn % len(acting)]
+        over = log_uniform(rng, FOUND_LADDER)
+        return Hidden(library, values_of(effect, limits, over, rng), (effect.name,), over)
     effect = acting[int(rng.integers(len(acting)))]
-    over = float(math.exp(rng.uniform(*np.log(LADDER)))) if case.row is Row.LADDER else STRONG
+    over = log_uniform(rng, LADDER) if case.row is Row.LADDER else STRONG
     values = values_of(effect, limits, over, rng)
     if case.row is not Row.TWO:
-        return Hidden(values, (effect.name,), over, "", library, {})
-    others = [o for o in acting if o.name not in confusable_class(limits, effect, robot.drive)]
-    others = [o for o in others if o.name not in [name for name, _ in effect.twins]]
-    others = [o for o in others if not _is_another_pair(limits, (effect, o), acting)]
+        return Hidden(library, values, (effect.name,), over)
+    alike = confusable_class(limits, effect, robot.drive) | {name for name, _ in effect.twins}
+    others = [other for other in acting if other.name not in alike]
+    others = [other for other in others if not _is_another_pair(limits, (effect, other), acting)]
     other = others[int(rng.integers(len(others)))]
     values |= values_of(other, limits, over, rng)
-    return Hidden(values, (effect.name, other.name), over, "", library, {})
+    return Hidden(library, values, (effect.name, other.name), over)
+
+
+def log_uniform(rng: np.random.Generator, ends: tuple[float, float]) -> float:
+    """Draw a number whose logarithm is uniform."""
+    return float(math.exp(rng.uniform(*np.log(ends))))
 
 
 def _is_another_pair(limits: Limits, pair: tuple[Effect, Effect], library: Sequence[Effect]) -> bool:
@@ -198,28 +162,20 @@ def _is_another_pair(limits: Limits, pair: tuple[Effect, Effect], library: Seque
     return any(limits.spanned(pair, third) for third in rest)
 
 
-def _draw_outside(
-    case: Case, limits: Limits, library: tuple[Effect, ...], rng: np.random.Generator
-) -> Hidden:
+def _draw_outside(kind: str, limits: Limits, library: tuple[Effect, ...], rng: np.random.Generator) -> Hidden:
     """Draw an effect that the library does not have: its entry is taken out, or there never was one."""
-    kind = OUTSIDE[(case.number // len(ROBOTS)) % len(OUTSIDE)]
     if kind in [effect.name for effect in library]:
         effect = effect_named(kind)
         over = float(rng.uniform(*ENTRY_TAKEN_OUT))
         rest = tuple(other for other in library if other is not effect)
-        return Hidden(values_of(effect, limits, over, rng), (), over, kind, rest, {})
-    extra = {}
-    if kind == "wheel_eccentricity":
-        extra = {"wheel_eccentricity_ratio": float(rng.uniform(*ECCENTRICITY_RATIO))}
-    elif kind == "stick_slip":
-        extra = {"stick_slip_a": float(rng.uniform(*STICK_SLIP_A))}
-    return Hidden({}, (), 0.0, kind, library, extra)
+        return Hidden(rest, values_of(effect, limits, over, rng), (), over, kind)
+    sizes = {name: ends for name, ends in OUTSIDE_SIZES.items() if name.startswith(kind)}
+    return Hidden(library, outside=kind, outside_values={n: float(rng.uniform(*e)) for n, e in sizes.items()})
 
 
 def values_of(effect: Effect, limits: Limits, over: float, rng: np.random.Generator) -> dict[str, float]:
     """Return values of an effect, of an amplitude over its limit, in a random direction within its bounds."""
-    low = np.array([p.low for p in effect.parameters])
-    high = np.array([p.high for p in effect.parameters])
+    low, high = (np.array(ends) for ends in zip(*((p.low, p.high) for p in effect.parameters), strict=True))
     direction = rng.standard_normal(len(effect.parameters))
     direction /= np.linalg.norm(direction)
     direction = np.where((low == 0.0) & (direction < 0), -direction, direction)
@@ -261,24 +217,18 @@ def hidden_runs(
     scatter : of the runs; that of the package by default
     heading : log a heading that does not depend on the gyro, too
     """
-    scatter, noise = scatter or load_scatter(), load_noise()
+    about = {
+        "scatter": scatter or load_scatter(),
+        "noise": load_noise(),
+        "outside": outside,
+        "heading": heading,
+    }
     each = [effects] * len(drives.twists) if isinstance(effects, Mapping) else effects
     runs = []
     for i, (twist, hills, own) in enumerate(zip(drives.twists, drives.hills, each, strict=True)):
-        run = simulate(
-            robot,
-            twist,
-            Ground(),
-            np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i)),
-            effects=own,
-            scatter=scatter,
-            noise=noise,
-            outside=outside,
-            heading=heading,
-            run_id=f"run_{i + 1:02d}",
-            terrain="ground",
-            conditions=hills,
-        )
+        draws = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, i))
+        names = {"run_id": f"run_{i + 1:02d}", "terrain": "ground"}
+        run = simulate(robot, twist, Ground(), draws, effects=own, conditions=hills, **about, **names)
         shown = {name: stream for name, stream in run.streams.items() if name not in ("truth", "commands")}
         rate = own.get("clock_rate_ratio", 0.0)
         runs.append(_after(replace(run, streams=shown, source=""), drives.lead_s, rate))
@@ -291,23 +241,19 @@ def _after(run: RunLog, lead_s: float, clock_rate_ratio: float) -> RunLog:
         return run
     streams = {}
     for name, stream in run.streams.items():
-        kept = stream.time_s >= lead_s - 0.5 / (2.0 * STEP_HZ)
+        after = stream.time_s >= lead_s - 0.5 / (2.0 * STEP_HZ)
         ahead_s = 0.0 if name == "wheels" else clock_rate_ratio * lead_s
-        time_s = stream.time_s[kept] - lead_s - ahead_s
-        streams[name] = Stream(time_s, stream.values[kept], stream.channels)
+        streams[name] = Stream(stream.time_s[after] - lead_s - ahead_s, stream.values[after], stream.channels)
     labels = tuple(label._replace(end_s=label.end_s - lead_s) for label in run.labels)
     return replace(run, streams=streams, labels=labels)
 
 
 # -- Values of an effect that differ from run to run, as they do on measured robots ------------------------
 
-SCATTER_RATIO = (0.1, 0.35)
-"""Range of the standard deviation from run to run over the value, as measured robots show it."""
-
-TRACK = "effective_track"
-"""Effect whose track scatters as well on a skid-steer robot."""
-
-TRACK_RATIO = "effective_track_ratio"
+SCATTER_RATIO = (
+    0.1,
+    0.35,
+)  #: range of the deviation from run to run over the value, as measured robots show it
 
 
 def factors(rng: np.random.Generator, ratio: float, n_runs: int) -> Array:
@@ -334,31 +280,28 @@ def scattered_values(
     ratio : standard deviation over the value
     track : whether the effective track scatters as well, by the same ratio of the track
     """
-    each: list[dict[str, float]] = [{} for _ in range(n_runs)]
+    columns = {}
     for name, value in values.items():
-        if name == TRACK_RATIO and track:
-            continue
-        low, high = BOUNDS[name]
-        for run, factor in zip(each, factors(rng, ratio, n_runs), strict=True):
-            run[name] = float(np.clip(value * factor, low, high))
+        if not (track and name == TRACK_RATIO):
+            columns[name] = value * factors(rng, ratio, n_runs)
     if track:
-        low, high = BOUNDS[TRACK_RATIO]
-        mean = 1.0 + values.get(TRACK_RATIO, 0.0)
-        for run, factor in zip(each, factors(rng, ratio, n_runs), strict=True):
-            run[TRACK_RATIO] = float(np.clip(mean * factor - 1.0, low, high))
-    return each
+        columns[TRACK_RATIO] = (1.0 + values.get(TRACK_RATIO, 0.0)) * factors(rng, ratio, n_runs) - 1.0
+    return [
+        {name: float(np.clip(column[i], *BOUNDS[name])) for name, column in columns.items()}
+        for i in range(n_runs)
+    ]
 
 
-# -- Logs whose stamps are late: of a whole logger, or of one sensor ---------------------------------------
+# -- Logs whose stamps are late, and logs of stalled runs --------------------------------------------------
 
-WHEELS_LOGGER = ("wheels", "steering")
-"""Streams that one logger stamps; the others are those of :data:`terrain.effects.OTHER_LOGGER`."""
-
-LOGGER_LATE_S = (0.15, 0.4)
-"""Range of the delay of a whole logger: wheels of measured robots are 0.26 to 0.28 s late."""
-
-SENSOR_LATE_S = (0.1, 0.3)
-"""Range of the delay of one sensor: a measured lidar is 0.16 s late."""
+WHEELS_LOGGER = (
+    "wheels",
+    "steering",
+)  #: streams that one logger stamps; others: terrain.effects.OTHER_LOGGER
+LOGGER_LATE_S = (0.15, 0.4)  #: range of its delay: wheels of measured robots are 0.26 to 0.28 s late
+SENSOR_LATE_S = (0.1, 0.3)  #: range of the delay of one sensor: a measured lidar is 0.16 s late
+STALLED_RATIO = (0.05, 0.15)  #: range of the ratio of runs that are stalled; one at the least
+CREEP_RATIO = (0.0, 0.03)  #: range of the ratio of the wheels' motion that a stalled body follows
 
 
 def with_late_streams(runs: Sequence[RunLog], names: Collection[str], late_s: float) -> tuple[RunLog, ...]:
@@ -369,18 +312,6 @@ def with_late_streams(runs: Sequence[RunLog], names: Collection[str], late_s: fl
         shifted = {name: replace(stream, time_s=stream.time_s + late_s) for name, stream in own.items()}
         late.append(replace(run, streams={**run.streams, **shifted}))
     return tuple(late)
-
-
-# -- Logs of stalled runs: the wheels turn as in any run, the body hardly moves ----------------------------
-
-STALLED_RATIO = (0.05, 0.15)
-"""Range of the ratio of runs that are stalled; one at the least."""
-
-CREEP_RATIO = (0.0, 0.03)
-"""Range of the ratio of the wheels' motion that a stalled body follows."""
-
-DRIVEN = ("wheels", "steering")
-"""Streams that a stalled run has as if it were driven."""
 
 
 def draw_stalled(rng: np.random.Generator, n_runs: int) -> tuple[int, ...]:
@@ -400,34 +331,22 @@ def with_stalled(
     *,
     heading: bool = False,
 ) -> tuple[RunLog, ...]:
-    """Return runs of which some are stalled: all but the wheels' logger sees a body that creeps.
-
-    Parameters
-    ----------
-    runs : as :func:`~studies.blind_trials.hidden.hidden_runs` returns them
-    stalled : places of the runs to be stalled
-    rng : draws how far each body creeps
-    robot, drives, seed, effects, heading : as the runs were simulated with
-    """
+    """Return runs of :func:`hidden_runs` of which some are stalled: all but the wheels' logger sees a body creep."""
     creep = np.ones(len(runs))
     creep[list(stalled)] = rng.uniform(*CREEP_RATIO, len(stalled))
     slow = drives._replace(twists=tuple(t * c for t, c in zip(drives.twists, creep, strict=True)))
-    out = list(runs)
-    seen = hidden_runs(robot, slow, seed, effects, heading=heading)
+    out, seen = list(runs), hidden_runs(robot, slow, seed, effects, heading=heading)
     for i in stalled:
-        kept = {name: stream for name, stream in runs[i].streams.items() if name in DRIVEN}
-        out[i] = replace(runs[i], streams={**seen[i].streams, **kept})
+        driven = {name: stream for name, stream in runs[i].streams.items() if name in WHEELS_LOGGER}
+        out[i] = replace(runs[i], streams={**seen[i].streams, **driven})
     return tuple(out)
 
 
 # -- Logs of the DRIVE layout from those of the planar simulation: 20 Hz, a lidar, no currents and no tilt --
 # DRIVE: Baril et al., ICRA 2024; see :mod:`terrain.logs.drive`.
 
-RATE_HZ = 20.0
-"""Of all streams."""
-
-CUTOFF_HZ = 0.4 * RATE_HZ
-"""Above which such a log holds nothing of the motion."""
+RATE_HZ = 20.0  #: of all streams
+CUTOFF_HZ = 0.4 * RATE_HZ  #: above which such a log holds nothing of the motion
 
 
 def sensing_of(scatter: Scatter | None = None) -> Sensing:
@@ -444,20 +363,14 @@ def with_lidar(run: RunLog) -> RunLog:
 
 
 def as_command_log(run: RunLog) -> RunLog:
-    """Return a skid-steer robot's run as the DRIVE layout holds it.
-
-    Parameters
-    ----------
-    run : of the planar simulation, with a heading
-    """
+    """Return a skid-steer robot's run of the planar simulation, with a heading, as the DRIVE layout holds it."""
     full = with_lidar(run).streams
     wheels = tuple(name for name in full["wheels"].channels if name.startswith("speed_"))
     imu = ("gyro_z_radps", *(f"accel_{axis}_mps2" for axis in "xyz"))
-    kept = {"wheels": wheels, "imu": imu, "lidar": TWIST_CHANNELS}
-    end_s = min(full[name].time_s[-1] for name in kept)
-    time_s = np.arange(1, int(end_s * RATE_HZ)) / RATE_HZ
-    streams = {}
-    for name, channels in kept.items():
+    layout = {"wheels": wheels, "imu": imu, "lidar": TWIST_CHANNELS}
+    end_s = min(full[name].time_s[-1] for name in layout)
+    time_s, streams = np.arange(1, int(end_s * RATE_HZ)) / RATE_HZ, {}
+    for name, channels in layout.items():
         columns = [_averaged(full[name].time_s, full[name].channel(c), time_s) for c in channels]
         streams[name] = Stream(time_s - time_s[0], np.column_stack(columns), channels)
     return replace(run, streams=streams)
@@ -476,9 +389,7 @@ def _averaged(stamps_s: Array, values: Array, time_s: Array) -> Array:
 # They are made by what ``terrain simulate`` calls, and diagnosed as ``terrain explain`` does.
 
 TERRAIN, SCENARIOS = "grass", ("complex", "starts", "survey")
-
-HIDDEN = {"wheel_radius_ratio": 0.03}
-"""Hidden in every second trial."""
+HIDDEN = {"wheel_radius_ratio": 0.03}  #: in every second trial
 
 
 class Setting(NamedTuple):
@@ -487,11 +398,6 @@ class Setting(NamedTuple):
     scenario: str
     vary: bool
     hides: bool
-
-    @property
-    def name(self) -> str:
-        """The setting in words."""
-        return f"{self.scenario}, varied" if self.vary else self.scenario
 
 
 def setting_of(number: int) -> Setting:
@@ -537,32 +443,22 @@ class Statement(NamedTuple):
 
 
 class WrittenFault(NamedTuple):
-    """A fault of a log.
-
-    Parameters
-    ----------
-    name : of the fault
-    drives : of robots whose logs show it
-    stream : that has it
-    write : gives the stream with the fault, of a robot
-    kind, column : of the statement, as :class:`terrain.discrepancy.faults.Fault` has them
-    word : in the sentence
-    """
+    """A fault of a log: drives of robots whose logs show it, the stream, and what gives it the fault."""
 
     name: str
     drives: tuple[str, ...]
     stream: str
     write: Callable[[Stream, Robot], Stream]
-    kind: FaultKind
+    kind: FaultKind  #: of the statement, as :class:`terrain.discrepancy.faults.Change` has it
     column: Column
-    word: str = ""
+    word: str = ""  #: in the sentence
 
     def stated_in(self, statements: Iterable[Statement]) -> bool:
         """Return whether one states this fault.
 
         Examples
         --------
-        >>> fault_named("gyro_deg").stated_in([Statement("unit", "gyro", "the gyro is in deg/s")])
+        >>> FAULTS["gyro_deg"].stated_in([Statement("unit", "gyro", "the gyro is in deg/s")])
         True
         """
         return any(s[:2] == (self.kind, self.column) and self.word in s.sentence for s in statements)
@@ -598,31 +494,30 @@ def _swapped(*kinds: str) -> Callable[[Stream, Robot], Stream]:
     return write
 
 
-_SIGN, _UNIT, _SWAPPED = FaultKind.SIGN, FaultKind.UNIT, FaultKind.SWAPPED
+_SIGN, _UNIT, _SWAPPED, _WHEELS = FaultKind.SIGN, FaultKind.UNIT, FaultKind.SWAPPED, Column.WHEELS
+_KMH, _DEG, _RPM = _scaled("speed_", 3.6), _scaled("gyro_", 180.0 / math.pi), _scaled("motor_", 30 / math.pi)
 _ALL_WHEELS = _swapped("speed_{}_mps", "motor_{}_radps")
 
-FAULTS: tuple[WrittenFault, ...] = (
-    WrittenFault("gyro_sign", BOTH, "imu", _scaled("gyro_z_", -1.0), _SIGN, Column.GYRO),
-    WrittenFault("gyro_deg", BOTH, "imu", _scaled("gyro_", 180.0 / math.pi), _UNIT, Column.GYRO, "deg/s"),
-    WrittenFault("wheels_kmh", SKIDDING, "wheels", _scaled("speed_", 3.6), _UNIT, Column.WHEELS, "km/h"),
-    WrittenFault("camera_kmh", SKIDDING, "odometry", _scaled("speed_", 3.6), _UNIT, Column.SPEED, "km/h"),
-    WrittenFault(
-        "wheels_rpm", (SWERVE,), "wheels", _scaled("motor_", 30 / math.pi), _UNIT, Column.WHEELS, "rpm"
-    ),
-    WrittenFault("swapped_currents", SKIDDING, "wheels", _swapped("current_{}_a"), _SWAPPED, Column.CURRENTS),
-    WrittenFault("swapped_wheels", BOTH, "wheels", _ALL_WHEELS, _SWAPPED, Column.WHEELS),
-)
-"""All of them.  A swap of currents does not show on a swerve robot, of which only their sum is compared."""
+FAULTS = {
+    fault.name: fault
+    for fault in (
+        WrittenFault("gyro_sign", BOTH, "imu", _scaled("gyro_z_", -1.0), _SIGN, Column.GYRO),
+        WrittenFault("gyro_deg", BOTH, "imu", _DEG, _UNIT, Column.GYRO, "deg/s"),
+        WrittenFault("wheels_kmh", SKIDDING, "wheels", _KMH, _UNIT, _WHEELS, "km/h"),
+        WrittenFault("camera_kmh", SKIDDING, "odometry", _KMH, _UNIT, Column.SPEED, "km/h"),
+        WrittenFault("wheels_rpm", (SWERVE,), "wheels", _RPM, _UNIT, _WHEELS, "rpm"),
+        WrittenFault(
+            "swapped_currents", SKIDDING, "wheels", _swapped("current_{}_a"), _SWAPPED, Column.CURRENTS
+        ),
+        WrittenFault("swapped_wheels", BOTH, "wheels", _ALL_WHEELS, _SWAPPED, _WHEELS),
+    )
+}
+"""By name.  A swap of currents does not show on a swerve robot, of which only their sum is compared."""
 
 
 def faults_of(drive: str) -> tuple[WrittenFault, ...]:
     """Return the faults that logs of robots of a drive can have."""
-    return tuple(fault for fault in FAULTS if drive in fault.drives)
-
-
-def fault_named(name: str) -> WrittenFault:
-    """Return the fault of a name; ``KeyError`` for an unknown one."""
-    return {fault.name: fault for fault in FAULTS}[name]
+    return tuple(fault for fault in FAULTS.values() if drive in fault.drives)
 
 
 def with_fault(runs: Iterable[RunLog], fault: WrittenFault, robot: Robot) -> tuple[RunLog, ...]:
@@ -635,14 +530,12 @@ def with_fault(runs: Iterable[RunLog], fault: WrittenFault, robot: Robot) -> tup
 
 # -- A robot of known truth that resembles a measured skid-steer one, in five cases from simple to complete --
 
-TRACK_ERROR = 1.5
-"""Effective track over the nominal one, less 1: a measured Husky turns 2.5 times less than its track says."""
-
+TRACK_ERROR = (
+    1.5  #: effective track over the nominal, less 1: a measured Husky turns 2.5 times less than it says
+)
 TRACK_SCATTER, WHEELS_LATE_S, N_STALLED = 0.15, 0.28, 4
 """Scatter of the track from run to run, delay of the wheels' stamps, and number of stalled runs."""
-
-VALUE_RATIO = 0.05
-"""Largest error of the effective track that counts as right."""
+VALUE_RATIO = 0.05  #: largest error of the effective track that counts as right
 
 
 class Known(NamedTuple):
@@ -654,7 +547,7 @@ class Known(NamedTuple):
     stalled: bool = False
 
 
-KNOWN: tuple[Known, ...] = (
+KNOWN = (
     Known("plain"),
     Known("scatter", scatters=True),
     Known("late", late=True),
@@ -662,14 +555,6 @@ KNOWN: tuple[Known, ...] = (
     Known("all", scatters=True, late=True, stalled=True),
 )
 """Trials take them in turn."""
-
-
-def track_of_runs(known: Known, rng: np.random.Generator, n_runs: int) -> list[dict[str, float]]:
-    """Return the effective track of each run, by its parameter."""
-    hidden = {TRACK_RATIO: TRACK_ERROR}
-    if not known.scatters:
-        return [dict(hidden) for _ in range(n_runs)]
-    return scattered_values(hidden, rng, TRACK_SCATTER, n_runs, track=True)
 
 
 def value_is_right(intervals: Mapping[str, tuple[float, float, float]]) -> bool:
@@ -680,7 +565,5 @@ def value_is_right(intervals: Mapping[str, tuple[float, float, float]]) -> bool:
     >>> value_is_right({TRACK_RATIO: (1.6, 1.5, 1.7)}), value_is_right({TRACK_RATIO: (1.7, 1.5, 1.9)})
     (True, False)
     """
-    if TRACK_RATIO not in intervals:
-        return False
-    true = 1.0 + TRACK_ERROR
-    return abs(1.0 + intervals[TRACK_RATIO][0] - true) <= VALUE_RATIO * true
+    off = intervals[TRACK_RATIO][0] - TRACK_ERROR if TRACK_RATIO in intervals else math.inf
+    return abs(off) <= VALUE_RATIO * (1.0 + TRACK_ERROR)

@@ -59,58 +59,45 @@ from terrain.simulation.planar.replay import sense
 from terrain.simulation.planar.run import with_silent_parts
 from terrain.simulation.run import simulate
 
-TEST_SIZE = 0.02
-"""Size of the test over the whole library, to which limits refer."""
-
-POWER = 0.9
-"""Rate at which an effect at its limit is detected."""
+TEST_SIZE = 0.02  #: Size of the test over the whole library, to which limits refer
+POWER = 0.9  #: Rate at which an effect at its limit is detected
 
 CONFUSABLE = 0.99
 """Two effects whose sensitivities correlate more than that, nuisances taken out, are of one class: a
 collinearity index of 10."""
-
-TURNING_MPS = 0.05
-"""Slower wheels do not count as turning."""
-
+TURNING_MPS = 0.05  #: Slower wheels do not count as turning
 UNSEEN = 1e-9
 """Information in a parameter's unit below which drives show nothing of it: its standard deviation, 3e4, is
 far beyond every bound."""
+WHEEL_SPEED, GRADE, ROLL = "wheel_speed_mps", "grade_rad", "roll_rad"
+"""What a replay is fed with, beside the channels that are compared."""
 
 
 class Sensing(NamedTuple):
-    """What the logs of a trial hold, all that the planar simulation measures by default.
+    """What the logs of a trial hold, all that the planar simulation measures by default."""
 
-    Parameters
-    ----------
-    channels : that are logged; without any those of the planar simulation
-    cutoff_hz : above which the log holds nothing
-    tilt : whether a tilt is logged; without one the simulation takes the ground as level
-    scatter : of the runs; that of the package by default
-    """
-
-    channels: tuple[str, ...] = ()
-    cutoff_hz: float = 0.4 * STEP_HZ
-    scatter: Scatter | None = None
-    tilt: bool = True
+    channels: tuple[str, ...] = ()  #: that are logged; without any those of the planar simulation
+    cutoff_hz: float = 0.4 * STEP_HZ  #: above which the log holds nothing
+    scatter: Scatter | None = None  #: of the runs; that of the package by default
+    tilt: bool = True  #: whether a tilt is logged; without one the simulation takes the ground as level
 
 
 class Limits(NamedTuple):
-    """Information of the drives of a trial.
-
-    Parameters
-    ----------
-    names : parameters (k,)
-    information : (k, k) of all runs, nuisances free
-    """
+    """Information (k, k) of the drives of a trial on parameters, of all runs, nuisances free."""
 
     names: tuple[str, ...]
     information: Array
 
+    def part(self, one: Effect, other: Effect) -> Array:
+        """Return the information between the parameters of two effects, which may be the same."""
+        rows, columns = ([self.names.index(p.name) for p in effect.parameters] for effect in (one, other))
+        return self.information[np.ix_(rows, columns)]
+
     def of(self, effect: Effect, direction: Array | None = None) -> float:
         """Return the smallest detectable amplitude, along a direction (p,) or the first parameter."""
-        at = [self.names.index(p.name) for p in effect.parameters]
-        along = np.eye(len(at))[0] if direction is None else direction
-        size = float(along @ self.information[np.ix_(at, at)] @ along)
+        own = self.part(effect, effect)
+        along = np.eye(len(own))[0] if direction is None else direction
+        size = float(along @ own @ along)
         desired = norm.isf(TEST_SIZE / 2 / self.library_size) + norm.ppf(POWER)
         return float(desired / math.sqrt(size)) if size > 0 else math.inf
 
@@ -130,27 +117,23 @@ class Limits(NamedTuple):
 
     def alike(self, one: Effect, other: Effect) -> bool:
         """Return whether two effects are of one confusable class."""
-        i, j = ([self.names.index(p.name) for p in effect.parameters] for effect in (one, other))
-        own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
-        cross = self.information[np.ix_(i, j)]
-        unseen = [bool(np.diag(each).min() <= UNSEEN) for each in (own, its)]
+        own, its, cross = self.part(one, one), self.part(other, other), self.part(one, other)
+        unseen = [bool(np.diag(information).min() <= UNSEEN) for information in (own, its)]
         if any(unseen):
             return all(unseen)
         # the largest cosine between a change of the one and a change of the other
-        shared = np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)
-        return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
+        return _largest_cosine(np.linalg.solve(own, cross) @ np.linalg.solve(its, cross.T)) > CONFUSABLE
 
     def in_place_of(self, effect: Effect, values: Mapping[str, float], other: Effect) -> bool:
         """Return whether another effect explains values of one so well that an answer has to state both.
 
         So it is where minus twice the log-likelihood of its best fit is worse by less than ``RIVAL_LOSS``.
         """
-        i, j = ([self.names.index(p.name) for p in each.parameters] for each in (effect, other))
         hidden = np.array([values[p.name] for p in effect.parameters])
-        cross, its = self.information[np.ix_(j, i)] @ hidden, self.information[np.ix_(j, j)]
+        cross, its = self.part(other, effect) @ hidden, self.part(other, other)
         if np.diag(its).min() <= UNSEEN:
             return False
-        own = hidden @ self.information[np.ix_(i, i)] @ hidden
+        own = hidden @ self.part(effect, effect) @ hidden
         return bool(own - cross @ np.linalg.solve(its, cross) < RIVAL_LOSS)
 
     def spanned(self, pair: tuple[Effect, Effect], other: Effect) -> bool:
@@ -158,15 +141,16 @@ class Limits(NamedTuple):
 
         Equal latencies of IMU and camera are a clock offset: logs determine two of the three.
         """
-        i = [self.names.index(p.name) for effect in pair for p in effect.parameters]
-        j = [self.names.index(p.name) for p in other.parameters]
-        own, its = self.information[np.ix_(i, i)], self.information[np.ix_(j, j)]
+        own = np.block([[self.part(row, column) for column in pair] for row in pair])
+        its, cross = self.part(other, other), np.vstack([self.part(effect, other) for effect in pair])
         if min(np.diag(its).min(), np.diag(own).min()) <= UNSEEN:
             return False
         inverse = np.linalg.pinv(own, hermitian=True, rcond=1e-9)
-        cross = self.information[np.ix_(i, j)]
-        shared = np.linalg.solve(its, cross.T @ inverse @ cross)
-        return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0)) > CONFUSABLE
+        return _largest_cosine(np.linalg.solve(its, cross.T @ inverse @ cross)) > CONFUSABLE
+
+
+def _largest_cosine(shared: Array) -> float:
+    return math.sqrt(max(float(np.linalg.eigvals(shared).real.max()), 0.0))
 
 
 def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> Limits:
@@ -309,9 +293,6 @@ def confusable_class(limits: Limits, effect: Effect, drive: str) -> set[str]:
 # Spectra are one-sided: their integral from 0 to the Nyquist frequency is the variance.  Steps of an encoder
 # count as white noise of its position, which they are once speeds change.
 
-WHEEL_SPEED, GRADE, ROLL = "wheel_speed_mps", "grade_rad", "roll_rad"
-"""What a replay is fed with, beside the channels that are compared."""
-
 
 def coloured_psd(frequency_hz: Array, std: float, tau_s: float, rate_hz: float) -> Array:
     """Return the one-sided density of :func:`coloured` noise at a rate, unit^2/Hz.
@@ -358,10 +339,7 @@ def noise_psd(
 
     Parameters
     ----------
-    noise : of the runs
-    robot, planar : of the runs
-    channel : one of ``effects.CHANNELS``, or ``wheel_speed_mps`` (of one wheel), ``grade_rad`` or
-    ``roll_rad``
+    channel : one of ``effects.CHANNELS``, or ``wheel_speed_mps`` (of one wheel), ``grade_rad`` or ``roll_rad``
     frequency_hz : from 0 to the logger's Nyquist frequency: 25 Hz, of the IMU's channels 50 Hz
     speed_mps : of the wheels
     encoder_lag_s : beside the lag of the robot's description

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import beta
 
-from studies.blind_trials.hidden import DRIVE_ROWS, KNOWN, OUTSIDE, ROBOTS, Row, fault_named, value_is_right
+from studies.blind_trials.hidden import DRIVE_ROWS, FAULTS, KNOWN, OUTSIDE, ROBOTS, Row, value_is_right
 from studies.blind_trials.trial import Trial
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import library_of
@@ -25,23 +25,14 @@ NAMED_ROWS = (
 
 
 class Score(NamedTuple):
-    """A rate with its 95 % interval by Clopper and Pearson (Biometrika 1934), beside the bar that it has to meet.
-
-    Parameters
-    ----------
-    hits, of : counts
-    rate : NaN where nothing was counted
-    low, high : ends of the interval
-    bar : in words; empty for a rate without a bar
-    met : whether the rate meets it
-    """
+    """A rate with its 95 % interval by Clopper and Pearson (Biometrika 1934), beside the bar that it has to meet."""
 
     hits: int
     of: int
-    rate: float
+    rate: float  #: NaN where nothing was counted
     low: float
     high: float
-    bar: str
+    bar: str  #: in words; empty for a rate without a bar
     met: bool
 
 
@@ -161,7 +152,7 @@ def is_right(trial: Trial) -> bool:
     silence.
     """
     if trial.row is Row.FAULT:
-        return fault_named(trial.fault).stated_in(trial.statements)
+        return FAULTS[trial.fault].stated_in(trial.statements)
     if trial.row is Row.HALF:
         return varies(trial, trial.causes[0]) and not wrong_names(trial)
     if not trial.causes:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,10 +42,10 @@ from studies.blind_trials.hidden import (
     faults_of,
     hidden_runs,
     is_clipped,
+    log_uniform,
     scattered_values,
     sensing_of,
     setting_of,
-    track_of_runs,
     values_of,
     with_fault,
     with_late_streams,
@@ -67,6 +68,7 @@ from terrain.effects import (
     SPEED_X,
     SPEED_Y,
     TURNING_CURRENT,
+    Effect,
     effect_named,
     library_of,
     nuisances_of,
@@ -77,12 +79,8 @@ from terrain.robots import BicycleRobot, Robot, load_robot
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.noise import load_scatter
 
-CLOCK_STATED_S = 0.04
-"""Largest error of the delay between two loggers that is stated: two samples of the wheels' logger."""
-
-
-OF_STAGE = ("variant", "accepted", "clipped", "late_s", "stalled", "present", "fault")
-"""What a trial takes from its stage as it is."""
+CLOCK = "clock_offset"  #: effect that a late logger is
+CLOCK_STATED_S = 0.04  #: largest error of its delay that is stated: two samples of the wheels' logger
 
 
 class Varying(NamedTuple):
@@ -95,58 +93,40 @@ class Varying(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What was hidden, and what the diagnosis answered.
-
-    Parameters
-    ----------
-    row, number, robot, n_runs : of the case; ``n_runs`` that were made
-    hidden : values by parameter
-    causes : names of the effects hidden
-    outside : name of what is hidden and not in the library
-    over_limit : amplitude over the detection limit, of a single effect
-    classes : by cause, the effects of its confusable class
-    verdict : ``REFUSED`` where the diagnosis did not accept the runs, as too few seemed to be fit
-    named, sets, unexplained : the answer
-    intervals : by parameter named, alone or in a set: value, lower and upper end of its 95 % interval
-    gain_low : lower end of the smallest held-out gain of a cause
-    seconds : duration of the diagnosis
-    variant, accepted, clipped, late_s, stalled, present, fault : as a
-        :class:`~studies.blind_trials.trial.Stage` has them
-    clock_s : median delay of IMU and camera that the answer states; NaN where it states none
-    excluded : ids of the runs that were excluded
-    varying : effects that differ from run to run
-    statements : what the answer states of faults of the logs
-    refusal : why the runs were refused
-    """
+    """What was hidden, and what the diagnosis answered."""
 
     row: Row
     number: int
     robot: str
     n_runs: int
-    hidden: dict[str, float]
-    causes: tuple[str, ...]
-    outside: str
-    over_limit: float
-    classes: dict[str, tuple[str, ...]]
-    verdict: Verdict
-    named: tuple[str, ...]
-    sets: tuple[tuple[str, ...], ...]
-    unexplained: tuple[tuple[str, str], ...]
-    intervals: dict[str, tuple[float, float, float]]
-    gain_low: float
-    seconds: float
-    variant: str = ""
-    accepted: tuple[str, ...] = ()
-    clipped: bool = False
-    late_s: float = math.nan
-    stalled: tuple[str, ...] = ()
-    present: tuple[str, ...] = ()
-    fault: str = ""
-    clock_s: float = math.nan
-    excluded: tuple[str, ...] = ()
-    varying: tuple[Varying, ...] = ()
-    statements: tuple[Statement, ...] = ()
-    refusal: str = ""
+    hidden: dict[str, float]  #: values by parameter
+    causes: tuple[str, ...]  #: names of the effects hidden
+    outside: str  #: name of what is hidden and not in the library
+    over_limit: float  #: amplitude over the detection limit, of a single effect
+    classes: dict[str, tuple[str, ...]]  #: by cause, the effects of its confusable class
+    seconds: float  #: duration of the diagnosis
+    # -- what is asked, by some rows
+    variant: str = ""  #: of the row, where it has several
+    accepted: tuple[str, ...] = ()  #: names that are no error beside the causes
+    clipped: bool = False  #: whether an amplitude was beyond the bounds of its effect
+    late_s: float = math.nan  #: how far the logger of IMU and camera is behind that of the wheels
+    stalled: tuple[str, ...] = ()  #: ids of the runs that are stalled
+    present: tuple[str, ...] = ()  #: ids of those that have the effect if only some do
+    fault: str = ""  #: name of the one written into the logs
+    # -- the answer
+    verdict: Verdict = (
+        Verdict.REFUSED
+    )  #: by default where the runs were not accepted, as too few seemed to be fit
+    refusal: str = ""  #: why they were refused
+    named: tuple[str, ...] = ()
+    sets: tuple[tuple[str, ...], ...] = ()
+    unexplained: tuple[tuple[str, str], ...] = ()
+    intervals: Mapping[str, tuple[float, float, float]] = field(default_factory=dict)
+    gain_low: float = math.nan  #: lower end of the smallest held-out gain of a cause
+    clock_s: float = math.nan  #: median delay of IMU and camera that is stated
+    excluded: tuple[str, ...] = ()  #: ids of the runs that were excluded
+    varying: tuple[Varying, ...] = ()  #: effects that differ from run to run
+    statements: tuple[Statement, ...] = ()  #: on faults of the logs
 
     def found(self, cause: str) -> bool:
         """Return whether a hidden effect is named, alone or in a set with none but its confusable class.
@@ -183,57 +163,48 @@ def run_trial(case: Case) -> Trial:
     key = [case.seed, case.number, list(Row).index(case.row), case.n_runs]
     drawn, noise = np.random.SeedSequence(key).spawn(2)
     stage = stage_of(case, robot, np.random.default_rng(drawn), noise)
-    answer: Diagnosis | None = None
-    refusal, start_s = "", time.perf_counter()
+    hidden, start_s = stage.hidden, time.perf_counter()
     try:
-        answer = diagnose(stage.runs, stage.simulation or simulation_of(robot), stage.hidden.library)
+        answer = _answered(
+            diagnose(stage.runs, stage.simulation or simulation_of(robot), stage.hidden.library)
+        )
     except DataError as error:
-        refusal = str(error)
-    hidden, seconds = stage.hidden, time.perf_counter() - start_s
+        answer = {"refusal": str(error)}
     return Trial(
         row=case.row,
         number=case.number,
         robot=case.robot,
         n_runs=len(stage.runs),
-        hidden=hidden.effects | hidden.outside_values,
+        hidden={**hidden.effects, **hidden.outside_values},
         causes=hidden.causes,
         outside=hidden.outside,
         over_limit=hidden.over_limit,
         classes=_classes(stage, robot, case.row),
-        seconds=seconds,
-        refusal=refusal,
-        **{name: getattr(stage, name) for name in OF_STAGE},
-        **_answered(answer),
+        seconds=time.perf_counter() - start_s,
+        **stage.asked,
+        **answer,
     )
 
 
-def _answered(answer: Diagnosis | None) -> dict[str, Any]:
-    """Return the fields of a trial that are the answer; what a diagnosis does not have is empty."""
-    if answer is None:
-        none = dict.fromkeys(("named", "sets", "unexplained"), ())
-        return {**none, "verdict": Verdict.REFUSED, "intervals": {}, "gain_low": math.nan}
-    causes = answer.causes
-    in_sets = [
-        value
-        for names in answer.ambiguous_sets
-        for n in names
-        for value in answer.ambiguous_values.get(n, ())
-    ]
-    values = [*in_sets, *(value for cause in causes for value in cause.parameters)]
+def _answered(answer: Diagnosis) -> dict[str, Any]:
+    """Return the fields of a trial that are the answer."""
+    causes, sets = answer.causes, answer.ambiguous_sets
+    in_sets = [answer.ambiguous_values.get(name, ()) for names in sets for name in names]
+    values = [value for some in (*in_sets, *(cause.parameters for cause in causes)) for value in some]
     offset_s = np.array([clock.offset_s for clock in answer.clocks])
     known_s = offset_s[np.isfinite(offset_s)]
     return {
         "verdict": answer.verdict,
         "named": tuple(cause.name for cause in causes),
-        "sets": answer.ambiguous_sets,
-        "unexplained": tuple((each.channel, each.input) for each in answer.unexplained),
+        "sets": sets,
+        "unexplained": tuple((left.channel, left.input) for left in answer.unexplained),
         "intervals": {value.name: (value.value, value.low, value.high) for value in values},
         "gain_low": min((cause.gain_ci[0] for cause in causes), default=math.nan),
         "clock_s": float(np.median(known_s)) if known_s.size else math.nan,
         "excluded": tuple(run.run_id for run in answer.excluded_runs),
         "varying": tuple(
-            Varying(each.name, tuple((group.value, group.runs) for group in each.groups), each.rivals)
-            for each in answer.varying
+            Varying(effect.name, tuple((group.value, group.runs) for group in effect.groups), effect.rivals)
+            for effect in answer.varying
         ),
         "statements": tuple(
             Statement(fault.change.kind.value, fault.change.column.value, fault.sentence)
@@ -248,16 +219,13 @@ def _classes(stage: Stage, robot: Robot, row: Row) -> dict[str, tuple[str, ...]]
         return {}
     has_heading = any("lidar" in run.streams for run in stage.runs)
     classes = {}
-    for cause in stage.hidden.causes:
-        if cause not in [effect.name for effect in LIBRARY]:
-            continue
-        effect = effect_named(cause)
+    for effect in (effect for effect in LIBRARY if effect.name in stage.hidden.causes):
         twins = {name for name, channel in effect.twins if not (has_heading and channel == HEADING)}
         twins |= confusable_class(stage.limits, effect, robot.drive)
         if row in DRIVE_ROWS:  # without currents a rolling resistance is nearly a smaller radius
             others, values = library_of(robot.drive), stage.hidden.effects
             twins |= {o.name for o in others if stage.limits.in_place_of(effect, values, o)}
-        classes[cause] = tuple(sorted(twins))
+        classes[effect.name] = tuple(sorted(twins))
     return classes
 
 
@@ -266,36 +234,29 @@ def _classes(stage: Stage, robot: Robot, row: Row) -> dict[str, tuple[str, ...]]
 CLEAR = (STRONG, 20.0)
 """Range of amplitudes over the limit beside what measured runs have: from one that has to be named to where
 row ``gross`` begins."""
+GROSS = (20.0, 100.0)  #: range in row ``gross``
+SHORT = (10.0, 50.0)
+"""Range in row ``short``: a replay of samples at 20 Hz is off by one limit of a delay, 0.3 ms, and the effect
+that has to be named is clear of that."""
+NOTHING_EVERY = 5  #: in rows of a drive one trial of so many hides nothing
+LATE_STREAMS = {"gyro": ("imu",), "camera": ("odometry",), "lidar": ("lidar",)}
+"""Sensors that are late in row ``sensor_late``, and their streams."""
+LATE_CAUSES = {
+    "gyro": ("imu_latency",),
+    "camera": ("camera_latency",),
+    "lidar": ("lidar_latency", "camera_latency"),
+}
+"""Effects that a late sensor is: the first that the catalogue has, or the last."""
 
 
 class Stage(NamedTuple):
-    """A trial before the diagnosis.
+    """A trial before the diagnosis."""
 
-    Parameters
-    ----------
-    runs : that the diagnosis gets
-    hidden : in them
-    limits : of the drives, for the confusable classes; None where nothing is hidden
-    simulation : under test; None for the one with the known scatter
-    variant : of the row, where it has several
-    accepted : names that are no error beside the causes
-    clipped : whether an amplitude was beyond the bounds of its effect
-    late_s : how far the logger of IMU and camera is behind that of the wheels; NaN where that is not asked
-    stalled, present : ids of the runs that are stalled, and of those that have the effect if only some do
-    fault : name of the one written into the logs
-    """
-
-    runs: tuple[RunLog, ...]
-    hidden: Hidden
-    limits: Limits | None
-    simulation: Simulation | None = None
-    variant: str = ""
-    accepted: tuple[str, ...] = ()
-    clipped: bool = False
-    late_s: float = math.nan
-    stalled: tuple[str, ...] = ()
-    present: tuple[str, ...] = ()
-    fault: str = ""
+    runs: tuple[RunLog, ...]  #: that the diagnosis gets
+    hidden: Hidden  #: in them
+    limits: Limits | None  #: of the drives, for the confusable classes; None where nothing is hidden
+    asked: Mapping[str, Any] = MappingProxyType({})  #: fields of a trial that some rows have
+    simulation: Simulation | None = None  #: under test; None for the one with the known scatter
 
 
 class Draw(NamedTuple):
@@ -306,147 +267,106 @@ class Draw(NamedTuple):
     rng: np.random.Generator
     noise: np.random.SeedSequence
 
+    @property
+    def library(self) -> tuple[Effect, ...]:
+        """Effects that apply to the robot."""
+        return library_of(self.robot.drive)
+
+    @property
+    def turn(self) -> int:
+        """How many trials of the robot came before."""
+        return self.case.number // len(ROBOTS)
+
     def rich(self) -> Drives:
         """Return drives that excite all effects."""
         return rich_drives(self.rng, self.case.n_runs)
+
+    def runs(self, drives: Drives, effects: Any, **options: Any) -> tuple[RunLog, ...]:
+        """Return the logs of drives with effects hidden."""
+        return hidden_runs(self.robot, drives, self.noise, effects, **options)
 
     def strong(
         self, limits: Limits, over_limit: tuple[float, float] = CLEAR, without: Sequence[str] = ()
     ) -> Hidden:
         """Draw an effect that these drives excite: its amplitude is within its bounds."""
-        library = library_of(self.robot.drive)
-        over = float(math.exp(self.rng.uniform(*np.log(over_limit))))
-        fit = [e for e in library if e.name not in without and e.parameters[0].name in limits.names]
+        over = log_uniform(self.rng, over_limit)
+        fit = [e for e in self.library if e.name not in without and e.parameters[0].name in limits.names]
         for i in self.rng.permutation(len(fit)):
             values = values_of(fit[i], limits, over, self.rng)
             if not is_clipped(values):
-                return Hidden(values, (fit[i].name,), over, "", library, {})
+                return Hidden(self.library, values, (fit[i].name,), over)
         raise RuntimeError(
             f"no effect of {over:.1f} times its limit is within its bounds"
         )  # no drives do that
 
-    def in_turn(self, limits: Limits, number: int) -> Hidden:
-        """Take in turn the effects that these drives show, of 3 times their limit, within their bounds."""
-        library = library_of(self.robot.drive)
-        most = {effect: CLIP_RATIO * min(p.high for p in effect.parameters) for effect in library}
-        shown = [effect for effect in library if STRONG * limits.of(effect) < most[effect]]
-        effect = shown[number % len(shown)]
-        values = values_of(effect, limits, STRONG, self.rng)
-        while is_clipped(values):  # in another direction it is not
-            values = values_of(effect, limits, STRONG, self.rng)
-        return Hidden(values, (effect.name,), STRONG, "", library, {})
-
-    def compared(self, stage: Stage) -> Stage:
-        """Return the stage with the simulation that ``terrain explain`` would test."""
-        simulation, _ = simulation_for(stage.runs, self.robot, stage.hidden.library)
-        return stage._replace(simulation=simulation)
-
-
-# -- How a trial of each row is made -----------------------------------------------------------------------
-
-GROSS = (20.0, 100.0)
-"""Range of amplitudes over the limit, in row ``gross``."""
-
-SHORT = (10.0, 50.0)
-"""Range in row ``short``: a replay of samples at 20 Hz is off by one limit of a delay, 0.3 ms, and the effect
-that has to be named is clear of that."""
-
-NOTHING_EVERY = 5
-"""In rows of a drive one trial of so many hides nothing."""
-
-CLOCK = "clock_offset"
-"""Effect that a late logger is."""
-
-LATE_STREAMS = {"gyro": ("imu",), "camera": ("odometry",), "lidar": ("lidar",)}
-"""Sensors that are late in row ``sensor_late``, and their streams."""
-
-LATE_CAUSES = {
-    "gyro": ("imu_latency",),
-    "camera": ("camera_latency",),
-    "lidar": ("lidar_latency", "camera_latency"),
-}
-"""Effects that a late sensor is: the first that the catalogue has, or the last."""
-
 
 def stage_of(case: Case, robot: Robot, rng: np.random.Generator, noise: np.random.SeedSequence) -> Stage:
-    """Draw a trial.
-
-    Parameters
-    ----------
-    case : of the trial
-    robot : of its name
-    rng : draws what is driven and hidden
-    noise : seed of all that differs from run to run
-    """
+    """Draw a trial: ``rng`` draws what is driven and hidden, ``noise`` seeds all that differs from run to run."""
     draw = Draw(case, robot, rng, noise)
-    build = _STAGES.get(case.row)
-    return _standing(draw) if build is None else draw.compared(build(draw))
+    if case.row not in _STAGES:
+        return _with_known_scatter(draw)
+    stage = _STAGES[case.row](draw)
+    # with the simulation that ``terrain explain`` would test
+    return stage._replace(simulation=simulation_for(stage.runs, robot, stage.hidden.library)[0])
 
 
-def _standing(draw: Draw) -> Stage:
+def _with_known_scatter(draw: Draw) -> Stage:
     """Rows whose runs have the scatter and the noise that the diagnosis is given."""
-    case, robot, rng, noise = draw
+    case, robot, rng, _ = draw
     rich = draw.rich()
     drives = poor_drives(rng, case.n_runs) if case.row is Row.POOR else rich
     limits = None if case.row is Row.NONE else limits_of(robot, rich)
     hidden = draw_hidden(case, robot, limits, rng)
-    runs = hidden_runs(robot, drives, noise, hidden.effects, hidden.outside_values)
-    return Stage(runs, hidden, limits)
+    return Stage(draw.runs(drives, hidden.effects, outside=hidden.outside_values), hidden, limits)
 
 
 def _of_drive(draw: Draw) -> Stage:
-    """Rows of robots whose logs have no currents."""
-    robot, number = draw.robot, draw.case.number
-    car = robot if isinstance(robot, BicycleRobot) else None
-    drives = car_drives(draw.rng, car, draw.case.n_runs) if car else draw.rich()
-    turn = number // len(ROBOTS_OF_ROW[draw.case.row])
+    """Rows of robots whose logs have no currents: effects in turn of 3 times their limit, within their bounds."""
+    robot, rng, library = draw.robot, draw.rng, draw.library
+    drives = car_drives(rng, robot, draw.case.n_runs) if isinstance(robot, BicycleRobot) else draw.rich()
+    turn = draw.case.number // len(ROBOTS_OF_ROW[draw.case.row])
     if turn % NOTHING_EVERY == NOTHING_EVERY - 1:
-        hidden, limits = Hidden({}, (), 0.0, "", library_of(robot.drive), {}), None
-    else:
-        limits = limits_of(robot, drives)
-        hidden = draw.in_turn(limits, turn - turn // NOTHING_EVERY)
-    return Stage(hidden_runs(robot, drives, draw.noise, hidden.effects), hidden, limits)
+        return Stage(draw.runs(drives, {}), Hidden(library), None)
+    limits = limits_of(robot, drives)
+    most = {effect: CLIP_RATIO * min(p.high for p in effect.parameters) for effect in library}
+    shown = [effect for effect in library if STRONG * limits.of(effect) < most[effect]]
+    effect = shown[(turn - turn // NOTHING_EVERY) % len(shown)]
+    values = values_of(effect, limits, STRONG, rng)
+    while is_clipped(values):  # in another direction it is not
+        values = values_of(effect, limits, STRONG, rng)
+    return Stage(draw.runs(drives, values), Hidden(library, values, (effect.name,), STRONG), limits)
 
 
 def _gross(draw: Draw) -> Stage:
     drives = draw.rich()
     limits = limits_of(draw.robot, drives)
-    library = library_of(draw.robot.drive)
-    seen = [effect for effect in library if math.isfinite(limits.of(effect))]
+    seen = [effect for effect in draw.library if math.isfinite(limits.of(effect))]
     effect = seen[int(draw.rng.integers(len(seen)))]
-    over = float(math.exp(draw.rng.uniform(*np.log(GROSS))))
+    over = log_uniform(draw.rng, GROSS)
     values = values_of(effect, limits, over, draw.rng)
-    hidden = Hidden(values, (effect.name,), over, "", library, {})
-    runs = hidden_runs(draw.robot, drives, draw.noise, values)
-    return Stage(runs, hidden, limits, clipped=is_clipped(values))
+    hidden = Hidden(draw.library, values, (effect.name,), over)
+    return Stage(draw.runs(drives, values), hidden, limits, {"clipped": is_clipped(values)})
 
 
 def _short(draw: Draw) -> Stage:
     drives = command_drives(draw.rng, draw.robot, draw.case.n_runs)
     limits = limits_of(draw.robot, drives, sensing_of())
     hidden = draw.strong(limits, SHORT)
-    runs = hidden_runs(draw.robot, drives, draw.noise, hidden.effects, heading=True)
+    runs = draw.runs(drives, hidden.effects, heading=True)
     return Stage(tuple(map(as_command_log, runs)), hidden, limits)
 
 
 def _late(draw: Draw) -> Stage:
     drives = draw.rich()
     every = limits_of(draw.robot, drives)
-    variant, names, sign = (
-        ("wheels", WHEELS_LOGGER, -1.0),
-        ("imu and camera", OTHER_LOGGER, 1.0),
-    )[draw.case.number // len(ROBOTS) % 2]
+    loggers = ("wheels", WHEELS_LOGGER, -1.0), ("imu and camera", OTHER_LOGGER, 1.0)
+    variant, names, sign = loggers[draw.turn % 2]
     late_s = float(draw.rng.uniform(*LOGGER_LATE_S))
     alike = confusable_class(every, effect_named(CLOCK), draw.robot.drive)
     hidden = draw.strong(every.free("clock_offset_s"), without=tuple(alike))
-    runs = hidden_runs(draw.robot, drives, draw.noise, hidden.effects)
-    return Stage(
-        with_late_streams(runs, names, late_s),
-        hidden._replace(causes=(CLOCK, *hidden.causes)),
-        every,
-        variant=variant,
-        late_s=sign * late_s,
-    )
+    runs = with_late_streams(draw.runs(drives, hidden.effects), names, late_s)
+    both = hidden._replace(causes=(CLOCK, *hidden.causes))
+    return Stage(runs, both, every, {"variant": variant, "late_s": sign * late_s})
 
 
 def _scattered(draw: Draw) -> Stage:
@@ -458,18 +378,18 @@ def _scattered(draw: Draw) -> Stage:
     limits = limits_of(robot, drives, Sensing(scatter=scatter))
     hidden = draw.strong(limits)
     each = scattered_values(hidden.effects, draw.rng, ratio, n_runs, track=robot.skids)
-    runs = hidden_runs(robot, drives, draw.noise, each)
-    return Stage(runs, hidden, limits, variant=f"{ratio:.0%}", accepted=(TRACK,) if robot.skids else ())
+    asked = {"variant": f"{ratio:.0%}", "accepted": (TRACK,) if robot.skids else ()}
+    return Stage(draw.runs(drives, each), hidden, limits, asked)
 
 
 def _stalled(draw: Draw) -> Stage:
     drives = draw.rich()
     limits = limits_of(draw.robot, drives)
     hidden = draw.strong(limits)
-    runs = hidden_runs(draw.robot, drives, draw.noise, hidden.effects)
+    runs = draw.runs(drives, hidden.effects)
     places = draw_stalled(draw.rng, len(runs))
     runs = with_stalled(runs, places, draw.rng, draw.robot, drives, draw.noise, hidden.effects)
-    return Stage(runs, hidden, limits, stalled=_ids(runs, places))
+    return Stage(runs, hidden, limits, {"stalled": tuple(runs[i].run_id for i in places)})
 
 
 def _half(draw: Draw) -> Stage:
@@ -478,77 +398,64 @@ def _half(draw: Draw) -> Stage:
     some = Drives(tuple(drives.twists[i] for i in places), tuple(drives.hills[i] for i in places))
     limits = limits_of(draw.robot, some)
     hidden = draw.strong(limits)
-    each = [hidden.effects if i in places else {} for i in range(n_runs)]
-    runs = hidden_runs(draw.robot, drives, draw.noise, each)
-    return Stage(runs, hidden, limits, present=_ids(runs, places))
+    runs = draw.runs(drives, [hidden.effects if i in places else {} for i in range(n_runs)])
+    return Stage(runs, hidden, limits, {"present": tuple(runs[i].run_id for i in places)})
 
 
 def _sensor_late(draw: Draw) -> Stage:
     drives, robot = draw.rich(), draw.robot
     sensors = tuple(LATE_STREAMS) if robot.skids else ("gyro", "camera")
-    sensor = sensors[draw.case.number // len(ROBOTS) % len(sensors)]
+    sensor = sensors[draw.turn % len(sensors)]
     late_s = float(draw.rng.uniform(*SENSOR_LATE_S))
     lidar = sensor == "lidar"
-    runs = hidden_runs(robot, drives, draw.noise, {}, heading=lidar)
+    runs = draw.runs(drives, {}, heading=lidar)
     channels = (GYRO, SPEED_X, SPEED_Y, ACCEL, CURRENT, TURNING_CURRENT, HEADING)
     limits = limits_of(robot, drives, Sensing(channels) if lidar else None)
     if lidar:
         runs = tuple(map(with_lidar, runs))
-    library = library_of(robot.drive)
-    known = [name for name in LATE_CAUSES[sensor] if name in [effect.name for effect in library]]
-    cause = known[0] if known else LATE_CAUSES[sensor][-1]
-    hidden = Hidden({f"{cause}_s": late_s}, (cause,), 0.0, "", library, {})
-    return Stage(with_late_streams(runs, LATE_STREAMS[sensor], late_s), hidden, limits, variant=sensor)
+    names = [effect.name for effect in draw.library]
+    cause = next((name for name in LATE_CAUSES[sensor] if name in names), LATE_CAUSES[sensor][-1])
+    hidden = Hidden(draw.library, {f"{cause}_s": late_s}, (cause,))
+    return Stage(with_late_streams(runs, LATE_STREAMS[sensor], late_s), hidden, limits, {"variant": sensor})
 
 
 def _fault(draw: Draw) -> Stage:
     faults = faults_of(draw.robot.drive)
-    fault = faults[draw.case.number // len(ROBOTS) % len(faults)]
-    runs = hidden_runs(draw.robot, draw.rich(), draw.noise, {})
-    hidden = Hidden({}, (), 0.0, "", library_of(draw.robot.drive), {})
-    return Stage(with_fault(runs, fault, draw.robot), hidden, None, variant=fault.name, fault=fault.name)
+    fault = faults[draw.turn % len(faults)]
+    runs = with_fault(draw.runs(draw.rich(), {}), fault, draw.robot)
+    return Stage(runs, Hidden(draw.library), None, {"variant": fault.name, "fault": fault.name})
 
 
 def _dynamic(draw: Draw) -> Stage:
     setting = setting_of(draw.case.number)
-    seed = int(draw.rng.integers(2**31))
-    values = HIDDEN if setting.hides else {}
+    seed, values = int(draw.rng.integers(2**31)), HIDDEN if setting.hides else {}
     runs = dynamic_runs(draw.robot, setting, seed, draw.case.n_runs, values)
     used, _ = split_runs(runs, None, 0)
-    library = library_of(draw.robot.drive)
-    causes = tuple(e.name for e in library if e.parameters[0].name in values)
+    causes = tuple(e.name for e in draw.library if e.parameters[0].name in values)
     limits = limits_of(draw.robot, drives_of(used)) if values else None
-    hidden = Hidden(dict(values), causes, 0.0, "", library, {})
-    return Stage(tuple(used), hidden, limits, variant=setting.name)
+    variant = f"{setting.scenario}, varied" if setting.vary else setting.scenario
+    return Stage(tuple(used), Hidden(draw.library, dict(values), causes), limits, {"variant": variant})
 
 
 def _known(draw: Draw) -> Stage:
-    robot, n_runs = draw.robot, draw.case.n_runs
+    robot, rng, n_runs = draw.robot, draw.rng, draw.case.n_runs
     known = KNOWN[draw.case.number % len(KNOWN)]
-    drives = command_drives(draw.rng, robot, n_runs)
-    scatter = load_scatter()
+    drives = command_drives(rng, robot, n_runs)
+    scatter, each = load_scatter(), [{TRACK_RATIO: TRACK_ERROR}] * n_runs
     if known.scatters:
         scatter = scatter._replace(effective_track_ratio=TRACK_SCATTER)
+        each = scattered_values(each[0], rng, TRACK_SCATTER, n_runs, track=True)
     limits = limits_of(robot, drives, sensing_of(scatter))
-    each = track_of_runs(known, draw.rng, n_runs)
-    runs = hidden_runs(robot, drives, draw.noise, each, heading=True)
-    places: tuple[int, ...] = ()
+    runs, places = draw.runs(drives, each, heading=True), ()
     if known.stalled:
-        places = tuple(sorted(draw.rng.choice(n_runs, N_STALLED, replace=False).tolist()))
-        runs = with_stalled(runs, places, draw.rng, robot, drives, draw.noise, each, heading=True)
-    runs = tuple(map(as_command_log, runs))
+        places = tuple(sorted(rng.choice(n_runs, N_STALLED, replace=False).tolist()))
+        runs = with_stalled(runs, places, rng, robot, drives, draw.noise, each, heading=True)
+    runs, asked = tuple(map(as_command_log, runs)), {"variant": known.name}
     if known.late:
         runs = with_late_streams(runs, WHEELS_LOGGER, WHEELS_LATE_S)
-    hidden = Hidden({TRACK_RATIO: TRACK_ERROR}, (TRACK,), 0.0, "", library_of(robot.drive), {})
-    return Stage(
-        runs,
-        hidden,
-        limits,
-        variant=known.name,
-        accepted=(CLOCK,) if known.late else (),
-        late_s=-WHEELS_LATE_S if known.late else math.nan,
-        stalled=_ids(runs, places),
-    )
+        asked |= {"accepted": (CLOCK,), "late_s": -WHEELS_LATE_S}
+    asked["stalled"] = tuple(runs[i].run_id for i in places)
+    return Stage(runs, Hidden(draw.library, {TRACK_RATIO: TRACK_ERROR}, (TRACK,)), limits, asked)
 
 
 _STAGES: dict[Row, Callable[[Draw], Stage]] = {
@@ -565,7 +472,3 @@ _STAGES: dict[Row, Callable[[Draw], Stage]] = {
     Row.TRACKED: _of_drive,
     Row.CAR: _of_drive,
 }
-
-
-def _ids(runs: Sequence[RunLog], places: Sequence[int]) -> tuple[str, ...]:
-    return tuple(runs[i].run_id for i in places)
