@@ -180,10 +180,11 @@ def _measurements(
 def _wheel_speeds(run: RunLog, robot: Robot) -> Array:
     """Wheel speeds (n, wheels that are logged), from wheel speeds or from the motors' rates."""
     wheels = run.streams["wheels"]
-    scales = {"motor_{}_radps": robot.wheel_radius_m / robot.motors.reduction_ratio, "speed_{}_mps": 1.0}
-    for pattern, scale in scales.items():
+    for pattern in ("motor_{}_radps", "speed_{}_mps"):
         names = [pattern.format(wheel) for wheel in robot.logged_wheels]
         if set(names) <= set(wheels.channels):
+            is_motor = pattern.startswith("motor")  # a robot whose motors are not described logs speeds
+            scale = robot.wheel_radius_m / robot.motors.reduction_ratio if is_motor else 1.0
             return np.column_stack([wheels.channel(name) for name in names]) * scale
     raise DataError(
         f"run {run.run_id}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "
