@@ -45,7 +45,7 @@ from terrain.estimation.filter import FilterSettings, Noise, run_filter
 from terrain.estimation.models.swerve import default_noise, make_filter, thesis_noise
 from terrain.estimation.wheel_slip import STEADY_SPEED_MPS, slip_figures, wheel_slip
 from terrain.kinematics.camera import body_motion, odometry_stream, to_camera
-from terrain.kinematics.commands import admissible_scale, admissible_yaw_rate
+from terrain.kinematics.commands import scaled
 from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
@@ -156,7 +156,7 @@ def admissible_twists(trial: Trial) -> Finding:
     own, xi = wheel_places(robot.track_m / half_m), robot.track_m / half_m
     angle = np.linspace(0.0, 2 * np.pi, 361)
     directions = 2.0 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(angle.size)])
-    slowest = float((2.0 * admissible_scale(own, 1.0, directions, 1.0)).min())
+    slowest = float(np.linalg.norm(scaled(own, 1.0, directions, 1.0), axis=1).min())
     rates = {track_m: float(_yaw_rates(place, 0.0)[1]) for track_m, place in places.items()}
     narrow_m, wide_m = min(TRACKS_M), max(TRACKS_M)
     # y' - (w/2) g' for both puts wheels 1 and 2 at one end, x' - t g' the third to the left.
@@ -188,6 +188,49 @@ def admissible_twists(trial: Trial) -> Finding:
 def wheel_places(xi: float) -> Array:
     """Return the places (3, 2) of the wheels in half wheelbases for a track of ``xi`` half wheelbases."""
     return np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -xi]])
+
+
+def admissible_yaw_rate(
+    positions_m: Array, radius_m: float, speed_x_mps: Array, speed_y_mps: Array, speed_max_radps: float
+) -> tuple[Array, Array]:
+    """Return the lowest and the highest yaw rate (...) that saturate no wheel at a given translation.
+
+    The boundary of the admissible region: with v_max = r w_max, (2.6) corrected asks of every wheel
+    ``(x_i^2 + y_i^2) g'^2 + 2 (x_i v_y - y_i v_x) g' + v_x^2 + v_y^2 - v_max^2 <= 0``, an interval of g'.
+    Figure 2.8 and its dimensionless twist (2.11) come of positions in half wheelbases, radius and limit 1.
+
+    Parameters
+    ----------
+    positions_m : (wheels, 2)
+    radius_m : of the wheels
+    speed_x_mps, speed_y_mps : (...) broadcast against each other
+    speed_max_radps : limit of the wheels
+
+    Returns
+    -------
+    low_radps, high_radps : (...); NaN where no yaw rate is admissible
+
+    Examples
+    --------
+    >>> xi = 1.5  # track over half the wheelbase
+    >>> admissible_yaw_rate([[-1, 0], [1, 0], [0, -xi]], 1.0, [0.0, 0.7], 0.0, 1.0)
+    (array([-0.66666667, -0.71414284]), array([0.66666667, 0.2       ]))
+    """
+    limit_mps = radius_m * speed_max_radps
+    x_mps, y_mps = np.broadcast_arrays(np.asarray(speed_x_mps, float), np.asarray(speed_y_mps, float))
+    x, y = np.asarray(positions_m, float).T
+    square = x * x + y * y
+    across = x * y_mps[..., None] - y * x_mps[..., None]
+    away = x * x_mps[..., None] + y * y_mps[..., None]
+    # across^2 + away^2 = square * speed^2 turns the discriminant into one that cancels nothing
+    inside = square * limit_mps**2 - away**2
+    # a wheel at the origin does not feel the yaw rate: it bounds the translation alone
+    free = np.where(np.hypot(x_mps, y_mps) <= limit_mps, np.inf, np.nan)[..., None]
+    root = np.sqrt(np.where(inside >= 0, inside, np.nan))
+    pivot = np.where(square > 0, square, 1.0)
+    low = np.where(square > 0, (-across - root) / pivot, -free).max(axis=-1)
+    high = np.where(square > 0, (-across + root) / pivot, free).min(axis=-1)
+    return np.where(low <= high, low, np.nan), np.where(low <= high, high, np.nan)
 
 
 def _yaw_rates(places: Array, ahead: float | Array) -> tuple[Array, Array]:

@@ -13,12 +13,12 @@ quaternion's vector part alike: forward is -z, left is -x, up is y.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
 from terrain.angles import unwrapped
-from terrain.records import Array, Stream, read_only
+from terrain.records import Array, Stream
 from terrain.robots import Camera
 
 QUATERNION_TOLERANCE = 0.01
@@ -34,31 +34,18 @@ CHANNELS: tuple[str, ...] = (
 """Channels of the stream ``odometry``."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BodyMotion:
-    """Motion of the robot as its camera saw it; NaN where it saw nothing.
+class BodyMotion(NamedTuple):
+    """Motion of the robot as its camera saw it; NaN where it saw nothing."""
 
-    Parameters
-    ----------
-    time_s : (n,) stamps of the stream
-    speed_mps : (n, 2) of the CAMERA point, forward and left in body axes: ``v_B + w x r`` (6.5, corrected)
-    yaw_rate_radps : (n,) about the body's z axis
-    roll_rad, pitch_rad : (n,) against the fixed frame; left side up and nose down positive
-    yaw_rad : (n,) unwrapped, 0 at the first valid sample
-    position_m : (n, 2) of the ROBOT'S ORIGIN, from 0 with heading 0 at the first valid sample
-    """
-
-    time_s: Array
-    speed_mps: Array
-    yaw_rate_radps: Array
-    roll_rad: Array
-    pitch_rad: Array
-    yaw_rad: Array
-    position_m: Array
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            object.__setattr__(self, item.name, read_only(getattr(self, item.name)))
+    time_s: Array  #: (n,) stamps of the stream
+    speed_mps: (
+        Array  #: (n, 2) of the CAMERA point, forward and left in body axes: ``v_B + w x r`` (6.5, corrected)
+    )
+    yaw_rate_radps: Array  #: (n,) about the body's z axis
+    roll_rad: Array  #: (n,) against the fixed frame; left side up positive
+    pitch_rad: Array  #: (n,) the same; nose down positive
+    yaw_rad: Array  #: (n,) unwrapped, 0 at the first valid sample
+    position_m: Array  #: (n, 2) of the ROBOT'S ORIGIN, from 0 with heading 0 at the first valid sample
 
 
 def body_motion(odometry: Stream, camera: Camera) -> BodyMotion:

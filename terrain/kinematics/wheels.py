@@ -9,7 +9,7 @@ along ``d_i``, all in body axes, the angle of its steering or that of an omni wh
 
 Where a wheel rolls without slip, the first is its circumferential speed u_i, which for all of them is ``u = J V``;
 the second is 0, but of an omni wheel, whose rollers turn with it.  The twist of wheels that contradict each other is
-that of least squares, which for wheels that do not roll across is ``V = H^+ S(d) u`` (2.3, 2.4).
+that of least squares over all these rows, which for wheels that do not roll across is ``V = H^+ S(d) u`` (2.3, 2.4).
 
 A twist is an array ``(..., 3)`` ordered ``(speed_x_mps, speed_y_mps, yaw_rate_radps)`` everywhere here.
 
@@ -37,45 +37,18 @@ MAX_CONDITION = 1e6
 """Of the matrix from twist to wheel speeds, lengths over the size of the robot: beyond, directions agree."""
 
 
-def finite_numbers(name: str, given: Any, size: int | None = None, missing: bool = False) -> Array:
+def finite_numbers(name: str, given: Any, size: int, missing: bool = False) -> Array:
     """Return ``given`` as an array of finite floats with ``size`` columns; NaN too where samples may miss."""
     try:
         array = np.asarray(given, dtype=np.float64)
     except (TypeError, ValueError):
         raise ConfigError(f"{name} cannot be read as an array of numbers") from None
-    if size is not None and array.shape[-1:] != (size,):
+    if array.shape[-1:] != (size,):
         raise ConfigError(f"{name} has shape {array.shape}, (..., {size}) is required")
     bad = np.isinf(array) if missing else ~np.isfinite(array)
     if bad.any():
         raise ConfigError(f"{name} holds {array[bad].flat[0]}, finite numbers are required")
     return array
-
-
-def wheel_positions(given: Any) -> Array:
-    """Return positions (wheels, 2) of two wheels or more that are not all in one place, or refuse them."""
-    positions = finite_numbers("positions_m", given, 2)
-    if positions.ndim != 2 or len(positions) < 2:
-        raise ConfigError(f"positions_m has shape {positions.shape}, (wheels, 2) with two wheels is required")
-    if (positions == positions[0]).all():
-        raise ConfigError("positions_m holds one place only: wheels in one place do not tell the yaw rate")
-    return positions
-
-
-def above_zero(name: str, given: Any) -> float:
-    """Return ``given`` as a number above zero, or refuse it."""
-    value = finite_numbers(name, given)
-    if value.ndim or not value > 0:
-        raise ConfigError(f"{name} is {given!r}, a number above zero is required")
-    return float(value)
-
-
-def broadcast(**arrays: Array) -> list[Array]:
-    """Return arrays of one shape, or refuse them; messages leave out the name ``_``."""
-    try:
-        return list(np.broadcast_arrays(*arrays.values()))
-    except ValueError:
-        names = " and ".join(f"{name} {array.shape}" for name, array in arrays.items() if name != "_")
-        raise ConfigError(f"shapes do not fit together: {names}") from None
 
 
 def point_velocity(
@@ -148,11 +121,6 @@ def velocity_matrix(positions_m: Array) -> Array:
 def wheel_velocities(positions_m: Array, twist: Array) -> Array:
     """Return the velocity (..., wheels, 2) of the wheel centres in the body frame, equation (2.2).
 
-    Raises
-    ------
-    ConfigError
-        if ``positions_m`` is no (wheels, 2), ``twist`` no (..., 3), or either is not finite.
-
     Examples
     --------
     >>> wheel_velocities([[-0.5, 0.0], [0.5, 0.0], [0.0, -0.75]], [1.0, 0.0, 0.2])
@@ -160,18 +128,13 @@ def wheel_velocities(positions_m: Array, twist: Array) -> Array:
            [ 1.  ,  0.1 ],
            [ 1.15,  0.  ]])
     """
-    positions = wheel_positions(positions_m)
-    flat = finite_numbers("twist", twist, 3) @ velocity_matrix(positions).T
-    return np.asarray(flat.reshape(*flat.shape[:-1], len(positions), 2))
+    rows = velocity_matrix(finite_numbers("positions_m", positions_m, 2))
+    flat = finite_numbers("twist", twist, 3) @ rows.T
+    return np.asarray(flat.reshape(*flat.shape[:-1], -1, 2))
 
 
 def rolling_matrix(positions_m: Array, direction_rad: Array) -> Array:
     """Return J (..., wheels, 3): circumferential speeds of wheels that roll without slip are J times the twist.
-
-    Raises
-    ------
-    ConfigError
-        for shapes that do not fit, and values that are not finite.
 
     Examples
     --------
@@ -180,8 +143,8 @@ def rolling_matrix(positions_m: Array, direction_rad: Array) -> Array:
            [-1. ,  0. ,  0.1],
            [ 0. , -1. ,  0.1]])
     """
-    positions = wheel_positions(positions_m)
-    direction = finite_numbers("direction_rad", direction_rad, len(positions))
+    positions = finite_numbers("positions_m", positions_m, 2)
+    direction = finite_numbers("direction_rad", direction_rad, len(positions), missing=True)
     (x_m, y_m), cos, sin = positions.T, np.cos(direction), np.sin(direction)
     return np.stack([cos, sin, x_m * sin - y_m * cos], axis=-1)
 
@@ -201,7 +164,7 @@ def no_slip_twist(
     Returns
     -------
     twist : (..., 3) least squares; NaN where a sample is missing
-    residual_mps : (...) norm over the wheels of what no twist explains: of three omni wheels always 0
+    residual_mps : (...) norm over the rows of what no twist explains: of three omni wheels always 0
 
     Raises
     ------
@@ -214,20 +177,17 @@ def no_slip_twist(
     >>> twist.round(3), residual_mps.round(3)
     (array([0.995, 0.   , 0.2  ]), np.float64(0.0))
     """
-    positions = wheel_positions(positions_m)
-    direction = finite_numbers("direction_rad", direction_rad, len(positions), missing=True)
-    speed = finite_numbers("wheel_speed_mps", wheel_speed_mps, len(positions), missing=True)
+    rows = rolling_matrix(positions_m, direction_rad)
+    speed = finite_numbers("wheel_speed_mps", wheel_speed_mps, rows.shape[-2], missing=True)
     if not rolls_across:
-        direction, speed = broadcast(direction_rad=direction, wheel_speed_mps=speed)
-        velocity = np.stack([np.cos(direction), np.sin(direction)], axis=-1) * speed[..., None]
-        seen, rows = velocity.reshape(*speed.shape[:-1], -1), velocity_matrix(positions)
-        twist = seen @ np.linalg.pinv(rows).T
-        return twist, np.linalg.norm(seen - twist @ rows.T, axis=-1)
-    rows = rolling_matrix(positions, direction)
-    size_m = np.linalg.norm(positions, axis=1).max()
-    if len(positions) < 3 or not (np.linalg.cond(rows / [1.0, 1.0, size_m]) < MAX_CONDITION).all():
+        across = rolling_matrix(positions_m, np.asarray(direction_rad) + np.pi / 2)
+        rows, speed = np.concatenate([rows, across], axis=-2), np.concatenate([speed, 0.0 * speed], axis=-1)
+    size_m = np.linalg.norm(positions_m, axis=-1).max()
+    known = np.nan_to_num(rows)[np.isfinite(rows).all(axis=(-2, -1))] / [1.0, 1.0, size_m or 1.0]
+    if rows.shape[-2] < 3 or not (np.linalg.cond(known) < MAX_CONDITION).all():
         raise ConfigError(
             "the wheels do not determine the twist: their drive directions allow a motion of none"
         )
-    twist = (np.linalg.pinv(rows) @ speed[..., None])[..., 0]
-    return twist, np.linalg.norm(speed - (rows @ twist[..., None])[..., 0], axis=-1)
+    square, seen = np.swapaxes(rows, -2, -1) @ rows, np.einsum("...ij,...i->...j", rows, speed)
+    twist = np.linalg.solve(square, seen[..., None])[..., 0]
+    return twist, np.linalg.norm(speed - np.einsum("...ij,...j->...i", rows, twist), axis=-1)

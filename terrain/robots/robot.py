@@ -147,11 +147,7 @@ class Equipment(NamedTuple):
 
 
 KIND_OF_SECTION: Mapping[str, type[Part]] = {
-    "body": Body,
-    "motors": Motors,
-    "steering": Steering,
-    "camera": Camera,
-    "sensors": Sensors,
+    kind.__name__.lower(): kind for kind in (Body, Motors, Steering, Camera, Sensors)
 }
 """What each section of a description is read into, by its key in the file."""
 
@@ -159,12 +155,24 @@ KIND_OF_SECTION: Mapping[str, type[Part]] = {
 P = TypeVar("P", bound=Part)
 
 
+class Wheel(NamedTuple):
+    """A wheel, or all wheels of a side that turn together."""
+
+    name: str  #: as channels have it
+    x_m: float
+    y_m: float
+    channel: str = ""  #: of its rate or speed in the stream ``wheels``; empty where it is not logged
+    direction_rad: float = 0.0  #: that it drives along where it is not steered; 0 is ahead
+    is_steered: bool = False  #: steered wheels are the first ones of a robot
+    rolls_across: bool = False  #: as an omni wheel, whose rollers turn with it
+
+
 @dataclass(frozen=True)
 class Robot(ABC):
     """A wheeled robot; body axes are x forward, y left, z up.
 
-    Each kind of drive is a subclass, and answers what differs between drives.  A section of the description
-    (:attr:`body`, :attr:`motors`, ...) is never None: where the description lacks it, asking for it raises
+    Each kind of drive is a subclass, which says what its wheels are; what follows from them is here.  A section of the
+    description (:attr:`body`, :attr:`motors`, ...) is never None: where the description lacks it, asking for it raises
     ``ConfigError``.  Code that can do without asks :meth:`describes` first, or takes :meth:`completed`.
 
     Parameters
@@ -181,6 +189,16 @@ class Robot(ABC):
     assumed : numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
     identified : what logs of it showed beside its nominal figures, as ``effective_track_m``
     filters : filters and observers that its description lists; none where all of its drive apply
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> husky = load_robot("husky")
+    >>> husky.rate_channels, husky.describes("camera", "steering")
+    (('speed_left_mps', 'speed_right_mps'), False)
+    >>> husky.without("motors").motors
+    Traceback (most recent call last):
+    terrain.errors.ConfigError: robot husky: its description has no section 'motors', which is needed here
     """
 
     name: str
@@ -202,32 +220,12 @@ class Robot(ABC):
     """What its descriptions call numbers that have another name here."""
     drive: ClassVar[str]
     """The kind of drive, as descriptions name it."""
-    wheels: ClassVar[tuple[str, ...]]
-    """The wheels' names, as channels have them."""
-    logged_wheels: ClassVar[tuple[str, ...]]
-    """Names of the wheels whose rates are logged, in the order of :attr:`rate_channels`."""
-    steered_wheels: ClassVar[tuple[str, ...]] = ()
-    """Names of the wheels that are steered, the first ones of :attr:`wheels`."""
-    by_motor: ClassVar[bool] = False
-    """Whether logs have the rates of motors, and tables those of wheels; else circumferential speeds."""
     sections: ClassVar[tuple[str, ...]] = ("body", "motors", "camera", "sensors")
     """Sections that a complete description has."""
     n_tyres: ClassVar[int]
     """Tyres that carry the weight."""
-    sideways: ClassVar[bool] = False
-    """Whether it can drive sideways."""
     skids: ClassVar[bool] = False
     """Whether it turns by skidding, so that the turning moment takes a current of its own."""
-
-    @property
-    def steered(self) -> bool:
-        """Whether wheels are steered: there is a stream of angles."""
-        return bool(self.steered_wheels)
-
-    @property
-    def on_omni_wheels(self) -> bool:
-        """Whether it drives sideways on wheels that are not steered, each along its own direction."""
-        return self.sideways and not self.steered
 
     def __post_init__(self) -> None:
         n = len(self.effects)
@@ -237,9 +235,8 @@ class Robot(ABC):
         for name, part in self.parts.items():
             if not isinstance(part, KIND_OF_SECTION.get(name, ())):
                 raise TypeError(f"section {name!r} is a {type(part).__name__}")
-        object.__setattr__(self, "parts", MappingProxyType(dict(self.parts)))
-        object.__setattr__(self, "effects", MappingProxyType(dict(self.effects)))
-        object.__setattr__(self, "identified", MappingProxyType(dict(self.identified)))
+        for name in ("parts", "effects", "identified"):
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
         object.__setattr__(self, "effects_cov", read_only(cov))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -254,27 +251,45 @@ class Robot(ABC):
         also |= {own.get(key, key): value for key, value in numbers.items()}
         return cls(name=name, **also)
 
-    @property
+    @cached_property
     @abstractmethod
-    def wheel_positions_m(self) -> Array:
-        """Position (wheels, 2) of each wheel in the body frame."""
+    def wheel_table(self) -> tuple[Wheel, ...]:
+        """The wheels."""
 
-    @property
-    def wheel_directions_rad(self) -> Array:
-        """Direction (wheels,) that each wheel drives along where it is not steered; 0 is ahead."""
-        return np.zeros(len(self.wheels))
+    @cached_property
+    def wheels(self) -> tuple[str, ...]:
+        """The wheels' names, as channels have them."""
+        return tuple(wheel.name for wheel in self.wheel_table)
 
-    @property
+    @cached_property
+    def logged_wheels(self) -> tuple[str, ...]:
+        """Names of the wheels whose rates are logged, in the order of :attr:`rate_channels`."""
+        return tuple(wheel.name for wheel in self.wheel_table if wheel.channel)
+
+    @cached_property
     def rate_channels(self) -> tuple[str, ...]:
         """Channels of the stream ``wheels``: rates of motors, ahead of the reduction, or wheel speeds."""
-        pattern = "motor_{}_radps" if self.by_motor else "speed_{}_mps"
-        return tuple(pattern.format(wheel) for wheel in self.logged_wheels)
+        return tuple(wheel.channel for wheel in self.wheel_table if wheel.channel)
 
-    @property
+    @cached_property
+    def by_motor(self) -> bool:
+        """Whether logs have the rates of motors, and tables those of wheels; else circumferential speeds."""
+        return self.rate_channels[0].startswith("motor_")
+
+    @cached_property
     def wheel_rows(self) -> tuple[str, ...]:
         """Row of each wheel's rate or speed in a table of measurements."""
-        unit = "radps" if self.by_motor else "mps"
-        return tuple(f"wheel_{wheel}_{unit}" for wheel in self.logged_wheels)
+        return tuple(f"wheel_{name}_{'radps' if self.by_motor else 'mps'}" for name in self.logged_wheels)
+
+    @cached_property
+    def steered_wheels(self) -> tuple[str, ...]:
+        """Names of the wheels that are steered."""
+        return tuple(wheel.name for wheel in self.wheel_table if wheel.is_steered)
+
+    @property
+    def steered(self) -> bool:
+        """Whether wheels are steered: there is a stream of angles."""
+        return bool(self.steered_wheels)
 
     @property
     def steer_rows(self) -> tuple[str, ...]:
@@ -283,15 +298,28 @@ class Robot(ABC):
 
     @property
     def steer_channels(self) -> tuple[str, ...]:
-        """Channels of the stream ``steering``, in the order of :attr:`steer_rows`; none without steering.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("adap2e").steer_channels, load_robot("husky").steer_channels
-        (('angle_front_rad',), ())
-        """
+        """Channels of the stream ``steering``, in the order of :attr:`steer_rows`; none without steering."""
         return tuple(f"angle_{wheel}_rad" for wheel in self.steered_wheels)
+
+    @cached_property
+    def on_omni_wheels(self) -> bool:
+        """Whether it drives sideways on wheels that are not steered, each along its own direction."""
+        return all(wheel.rolls_across for wheel in self.wheel_table)
+
+    @cached_property
+    def sideways(self) -> bool:
+        """Whether it can drive sideways."""
+        return all(wheel.rolls_across or wheel.is_steered for wheel in self.wheel_table)
+
+    @cached_property
+    def wheel_positions_m(self) -> Array:
+        """Position (wheels, 2) of each wheel in the body frame."""
+        return read_only([[wheel.x_m, wheel.y_m] for wheel in self.wheel_table])
+
+    @cached_property
+    def wheel_directions_rad(self) -> Array:
+        """Direction (wheels,) that each wheel drives along where it is not steered; 0 is ahead."""
+        return read_only([wheel.direction_rad for wheel in self.wheel_table])
 
     @property
     def steering_zeros_rad(self) -> Array:
@@ -307,7 +335,7 @@ class Robot(ABC):
         """Return what :attr:`rate_channels` log of wheel circumferential speeds (..., wheels)."""
         if self.by_motor:
             return np.asarray(wheel_speed_mps / self.wheel_radius_m * self.motors.reduction_ratio)
-        return np.asarray(wheel_speed_mps)[..., len(self.wheels) - len(self.logged_wheels) :]
+        return np.asarray(wheel_speed_mps)[..., [bool(wheel.channel) for wheel in self.wheel_table]]
 
     def wheel_speeds_mps(self, rows: Array) -> Array:
         """Return wheel circumferential speeds for values (..., wheels) of :attr:`wheel_rows`."""
@@ -335,15 +363,17 @@ class Robot(ABC):
 
     @property
     def equipment(self) -> Equipment:
-        """All sections of the description; ``ConfigError`` where one is missing.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("agrimaro").equipment.motors.torque_max_nm
-        60.0
-        """
+        """All sections of the description; ``ConfigError`` where one is missing."""
         return Equipment(self.body, self.motors, self._part(Steering), self.camera, self.sensors)
+
+    def _part(self, kind: type[P]) -> P:
+        section = kind.__name__.lower()
+        part = self.parts.get(section)
+        if not isinstance(part, kind):
+            raise ConfigError(
+                f"robot {self.name}: its description has no section {section!r}, which is needed here"
+            )
+        return part
 
     @property
     def encoder_lag_s(self) -> float:
@@ -351,40 +381,16 @@ class Robot(ABC):
         return self.completed.sensors.encoder_time_constant_s + self.effects.get("encoder_lag_s", 0.0)
 
     def describes(self, *sections: str) -> bool:
-        """Return whether the description has all the sections named.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("husky").describes("camera", "steering")
-        False
-        """
+        """Return whether the description has all the sections named."""
         return self.parts.keys() >= set(sections)
 
     def require(self, *sections: str) -> None:
-        """Make sure that the description has the sections named.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("husky").without("motors").require("motors")
-        Traceback (most recent call last):
-        terrain.errors.ConfigError: robot husky: its description has no section 'motors', which is needed here
-        """
+        """Make sure that the description has the sections named; else ``ConfigError``."""
         for section in sections:
             self._part(KIND_OF_SECTION[section])
 
     def with_parts(self, **parts: Part) -> Self:
-        """Return the robot with sections of its description set, by name.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> husky = load_robot("husky")
-        >>> slow = husky.with_parts(motors=replace(husky.motors, speed_max_radps=3.0))
-        >>> slow.motors.speed_max_radps
-        3.0
-        """
+        """Return the robot with sections of its description set, by name."""
         return replace(self, parts={**self.parts, **parts})
 
     def without(self, *sections: str) -> Self:
@@ -398,39 +404,20 @@ class Robot(ABC):
         Neutral parts do not act: the mass is a point in the middle of the wheels, a traction of 1 N takes 1 A
         and no friction, camera and sensors have neither delay nor bias nor lever arm; rates and noise, which
         have no neutral value, are NaN.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> bare = load_robot("husky").without("camera", "sensors")
-        >>> bare.completed.camera.latency_s, bare.completed.sensors.gyro_std_radps
-        (0.0, nan)
         """
         middle_m = self.wheel_positions_m.mean(axis=0)
+        unlimited = dict.fromkeys(("torque_max_nm", "speed_max_radps"), np.inf)
+        scale = {"reduction_ratio": 1.0, "efficiency_ratio": 1.0, "torque_constant_nmpa": self.wheel_radius_m}
         neutral: dict[str, Part] = {
             "body": _neutral(Body, com_x_m=float(middle_m[0]), com_y_m=float(middle_m[1])),
-            "motors": _neutral(
-                Motors,
-                reduction_ratio=1.0,
-                torque_constant_nmpa=self.wheel_radius_m,
-                efficiency_ratio=1.0,
-                torque_max_nm=np.inf,
-                speed_max_radps=np.inf,
-            ),
+            "motors": _neutral(Motors, **scale, **unlimited),
             "camera": _neutral(Camera),
             "sensors": _neutral(Sensors),
         }
         return replace(self, parts={**neutral, **self.parts})
 
     def with_track(self, track_m: float) -> Self:
-        """Return the robot with its adjustable track set.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("agrimaro").with_track(1.0).wheel_positions_m[2]
-        array([ 0., -1.])
-        """
+        """Return the robot with its adjustable track set."""
         changed = replace(self, track_m=float(track_m))
         changed.check_geometry(f"robot {self.name}")
         return changed
@@ -450,33 +437,24 @@ class Robot(ABC):
                 f"{place}: track_m is {self.track_m:g}; the footprint allows {low_m:g} to {high_m:g} m"
             )
 
-    def _part(self, kind: type[P]) -> P:
-        section = kind.__name__.lower()
-        part = self.parts.get(section)
-        if not isinstance(part, kind):
+    def check_load(self, place: str) -> None:
+        """Refuse a centre of mass that lifts one of three wheels."""
+        if not self.describes("body"):
+            return
+        com_m = [self.body.com_x_m, self.body.com_y_m]
+        parts = np.linalg.solve(np.vstack([np.ones(3), self.wheel_positions_m.T]), [1.0, *com_m])
+        if parts.min() <= 0:
             raise ConfigError(
-                f"robot {self.name}: its description has no section {section!r}, which is needed here"
+                f"{place}: the centre of mass ({com_m[0]:g}, {com_m[1]:g}) m lies outside the "
+                f"triangle of the wheels: wheel {int(parts.argmin()) + 1} would carry nothing"
             )
-        return part
-
-
-def check_centre_of_mass(place: str, positions_m: Array, body: Body) -> None:
-    """Refuse a centre of mass that lifts one of three wheels."""
-    moments = np.vstack([np.ones(3), positions_m.T])
-    shares = np.linalg.solve(moments, [1.0, body.com_x_m, body.com_y_m])
-    if shares.min() <= 0:
-        raise ConfigError(
-            f"{place}: the centre of mass ({body.com_x_m:g}, {body.com_y_m:g}) m lies outside the "
-            f"triangle of the wheels: wheel {int(shares.argmin()) + 1} would carry nothing"
-        )
 
 
 def _neutral(kind: type[P], **values: float) -> P:
     """Return a part that does not act: 0 or, of a scale, 1; NaN for rates and noise."""
-    named = {item.name: item.name for item in fields(kind)}
     default = {
         name: 1.0 if "_scale_" in name else np.nan if "_std_" in name or name.endswith("_hz") else 0.0
-        for name in named
+        for name in (item.name for item in fields(kind))
     }
     return kind(**(default | values))
 
@@ -489,15 +467,16 @@ class SkidSteerRobot(Robot):
     """
 
     drive: ClassVar[str] = "skid_steer"
-    wheels: ClassVar[tuple[str, ...]] = ("left", "right")
-    logged_wheels: ClassVar[tuple[str, ...]] = wheels
     n_tyres: ClassVar[int] = 4
     skids: ClassVar[bool] = True
 
     @cached_property
-    def wheel_positions_m(self) -> Array:
-        """Middle (2, 2) of each side in the body frame."""
-        return read_only([[0.0, self.track_m / 2], [0.0, -self.track_m / 2]])
+    def wheel_table(self) -> tuple[Wheel, ...]:
+        """Middle of each side."""
+        return tuple(
+            Wheel(side, 0.0, y_m, f"speed_{side}_mps")
+            for side, y_m in (("left", self.track_m / 2), ("right", -self.track_m / 2))
+        )
 
 
 @dataclass(frozen=True)
@@ -505,15 +484,10 @@ class TrackedRobot(SkidSteerRobot):
     """Two tracks; ``wheel_radius_m`` is that of the sprocket, ``wheelbase_m`` the length on the ground.
 
     Logs are those of a skid-steer robot, and so is all that needs no more than the speeds of the two sides.
-
-    Parameters
-    ----------
-    track_width_m : of one track
-    com_height_m : of the centre of mass above the ground
     """
 
-    track_width_m: float = 0.15
-    com_height_m: float = 0.15
+    track_width_m: float = 0.15  #: of one track
+    com_height_m: float = 0.15  #: of the centre of mass above the ground
 
     numbers: ClassVar[tuple[str, ...]] = (
         *("sprocket_radius_m", "track_m", "contact_length_m", "track_width_m", "com_height_m", "mass_kg"),
@@ -526,14 +500,7 @@ class TrackedRobot(SkidSteerRobot):
 
     @property
     def half_track_m(self) -> float:
-        """Half the distance between the middles of the tracks, d of Tazzari et al. and Yamauchi et al.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("patako").half_track_m
-        0.1965
-        """
+        """Half the distance between the middles of the tracks, d of Tazzari et al. and Yamauchi et al."""
         return self.track_m / 2.0
 
     @property
@@ -558,31 +525,28 @@ class SwerveRobot(Robot):
     """Three wheels that are driven and steered each.
 
     Two of them are on the body's x axis, the third to the right of it (Danzi, AgriMaRo thesis, 7.2).
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> load_robot("agrimaro").with_track(1.0).wheel_positions_m
+    array([[-0.5075,  0.    ],
+           [ 0.5075,  0.    ],
+           [ 0.    , -1.    ]])
     """
 
     drive: ClassVar[str] = "swerve"
-    wheels: ClassVar[tuple[str, ...]] = ("1", "2", "3")
-    logged_wheels: ClassVar[tuple[str, ...]] = wheels
-    steered_wheels: ClassVar[tuple[str, ...]] = wheels
-    by_motor: ClassVar[bool] = True
-    sections: ClassVar[tuple[str, ...]] = ("body", "motors", "steering", "camera", "sensors")
+    sections: ClassVar[tuple[str, ...]] = tuple(KIND_OF_SECTION)
     n_tyres: ClassVar[int] = 3
-    sideways: ClassVar[bool] = True
 
     @cached_property
-    def wheel_positions_m(self) -> Array:
-        """Position (3, 2) of each wheel in the body frame.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("agrimaro").wheel_positions_m
-        array([[-0.5075,  0.    ],
-               [ 0.5075,  0.    ],
-               [ 0.    , -0.756 ]])
-        """
+    def wheel_table(self) -> tuple[Wheel, ...]:
+        """Three wheels."""
         half_m = self.wheelbase_m / 2
-        return read_only([[-half_m, 0.0], [half_m, 0.0], [0.0, -self.track_m]])
+        return tuple(
+            Wheel(f"{k}", x_m, y_m, f"motor_{k}_radps", is_steered=True)
+            for k, x_m, y_m in ((1, -half_m, 0.0), (2, half_m, 0.0), (3, 0.0, -self.track_m))
+        )
 
     @property
     def steering(self) -> Steering:
@@ -602,8 +566,7 @@ class SwerveRobot(Robot):
     def check_geometry(self, place: str) -> None:
         """Refuse dimensions that no body can have, and a load that lifts a wheel."""
         super().check_geometry(place)
-        if self.describes("body"):
-            check_centre_of_mass(place, self.wheel_positions_m, self.body)
+        self.check_load(place)
 
 
 @dataclass(frozen=True)
@@ -614,81 +577,57 @@ class OmniRobot(Robot):
     ``wheelbase_m`` are the sides of the rectangle around the wheels where the first is at 60 degrees:
     ``sqrt(3) d`` and ``1.5 d`` of the distance d.
 
-    Parameters
-    ----------
-    first_wheel_rad : place of the first wheel on the circle, from the x axis
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> robot = load_robot("robotino")
+    >>> round(robot.wheel_distance_m, 6), np.degrees(robot.wheel_directions_rad).round(6).tolist()
+    (0.125, [150.0, 270.0, 390.0])
     """
 
-    first_wheel_rad: float = math.pi / 3
+    first_wheel_rad: float = math.pi / 3  #: place of the first wheel on the circle, from the x axis
 
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "wheel_distance_m", "first_wheel_rad", "mass_kg")
     drive: ClassVar[str] = "omni"
-    wheels: ClassVar[tuple[str, ...]] = ("1", "2", "3")
-    logged_wheels: ClassVar[tuple[str, ...]] = wheels
-    by_motor: ClassVar[bool] = True
     n_tyres: ClassVar[int] = 3
-    sideways: ClassVar[bool] = True
 
     @classmethod
     def described(cls, name: str, numbers: Mapping[str, float], **also: Any) -> Self:
         """Return the robot of a description's numbers; ``also`` are other parameters."""
-        distance_m = numbers["wheel_distance_m"]
-        return cls(
-            name,
-            numbers["wheel_radius_m"],
-            math.sqrt(3.0) * distance_m,
-            1.5 * distance_m,
-            numbers["mass_kg"],
-            first_wheel_rad=numbers["first_wheel_rad"],
-            **also,
+        own = dict(numbers)
+        distance_m = own.pop("wheel_distance_m")
+        return super().described(
+            name, own | {"track_m": math.sqrt(3.0) * distance_m, "wheelbase_m": 1.5 * distance_m}, **also
         )
 
     @property
     def wheel_distance_m(self) -> float:
-        """Distance of each wheel from the body's origin.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> round(load_robot("robotino").wheel_distance_m, 6)
-        0.125
-        """
+        """Distance of each wheel from the body's origin."""
         return self.track_m / math.sqrt(3.0)
 
     @cached_property
-    def _places_rad(self) -> Array:
-        return self.first_wheel_rad + 2.0 * np.pi / 3.0 * np.arange(3)
-
-    @cached_property
-    def wheel_positions_m(self) -> Array:
-        """Position (3, 2) of each wheel in the body frame."""
-        angle = self._places_rad
-        return read_only(self.wheel_distance_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-
-    @cached_property
-    def wheel_directions_rad(self) -> Array:
-        """Direction (3,) that each wheel drives along: counter-clockwise about the origin.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> np.degrees(load_robot("robotino").wheel_directions_rad).round(6).tolist()
-        [150.0, 270.0, 390.0]
-        """
-        return read_only(self._places_rad + np.pi / 2)
+    def wheel_table(self) -> tuple[Wheel, ...]:
+        """Three wheels, each driving counter-clockwise about the origin."""
+        places = (self.first_wheel_rad + 2.0 * np.pi / 3.0 * np.arange(3)).tolist()
+        d = self.wheel_distance_m
+        return tuple(
+            Wheel(
+                *(f"{k}", d * float(np.cos(at)), d * float(np.sin(at)), f"motor_{k}_radps", at + np.pi / 2),
+                rolls_across=True,
+            )
+            for k, at in enumerate(places, 1)
+        )
 
     def check_geometry(self, place: str) -> None:
         """Refuse dimensions that no body can have, and a load that lifts a wheel."""
         if self.wheel_distance_m <= 0:
             raise ConfigError(f"{place}: wheel_distance_m must be above zero")
-        if not self.describes("body"):
-            return
-        if 2.0 * self.wheel_distance_m > self.body.footprint_max_m:
+        if self.describes("body") and 2.0 * self.wheel_distance_m > self.body.footprint_max_m:
             raise ConfigError(
                 f"{place}: wheel_distance_m is {self.wheel_distance_m:g}; the footprint allows up to "
                 f"{self.body.footprint_max_m / 2.0:g} m"
             )
-        check_centre_of_mass(place, self.wheel_positions_m, self.body)
+        self.check_load(place)
 
 
 @dataclass(frozen=True)
@@ -697,26 +636,21 @@ class BicycleRobot(Robot):
 
     Logs have one speed, that of the rear axle, and one steering angle, that of the bicycle's front wheel.
 
-    Parameters
-    ----------
-    com_ahead_m : distance of the centre of mass ahead of the rear axle, L_R
-    com_height_m : of the centre of mass above the ground
-    yaw_inertia_kgm2 : about the centre of mass, I_z
-    steering_max_rad : largest steering angle
-    steering_time_constant_s : of the first-order lag of the steering
-    steering_rate_radps : fastest steering rate
-    speed_max_mps : fastest speed
-    front_cornering_npr, rear_cornering_npr : cornering stiffness of each axle, N/rad
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> load_robot("adap2e").steer_channels, load_robot("adap2e").understeer_s2pm
+    (('angle_front_rad',), 0.0)
     """
 
-    com_ahead_m: float = 0.6
-    com_height_m: float = 0.4
-    yaw_inertia_kgm2: float = 200.0
+    com_ahead_m: float = 0.6  #: distance of the centre of mass ahead of the rear axle, L_R
+    com_height_m: float = 0.4  #: of the centre of mass above the ground
+    yaw_inertia_kgm2: float = 200.0  #: about the centre of mass, I_z
     steering_max_rad: float = 0.35
-    steering_time_constant_s: float = 0.1
-    steering_rate_radps: float = 1.0
+    steering_time_constant_s: float = 0.1  #: of the first-order lag of the steering
+    steering_rate_radps: float = 1.0  #: fastest
     speed_max_mps: float = 8.0
-    front_cornering_npr: float = 15000.0
+    front_cornering_npr: float = 15000.0  #: cornering stiffness of each axle
     rear_cornering_npr: float = 15000.0
 
     numbers: ClassVar[tuple[str, ...]] = (
@@ -726,42 +660,26 @@ class BicycleRobot(Robot):
         *("front_cornering_npr", "rear_cornering_npr"),
     )
     drive: ClassVar[str] = "bicycle"
-    wheels: ClassVar[tuple[str, ...]] = ("front", "rear")
-    logged_wheels: ClassVar[tuple[str, ...]] = ("rear",)
-    steered_wheels: ClassVar[tuple[str, ...]] = ("front",)
     sections: ClassVar[tuple[str, ...]] = ("sensors",)
     n_tyres: ClassVar[int] = 4
 
+    @cached_property
+    def wheel_table(self) -> tuple[Wheel, ...]:
+        """Front and rear wheel; the rear axle is the body's origin."""
+        front = Wheel("front", self.wheelbase_m, 0.0, is_steered=True)
+        return front, Wheel("rear", 0.0, 0.0, "speed_rear_mps")
+
     @property
     def com_behind_front_m(self) -> float:
-        """Distance of the centre of mass behind the front axle, L_F.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("adap2e").com_behind_front_m
-        0.6
-        """
+        """Distance of the centre of mass behind the front axle, L_F."""
         return self.wheelbase_m - self.com_ahead_m
 
     @property
     def understeer_s2pm(self) -> float:
-        """Understeer K by its tyres: at speed v it turns as one with the wheelbase ``L + K v^2``.
-
-        Examples
-        --------
-        >>> from terrain.robots import load_robot
-        >>> load_robot("adap2e").understeer_s2pm
-        0.0
-        """
+        """Understeer K by its tyres: at speed v it turns as one with the wheelbase ``L + K v^2``."""
         ahead = self.com_ahead_m / self.front_cornering_npr
         behind = self.com_behind_front_m / self.rear_cornering_npr
         return self.mass_kg * (ahead - behind) / self.wheelbase_m
-
-    @cached_property
-    def wheel_positions_m(self) -> Array:
-        """Position (2, 2) of the front and the rear wheel; the rear axle is the body's origin."""
-        return read_only([[self.wheelbase_m, 0.0], [0.0, 0.0]])
 
     @property
     def steering_rate_max_radps(self) -> float:

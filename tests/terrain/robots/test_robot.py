@@ -1,42 +1,59 @@
+"""Robots: what each drive is, sections of descriptions, and descriptions that cannot be."""
+
+import math
 import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 
 from terrain.errors import ConfigError
-from terrain.robots import OmniRobot, SkidSteerRobot, SwerveRobot, as_drive, load_robot
+from terrain.files.names import data_folder
+from terrain.robots import SkidSteerRobot, SwerveRobot, as_drive, load_robot
 
-AGRIMARO, HUSKY, ROBOTINO = (load_robot(name) for name in ("agrimaro", "husky", "robotino"))
-
-
-def test_the_drive_of_a_description_is_the_type_of_the_robot():
-    assert isinstance(AGRIMARO, SwerveRobot)
-    assert isinstance(HUSKY, SkidSteerRobot)
-    assert not hasattr(HUSKY, "steering")
+NAMES = ("agrimaro", "husky", "robotino", "adap2e", "orchard_ugv")
+AGRIMARO, HUSKY, ROBOTINO, CAR, UGV = ROBOTS = [load_robot(name) for name in NAMES]
 
 
-@pytest.mark.parametrize("robot", [AGRIMARO, HUSKY, ROBOTINO], ids=lambda robot: robot.name)
-def test_every_drive_type_provides_the_robot_interface(robot):
+@pytest.mark.parametrize("robot", ROBOTS, ids=NAMES)
+def test_every_drive_is_its_wheels(robot):
     n = len(robot.wheels)
     assert robot.wheel_positions_m.shape == (n, 2)
-    assert len(robot.rate_channels) == len(robot.wheel_rows) == len(robot.steering_zeros_rad) == n
-    assert robot.wheel_directions_rad.shape == (n,)
-    assert len(robot.steer_rows) == (n if robot.steered else 0)
+    assert robot.wheel_directions_rad.shape == robot.steering_zeros_rad.shape == (n,)
+    assert len(robot.rate_channels) == len(robot.wheel_rows) == len(robot.logged_wheels)
+    assert robot.steered_wheels == robot.wheels[: len(robot.steer_rows)]
     assert (robot.steering_rate_max_radps > 0) == robot.steered
-    assert robot.describes(*robot.sections)
-    robot.require(*robot.sections)
+    if robot not in (CAR, UGV):  # whose sensors are part of their simulations
+        robot.require(*robot.sections)
+    speed_mps = np.array([0.2, -0.1, 0.4])[:n]
+    logged = robot.logged_rates(speed_mps)
+    if robot.by_motor:
+        logged = robot.wheel_speeds_mps(logged / robot.motors.reduction_ratio)
+    np.testing.assert_allclose(logged, speed_mps[-len(robot.logged_wheels) :], rtol=1e-12)
+
+
+def test_what_drives_can_do_follows_from_their_wheels():
+    assert [robot.sideways for robot in ROBOTS] == [True, False, True, False, False]
+    assert [robot.on_omni_wheels for robot in ROBOTS] == [False, False, True, False, False]
+    assert CAR.rate_channels == ("speed_rear_mps",)
+    assert CAR.steer_channels == ("angle_front_rad",)
+    positions, directions = ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 0.125, rtol=1e-9)
+    lever = positions[:, 0] * np.sin(directions) - positions[:, 1] * np.cos(directions)
+    np.testing.assert_allclose(lever, 0.125, rtol=1e-9)  # all turn it to the left
+    np.testing.assert_allclose(positions.sum(axis=0), 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("section", ["body", "motors", "camera", "sensors"])
 def test_a_section_that_is_not_described_is_named_when_it_is_asked_for(section):
     bare = HUSKY.without(section)
     assert not bare.describes(section)
-    message = f"robot husky: its description has no section '{section}', which is needed here"
     for ask in (lambda: getattr(bare, section), lambda: bare.require(section)):
-        with pytest.raises(ConfigError) as error:
+        with pytest.raises(
+            ConfigError, match=f"^robot husky: its description has no section '{section}', which is"
+        ):
             ask()
-        assert str(error.value) == message
 
 
 def test_a_completed_robot_keeps_its_parts_and_adds_neutral_ones():
@@ -51,57 +68,92 @@ def test_a_completed_robot_keeps_its_parts_and_adds_neutral_ones():
     assert AGRIMARO.completed == AGRIMARO
 
 
-def test_a_part_of_the_wrong_kind_is_refused():
-    with pytest.raises(TypeError, match="section 'camera' is a Sensors"):
-        AGRIMARO.with_parts(camera=AGRIMARO.sensors)
-
-
 def test_a_robot_is_pickled_with_its_parts_and_effects():
     robot = replace(AGRIMARO.without("camera"), effects={"payload_ratio": 0.1}, effects_cov=np.eye(1))
     back = pickle.loads(pickle.dumps(robot))
     assert back == robot
-    assert back.effects_cov == robot.effects_cov
-    assert back.steering == robot.steering
+    assert (back.effects_cov, back.steering) == (robot.effects_cov, robot.steering)
 
 
-def test_robots_of_another_drive_are_refused_with_the_sentence_given():
+def test_a_part_or_a_drive_of_the_wrong_kind_is_refused():
+    with pytest.raises(TypeError, match="section 'camera' is a Sensors"):
+        AGRIMARO.with_parts(camera=AGRIMARO.sensors)
     assert as_drive(SwerveRobot, AGRIMARO, "") is AGRIMARO
-    assert as_drive(SkidSteerRobot, HUSKY, "") is HUSKY
-    assert as_drive(OmniRobot, ROBOTINO, "") is ROBOTINO
     with pytest.raises(ConfigError, match=r"^agrimaro: 'swerve' does not skid$"):
         as_drive(SkidSteerRobot, AGRIMARO, "{name}: {drive!r} does not skid")
 
 
-def test_log_rates_and_rows_are_two_views_of_wheel_speeds():
-    speed_mps = np.array([0.2, -0.1, 0.4])
-    motors = AGRIMARO.logged_rates(speed_mps)
-    back = AGRIMARO.wheel_speeds_mps(motors / AGRIMARO.motors.reduction_ratio)
-    np.testing.assert_allclose(back, speed_mps, rtol=1e-12)
-    motors = ROBOTINO.logged_rates(speed_mps)
-    back = ROBOTINO.wheel_speeds_mps(motors / ROBOTINO.motors.reduction_ratio)
-    np.testing.assert_allclose(back, speed_mps, rtol=1e-12)
-    np.testing.assert_array_equal(HUSKY.wheel_speeds_mps(HUSKY.logged_rates(speed_mps[:2])), speed_mps[:2])
+@pytest.mark.parametrize(
+    ("robot", "change", "message"),
+    [
+        (ROBOTINO, {"track_m": 0.5}, "the footprint allows up to 0.185 m"),
+        (ROBOTINO, {"track_m": -0.1}, "wheel_distance_m must be above zero"),
+        (
+            ROBOTINO,
+            {"body": {"com_x_m": 0.2}},
+            "outside the triangle of the wheels: wheel 2 would carry nothing",
+        ),
+        (
+            AGRIMARO,
+            {"body": {"com_x_m": 0.6}},
+            "outside the triangle of the wheels: wheel 1 would carry nothing",
+        ),
+        (AGRIMARO, {"track_m": 5.0}, "track_m is 5; the footprint allows"),
+        (UGV, {"track_width_m": 2.0}, "the tracks would overlap"),
+        (CAR, {"com_ahead_m": 2.0}, "between 0 and wheelbase_m"),
+        (CAR, {"steering_max_rad": 2.0}, "below pi/2 is required"),
+    ],
+)
+def test_impossible_dimensions_are_refused(robot, change, message):
+    if "body" in change:
+        robot, change = robot.with_parts(body=replace(robot.body, **change["body"])), {}
+    with pytest.raises(ConfigError, match=message):
+        replace(robot, **change).check_geometry("robot")
 
 
-def test_wheels_of_an_omni_robot_turn_it_to_the_left_from_a_third_of_a_turn_apart():
-    positions, directions = ROBOTINO.wheel_positions_m, ROBOTINO.wheel_directions_rad
-    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 0.125, rtol=1e-9)
-    lever = positions[:, 0] * np.sin(directions) - positions[:, 1] * np.cos(directions)
-    np.testing.assert_allclose(lever, 0.125, rtol=1e-9)
-    np.testing.assert_allclose(positions.sum(axis=0), 0.0, atol=1e-9)
+@pytest.fixture
+def husky_yaml():
+    return yaml.safe_load((data_folder("robots") / "husky.yaml").read_text())
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"track_m": 0.5}, "the footprint allows up to 0.185 m"),
-        ({"track_m": -0.1}, "wheel_distance_m must be above zero"),
-        ({"body": {"com_x_m": 0.2}}, "outside the triangle of the wheels: wheel 2 would carry nothing"),
+        (lambda d: d.update(wheels=4), "key 'wheels' is unknown"),
+        (lambda d: d.pop("track_m"), "key 'track_m' is missing"),
+        (lambda d: d["track_m"].update(value=0.0), "track_m is 0.0, a number above zero"),
+        (lambda d: d["track_m"].update(value=math.inf), "track_m is inf"),
+        (lambda d: d["track_m"].update(value="wide"), "track_m is 'wide'"),
+        (lambda d: d["track_m"].update(value=True), "track_m is True"),
+        (lambda d: d["track_m"].update(unit="mm"), "track_m has the unit 'mm', 'm' is required"),
+        (lambda d: d["track_m"].pop("source"), "track_m: key 'source' is missing"),
+        (lambda d: d["track_m"].update(source=" "), "track_m has no source"),
+        (lambda d: d.update(track_m=0.57), "track_m is 0.57, a mapping with value, unit, source"),
+        (lambda d: d.update(drive="legs"), "drive 'legs' is unknown"),
     ],
 )
-def test_an_omni_robot_with_impossible_dimensions_is_refused(change, message):
-    robot = ROBOTINO
-    if "body" in change:
-        robot = robot.with_parts(body=replace(robot.body, **change.pop("body")))
-    with pytest.raises(ConfigError, match=message):
-        replace(robot, **change).check_geometry("robot robotino")
+def test_a_description_that_cannot_be_is_refused_in_one_sentence(tmp_path, husky_yaml, change, message):
+    change(husky_yaml)
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(husky_yaml))
+    with pytest.raises(ConfigError, match=r"mine\.yaml") as error:
+        load_robot(path)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("name", ["rover", "../robots/husky", "none.yaml"])
+def test_an_unknown_robot_is_named(name):
+    with pytest.raises(ConfigError, match=name.replace(".", r"\.")):
+        load_robot(name)
+
+
+def test_a_key_given_twice_is_refused_and_yaml_cannot_run_code(tmp_path, husky_yaml):
+    path = tmp_path / "mine.yaml"
+    path.write_text(yaml.safe_dump(husky_yaml) + "drive: swerve\n")
+    with pytest.raises(ConfigError, match="'drive' is given twice"):
+        load_robot(path)
+    path.write_text(f"!!python/object/apply:pathlib.Path.touch [{tmp_path}/touched]")
+    with pytest.raises(ConfigError, match="is no YAML"):
+        load_robot(path)
+    assert not (tmp_path / "touched").exists()
