@@ -80,6 +80,12 @@ class Combine(Enum):
             return number + value if self is Combine.ADDED else number - value
         return number * (1.0 + value) if self is Combine.TIMES else number / (1.0 + value)
 
+    def invert(self, number: Any, value: float) -> Any:
+        """Return the number, or numbers, from what :meth:`apply` makes of them."""
+        pairs = (Combine.ADDED, Combine.SUBTRACTED), (Combine.TIMES, Combine.OVER)
+        ((first, second),) = (pair for pair in pairs if self in pair)
+        return (second if self is first else first).apply(number, value)
+
 
 class Home(NamedTuple):
     """A number of the description that a parameter changes."""
@@ -108,9 +114,9 @@ class Block(NamedTuple):
 
 
 class Inverse(NamedTuple):
-    """How a parameter is taken off the samples of a log, by :class:`terrain.extension.Correction`.
+    """How a parameter is taken off the samples of a log, and how it acts on those of a sensor.
 
-    Of all that act on one number, offsets come off before factors.
+    Of all that act on one number, factors do before offsets, and offsets come off before factors.
     """
 
     streams: tuple[str, ...]  #: whose samples or stamps change
@@ -118,8 +124,14 @@ class Inverse(NamedTuple):
     columns: tuple[str, ...] = ()  #: beginnings of the channels that change, or STAMPS
     combine: Combine = Combine.ADDED  #: how the corrected number follows from the measured one
     without_home: bool = False  #: only where the description lacks the section of the parameter's home
+    #: of what takes more than one number a sample; two parameters may share one
     undo: Callable[[Block, float], None] | None = None
-    """Of what takes more than one number a sample; two parameters may share one."""
+    act: Callable[[Block, float], None] | None = None
+
+    @property
+    def is_factor(self) -> bool:
+        """Whether numbers are multiplied."""
+        return self.combine in (Combine.TIMES, Combine.OVER)
 
 
 class Parameter(NamedTuple):
@@ -338,9 +350,20 @@ def _undo_one_sided_radius(block: Block, e: float) -> None:
             block.values[:, i] *= 1.0 + (0.5 if wheel in ("3", "right") else -0.5) * e
 
 
+def _warm(block: Block, e: float) -> tuple[list[int], Array]:
+    """Return the columns of currents, and their factor (k, 1)."""
+    currents = [i for i, name in enumerate(block.channels) if name.startswith("current_")]
+    return currents, 1.0 + e * (block.time_s - block.start_s)[:, None] / 60.0
+
+
+def _act_motor_drift(block: Block, e: float) -> None:
+    currents, factor = _warm(block, e)
+    block.values[:, currents] *= factor
+
+
 def _undo_motor_drift(block: Block, e: float) -> None:
-    warm = 1.0 + e * (block.time_s - block.start_s) / 60.0
-    block.values[:, [name.startswith("current_") for name in block.channels]] /= warm[:, None]
+    currents, factor = _warm(block, e)
+    block.values[:, currents] /= factor
 
 
 def _undo_steering_backlash(block: Block, half_rad: float) -> None:
@@ -420,6 +443,10 @@ def turn_camera(values: Array, channels: tuple[str, ...], angle_rad: float) -> N
             x, y = values[:, i].copy(), values[:, j].copy()
             values[:, i] = cos * x - sin * y
             values[:, j] = sin * x + cos * y
+
+
+def _act_camera_yaw(block: Block, angle_rad: float) -> None:
+    turn_camera(block.values, block.channels, angle_rad)
 
 
 def _undo_camera_yaw(block: Block, angle_rad: float) -> None:
@@ -643,6 +670,7 @@ SENSORS: tuple[Effect, ...] = (
             ("odometry", "lidar", "pose"),
             "R(a) of what the camera measured; yaw of a pose + a",
             undo=_undo_camera_yaw,
+            act=_act_camera_yaw,
         ),
         sensed_only=True,
         stage=Stage.SENSORS,
@@ -917,6 +945,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
             "current / (1 + q t / 60 s), from the first stamp of the wheels",
             combine=Combine.OVER,
             undo=_undo_motor_drift,
+            act=_act_motor_drift,
         ),
         sensed_only=True,
         stage=Stage.SENSORS,
@@ -1159,6 +1188,38 @@ def in_plant(*stages: Stage) -> tuple[str, ...]:
     ('wheel_radius_ratio', 'one_sided_radius_ratio', 'payload_ratio')
     """
     return tuple(p.name for effect in LIBRARY if effect.stage in stages for p in effect.parameters)
+
+
+def on_samples(
+    stream: str, channels: tuple[str, ...], effects: Mapping[str, float]
+) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """Return what makes of times (k,) and values (k, c) of a stream those that a simulated sensor stamps and reports.
+
+    A gyro's scale, which comes before its bias, is no part of it: its sensor has that.
+
+    Examples
+    --------
+    >>> change = on_samples("wheels", ("motor_1_radps",), {"wheel_scale_1_ratio": 1.0})
+    >>> change(np.zeros(1), np.array([[3.0]]))[1]
+    array([[1.5]])
+    """
+    inverses = [(effects.get(name, 0.0), PARAMETER[name].inverse) for name in in_plant(Stage.SENSORS)]
+    acting = [(e, inverse) for e, inverse in inverses if e and inverse and stream in inverse.streams]
+    acting.sort(key=lambda each: not each[1].is_factor)
+
+    def change(time_s: Array, values: Array) -> tuple[Array, Array]:
+        stamps = time_s
+        for e, inverse in acting:
+            if inverse.columns == STAMPS:
+                stamps = inverse.combine.invert(stamps, e)
+            elif inverse.act is not None:
+                inverse.act(Block(stream, channels, time_s, values, 0.0, None, None, {}), e)
+            for i, channel in enumerate(channels):
+                if inverse.columns and channel.startswith(inverse.columns):
+                    values[:, i] = inverse.combine.invert(values[:, i], e)
+        return stamps, values
+
+    return change
 
 
 def read_effects_of(texts: Iterable[str], drive: str) -> dict[str, float]:

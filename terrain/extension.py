@@ -30,7 +30,6 @@ from terrain.effects import (
     SCHEMA,
     STAMPS,
     Block,
-    Combine,
     Home,
     Parameter,
     checked_covariance,
@@ -342,7 +341,7 @@ class Correction:
             and (name in self._applied.effects or not inverse.without_home)
         ]
         # what was added last comes off first: offsets, then factors
-        self._acting = sorted(acting, key=lambda each: each[1].combine in (Combine.TIMES, Combine.OVER))
+        self._acting = sorted(acting, key=lambda each: each[1].is_factor)
         self._memory: dict[str, Any] = {}
 
     def __call__(

@@ -24,7 +24,7 @@ import numpy as np
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.effects import turn_camera
+from terrain.effects import on_samples
 from terrain.kernels import njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera
@@ -143,9 +143,9 @@ class Sensor:
             array.flags.writeable = False
         self._n_written = self._n_given = 0
 
-    def stamp(self, offset_s: float, rate_ratio: float) -> None:
-        """Stamp by a clock of its own, ``t' = (1 + r) t + T``; samples arrive when they did."""
-        self._logged = ((1.0 + rate_ratio) * self.time_s + offset_s, self._logged[1])
+    def stamp(self, stream: str, effects: Mapping[str, float]) -> None:
+        """Stamp as effects have it; samples arrive when they did."""
+        self._logged = (on_samples(stream, (), effects)(self.time_s.copy(), self.values)[0], self._logged[1])
         self._logged[0].flags.writeable = False
 
     def update(self) -> None:
@@ -230,23 +230,22 @@ def add_rate_noise(rate: Array, noise: Array, standstill: float) -> Array:
 def wheel_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> Sensor:
     """Return motor rates after the motor driver's low-pass on quantised Hall steps, and motor currents.
 
-    Of the robot's effects it applies motor_drift, current_offset and the scales of the encoders.
+    Effects act before the noise.
     """
-    motors, sensors, effects = robot.equipment.motors, robot.equipment.sensors, robot.effects
+    motors, sensors = robot.equipment.motors, robot.equipment.sensors
     time_s, rows = motion.at(sensors.wheels_rate_hz)
-    scales = np.array([1.0 + effects.get(f"wheel_scale_{i}_ratio", 0.0) for i in (1, 2, 3)])
-    reduction = motors.reduction_ratio / scales
     per_amp_nm = motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio
     motor_noise = sensors.motor_std_radps * rng.standard_normal((len(rows), 3))
     current_noise = sensors.current_std_a * rng.standard_normal((len(rows), 3))
-    warm = 1.0 + effects.get("motor_drift_ratio", 0.0) * time_s[:, None] / 60.0
-    offset_a = effects.get("current_offset_a", 0.0)
+    changed = on_samples("wheels", WHEELS_CHANNELS, robot.effects)
 
     def write(new: slice, rows: Array, _: Array) -> Array:
         wheels = motion.record["wheels"][rows]
-        rates = add_rate_noise(wheels["reported_radps"] * reduction, motor_noise[new], STANDSTILL_RADPS)
-        current_a = wheels["torque_nm"] / per_amp_nm * warm[new] + offset_a + current_noise[new]
-        return np.hstack([rates, current_a])
+        true = wheels["reported_radps"] * motors.reduction_ratio, wheels["torque_nm"] / per_amp_nm
+        rates, current_a = np.hsplit(changed(time_s[new], np.hstack(true))[1], 2)
+        return np.hstack(
+            [add_rate_noise(rates, motor_noise[new], STANDSTILL_RADPS), current_a + current_noise[new]]
+        )
 
     return Sensor(motion, WHEELS_CHANNELS, (time_s, rows), write)
 
@@ -454,7 +453,7 @@ def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults
     """Return a tracking camera in its own frames: drifting pose, noisy speed, dropouts and relocalisation jumps.
 
     Without noise its samples are those of :func:`terrain.kinematics.camera.odometry_stream`; lost samples are left out.
-    Of the robot's effects it applies camera_yaw.
+    Effects act on samples with their noise.
     """
     camera, record = robot.equipment.camera, motion.record
     time_s, rows = motion.at(camera.rate_hz, camera.latency_s)
@@ -478,7 +477,7 @@ def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults
     drift, position_noise, jumped = drift[~lost], position_noise[~lost], jumped[~lost]
     errors = np.column_stack([yaw_noise, speed_noise, rate_noise])[~lost]
     lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
-    mounting_rad, yaw_noise_0 = robot.effects.get("camera_yaw_rad", 0.0), yaw_noise[0] if n else 0.0
+    yaw_noise_0, changed = yaw_noise[0] if n else 0.0, on_samples("odometry", CAMERA_CHANNELS, robot.effects)
 
     def fill(first: int, out: Array) -> None:
         for i, name in enumerate(_SEEN):
@@ -490,9 +489,7 @@ def camera_sensor(motion: Motion, robot: Robot, rng: np.random.Generator, faults
         values = np.empty((len(rows), len(CAMERA_CHANNELS)))
         yaw_0 = record["yaw_rad"][0] + yaw_noise_0
         camera_samples(position, seen, errors[new], lever_m, yaw_0, values)
-        if mounting_rad:
-            turn_camera(values, CAMERA_CHANNELS, mounting_rad)
-        return values
+        return changed(time_s[~lost][new], values)[1]
 
     low_pass = LowPass([camera.time_constant_s] * len(_SEEN))
     return Sensor(motion, CAMERA_CHANNELS, (time_s[~lost], rows[~lost]), write, (fill, low_pass))

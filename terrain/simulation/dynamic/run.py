@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from terrain.effects import OTHER_LOGGER, Stage, checked_effects, in_plant
+from terrain.effects import Stage, checked_effects, in_plant
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.extension import apply_homes
 from terrain.kernels import filled, is_finite
@@ -164,10 +164,8 @@ def _sensors(
     }
     if gnss is not None:
         sensors["gnss"] = gnss_sensor(motion, gnss, rngs["gnss"], faults)
-    offset_s, rate = (robot.effects.get(name, 0.0) for name in ("clock_offset_s", "clock_rate_ratio"))
-    if offset_s or rate:
-        for name in sensors.keys() & set(OTHER_LOGGER):
-            sensors[name].stamp(offset_s, rate)
+    for name, sensor in sensors.items():
+        sensor.stamp(name, robot.effects)
     return sensors, gyro_bias_radps
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import terrain
-from terrain.effects import parameters_of
+from terrain.effects import Stage, in_plant, on_samples, parameters_of
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import enriched, estimate_run, filter_run, summarize
 from terrain.estimation.feed import measurement_table
@@ -22,6 +22,7 @@ from terrain.extension import (
     corrected,
     corrected_log,
 )
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
@@ -136,6 +137,31 @@ def test_a_correction_changes_the_streams_that_the_catalogue_names_and_no_others
         if p.inverse and p.inverse.without_home and applied:
             named = set()
         assert changed == named, name
+
+
+def test_what_an_effect_does_to_samples_of_a_sensor_its_correction_takes_off_them():
+    """All entries at once, on pure numbers; stamps come back as well."""
+    effects = {
+        n: 0.4 * parameters_of("swerve")[n].high for n in in_plant(Stage.SENSORS) if not n.startswith("gyro")
+    }
+    correction = Correction(extended(**effects), 0.0)
+    streams = every_stream() | {"odometry": Stream(np.arange(3.0), np.eye(3, 14), CAMERA_CHANNELS)}
+    for name, stream in streams.items():
+        time_s = stream.time_s - stream.time_s[0]
+        stamps, values = on_samples(name, stream.channels, effects)(time_s, stream.values.copy())
+        back_s, back = correction(name, stream.channels, stamps, values)
+        np.testing.assert_allclose(back_s, time_s, atol=1e-12)
+        if name not in ("pose", "wheels"):
+            np.testing.assert_allclose(back, stream.values, atol=1e-12, err_msg=name)
+    channels = (
+        "motor_1_radps",
+        "motor_2_radps",
+        "current_1_a",
+    )  # no stream of the wheels' logger is stamped otherwise
+    values = np.arange(9.0).reshape(3, 3)
+    seen = on_samples("wheels", channels, effects)(np.arange(3.0), values.copy())[1]
+    assert not np.isclose(seen[1:], values[1:]).any()
+    np.testing.assert_allclose(correction("wheels", channels, np.arange(3.0), seen)[1], values, atol=1e-12)
 
 
 SENSED = {

@@ -11,11 +11,11 @@ from scipy.optimize import minimize_scalar
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import library_of
 from terrain.errors import ConfigError
-from terrain.estimation.feed import low_pass
 from terrain.extension import corrected, corrected_log
 from terrain.kinematics.camera import body_motion
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.robots import load_robot
+from terrain.signals import low_passed
 from terrain.simulation.conditions import Conditions, Faults
 from terrain.simulation.contact import shear_slip
 from terrain.simulation.run import simulate
@@ -187,7 +187,7 @@ def encoder_late(run, robot):
     true = truth(run, "wheel_1_radps", wheels.time_s)
     reported = wheels.channel("motor_1_radps") / robot.motors.reduction_ratio
     best = minimize_scalar(
-        lambda lag_s: np.sum((low_pass(wheels.time_s, true, lag_s, 1.0) - reported) ** 2), (0.01, 0.1)
+        lambda lag_s: np.sum((low_passed(wheels.time_s, true, lag_s, 1.0) - reported) ** 2), (0.01, 0.1)
     )
     return float(best.x) - robot.sensors.encoder_time_constant_s
 
