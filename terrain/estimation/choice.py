@@ -18,14 +18,14 @@ from terrain.robots import Robot
 Estimate = LiveEstimate | LiveObserverEstimate
 Estimator = LiveFilter | LiveObserver
 
+#: Filters and observers that run sample by sample, by drive, without a file of their own; the first is used where
+#: none is named.
 LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
     "swerve": ("vio15", "vio12", "slip14", "encoder12"),
     "skid_steer": ("skid",),
     "tracked": ("skid", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
     "bicycle": ("sideslip-multi", "sideslip-dynamic", "sideslip-kinematic"),
 }
-"""Filters and observers that run sample by sample, by drive, without a file of their own; the first is used
-where none is named."""
 
 
 def make_live_filter(
@@ -35,20 +35,11 @@ def make_live_filter(
     rate_hz: Mapping[str, float],
     correction: Correction | None = None,
 ) -> Estimator:
-    """Return a filter or an observer of a robot, before its first sample.
+    """Return a filter of :data:`LIVE_FILTERS`, or an observer, of a corrected robot before its first sample.
 
-    Parameters
-    ----------
-    name : one of :data:`LIVE_FILTERS` of the robot's drive
-    robot : corrected
-    channels : of each stream that is measured, in the order of the columns of its readings
-    rate_hz : of the streams, where they are not those of the robot's description
-    correction : takes the effects of an extended robot off what arrives
-
-    Raises
-    ------
-    ConfigError
-        if a channel that the filter needs is not measured.
+    ``channels`` of each stream that is measured are in the order of the columns of its readings; ``rate_hz`` are of the
+    streams where they are not those of the robot's description.  ``ConfigError`` if a channel that is needed is not
+    measured.
     """
     if name in OBSERVERS:
         return LiveObserver(make_observer(name, robot), robot, channels, correction)

@@ -18,41 +18,25 @@ import numpy as np
 
 from terrain.records import Array, Reading
 
-PERIOD_S = 0.02
-"""Time that passes at a step whose time does not say."""
-
-REWIND_S = 0.25
-"""A sample that is later than that is not taken any more."""
-
-LONGEST_STEP_S = 0.5
-"""A longer step of the time, or one back, is a clock that was set."""
-
-AHEAD_S = 0.1
-"""A stamp that is further ahead of the time is wrong."""
-
+PERIOD_S = 0.02  #: Time that passes at a step whose time does not say.
+REWIND_S = 0.25  #: A sample that is later than that is not taken any more.
+LONGEST_STEP_S = 0.5  #: A longer step of the time, or one back, is a clock that was set.
+AHEAD_S = 0.1  #: A stamp that is further ahead of the time is wrong.
+#: Stamps that advance by so much more than the time have jumped; readings whose difference to the time is the same
+#: within this, and how many of them are believed.
 JUMP_S, AGREED_S, N_AGREED = 0.25, 0.05, 3
-"""Stamps that advance by so much more than the time have jumped; readings whose difference to the time is the
-same within this, and how many of them are believed."""
-
-REMEMBERED = 64
-"""Messages of which the least late one tells the difference of the clocks."""
-
+REMEMBERED = 64  #: Messages of which the least late one tells the difference of the clocks.
+#: A stamp that is further ahead of what is known, or that many in a row are behind it, is of a clock that was set.
 SET_S, N_SET = 0.5, 5
-"""A stamp that is further ahead of what is known, or that many in a row are behind it, is of a clock that was
-set."""
-
+#: A reading that is so far behind the newest stamp of its stream is late, or its clock was set where so many follow
+#: each other: late ones are fewer.
 BEHIND_S, N_BEHIND = 1.0, 5
-"""A reading that is so far behind the newest stamp of its stream is late, or its clock was set where so many
-follow each other: late ones are fewer."""
-
+#: Rows of a stream that wait for a step: some seconds at a kilohertz; of more, the oldest are left out.
 MAX_QUEUED = 20_000
-"""Rows of a stream that wait for a step: some seconds at a kilohertz; of more, the oldest are left out."""
-
+#: A stream that gives nothing for so long is lost; of one that is slower, so many of its periods.
 LOST_AFTER_S, PERIODS = 0.5, 3.0
-"""A stream that gives nothing for so long is lost; of one that is slower, so many of its periods."""
-
+#: When samples came last that were too late to be taken, and by how much, of what never had any.
 NEVER = -math.inf, math.nan
-"""When samples came last that were too late to be taken, and by how much, of what never had any."""
 
 
 def number(value: Any) -> float:

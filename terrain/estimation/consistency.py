@@ -29,14 +29,10 @@ from terrain.robots import Robot
 from terrain.signals import low_passed
 from terrain.slip import slip_ratio
 
-OUTSIDE = 0.05
-"""Probability outside the bounds, half on each side."""
-
+OUTSIDE = 0.05  #: Probability outside the bounds, half on each side.
+#: A sensor of which a larger fraction is gated does not have the noise of the model: 0.01 % is expected.
 MOST_GATED = 0.01
-"""A sensor of which a larger fraction is gated does not have the noise of the model: 0.01 % is expected."""
-
-LONGEST_STEP_S = 0.1
-"""A longer step in the truth is a gap."""
+LONGEST_STEP_S = 0.1  #: A longer step in the truth is a gap.
 
 
 class ConsistencyVerdict(StrEnum):
@@ -72,24 +68,11 @@ class ConsistencyReport(NamedTuple):
 
 
 def consistency_report(track: StateTrack, truth: Array | None = None) -> ConsistencyReport:
-    """Judge a track by its innovations, and by the truth where there is one.
+    """Judge a track by its innovations, and by the truth (n, d) of its states where there is one, NaN where unknown.
 
-    Parameters
-    ----------
-    track : what the filter gave
-    truth : (n, d) in the order of the track's states and at its times; NaN where it is not known
-
-    Returns
-    -------
-    ConsistencyReport
-        the mean per degree of freedom is judged by the two-sided 95 % bounds for as many independent
-        values as there are.  States are grouped as their names are (``speed`` has x and y), and all that
-        are known together are ``all``.
-
-    Raises
-    ------
-    DataError
-        where the shape of the truth does not fit.
+    The mean per degree of freedom is judged by the two-sided 95 % bounds for as many independent values as there are.
+    States are grouped as their names are (``speed`` has x and y), and all that are known together are ``all``.
+    ``DataError`` where the shape of the truth does not fit.
     """
     sensors, states = [], []
     for k, name in enumerate(track.sensors):
@@ -113,18 +96,10 @@ def consistency_report(track: StateTrack, truth: Array | None = None) -> Consist
 
 
 def nees(track: StateTrack, truth: Array, states: Sequence[str] | None = None) -> Array:
-    """Return the squared error of each instant over its covariance (n,); NaN where the truth is.
+    """Return the squared error of each instant over its covariance (n,); NaN where the truth (n, d) is.
 
-    Parameters
-    ----------
-    track : what the filter gave
-    truth : (n, d) at the track's times, one column a state
-    states : the d states in question; all of them without.  Errors of angles (names in ``rad``) are wrapped
-
-    Raises
-    ------
-    DataError
-        where the shape does not fit, or there is no such state.
+    Errors of angles (states in ``rad``) are wrapped.  ``DataError`` where the shape does not fit, or there is no such
+    state.
     """
     states = track.states if states is None else tuple(states)
     for unknown in (state for state in states if state not in track.states):
@@ -186,15 +161,8 @@ def innovations(
     """Return by row the innovation (n,) at each instant, and the standard deviation that was expected of it.
 
     That is ``z - h(x)`` and ``sqrt(diag(H P H' + R))`` with what is predicted from the instant before; NaN where
-    nothing was measured, at the first instant and after a gap.
-
-    Parameters
-    ----------
-    model, noise : the filter, and what it was run with, at the instants of the track
-    track : what it gave
-    z : (n, m) measurements at these instants
-    max_gap_s : over a longer step there is no prediction
-    inputs : (n, k) of the step up to each
+    nothing was measured, at the first instant and after a gap.  Noise, measurements (n, m) and inputs (n, k) are those
+    at the instants of the track.
     """
     n, d, m = len(track.time_s), len(model.states), len(model.rows)
     value, std = np.full((2, n, m), np.nan)
@@ -223,15 +191,7 @@ def sample_from_model(
 ) -> tuple[Array, Array, Array]:
     """Draw a truth and its measurements from a filter's own equations: on these it has to be consistent.
 
-    Parameters
-    ----------
-    model, noise : the filter; the truth starts from its initial mean and variance
-    n, dt_s : number of samples, and their spacing
-    rng : source of the noise
-
-    Returns
-    -------
-    time_s (n,), truth (n, d), z (n, m)
+    Returns ``time_s (n,), truth (n, d), z (n, m)``; the truth starts from the initial mean and variance.
     """
     d, m = len(model.states), len(model.rows)
     start = Filter(model, noise)
@@ -258,14 +218,12 @@ def sample_from_model(
 def true_states(
     run: RunLog, track: StateTrack, robot: Robot, time_constant_s: float, initial_yaw_rad: float = 0.0
 ) -> Array | None:
-    """Return the truth (n, d) at each instant of a track, or None where the log has none.
+    """Return the truth (n, d) at each instant of a track, or None where the log has no stream ``truth``.
 
     States that the truth does not know (an effective track) are NaN, and so is what lies outside its time.
 
     Parameters
     ----------
-    run : log with the stream ``truth`` as ``terrain.simulation`` writes it
-    track : of a filter on that log
     robot : as the filter was given it: slip speeds are those against its nominal radius
     time_constant_s : of the low-pass on the filter's inputs
     initial_yaw_rad : what the filter calls the heading of the start
@@ -305,12 +263,6 @@ def lagged_slip(truth: Stream, robot: Robot, time_constant_s: float) -> tuple[Ar
     """Return the true slip ratio and speed over ground of each wheel, both (n, wheels), behind a low-pass.
 
     Of slip between speeds that come behind it, this is the best that can be estimated.
-
-    Parameters
-    ----------
-    truth : stream as ``terrain.simulation`` writes it
-    robot : gives the nominal radius and the wheels' places
-    time_constant_s : of the low-pass on the filter's inputs
     """
     wheel_speed, ground = (
         np.column_stack(

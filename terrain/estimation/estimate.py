@@ -38,9 +38,8 @@ from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import GATED, USED, Array, RunLog, SlipTrack, StateTrack, Stream
 from terrain.robots import Robot
 
-FILTERS = (*swerve.FILTERS, "skid")
-"""Names of the filters; the numbers are those of their states."""
-
+FILTERS = (*swerve.FILTERS, "skid")  #: Names of the filters; the numbers are those of their states.
+#: Filters of each drive.
 FILTERS_OF_DRIVE: Mapping[str, tuple[str, ...]] = {
     "swerve": swerve.FILTERS,
     "skid_steer": ("skid",),
@@ -48,55 +47,35 @@ FILTERS_OF_DRIVE: Mapping[str, tuple[str, ...]] = {
     "omni": (),
     "bicycle": (),
 }
-"""Filters of each drive."""
-
+#: Noise in natural units; the thesis' own (6.13), (6.14), with its smoothing and without gates; process noise fitted
+#: to chosen runs.
 TUNINGS = ("physical", "thesis", "likelihood")
-"""Noise in natural units; the thesis' own (6.13), (6.14), with its smoothing and without gates; process noise
-fitted to chosen runs."""
-
+#: Tuning unless another is chosen: vio12 is the thesis' own filter, all others are physical.
 OWN_TUNING: Mapping[str, str] = {"vio12": "thesis"}
-"""Tuning unless another is chosen: vio12 is the thesis' own filter, all others are physical."""
-
+#: Q of the thesis is per step; the sample time, which it does not print, is that of the wheels stream.
 THESIS_SAMPLE_TIME_S = 0.02
-"""Q of the thesis is per step; the sample time, which it does not print, is that of the wheels stream."""
-
-THESIS_EMA_ALPHA = 0.2
-"""Thesis (7.8): smoothing of the camera."""
-
+THESIS_EMA_ALPHA = 0.2  #: Thesis (7.8): smoothing of the camera.
+#: States whose error is judged (NEES): those that slip is computed from.
 JUDGED_STATES = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "slip_speed_")
-"""States whose error is judged (NEES): those that slip is computed from."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """All that is known of one run after filtering it.
+    """All that is known of one run after filtering it."""
 
-    Parameters
-    ----------
-    run : the log, as measured
-    robot : whose log it is, as the filter models it: without the effects of an extended one
-    name : of the filter
-    model, noise : the filter, and of its process and its measurements
-    table : its measurements, of the log without the robot's effects
-    track : its states
-    slip : NaN where the speed over ground is not observed
-    blind : the slip by the encoders and the filter's own speed; of a filter without a reference of the speed
-        over ground that is no slip
-    figures : of ``slip``, or of ``blind`` where there is no other
-    truth : (n, d) true states, or None
-    """
-
-    run: RunLog
-    robot: Robot
-    name: str
-    model: FilterModel
+    run: RunLog  #: the log, as measured
+    robot: Robot  #: whose log it is, as the filter models it: without the effects of an extended one
+    name: str  #: of the filter
+    model: FilterModel  #: the filter, and of its process and its measurements
     noise: Noise
-    table: MeasurementTable
-    track: StateTrack
-    slip: SlipTrack
+    table: MeasurementTable  #: its measurements, of the log without the robot's effects
+    track: StateTrack  #: its states
+    slip: SlipTrack  #: NaN where the speed over ground is not observed
+    #: the slip by the encoders and the filter's own speed; of a filter without a reference of the speed over ground
+    #: that is no slip
     blind: SlipTrack
-    figures: SlipFigures
-    truth: Array | None
+    figures: SlipFigures  #: of ``slip``, or of ``blind`` where there is no other
+    truth: Array | None  #: (n, d) true states, or None
 
     @property
     def innovations(self) -> dict[str, tuple[Array, Array]]:
@@ -134,15 +113,13 @@ def estimate_run(
 
     Parameters
     ----------
-    run : log of the robot, as measured
-    robot : its description
+    run, robot : log of the robot, as measured, and its description
     name, tuning, noise, initial_yaw_rad : as :func:`filter_run` takes them
-    tuned : of other runs, which may have other sensors; only its process variance is taken
+    tuned : noise of other runs, which may have other sensors; only its process variance is taken
 
     Returns
     -------
-    Estimate
-        of the corrected robot, beside the run as measured, less the GNSS that was left out
+    of the corrected robot, beside the run as measured, less the GNSS that was left out
 
     Raises
     ------
@@ -281,48 +258,32 @@ def enriched(estimate: Estimate) -> RunLog:
 
 @dataclass(frozen=True, slots=True)
 class EstimateSummary:
-    """Figures of one run; NaN where something is not known.
+    """Figures of one run; NaN where something is not known."""
 
-    Parameters
-    ----------
-    run_id, filter : which run and which filter
-    slip_mean, slip_std : in steady motion, positive in traction for both rolling directions; of a filter
-        without a reference of the speed over ground it is the blind figure, and ``slip_observable`` is false
-    slip_true_mean : the true slip at the same instants
-    slip_observable : whether the speed over ground was measured
-    slip_peak : largest of a wheel in transients
-    steady_s, stale_s : time of steady motion, and time without a recent speed over ground
-    nis : mean squared innovation of each sensor a degree of freedom, of what was used
-    nees : mean squared error of speeds, yaw rate and slip speeds over its covariance, a state
-    consistency : by ``sensors`` (NIS) and, where there is a truth, by groups of ``states`` (NEES): whether
-        the value is within its chi-square bounds
-    speed_rmse_mps : of the speed over ground
-    n_dropped, n_gated, dropped : samples left out, measurements rejected by a gate, and counts by kind
-    finite : whether all states and covariances are finite
-    motion : time that the robot was at rest, moving, stuck, and neither is known; None of a filter that does
-        not judge it
-    stuck : when it was stuck, None as ``motion``
-    """
-
-    run_id: str
+    run_id: str  #: which run and which filter
     filter: str
+    #: in steady motion, positive in traction for both rolling directions; of a filter without a reference of the
+    #: speed over ground it is the blind figure, and ``slip_observable`` is false
     slip_mean: float
     slip_std: float
-    slip_true_mean: float
-    slip_observable: bool
-    slip_peak: float
-    steady_s: float
+    slip_true_mean: float  #: the true slip at the same instants
+    slip_observable: bool  #: whether the speed over ground was measured
+    slip_peak: float  #: largest of a wheel in transients
+    steady_s: float  #: time of steady motion, and time without a recent speed over ground
     stale_s: float
-    nis: Mapping[str, float]
-    nees: float
+    nis: Mapping[str, float]  #: mean squared innovation of each sensor a degree of freedom, of what was used
+    nees: float  #: mean squared error of speeds, yaw rate and slip speeds over its covariance, a state
+    #: by ``sensors`` (NIS) and, where there is a truth, by groups of ``states`` (NEES): whether the value is within
+    #: its chi-square bounds
     consistency: Mapping[str, Mapping[str, str]]
-    speed_rmse_mps: float
-    n_dropped: int
+    speed_rmse_mps: float  #: of the speed over ground
+    n_dropped: int  #: samples left out, measurements rejected by a gate, and counts by kind
     n_gated: int
     dropped: Mapping[str, int]
-    finite: bool
+    finite: bool  #: whether all states and covariances are finite
+    #: time that the robot was at rest, moving, stuck, and neither is known; None of a filter that does not judge it
     motion: Mapping[str, float] | None
-    stuck: tuple[StuckInterval, ...] | None
+    stuck: tuple[StuckInterval, ...] | None  #: when it was stuck, None as ``motion``
 
 
 def summarize(estimate: Estimate) -> EstimateSummary:

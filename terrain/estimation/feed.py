@@ -66,24 +66,21 @@ from terrain.records import Array, RunLog, Stream, read_only
 from terrain.robots import Robot
 from terrain.signals import low_pass_step
 
-TICK_S = 1e-9
-"""Stamps that differ by less are the same instant, rounded differently by two clocks."""
-
+TICK_S = 1e-9  #: Stamps that differ by less are the same instant, rounded differently by two clocks.
+#: A value is held until the next one is due and half a period more, of the slower of sensor and clock.
 MAX_AGE_PERIODS = 1.5
-"""A value is held until the next one is due and half a period more, of the slower of sensor and clock."""
-
+#: After a longer gap the low-pass starts anew: its memory is not the recent past of the next sample. Steps are whole
+#: periods, so that half of one between two of them leaves nothing to how stamps are rounded, nor to whether the
+#: period is that of a description (live) or the median of a log (batch).
 GAP_PERIODS = 5.5
-"""After a longer gap the low-pass starts anew: its memory is not the recent past of the next sample.  Steps
-are whole periods, so that half of one between two of them leaves nothing to how stamps are rounded, nor to
-whether the period is that of a description (live) or the median of a log (batch)."""
-
+#: A value that has jumped and stays is accepted after this long: it is left to the filter's gate.
 BELIEVED_S = 0.1
-"""A value that has jumped and stays is accepted after this long: it is left to the filter's gate."""
-
+#: What becomes of a value that jumped: it is accepted after a while; it is left out until it jumps back, as a speed
+#: over ground cannot have jumped; its jump is taken off, as a heading counts from anywhere.
 PASSING, LATCHED, SUBTRACTED = range(3)
-"""What becomes of a value that jumped: it is accepted after a while; it is left out until it jumps back, as a
-speed over ground cannot have jumped; its jump is taken off, as a heading counts from anywhere."""
-
+#: Largest change of a row between two samples: noise, and a second what a robot can do: half a g of speed, two thirds
+#: of a turn, twice the fastest steering; an accelerometer on rough terrain sees several g; roll and pitch turn by 3
+#: rad/s at the most, and a jump tilts gravity. Then what becomes of a value that jumped.
 JUMPS: dict[str, tuple[float, float, int]] = {
     "accel_mps2": (20.0, 1000.0, PASSING),
     "gyro_z_radps": (0.5, 20.0, PASSING),
@@ -94,131 +91,75 @@ JUMPS: dict[str, tuple[float, float, int]] = {
     "camera_yaw_rad": (0.1, 4.0, SUBTRACTED),
     "tilt_rad": (0.05, 3.0, LATCHED),
 }
-"""Largest change of a row between two samples: noise, and a second what a robot can do: half a g of speed,
-two thirds of a turn, twice the fastest steering; an accelerometer on rough terrain sees several g; roll and
-pitch turn by 3 rad/s at the most, and a jump tilts gravity.  Then what becomes of a value that jumped."""
-
-NO_JUMP = (math.inf, math.inf, PASSING)
-"""Of a row whose changes are not judged."""
-
+NO_JUMP = (math.inf, math.inf, PASSING)  #: Of a row whose changes are not judged.
+#: The camera tells 0, 1/3, 2/3 or 1; at 1/3 (low) and below it has lost its features.
 MIN_CONFIDENCE_RATIO = 0.34
-"""The camera tells 0, 1/3, 2/3 or 1; at 1/3 (low) and below it has lost its features."""
-
-MAX_RATE_FACTOR = 2.0
-"""Wheel rates above this multiple of the motor's maximum are discarded."""
-
-LATE_S = 0.5
-"""A camera whose first sample comes later than this after the clock's may have missed a turn."""
-
-STANDING_S = 1.0
-"""Longest stretch, before the wheels turn, over which the heading at the start is averaged."""
-
+MAX_RATE_FACTOR = 2.0  #: Wheel rates above this multiple of the motor's maximum are discarded.
+LATE_S = 0.5  #: A camera whose first sample comes later than this after the clock's may have missed a turn.
+STANDING_S = 1.0  #: Longest stretch, before the wheels turn, over which the heading at the start is averaged.
+#: Wheel circumferential speed below which a wheel counts as standing (thesis 7.2.1).
 STANDING_SPEED_MPS = 0.05
-"""Wheel circumferential speed below which a wheel counts as standing (thesis 7.2.1)."""
-
-GNSS_LATENCY_S = 0.1
-"""Age of a position when it arrives; assumed, as in the simulated receiver."""
-
+GNSS_LATENCY_S = 0.1  #: Age of a position when it arrives; assumed, as in the simulated receiver.
+#: Position's standard deviation with a fix (RTK, thesis 5.1.1) and with a float solution (assumed).
 FIX_STD_M, FLOAT_STD_M = 0.02, 0.5
-"""Position's standard deviation with a fix (RTK, thesis 5.1.1) and with a float solution (assumed)."""
-
-GNSS_SPEED_STD_MPS = 0.03
-"""Of the Doppler speed; assumed, as in the simulated receiver."""
-
-GNSS_PERIOD_S = 0.1
-"""Between two positions; no robot's description tells it."""
-
+GNSS_SPEED_STD_MPS = 0.03  #: Of the Doppler speed; assumed, as in the simulated receiver.
+GNSS_PERIOD_S = 0.1  #: Between two positions; no robot's description tells it.
+#: Memory of the vibration; low-passes of the wheels' speeds. Behind one of them, the change of a speed would
+#: correlate with the noise of the speed itself, and slip speeds that grow by it would drift.
 VIBRATION_S, CHANGE_S = 0.3, 0.15
-"""Memory of the vibration; low-passes of the wheels' speeds.  Behind one of them, the change of a speed would
-correlate with the noise of the speed itself, and slip speeds that grow by it would drift."""
-
-MOVING_MPS = 0.05
-"""A wheel that turns faster moves, and shakes what is mounted on the robot."""
-
+MOVING_MPS = 0.05  #: A wheel that turns faster moves, and shakes what is mounted on the robot.
+#: A wheel's speed is that far from its low-passed one by the ripple of the Hall steps, a saw-tooth: what grew by it
+#: would drift.
 RIPPLE_MPS = 0.03
-"""A wheel's speed is that far from its low-passed one by the ripple of the Hall steps, a saw-tooth: what grew
-by it would drift."""
-
-WAVERING_MPS = 0.02
-"""By so much the two low-passed speeds of a wheel differ in steady motion."""
-
-CRAWL_MPS = 0.1
-"""w_0: well below it a slip speed no longer follows the speed of its wheel."""
-
-REST_AFTER_S = 0.5
-"""Time for which nothing has to move."""
-
+WAVERING_MPS = 0.02  #: By so much the two low-passed speeds of a wheel differ in steady motion.
+CRAWL_MPS = 0.1  #: w_0: well below it a slip speed no longer follows the speed of its wheel.
+REST_AFTER_S = 0.5  #: Time for which nothing has to move.
+#: What counts as nothing, of a wheel's low-passed speed, the gyro, the accelerometer and the camera: biases and noise
+#: at rest stay below, as does a wheel that is held to and fro on soft ground.
 REST_WHEEL_MPS, REST_TURN_RADPS, REST_ACCEL_MPS2, REST_SEEN_MPS = 0.01, 0.03, 0.4, 0.05
-"""What counts as nothing, of a wheel's low-passed speed, the gyro, the accelerometer and the camera: biases
-and noise at rest stay below, as does a wheel that is held to and fro on soft ground."""
-
-UNSEEN_AFTER_S = 0.15
-"""Age of the camera's speed from which on there is none."""
-
+UNSEEN_AFTER_S = 0.15  #: Age of the camera's speed from which on there is none.
+#: Without a camera a change of a wheel's speed counts for so long: the body, and slip, follow it late.
 HELD_S = 0.5
-"""Without a camera a change of a wheel's speed counts for so long: the body, and slip, follow it late."""
-
-REST_S = 1.0
-"""So long wheels and gyro have to be steady: a robot that stops still rocks for half of it."""
-
+REST_S = 1.0  #: So long wheels and gyro have to be steady: a robot that stops still rocks for half of it.
+#: Wheel circumferential speed below which a side stands: a few steps of an encoder in a sample.
 STANDING_MPS = 0.01
-"""Wheel circumferential speed below which a side stands: a few steps of an encoder in a sample."""
-
+#: Largest range of a gyro that is at rest. Measured at rest its samples scatter by 0.002 rad/s (Husky on snow); an
+#: engine or wind that shakes the robot by more makes it unknown whether it rests.
 STEADY_RADPS = 0.02
-"""Largest range of a gyro that is at rest.  Measured at rest its samples scatter by 0.002 rad/s (Husky on
-snow); an engine or wind that shakes the robot by more makes it unknown whether it rests."""
-
-MAX_READING_RADPS = 0.1
-"""No gyro has a larger bias: a robot on a turntable is not at rest."""
-
+MAX_READING_RADPS = 0.1  #: No gyro has a larger bias: a robot on a turntable is not at rest.
+#: Where the channels of the IMU, the camera, its speed in the body's axes and the motors begin among those that may
+#: freeze.
 FIRST_IMU, FIRST_CAMERA, FIRST_SPEED, FIRST_WHEEL = 0, 9, 23, 25
-"""Where the channels of the IMU, the camera, its speed in the body's axes and the motors begin among those that may
-freeze."""
-
+#: Repetitions from which on a channel counts as frozen: of the IMU 0.1 s of a rate, 0.15 s of an attitude; of the
+#: camera, at 200 Hz, 0.1 s of the quaternion, 0.05 s of a velocity (its position is not used); of a motor 0.1 s.
 REPEATED = np.array(
     [10.0] * 6 + [15.0] * 3 + [np.inf] * 3 + [20.0] * 4 + [10.0] * 6 + [np.inf] + [10.0] * 2 + [5.0] * 3
 )
-"""Repetitions from which on a channel counts as frozen: of the IMU 0.1 s of a rate, 0.15 s of an attitude; of the
-camera, at 200 Hz, 0.1 s of the quaternion, 0.05 s of a velocity (its position is not used); of a motor 0.1 s."""
-
+#: A coarse channel repeats itself by nature: what counts as frozen is four times the longest run that has ended in
+#: motion. Wheels are compared with each other: where all of them turn evenly, their rates may be rounded; one is
+#: frozen while another has repeated itself twice at most.
 LONGER, LIVELY = 4.0, 2.0
-"""A coarse channel repeats itself by nature: what counts as frozen is four times the longest run that has
-ended in motion.  Wheels are compared with each other: where all of them turn evenly, their rates may be
-rounded; one is frozen while another has repeated itself twice at most."""
-
-SAME = 1e-12
-"""Values that differ by less are the same, turned into other axes and back."""
-
-UNMEASURED_AFTER_S = 0.5
-"""After this time without a rate or an angle, the motion of a wheel is unknown."""
-
+SAME = 1e-12  #: Values that differ by less are the same, turned into other axes and back.
+UNMEASURED_AFTER_S = 0.5  #: After this time without a rate or an angle, the motion of a wheel is unknown.
+#: Channels of each stream but the wheels, in the order in which the kernels know streams and channels.
 STREAMS = {
     "steering": STEERING_CHANNELS,
     "imu": IMU_CHANNELS,
     "odometry": CAMERA_CHANNELS,
     "gnss": GNSS_CHANNELS,
 }
-"""Channels of each stream but the wheels, in the order in which the kernels know streams and channels."""
-
-STEERING, IMU, ODOMETRY, GNSS = range(len(STREAMS))
-"""Number of each stream."""
+STEERING, IMU, ODOMETRY, GNSS = range(len(STREAMS))  #: Number of each stream.
 
 N_CHANNELS = max(map(len, STREAMS.values()))
 
+#: Channels that never repeat themselves all at once, of streams that are left out where they do.
 NOISY = {"imu": slice(0, 6), "odometry": slice(3, 13)}
-"""Channels that never repeat themselves all at once, of streams that are left out where they do."""
-
+#: Noise of a log that repeats exactly for so long is none: 50 samples of the camera, 25 of the IMU.
 FROZEN_S = 0.25
-"""Noise of a log that repeats exactly for so long is none: 50 samples of the camera, 25 of the IMU."""
-
-OFF_CLOCK_S = 1.0
-"""A sample that is further from every tick is of no use to anyone: its clock jumped."""
-
-HEADING_SPEED_MPS = 0.2
-"""Slower, a course is noise."""
-
+OFF_CLOCK_S = 1.0  #: A sample that is further from every tick is of no use to anyone: its clock jumped.
+HEADING_SPEED_MPS = 0.2  #: Slower, a course is noise.
+#: A heading that is known no better is not known: at 1 m/s it would be 5 cm/s of sideways speed.
 MAX_HEADING_STD_RAD = 0.05
-"""A heading that is known no better is not known: at 1 m/s it would be 5 cm/s of sideways speed."""
 
 CAMERA_ROWS = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
 GNSS_ROWS = ("gnss_position_x_m", "gnss_position_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps")
@@ -243,8 +184,8 @@ _ROWS = {
     "side_mps": SIDE_ROWS,
     "rest_gyro_radps": (REST_ROW,),
 }
+#: Names of all numbers of a :data:`ROW`, in its order.
 ROWS = tuple(name for names in _ROWS.values() for name in names)
-"""Names of all numbers of a :data:`ROW`, in its order."""
 
 DERIVED_ROWS = ROWS[ROWS.index("vibration_mps2") : ROWS.index(SIDE_ROWS[0])]
 _SIDES = (*SIDE_ROWS, "gyro_z_radps", *GNSS_ROWS, REST_ROW)
@@ -259,48 +200,43 @@ def _sized(kind: Any, n: int) -> Any:
     return kind if n == 1 else (kind, n)
 
 
+#: What is measured at a tick, NaN where nothing is: the numbers of :data:`ROWS`, and the variances of
+#: :data:`GNSS_ROWS`.
 ROW = record(
     {name: _sized(float, len(names)) for name, names in _ROWS.items()} | {"gnss_variance": (float, 4)}
 )
-"""What is measured at a tick, NaN where nothing is: the numbers of :data:`ROWS`, and the variances of
-:data:`GNSS_ROWS`."""
-
+#: What is behind a low-pass and held, by the stream that measures it; of the tilt jumps are seen only.
 _SIGNALS = {
     "steer_rad": "steering",
     **dict.fromkeys(("accel_mps2", "gyro_z_radps", "imu_yaw_rad", "tilt_rad"), "imu"),
     **dict.fromkeys(("camera_speed_mps", "camera_yaw_rate_radps", "camera_yaw_rad"), "odometry"),
     **dict.fromkeys(("gnss_position_m", "gnss_speed_mps"), "gnss"),
 }
-"""What is behind a low-pass and held, by the stream that measures it; of the tilt jumps are seen only."""
-
+#: What is constant of a signal: low-pass, longest step, oldest value, the largest change between two samples (a
+#: constant, and a part per second), whether a sample is given at one tick only, and what becomes of a jump.
 LIMIT = record(numbers("time_constant_s gap_s age_s jump jump_per_s") | {"once": bool, "policy": int})
-"""What is constant of a signal: low-pass, longest step, oldest value, the largest change between two samples
-(a constant, and a part per second), whether a sample is given at one tick only, and what becomes of a jump."""
-
+#: Memory of a signal: value, instant, arrival and low-pass output of the last sample, whether it was given at a tick;
+#: value and instant that jumps are judged against, since when values have been jumping; and of a signal that is not
+#: passing the last sample, taken or not, its instant, the sum of its jumps, since when that is not 0, and whether a
+#: sample before it is known to be right.
 LINE = record(
     numbers("value instant_s came_s low_passed judged judged_s jumping_s raw raw_s jumped_by jumped_s")
     | {"was_given": bool, "is_followed": bool}
 )
-"""Memory of a signal: value, instant, arrival and low-pass output of the last sample, whether it was given at a
-tick; value and instant that jumps are judged against, since when values have been jumping; and of a signal
-that is not passing the last sample, taken or not, its instant, the sum of its jumps, since when that is not 0,
-and whether a sample before it is known to be right."""
-
+#: Of a channel that may freeze: last value, number of repetitions, longest run, and whether this one began in motion.
 CHANNEL = record(numbers("last repeated longest") | {"began_in_motion": bool})
-"""Of a channel that may freeze: last value, number of repetitions, longest run, and whether this one began in
-motion."""
 
 _TURN = record(numbers("last_rad turned_rad"))  # of an unwrapped angle the last one, and the turns so far
 _AVERAGE = record({"sum": float, "n": int, "mean": float})
 _SIZES = {name: len(_ROWS.get(name, "xy")) for name in _SIGNALS}
 
+#: What is constant of a robot's feed.
 SETTINGS = record(
     {name: _sized(LIMIT, n) for name, n in _SIZES.items()}
     | {"latency_s": (float, len(STREAMS)), "is_steered": bool}
     | numbers("reduction_ratio fastest_radps wheel_radius_m initial_yaw_rad gyro_bias_radps")
     | dict.fromkeys(("steering_zeros_rad", "accel_bias_mps2", "accel_scale_ratio"), (float, 3))
 )
-"""What is constant of a robot's feed."""
 
 COUNTS = ("not_finite", "frozen", "low_confidence", "no_rotation", "jump")
 FEED = record(
@@ -339,16 +275,10 @@ def feed_settings(
 
     Parameters
     ----------
-    robot : gives calibration, latencies and lags
     period_s : of the wheels, and of each stream that comes
     initial_yaw_rad : heading of the start
     gnss_latency_s : age of a position when it arrives
     time_constant_s : of the low-pass on all but the wheels; by default what each sensor lacks to the encoders'
-
-    Raises
-    ------
-    ConfigError
-        if a time constant or a latency is out of range.
     """
     for name, value in (("time_constant_s", time_constant_s), ("gnss_latency_s", gnss_latency_s)):
         if value is not None and not 0 <= value < np.inf:
@@ -382,14 +312,7 @@ def feed_settings(
 def signal_limits(
     time_constant_s: float, period_s: float, tick_s: float, jump: tuple[float, float, int] = NO_JUMP
 ) -> Array:
-    """Return the :data:`LIMIT` (1,) of a signal.
-
-    Parameters
-    ----------
-    time_constant_s : of its low-pass; 0 for none
-    period_s, tick_s : of its sensor, and of the clock
-    jump : largest change between two samples: a constant, a part per second, and what becomes of a jump
-    """
+    """Return the :data:`LIMIT` (1,) of a signal by its low-pass (0 for none), its sensor's period and the clock's."""
     return filled(
         LIMIT,
         time_constant_s=time_constant_s,
@@ -908,14 +831,9 @@ def measurements(rows: Any) -> Array:
 def on_clock(
     clock: Array, time_s: Array, signals: Mapping[str, Array], time_constant_s: float
 ) -> dict[str, Array]:
-    """Return each signal behind the low-pass, at the ticks of the clock.
+    """Return each signal (n,) behind the low-pass, at the ticks of the clock.
 
-    Parameters
-    ----------
-    clock : (n_ticks,) increasing
-    time_s : (n,) increasing instants of the samples
-    signals : each (n,), NaN where a sample is missing
-    time_constant_s : of the low-pass; 0 for none
+    Instants of samples and ticks increase; a missing sample is NaN; a time constant of 0 is no low-pass.
     """
     limits = signal_limits(time_constant_s, median_step_s(time_s), median_step_s(clock))
     return {
@@ -939,21 +857,13 @@ def _on_clock(clock: Array, time_s: Array, signal: Array, line: Array, limit: Ar
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasurementTable:
-    """What a filter measures at each tick of its clock; NaN where a sensor gave nothing.
+    """What a filter measures at each tick of its clock; NaN where a sensor gave nothing."""
 
-    Parameters
-    ----------
-    time_s : (n,) stamps of the wheels stream
-    rows : name of each of the m measurements
-    z : (n, m)
-    gnss_variance : (n, 4) of :data:`GNSS_ROWS`, in their units squared; NaN where they are
-    dropped : samples left out, as counts by stream and kind (``"imu: frozen"``)
-    """
-
-    time_s: Array
-    rows: tuple[str, ...]
-    z: Array
-    gnss_variance: Array
+    time_s: Array  #: (n,) stamps of the wheels stream
+    rows: tuple[str, ...]  #: name of each of the m measurements
+    z: Array  #: (n, m)
+    gnss_variance: Array  #: (n, 4) of :data:`GNSS_ROWS`, in their units squared; NaN where they are
+    #: samples left out, as counts by stream and kind (``"imu: frozen"``)
     dropped: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -39,25 +39,20 @@ from terrain.kernels import filled, inner, njit, record
 from terrain.logs.schema import unit_of
 from terrain.records import ABSENT, GATED, REOPENED, USED, Array, StateTrack, read_only
 
+#: Five standard deviations: a wheel that starts to slip is a surprise of four, and no fault.
 GATE_PROBABILITY = 1.0 - 1e-6
-"""Five standard deviations: a wheel that starts to slip is a surprise of four, and no fault."""
-
+#: Spikes last a sample or two; what disagrees for longer is the ground's doing, a brake or a bump.
 REOPEN_AFTER_S = 0.2
-"""Spikes last a sample or two; what disagrees for longer is the ground's doing, a brake or a bump."""
-
-HELD_S = 2.0
-"""A sensor that the model holds is not reopened before this time."""
-
+HELD_S = 2.0  #: A sensor that the model holds is not reopened before this time.
+#: No state or measurement of a ground robot in SI units comes near: what does is taken for garbage.
 LARGEST = 1e9
-"""No state or measurement of a ground robot in SI units comes near: what does is taken for garbage."""
 
 WIDEST = LARGEST**4
 
+#: After a longer gap a position is no less certain than after this one: that is nowhere already.
 LONGEST_GAP_S = 3600.0
-"""After a longer gap a position is no less certain than after this one: that is nowhere already."""
-
+#: Room in the records for states, rows and sensors: every filter is one type for the compiled step.
 MOST = 32
-"""Room in the records for states, rows and sensors: every filter is one type for the compiled step."""
 
 _SLACK_S = 1e-9  # what sums of steps may be off by
 
@@ -72,26 +67,6 @@ _SIGNATURES = {
 class FilterModel:
     """What a filter estimates, and from what.
 
-    Parameters
-    ----------
-    name : what reports call it
-    states, rows : d states and m measurements, each name ending in its unit
-    sensors : name and rows of each sensor, in the order in which they are judged, each after those before; a
-        sensor is believed or left out as a whole, and every row belongs to one
-    propagate : ``propagate(x, dt, params, x_next, F)`` writes the next state (d,), and the entries of the
-        Jacobian that are not zero: F (d, d) comes as zeros, and rows that stay short cost less
-    observe : ``observe(x, params, z_hat, H)`` writes the measurement expected (m,), and the entries of H
-        (m, d) that are not zero.  Both are functions of numba, ``@njit``
-    params : what the two functions need of the robot; the inputs of a sample stand behind them
-    initial_std : (d,) how little is known of each state where nothing is known
-    initial_mean : (d,) zeros without
-    inputs : names of what is known of each step beside the state; 0 where it is not given
-    references : sensors of the speed over ground
-    held : sensors that are not reopened before two seconds: those that fail, rather than show the ground's
-        doing
-    positions : states that a gap in the data leaves where they were, with a covariance that grew
-    angle_states, angle_rows : states that are wrapped to (-pi, pi], and rows whose innovation is
-
     Raises
     ------
     ConfigError
@@ -99,20 +74,29 @@ class FilterModel:
         none of numba.
     """
 
-    name: str
-    states: tuple[str, ...]
+    name: str  #: what reports call it
+    states: tuple[str, ...]  #: d states and m measurements, each name ending in its unit
     rows: tuple[str, ...]
+    #: name and rows of each sensor, in the order in which they are judged, each after those before; a sensor is
+    #: believed or left out as a whole, and every row belongs to one
     sensors: tuple[tuple[str, tuple[str, ...]], ...]
+    #: ``propagate(x, dt, params, x_next, F)`` writes the next state (d,), and the entries of the Jacobian that are
+    #: not zero: F (d, d) comes as zeros, and rows that stay short cost less
     propagate: Any
+    #: ``observe(x, params, z_hat, H)`` writes the measurement expected (m,), and the entries of H (m, d) that are not
+    #: zero.  Both are functions of numba, ``@njit``
     observe: Any
-    params: Array
-    initial_std: Array
-    initial_mean: Array = field(default_factory=lambda: np.zeros(0))
+    params: Array  #: what the two functions need of the robot; the inputs of a sample stand behind them
+    initial_std: Array  #: (d,) how little is known of each state where nothing is known
+    initial_mean: Array = field(default_factory=lambda: np.zeros(0))  #: (d,) zeros without
+    #: names of what is known of each step beside the state; 0 where it is not given
     inputs: tuple[str, ...] = ()
-    references: tuple[str, ...] = ()
+    references: tuple[str, ...] = ()  #: sensors of the speed over ground
+    #: sensors that are not reopened before two seconds: those that fail, rather than show the ground's doing
     held: tuple[str, ...] = ()
+    #: states that a gap in the data leaves where they were, with a covariance that grew
     positions: tuple[str, ...] = ()
-    angle_states: tuple[str, ...] = ()
+    angle_states: tuple[str, ...] = ()  #: states that are wrapped to (-pi, pi], and rows whose innovation is
     angle_rows: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -167,15 +151,6 @@ class FilterModel:
 class Noise:
     """How much a model is off: variances in squared natural units, as ``0.02**2``.
 
-    Parameters
-    ----------
-    process_variance : (d,) or (d, d), **per second**: a step of dt adds Q dt
-    measurement_variance : (m,) of each row, or (n, m) where it changes from sample to sample (of a sample
-        whose variance is NaN, zero or negative, the row is not used); rows are independent
-    initial_variance : (d,) or (d, d); what the model says without
-    walk_variance : (n, d), **per second**, of each sample beside the process variance: for states that change
-        faster at times
-
     Raises
     ------
     ConfigError
@@ -188,9 +163,12 @@ class Noise:
     terrain.errors.ConfigError: measurement_variance is a matrix: rows are taken as independent, give (m,)
     """
 
-    process_variance: Array
+    process_variance: Array  #: (d,) or (d, d), **per second**: a step of dt adds Q dt
+    #: (m,) of each row, or (n, m) where it changes from sample to sample (of a sample whose variance is NaN, zero or
+    #: negative, the row is not used); rows are independent
     measurement_variance: Array
-    initial_variance: Array | None = None
+    initial_variance: Array | None = None  #: (d,) or (d, d); what the model says without
+    #: (n, d), **per second**, of each sample beside the process variance: for states that change faster at times
     walk_variance: Array | None = None
 
     def __post_init__(self) -> None:
@@ -240,17 +218,6 @@ def _covariance(what: str, given: Any, *, definite: bool) -> Array:
 class FilterSettings:
     """When a measurement or a stamp is not believed; ``ConfigError`` where a value is out of its range.
 
-    Parameters
-    ----------
-    gate_probability : a sensor's squared innovation under the value that chi-square stays under with this
-        probability is believed; 1 believes everything
-    reopen_after_s : a sensor that was rejected all this time is believed once.  First the variance of the
-        states that it is put down to goes back to the initial one, or to what explains the measurement where
-        that is more.  These states are those that it alone observes; without any, those that no sensor used
-        before it in the row observes; else all that it does.  A sensor that the model holds takes two seconds
-        at least
-    max_gap_s : over a longer step nothing is integrated; a log sampled slower than that needs another value
-
     Examples
     --------
     >>> FilterSettings(gate_probability=99.99)
@@ -258,8 +225,15 @@ class FilterSettings:
     terrain.errors.ConfigError: gate_probability is 99.99, a number over 0 up to 1 is required
     """
 
+    #: a sensor's squared innovation under the value that chi-square stays under with this probability is believed; 1
+    #: believes everything
     gate_probability: float = 0.9999
+    #: a sensor that was rejected all this time is believed once.  First the variance of the states that it is put
+    #: down to goes back to the initial one, or to what explains the measurement where that is more.  These states are
+    #: those that it alone observes; without any, those that no sensor used before it in the row observes; else all
+    #: that it does.  A sensor that the model holds takes two seconds at least
     reopen_after_s: float = 1.0
+    #: over a longer step nothing is integrated; a log sampled slower than that needs another value
     max_gap_s: float = 1.0
 
     def __post_init__(self) -> None:
@@ -274,6 +248,9 @@ class FilterSettings:
 
 DEFAULT_SETTINGS = FilterSettings()
 
+#: What is fixed by model, noise and settings: places of the rows, sensor by sensor (``order``), and where each sensor
+#: begins among them; first state and covariance, what is added to it a second, and the largest squared innovation
+#: that is believed, by its number of rows.
 MODEL = record(
     {
         **dict.fromkeys(("n_states", "n_rows", "n_sensors", "n_inputs"), int),
@@ -287,9 +264,6 @@ MODEL = record(
         **dict.fromkeys(("reopen_after_s", "max_gap_s"), float),
     }
 )
-"""What is fixed by model, noise and settings: places of the rows, sensor by sensor (``order``), and where each
-sensor begins among them; first state and covariance, what is added to it a second, and the largest squared
-innovation that is believed, by its number of rows."""
 
 STATE = record(
     {
@@ -308,6 +282,7 @@ Stamp of the last sample, that of a jump that is not believed yet, time since th
 measured; what became of the sensors of the last sample and how likely it was, for how long each was rejected (-1 for
 one that was not), and counts of what was left out."""
 
+#: Room to compute in.
 _WORK = record(
     {
         **dict.fromkeys(("f", "fp", "h", "p_before"), (float, (MOST, MOST))),
@@ -319,7 +294,6 @@ _WORK = record(
         "chosen": (bool, MOST),
     }
 )
-"""Room to compute in."""
 
 _SKIP, _START, _STEP, _JUMP = range(4)  # what the clock says of a row
 _UNSOUND = -1  # a use that is never reported
@@ -759,7 +733,6 @@ class Filter:
 
         Parameters
         ----------
-        time_s : stamp of the sample; the first one starts the clock
         z : (m,) measurements, NaN where there is none
         variance : (m,) in place of that of the noise, which has to be (m,) without
         walk : (d,) variance per second up to the sample, beside the process variance
@@ -822,17 +795,9 @@ class Filter:
         return {name: (float(self.mean[i]), math.sqrt(float(self.cov[i, i]))) for name, i in places.items()}
 
     def begin_from(self, known: Mapping[str, tuple[float, float]], age_s: float) -> None:
-        """Start from what was known of some states.
+        """Start from what was known of states by name, mean and standard deviation, a time ago; ``DataError`` if it runs.
 
-        Parameters
-        ----------
-        known : mean and standard deviation by name of the state; what the filter does not have is left out
-        age_s : time since then, for which each walks; none is believed less than without it
-
-        Raises
-        ------
-        DataError
-            if a sample was taken already.
+        Each walks for that time; none is believed less than without it, and what the filter does not have is left out.
         """
         if not math.isnan(self.state["time_s"][0]):
             raise DataError("a filter that runs cannot start from another state")

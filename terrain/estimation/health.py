@@ -46,32 +46,23 @@ class Health(IntEnum):
 
 SOUND = Health.REOPENED
 
+#: Sensors that are judged; ``tilt`` is the IMU's pitch and roll.
 SENSORS = (
     *(f"wheel_{i}" for i in (1, 2, 3)),
     *(f"steer_{i}" for i in (1, 2, 3)),
     *("gyro", "accel", "tilt", "imu_yaw"),
     *("camera_speed", "camera_yaw_rate", "camera_yaw"),
 )
-"""Sensors that are judged; ``tilt`` is the IMU's pitch and roll."""
-
+#: Those that slip control is built on: the camera's yaw turns its speed into the body's axes.
 SLIP_SENSORS = tuple(name for name in SENSORS if name not in ("imu_yaw", "camera_yaw_rate"))
-"""Those that slip control is built on: the camera's yaw turns its speed into the body's axes."""
 
 LOST_AFTER_S, WHEELS_LOST_S, GATED_AFTER_S, JUMPING_S, LATE_PERIODS = 0.25, 0.1, 0.1, 0.03, 3.0
-N_STUCK = 4
-"""Repetitions of all that the wheels measure, from which on they are frozen."""
-
-AT_REST_MPS = 0.1
-"""A robot that is faster is not at rest, whatever its wheels measure."""
-
-BIAS_RADPS = 0.05
-"""A gyro's bias beyond this, five times what is usual, is a gyro that is broken."""
-
+N_STUCK = 4  #: Repetitions of all that the wheels measure, from which on they are frozen.
+AT_REST_MPS = 0.1  #: A robot that is faster is not at rest, whatever its wheels measure.
+BIAS_RADPS = 0.05  #: A gyro's bias beyond this, five times what is usual, is a gyro that is broken.
+#: Memory of camera against accelerometer, and the difference that is none of noise and vibration.
 COMPARED_S, DISAGREES_MPS = 0.4, 0.25
-"""Memory of camera against accelerometer, and the difference that is none of noise and vibration."""
-
-N_COLUMNS = 16
-"""So many channels of the wheels are compared with those of the sample before."""
+N_COLUMNS = 16  #: So many channels of the wheels are compared with those of the sample before.
 
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 _BIASES = ("accel_bias_x_mps2", "accel_bias_y_mps2", "gyro_bias_radps")
@@ -81,6 +72,8 @@ _WHEEL, _STEER, _GYRO, _ACCEL, _TILT, _YAW, _SEEN, _SEEN_TURN, _SEEN_YAW = (
     *range(6, 13),
 )  # among SENSORS
 
+#: What is constant: places of motion and biases among the states and of the sensors in the filter, -1 where there is
+#: none; periods of the sensors, and of the ticks.
 MONITOR = record(
     {
         **dict.fromkeys(("motion_places", "bias_places"), (int, 3)),
@@ -89,9 +82,9 @@ MONITOR = record(
         "tick_s": float,
     }
 )
-"""What is constant: places of motion and biases among the states and of the sensors in the filter, -1 where
-there is none; periods of the sensors, and of the ticks."""
-
+#: What is remembered: health at the last tick, how long each sensor has been gated; difference of camera and
+#: accelerometer along and across, the camera's last speeds and their instant; the sample of the wheels, and how often
+#: it repeated itself.
 MEMORY = record(
     {
         "health": (np.int8, len(SENSORS)),
@@ -103,9 +96,6 @@ MEMORY = record(
         "n_repeated": int,
     }
 )
-"""What is remembered: health at the last tick, how long each sensor has been gated; difference of camera and
-accelerometer along and across, the camera's last speeds and their instant; the sample of the wheels, and how
-often it repeated itself."""
 
 _inner = inner(error_model="numpy")
 
@@ -142,13 +132,9 @@ class HealthMonitor:
     def judge(
         self, time_s: float, wheels: Array, rates: Array, row: Array, feed: Array, state: Array
     ) -> None:
-        """Judge the sensors at a tick.
+        """Judge the sensors at a tick, by the sample (c,) of the wheels and the rates (3,) of the motors in it.
 
-        Parameters
-        ----------
-        wheels, rates : (c,) sample of the wheels, and the rates (3,) of the motors in it
-        row, feed : of :mod:`terrain.estimation.feed`
-        state : of the filter, after the tick
+        ``row`` and ``feed`` are of :mod:`terrain.estimation.feed`, ``state`` is that of the filter after the tick.
         """
         n = min(wheels.size, N_COLUMNS)
         self._wheels[:n] = wheels[:n]

@@ -56,74 +56,46 @@ from terrain.logs.schema import WHEELS_CHANNELS
 from terrain.records import Array, Reading
 from terrain.robots import Robot
 
-SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
-"""Those of the batch."""
-
+SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)  #: Those of the batch.
+#: Default channels of each stream of a swerve robot.
 CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **STREAMS}
-"""Default channels of each stream of a swerve robot."""
-
+#: States that are of a sensor, and stay what they are while the robot does anything.
 BIASES = ("gyro_bias_radps", "accel_bias_x_mps2", "accel_bias_y_mps2")
-"""States that are of a sensor, and stay what they are while the robot does anything."""
-
-N_TICKS = 64
-"""Most ticks that are remembered; at 200 Hz a little more than :data:`REWIND_S`."""
-
-N_STEPS = 1024
-"""Most steps whose samples are remembered, where no tick says that they are old."""
-
-QUEUE = 1024
-"""Samples of a stream that wait for the wheels; five seconds of a camera."""
-
-LATE_PERIODS = 1.5
-"""So many periods without wheels make a tick without them."""
+N_TICKS = 64  #: Most ticks that are remembered; at 200 Hz a little more than :data:`REWIND_S`.
+N_STEPS = 1024  #: Most steps whose samples are remembered, where no tick says that they are old.
+QUEUE = 1024  #: Samples of a stream that wait for the wheels; five seconds of a camera.
+LATE_PERIODS = 1.5  #: So many periods without wheels make a tick without them.
 
 _JUST_BEFORE_S = 1e-6
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
 
-Samples = tuple[list[float], Array, Array]
-"""Stamps, twice, and values of a stream."""
+Samples = tuple[list[float], Array, Array]  #: Stamps, twice, and values of a stream.
 
 
 class LiveEstimate(NamedTuple):
-    """What is believed at one tick; arrays are the caller's to keep, and NaN where something is not known.
+    """What is believed at one tick; arrays are the caller's to keep, and NaN where something is not known."""
 
-    Parameters
-    ----------
-    time_s : stamp of the wheels
-    mean, std : (d,) states and their standard deviations, in the order of :attr:`LiveFilter.states`
-    slip_ratio, slip_std : (wheels,) NaN where unknown or where the wheel stands
-    slip_stale : whether the speed over ground was not measured lately
-    reference_age_s : time since it was; infinite before the first time
-    rows : (32,) what was measured, in the order of :data:`~terrain.estimation.feed.ROWS`
-    speed_x_mps, speed_y_mps, yaw_rate_radps, accel_x_mps2, accel_y_mps2 : of the states, by name; of a robot
-        that skids the speed is that of its wheels
-    motor_radps, current_a : (wheels,) of this sample of the wheels
-    wheel_speed_mps : (wheels,) circumferential speeds of that sample
-    health : (13,) of the sensors of a swerve robot, as :class:`~terrain.estimation.health.Health`, in the order
-        of :data:`~terrain.estimation.health.SENSORS`; of others (0,)
-    motion : what is known of the motion of a robot that skids; UNKNOWN of others
-    stuck_since_s : when the robot became stuck; NaN where it is not
-    """
-
-    time_s: float
-    mean: Array
+    time_s: float  #: stamp of the wheels
+    mean: Array  #: (d,) states and their standard deviations, in the order of :attr:`LiveFilter.states`
     std: Array
-    slip_ratio: Array
+    slip_ratio: Array  #: (wheels,) NaN where unknown or where the wheel stands
     slip_std: Array
-    slip_stale: bool
-    reference_age_s: float
-    rows: Array
-    speed_x_mps: float
+    slip_stale: bool  #: whether the speed over ground was not measured lately
+    reference_age_s: float  #: time since it was; infinite before the first time
+    rows: Array  #: (32,) what was measured, in the order of :data:`~terrain.estimation.feed.ROWS`
+    speed_x_mps: float  #: of the states, by name; of a robot that skids the speed is that of its wheels
     speed_y_mps: float
     yaw_rate_radps: float
     accel_x_mps2: float
     accel_y_mps2: float
-    motor_radps: Array
+    motor_radps: Array  #: (wheels,) of this sample of the wheels
     current_a: Array
-    wheel_speed_mps: Array
+    wheel_speed_mps: Array  #: (wheels,) circumferential speeds of that sample
+    #: (13,) of the sensors of a swerve robot, as :class:`~terrain.estimation.health.Health`, in the order of
+    #: :data:`~terrain.estimation.health.SENSORS`; of others (0,)
     health: Array
-    motion: Motion = Motion.UNKNOWN
-    stuck_since_s: float = math.nan
+    motion: Motion = Motion.UNKNOWN  #: what is known of the motion of a robot that skids; UNKNOWN of others
+    stuck_since_s: float = math.nan  #: when the robot became stuck; NaN where it is not
 
 
 class Tick(NamedTuple):
@@ -415,17 +387,14 @@ class LiveFilter:
     def step(self, readings: Mapping[str, Reading], now_s: float | None = None) -> list[LiveEstimate]:
         """Take in what arrived, and return the estimates at samples of the wheels that have settled.
 
+        They are in order of time, unless the clock of the wheels was set back.  A stamp that jumps by more than
+        ``settings.max_gap_s`` is accepted, and reported, when the next one follows it.
+
         Parameters
         ----------
         readings : by stream; any may be missing, late, repeated or wrong, and other streams are not looked at
         now_s : the time by the clock of the stamps: a tick where the wheels have given nothing for one and a
             half of their periods
-
-        Returns
-        -------
-        list of LiveEstimate
-            in order of time, unless the clock of the wheels was set back.  A stamp that jumps by more than
-            ``settings.max_gap_s`` is accepted, and reported, when the next one follows it.
         """
         if not isinstance(readings, Mapping):
             readings = {}

@@ -28,24 +28,17 @@ from terrain.identify import Parameter, identify
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, packaged_robot
 
+#: Number of runs to tune on unless they are named: the likelihood of each is evaluated a hundred times.
 MAX_RUNS = 3
-"""Number of runs to tune on unless they are named: the likelihood of each is evaluated a hundred times."""
-
-MAX_STEPS = 25
-"""Of the search, each of which evaluates the likelihood once, and once a group."""
-
-WIDEST_SCALE = 1e4
-"""No variance is scaled up or down by more than this."""
-
+MAX_STEPS = 25  #: Of the search, each of which evaluates the likelihood once, and once a group.
+WIDEST_SCALE = 1e4  #: No variance is scaled up or down by more than this.
+#: A scale that is so near to that, as a logarithm, is at its bound: the likelihood is flat there.
 AT_END = 0.1
-"""A scale that is so near to that, as a logarithm, is at its bound: the likelihood is flat there."""
-
+#: A scale twice or half as large has to cost this much log likelihood, as an error of two standard deviations does;
+#: otherwise the runs say nothing on it.
 CLEAR_DROP = 2.0
-"""A scale twice or half as large has to cost this much log likelihood, as an error of two standard deviations
-does; otherwise the runs say nothing on it."""
-
+#: States are tuned together whose names begin alike.
 GROUPS = ("speed", "yaw_rate", "accel", "steer", "slip", "effective_track", "gyro_bias")
-"""States are tuned together whose names begin alike."""
 
 
 class TuningStatus(StrEnum):
@@ -58,39 +51,25 @@ class TuningStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TunedNoise:
-    """Result of a tuning.
+    """Result of a tuning."""
 
-    Parameters
-    ----------
-    runs : ids of the runs tuned on
-    log_likelihood_before, log_likelihood_after : summed over them
-    scales : of the variances, by group
-    status : of each scale, by group
-    """
-
-    runs: tuple[str, ...]
-    log_likelihood_before: float
+    runs: tuple[str, ...]  #: ids of the runs tuned on
+    log_likelihood_before: float  #: summed over them
     log_likelihood_after: float
-    scales: Mapping[str, float]
-    status: Mapping[str, TuningStatus]
+    scales: Mapping[str, float]  #: of the variances, by group
+    status: Mapping[str, TuningStatus]  #: of each scale, by group
 
 
 def tuned_noise(
     runs: Sequence[RunLog], robot: Robot | None, name: str, names: Sequence[str] | None = None
 ) -> tuple[Noise, TunedNoise]:
-    """Return noise under which the runs are most likely, and what became of each group.
+    """Return noise under which runs as measured are most likely, and what became of each group.
 
     Parameters
     ----------
-    runs : logs, as measured
     robot : whose they are; by default the one that the first names
     name : of the filter
-    names : of the runs to tune on; the first few by default
-
-    Raises
-    ------
-    DataError
-        if no run is named, or there is none of a name.
+    names : of the runs to tune on; the first few by default; ``DataError`` if there is no run of a name
     """
     by_id = {run.run_id: run for run in runs}
     names = list(by_id)[:MAX_RUNS] if names is None else names
@@ -111,12 +90,8 @@ def tune_noise(
 ) -> tuple[Noise, TunedNoise]:
     """Scale the process variances of each of :data:`GROUPS` so that samples become as likely as they can.
 
-    Parameters
-    ----------
-    model : the filter
-    samples : ``time_s (n,), z (n, m)`` of each run
-    noise : where to start, with variances of measurements that do not change from sample to sample
-    runs : their ids, to be reported
+    ``samples`` are ``time_s (n,), z (n, m)`` of each run, by whose ids they are reported; the variances of measurements
+    must not change from sample to sample.
     """
     members = {name: [state.startswith(name) for state in model.states] for name in GROUPS}
     members = {name: states for name, states in members.items() if any(states)}

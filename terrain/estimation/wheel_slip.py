@@ -20,20 +20,16 @@ from terrain.records import Array, SlipTrack, StateTrack, read_only
 from terrain.robots import Robot
 from terrain.slip import MIN_SPEED_MPS
 
-STEADY_SPEED_MPS = 0.2
-"""Slower, 1 cm/s of error in the speed is over 5 % of slip."""
-
+STEADY_SPEED_MPS = 0.2  #: Slower, 1 cm/s of error in the speed is over 5 % of slip.
+#: Largest change of speed over :data:`STEADY_BEFORE_S` that counts as none: 0.1 m/s^2 asks for a hundredth of the
+#: weight in traction, little beside what rolling on soft ground does.
 STEADY_CHANGE_MPS = 0.1
-"""Largest change of speed over :data:`STEADY_BEFORE_S` that counts as none: 0.1 m/s^2 asks for a hundredth of
-the weight in traction, little beside what rolling on soft ground does."""
-
+#: How long the speed has to have been steady, for transients to have died out, and how long it has to remain so, for
+#: the start of a braking not to count before it shows.
 STEADY_BEFORE_S, STEADY_AFTER_S = 1.0, 0.25
-"""How long the speed has to have been steady, for transients to have died out, and how long it has to remain
-so, for the start of a braking not to count before it shows."""
-
+#: Age of the last speed over ground beyond which slip counts as stale: one and a half periods of GNSS, at 10 Hz the
+#: slowest sensor of it, so that no sound one is called so; a 1 m/s^2 start gains 0.15 m/s unseen.
 STALE_AFTER_S = 0.15
-"""Age of the last speed over ground beyond which slip counts as stale: one and a half periods of GNSS, at 10
-Hz the slowest sensor of it, so that no sound one is called so; a 1 m/s^2 start gains 0.15 m/s unseen."""
 
 
 def wheel_slip(
@@ -210,18 +206,11 @@ def wheel_speed_scatter_mps(robot: Robot) -> float:
 
 
 class SlipFigures(NamedTuple):
-    """Slip of a run in a few figures, ratios; NaN where there was nothing to take them from.
+    """Slip of a run in a few figures, ratios; NaN where there was nothing to take them from."""
 
-    Parameters
-    ----------
-    steady : (n,) where the robot drove steadily
-    steady_mean : over all wheels then
-    peak : largest absolute slip of any wheel while the robot moved and not steadily
-    """
-
-    steady: Array
-    steady_mean: float
-    peak: float
+    steady: Array  #: (n,) where the robot drove steadily
+    steady_mean: float  #: over all wheels then
+    peak: float  #: largest absolute slip of any wheel while the robot moved and not steadily
 
 
 def slip_figures(

@@ -59,34 +59,27 @@ from terrain.kernels import filled, njit, numbers, record
 from terrain.records import Array
 from terrain.robots import Robot, SkidSteerRobot, as_drive
 
+#: Wheels that differ by less, over the described track, show nothing of the effective one: D is noise.
 MIN_TURN_RADPS = 0.15
-"""Wheels that differ by less, over the described track, show nothing of the effective one: D is noise."""
-
+#: Largest effective track over the described one; twice what is usual on firm ground (Mandow et al. 2007).
 MAX_TRACK_RATIO = 4.0
-"""Largest effective track over the described one; twice what is usual on firm ground (Mandow et al. 2007)."""
-
+#: Largest bias of a gyro, 3.4 degrees a second: seven times what makers of IMUs allow themselves.
 MAX_BIAS_RADPS = 0.06
-"""Largest bias of a gyro, 3.4 degrees a second: seven times what makers of IMUs allow themselves."""
-
+#: How little is known of the bias: a gyro of a robot's IMU repeats within 0.5 degrees a second from start to start
+#: (Xsens, Bias repeatability of gyroscopes, knowledge base), 0.3 as a standard deviation.
 BIAS_STD_RADPS = 0.005
-"""How little is known of the bias: a gyro of a robot's IMU repeats within 0.5 degrees a second from start to
-start (Xsens, Bias repeatability of gyroscopes, knowledge base), 0.3 as a standard deviation."""
-
+#: T: times q it is what the wheels of a straight drive on firm ground are worth, 0.03 rad/s a root second.
 FOLLOWS_S = 0.055
-"""T: times q it is what the wheels of a straight drive on firm ground are worth, 0.03 rad/s a root second."""
-
+#: e_0: more than the gyro's noise, less than the yaw rates that bumps and ruts cause.
 DISAGREEMENT_RADPS = 0.02
-"""e_0: more than the gyro's noise, less than the yaw rates that bumps and ruts cause."""
-
-SLIP_TURN_RADPS = 0.15
-"""w_0: where slip makes the wheels half as good as when driving straight."""
+SLIP_TURN_RADPS = 0.15  #: w_0: where slip makes the wheels half as good as when driving straight.
 
 _STATES = (
     *("position_x_m", "position_y_m", "yaw_rad", "speed_mps", "yaw_rate_radps"),
     *("effective_track_m", "gyro_bias_radps", "wheel_difference_mps"),
 )
+#: Rows of the table that the filter takes beside that of rest.
 WHEELS_AND_GYRO = (*SIDE_ROWS, "gyro_z_radps")
-"""Rows of the table that the filter takes beside that of rest."""
 
 _ROWS = (*WHEELS_AND_GYRO, REST_ROW)
 _X, _Y, _YAW, _V, _W, _TRACK, _BIAS, _DIFFERENCE = range(8)
@@ -154,10 +147,7 @@ def within_bounds(mean: Array, track_m: float) -> Array:
 def make_skid_filter(robot: Robot) -> FilterModel:
     """Return the filter of a skid-steer robot; the effective track starts as the described one, hardly known.
 
-    Raises
-    ------
-    ConfigError
-        where the robot is of another kind.
+    ``ConfigError`` where the robot is of another kind.
 
     Examples
     --------
@@ -192,29 +182,19 @@ def skid_noise(robot: Robot) -> Noise:
     return Noise(walk_std**2, np.array([0.06, 0.06, 0.01, 0.002]) ** 2, model.initial_std**2)
 
 
+#: Time constant of the means: longer than a wheel's measurement is late (0.3 s), shorter than a turn.
 MEAN_S = 1.0
-"""Time constant of the means: longer than a wheel's measurement is late (0.3 s), shorter than a turn."""
-
+#: A robot that turns with less than a tenth of D / B_0: firm ground and ice have 0.5 to 0.7, snow 0.3.
 STUCK_RATIO = 0.1
-"""A robot that turns with less than a tenth of D / B_0: firm ground and ice have 0.5 to 0.7, snow 0.3."""
-
+#: A turn has to have failed for so long: clocks of two loggers may be 1.3 s apart (BorealTC, SNOW_14).
 STUCK_AFTER_S = 2.0
-"""A turn has to have failed for so long: clocks of two loggers may be 1.3 s apart (BorealTC, SNOW_14)."""
-
+#: Wheels that would turn the robot slower show nothing: a tenth of it is a gyro's bias.
 LEAST_TURN_RADPS = 0.1
-"""Wheels that would turn the robot slower show nothing: a tenth of it is a gyro's bias."""
-
+#: A robot that turns faster moves, whatever its wheels do: what is left of a bias is not so large.
 MOVING_RADPS = 0.03
-"""A robot that turns faster moves, whatever its wheels do: what is left of a bias is not so large."""
-
-OPPOSED_RATIO = 0.25
-"""Largest mean of the sides over their difference of wheels that turn on the spot."""
-
-FASTEST_MPS = 50.0
-"""A wheel that is read as faster is not read."""
-
-UNKNOWN_AFTER_S = 0.5
-"""Without wheels or gyro for longer, nothing is known."""
+OPPOSED_RATIO = 0.25  #: Largest mean of the sides over their difference of wheels that turn on the spot.
+FASTEST_MPS = 50.0  #: A wheel that is read as faster is not read.
+UNKNOWN_AFTER_S = 0.5  #: Without wheels or gyro for longer, nothing is known.
 
 
 class Motion(IntEnum):
@@ -234,12 +214,12 @@ class StuckInterval:
     end_s: float
 
 
+#: Memory of :func:`motion_at`: stamp of the last measurement; the means; since when a turn has failed, the wheels
+#: have stood, and the means are taken; since when the robot is stuck, NaN where it is not; and its :class:`Motion`.
 MOTION = record(
     numbers("last_s mean_mps difference_mps turn_radps failing_s standing_s start_s stuck_since_s")
     | {"status": int}
 )
-"""Memory of :func:`motion_at`: stamp of the last measurement; the means; since when a turn has failed, the wheels have
-stood, and the means are taken; since when the robot is stuck, NaN where it is not; and its :class:`Motion`."""
 
 
 def motion_memory() -> Array:
@@ -312,14 +292,7 @@ def motion_at(
 def motion_track(
     time_s: Array, wheels_and_gyro: Array, yaw_rate_radps: Array, bias_std_radps: Array, track_m: float
 ) -> Array:
-    """Return the :class:`Motion` (n,) of a whole log: :func:`motion_at`, looped.
-
-    Parameters
-    ----------
-    time_s : (n,) stamps of the wheels
-    wheels_and_gyro : (n, 3) left and right speed and gyro, NaN where there is none
-    yaw_rate_radps, bias_std_radps : (n,) of the filter
-    track_m : the described track
+    """Return the :class:`Motion` (n,) of a log: :func:`motion_at`, looped over left and right speed and gyro (n, 3).
 
     Examples
     --------
@@ -342,12 +315,7 @@ def motion_track(
 
 
 def stuck_intervals(time_s: Array, motion: Array) -> tuple[StuckInterval, ...]:
-    """Return the times in which a robot was stuck, from when it became so, :data:`STUCK_AFTER_S` before it is known.
-
-    Parameters
-    ----------
-    time_s, motion : (n,) as of :func:`motion_track`
-    """
+    """Return the times in which a robot was stuck, from when it became so, :data:`STUCK_AFTER_S` before it is known."""
     stuck = np.concatenate([[False], motion == Motion.STUCK, [False]])
     first, after = np.flatnonzero(stuck[1:] & ~stuck[:-1]), np.flatnonzero(stuck[:-1] & ~stuck[1:])
     begins = np.maximum(time_s[first] - STUCK_AFTER_S, time_s[:1])

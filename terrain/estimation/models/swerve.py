@@ -76,14 +76,9 @@ from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.records import Array
 from terrain.robots import Robot, SwerveRobot, as_drive
 
-LARGEST_SLIP_RATIO = 0.95
-"""slip14's wheel row has a pole at 1: it is evaluated no nearer."""
-
-UNKNOWN_MPS2 = 1.4
-"""Vibration where it is not known: that of rough ground."""
-
-NO_SLIP, SLIP_RATIO, SLIP_SPEED = 0.0, 1.0, 2.0
-"""What a model has as slip of a wheel."""
+LARGEST_SLIP_RATIO = 0.95  #: slip14's wheel row has a pole at 1: it is evaluated no nearer.
+UNKNOWN_MPS2 = 1.4  #: Vibration where it is not known: that of rough ground.
+NO_SLIP, SLIP_RATIO, SLIP_SPEED = 0.0, 1.0, 2.0  #: What a model has as slip of a wheel.
 
 _WHEELS = ("1", "2", "3")
 _FADING_PER_S = 3.0  # of the acceleration of vio15: a third of a second, shorter than a start and a stop
@@ -115,8 +110,7 @@ _LAYOUTS = {
     "vio15": _Layout(_WITH_SLIP_SPEED, SLIP_SPEED, True),
 }
 
-FILTERS = tuple(_LAYOUTS)
-"""Names of the filters."""
+FILTERS = tuple(_LAYOUTS)  #: Names of the filters.
 
 _REST_ROWS = DERIVED_ROWS[-3:]
 _ROWS = (
