@@ -795,7 +795,7 @@ class Filter:
         return {name: (float(self.mean[i]), math.sqrt(float(self.cov[i, i]))) for name, i in places.items()}
 
     def begin_from(self, known: Mapping[str, tuple[float, float]], age_s: float) -> None:
-        """Start from what was known of states by name, mean and standard deviation, a time ago; ``DataError`` if it runs.
+        """Start from what was known of states, mean and standard deviation, a time ago; ``DataError`` if it runs.
 
         Each walks for that time; none is believed less than without it, and what the filter does not have is left out.
         """
