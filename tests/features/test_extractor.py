@@ -6,11 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
-from skops import io
 
 from features.extractor import (
-    LEFT_OUT,
-    LEVEL_STATISTICS,
     MIN_WHEEL_DIFFERENCE_MPS,
     FeatureExtractor,
     SampleExtractor,
@@ -87,28 +84,6 @@ def test_a_set_switched_off_takes_away_exactly_the_features_it_is_part_of(off):
     np.testing.assert_array_equal(part.transform(windows), whole.transform(windows)[:, kept])
 
 
-def test_levels_that_are_no_terrain_are_left_out_by_default():
-    windows = draw_windows()
-
-    def levels(extractor):
-        return {
-            f.name for f in extractor.fit(windows).features_ if f.name.rpartition(".")[2] in LEVEL_STATISTICS
-        }
-
-    by_default, all_levels = levels(FeatureExtractor()), levels(FeatureExtractor(level_sets=SIGNAL_SETS))
-    assert all_levels - by_default == {
-        f"{stream}.{channel}.{statistic}"
-        for stream, channel in [
-            *(("wheels", f"speed_{side}") for side in ("left", "right")),
-            ("estimator", "speed_x"),
-            *(("imu", name.rpartition("_")[0]) for name in CHANNELS["imu"]),
-            *(("imu", name) for name in ("gyro_norm", "accel_norm")),
-        ]
-        for statistic in LEFT_OUT["imu" if stream == "imu" else "wheels"]
-    }
-    assert by_default < all_levels
-
-
 def test_one_by_one_is_all_at_once_and_the_order_of_channels_is_no_matter():
     windows = draw_windows(10)
     extractor = FeatureExtractor().fit(windows)
@@ -178,48 +153,11 @@ def test_windows_of_another_kind_are_refused():
             extractor.transform(other)
 
 
-@pytest.mark.parametrize(
-    ("first_hz", "second_hz"), [(99.97, 100.02), (100.02, 99.97), (98.0, 101.5), (101.5, 98.0)]
-)
-def test_windows_cut_from_two_sets_of_runs_fit_each_other(first_hz, second_hz):
-    def cut(rate_hz, seed):
-        time_s = np.arange(0.0, 40.0, 1 / rate_hz)
-        noise = np.random.default_rng(seed).standard_normal((len(time_s), 1))
-        run = RunLog("a", "husky", {"imu": Stream(time_s, noise, ("accel_z_mps2",))}, ((0.0, 40.0, "ice"),))
-        return cut_windows([run], WindowRule(steady=None)).windows
-
-    first, second = cut(first_hz, 0), cut(second_hz, 1)
-    extractor = FeatureExtractor().fit(first)
-    other = extractor.transform(second)
-    if abs(first_hz / second_hz - 1) < 1e-3:  # a nominal rate gives one number of samples
-        assert first.values["imu"].shape[2] == second.values["imu"].shape[2] == 200
-    names = extractor.get_feature_names_out().tolist()
-    own = FeatureExtractor().fit(second).transform(second)
-    spread = own[:, names.index("imu.accel_z.std [m/s^2]")]
-    np.testing.assert_allclose(other[:, names.index("imu.accel_z.std [m/s^2]")], spread, rtol=0.05)
-
-
 def test_a_set_that_is_unknown_or_has_no_channel_is_refused():
     with pytest.raises(ConfigError, match="unknown signal set 'lidar'; there are imu, wheels, currents"):
         FeatureExtractor(["imu", "lidar"]).fit(draw_windows())
     with pytest.raises(DataError, match="hold no channel of the signal sets slip"):
         FeatureExtractor(["slip"]).fit(draw_windows(streams=("imu", "wheels")))
-
-
-def test_a_trained_model_is_stored_without_pickle():
-    windows = draw_windows()
-    extractor = FeatureExtractor().fit(windows)
-    stored = io.dumps(extractor)
-    unknown = io.get_untrusted_types(data=stored)
-    assert set(unknown) <= {
-        "builtins.frozenset",
-        "features.extractor.Feature",
-        "features.extractor.FeatureExtractor",
-        "features.windows.Layout",
-    }
-    loaded = io.loads(stored, trusted=unknown)
-    np.testing.assert_array_equal(loaded.transform(windows), extractor.transform(windows))
-    assert loaded.get_feature_names_out().tolist() == extractor.get_feature_names_out().tolist()
 
 
 IMU, WHEELS = CHANNELS["imu"], CHANNELS["wheels"]
@@ -229,16 +167,6 @@ def by_name(imu, wheels, wheel_channels=WHEELS):
     features, table = speed_features({"imu": imu, "wheels": wheels}, {"imu": IMU, "wheels": wheel_channels})
     assert table.shape == (len(imu), len(features))
     return dict(zip([feature.name for feature in features], table.T, strict=True))
-
-
-def test_speed_features_exclude_estimated_signals():
-    values = {"imu": np.ones((2, 6, 50)), "estimator": np.ones((2, 2, 50))}
-    channels = {"imu": IMU, "estimator": ("speed_x_mps", "accel_x_mps2")}
-    assert speed_features(values, channels)[0] == []  # an estimated speed is none of the wheels'
-    values["wheels"], channels["wheels"] = np.ones((2, 4, 13)), WHEELS
-    names = [feature.name for feature in speed_features(values, channels)[0]]
-    assert any(name.startswith("imu.accel_x") for name in names)
-    assert not any(name.startswith("estimator") for name in names)
 
 
 def turning_windows(track_m, n_windows=30, noise_radps=0.02, seed=0):
@@ -300,19 +228,6 @@ def test_norms_do_not_see_how_the_sensor_is_mounted(seed):
     assert names == ("gyro_norm_radps", "accel_norm_mps2")
     np.testing.assert_allclose(turned, there, rtol=1e-10)
     assert there[1, 1, 7] == pytest.approx(np.linalg.norm(imu[1, 3:, 7]))
-
-
-def test_total_and_difference_of_currents():
-    current = np.random.default_rng(0).standard_normal((3, 2, 10))
-    channels = ("current_right_a", "current_left_a")
-    derived, names = derived_channels(current, channels)
-    assert names == ("current_total_a", "current_difference_a")
-    np.testing.assert_allclose(
-        derived, np.stack([current.sum(axis=1), current[:, 0] - current[:, 1]], axis=1)
-    )
-    four = np.random.default_rng(0).standard_normal((3, 4, 10))
-    derived, _ = derived_channels(four, tuple(f"current_{i}_a" for i in range(4)))
-    np.testing.assert_allclose(derived[:, 1], four.max(axis=1) - four.min(axis=1))
 
 
 def test_each_column_is_a_sample_of_its_channel_after_the_features():

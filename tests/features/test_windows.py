@@ -8,7 +8,6 @@ from features.windows import (
     RATE_SLACK,
     SteadyMotion,
     WindowRule,
-    cut_at,
     cut_windows,
     label_windows,
     layout_of,
@@ -145,14 +144,6 @@ def test_regular_starts_are_all_that_fit(start_s, n, length_s, step_s):
     assert following_s + length_s > end_s - 1e-6
 
 
-def test_chosen_starts_replace_the_regular_ones_and_incomplete_windows_vanish_uncounted():
-    run = make_run()
-    cut = cut_windows([run], ANY_MOTION, starts_s={"a": np.array([0.25, 3.0, 6.5])})
-    assert cut.windows.start_s.tolist() == [0.25, 3.0]
-    assert cut.dropped == {}
-    assert cut_at(run.streams, np.array([6.5]), ANY_MOTION, layout_of([run]))[1].tolist() == ["incomplete"]
-
-
 @pytest.mark.parametrize("name", ["length_s", "stride_s", "max_gap_periods"])
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_a_rule_refuses_what_is_not_positive(name, value):
@@ -180,12 +171,3 @@ def test_runs_that_do_not_fit_together_are_refused_by_name():
         cut_windows([RunLog("a", "husky", {"imu": imu})])
     with pytest.raises(DataError, match="there is no run"):
         layout_of([])
-
-
-def test_short_runs_can_be_skipped_and_are_counted():
-    cut = cut_windows([make_run("a"), make_run("b", duration_s=1.0)], skip_short=True)
-    assert cut.dropped == {"run too short": 1}
-    assert set(cut.windows.run_id) == {"a"}
-    nothing = cut_windows([make_run("b", duration_s=1.0)], skip_short=True).windows
-    assert len(nothing) == 0
-    assert nothing.values["imu"].shape == (0, 1, 100)

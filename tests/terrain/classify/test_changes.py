@@ -9,16 +9,13 @@ from terrain.classify.changes import (
     BLOCK_S,
     SHIFT_LEAST,
     blocks_of,
-    breakaways,
     calibrate,
     change_points,
     changes_of,
     partition,
     stretches,
 )
-from terrain.classify.held_out import HeldOut
 from terrain.errors import DataError
-from terrain.records import Windows
 
 
 def cost(z, ends, penalty):
@@ -94,15 +91,6 @@ def test_windows_beside_a_pause_are_no_stretch_and_nothing_is_found_in_nothing()
     paused = START_S + 60.0 * (np.arange(30) >= 15)
     assert of_run(probability, paused) == []
     assert of_run(np.empty((0, 2)), np.empty(0)) == []
-
-
-def test_run_and_both_terrains_are_named():
-    probability = np.repeat([[0.9, 0.1], [0.1, 0.9], [0.9, 0.1]], [13, 4, 13], axis=0)
-    terrain, run_id = np.full(30, "ice"), np.full(30, "a", dtype=object)
-    windows = Windows({}, {}, {}, 2.0, START_S, run_id, terrain)
-    (found,) = breakaways(HeldOut.of_model(np.array(["ice", "snow"]), probability, terrain), windows)
-    assert (found.run_id, found.label, found.looks_like) == ("a", "ice", "snow")
-    assert (found.start_s, found.end_s) == (26.0, 34.0)
 
 
 def log_of(rng, change_s=None, step=0.2, length_s=15.0, speed=0.1):

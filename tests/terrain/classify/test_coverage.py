@@ -92,14 +92,6 @@ def test_the_terrain_that_was_driven_once_at_a_speed_is_asked_for_first():
     assert never["windows_ratio"] == pytest.approx(20 / len(one.run_id))
 
 
-def test_rows_count_every_window_once_and_name_what_was_never_driven():
-    one = evaluated([*RUNS, ("ice", 1.5)])
-    rows = one.coverage().support
-    assert sum(row.windows for row in rows) == len(one.run_id)
-    missing = [row.as_json() for row in rows if row.windows == 0]
-    assert [(row["class"], row["n_runs"], row["accuracy"]) for row in missing] == [("mud", 0, None)]
-
-
 @pytest.mark.parametrize("law", [(0.05, 0.7, 1.0), (0.0, 0.9, 0.5)])
 def test_a_hidden_law_is_found(law):
     rng = np.random.default_rng(1)
@@ -156,16 +148,6 @@ def test_levels_and_marks_divide_windows_and_errors(seed):
         for part in parts:
             low, high = part.windows_ratio_ci
             assert low <= high
-
-
-def test_a_part_without_windows_has_no_accuracy_and_no_errors_have_no_ratio():
-    ones = np.ones((1, 6), dtype=int)
-    held_out = HeldOutSupport(ones > 0, 9 * ones, 9 * ones, 0.9 * ones, ones > 0)
-    run_id, terrain = np.array(list("aabbcc")), np.full(6, "ice")
-    _, without, supported, auc = support_accuracy(held_out, run_id, terrain, np.random.default_rng(0))
-    assert without == (0.0, (0.0, 0.0), None, None, None, None)
-    assert supported.accuracy == 1.0
-    assert auc is None
 
 
 @pytest.mark.parametrize("speeds", [(0.2, 0.4, 0.6, 0.8), (0.24, 0.39, 0.63, 0.79), (0.5,), (0.3, 2.0)])

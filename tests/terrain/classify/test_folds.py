@@ -3,7 +3,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrain.classify.folds import block_groups, fold_numbers, hold_out_runs, single_run_classes, split_runs
+from terrain.classify.folds import (
+    block_groups,
+    fold_numbers,
+    hold_out_runs,
+    inner_splits,
+    single_run_classes,
+    split_runs,
+)
 from terrain.errors import DataError
 
 
@@ -98,3 +105,18 @@ def test_enough_is_left_of_every_terrain(make_run, counts, held_out):
     training, out = hold_out_runs(runs)
     assert [each.run_id for each in out] == held_out
     assert sorted(each.run_id for each in (*training, *out)) == sorted(each.run_id for each in runs)
+
+
+@pytest.mark.parametrize("lacking", [False, True])
+def test_inner_folds_keep_runs_whole_and_leave_out_what_shares_samples_with_a_test_block(lacking):
+    y = np.repeat(["ice", "snow"], 60)
+    groups = np.where(y == "ice", "only", np.repeat([f"r{i}" for i in range(12)], 10))
+    splits = list(inner_splits(y, groups, 3, 0, 4, lacking=lacking))
+    assert len(splits) == 3
+    for train, test in splits:
+        assert set(groups[train]) & set(groups[test]) == {"only"}
+        assert np.abs(train[train < 60][:, None] - test[test < 60]).min() == 5
+    short = np.r_[0:4, 60:120]  # the gap beside each block leaves out all of its class
+    assert list(inner_splits(y[short], groups[short], 3, 0, 4, lacking=lacking)) == []
+    with pytest.raises(DataError, match="too few to hold some of them out"):
+        list(inner_splits(y[:61], groups[:61], 3, 0))

@@ -9,7 +9,6 @@ from terrain.classify.held_out import (
     Applicability,
     drawn_folds,
     left_out_folds,
-    run_speeds,
     slow_fast_split,
 )
 from terrain.errors import DataError
@@ -80,15 +79,6 @@ def windows_of(plan, duration_s=32.0, stride_s=2.0):
             for start_s in np.arange(0.0, duration_s - 1.9, stride_s):
                 rows.append((speed + 0.005 * rng.normal(size=20), f"{terrain}_{i}", terrain, start_s))
     return [np.array(column) for column in zip(*rows, strict=True)]
-
-
-def test_the_speed_of_a_run_is_that_where_it_moves():
-    fastest = np.vstack(
-        [np.full((6, 20), 0.01), np.full((4, 20), 0.6), np.zeros((3, 20)), np.full((1, 20), np.nan)]
-    )
-    speeds = run_speeds(fastest, np.repeat(["creeps", "rests", "unknown"], [10, 3, 1]))
-    assert speeds.pop("creeps") == 0.6
-    assert np.isnan(list(speeds.values())).all()
 
 
 def test_each_class_is_split_at_its_own_median_speed():

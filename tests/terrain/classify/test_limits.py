@@ -19,7 +19,6 @@ from terrain.classify.limits import (
     YAW_STEP_RADPS,
     check_novelty,
     check_support,
-    conformal_sets,
     conformal_threshold,
     largest_margin,
     learn_novelty,
@@ -59,15 +58,6 @@ def test_a_terrain_that_was_hidden_is_found_and_held_out_runs_of_known_ones_are_
     kept = 1.0 - is_unknown(fitted, known).mean()
     assert abs(kept - KNOWN_KEPT) < 0.04  # 60 runs whose windows are alike: 3 x sqrt(0.05 x 0.95 / 300)
     assert fitted.score(hidden).mean() > fitted.score(known).mean() + 2.0
-
-
-def test_the_score_of_a_window_does_not_depend_on_the_others_nor_on_the_order_of_runs(fitted):
-    X, y, runs = draw((0, 1, 2))
-    scores = fitted.score(X)
-    np.testing.assert_allclose(fitted.score(X[::-1]), scores[::-1], rtol=1e-9)
-    np.testing.assert_allclose(fitted.score(X[7:8]), scores[7:8], rtol=1e-9)
-    again = learn_novelty(X, y, runs, seed=1)
-    assert all(np.array_equal(a, b) for a, b in zip(again, fitted, strict=True))
 
 
 def test_terms_agree_with_their_equations(fitted):
@@ -166,11 +156,6 @@ def test_the_table_counts_the_runs_that_are_near(seed):
     np.testing.assert_array_equal(table.near_runs(speed, yaw), counted(training, speed, yaw))
 
 
-def test_what_is_faster_than_any_cell_is_still_counted():
-    table = learn_support(np.array([1e6]), np.array([1e3]), np.array(["mud"]), np.array(["a"]), CLASSES)
-    assert table.near_runs(np.array([30.0]), np.array([50.0])).tolist() == [[0, 1, 0]]
-
-
 @pytest.mark.parametrize(
     "changed",
     [
@@ -220,17 +205,6 @@ def test_runs_weigh_alike_however_long():
     runs = np.concatenate([np.zeros(1000), np.arange(1, 20)])
     assert conformal_threshold(scores, runs, 0.9) == 0.1  # one run in twenty
     assert conformal_threshold(scores, np.arange(1019), 0.9) == 0.9
-
-
-def test_sets_grow_with_the_threshold_and_hold_the_most_probable_class():
-    probability = np.random.default_rng(0).dirichlet(np.ones(4), 50)
-    before = conformal_sets(probability, 0.0)
-    assert (before.sum(axis=1) == 1).all()
-    for threshold in (0.3, 0.6, 0.9, 1.0):
-        now = conformal_sets(probability, threshold)
-        assert (now | before == now).all()
-        before = now
-    assert before.all()
 
 
 def test_few_runs_and_no_scores():

@@ -10,22 +10,17 @@ from terrain.classify import metrics
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import FoldResult, HeldOut, Scored
 from terrain.classify.metrics import (
-    CALIBRATION_BINS,
     STRIDE_S,
     ClassFigures,
     Outcome,
     Verdict,
     accuracy_at_coverage,
-    calibration_error,
     class_figures,
     compare_outcomes,
     confidence_auc,
-    confidence_figures,
     enough_runs,
     held_out_figures,
     last_class,
-    learning_curve,
-    reliability_bins,
     run_bootstrap,
     sequence_figures,
     track_of,
@@ -53,29 +48,6 @@ def test_class_figures_agree_with_scikit_learn_and_a_class_without_windows_does_
     few = class_figures(y, np.array(["ice", "snow", "mud", "mud"]), np.array(["ice", "mud", "snow"]))
     assert few["balanced_accuracy"] == pytest.approx((0.5 + 1.0) / 2)
     assert few["per_class"]["snow"] == ClassFigures(0.0, 0.0, 0.0, 0)
-
-
-def ballots(*votes):
-    """Return probabilities of three classes in which ``a``, ``b`` or ``c`` gets that probability."""
-    probability = np.array([[(1 - p) / 2] * 3 for _, p in votes])
-    for row, (name, p) in zip(probability, votes, strict=True):
-        row["abc".index(name)] = p
-    return probability
-
-
-def test_a_vote_counts_the_windows_of_the_last_five_seconds():
-    votes = [("a", 0.9), ("b", 0.5), ("b", 0.5), ("b", 0.5), ("a", 0.9), ("a", 0.9), ("a", 0.9)]
-    voted, sizes = vote(ballots(*votes), np.zeros(7), np.arange(7.0), 1.0)
-    # At the end of window 4 the last 5 s hold a b b b a; of window 5: b b b a a; of window 6: b b a a a.
-    assert "".join("abc"[i] for i in voted) == "aabbbba"
-    assert sizes.tolist() == [1, 2, 3, 4, 5, 5, 5]
-    # Windows of 2 s: only two lie wholly within 5 s; of one each the more probable wins, in either order.
-    pairs = [("a", 0.9), ("b", 0.5), ("a", 0.6), ("c", 0.8)]
-    assert vote(ballots(*pairs), np.zeros(4), 2.0 * np.arange(4), 2.0)[0].tolist() == [0, 0, 0, 2]
-    # A pause of the log does not stretch the five seconds, and a window longer than that votes alone.
-    late = np.array([0.0, 1.0, 2.0, 30.0])
-    assert vote(ballots(("a", 0.9), ("a", 0.9), ("a", 0.9), ("b", 0.5)), np.zeros(4), late, 1.0)[0][-1] == 1
-    assert vote(ballots(*votes), np.zeros(7), np.arange(7.0), 6.0)[0].tolist() == [0, 1, 1, 1, 0, 0, 0]
 
 
 def test_votes_agree_with_a_slow_count_and_never_cross_segments():
@@ -183,30 +155,6 @@ def once(n):
     return np.ones((1, n))
 
 
-def ece(confidence, right, n_bins=CALIBRATION_BINS):
-    return calibration_error(confidence, right.astype(float), once(len(right)), n_bins)[0]
-
-
-def test_calibration_bins_are_of_equal_mass_whatever_the_order():
-    rng = np.random.default_rng(1)
-    confidence = rng.beta(8, 1, 1003)  # crowded near 1: bins of equal width would be empty
-    right = rng.random(1003) < confidence**2
-    table = reliability_bins(confidence[None], right[None], once(1003), CALIBRATION_BINS)
-    counts = [row.n_windows for row in table]
-    assert len(table) == CALIBRATION_BINS
-    assert sum(counts) == 1003
-    assert max(counts) - min(counts) <= 1
-    assert np.all(np.diff([row.confidence for row in table]) > 0)
-    expected = (
-        sum(n * abs(row.accuracy - row.confidence) for n, row in zip(counts, table, strict=True)) / 1003
-    )
-    assert ece(confidence, right) == pytest.approx(expected)
-    shuffled = rng.permutation(1003)
-    assert ece(confidence[shuffled], right[shuffled]) == pytest.approx(expected)
-    few = reliability_bins(confidence[None, :4], right[None, :4], once(4), CALIBRATION_BINS)
-    assert [row.n_windows for row in few] == [1] * 4
-
-
 def test_the_area_is_that_of_scikit_learn_with_ties_and_with_weights():
     rng = np.random.default_rng(2)
     confidence = rng.integers(5, 11, 300) / 10  # many ties
@@ -228,17 +176,6 @@ def test_a_weight_is_as_good_as_a_copy():
         copied = accuracy_at_coverage(confidence[rows], right[rows], once(len(rows)), coverage)[0]
         assert weighted == pytest.approx(copied)
     assert accuracy_at_coverage(confidence, right, once(200), 1.0)[0] == pytest.approx(right.mean())
-
-
-def test_where_all_are_right_the_area_is_not_known():
-    runs = np.arange(40) // 10
-    found = confidence_figures(
-        np.full((2, 40), 0.9), np.ones((2, 40), dtype=bool), runs, np.zeros(40), np.random.default_rng(0)
-    )
-    assert np.isnan(found["confidence_auc"])
-    assert np.isnan(found["confidence_auc_ci"]).all()
-    assert found["accuracy_at_coverage"][0].accuracy == 1.0
-    assert found["ece"] == pytest.approx(0.1)
 
 
 def outcomes(gain, seed, n_runs=24, n_windows=25, run_std=0.2):
@@ -292,16 +229,6 @@ def test_figures_are_those_of_counting():
     assert by_run["7"] == pytest.approx(a.correct[:, a.run_id == "7"].mean())
     per_class = [np.mean([row.b for row in found.by_run if row.terrain == name]) for name in ("ice", "mud")]
     assert found.macro_run_accuracy.b == pytest.approx(np.mean(per_class))
-
-
-def test_one_run_gives_no_interval():
-    a, b = outcomes(0.5, 2)
-    alone = [each._replace(terrain=np.where(each.run_id == "3", "sand", each.terrain)) for each in (a, b)]
-    row = compare_outcomes(*alone, np.random.default_rng(0)).by_class["sand"]
-    assert row.n_runs == 1
-    assert row.difference > 0
-    assert np.isnan(row.interval).all()
-    assert row.verdict is Verdict.NOT_DISTINGUISHED
 
 
 def test_windows_may_differ_but_runs_may_not():
@@ -392,10 +319,3 @@ def test_a_curve_that_still_climbs_gives_no_number():
     few = enough_runs(m[:3], m[:3] / 4)
     assert few == (None, "3 sizes are too few to estimate how many runs are enough")
     assert enough_runs(m, np.full(4, 0.8))[0] == 1
-
-
-def test_a_learning_curve_has_the_mean_and_the_spread_of_its_draws():
-    curve = learning_curve(np.array([1.0, 2.0, 3.0, 4.0]), [0.4, 0.6, 0.6, 0.8, 0.7, 0.7], 0.77)
-    assert curve.accuracy == pytest.approx((0.5, 0.7, 0.7, 0.77))
-    assert curve.accuracy_spread[:-1] == pytest.approx((0.02**0.5, 0.02**0.5, 0.0))
-    assert curve.accuracy_spread[-1] is None

@@ -16,7 +16,6 @@ from terrain.classify.network import (
     Training,
     augmented,
     check_network,
-    fill_of,
     fit_temperature,
     log_probabilities,
     log_softmax,
@@ -116,28 +115,6 @@ def test_out_of_fold_probabilities_are_of_members_that_did_not_see_the_run(fitte
     of_truth = model.inner_probability_[np.arange(len(truth)), truth]
     assert of_truth.mean() < 0.45  # chance is 0.33: nothing of the held-out run is known
     assert np.mean(fitted.classes_[held_out.argmax(axis=1)] == y) > 0.8
-
-
-def test_missing_samples_are_taken_for_the_mean_of_their_channel(fitted):
-    X, _, _ = draw_windows(seed=3)
-    damaged = X.copy()
-    damaged[:, 100:] = np.nan
-    filled = X.copy()
-    filled[:, 100:] = fill_of(COLUMNS, draw_windows()[0])[100:]
-    assert np.array_equal(fitted.predict_proba(damaged), fitted.predict_proba(filled))
-    X_train, y, run = draw_windows()
-    X_train[:, 100:] = np.nan  # never measured
-    assert np.isfinite(quick(epochs=1).fit(X_train, y, run).predict_proba(X_train)).all()
-
-
-def test_a_variation_is_kept_only_where_held_out_runs_are_more_likely_under_it():
-    X, y, run = draw_windows()
-    model = quick(trial_epochs=2).fit(X, y, run)
-    losses = {each.augmentation: each.loss for each in model.trials_}
-    assert {Augmentation(), Augmentation(shift=True), Augmentation(dropout=True)} <= losses.keys()
-    assert Augmentation(mirror=True) in losses  # all channels have a mirror image
-    chosen = Augmentation(*model.best_[:4])
-    assert losses[chosen] == min(losses.values())
 
 
 @pytest.mark.parametrize(

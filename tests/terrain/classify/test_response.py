@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 
-from terrain.classify.response import GroupedResponse, ResponseColumns, fit_process, left_out, log_density
+from terrain.classify.response import GroupedResponse, ResponseColumns, fit_process, left_out
 from terrain.errors import DataError
 
 WHEELS = np.radians([150.0, 270.0, 390.0])
@@ -106,11 +106,3 @@ def test_data_that_cannot_answer_are_refused():
     X[y == "carpet", 4] = np.nan
     with pytest.raises(DataError, match="no window of class 'carpet'"):
         GroupedResponse(COLUMNS).fit(X, y, groups=groups)
-
-
-def test_the_density_of_known_responses_is_that_of_their_part_of_the_covariance():
-    covariance = np.array([[2.0, 0.6], [0.6, 1.0]])
-    apart = np.array([[1.0, np.nan], [np.nan, 1.0]])
-    found = log_density(apart, covariance)
-    alone = [log_density(np.array([[1.0]]), covariance[i : i + 1, i : i + 1])[0] for i in range(2)]
-    np.testing.assert_allclose(found, alone)

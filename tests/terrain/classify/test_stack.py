@@ -44,14 +44,6 @@ def test_the_one_that_knows_has_the_weight_and_is_chosen(informed, weight):
     assert np.mean(best.predict(test) == truth) > 0.9
 
 
-def test_what_does_not_help_is_not_kept():
-    best = quick(choose=True).fit(*draw("features"))
-    assert best.best_.used == "svm"
-    assert best.network_ is None
-    X = draw("features", seed=2)[0]
-    assert np.array_equal(best.predict_proba(X), best.svm_.predict_proba(X[:, :N_FEATURES]))
-
-
 def test_weights_are_those_of_a_search_over_a_grid():
     rng = np.random.default_rng(0)
     truth = rng.integers(3, size=300)

@@ -5,7 +5,6 @@ import pytest
 from scipy.special import expit
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from terrain.classify import folds, grouped, svm
 from terrain.classify.svm import CANDIDATES, GroupedSVC, class_probabilities, fit_scale, pairs_of
 from terrain.errors import DataError
 
@@ -33,21 +32,6 @@ def test_probabilities_are_those_of_the_plain_form(k):
     np.testing.assert_allclose(found, coupled_plainly(margins, k, 1.7), atol=1e-10)
     np.testing.assert_allclose(found.sum(axis=1), 1.0)
     assert (found >= 0).all()
-
-
-def test_consistent_pairs_give_back_the_probabilities_that_they_are_made_of():
-    p = np.random.default_rng(0).dirichlet(np.ones(5), 40)
-    margins = np.column_stack([np.log(p[:, a] / p[:, b]) for a, b in pairs_of(5)])
-    np.testing.assert_allclose(class_probabilities(margins, 5, 1.0), p, atol=1e-6)
-
-
-def test_extreme_margins_give_finite_probabilities():
-    margins = np.array([[800.0, 800.0, -800.0], [-800.0, 800.0, 800.0], [1e300, -1e300, 0.0]])
-    found = class_probabilities(margins, 3, 50.0)
-    assert np.isfinite(found).all()
-    np.testing.assert_allclose(found.sum(axis=1), 1.0)
-    assert found[0].argmax() == 0
-    assert found[0, 0] > 0.999
 
 
 def test_a_hidden_scale_is_recovered_from_several_classes():
@@ -98,22 +82,6 @@ def test_contract_of_scikit_learn(estimator, check):
     check(estimator)
 
 
-@pytest.mark.parametrize("terrains", [["ice", "snow"], ["ice", "sand", "snow"]])
-def test_probabilities_sum_to_one_and_agree_with_the_prediction(terrains):
-    X, y, runs = draw_runs()
-    kept = np.isin(y, terrains)
-    model = GroupedSVC().fit(X[kept], y[kept], groups=runs[kept])
-    new, truth, _ = draw_runs(seed=1)
-    probability = model.predict_proba(new)
-    assert model.classes_.tolist() == terrains
-    assert probability.shape == (len(new), len(terrains))
-    np.testing.assert_allclose(probability.sum(axis=1), 1.0)
-    assert (probability > 0).all()
-    np.testing.assert_array_equal(model.classes_[probability.argmax(axis=1)], model.predict(new))
-    known = np.isin(truth, terrains)
-    assert np.mean(model.predict(new)[known] == truth[known]) > 0.85
-
-
 def test_the_choice_is_the_best_held_out_candidate_and_costs_few_fits():
     X, y, runs = draw_runs()
     model = GroupedSVC().fit(X, y, groups=runs)
@@ -123,34 +91,6 @@ def test_the_choice_is_the_best_held_out_candidate_and_costs_few_fits():
     hopeless = (1e-6, 1e-6, 100.0)
     for candidates in ([hopeless, CANDIDATES[3]], [CANDIDATES[3], hopeless]):
         assert GroupedSVC(candidates).fit(X, y, groups=runs).best_ == CANDIDATES[3]
-
-
-def test_inner_folds_never_split_a_run(monkeypatch):
-    X, y, runs = draw_runs(n_runs=5)
-    X[:, 0] = runs
-    fitted, held_out = [], []
-    fit, prepare = svm.fit_preparation, grouped.Preparation.of
-
-    def seen(X):
-        return set(X[:, 0].astype(int))
-
-    def spied_fit(X, y, percentile):
-        fitted.append(seen(X))
-        return fit(X, y, percentile)
-
-    def spied_preparation(self, X):
-        if seen(X) != fitted[-1]:
-            held_out.append((fitted[-1], seen(X)))
-        return prepare(self, X)
-
-    monkeypatch.setattr(svm, "fit_preparation", spied_fit)
-    monkeypatch.setattr(grouped.Preparation, "of", spied_preparation)
-    GroupedSVC().fit(X, y, groups=runs)
-    assert len(held_out) == 3 * len({candidate.percentile for candidate in CANDIDATES})
-    for trained, tested in held_out:
-        assert trained.isdisjoint(tested)
-        assert trained | tested == set(runs)
-    assert fitted[-1] == set(runs)
 
 
 def test_labels_that_only_identify_runs_give_scores_of_chance():
@@ -192,23 +132,3 @@ def test_too_few_classes_or_windows_are_refused():
     both = np.r_[np.flatnonzero(y == "ice")[:2], np.flatnonzero(y == "snow")[:2]]
     with pytest.raises(DataError, match="too few to hold some of them out"):
         GroupedSVC().fit(X[both], y[both], groups=np.array(list("aabb")))
-
-
-def test_inner_folds_leave_out_what_shares_samples_with_a_test_block(monkeypatch):
-    """The only run of a class is cut into inner blocks: windows that overlap one must not train."""
-    splits, split_runs = [], folds.split_runs
-
-    def spy(*args):
-        for train, test in split_runs(*args):
-            splits.append((train, test))
-            yield train, test
-
-    monkeypatch.setattr(folds, "split_runs", spy)
-    rng = np.random.default_rng(0)
-    y = np.repeat(["ice", "snow"], 60)
-    groups = np.where(y == "ice", "only", np.repeat([f"r{i}" for i in range(12)], 10))
-    GroupedSVC(gap=4).fit(rng.normal(size=(120, 3)) + (y == "ice")[:, None], y, groups=groups)
-    assert splits
-    for train, test in splits:
-        ice_train, ice_test = train[train < 60], test[test < 60]
-        assert np.abs(ice_train[:, None] - ice_test).min() == 5
