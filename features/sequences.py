@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -13,45 +14,37 @@ from terrain.classify.folds import Fold
 from terrain.classify.metrics import STRIDE_S, Track, last_class, track_of
 from terrain.classify.terrain_filter import TerrainFilter, check_filter, filter_run, reported
 from terrain.logs.splicing import SplicedRun, parts_under, sequences_of
-from terrain.records import Array, RunLog, Windows
+from terrain.records import RunLog, Windows
 
 
-class Following(NamedTuple):
-    """Follows sequences with a classifier once it is fitted, in whatever process fits it.
+def follow(
+    features: Any,
+    sequences: Sequence[SplicedRun],
+    rule: WindowRule,
+    layout: Layout,
+    prior: Mapping[str, float],
+    classifier: Any,
+) -> list[Track]:
+    """Return what a fitted classifier and its filter report along each sequence.
 
-    ``rule`` and ``layout`` are of the classifier's windows; ``classes`` and ``prior`` (k,) names in the order of the
-    columns, and the part of each among the training windows.
+    ``prior`` has the part of each class among the training windows, in order.
     """
-
-    features: Any
-    sequences: tuple[SplicedRun, ...]
-    rule: WindowRule
-    layout: Layout
-    classes: Array
-    prior: Array
-
-    def __call__(self, classifier: Any) -> list[Track]:
-        """Return what is reported along each sequence."""
-        tracks = []
-        for log, runs, spliced in self.sequences:
-            rule = replace(self.rule, stride_s=STRIDE_S)
-            begin_s, end_s = span_of(log, self.layout)
-            starts_s = regular_starts(begin_s, end_s, rule.length_s, STRIDE_S)
-            probability = np.full((len(starts_s), len(self.classes)), np.nan)
-            windows = cut_windows([log], rule, layout=self.layout, skip_short=True).windows
-            if len(windows):
-                rows = np.rint((windows.start_s - begin_s) / STRIDE_S).astype(int)
-                columns = np.searchsorted(self.classes, classifier.classes_)
-                probability[rows] = 0.0
-                features = np.asarray(self.features.fit_transform(windows))
-                probability[np.ix_(rows, columns)] = classifier.predict_proba(features)
-            settings = check_filter(TerrainFilter(tuple(self.prior.tolist())))
-            belief = filter_run(probability, starts_s + rule.length_s, settings)
-            reports = reported(belief, settings.threshold), last_class(probability)
-            tracks.append(
-                track_of(log.labels, runs, starts_s, rule.length_s, *reports, self.classes, spliced)
-            )
-        return tracks
+    classes, tracks, rule = np.array([*prior]), [], replace(rule, stride_s=STRIDE_S)
+    settings = check_filter(TerrainFilter(tuple(prior.values())))
+    for log, runs, spliced in sequences:
+        begin_s, end_s = span_of(log, layout)
+        starts_s = regular_starts(begin_s, end_s, rule.length_s, STRIDE_S)
+        probability = np.full((len(starts_s), len(classes)), np.nan)
+        windows = cut_windows([log], rule, layout=layout, skip_short=True).windows
+        if len(windows):
+            rows = np.rint((windows.start_s - begin_s) / STRIDE_S).astype(int)
+            probability[rows] = 0.0
+            found = classifier.predict_proba(np.asarray(features.fit_transform(windows)))
+            probability[np.ix_(rows, np.searchsorted(classes, classifier.classes_))] = found
+        belief = filter_run(probability, starts_s + rule.length_s, settings)
+        reports = reported(belief, settings.threshold), last_class(probability)
+        tracks.append(track_of(log.labels, runs, starts_s, rule.length_s, *reports, classes, spliced))
+    return tracks
 
 
 def following(
@@ -61,8 +54,8 @@ def following(
     rule: WindowRule,
     folds: Sequence[Fold],
     seed: int,
-) -> Iterator[Following]:
-    """Yield what follows, for each fold, the sequences through its held-out runs.
+) -> Iterator[Callable[[Any], list[Track]]]:
+    """Yield, for each fold, what follows the sequences through its held-out runs with a classifier once it is fitted.
 
     ``features`` transforms windows, and learns nothing but their channels and rates; the folds number ``windows``.
     """
@@ -73,4 +66,5 @@ def following(
         parts = parts_under(by_id, windows[test])
         sequences = sequences_of(parts, layout.channels, f"course {repeat} {number}", rng)
         counts = np.bincount(class_of[train], minlength=len(classes)) + 1.0
-        yield Following(features, sequences, rule, layout, classes, counts / counts.sum())
+        prior = dict(zip(classes.tolist(), (counts / counts.sum()).tolist(), strict=True))
+        yield partial(follow, features, sequences, rule, layout, prior)

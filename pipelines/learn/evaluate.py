@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,9 +26,9 @@ from terrain.classify.coverage import coverage_of
 from terrain.classify.folds import N_FOLDS, Fold, single_run_classes
 from terrain.classify.held_out import (
     Applicability,
-    ChannelDrops,
     Examples,
     HeldOut,
+    channel_drops,
     drawn_folds,
     fit_fold,
     itself,
@@ -136,7 +137,7 @@ def evaluate_recipe(
         asks = [
             None
             if fold.repeat
-            else ChannelDrops(features[fold.test], truth[fold.test], channels, seed, fold.number)
+            else partial(channel_drops, features[fold.test], truth[fold.test], channels, seed, fold.number)
             for fold in folds
         ]
     held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, bool(channels))

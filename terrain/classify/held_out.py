@@ -218,21 +218,14 @@ class Applicability(StrEnum):
     NOT_APPLICABLE = "not applicable"
 
 
-class ClassSpeeds(NamedTuple):
-    """Median speeds of the slow and of the fast runs of a class."""
-
-    slow_mps: float
-    fast_mps: float
-
-
 class SlowFast(NamedTuple):
     """Accuracy when slow runs train and fast runs test, and the reverse; None where not applicable.
 
-    ``classes`` are those that are kept, ``left_out`` has the reason for each of the others.
+    ``classes`` has the median speeds of slow and fast runs of those that are kept, ``left_out`` why the others are not.
     """
 
     status: Applicability
-    classes: Mapping[str, ClassSpeeds]
+    classes: Mapping[str, Mapping[str, float]]
     left_out: Mapping[str, str]
     slow_to_fast: float | None = None
     fast_to_slow: float | None = None
@@ -265,7 +258,7 @@ def slow_fast_split(
     split : of the classes, without accuracies
     """
     side = np.full(len(terrain), "", dtype=object)
-    kept: dict[str, ClassSpeeds] = {}
+    kept: dict[str, dict[str, float]] = {}
     left_out: dict[str, str] = {}
     for name in np.unique(terrain).tolist():
         of_class = terrain == name
@@ -283,9 +276,9 @@ def slow_fast_split(
             elif time_s < MIN_TIME_A_SIDE_S:
                 left_out.setdefault(name, f"{each} runs: {time_s:.0f} s")
         if name not in left_out:
-            medians = (float(np.median([known[run] for run in runs])) for runs in parts.values())
-            kept[name] = ClassSpeeds(*medians)
+            kept[name] = {}
             for each, runs in parts.items():
+                kept[name][f"{each}_mps"] = float(np.median([known[run] for run in runs]))
                 side[of_class & np.isin(run_id, runs)] = each
     both = set(run_id[side == "slow"]) & set(run_id[side == "fast"])
     side[np.isin(run_id, list(both))] = ""
@@ -326,40 +319,31 @@ def channel_of(feature: str) -> str:
     return f"{stream}.correlations" if "~" in channel else f"{stream}{separator}{channel}"
 
 
-class ChannelDrops(NamedTuple):
-    """Called with the classifier of a fold, it returns a drop a channel, means over shuffles.
+def channel_drops(
+    features: Array, truth: Array, channels: Sequence[str], seed: int, number: int, fitted: Any
+) -> list[float]:
+    """Return the drop of each channel (f,), in the order of their names, means over shuffles, by a fold's classifier.
 
-    ``features`` (n, f) and ``truth`` (n,) are of the windows that the fold holds out, ``channels`` (f,) of the
-    features; ``seed`` and ``number``, of the fold, draw the permutations.
+    ``features`` (n, f) and ``truth`` (n,) are of the windows that the fold of that number holds out.
     """
+    present, names = np.isin(truth, fitted.classes_), np.array(channels)
+    test, truth = features[present], truth[present]
+    labels = np.unique(truth)
 
-    features: Array
-    truth: Array
-    channels: Sequence[str]
-    seed: int
-    number: int
+    def balanced_accuracy(features: Array) -> float:
+        return float(recall_score(truth, fitted.predict(features), labels=labels, average="macro"))
 
-    def __call__(self, fitted: Any, /) -> list[float]:
-        """Return the drop of each channel, in the order of their names."""
-        present = np.isin(self.truth, fitted.classes_)
-        test, truth = self.features[present], self.truth[present]
-        labels, channels = np.unique(truth), np.array(self.channels)
-
-        def balanced_accuracy(features: Array) -> float:
-            return float(recall_score(truth, fitted.predict(features), labels=labels, average="macro"))
-
-        baseline = balanced_accuracy(test)
-        rng = np.random.default_rng((self.seed, self.number))
-        drops = []
-        for channel in np.unique(channels):
-            columns = np.flatnonzero(channels == channel)
-            scores = []
-            for _ in range(N_PERMUTATIONS):
-                shuffled = test.copy()
-                shuffled[:, columns] = test[rng.permutation(len(test))][:, columns]
-                scores.append(balanced_accuracy(shuffled))
-            drops.append(float(baseline - np.mean(scores)))
-        return drops
+    baseline = balanced_accuracy(test)
+    rng = np.random.default_rng((seed, number))
+    drops = []
+    for channel in np.unique(names):
+        columns, scores = np.flatnonzero(names == channel), []
+        for _ in range(N_PERMUTATIONS):
+            shuffled = test.copy()
+            shuffled[:, columns] = test[rng.permutation(len(test))][:, columns]
+            scores.append(balanced_accuracy(shuffled))
+        drops.append(float(baseline - np.mean(scores)))
+    return drops
 
 
 def channel_importance(

@@ -434,7 +434,7 @@ def require_onnx() -> Any:
 
 
 class _Graph:
-    """Nodes and constants of a graph; each step returns the name of its output."""
+    """Nodes and constants of a graph; each step takes names and arrays, and returns the name of its output."""
 
     def __init__(self) -> None:
         self.onnx = require_onnx()
@@ -448,16 +448,14 @@ class _Graph:
         self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
         return name
 
-    def step(self, kind: str, *inputs: str, output: str | None = None, **attributes: Any) -> str:
-        name = output or f"n{len(self.nodes)}"
-        self.nodes.append(self.onnx.helper.make_node(kind, list(inputs), [name], **attributes))
-        return name
+    def step(self, kind: str, *inputs: Any, output: str = "", **attributes: Any) -> str:
+        names = [each if isinstance(each, str) else self.constant(np.array(each)) for each in inputs]
+        output = output or f"n{len(self.nodes)}"
+        self.nodes.append(self.onnx.helper.make_node(kind, names, [output], **attributes))
+        return output
 
     def mean(self, values: str, axis: int) -> str:
         return self.step("ReduceMean", values, axes=[axis], keepdims=1)
-
-    def shaped(self, values: str, shape: Sequence[int]) -> str:
-        return self.step("Reshape", values, self.constant(np.array(shape, dtype=np.int64)))
 
     def branch(self, columns: SampleColumns, branch: Branch, fill: Array, nets: Sequence[Any]) -> list[str]:
         """Return what a branch passes on, each (windows, K, p); its channels are centred on request, and filled.
@@ -465,46 +463,45 @@ class _Graph:
         ``nets`` are the layers of the K members in this branch, ``fill`` (c, samples) for missing samples.
         """
         stream, c, frame, half = columns.stream, len(columns.channels), columns.frame, columns.frame // 2
-        mask = self.constant(np.zeros((c, 1), bool), f"{stream}.centred")  # at first of no channel
-        mean = self.step("Where", mask, self.mean(stream, 2), self.constant(np.array(0.0)))
-        values = self.step("Sub", stream, mean)
-        missing = self.step("IsNaN", values)
-        values = self.step("Where", missing, self.constant(fill, f"{stream}.fill"), values)
         n_times = columns.n_samples
+
+        def named(array: Array, kind: str) -> str:
+            return self.constant(array, f"{stream}.{kind}")
+
+        centred = named(np.zeros((c, 1), bool), "centred")  # at first no channel is
+        values = self.step("Sub", stream, self.step("Where", centred, self.mean(stream, 2), 0.0))
+        values = self.step("Where", self.step("IsNaN", values), named(fill, "fill"), values)
         if frame:
             values = self.step("Sub", values, self.mean(values, 2))
-            single = self.shaped(values, (-1, 1, columns.n_samples))
-            kernel = self.constant(fourier_kernel(frame).T[:, None])
-            waves = self.step("Conv", single, kernel, strides=[columns.hop])
+            single = self.step("Reshape", values, [-1, 1, n_times])
+            waves = self.step("Conv", single, fourier_kernel(frame).T[:, None], strides=[columns.hop])
             squares = self.step("Mul", waves, waves)
-            at = [self.constant(np.array([place])) for place in (0, half, 2 * half)]
-            axis = self.constant(np.array([1]))
-            cosine, sine = (self.step("Slice", squares, at[i], at[i + 1], axis) for i in (0, 1))
-            n_times = (columns.n_samples - frame) // columns.hop + 1
-            power = self.shaped(self.step("Add", cosine, sine), (-1, c, half, n_times))
-            floor = self.constant(branch.floor[:, None, None], f"{stream}.floor")
-            values = self.step("Log", self.step("Add", power, floor))
+            cosine = self.step("Slice", squares, [0], [half], [1])
+            sine = self.step("Slice", squares, [half], [2 * half], [1])
+            n_times = (n_times - frame) // columns.hop + 1
+            power = self.step("Reshape", self.step("Add", cosine, sine), [-1, c, half, n_times])
+            values = self.step("Log", self.step("Add", power, named(branch.floor[:, None, None], "floor")))
         else:
-            values = self.shaped(values, (-1, c, 1, columns.n_samples))
-        scaled = self.step("Sub", values, self.constant(branch.mean[:, :, None], f"{stream}.mean"))
-        scaled = self.step("Div", scaled, self.constant(branch.std[:, :, None], f"{stream}.std"))
-        limits = [self.constant(np.array(limit)) for limit in (-CLIP_STD, CLIP_STD)]
-        rows = self.shaped(self.step("Clip", scaled, *limits), (0, branch.mean.size, n_times))
-        found, n_members = rows, len(nets)
-        for number, (place, groups) in enumerate(((1, 1), (5, n_members)), start=1):
+            values = self.step("Reshape", values, [-1, c, 1, n_times])
+        scaled = self.step("Sub", values, named(branch.mean[:, :, None], "mean"))
+        scaled = self.step("Div", scaled, named(branch.std[:, :, None], "std"))
+        clipped = self.step("Clip", scaled, -CLIP_STD, CLIP_STD)
+        found = rows = self.step("Reshape", clipped, [0, branch.mean.size, n_times])
+        for number, (place, groups) in enumerate(((1, 1), (5, len(nets))), start=1):
             weights, biases = zip(*(_folded(net[place], net[place + 1]) for net in nets), strict=True)
-            kernel = self.constant(np.concatenate(weights), f"{stream}.weight_{number}")
-            offset = self.constant(np.concatenate(biases), f"{stream}.bias_{number}")
+            kernel = named(np.concatenate(weights), f"weight_{number}")
+            offset = named(np.concatenate(biases), f"bias_{number}")
             found = self.step("Relu", self.step("Conv", found, kernel, offset, pads=[1, 1], group=groups))
-        each = (-1, n_members, len(biases[0]))
         largest = self.step("ReduceMax", found, axes=[2], keepdims=1)
-        pooled = [self.shaped(self.mean(found, 2), each), self.shaped(largest, each)]
+        each = [-1, len(nets), len(biases[0])]
+        pooled = [self.step("Reshape", part, each) for part in (self.mean(found, 2), largest)]
         if not frame:
             mean = self.mean(rows, 2)
             offset = self.step("Sub", rows, mean)
             spread = self.step("Sqrt", self.mean(self.step("Mul", offset, offset), 2))
-            ones = self.constant(np.ones((1, n_members, 1)))
-            pooled += [self.step("Mul", self.shaped(part, (-1, 1, c)), ones) for part in (mean, spread)]
+            for part in (mean, spread):
+                alike = self.step("Reshape", part, [-1, 1, c])
+                pooled.append(self.step("Mul", alike, np.ones((1, len(nets), 1))))
         return pooled
 
 
@@ -518,35 +515,32 @@ def network_onnx(
     """
     graph, columns = _Graph(), training.columns
     helper, float_ = graph.onnx.helper, graph.onnx.TensorProto.FLOAT
-    inputs, pooled = [], []
+    inputs, pooled, streams = [], [], {}
     for number, (each, missing) in enumerate(zip(columns, streams_of(columns, fill[None]), strict=True)):
         shape = ["windows", len(each.channels), each.n_samples]
         inputs.append(helper.make_tensor_value_info(each.stream, float_, shape))
         layers = [net.branches[number] for net in nets]
         pooled += graph.branch(each, training.branches[number], missing[0], layers)
-    column = graph.step("Unsqueeze", graph.step("Concat", *pooled, axis=2), graph.constant(np.array([3])))
+        described = {"channels": each.channels, "rate_hz": each.rate_hz, "n_samples": each.n_samples}
+        streams[each.stream] = described
+    column = graph.step("Unsqueeze", graph.step("Concat", *pooled, axis=2), [3])
     weights, biases = (
         np.stack([getattr(net.head[1], name).detach().numpy() for net in nets]) for name in ("weight", "bias")
     )
     product = graph.step("MatMul", graph.constant(weights, "head_weight"), column)
-    flat = graph.step("Squeeze", product, graph.constant(np.array([3])))
-    each_log = graph.step("LogSoftmax", graph.step("Add", flat, graph.constant(biases, "head_bias")), axis=2)
-    mean = graph.step("ReduceMean", each_log, axes=[1], keepdims=0)
+    logits = graph.step("Add", graph.step("Squeeze", product, [3]), graph.constant(biases, "head_bias"))
+    mean = graph.step("ReduceMean", graph.step("LogSoftmax", logits, axis=2), axes=[1], keepdims=0)
     tempered = graph.step("Div", mean, graph.constant(np.array(temperature), "temperature"))
-    graph.step("Softmax", tempered, output=OUTPUT, axis=1)
-    graph.step("LogSoftmax", tempered, output=LOG_OUTPUT, axis=1)
-    shape = ["windows", len(classes)]
-    outputs = [helper.make_tensor_value_info(name, float_, shape) for name in (OUTPUT, LOG_OUTPUT)]
+    outputs = []
+    for kind, name in (("Softmax", OUTPUT), ("LogSoftmax", LOG_OUTPUT)):
+        graph.step(kind, tempered, output=name, axis=1)
+        outputs.append(helper.make_tensor_value_info(name, float_, ["windows", len(classes)]))
     model = helper.make_model(
         helper.make_graph(graph.nodes, "terrain", inputs, outputs, graph.constants),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="terrain-slip",
     )
-    streams = {
-        each.stream: {"channels": each.channels, "rate_hz": each.rate_hz, "n_samples": each.n_samples}
-        for each in columns
-    }
     metadata = {"classes": json.dumps([str(name) for name in classes]), "streams": json.dumps(streams)}
     helper.set_model_props(model, metadata)
     graph.onnx.checker.check_model(model)

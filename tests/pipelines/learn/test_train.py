@@ -20,7 +20,7 @@ from pipelines.learn.model_file import CARD_FILE, TRAINING_FILE, read_model, sea
 from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.train import Settings, run
 from pipelines.report.results import as_json
-from terrain.classify.held_out import ChannelDrops
+from terrain.classify.held_out import channel_drops
 from terrain.errors import ConfigError, ModelError, TerrainError
 from terrain.logs.write import write_run
 
@@ -76,7 +76,7 @@ def test_only_the_channel_that_is_used_is_important():
     features = np.random.default_rng(0).normal(size=(400, 3))
     truth = np.where(features[:, 0] > 0, "b", "a")
     stump = DecisionTreeClassifier(max_depth=1).fit(features, truth)
-    drops = ChannelDrops(features, truth, ["imu.x", "imu.y", "imu.x"], 0, 1)(stump)
+    drops = channel_drops(features, truth, ["imu.x", "imu.y", "imu.x"], 0, 1, stump)
     assert drops[0] == pytest.approx(0.5, abs=0.1)
     assert drops[1] == 0.0
 
