@@ -290,7 +290,13 @@ def calibrate(
 
     ``logs`` are as :func:`changes_of` takes them; ``DataError`` where none is long enough.
     """
-    runs = [blocks for log in logs if len(blocks := steady_blocks(*log)) >= 2 * MIN_BLOCKS]
+    runs = []
+    for time_s, responses, wheel_speed_mps in logs:
+        detector = ChangeDetector(DetectorSettings(np.eye(responses.shape[1]), np.inf, 0, 0.0))
+        for block in blocks_of(time_s, responses, wheel_speed_mps):
+            detector.take(block)
+        if len(detector.blocks) >= 2 * MIN_BLOCKS:  # of one regime, settled, with all responses
+            runs.append(detector.blocks)
     if not runs:
         raise DataError(
             f"no run is driven steadily for {2 * MIN_BLOCKS * BLOCK_S + SETTLING_S:g} s, as a threshold takes"
@@ -307,11 +313,3 @@ def calibrate(
             largest[i] = max(largest[i], detector.ratio()[0])
     threshold = float(np.quantile(largest, 1.0 - false_alarm_ratio))
     return DetectorSettings(covariance, threshold, len(runs), float(np.mean(largest > threshold)))
-
-
-def steady_blocks(time_s: Array, responses: Array, wheel_speed_mps: Array) -> list[Block]:
-    """Return the blocks of a log that a detector compares: of one regime, settled, with all responses."""
-    detector = ChangeDetector(DetectorSettings(np.eye(responses.shape[1]), np.inf, 0, 0.0))
-    for block in blocks_of(time_s, responses, wheel_speed_mps):
-        detector.take(block)
-    return detector.blocks

@@ -97,12 +97,6 @@ def speed_edges(speed_mps: Array) -> tuple[float, ...]:
     return (first, *sorted(edge for edge in inner if first < edge < last), last)
 
 
-def regime_numbers(edges_mps: tuple[float, ...], motion: Motion) -> Array:
-    """Return the regime (n,) of windows, numbered manoeuvre by manoeuvre within each range of speed."""
-    within = np.searchsorted(np.array(edges_mps[1:-1]), motion.speed_mps, side="right")
-    return np.asarray(within * len(Manoeuvre) + manoeuvres(motion), dtype=int)
-
-
 def regime_name(edges_mps: tuple[float, ...], number: int) -> str:
     """Return a regime in words.
 
@@ -320,7 +314,10 @@ def coverage_of(
     run_id, terrain, motion = run_id[tested], held_out.truth[tested], motion.of(tested)
     near = table.near_runs(motion.speed_mps, motion.yaw_rate_radps)
     edges_mps = speed_edges(motion.speed_mps)
-    regime = regime_numbers(edges_mps, motion)
+    within = np.searchsorted(np.array(edges_mps[1:-1]), motion.speed_mps, side="right")
+    regime = (within * len(Manoeuvre) + manoeuvres(motion)).astype(
+        int
+    )  # manoeuvre by manoeuvre in each range
     rows, cells = [], []
     for column, name in enumerate(classes):
         for number in np.unique(regime):

@@ -270,7 +270,10 @@ def slow_fast_split(
             "fast": [run for run, speed in known.items() if speed > median],
         }
         for each, runs in parts.items():
-            time_s = sum(covered_s(start_s[of_class & (run_id == run)], length_s) for run in runs)
+            starts_s = [
+                np.sort(start_s[of_class & (run_id == run)]) for run in runs
+            ]  # what overlaps counts once
+            time_s = sum(np.minimum(np.diff(each), length_s).sum() + length_s for each in starts_s)
             if len(runs) < MIN_RUNS_A_SIDE:
                 left_out.setdefault(name, f"{each} runs: {len(runs)}")
             elif time_s < MIN_TIME_A_SIDE_S:
@@ -285,11 +288,6 @@ def slow_fast_split(
     enough = len(kept) >= MIN_CLASSES
     status = Applicability.APPLICABLE if enough else Applicability.NOT_APPLICABLE
     return side, SlowFast(status, kept, left_out)
-
-
-def covered_s(start_s: Array, length_s: float) -> float:
-    """Return the time that windows of one run cover; where they overlap it counts once."""
-    return float(np.minimum(np.diff(np.sort(start_s)), length_s).sum() + length_s)
 
 
 N_PERMUTATIONS = 3

@@ -12,7 +12,6 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import StrEnum
 from functools import partial
-from itertools import pairwise
 from types import MappingProxyType
 from typing import Any, NamedTuple, Self
 
@@ -34,13 +33,6 @@ Interval = tuple[float, float]
 NO_INTERVAL: Interval = (math.nan, math.nan)
 
 
-def runs_of_classes(run_id: Array, terrain: Array) -> tuple[Array, Array]:
-    """Return the class (runs,) of each run, one of several classes once for each, and the run (n,) of each window."""
-    names = np.char.add(np.char.add(terrain.astype(str), "\n"), run_id.astype(str))
-    _, first, place = np.unique(names, return_index=True, return_inverse=True)
-    return terrain[first], place
-
-
 def drawn_runs(
     run_id: Array,
     terrain: Array,
@@ -52,8 +44,9 @@ def drawn_runs(
 
     A run of several classes counts for each.  The weights are (1 + n_draws, runs).
     """
-    class_of, place = runs_of_classes(run_id, terrain)
-    return np.vstack([np.ones(len(class_of)), counts_of(class_of, n_draws, rng)]), place
+    names = np.char.add(np.char.add(terrain.astype(str), "\n"), run_id.astype(str))
+    _, first, place = np.unique(names, return_index=True, return_inverse=True)
+    return np.vstack([np.ones(len(first)), counts_of(terrain[first], n_draws, rng)]), place
 
 
 def row_counts(stratum: Array, n_draws: int, rng: np.random.Generator) -> Array:
@@ -169,38 +162,6 @@ def runs_by_terrain(run_id: Array, terrain: Array) -> Array:
     return np.array([f"{run} ({name})" if run in mixed else run for run, name in pairs])
 
 
-def per_run_figures(
-    correct: Array, predicted: Array, voted_correct: Array, run_id: Array, terrain: Array
-) -> tuple[RunFigures, ...]:
-    """Return the figures of each run, in the order of their ids, from windows (n,) or (repeats, n).
-
-    ``predicted`` (n,) are predictions of one repeat.
-    """
-    figures = []
-    for name in np.unique(run_id):
-        rows = run_id == name
-        wrong, counts = np.unique(predicted[rows & (predicted != terrain)], return_counts=True)
-        figures.append(
-            RunFigures(
-                run_id=str(name),
-                terrain=str(terrain[rows][0]),
-                n_windows=int(rows.sum()),
-                accuracy=float(np.mean(correct[..., rows])),
-                vote_accuracy=float(np.mean(voted_correct[..., rows])),
-                mistaken_for=str(wrong[counts.argmax()]) if len(wrong) else None,
-            )
-        )
-    return tuple(figures)
-
-
-def macro_run_accuracy(runs: Iterable[RunFigures]) -> float:
-    """Return the mean over classes of the mean accuracy of their runs, whatever their numbers of windows."""
-    of_class: dict[str, list[float]] = {}
-    for run in runs:
-        of_class.setdefault(run.terrain, []).append(run.accuracy)
-    return float(np.mean([np.mean(accuracies) for accuracies in of_class.values()]))
-
-
 #: Fractions of the windows, the most confident first, of which the accuracy is given.
 COVERAGES = (0.8, 0.5)
 N_DRAWS = 1000
@@ -267,16 +228,11 @@ def calibration_error(confidence: Array, correct: Array, weights: Array, n_bins:
     ``n_bins`` bins of equal count (Guo et al. 2017, equation 3, equal mass instead of equal width).
     """
     order = np.argsort(confidence, kind="stable")
-    first = bin_edges(len(order), n_bins)[:-1]
+    first = np.cumsum([0, *(len(part) for part in np.array_split(order, n_bins)[:-1] if len(part))])
+    first = first[first < len(order)]
     gaps = np.add.reduceat(weights[:, order] * (correct[order] - confidence[order]), first, axis=1)
     found: Array = np.abs(gaps).sum(axis=1) / weights.sum(axis=1)
     return found
-
-
-def bin_edges(n: int, n_bins: int) -> Array:
-    """Return where bins of equal count begin, and n; fewer bins where there are fewer windows."""
-    sizes = [len(part) for part in np.array_split(np.arange(n), n_bins) if len(part)]
-    return np.cumsum([0, *sizes])
 
 
 def reliability_bins(
@@ -287,8 +243,7 @@ def reliability_bins(
     confidence, correct = confidence.ravel(), correct.ravel().astype(float)
     order = np.argsort(confidence, kind="stable")
     found = []
-    for start, end in pairwise(bin_edges(len(order), n_bins).tolist()):
-        rows = order[start:end]
+    for rows in np.array_split(order, min(n_bins, len(order))):
         drawn = np.vstack([np.ones(len(rows)), weights[:, rows % n]])
         accuracy, interval = ratio_over_runs(drawn @ correct[rows], drawn.sum(axis=1))
         of_bin = float(confidence[rows].mean()), accuracy or 0.0, len(rows), interval or NO_INTERVAL
@@ -355,7 +310,15 @@ def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: in
     repeats = [class_figures(terrain, each, classes) for each in predicted]
     pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
     accuracies = np.array([repeat["accuracy"] for repeat in repeats])
-    per_run = per_run_figures(correct, predicted[0], voted, run_id, terrain)
+    per_run, of_terrain = [], dict[str, list[float]]()
+    for run in np.unique(run_id):
+        mine = run_id == run
+        name, accuracy = str(terrain[mine][0]), float(np.mean(correct[:, mine]))
+        wrong, counts = np.unique(predicted[0, mine & ~correct[0]], return_counts=True)
+        mistaken_for = str(wrong[counts.argmax()]) if len(wrong) else None
+        voted_right = float(np.mean(voted[:, mine]))
+        per_run.append(RunFigures(str(run), name, int(mine.sum()), accuracy, voted_right, mistaken_for))
+        of_terrain.setdefault(name, []).append(accuracy)
     right = np.where(held_out.tested, held_out.correct, np.nan)
     of_confidence = probability.max(axis=2), correct, run_id, terrain, np.random.default_rng(seed)
     folds = []
@@ -374,13 +337,13 @@ def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: in
         "accuracy_ci": run_bootstrap(correct.mean(axis=0), run_id, terrain, np.random.default_rng(seed)),
         "balanced_accuracy": float(np.mean([repeat["balanced_accuracy"] for repeat in repeats])),
         "macro_f1": float(np.mean([repeat["macro_f1"] for repeat in repeats])),
-        "macro_run_accuracy": macro_run_accuracy(per_run),
+        "macro_run_accuracy": float(np.mean([np.mean(each) for each in of_terrain.values()])),
         "per_class": pooled["per_class"],
         "confusion": pooled["confusion"],
         "vote_accuracy": float(np.mean(voted)),
         "vote_windows": float(np.mean([sizes for _, sizes in votes])),
         **confidence_figures(*of_confidence),
-        "per_run": per_run,
+        "per_run": tuple(per_run),
         "folds": tuple(folds),
     }
 
@@ -407,23 +370,17 @@ def set_figures(held_out: HeldOut, windows: Windows, seed: int) -> ConformalFigu
     for result in held_out.results:
         member[result.fold.repeat, result.fold.test] = conformal_sets(result.probability, result.conformal)
     rows = np.flatnonzero(held_out.tested)
-    terrain = held_out.truth[rows]
+    terrain, member = held_out.truth[rows], member[:, rows]
     run_id = runs_by_terrain(windows.run_id.astype(str)[rows], terrain)
-    return conformal_figures(member[:, rows], held_out.classes, terrain, run_id, np.random.default_rng(seed))
-
-
-def conformal_figures(
-    member: Array, classes: Array, terrain: Array, run_id: Array, rng: np.random.Generator
-) -> ConformalFigures:
-    """Return the figures of sets: whether a class (k,) is in that of a window (repeats, n, k)."""
-    held = member[:, np.arange(len(terrain)), np.searchsorted(classes, terrain)].mean(axis=0)
+    truth = np.searchsorted(held_out.classes, terrain)
+    held = member[:, np.arange(len(terrain)), truth].mean(axis=0)
     _, run_of = np.unique(run_id, return_inverse=True)
     per_run = np.bincount(run_of, weights=held) / np.bincount(run_of)
     sizes = member.sum(axis=2)
     return ConformalFigures(
         LEVEL,
         float(held.mean()),
-        run_bootstrap(held, run_id, terrain, rng),
+        run_bootstrap(held, run_id, terrain, np.random.default_rng(seed)),
         float(per_run.mean()),
         float(per_run.min()),
         float(sizes.mean()),
