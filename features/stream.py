@@ -13,8 +13,10 @@ stream that stops costs windows and no memory.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,18 +36,20 @@ BUFFER_MARGIN = 4
 _MIN_BUFFER = 64
 
 
+@dataclass
 class _Buffer:
-    """Accepted samples of one stream, oldest first, in arrays that are made once."""
+    """Accepted samples of one stream, oldest first, at most so many."""
 
-    def __init__(self, capacity: int, n_channels: int) -> None:
-        self.time_s = np.empty(capacity)
-        self.values = np.empty((capacity, n_channels))
-        self.end = 0
-        self.first_s = self.last_s = math.nan
-        self.suspect: tuple[float, Array] | None = None
+    capacity: int
+    n_channels: int
+    time_s: list[float] = field(default_factory=list)
+    values: list[Array] = field(default_factory=list)
+    first_s: float = math.nan
+    last_s: float = math.nan
+    suspect: tuple[float, Sequence[float] | Array] | None = None
 
     def first_at(self, time_s: float) -> int:
-        return int(np.searchsorted(self.time_s[: self.end], time_s - TIME_TOLERANCE_S))
+        return bisect_left(self.time_s, time_s - TIME_TOLERANCE_S)
 
 
 class WindowStream:
@@ -53,20 +57,17 @@ class WindowStream:
 
     Fed with the samples of a log in order of time, it returns the windows that
     :func:`~features.windows.cut_windows` cuts from that log with the same rule and layout, bit for bit,
-    and counts the same drops; samples of different streams may arrive out of order by up to ``patience_s``.
-    Streams that pause for longer than ``patience_s`` may differ in the reason that is counted, and where
+    and counts the same drops; samples of different streams may arrive out of order by up to :data:`PATIENCE_S`.
+    Streams that pause for longer may differ in the reason that is counted, and where
     one never comes back, windows that a log would not hold at all are counted as ``gap``.
 
-    A stamp that is further ahead than ``patience_s``, like the first one of a stream, is held back until
+    A stamp that is further ahead than that, like the first one of a stream, is held back until
     the next sample confirms it, so that one wrong stamp costs one sample and not the rest of the run.  A
     clock that starts again from an earlier time needs a new ``WindowStream``.
 
     Parameters
     ----------
     rule, layout : how to cut; streams, channels (in the order in which their values are pushed) and rates
-    run_id : run of the windows
-    patience_s : how far the others are ahead before a stream counts as stopped and the windows that wait
-        for it are dropped; longer than the longest step between two samples that is no gap
 
     Attributes
     ----------
@@ -86,19 +87,14 @@ class WindowStream:
     ([], {('wheels', 'time goes back or repeats'): 1})
     """
 
-    def __init__(
-        self, rule: WindowRule, layout: Layout, run_id: str = "live", patience_s: float = PATIENCE_S
-    ) -> None:
+    def __init__(self, rule: WindowRule, layout: Layout) -> None:
         longest_step_s = max(rule.max_gap_periods / rate for rate in layout.rate_hz.values())
-        if not (math.isfinite(patience_s) and patience_s > longest_step_s):
+        if not longest_step_s < PATIENCE_S:
             raise ConfigError(
-                f"patience_s is {patience_s}; it must be finite and over {longest_step_s:.3g} s, the longest "
-                "step between two samples that is no gap"
+                f"a step of {longest_step_s:.3g} s is no gap; less than {PATIENCE_S:g} s is accepted"
             )
         self.rule = rule
         self.layout = layout
-        self.run_id = run_id
-        self.patience_s = float(patience_s)
         self.dropped: Counter[str] = Counter()
         self.dropped_samples: Counter[tuple[str, str]] = Counter()
         self._n_samples = {name: layout.n_samples(name, rule.length_s) for name in layout.channels}
@@ -106,13 +102,11 @@ class WindowStream:
             empty = {name: np.empty((0, len(names), 0)) for name, names in layout.channels.items()}
             wheel_speeds(empty, layout.channels)
         self._period_s = {name: 1 / layout.rate_hz[name] for name in layout.channels}
-        span_s = rule.length_s + rule.step_s + self.patience_s
-        self._buffers = {
-            name: _Buffer(
-                max(_MIN_BUFFER, math.ceil(BUFFER_MARGIN * span_s * layout.rate_hz[name])), len(channels)
-            )
-            for name, channels in layout.channels.items()
-        }
+        span_s = rule.length_s + rule.step_s + PATIENCE_S
+        self._buffers = {}
+        for name, channels in layout.channels.items():
+            capacity = max(_MIN_BUFFER, math.ceil(BUFFER_MARGIN * span_s * layout.rate_hz[name]))
+            self._buffers[name] = _Buffer(capacity, len(channels))
         self._start_s = math.nan  # of window 0, once every stream has begun
         self._next = 0  # number of the window that comes next
         self._due_s = dict.fromkeys(layout.channels, -math.inf)  # no sample before this can finish it
@@ -121,19 +115,6 @@ class WindowStream:
     def due_s(self) -> float:
         """No sample before this time can finish a window; minus infinity before all streams have begun."""
         return min(self._due_s.values())
-
-    @property
-    def silent_streams(self) -> tuple[str, ...]:
-        """Streams that lag behind the others by more than ``patience_s``, or have not begun by then."""
-        begun = [b.last_s for b in self._buffers.values() if b.end]
-        if not begun:
-            return ()
-        earliest, front = min(b.first_s for b in self._buffers.values() if b.end), max(begun)
-        return tuple(
-            name
-            for name, buffer in self._buffers.items()
-            if front - (buffer.last_s if buffer.end else earliest) > self.patience_s
-        )
 
     def push(self, stream: str, time_s: float, values: Sequence[float] | Array) -> list[Windows]:
         """Take one sample and return the windows that it completes, each a ``Windows`` of length 1.
@@ -152,21 +133,21 @@ class WindowStream:
         if buffer is None:
             known = ", ".join(self._buffers)
             raise ConfigError(f"there is no stream {stream!r} in the layout; it has {known}")
-        if len(values) != buffer.values.shape[1]:
+        if len(values) != buffer.n_channels:
             raise ValueError(
-                f"stream {stream!r} has {buffer.values.shape[1]} channels; the sample has {len(values)} values"
+                f"stream {stream!r} has {buffer.n_channels} channels; the sample has {len(values)} values"
             )
-        if buffer.suspect is None and 0.0 < time_s - buffer.last_s <= self.patience_s:  # False for NaN
+        if buffer.suspect is None and 0.0 < time_s - buffer.last_s <= PATIENCE_S:  # False for NaN
             self._append(stream, buffer, time_s, values)
             return self._advance() if time_s >= self._due_s[stream] else []
         return self._push_doubtful(stream, buffer, float(time_s), values)
 
     def _append(self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array) -> None:
-        if buffer.end == len(buffer.time_s):
+        if len(buffer.time_s) == buffer.capacity:
             self._make_room(stream)
-        buffer.values[buffer.end] = values
-        buffer.time_s[buffer.end] = buffer.last_s = time_s
-        buffer.end += 1
+        buffer.values.append(np.array(values, dtype=float))
+        buffer.time_s.append(time_s)
+        buffer.last_s = time_s
 
     def _push_doubtful(
         self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array
@@ -179,11 +160,11 @@ class WindowStream:
         if time_s <= buffer.last_s or (suspect and time_s == suspect[0]):
             self.dropped_samples[stream, "time goes back or repeats"] += 1
             return []
-        if suspect and not 0.0 < time_s - suspect[0] <= self.patience_s:
+        if suspect and not 0.0 < time_s - suspect[0] <= PATIENCE_S:
             self.dropped_samples[stream, "time jumps ahead"] += 1
             suspect = buffer.suspect = None
-        if suspect is None and not time_s - buffer.last_s <= self.patience_s:
-            buffer.suspect = (time_s, np.array(values, dtype=float))
+        if suspect is None and not time_s - buffer.last_s <= PATIENCE_S:
+            buffer.suspect = time_s, np.array(values, dtype=float)
             return []
         buffer.suspect = None
         if suspect is not None:
@@ -214,11 +195,11 @@ class WindowStream:
         reached_s = min(buffer.last_s + self._period_s[name] for name, buffer in self._buffers.items())
         # The numbers of windows that fit, by the formula of `regular_starts`, and that wait no longer.
         n_fit = self._n_windows(reached_s)
-        n_overdue = self._n_windows(front_s - self.patience_s)
+        n_overdue = self._n_windows(front_s - PATIENCE_S)
         while self._next < max(n_fit, n_overdue):
             start_s = self._start_of(self._next)
             first = {name: buffer.first_at(start_s) for name, buffer in self._buffers.items()}
-            if all(first[name] + n <= self._buffers[name].end for name, n in self._n_samples.items()):
+            if all(first[name] + n <= len(self._buffers[name].time_s) for name, n in self._n_samples.items()):
                 found += self._cut(start_s, first)
                 self._next += 1
             elif self._next < n_overdue:
@@ -238,40 +219,30 @@ class WindowStream:
         streams = {}
         for name, buffer in self._buffers.items():
             rows = slice(first[name], first[name] + self._n_samples[name])
-            streams[name] = Stream(buffer.time_s[rows], buffer.values[rows], self.layout.channels[name])
+            samples = np.array(buffer.time_s[rows]), np.array(buffer.values[rows])
+            streams[name] = Stream(*samples, self.layout.channels[name])
         at = np.array([start_s])
         values, reason = cut_at(streams, at, self.rule, self.layout)
         if reason[0]:
             self.dropped[str(reason[0])] += 1
             return []
-        return [
-            Windows(
-                values,
-                self.layout.channels,
-                self.layout.rate_hz,
-                self.rule.length_s,
-                at,
-                np.array([self.run_id], dtype=object),
-                np.array([""], dtype=object),
-            )
-        ]
+        run_id, unknown = (np.array([name], dtype=object) for name in ("live", ""))
+        of_layout = self.layout.channels, self.layout.rate_hz, self.rule.length_s
+        return [Windows(values, *of_layout, at, run_id, unknown)]
 
     def _make_room(self, stream: str) -> None:
         """Remove what no window needs any more, and the oldest samples where that is not enough."""
         buffer = self._buffers[stream]
         if math.isnan(self._start_s):
-            needed_from_s = max(b.last_s for b in self._buffers.values() if b.end) - self.patience_s
+            needed_from_s = max(b.last_s for b in self._buffers.values() if b.time_s) - PATIENCE_S
         else:
             needed_from_s = self._start_of(self._next)
         n = buffer.first_at(needed_from_s)
-        enough = len(buffer.time_s) // BUFFER_MARGIN
+        enough = buffer.capacity // BUFFER_MARGIN
         if n < enough:
             self.dropped_samples[stream, "faster than its rate"] += enough - n
             n = enough
-        kept = buffer.end - n
-        for array in (buffer.time_s, buffer.values):
-            array[:kept] = array[n : buffer.end]
-        buffer.end = kept
+        del buffer.time_s[:n], buffer.values[:n]
 
 
 class WindowFeed:

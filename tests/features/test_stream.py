@@ -135,21 +135,14 @@ def test_each_bad_stamp_costs_only_its_sample():
     assert not stream.dropped
 
 
-def test_a_silent_stream_costs_windows_but_no_memory_and_is_named():
+def test_a_silent_stream_costs_windows_but_no_memory():
     streams = steady_log(400.0)
     silence = [event for event in merged(streams) if event[0] != "wheels" or not 30 < event[1] < 300]
-    stream = WindowStream(RULE, LAYOUT, patience_s=3.0)
-    size = {name: buffer.time_s.size for name, buffer in stream._buffers.items()}
-    found, silent_s = [], []
+    stream, found, longest = WindowStream(RULE, LAYOUT), [], 0
     for name, time_s, row in silence:
         found += stream.push(name, time_s, row)
-        if stream.silent_streams:
-            assert stream.silent_streams == ("wheels",)
-            silent_s.append(time_s)
-    assert min(silent_s) == pytest.approx(33.02, abs=0.03)
-    assert max(silent_s) == pytest.approx(300.0, abs=0.2)
-    assert {name: buffer.time_s.size for name, buffer in stream._buffers.items()} == size
-    assert sum(buffer.time_s.nbytes + buffer.values.nbytes for buffer in stream._buffers.values()) < 1e5
+        longest = max(longest, *(len(buffer.time_s) for buffer in stream._buffers.values()))
+    assert longest < 2000
     wheels = streams["wheels"]
     there = (wheels.time_s <= 30) | (wheels.time_s >= 300)
     cut = Stream(wheels.time_s[there], wheels.values[there], wheels.channels)
@@ -158,12 +151,11 @@ def test_a_silent_stream_costs_windows_but_no_memory_and_is_named():
     assert dict(stream.dropped) == batch.dropped
 
 
-def test_a_stream_that_begins_late_or_never_is_named_and_nothing_piles_up():
+def test_a_stream_that_begins_late_or_never_piles_nothing_up():
     stream = WindowStream(RULE, LAYOUT)
     for i in range(100_000):
         assert not stream.push("imu", i / 50, (0.0, 0.0))
-    assert stream.silent_streams == ("wheels",)
-    assert stream._buffers["imu"].time_s.size < 2000
+    assert len(stream._buffers["imu"].time_s) < 2000
     events = [(name, time_s + 2000.0, row) for name, time_s, row in merged(STREAMS)]
     found = [window for event in events for window in stream.push(*event)]
     assert [float(window.start_s[0]) for window in found] == np.arange(2000, 2018.5, 0.5).tolist()
@@ -176,8 +168,8 @@ def test_faults_of_the_programmer_are_raised():
     for values in ([1.0], [1.0, 2.0, 3.0], []):
         with pytest.raises(ValueError, match=f"'imu' has 2 channels; the sample has {len(values)} values"):
             stream.push("imu", 0.0, values)
-    with pytest.raises(ConfigError, match=r"patience_s is 0\.1; it must be finite and over 0\.18 s"):
-        WindowStream(RULE, LAYOUT, patience_s=0.1)
+    with pytest.raises(ConfigError, match=r"a step of 6 s is no gap; less than 5 s is accepted"):
+        WindowStream(WindowRule(20.0), Layout({"wheels": CHANNELS["wheels"]}, {"wheels": 0.3}))
     with pytest.raises(DataError, match="without wheel speeds"):
         WindowStream(RULE, Layout({"imu": CHANNELS["imu"]}, {"imu": 50.0}))
     with pytest.raises(DataError, match="holds 2 samples of stream 'wheels'"):
