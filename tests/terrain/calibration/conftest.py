@@ -6,28 +6,20 @@ from studies.intervals import HIDDEN, NOMINAL, drive_hidden
 
 @pytest.fixture(scope="session")
 def nominal():
-    """The description that a calibration starts from."""
     return NOMINAL
 
 
 @pytest.fixture(scope="session")
 def hidden():
-    """The robot that was driven."""
     return HIDDEN
 
 
 @pytest.fixture(scope="session")
 def drive():
-    """Return a maker of runs of the hidden robot: ``drive(scenario, seed, ...)``."""
     return drive_hidden
 
 
 @pytest.fixture(scope="session")
 def truth():
-    """Return a function that tells the hidden truth of a parameter."""
-
-    def of(parameter):
-        section, _, name = parameter.partition(".")
-        return getattr(getattr(HIDDEN, section), name)
-
-    return of
+    """Return the hidden truth of a parameter: ``truth("steering.zero_1_rad")``."""
+    return lambda parameter: getattr(getattr(HIDDEN, parameter.split(".")[0]), parameter.split(".")[-1])

@@ -1,7 +1,5 @@
 """Odometry fitted to legs: a hidden slip model comes back, folds hold whole runs, mounts are taken off."""
 
-import math
-
 import numpy as np
 import pytest
 from studies.intervals import tracked_arcs
@@ -11,24 +9,16 @@ from terrain.calibration.odometry import (
     ENDO,
     GYRODOMETRY,
     SLIP,
-    Leg,
-    composed,
-    end_by_efficiencies,
     fit_odometry,
     held_out_ends,
     legs_of_poses,
-    legs_of_windows,
     level,
-    of_body,
-    predict_ends,
-    relative,
     score_legs,
     without_tilt,
 )
 from terrain.errors import DataError
-from terrain.logs.drive import WindowPoses
 from terrain.robots import load_robot
-from terrain.simulation.tracked import QUIET, PrescribedSlip
+from terrain.simulation.tracked import PrescribedSlip
 
 PATAKO = load_robot("patako")
 GIVEN = PrescribedSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)
@@ -59,12 +49,6 @@ def test_a_hidden_slip_model_comes_back_within_its_own_error(legs):
     assert track == pytest.approx(1.0 / 0.6, rel=0.05)
 
 
-def test_legs_without_noise_are_predicted_exactly():
-    quiet = [leg for k, run in enumerate(drives(sensors=QUIET)) for leg in legs_of_poses(run, k, PATAKO, 2.0)]
-    ends = predict_ends(fit_odometry(ENDO, quiet, PATAKO), quiet, PATAKO)
-    assert ends[:, :2] == pytest.approx(np.array([leg.moved[:2] for leg in quiet]), abs=1e-3)
-
-
 def test_slip_that_is_known_beats_slip_that_is_not_on_runs_held_out(legs):
     ends = held_out_ends({"2 s": legs}, PATAKO, 4, 0)
     scores = score_legs(legs, {name: by["2 s"] for name, by in ends.items()}, 0)
@@ -86,52 +70,11 @@ def test_a_run_is_never_in_the_fit_that_predicts_it(legs):
     assert not np.allclose(spoiled[~own], clean[~own], atol=1e-9)
 
 
-def test_a_mount_is_taken_off_and_put_back():
-    mount, pose = np.array([-0.3, 0.1, 0.2]), np.array([1.0, -0.5, 2.5])
-    assert of_point(of_body(pose, mount), mount) == pytest.approx(pose)
-    assert of_body(np.zeros(3), mount) == pytest.approx(np.zeros(3))
-    spin = of_point(np.array([0.0, 0.0, math.pi]), np.array([-0.3, 0.0, 0.0]))
-    assert spin == pytest.approx([0.6, 0.0, math.pi])
-
-
 def test_the_mount_is_found_from_spins(legs):
     mount = np.array([-0.2, 0.05, 0.03])
     seen = [leg._replace(moved=of_point(leg.moved, mount)) for leg in legs]
     found = fit_odometry(level(SLIP), seen, PATAKO)
     assert found.mount == pytest.approx(mount, abs=0.02)
-
-
-def test_poses_compose_and_relate():
-    rng = np.random.default_rng(0)
-    for first, then in rng.normal(size=(20, 2, 3)):
-        assert relative(first, composed(first, then)) == pytest.approx(then)
-
-
-def test_windows_are_chained_over_their_gaps():
-    run = drives(n=1)[0]
-    pose, time = run.streams["pose"].values, run.streams["pose"].time_s
-
-    def window(begin, end):
-        rows = np.flatnonzero((time >= begin) & (time <= end))[::10]
-        moved = np.array([relative(pose[rows[0]], pose[k]) for k in rows])
-        moved[:, 2] = np.unwrap(moved[:, 2])
-        return WindowPoses(time[rows], moved)
-
-    windows = [window(1.0, 2.9), window(3.0, 4.9)]
-    single, whole = legs_of_windows(run, 0, windows, PATAKO, 0.0)
-    assert [round(leg.length_s, 6) for leg in single] == [1.9, 1.9]
-    assert whole is None  # no lidar bridges the gap
-    assert legs_of_windows(run, 0, [], PATAKO, 0.0) == ([], None)
-
-
-def test_efficiencies_give_the_arc_of_the_paper():
-    speeds = np.tile([0.4, 0.6], (200, 1))
-    leg = Leg(0, np.zeros(3), 0.01, speeds, np.zeros(200), np.zeros((200, 2)), 2.0)
-    x, y, yaw = end_by_efficiencies(leg, np.array([1.1, 0.8]), np.zeros(3), PATAKO)
-    turn = (0.48 - 0.44) / PATAKO.track_m
-    assert yaw == pytest.approx(2.0 * turn)
-    radius = 0.46 / turn
-    assert (x, y) == pytest.approx((radius * math.sin(yaw), radius * (1.0 - math.cos(yaw))), rel=1e-3)
 
 
 def test_too_little_is_refused(legs):

@@ -4,12 +4,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.report.results import silent
-from pipelines.slip import calibrate
-from terrain.calibration.omni import COM_X, COM_Y, DISTANCE, FRICTION, RADIUS, identify_omni, motor_friction
-from terrain.errors import DataError
+from terrain.calibration.omni import COM_X, COM_Y, FRICTION, RADIUS, identify_omni, motor_friction
 from terrain.kinematics.logged_wheels import with_wheel_speeds
-from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground
@@ -105,39 +101,6 @@ def test_a_drive_at_one_speed_is_not_taken_for_motors_alone():
     assert not motor_friction([standing], ROBOT).determined
     broken = replace(one, streams={"wheels": Stream(np.arange(3.0), np.zeros((3, 1)), ("motor_1_radps",))})
     assert not motor_friction([broken], ROBOT).determined
-
-
-def test_a_drive_whose_camera_was_lost_says_nothing_of_the_motors(runs):
-    drive = next(run for run in runs if run.terrains)
-    wheels = {name: stream for name, stream in drive.streams.items() if name == "wheels"}
-    assert not motor_friction([], ROBOT).determined
-    for finding in identify_omni([replace(drive, streams=wheels)], ROBOT):
-        assert not finding.determined
-    falling = alone(np.random.default_rng(3), slope=-1e-3)
-    assert not motor_friction([falling], ROBOT).determined
-
-
-def test_few_runs_determine_no_load_and_turns_no_distance(runs):
-    few = {finding.parameter: finding for finding in identify_omni(runs[:4], ROBOT)}
-    assert "10 runs in steady motion" in few[COM_X].note
-    assert not few[DISTANCE].determined
-
-
-def test_calibrate_writes_a_description_that_is_read_again(runs, tmp_path):
-    for run in runs:
-        write_run(run, tmp_path / "runs")
-    result = calibrate.run(
-        calibrate.Settings(data=tmp_path / "runs", robot="robotino", out=tmp_path / "mine.yaml"), silent
-    )
-    again = load_robot(str(tmp_path / "mine.yaml"))
-    rows = {row.parameter: row for row in result.findings}
-    assert again.body.com_x_m == pytest.approx(rows[COM_X].value, abs=1e-4)
-    assert again.identified["rolling_radius_m"] == pytest.approx(0.0376, abs=0.0003)
-    assert result.measurement_variances == {}
-    (tmp_path / "none").mkdir()
-    write_run(alone(np.random.default_rng(2), levels=(60.0, 60.0)), tmp_path / "none")
-    with pytest.raises(DataError, match="nothing of robot robotino can be calibrated"):
-        calibrate.run(calibrate.Settings(data=tmp_path / "none", robot="robotino"), silent)
 
 
 def test_friction_of_the_measured_motors_is_near_the_described_one(measured):

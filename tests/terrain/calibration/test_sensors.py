@@ -13,16 +13,14 @@ from terrain.calibration.sensors import (
     MIN_POSITION_S,
     accelerometer,
     fit_gravity,
-    gyro_bias,
     measurement_variances,
     sensor_noise,
     standing,
 )
 from terrain.constants import GRAVITY_MPS2
-from terrain.errors import ConfigError, DataError
+from terrain.errors import DataError
 from terrain.estimation.feed import ROWS_OF_DRIVE
 from terrain.records import RunLog, Stream
-from terrain.simulation.run import six_positions_log
 
 
 def with_imu(run, change):
@@ -76,40 +74,6 @@ def test_a_knock_ends_a_stretch_and_a_dead_sensor_has_none(drive, nominal):
     assert standing(RunLog("r", "agrimaro", {"wheels": run.streams["wheels"]}), nominal) == []
 
 
-def test_wheels_that_turn_slowly_do_not_stand(drive, nominal):
-    run = drive("stand", 3)
-    wheels = run.streams["wheels"]
-    values = np.array(wheels.values)
-    values[500:, 1] = 1.0  # 2 cm/s
-    creeping = RunLog(
-        "r", run.robot, {**run.streams, "wheels": Stream(wheels.time_s, values, wheels.channels)}
-    )
-    (stretch,) = standing(creeping, nominal)
-    assert stretch.end_s <= 10.0
-
-
-def test_coloured_noise_widens_the_interval(nominal):
-    still = nominal.with_parts(sensors=replace(nominal.sensors, gyro_bias_std_radps=0.0))
-    rng = np.random.default_rng(0)
-    inside, naive = [], []
-    for _ in range(30):
-        stretches = standing(noise_run(still, rng, 0.95, bias_radps=0.003), still)
-        finding = gyro_bias(stretches, still)[2]
-        inside.append(finding.low <= 0.003 <= finding.high)
-        naive.append(abs(finding.value - 0.003) < 1.96 * still.sensors.gyro_std_radps / np.sqrt(finding.n))
-    assert np.mean(inside) >= 0.8
-    assert np.mean(naive) < 0.6  # what independent samples would have had
-
-
-def test_without_a_standing_stretch_no_bias_is_determined(nominal):
-    findings = gyro_bias([], nominal)
-    assert len(findings) == 4
-    assert not any(finding.determined for finding in findings)
-    assert {finding.note for finding in findings} == {
-        "no run has a standing stretch of 5 s: let the robot stand, switched on"
-    }
-
-
 def noise_of(runs, robot):
     found = sensor_noise([stretch for run in runs for stretch in standing(run, robot)], robot)
     return {finding.parameter: finding for finding in found}
@@ -143,22 +107,6 @@ def test_the_interval_of_coloured_noise_is_wider(nominal):
     assert imu[0.6][1] > 1.3 * imu[0.0][1]
 
 
-def test_noise_below_the_encoder_step_is_undetermined(drive, nominal):
-    fine = nominal.with_parts(sensors=replace(nominal.sensors, steering_std_rad=0.0004))
-    finding = noise_of([drive("stand", 1, robot=fine)], nominal)["sensors.steering_std_rad"]
-    assert not finding.determined
-    assert "step" in finding.note or finding.note == "no noise at rest"
-
-
-def test_a_missing_sensor_has_undetermined_noise(drive, nominal):
-    run = drive("stand", 1)
-    bare = RunLog("r", run.robot, {name: run.streams[name] for name in ("imu", "wheels")})
-    found = noise_of([bare], nominal)
-    assert found["sensors.gyro_std_radps"].determined
-    assert found["camera.speed_std_mps"].note == "no standing stretch has this signal"
-    assert not any(finding.determined for finding in sensor_noise([], nominal))
-
-
 def test_variances_of_the_filters_rows(nominal):
     variances = measurement_variances(nominal)
     assert set(variances) == set(ROWS_OF_DRIVE["swerve"][:14])
@@ -188,15 +136,6 @@ def test_more_and_crooked_positions_fit_too():
     assert np.abs(np.mean(pulls, axis=0)).max() < 4 / np.sqrt(60)
 
 
-def test_square_positions_have_a_closed_form():
-    up = GRAVITY_MPS2 * np.vstack([np.eye(3), -np.eye(3)])
-    scale, bias = np.array([1.02, 0.97, 1.0]), np.array([0.1, -0.3, 0.0])
-    seen = scale * up + bias
-    b, k, _ = fit_gravity(seen, np.full((6, 3), 1e-6))
-    np.testing.assert_allclose(b, (seen.max(axis=0) + seen.min(axis=0)) / 2, atol=0.02)
-    np.testing.assert_allclose(np.abs(((seen - b) / k) ** 2).sum(axis=1), GRAVITY_MPS2**2, rtol=1e-9)
-
-
 def test_level_standing_alone_is_not_enough(drive, nominal, hidden):
     findings = calibrated([drive("stand", 1)], nominal)
     assert len(findings) == 7
@@ -205,21 +144,3 @@ def test_level_standing_alone_is_not_enough(drive, nominal, hidden):
     up = GRAVITY_MPS2 * np.vstack([np.eye(3), -np.eye(3)])
     with pytest.raises(DataError, match="axis y was not turned both up and down"):
         fit_gravity(up[[0, 1, 2, 3, 5]], np.full((5, 3), 1e-6))
-
-
-def test_the_bench_is_a_power_on_like_any_other(nominal, hidden):
-    log = six_positions_log(hidden, 3, hold_s=6.0)
-    again = six_positions_log(hidden, 3, hold_s=6.0)
-    assert log.streams["imu"].values.tobytes() == again.streams["imu"].values.tobytes()
-    held = standing(log, nominal)
-    assert len(held) == 6
-    assert gyro_bias(held, nominal)[0].determined
-    imu = log.streams["imu"]
-    roll, pitch = (imu.channel(name) for name in ("roll_rad", "pitch_rad"))
-    vertical = np.column_stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)])
-    scales = [getattr(hidden.sensors, f"accel_scale_{axis}_ratio") for axis in "xyz"]
-    biases = [getattr(hidden.sensors, f"accel_bias_{axis}_mps2") for axis in "xyz"]
-    error = imu.values[:, 3:6] - biases - scales * vertical * GRAVITY_MPS2
-    assert np.abs(error.mean(axis=0)).max() < 4 * hidden.sensors.accel_bias_std_mps2
-    with pytest.raises(ConfigError, match="hold_s is 0"):
-        six_positions_log(hidden, 3, hold_s=0)

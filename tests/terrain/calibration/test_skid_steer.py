@@ -7,8 +7,6 @@ from studies.intervals import NOMINAL_M
 from studies.intervals import skid_run as driven
 
 from pipelines.data.datasets import load_runs
-from pipelines.report.results import silent
-from pipelines.slip import calibrate
 from terrain.calibration.skid_steer import (
     LIDAR_DELAY,
     RADIUS,
@@ -16,23 +14,20 @@ from terrain.calibration.skid_steer import (
     WHEELS_DELAY,
     identify,
 )
-from terrain.errors import ConfigError, DataError
-from terrain.logs.write import write_run
 from terrain.records import Stream
-from terrain.robots import description_file, load_robot
+from terrain.robots import load_robot
 
 HIDDEN = [(0.287, 1.8, 0.3, 0.05), (0.31, 1.5, 0.45, 0.12), (0.3, 2.1, 0.1, 0.0)]
 
 
 @pytest.mark.parametrize("hidden", HIDDEN)
-@pytest.mark.parametrize("seed", [0, 1])
-def test_hidden_values_come_back_within_their_intervals(hidden, seed):
-    runs = [driven(*hidden, 100 * seed + i) for i in range(12)]
+def test_hidden_values_come_back_within_their_intervals(hidden):
+    runs = [driven(*hidden, i) for i in range(12)]
     found = {f.parameter: f for f in identify(runs, NOMINAL_M, ("asphalt",))}
     for name, value in zip((RADIUS, TRACK, LIDAR_DELAY, WHEELS_DELAY), hidden, strict=True):
         finding = found[name]
         assert finding.determined
-        # 95 % of intervals hold the value; here each is widened to hold all 24
+        # 95 % of intervals hold the value; here each is widened to hold all 12
         middle, half = (finding.low + finding.high) / 2, (finding.high - finding.low) / 2
         assert abs(middle - value) < 1.5 * half, (name, finding)
         assert half < {RADIUS: 0.012, TRACK: 0.1, LIDAR_DELAY: 0.02, WHEELS_DELAY: 0.02}[name]
@@ -93,31 +88,6 @@ def test_without_turns_or_gyro_it_is_unknown_and_not_zero():
     assert found[LIDAR_DELAY].low < 0.25 < found[LIDAR_DELAY].high  # behind the wheels: 0.3 - 0.05
 
 
-def test_runs_without_a_lidar_are_one_sentence(tmp_path):
-    run = driven(0.29, 1.8, 0.3, 0.05, 0)
-    write_run(replace(run, streams={n: s for n, s in run.streams.items() if n != "lidar"}), tmp_path / "runs")
-    with pytest.raises(
-        DataError, match="drive 'skid_steer' is not calibrated from logs without the stream 'lidar'"
-    ):
-        calibrate.run(calibrate.Settings(data=tmp_path / "runs", robot="warthog"), silent)
-
-
-def test_a_section_with_a_wrong_key_or_unit_is_one_sentence(tmp_path):
-    text, file = description_file("warthog").read_text(), tmp_path / "mine.yaml"
-    file.write_text(text.replace("effective_track_m:", "effective_width_m:"))
-    with pytest.raises(ConfigError, match="identified: key 'effective_width_m' is unknown"):
-        load_robot(file)
-    file.write_text(text.replace("0.41, unit: s", "0.41, unit: ms"))
-    with pytest.raises(ConfigError, match="lidar_delay_s has the unit 'ms', 's' is required"):
-        load_robot(file)
-
-
-def overlap(finding, name, robot):
-    """Whether a finding is what the package's robot states, within 2.5 of its own half intervals."""
-    half = (finding.high - finding.low) / 2
-    return abs(finding.value - robot.identified[name]) < 2.5 * half
-
-
 @pytest.mark.parametrize("robot_name", ["warthog", "marmotte"])
 def test_what_the_package_states_is_what_measured_logs_show(measured, robot_name):
     folder = {"warthog": "drive_warthog_terrains", "marmotte": "drive_marmotte"}[robot_name]
@@ -125,7 +95,8 @@ def test_what_the_package_states_is_what_measured_logs_show(measured, robot_name
     runs = load_runs(measured(folder), robot=robot_name)
     found = {f.parameter.partition(".")[2]: f for f in identify(runs, robot.wheel_radius_m, ("asphalt",))}
     for name in robot.identified:
-        assert overlap(found[name], name, robot), (name, found[name])
+        half = (found[name].high - found[name].low) / 2
+        assert abs(found[name].value - robot.identified[name]) < 2.5 * half, (name, found[name])
     assert found["rolling_radius_m"].low < 1.02 * robot.wheel_radius_m
     assert found["rolling_radius_m"].high > 0.98 * robot.wheel_radius_m
     assert 1.0 < robot.identified["effective_track_m"] / robot.track_m < 2.0
