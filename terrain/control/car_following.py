@@ -151,14 +151,7 @@ def steer(
 ) -> tuple[float, SteerState, SteerStatus]:
     """Return the steering to command, the next state and the status.
 
-    Parameters
-    ----------
-    robot, settings : that steers; accepted ones
-    state : ``SteerState()`` at first, then what the step before returned
-    path, place : that is followed, and where the robot is on it
-    slips : (2,) of front and rear; NaN is taken as no slip
-    speed_mps : of the robot
-    dt_s : since the step before
+    ``SteerState()`` at first; slips (2,) of front and rear, of which NaN is taken as no slip.
     """
     if not (0.0 <= dt_s <= LONGEST_STEP_S and abs(speed_mps) < 100.0 and abs(place.distance_m) < 1e9):
         return state.command_rad, state, SteerStatus.BAD_INPUT
@@ -365,17 +358,8 @@ _NO_GRIP = Grip(math.nan, math.nan)
 class CarFollower:
     """Controller of a drive along a path, for :func:`terrain.simulation.car.run_car`.
 
-    Parameters
-    ----------
-    robot : car-like
-    path : to follow
-    source : of the sideslip
-    steering : gains of the law
-    observer : another observer than :func:`sideslip_observer` gives
-
-    Attributes
-    ----------
-    ticks : what was known and done, in the order of time
+    The sideslip is from a source, or from another observer than :func:`sideslip_observer` gives; ``ticks`` are what was
+    known and done, in the order of time.
     """
 
     def __init__(
@@ -485,14 +469,7 @@ class FollowedDrive(NamedTuple):
 
 
 def followed_drive(run: RunLog, path: ReferencePath, ticks: Sequence[FollowedTick]) -> FollowedDrive:
-    """Return the drive of a simulated car and what its controller knew.
-
-    Parameters
-    ----------
-    run : as simulated, with its truth
-    path : that was followed
-    ticks : of the controller, one for each tick of the wheels
-    """
+    """Return the drive of a simulated car, and what its controller knew at each tick of the wheels."""
     truth, n = run.streams["truth"], len(ticks)
     step = round(len(truth) / n)
     columns = {name: truth.channel(name)[::step][:n] for name in truth.channels}

@@ -129,19 +129,10 @@ class Controller:
 def make_controller(
     name: str, table: SlipTable, delay_s: float, ramp_mps2: float | None = None
 ) -> Controller:
-    """Return a controller by name.
+    """Return a controller: of :data:`KINDS`, ``known:NAME`` or ``target:SLIP``, with or without path tracking.
 
-    Parameters
-    ----------
-    name : of :data:`KINDS`, ``known:NAME`` or ``target:SLIP``, with or without path tracking
-    table : target slips
-    delay_s : from a sample to the wheel
-    ramp_mps2 : largest rise of speed of ``ramp``; that of the pilot's settings by default
-
-    Raises
-    ------
-    ConfigError
-        if there is none of that name, or its terrain or target is none.
+    The delay is from a sample to the wheel, the ramp the largest rise of speed of ``ramp``.  ``ConfigError`` is
+    raised if there is none of that name, or its terrain or target is none.
     """
     from terrain.control.robot_control import PilotSettings
     from terrain.records import SlipTarget, TargetStatus

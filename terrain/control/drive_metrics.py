@@ -103,14 +103,10 @@ class DriveHistory(NamedTuple):
 def drive_history(
     run: RunLog, robot: Robot, radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
 ) -> DriveHistory:
-    """Return the history of a simulated run.
+    """Return the history of a simulated run of a robot.
 
-    Parameters
-    ----------
-    run : with its truth
-    robot : the one that was simulated
-    radius_factors : true radius of each wheel over the nominal one (``Conditions``); without them, wheels
-        of different radii appear to gain energy from the ground
+    Factors are the true radius of each wheel over the nominal one (``Conditions``); without them, wheels of different
+    radii appear to gain energy from the ground.
     """
     truth, wheels = run.streams["truth"], robot.wheels
     step_s = float(np.median(np.diff(truth.time_s)))
@@ -277,13 +273,8 @@ def evaluate_drive(
 ) -> dict[str, float]:
     """Return the metrics of a drive by name, without the energy at equal distance; NaN where undefined.
 
-    Parameters
-    ----------
-    run, history : the drive's log, and the history of its truth
-    robot : the one that was simulated, whatever its controller assumed
-    situation : in which it was driven
-    adapting_to : targets of a controller that uses the terrain; without, neither adaptation nor belief is
-        evaluated
+    The robot is the one that was simulated, whatever its controller assumed; without targets that a controller adapts
+    to, neither adaptation nor belief is evaluated.
     """
     control, scenario = run.streams["control"], situation.scenario
     limited = control.channel("driven_mps") < control.channel("desired_mps") - 1e-6
@@ -520,13 +511,7 @@ def matching_ramp(
 ) -> float | None:
     """Return the rise of speed in m/s^2 by which the ramp travels as far as the first reference among controllers.
 
-    None where no controller is a reference.
-
-    Parameters
-    ----------
-    drives : by controller, at the same seeds
-    of_ramp : drives of the controller ``ramp`` with a rise of speed in m/s^2
-    scenario, accel_mps2 : that is driven, and the desired rise of speed
+    None where no controller is a reference.  ``of_ramp`` gives drives with a rise of speed, at the same seeds.
     """
     references = [name for kind in REFERENCES for name in drives if name in (kind, f"{kind}{TRACK}")]
     references += [name for name in drives if name.startswith(("known:", "target:"))]

@@ -53,11 +53,6 @@ STEADY_FAULT_S = 5.0
 def make_fault_situation(name: str, robot: Robot, terrain: str, seed: int) -> tuple[Situation, float]:
     """Return a situation without any fault by chance, and the time at which a fault begins in it.
 
-    Raises
-    ------
-    ConfigError
-        if the name is none of :data:`FAULT_SITUATIONS`, or the terrain is unknown.
-
     Examples
     --------
     >>> from terrain.robots import load_robot
@@ -431,17 +426,9 @@ def clean_drive(place: Place, references: References) -> dict[str, Any]:
 class GuardedPilot:
     """Passes samples to a pilot; where it fails, the wheels keep their last command.
 
-    Parameters
-    ----------
-    pilot : gets the samples.  Its ``health``, a mapping from a sensor to the name of its status, is recorded
-        where it has one
-
-    Attributes
-    ----------
-    n_exceptions, n_not_finite : steps at which it raised, or gave a command that is not three finite numbers
-    exception : the first one, or empty
-    speed_mps : estimated forward speed after each step; NaN where there is none
-    health : after each step; None where the pilot has none
+    Counted are steps at which it raised, or gave a command that is not three finite numbers, with the first exception;
+    recorded after each step are the estimated forward speed, NaN without one, and the pilot's ``health``, a mapping
+    from a sensor to the name of its status, None without one.
     """
 
     def __init__(self, pilot: Any) -> None:

@@ -84,13 +84,6 @@ def check_tracking(
 ) -> TrackSettings:
     """Return settings that can be used, as floats.
 
-    Parameters
-    ----------
-    robot : with its sections
-    settings : to check
-    delay_s : from the estimate to the wheels, beside the filter's lag
-    dt_s : sample time
-
     Raises
     ------
     ConfigError

@@ -150,11 +150,6 @@ class ReferencePath:
 def path_from_curvature(distance_m: Array, curvature_pm: Array) -> ReferencePath:
     """Return the path from (0, 0) along x whose curvature runs linearly between given values.
 
-    Parameters
-    ----------
-    distance_m : (n,) rising from 0
-    curvature_pm : (n,)
-
     Examples
     --------
     >>> circle = path_from_curvature(np.array([0.0, 2 * np.pi * 10]), np.array([0.1, 0.1]))

@@ -124,13 +124,7 @@ class PilotStatus(NamedTuple):
 
 
 def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> SwerveRobot:
-    """Return a robot that can be driven.
-
-    Raises
-    ------
-    ConfigError
-        as a pilot does, apart from the settings of traction and tracking.
-    """
+    """Return a robot that can be driven; ``ConfigError`` as a pilot, but for settings of traction and tracking."""
     if settings.controller not in CONTROLLERS:
         raise ConfigError(
             f"controller {settings.controller!r} is unknown: use one of {', '.join(CONTROLLERS)}"
@@ -171,38 +165,28 @@ def observe_wheels(
 ) -> WheelMotion:
     """Return the motion along each wheel from an estimate of the robot's motion; NaN before the first one.
 
-    Parameters
-    ----------
-    robot : swerve robot with motors
-    steer_states : (wheels,) places of the steering angles among the estimate's states
-    estimate, time_s : the last one, and the time of the step
+    ``steer_states`` (wheels,) are the places of the steering angles among the estimate's states.
     """
     if estimate is None:
         return UNOBSERVED
-    motors, stale_s = robot.equipment.motors, estimate_age(estimate, time_s)
-    steer = estimate.mean[steer_states]
-    rows = estimate.wheel_speed_mps, estimate.slip_ratio, estimate.slip_std, steer
+    motors, stale_s, steer_rad = (
+        robot.equipment.motors,
+        estimate_age(estimate, time_s),
+        estimate.mean[steer_states],
+    )
+    cos, sin, (x_m, y_m) = np.cos(steer_rad), np.sin(steer_rad), np.transpose(robot.wheel_positions_m)
     motion = estimate.speed_x_mps, estimate.speed_y_mps, estimate.yaw_rate_radps
-    columns = []
-    for (x_m, y_m), wheel_speed, slip, std, steer_rad in zip(
-        robot.wheel_positions_m, *(row.tolist() for row in rows), strict=True
-    ):
-        cos, sin = math.cos(steer_rad), math.sin(steer_rad)
-        speed, _ = in_wheel_frame(*point_velocity(*motion, x_m, y_m), cos, sin)
-        accel = estimate.accel_x_mps2 * cos + estimate.accel_y_mps2 * sin
-        fastest = abs(speed) if abs(wheel_speed) <= abs(speed) else abs(wheel_speed)  # NaN too
-        # a wheel stands by the filter's rate, which differs a little from the measured one
-        standing = fastest < (2.0 if math.isnan(slip) else 1.0) * MIN_SPEED_MPS
-        slip = 0.0 if standing and not math.isinf(stale_s) else slip
-        columns.append((speed, accel, slip, 0.0 if standing else std))
-    speed_mps, accel_mps2, slip_ratio, slip_std = np.array(columns).T
+    speed, _ = in_wheel_frame(*point_velocity(*motion, x_m, y_m), cos, sin)
+    wheel, slip = np.abs(estimate.wheel_speed_mps), estimate.slip_ratio
+    fastest = np.where(wheel <= np.abs(speed), np.abs(speed), wheel)  # NaN too
+    # a wheel stands by the filter's rate, which differs a little from the measured one
+    standing = fastest < np.where(np.isnan(slip), 2.0, 1.0) * MIN_SPEED_MPS
     return WheelMotion(
-        speed_mps,
-        accel_mps2,
-        slip_ratio,
-        slip_std,
-        torque_nm=estimate.current_a
-        * (motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio),
+        speed,
+        estimate.accel_x_mps2 * cos + estimate.accel_y_mps2 * sin,
+        np.where(standing & (stale_s < math.inf), 0.0, slip),
+        np.where(standing, 0.0, estimate.slip_std),
+        estimate.current_a * (motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio),
         wheel_radps=estimate.wheel_speed_mps / robot.wheel_radius_m,
         chassis_mps=math.hypot(estimate.speed_x_mps, estimate.speed_y_mps),
         stale_s=stale_s,
@@ -369,56 +353,14 @@ SLOW_S, APPROACH = 0.2, 0.02
 SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 
 
-class Follower:
-    """A wheel's speed, or a steering angle, against its command: whether it ``is_off``.
-
-    The tolerance is a constant and a ratio of the command; a value that repeats itself has to change as the
-    command does within ``still_s``.
-    """
-
-    def __init__(self, tolerance: float, ratio: float = 0.0, still_s: float = math.inf) -> None:
-        self._tolerance, self._ratio, self._still_s = tolerance, ratio, still_s
-        self._commands: deque[tuple[float, float]] = deque(maxlen=N_COMMANDS)
-        self._last = self._before = self._smooth = self._slow = math.nan
-        self._repeated_s, self._off_s, self._on_s = 0.0, 0.0, SETTLED_S
-        self.is_off = False
-
-    def update(self, now_s: float, step_s: float, command: float, measured: float) -> None:
-        """Take the command that was in force until now, and what is measured; NaN for none."""
-        self._commands.append((now_s, command))
-        middle = self._middle(measured, step_s)
-        self._smooth = _low_passed(self._smooth, middle, step_s / SMOOTH_S)
-        self._slow = _low_passed(self._slow, middle, step_s / SLOW_S)
-        smooth, since_s = self._smooth, now_s - (STILL_S if self._repeated_s >= self._still_s else WINDOW_S)
-        commands = [value for time_s, value in self._commands if time_s >= since_s and not math.isnan(value)]
-        deviates = False
-        if commands and not math.isnan(smooth):
-            low, high = min(commands), max(commands)
-            slack = self._tolerance + self._ratio * max(abs(low), abs(high))
-            below, above = smooth < low - slack, smooth > high + slack
-            if (below and smooth > self._slow + APPROACH) or (above and smooth < self._slow - APPROACH):
-                return
-            deviates = below or above
-        self._off_s = self._off_s + step_s if deviates else 0.0
-        self._on_s = 0.0 if deviates else self._on_s + step_s
-        if self._off_s >= PERSISTS_S:
-            self.is_off = True
-        elif self._on_s >= SETTLED_S:
-            self.is_off = False
-
-    def _middle(self, measured: float, step_s: float) -> float:
-        """Return the middle one of the last three values, or this one where there are fewer."""
-        last, before = self._last, self._before
-        self._repeated_s = self._repeated_s + step_s if measured == last else 0.0
-        self._last, self._before = measured, last
-        if math.isnan(measured + last + before):
-            return measured
-        return max(min(measured, last), min(max(measured, last), before))
+def _low_passed(before: Array, value: Array, step_ratio: float) -> Array:
+    """Return values behind a low-pass; an unknown one leaves nothing there."""
+    passed = before - (value - before) * math.expm1(-step_ratio)
+    return np.where(np.isnan(passed), value, passed)
 
 
-def _low_passed(before: float, value: float, step_ratio: float) -> float:
-    """Return a value behind a low-pass; an unknown one leaves nothing there."""
-    return value if math.isnan(before + value) else before + (value - before) * -math.expm1(-step_ratio)
+_TOLERANCE, _RATIO = np.repeat([SPEED_MPS, STEER_RAD], 3), np.repeat([SPEED_RATIO, 0.0], 3)
+_STILL_S = np.repeat([STILL_S, math.inf], 3)  # a steering angle may repeat itself
 
 
 class Actuation:
@@ -428,25 +370,44 @@ class Actuation:
     """
 
     def __init__(self, mps_per_radps: float) -> None:
-        self._mps_per_radps = mps_per_radps
-        self._command = [math.nan] * 6
-        self._followers = [Follower(SPEED_MPS, SPEED_RATIO, STILL_S) for _ in range(3)]
-        self._followers += [Follower(STEER_RAD) for _ in range(3)]
+        self._mps_per_radps, self._command = mps_per_radps, np.full(6, math.nan)
+        self._commands: deque[tuple[float, Array]] = deque(maxlen=N_COMMANDS)
+        self._last = self._before = self._smooth = self._slow = np.full(6, math.nan)
+        self._repeated_s, self._off_s, self._on_s = np.zeros(6), np.zeros(6), np.full(6, SETTLED_S)
         self.off = np.zeros(6, dtype=np.bool_)
 
     def commanded(self, wheel_mps: Array, steer_rad: Array) -> None:
         """Take the commands (3,), (3,) that are in force from now on."""
-        self._command = [*wheel_mps.tolist(), *steer_rad.tolist()]
+        self._command = np.concatenate([wheel_mps, steer_rad])
 
     def measured(self, now_s: float, step_s: float, wheels: Reading | None, steer_rad: Array | None) -> None:
         """Compare the rates, first columns of the wheels, and steering angles (3,) with the commands."""
-        unknown = [math.nan] * 3
-        rates = unknown if wheels is None else wheels.values[-1, :3].tolist()
-        angles = unknown if steer_rad is None else steer_rad.tolist()
-        measured = [*(rate * self._mps_per_radps for rate in rates), *angles]
-        for follower, command, value in zip(self._followers, self._command, measured, strict=True):
-            follower.update(now_s, step_s, command, value)
-        self.off = np.array([follower.is_off for follower in self._followers])
+        value = np.full(6, math.nan)
+        if wheels is not None:
+            value[:3] = wheels.values[-1, :3] * self._mps_per_radps
+        if steer_rad is not None:
+            value[3:] = steer_rad
+        last_three = np.array([value, self._last, self._before])
+        middle = np.where(np.isnan(last_three).any(axis=0), value, np.sort(last_three, axis=0)[1])
+        self._repeated_s = np.where(value == self._last, self._repeated_s + step_s, 0.0)
+        self._last, self._before = value, self._last
+        smooth = self._smooth = _low_passed(self._smooth, middle, step_s / SMOOTH_S)
+        slow = self._slow = _low_passed(self._slow, middle, step_s / SLOW_S)
+        self._commands.append((now_s, self._command))
+        commands = np.array([command for _, command in self._commands])
+        since_s = now_s - np.where(self._repeated_s >= _STILL_S, STILL_S, WINDOW_S)
+        counts = (np.array([[time_s] for time_s, _ in self._commands]) >= since_s) & ~np.isnan(commands)
+        known = counts.any(axis=0)
+        low = np.where(known, np.where(counts, commands, math.inf).min(axis=0), 0.0)
+        high = np.where(known, np.where(counts, commands, -math.inf).max(axis=0), 0.0)
+        slack = _TOLERANCE + _RATIO * np.maximum(np.abs(low), np.abs(high))
+        below, above = known & (smooth < low - slack), known & (smooth > high + slack)
+        goes = ~((below & (smooth > slow + APPROACH)) | (above & (smooth < slow - APPROACH)))
+        deviates = below | above
+        self._off_s = np.where(goes, np.where(deviates, self._off_s + step_s, 0.0), self._off_s)
+        self._on_s = np.where(goes, np.where(deviates, 0.0, self._on_s + step_s), self._on_s)
+        now_off = (self._off_s >= PERSISTS_S) | (self.off & (self._on_s < SETTLED_S))
+        self.off = np.where(goes, now_off, self.off)
 
 
 _ROLL, _PITCH = IMU_CHANNELS.index("roll_rad"), IMU_CHANNELS.index("pitch_rad")

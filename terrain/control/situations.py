@@ -70,12 +70,7 @@ def make_situation(
 
     Load, soil, tyres, roughness and noise are drawn, by seed and terrain alone: a soil, or ``course`` for all of
     them.  ``course`` and ``mixed`` have slopes and undulations as fields have (``data/spread``); all others have
-    the chosen grade.
-
-    Raises
-    ------
-    ConfigError
-        if scenario or terrain are unknown or do not go together, or an option is out of range.
+    the chosen grade.  ``ConfigError`` is raised where they do not go together, or an option is out of range.
     """
     known = (*SITUATIONS, *(scenario for scenario in SCENARIOS if scenario not in SITUATIONS))
     if name not in known:

@@ -139,13 +139,9 @@ class _Entry(BaseModel):
 def load_slip_table(
     path: str | Path | None = None, robot: str | None = None, text: str | None = None
 ) -> SlipTable:
-    """Read a table; the packaged ``default`` one without a path.
+    """Read a table for a robot, any by default; the packaged ``default`` one without a path.
 
-    Parameters
-    ----------
-    path : YAML file
-    robot : name of the robot that is to be driven; any by default
-    text : content, of which the path is but the name in messages
+    With a text, the path is but its name in messages.
 
     Raises
     ------
@@ -223,15 +219,7 @@ def _check_curve(where: str, curve: CurveEntry) -> None:
 
 
 def write_slip_table(table: SlipTable, path: str | Path) -> None:
-    """Write a table as a file of schema 2, whole or not at all; reading it gives the same table.
-
-    Raises
-    ------
-    ConfigError
-        if it is no robot's.
-    TerrainError
-        if the place cannot be written.
-    """
+    """Write a table of a robot as a file of schema 2, whole or not at all; reading it gives the same table."""
     if not table.robot:
         raise ConfigError(f"table {table.name!r} is no robot's: a learned table names the one it is for")
     content = table_content(table)

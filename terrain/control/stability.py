@@ -67,23 +67,9 @@ def check_stable(
 ) -> float:
     """Return the factor on all gains at which the loop becomes unstable somewhere in the robot's range of operation.
 
-    Parameters
-    ----------
-    robot : with its sections
-    gains : whose limits are not used
-    delay_s : from measurement to command, beside the encoders' low-pass
-    dt_s : sample time
-    low_speed_mps : below which the controller is inactive
-
-    Returns
-    -------
-    float
-        above 1; infinite for none
-
-    Raises
-    ------
-    ConfigError
-        if the loop is unstable at some speed, or a gain, the delay or a time is not accepted.
+    It is above 1, and infinite for none; ``ConfigError`` is raised if the loop is unstable at some speed, or a gain
+    or a time is not accepted.  The delay is from measurement to command, beside the encoders' low-pass; below the
+    low speed the controller is inactive.
 
     Examples
     --------

@@ -109,11 +109,6 @@ def check_settings(settings: TractionSettings, robot: Robot | None = None) -> Tr
     of ``T / K_P`` with the time constant ``K_P / K_I``.  At a deceleration a, each of n wheels carries
     ``T = a m r / n``.
 
-    Raises
-    ------
-    ConfigError
-        if one is not finite or is negative, or a time constant or the launch speed is zero.
-
     Examples
     --------
     >>> from terrain.robots import load_robot
