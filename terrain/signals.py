@@ -184,6 +184,18 @@ def _low_passed(time_s: Array, value: Array, time_constant_s: float, gap_s: floa
     return out
 
 
+def true_stretches(mask: Array) -> Array:
+    """Return first and end (k, 2) of the stretches of a mask (n,), the end exclusive.
+
+    Examples
+    --------
+    >>> true_stretches(np.array([True, False, True, True])).tolist()
+    [[0, 1], [2, 4]]
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(mask).astype(int), [0]])))
+    return edges.reshape(-1, 2)
+
+
 def at_times(time_s: Array, values: Array, at_s: Array, max_gap_s: float) -> Array:
     """Return samples (n, c) at other times (m,), on straight lines; NaN outside, and within longer gaps."""
     after = np.searchsorted(time_s, at_s)

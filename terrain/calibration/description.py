@@ -45,10 +45,7 @@ def hard_grounds() -> tuple[str, ...]:
 def findings_of(runs: Sequence[RunLog], description: Any, robot: Robot, hard: Sequence[str]) -> list[Finding]:
     """Return what the runs of a robot show, by its drive, beside what its description has.
 
-    Raises
-    ------
-    DataError
-        if a run is another robot's, or those of a skid-steer robot have no lidar.
+    ``DataError`` if a run is another robot's, or those of a skid-steer robot have no lidar.
     """
     if robot.skids and not any("lidar" in run.streams for run in runs):
         raise DataError(

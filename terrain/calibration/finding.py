@@ -56,17 +56,10 @@ def biases(
 ) -> list[Finding]:
     """Predict the biases of future power-ons, and their scatter, from those of single power-ons.
 
-    Parameters
-    ----------
-    parameters, std_parameter : places of the three biases and of their scatter from power-on to power-on
-    found, variance : (k, 3) biases in each power-on, and the variances of their errors
-    described_std : the scatter, taken for true where there is one power-on alone
-    n, counted, runs : what they rest on; each run is a power-on
-
-    Notes
-    -----
-    However well a bias is known in one power-on, the scatter limits how well it predicts the next one.
-    The axes share one scatter, as the description has it: k power-ons give 3 (k - 1) degrees of freedom.
+    Found are (k, 3) biases in each power-on, each run one, with the variances of their errors; the described scatter is
+    taken for true where there is one alone.  However well a bias is known in one power-on, the scatter limits how well
+    it predicts the next one.  The axes share one scatter, as the description has it: k power-ons give 3 (k - 1)
+    degrees of freedom.
     """
     k = len(found)
     mean = found.mean(axis=0)

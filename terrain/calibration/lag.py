@@ -31,7 +31,7 @@ from terrain.identify import half_width
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.signals import at_times, low_passed
+from terrain.signals import at_times, low_passed, true_stretches
 
 #: Of the accelerometer itself: 62.5 Hz of bandwidth in the fusion modes (Bosch, BNO055 data sheet).
 REFERENCE_LAG_S = 1 / (2 * math.pi * 62.5)
@@ -166,10 +166,9 @@ def _ramps(time_s: Array, speed_mps: Array) -> list[tuple[float, float]]:
     change = np.linalg.norm(speed_mps[2 * n :] - speed_mps[: -2 * n], axis=1)
     slope[n:-n] = np.nan_to_num(change / (time_s[2 * n :] - time_s[: -2 * n]))
     steep = slope >= MIN_ACCEL_MPS2
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], steep.astype(int), [0]]))).reshape(-1, 2)
     cores = [
         (float(time_s[first]), float(time_s[end - 1]))
-        for first, end in edges
+        for first, end in true_stretches(steep)
         if time_s[end - 1] - time_s[first] >= MIN_EVENT_S
     ]
     found = []

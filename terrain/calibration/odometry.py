@@ -81,13 +81,7 @@ class Leg(NamedTuple):
 
 
 def odometry_rows(run: RunLog, robot: TrackedRobot) -> tuple[Array, Array]:
-    """Return the ticks (n,) of a run's encoders, and what an odometry takes at each (n, 5).
-
-    Raises
-    ------
-    DataError
-        if the run has no speeds of tracks.
-    """
+    """Return the ticks (n,) of a run's encoders, and what an odometry takes at each (n, 5)."""
     return rows_of(run, robot, ODOMETRY_ROWS)[:2]
 
 
@@ -96,17 +90,8 @@ def legs_of_windows(
 ) -> tuple[list[Leg], Leg | None]:
     """Return the legs of a command's windows, and that of all of them in a row; None where they have gaps.
 
-    Parameters
-    ----------
-    run, number : of the command
-    windows : its poses
-    robot : that drove
-    delay_s : of the poses behind the gyro and the tracks
-
-    Notes
-    -----
-    Poses are of an earlier time than their stamps by the delay; before its first sample a run is taken to
-    have driven as at that.
+    Poses are of an earlier time than their stamps by the delay behind gyro and tracks; before its first sample a run is
+    taken to have driven as at that.
     """
     found = (
         _leg(run, number, window.pose[-1], (window.time_s[0], window.time_s[-1]), robot, delay_s)
@@ -148,13 +133,7 @@ def legs_of_poses(
 ) -> list[Leg]:
     """Return legs of a run with poses in one frame, one after the other.
 
-    Parameters
-    ----------
-    run : with the stream pose
-    number : of the run
-    robot : that drove
-    length_s : of each leg
-    delay_s : of the poses behind the gyro and the tracks
+    The delay is that of the poses behind the gyro and the tracks.
     """
     pose = run.streams["pose"]
     values = pose.values.copy()
@@ -282,18 +261,9 @@ class FittedOdometry:
 
 
 def fit_odometry(kind: Kind, legs: Sequence[Leg], robot: TrackedRobot) -> FittedOdometry:
-    """Fit a kind of odometry.
+    """Fit a kind of odometry to legs, of which longer ones count by the inverse of their length.
 
-    Parameters
-    ----------
-    kind : which parts of the model are free
-    legs : to fit; longer ones count by the inverse of their length
-    robot : that drove them
-
-    Raises
-    ------
-    DataError
-        if there are fewer than ten legs.
+    ``DataError`` if there are fewer than ten legs.
     """
     if len(legs) < MIN_LEGS:
         raise DataError(f"{len(legs)} legs have poses at both ends, {MIN_LEGS} or more are required")
@@ -459,18 +429,8 @@ def held_out_ends(
 ) -> dict[str, dict[str, Array]]:
     """Return by kind and group the predicted ends (n, 3) of legs whose runs were held out of the fit.
 
-    Parameters
-    ----------
-    groups : legs by length
-    robot : that drove them
-    n_folds : whole runs are dealt into so many
-    seed : of the deal
-    progress : called after each fit
-
-    Raises
-    ------
-    DataError
-        if there are fewer runs than folds.
+    Groups are legs by length; whole runs are dealt into folds by the seed.  ``DataError`` if there are fewer runs than
+    folds.
     """
     every = [leg for legs in groups.values() for leg in legs]
     run = np.array([leg.run for leg in every])
@@ -488,14 +448,7 @@ def held_out_ends(
 
 
 def score_legs(legs: Sequence[Leg], ends: Mapping[str, Array], seed: int) -> LegScores:
-    """Return the scores of kinds over legs of one length.
-
-    Parameters
-    ----------
-    legs : n of them
-    ends : predicted (n, 3) by the name of the kind
-    seed : of the bootstrap over runs
-    """
+    """Return the scores of kinds over n legs of one length, by predicted ends (n, 3) and a bootstrap over runs."""
     measured = np.array([leg.moved for leg in legs])
     runs, number = np.unique([leg.run for leg in legs], return_inverse=True)
     counts, legs_of_run = bootstrap_counts(len(runs), DRAWS, seed), np.bincount(number)
@@ -622,21 +575,10 @@ def judge_odometry(
     seed: int,
     count: Callable[[int, int], None] = lambda done, total: None,
 ) -> JudgedOdometry:
-    """Fit kinds of odometry to folds of runs, judge them on the others, and fit the slip model to all.
+    """Fit kinds of odometry to folds of whole runs, judge them on the others, and fit the slip model to all.
 
-    Parameters
-    ----------
-    runs : with poses, or commands of DRIVE
-    windows : poses of the windows of DRIVE, by run; empty for runs with poses
-    robot : whose they are
-    lengths_s : after which poses are compared; windows of DRIVE have their own
-    folds, seed : of whole runs
-    count : gets how many fits are done, and how many there are
-
-    Raises
-    ------
-    DataError
-        if fewer runs than folds have poses.
+    Runs have poses, compared after some lengths, or are commands of DRIVE with the poses of their windows by run.
+    ``DataError`` if fewer runs than folds have poses.
     """
     delay_s = robot.identified.get("lidar_delay_s", 0.0) if windows else 0.0
     groups = (

@@ -52,12 +52,8 @@ MIN_BLOCKS = 8  #: Of each motor: two unknowns.
 def identify_omni(runs: Sequence[RunLog], robot: OmniRobot, seed: int = 0) -> list[Finding]:
     """Return a finding for each number of an omni robot that runs can determine.
 
-    Parameters
-    ----------
-    runs : of motors alone, driving runs under a camera, or both; runs of a session (with weights, say) are
-        not those of the robot as described, and are left out
-    robot : as described so far
-    seed : of the draws
+    They are of motors alone, driving runs under a camera, or both; runs of a session (with weights, say) are not those
+    of the robot as described, and are left out.
     """
     measured = [run for run in runs if outside_source(run) is not None]
     own = [run for run in measured if not run.session and len(run.terrains) == 1]

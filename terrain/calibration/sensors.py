@@ -37,6 +37,7 @@ from terrain.kinematics.wheels import TWIST, point_velocity
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
+from terrain.signals import true_stretches
 
 #: Shorter stops are passed over: the robot still swings, and noise averages out too little.
 MIN_STANDING_S = 5.0
@@ -97,11 +98,10 @@ def standing(run: RunLog, robot: Robot, min_s: float = MIN_STANDING_S) -> list[S
         moving_s = wheels.time_s[wheel_speed_mps > STANDING_MPS]
         quiet &= np.searchsorted(moving_s, time_s[:, 0]) == np.searchsorted(moving_s, time_s[:, -1])
         quiet &= (time_s[:, 0] >= wheels.time_s[0]) & (time_s[:, -1] <= wheels.time_s[-1] + BLOCK_S)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], quiet.astype(int), [0]]))).reshape(-1, 2)
     # Nearly a block at either end shares its block with a motion; one more is left away for what swings on.
     return [
         Stretch(run, float(time_s[first + 1, 0]), float(time_s[end - 1, 0]))
-        for first, end in edges
+        for first, end in true_stretches(quiet)
         if end - first > 2 and (end - first + 2) * BLOCK_S >= min_s
     ]
 
@@ -196,22 +196,10 @@ GRAVITY = f"gravity taken for {GRAVITY_MPS2} m/s^2; on Earth it is within 0.3 % 
 
 
 def fit_gravity(means_mps2: Array, variance: Array) -> tuple[Array, Array, Array]:
-    """Return what makes gravity of the means of resting stretches.
+    """Return what makes gravity of the means of n resting stretches (n, 3) with the variances of their errors (n, 3).
 
-    Parameters
-    ----------
-    means_mps2 : (n, 3) mean of the accelerometer in each of n positions
-    variance : (n, 3) variance of the errors of the means
-
-    Returns
-    -------
-    bias_mps2, scale_ratio : (3,)
-    cov : (6, 6) of both, in that order
-
-    Raises
-    ------
-    DataError
-        if an axis was never turned both up and down.
+    Biases (3,), scales (3,), and the covariance (6, 6) of both; ``DataError`` if an axis was never turned both up and
+    down.
 
     Examples
     --------

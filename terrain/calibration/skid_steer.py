@@ -105,11 +105,8 @@ class Summary(NamedTuple):
 def identify(runs: Sequence[RunLog], wheel_radius_m: float, hard: Sequence[str]) -> list[Finding]:
     """Return rolling radius, effective track and delays, or why these runs do not determine them.
 
-    Parameters
-    ----------
-    runs : of one robot; those labelled as hard ground are used, all of them where no run has a label
-    wheel_radius_m : described, by which the runs' wheel speeds were made
-    hard : terrain labels of hard ground
+    Runs of one robot that are labelled as hard ground are used, all of them where no run has a label; the described
+    wheel radius is that by which the runs' wheel speeds were made.
     """
     labelled = any(run.labels for run in runs)
     chosen = [run for run in runs if not labelled or (run.terrains and set(run.terrains) <= set(hard))]

@@ -37,7 +37,7 @@ from terrain.identify import half_width
 from terrain.kinematics.wheels import wheel_velocities
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
-from terrain.signals import at_times
+from terrain.signals import at_times, true_stretches
 
 #: Steady driving: the means over this time before and after an instant differ by no more than the two below.
 STEADY_S = 0.5
@@ -123,9 +123,8 @@ def _within(stretch: Stretch, robot: Robot) -> list[Steady]:
     steady &= (np.linalg.norm(centre, axis=2) >= MIN_SPEED_MPS).all(axis=1)
     steady &= _change(np.nan_to_num(angle), n) <= MAX_STEER_CHANGE_RAD
     steady &= _change(wheel_speed, n) <= MAX_SPEED_CHANGE_MPS
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], steady.astype(int), [0]]))).reshape(-1, 2)
     found = []
-    for first, end in edges:
+    for first, end in true_stretches(steady):
         if time_s[end - 1] - time_s[first] < MIN_LENGTH_S:
             continue
         rows = slice(first, end)

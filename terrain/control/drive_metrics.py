@@ -33,7 +33,7 @@ from terrain.kinematics.logged_wheels import true_slip
 from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.signals import low_pass
+from terrain.signals import low_pass, true_stretches
 from terrain.simulation.scenario import Scenario
 
 PEAK_ABOVE_MPS = 0.2  #: Slip is evaluated above this speed: below it is the ratio of two small speeds.
@@ -165,12 +165,6 @@ def low_passed_slip(slip_ratio: Array, step_s: float) -> Array:
     return low_pass(np.nan_to_num(slip_ratio), step_s, SMOOTH_S)
 
 
-def stretches(mask: Array) -> Array:
-    """Return the lengths (k,) of the stretches of a mask (n,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(int)))
-    return np.asarray(edges[1::2] - edges[::2])
-
-
 def slip_peak(history: DriveHistory, within: Array | None = None) -> float:
     """Return the largest slip of the robot, the mean over its wheels, above :data:`PEAK_ABOVE_MPS`; or NaN.
 
@@ -216,7 +210,7 @@ def immobilised(history: DriveHistory, control: Stream) -> int:
     """
     desired = np.interp(history.time_s, control.time_s, control.channel("desired_mps"))
     moving_mps = (history.ground_mps * np.sign(history.wheel_speed_mps)).max(axis=1)
-    stuck = stretches((desired > STUCK_COMMAND_MPS) & (moving_mps < STUCK_MPS))
+    stuck = np.ptp(true_stretches((desired > STUCK_COMMAND_MPS) & (moving_mps < STUCK_MPS)), axis=1)
     return int((stuck * (history.time_s[1] - history.time_s[0]) >= STUCK_S).sum())
 
 

@@ -22,7 +22,6 @@ from terrain.control.drive_metrics import (
     DriveHistory,
     drive_history,
     stopping_distance,
-    stretches,
 )
 from terrain.control.situations import (
     BRAKE,
@@ -37,7 +36,7 @@ from terrain.control.traction import TractionStatus
 from terrain.errors import ConfigError
 from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
-from terrain.signals import low_pass
+from terrain.signals import low_pass, true_stretches
 from terrain.simulation.conditions import Faults
 from terrain.simulation.faults import FaultyBus, Nature, fault_catalogue
 from terrain.simulation.scenario import Scenario
@@ -215,7 +214,7 @@ def fault_figures(
     stop_m = drive.stop_m if math.isfinite(drive.stop_m) else math.inf
     return FaultFigures(
         ok_total_s=lasts_s(ok.sum()),
-        ok_longest_s=lasts_s(stretches(ok).max(initial=0)),
+        ok_longest_s=lasts_s(np.ptp(true_stretches(ok), axis=1).max(initial=0)),
         not_ok_s=lasts_s(max(not_ok.sum() - clean_not_ok.sum(), 0)),
         slip_error_ratio=slip_error(drive),
         clean_slip_error_ratio=slip_error(clean),
@@ -224,7 +223,7 @@ def fault_figures(
         stop_m=stop_m if is_stop else math.nan,
         stop_ratio=stop_m / plain.stop_m if is_stop else math.nan,
         recovery_s=recovery_s,
-        overspeed_s=lasts_s(stretches(since & too_fast).max(initial=0)),
+        overspeed_s=lasts_s(np.ptp(true_stretches(since & too_fast), axis=1).max(initial=0)),
         n_exceptions=n_exceptions,
         n_not_finite=n_not_finite,
     )
