@@ -7,7 +7,6 @@ from terrain.errors import DataError
 from terrain.estimation.consistency import (
     consistency_report,
     innovations,
-    lagged_slip,
     nees,
     sample_from_model,
     true_states,
@@ -15,7 +14,6 @@ from terrain.estimation.consistency import (
 from terrain.estimation.filter import FilterModel, FilterSettings, Noise, run_filter
 from terrain.estimation.models.swerve import default_noise, make_filter
 from terrain.kernels import njit
-from terrain.kinematics.logged_wheels import wheel_and_ground_speed
 from terrain.records import RunLog, StateTrack, Stream
 from terrain.robots import load_robot
 from terrain.signals import low_passed
@@ -200,17 +198,6 @@ def test_truth_passes_the_low_pass_of_the_filter_inputs(run):
     assert lag_s == pytest.approx(0.05, abs=0.01)
     assert found[0, 0] == pytest.approx(0.0, abs=0.02)
     assert np.isnan(found[:, 5]).all()  # there is no true effective track
-
-
-def test_slip_behind_the_low_pass_is_the_slip_where_driving_is_steady(run):
-    truth = run.streams["truth"]
-    slip, ground = lagged_slip(truth, ROBOT, 0.05)
-    np.testing.assert_array_equal(lagged_slip(truth, ROBOT, 0.0)[1], wheel_and_ground_speed(truth, ROBOT)[1])
-    steady = (truth.time_s > 4.0) & (truth.time_s < 7.0)
-    true_slip = np.column_stack([truth.channel(f"slip_{i}_ratio") for i in (1, 2, 3)])
-    assert np.abs(slip[steady].mean(axis=0) - true_slip[steady].mean(axis=0)).max() < 0.002
-    assert np.isnan(slip[truth.time_s < 0.9]).all()  # it stands
-    assert (ground[steady] > 0.5).all()
 
 
 def test_a_run_without_truth_gives_none_and_an_extra_wheel_is_refused(run):

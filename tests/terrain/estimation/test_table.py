@@ -260,44 +260,6 @@ def test_smoothing_of_the_thesis_is_there_to_be_compared():
 # faults
 
 
-@pytest.mark.parametrize(
-    ("stream", "rows"),
-    [
-        ("odometry", CAMERA_ROWS),
-        ("imu", ("accel_x_mps2", "accel_y_mps2", "gyro_z_radps", "imu_yaw_rad")),
-        ("steering", ("steer_1_rad", "steer_2_rad", "steer_3_rad")),
-        ("gnss", GNSS_ROWS),
-    ],
-)
-def test_a_stream_that_is_missing_or_ends_early_or_has_a_hole_is_unknown_there(stream, rows):
-    whole = measurement_table(RUN, bare(sensors={"encoder_time_constant_s": 0.05}))
-    robot = bare(sensors={"encoder_time_constant_s": 0.05})
-    gone = measurement_table(without(RUN, stream), robot)
-    assert np.isnan(gone.columns(rows)).all()
-    empty = change(RUN, stream, lambda t, v, c: (t[:0], v[:0]))
-    assert np.isnan(measurement_table(empty, robot).columns(rows)).all()
-    by_camera = ("camera_age_s", *(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)))
-    others = [row for row in whole.rows if row not in (*rows, "vibration_mps2", *by_camera)]
-    np.testing.assert_array_equal(gone.columns(others), whole.columns(others))
-
-    def hole(time_s, values, _):
-        kept = (time_s < 2.0) | ((time_s > 3.5) & (time_s < 5.0))
-        return time_s[kept], values[kept]
-
-    holed = measurement_table(change(RUN, stream, hole), robot)
-    t = holed.time_s
-    period = max(0.02, np.median(np.diff(RUN.streams[stream].time_s)))
-    for row in rows:
-        value, known = holed.columns([row])[:, 0], whole.columns([row])[:, 0]
-        assert np.isnan(value[(t > 2.0 + 1.5 * period) & (t < 3.5)]).all()
-        assert np.isnan(value[t > 5.0 + 1.5 * period]).all()
-        before, after = t < 1.9, (t > 4.2) & (t < 4.9)
-        np.testing.assert_array_equal(value[before], known[before])
-        # anew after the hole, the low-pass has settled again
-        np.testing.assert_allclose(value[after], known[after], atol=2e-3)
-        assert np.nanmax(np.abs(np.diff(value[(t > 3.6) & (t < 4.9)])), initial=0.0) < 0.02 + NOISE * 10
-
-
 def test_samples_that_are_no_numbers_are_left_out_and_counted():
     run = change(RUN, "imu", set_rows([10, 11, 200], np.inf, "gyro_z_radps"))
     run = change(run, "odometry", set_rows(lambda t: (t > 2) & (t < 3), np.nan))
