@@ -45,23 +45,19 @@ THIRDS, HALVES = (
 
 
 class Constancy(NamedTuple):
-    """Values of a cause in parts of the data.
+    """Values of a cause in parts of the data: in groups of one kind, or split.
 
-    Parameters
-    ----------
-    values, std : by ``time`` (thirds of each run's time, the first first) and ``runs`` (halves of the runs, in
-        the order given): (groups, p); without ``runs`` where these are few, NaN where a part shows nothing
-    ratio : root mean square difference of groups of one kind from their mean, each with the weight of its
-        information, over the size of the value
-    split : ``time`` or ``runs``, where that is largest
-    certain : whether differences are beyond the noise
+    By ``time`` they are thirds of each run's time, the first first, by ``runs`` halves of the runs in the order
+    given, where these are enough.
     """
 
-    values: dict[str, Array]
+    values: dict[str, Array]  #: by split (groups, p); NaN where a part shows nothing
     std: dict[str, Array]
     ratio: float
-    split: str
-    certain: bool
+    """Root mean square difference of groups from their mean, each with the weight of its information, over the size
+    of the value."""
+    split: str  #: where that is largest
+    certain: bool  #: whether differences are beyond the noise
 
     @property
     def varies(self) -> bool:
@@ -92,14 +88,9 @@ class Constancy(NamedTuple):
 def constancy_of(
     info: Evidence, names: Sequence[str], own: Sequence[str], change: Array, inflation: float
 ) -> Constancy:
-    """Return the values of some of the fitted parameters in parts of the data.
+    """Return the values of some (``own``) of the parameters fitted together, to a change (k,), in parts of the data.
 
-    Parameters
-    ----------
-    info : at the fit, changes counted from any point
-    names, change : parameters fitted together, (k,), and their values
-    own : those of one effect
-    inflation : of the variances over those from the noise
+    Variances are those from the noise times ``inflation``.
     """
     n, half = len(info.a), len(info.a) // 2
     where = {"time": np.tile(np.arange(N_BLOCKS), (n, 1))}
@@ -153,13 +144,7 @@ class PartValues(NamedTuple):
 
 
 def part_values(info: Evidence, causes: Sequence[Cause]) -> tuple[PartValues, ...]:
-    """Return the values of named causes by thirds of the time and halves of the runs.
-
-    Parameters
-    ----------
-    info : around the simulation with the causes built in
-    causes : named
-    """
+    """Return the values of named causes in parts of the data, of evidence with the causes built in."""
     names = [value.name for cause in causes for value in cause.parameters]
     parts = []
     for cause in causes:
@@ -195,15 +180,7 @@ SHOWN_RATIO = 1e-4
 def values_by_session(
     fit: CauseFit, signals: Sequence[Signals], named: Sequence[Effect], robot: Robot
 ) -> tuple[BySession, ...]:
-    """Return the values of named causes by terrain and session; none where runs are of one session.
-
-    Parameters
-    ----------
-    fit : of all runs
-    signals : of the same runs, in the same order
-    named : causes whose values are compared
-    robot : whose description values are stated by
-    """
+    """Return the values of named causes by terrain and session; none where runs (of the fit) are of one session."""
     groups: dict[tuple[str, str], list[int]] = {}
     for i, run in enumerate(signals):
         if run.session:

@@ -265,24 +265,16 @@ REST_MPS = 0.02  #: Fastest that a wheel turns, by its sensor's noise, in a run 
 
 
 class Prepared(NamedTuple):
-    """Runs that are fit to be compared.
+    """Runs that are fit to be compared."""
 
-    Parameters
-    ----------
-    problem : of these runs, faults repaired
-    faults : that were found and repaired, in all runs that were given
-    excluded : runs that are unfit
-    seeds : lags of sensors, by parameter, that are so large that a search has to start from them
-    aligned : information of the runs with these lags built in
-    shift : clocks of the runs behind that
-    """
-
-    problem: Problem
-    faults: tuple[Fault, ...]
-    excluded: tuple[Excluded, ...]
-    seeds: Mapping[str, float]
-    aligned: Evidence
-    shift: Shift
+    problem: Problem  #: of these runs, faults repaired
+    faults: tuple[Fault, ...]  #: that were found and repaired, in all runs that were given
+    excluded: tuple[Excluded, ...]  #: runs that are unfit
+    seeds: Mapping[
+        str, float
+    ]  #: lags of sensors, by parameter, so large that a search has to start from them
+    aligned: Evidence  #: of the runs with these lags built in
+    shift: Shift  #: clocks of the runs behind that
 
 
 def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequence[Effect]) -> Prepared:

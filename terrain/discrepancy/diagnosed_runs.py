@@ -44,54 +44,33 @@ with it."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiagnosedRuns:
-    """Runs with their diagnosis, which figures are drawn from.
-
-    Parameters
-    ----------
-    diagnosis : of the runs used
-    simulation, extended : before and after; ``extended`` is None where no cause was named
-    terrains : on which the runs of each label were simulated
-    fit, used, held_out : runs behind the diagnosis, these and those excluded from it, and those held out
-    compared : fit runs beside the simulation
-    held_signals : of the runs held out, faults repaired
-    noise, low_pass : of the fit runs
-    parts : values of the causes in parts of the data
-    acting : by cause, the channels that it changes
-    """
+    """Runs with their diagnosis, which figures are drawn from."""
 
     diagnosis: Diagnosis
     simulation: Simulation
-    extended: Simulation | None
-    terrains: tuple[TerrainMatch, ...]
-    fit: tuple[RunLog, ...]
-    used: tuple[RunLog, ...]
+    extended: Simulation | None  #: with the causes built in; None where no cause was named
+    terrains: tuple[TerrainMatch, ...]  #: on which the runs of each label were simulated
+    fit: tuple[RunLog, ...]  #: behind the diagnosis
+    used: tuple[RunLog, ...]  #: these and those excluded from it
     held_out: tuple[RunLog, ...]
-    compared: tuple[ComparedRun, ...]
-    held_signals: tuple[Signals, ...]
-    noise: Noise
+    compared: tuple[ComparedRun, ...]  #: fit runs beside the simulation
+    held_signals: tuple[Signals, ...]  #: of the runs held out, faults repaired
+    noise: Noise  #: of the fit runs
     low_pass: LowPass
-    parts: tuple[PartValues, ...]
-    acting: Mapping[str, Sequence[str]]
+    parts: tuple[PartValues, ...]  #: values of the causes in parts of the data
+    acting: Mapping[str, Sequence[str]]  #: by cause, the channels that it changes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeldOutGain:
-    """What an extension gains on held-out runs.
-
-    Parameters
-    ----------
-    gain : None where it was not measured
-    reason : why it was not
-    comparisons : by ``filter`` and ``classifier``; None for one that does not apply
-    black_box : what a black-box reference reaches on the same runs; None where none is held out
-    judged : held-out runs that are fit, beside the simulation
-    """
+    """What an extension gains on held-out runs; None, and why, where it was not measured."""
 
     gain: Gain | None
     reason: str | None = None
     comparisons: Mapping[str, Comparison | None] = field(default_factory=dict)
-    black_box: Reference | None = None
-    judged: tuple[ComparedRun, ...] = ()
+    """By ``filter`` and ``classifier``; None for one that does not apply."""
+    black_box: Reference | None = None  #: what a black-box reference reaches; None where no run is held out
+    judged: tuple[ComparedRun, ...] = ()  #: held-out runs that are fit, beside the simulation
 
     def as_json(self) -> dict[str, Any]:
         """Return the gain as JSON has it."""
@@ -103,15 +82,7 @@ class HeldOutGain:
 def diagnose_runs(
     runs: Sequence[RunLog], robot: Robot, library: Sequence[Effect], hold_out: int | None, seed: int
 ) -> DiagnosedRuns:
-    """Return the diagnosis of all runs but those held out, and the simulation extended by it.
-
-    Parameters
-    ----------
-    runs : of the robot
-    robot : whose simulation is tested
-    library : effects that may be named
-    hold_out : number of runs held out; a quarter of six or more by default
-    seed : of the choice of held-out runs
+    """Return the diagnosis of all runs but those held out (chosen by the seed), and the simulation extended by it.
 
     Raises
     ------
@@ -155,14 +126,7 @@ def _noise_of(diagnosis: Diagnosis) -> dict[str, float]:
 def acting_causes(
     simulation: Simulation, diagnosis: Diagnosis, signals: Sequence[Signals], used: Sequence[ComparedRun]
 ) -> dict[str, tuple[str, ...]]:
-    """Return the channels that each named cause changes: where the extension without it predicts otherwise.
-
-    Parameters
-    ----------
-    simulation : before
-    diagnosis : of the runs
-    signals, used : runs behind the diagnosis, and the same beside the simulation
-    """
+    """Return the channels that each named cause changes: where the extension without it predicts otherwise."""
     acting, low_pass = {}, low_pass_of(signals)
 
     def squares(others: Sequence[ComparedRun], extended: bool) -> Array:
@@ -182,14 +146,7 @@ def acting_causes(
 
 
 def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutGain:
-    """Return what the extension gains on the runs held out, or why that was not measured.
-
-    Parameters
-    ----------
-    diagnosed : runs with their diagnosis
-    robot : as it was tested
-    seed : of the bootstrap
-    """
+    """Return what the extension gains on the runs held out, or why that was not measured."""
     simulation, extended, runs = diagnosed.simulation, diagnosed.extended, diagnosed.held_signals
     gain, reason = None, None
     comparisons: dict[str, Comparison | None] = {}

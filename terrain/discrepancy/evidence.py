@@ -44,12 +44,7 @@ class Statistics(NamedTuple):
 
 
 def marginal(grams: Array, random: Sequence[int] | Array, std: Array) -> tuple[Array, Array, Array]:
-    """Integrate random columns out of products of columns.
-
-    Parameters
-    ----------
-    grams : (runs, parts, m, m)
-    random, std : (q,) places of the random columns, and their standard deviations
+    """Integrate random columns, at places (q,) and of standard deviations (q,), out of grams (runs, parts, m, m).
 
     Returns
     -------
@@ -77,31 +72,20 @@ def marginal_parts(grams: Array, random: Sequence[int] | Array, std: Array) -> A
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Evidence of runs around one point of the parameters.
+    """Evidence of runs around one point of the parameters."""
 
-    Parameters
-    ----------
-    names : of the k parameters
-    vector : (len(PARAMETERS),) the point from which changes are counted
-    origin : the point where sensitivities were taken, whatever changes are counted from
-    grams : (runs, N_BLOCKS, k + 1, k + 1) products of whitened sensitivities and, last, of the residual at
-        ``origin``, in each third of each run; nothing is marginalised
-    nuisances, nuisance_std : (q,) places in ``names`` of what varies from run to run, and its size
-    rows, noise : from which they come
-    white : of each run (k + 1, rows, channels) the same columns, 0 where nothing was measured
-    model_std : (k,) error of the simulation itself in units of each parameter, the same in all runs
-    """
-
-    names: tuple[str, ...]
-    vector: Array
-    origin: Array
+    names: tuple[str, ...]  #: of the k parameters
+    vector: Array  #: (len(PARAMETERS),) the point from which changes are counted
+    origin: Array  #: the point where sensitivities were taken, whatever changes are counted from
     grams: Array
-    nuisances: Array
-    nuisance_std: Array
-    rows: tuple[Rows, ...]
+    """(runs, N_BLOCKS, k + 1, k + 1) products of whitened sensitivities and, last, of the residual at ``origin``,
+    in each third of each run; nothing is marginalised."""
+    nuisances: Array  #: (q,) places in ``names`` of what varies from run to run
+    nuisance_std: Array  #: (q,) by how much
+    rows: tuple[Rows, ...]  #: from which they come
     noise: Noise
-    white: tuple[Array, ...]
-    model_std: Array
+    white: tuple[Array, ...]  #: of each run (k + 1, rows, channels) the columns, 0 where nothing was measured
+    model_std: Array  #: (k,) error of the simulation itself in units of each parameter, the same in all runs
 
     def places(self, names: Sequence[str]) -> list[int]:
         """Return the positions of parameters in the matrices."""
@@ -165,15 +149,8 @@ class Evidence:
     def fit(self, own: Sequence[str], others: Sequence[str], where: Array) -> tuple[Array, Array]:
         """Fit parameters in each group of the data, others in common, what varies from run to run marginalised.
 
-        Parameters
-        ----------
-        own, others : names of p parameters with a value in each group, and of those with one in all
-        where : (runs, N_BLOCKS) the group of each third of each run
-
-        Returns
-        -------
-        values : (groups, p); NaN where a group shows nothing
-        cov : (groups, p, groups, p) by the noise
+        ``where`` (runs, N_BLOCKS) is the group of each third of each run.  Returned are values (groups, p), NaN
+        where a group shows nothing, and their covariance (groups, p, groups, p) by the noise.
         """
         n_groups, p, q = int(where.max()) + 1, len(own), self.nuisances.size
         k = n_groups * p + len(others)
@@ -337,17 +314,10 @@ def loss_of(info: Evidence, names: Sequence[str]) -> float:
 
 
 def partial_information(a: Array, base: Sequence[int], own: Sequence[int]) -> tuple[Array, Array]:
-    """Return the information on parameters while others are fitted with them.
+    """Return the information on parameters at places ``own`` (q) while others (n) are fitted with them.
 
-    Parameters
-    ----------
-    a : (k, k)
-    base, own : places of the n others and of the q parameters
-
-    Returns
-    -------
-    follow : (n, q) by how much the others go back where the parameters go ahead
-    free : (q, q) information that is left, the Schur complement
+    First is by how much (n, q) the others go back where the parameters go ahead, then the information (q, q) that
+    is left, the Schur complement.
     """
     if not len(base):
         return np.zeros((0, len(own))), a[np.ix_(own, own)]
@@ -412,11 +382,8 @@ EM_STEPS = 60
 def scatter_of(gram: Array, score: Array, assumed_std: Array) -> Array:
     """Return the standard deviation (q,) of parameters from run to run.
 
-    Parameters
-    ----------
-    gram : (runs, q, q) of whitened sensitivities of each run
-    score : (runs, q) of the whitened residual along them, what all runs have in common taken out
-    assumed_std : (q,) the least
+    ``gram`` (runs, q, q) is of whitened sensitivities, ``score`` (runs, q) of the whitened residual along them, what
+    all runs have in common taken out; ``assumed_std`` (q,) is the least.
 
     Examples
     --------

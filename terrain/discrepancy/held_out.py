@@ -72,18 +72,10 @@ def repair_held_out(
     low_pass: LowPass,
     noise: Mapping[str, float],
 ) -> tuple[Signals, ...]:
-    """Return runs held out without the faults that were found in the others.
+    """Return runs held out without the faults that were found in the others, in the order of their repair.
 
-    A run has a fault if it is nearer to the simulation without it; a channel whose readings could not be
-    distinguished is left out of all of them.
-
-    Parameters
-    ----------
-    signals : of the runs held out
-    faults : found in the runs behind the diagnosis, in the order in which they are repaired
-    simulation : with the causes built in
-    low_pass : of the comparison
-    noise : by channel, over which squares are added
+    A run has a fault if it is nearer to the simulation, with the causes built in, without it: by squares over the
+    ``noise`` of each channel.  A channel whose readings could not be distinguished is left out of all of them.
     """
     size = np.array([noise.get(name) or math.nan for name in CHANNELS])
 
@@ -105,43 +97,25 @@ def repair_held_out(
 
 
 class ChannelGain(NamedTuple):
-    """Measured minus simulated in one channel, before and after.
+    """Measured minus simulated in one channel, before and after."""
 
-    Parameters
-    ----------
-    rms_before, rms_after : behind the common low-pass, in the channel's unit
-    white_before, white_after : behind the whitening filter, too; noise alone has 1
-    reduction, ci : ratio of the square behind the low-pass that is removed, and its 95 % interval
-    refused : whether no gain can be claimed: the interval includes zero, or lies below
-    """
-
-    rms_before: float
+    rms_before: float  #: behind the common low-pass, in the channel's unit
     rms_after: float
-    white_before: float
+    white_before: float  #: behind the whitening filter, too; noise alone has 1
     white_after: float
-    reduction: float
-    ci: tuple[float, float]
-    refused: bool
+    reduction: float  #: ratio of the square behind the low-pass that is removed
+    ci: tuple[float, float]  #: its 95 % interval
+    refused: bool  #: whether no gain can be claimed: the interval includes zero, or lies below
 
 
 class Gain(NamedTuple):
-    """What an extension gains.
+    """What an extension gains."""
 
-    Parameters
-    ----------
-    runs : ids of those on which it was measured
-    excluded_runs : that were given and are unfit
-    clusters : ``runs``, or ``thirds of runs`` where runs are few
-    channels : by name
-    reduction, ci, refused : as of a channel, of the whitened square of all channels, with variations from run
-        to run marginalised
-    """
-
-    runs: tuple[str, ...]
-    excluded_runs: tuple[Excluded, ...]
-    clusters: str
+    runs: tuple[str, ...]  #: ids of those on which it was measured
+    excluded_runs: tuple[Excluded, ...]  #: that were given and are unfit
+    clusters: str  #: ``runs``, or ``thirds of runs`` where runs are few
     channels: dict[str, ChannelGain]
-    reduction: float
+    reduction: float  #: of the whitened square of all channels, with variations from run to run marginalised
     ci: tuple[float, float]
     refused: bool
 
@@ -153,17 +127,6 @@ def gain_of_signals(
 
     One low-pass and one whitening filter serve before and after: fitted to the residual that
     remains with the whole library freed around the extension.
-
-    Parameters
-    ----------
-    simulation, extended : before and after
-    runs : held out of the diagnosis
-    seed : of the bootstrap
-
-    Raises
-    ------
-    DataError
-        if there is no run, or none is fit.
     """
     signals, excluded, after = fit_to_judge(extended, runs)
     before = evidence_at(signals, simulation, simulation.vector, (), low_pass_of(signals), after.statistics)
@@ -190,12 +153,7 @@ def gain_of_signals(
 def fit_to_judge(
     simulation: Simulation, runs: Sequence[Signals]
 ) -> tuple[tuple[Signals, ...], tuple[Excluded, ...], Evidence]:
-    """Return the runs that are fit to be judged on, those that are not, and the information of the first.
-
-    Parameters
-    ----------
-    simulation : with the causes built in, if there are any
-    runs : that were not used in the diagnosis
+    """Return the runs that are fit to be judged on, those that are not, and the evidence of the first.
 
     Raises
     ------
@@ -268,22 +226,13 @@ class Change(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What an extension changes for a filter or a classifier on held-out runs.
-
-    Parameters
-    ----------
-    name : of the filter or the recipe
-    reason : why there are no errors; None where there are
-    n_runs : that were compared
-    errors : by figure
-    terrains : of the runs; None where they do not matter
-    """
+    """What an extension changes for a filter or a classifier (recipe) on held-out runs."""
 
     name: str
-    reason: str | None
-    n_runs: int
-    errors: Mapping[str, Change]
-    terrains: tuple[str, ...] | None = None
+    reason: str | None  #: why there are no errors; None where there are
+    n_runs: int  #: that were compared
+    errors: Mapping[str, Change]  #: by figure
+    terrains: tuple[str, ...] | None = None  #: of the runs; None where they do not matter
 
     def as_json(self) -> dict[str, Any]:
         """Return the comparison as JSON has it."""
@@ -331,13 +280,7 @@ def _errors(estimate: Estimate) -> tuple[float, ...]:
 
 
 def accuracy_change(before: Array, after: Array, run_id: Array, seed: int) -> Change:
-    """Return accuracies before and after, and the 95 % interval of their difference.
-
-    Parameters
-    ----------
-    before, after : (n,) whether each window is classified correctly
-    run_id : (n,) run of each window
-    seed : of the bootstrap over runs
+    """Return accuracies before and after (n,), and the 95 % interval of their difference by bootstrap over runs (n,).
 
     Examples
     --------
@@ -372,36 +315,22 @@ LEAST_RANGE = 1e-6  #: Spread of a column that counts as constant
 
 
 class ChannelReference(NamedTuple):
-    """Squared residual of one channel on the runs held out.
-
-    Parameters
-    ----------
-    rms_before, rms_after : root mean square before, and behind the reference, in the channel's unit
-    reduction : part of the square that the reference removes; below 0 where it adds to it
-    named_reduction : part that the named causes remove; NaN where none was named
-    left_to_find_from : lower end of the 95 % interval, by bootstrap over runs, of what the reference removes
-        beyond the named causes; NaN where runs are too few: what one run has in common in itself is no cause
-    """
+    """Residual of one channel on the runs held out, and behind the reference, in the channel's unit."""
 
     rms_before: float
     rms_after: float
-    reduction: float
-    named_reduction: float
+    reduction: float  #: part of the square that the reference removes; below 0 where it adds to it
+    named_reduction: float  #: part that the named causes remove; NaN where none was named
     left_to_find_from: float
+    """Lower end of the 95 % interval, by bootstrap over runs, of what the reference removes beyond the named
+    causes; NaN where runs are too few: what one run has in common in itself is no cause."""
 
 
 class Reference(NamedTuple):
-    """What a black-box reference reaches, beside the named causes.
+    """What a black-box reference reaches, beside the named causes."""
 
-    Parameters
-    ----------
-    n_runs : held out, on which it is judged
-    reduction, named_reduction : of the squares of all channels, each over its noise
-    channels : by name
-    """
-
-    n_runs: int
-    reduction: float
+    n_runs: int  #: held out, on which it is judged
+    reduction: float  #: of the squares of all channels, each over its noise
     named_reduction: float
     channels: Mapping[str, ChannelReference]
 
@@ -412,14 +341,9 @@ def black_box_reference(
     noise: Mapping[str, float],
     seed: int = 0,
 ) -> Reference | None:
-    """Return what a black-box reference reaches on runs held out; None where there are none.
+    """Return what a black-box reference, fitted to the runs used, reaches on runs held out; None without any.
 
-    Parameters
-    ----------
-    used : runs that it is fitted to
-    held_out : on which it and the named causes are judged, behind the same low-pass
-    noise : by channel, over which the squares of channels are added
-    seed : of the bootstrap
+    Squares of channels are added over the ``noise`` of each.
     """
     if not used or not held_out:
         return None

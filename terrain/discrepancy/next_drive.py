@@ -107,15 +107,10 @@ def next_drive(
 ) -> NextDrive | None:
     """Return the next drive, None where nothing is to be distinguished or no scenario helps.
 
-    Parameters
-    ----------
-    simulation : with what is built in so far
-    sets : effects of which one is present, and which the runs cannot distinguish
-    missed : what the runs did not excite; used only where nothing is to be distinguished
-    info : of the runs; without it channels and noise are typical ones, and nothing is compared
-
-    Where a set cannot be distinguished by any drive with the channels that are logged, but could be with one
-    more, the reason names it.
+    It distinguishes the effects of sets of which one is present; where there are none, it excites what the runs
+    missed.  Without their evidence channels and noise are typical ones, and nothing is compared.  Where a set
+    cannot be distinguished by any drive with the channels that are logged, but could be with one more, the reason
+    names it.
     """
     if sets:
         return _separating_drive(simulation, sets, info)

@@ -41,18 +41,12 @@ TILT_INPUTS = ("grade", "roll", "grade |speed|", "roll |speed|")
 
 
 class ProbeResult(NamedTuple):
-    """Evidence of one probe.
+    """Evidence of one probe."""
 
-    Parameters
-    ----------
-    z : as of :class:`terrain.discrepancy.selection.WaldTest`
-    gain : fall of minus twice the log-likelihood, were it built in
-    alike : by selected parameter, the correlation of what the input and the parameter change in the channel
-    """
-
-    z: float
-    gain: float
+    z: float  #: as of :class:`terrain.discrepancy.selection.WaldTest`
+    gain: float  #: fall of minus twice the log-likelihood, were it built in
     alike: Mapping[str, float] = MappingProxyType({})
+    """By selected parameter, the correlation of what the input and the parameter change in the channel."""
 
     @property
     def significant(self) -> bool:
@@ -108,15 +102,10 @@ def probe_residuals(
     change: Array,
     error: Mapping[tuple[str, str], float] = MappingProxyType({}),
 ) -> dict[tuple[str, str], ProbeResult]:
-    """Return the result of every probe, by channel and input.
+    """Return the result of every probe beside the fitted change of parameters, by channel and input.
 
-    Parameters
-    ----------
-    info : of the runs at the fit; changes counted from any point
-    names, change : parameters that were selected, and their fitted change, beside which a probe has to be
-        significant
-    error : how much a channel depends on an input by the simulation's own error, in the channel's unit for
-        one of the input; where it is not named, not at all
+    ``error`` is how much a channel depends on an input by the simulation's own error, in the channel's unit for one
+    of the input; where it is not named, not at all.
     """
     rate_hz = 1 / float(np.median(np.diff(info.rows[0].time_s)))
     results: dict[tuple[str, str], ProbeResult] = {}

@@ -44,35 +44,25 @@ RIVAL_REFITS = 3  #: Most relinearisations of a rival
 
 
 class Nearby(NamedTuple):
-    """Quadratic form of a few parameters at another point, by the noise and scatter of an evidence.
+    """Quadratic form of a few parameters at another point, by the noise and scatter of an evidence, of all runs."""
 
-    Parameters
-    ----------
-    vector : the point
-    a, g, c : (k, k), (k,) and the constant, all runs together
-    white_residual : of each run (rows, channels)
-    """
-
-    vector: Array
-    a: Array
-    g: Array
+    vector: Array  #: the point
+    a: Array  #: (k, k)
+    g: Array  #: (k,)
     c: float
-    white_residual: tuple[Array, ...]
+    white_residual: tuple[Array, ...]  #: of each run (rows, channels)
 
 
 class Problem(NamedTuple):
-    """Runs, the simulation, the low-pass of all, and the effects that may be named.
-
-    Parameters
-    ----------
-    varying : standard deviation from run to run, by parameter, beside the scatter that the simulation has
-    """
+    """Runs, the simulation, the low-pass of all, and the effects that may be named."""
 
     signals: tuple[Signals, ...]
     simulation: Simulation
     low_pass: LowPass
     library: tuple[Effect, ...]
-    varying: Mapping[str, float] = MappingProxyType({})
+    varying: Mapping[str, float] = MappingProxyType(
+        {}
+    )  #: scatter by parameter, beside that of the simulation
 
     @property
     def scatter(self) -> dict[str, float]:
@@ -107,18 +97,12 @@ class Problem(NamedTuple):
 
 
 def misfit_of(info: Evidence, white_residual: Sequence[Array]) -> float:
-    """Return by how much the whole library could still reduce residuals (rows, channels) at another point.
+    """Return by how much the whole library could still reduce residuals (rows, channels) of runs at another point.
 
-    Parameters
-    ----------
-    info : whose sensitivities and noise are the measure
-    white_residual : of each run, whitened by the noise of ``info``
-
-    Notes
-    -----
-    Up to a constant it is minus twice the log-likelihood there, as far as the problem is linear.  The sum of
-    squares itself will not do: the noise of the wheels is in the prediction, and a cause that makes it larger
-    or smaller, as a mass does, would be judged by it.
+    Sensitivities and noise of ``info`` are the measure, by which residuals are whitened.  Up to a constant it is
+    minus twice the log-likelihood there, as far as the problem is linear.  The sum of squares itself will not do:
+    the noise of the wheels is in the prediction, and a cause that makes it larger or smaller, as a mass does, would
+    be judged by it.
     """
     score = np.zeros(len(info.names))
     for residual, white, shift in zip(white_residual, info.white, info.marginal[1], strict=True):
@@ -128,18 +112,11 @@ def misfit_of(info: Evidence, white_residual: Sequence[Array]) -> float:
 
 
 class Refit(NamedTuple):
-    """A nonlinear fit.
+    """A nonlinear fit."""
 
-    Parameters
-    ----------
-    loss : how badly it fits, as minus twice a log-likelihood; see :func:`misfit_of`
-    square : whitened square that it leaves
-    change, std : (k,) of its parameters
-    """
-
-    loss: float
-    square: float
-    change: Array
+    loss: float  #: how badly it fits, as minus twice a log-likelihood; see :func:`misfit_of`
+    square: float  #: whitened square that it leaves
+    change: Array  #: (k,) of its parameters
     std: Array
 
 
@@ -223,18 +200,13 @@ else, and is no rival, however little worse it fits."""
 
 
 class Rival(NamedTuple):
-    """An effect that fits as well as a cause in its place.
-
-    Parameters
-    ----------
-    effect : that
-    behind : by how much it fits worse, as minus twice a log-likelihood, over the inflation of the cause
-    change, std : (p,) of its parameters, by a fit of its own; a value may be at its bound
-    """
+    """An effect that fits as well as a cause in its place."""
 
     effect: Effect
-    behind: float
-    change: Array
+    behind: (
+        float  #: by how much it fits worse, as minus twice a log-likelihood, over the inflation of the cause
+    )
+    change: Array  #: (p,) of its parameters, by a fit of its own; a value may be at its bound
     std: Array
 
 
@@ -305,37 +277,24 @@ ALIKE = 0.99  #: Two effects whose sensitivities correlate more are not taken fo
 
 
 class CauseFit(NamedTuple):
-    """Causes fitted to the runs together.
+    """Causes fitted to the runs together."""
 
-    Parameters
-    ----------
-    causes : effects selected, in the order in which they came
-    info : of the runs there, changes counted from the simulation that was given
-    names, change, cov : parameters (k,), their change and its covariance
-    tests : evidence of every effect of the library beside them
-    assumed_scatter : from run to run, by parameter, that is no news
-    rivals : by cause, the effects that fit as well in its place, once they have been looked for
-    """
-
-    causes: tuple[Effect, ...]
-    info: Evidence
-    names: tuple[str, ...]
+    causes: tuple[Effect, ...]  #: effects selected, in the order in which they came
+    info: Evidence  #: of the runs there, changes counted from the simulation that was given
+    names: tuple[str, ...]  #: of their parameters (k,)
     change: Array
     cov: Array
-    tests: dict[str, WaldTest]
-    assumed_scatter: Mapping[str, float]
+    tests: dict[str, WaldTest]  #: evidence of every effect of the library beside them
+    assumed_scatter: Mapping[str, float]  #: from run to run, by parameter, that is no news
     rivals: Mapping[str, tuple[Rival, ...]] = MappingProxyType({})
+    """By cause, the effects that fit as well in its place, once they have been looked for."""
 
 
 def search(problem: Problem, start: Evidence, seeds: Mapping[str, float] | None = None) -> CauseFit:
-    """Return the causes that explain the runs.
+    """Return the causes that explain the runs, from their evidence around the simulation as it is given.
 
-    Parameters
-    ----------
-    problem : of what
-    start : information of the runs around the simulation as it is given
-    seeds : parameters whose values are so large that sensitivities without them would mislead, as lags of
-        sensors: other causes are first searched with them built in, then all are fitted together
+    Where values of parameters (``seeds``) are so large that sensitivities without them would mislead, as lags of
+    sensors, other causes are first searched with them built in, then all are fitted together.
     """
     base, info = start.vector, start
     causes: list[Effect] = []

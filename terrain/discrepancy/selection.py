@@ -29,21 +29,15 @@ N_BOOTSTRAP = 1000
 class WaldTest(NamedTuple):
     """Evidence of an effect beside those selected.
 
-    Parameters
-    ----------
-    change : (p,) of its parameters, fitted together with the selected ones
-    z : evidence as a standard normal number of the same improbability: the fit over its noise, whose variance
-        is weighed from whitening and from the scatter between clusters, as a t statistic
-    dispersion : scatter between clusters over that which the noise allows, as variances
-    gain : (runs,) fall of minus twice the log-likelihood of each run when it is left out of the fit
-    inside : whether the fitted values lie within their bounds
+    It is the fit over its noise, whose variance is weighed from whitening and from the scatter between clusters,
+    as a t statistic.
     """
 
-    change: Array
-    z: float
-    dispersion: float
-    gain: Array
-    inside: bool
+    change: Array  #: (p,) of its parameters, fitted together with the selected ones
+    z: float  #: the standard normal number of the same improbability
+    dispersion: float  #: scatter between clusters over that which the noise allows, as variances
+    gain: Array  #: (runs,) fall of minus twice the log-likelihood of each run when it is left out of the fit
+    inside: bool  #: whether the fitted values lie within their bounds
 
     @property
     def significant(self) -> bool:
@@ -114,13 +108,9 @@ def _dispersion(
 
 
 def clustered_variance(a: Array, g: Array, x: Array, direction: Array, size: float) -> tuple[float, float]:
-    """Return the variance of a fit along a direction over that from the noise, and its degrees of freedom.
+    """Return the variance of a fit ``x`` (k,) along a direction over that from the noise, and its degrees of freedom.
 
-    Parameters
-    ----------
-    a, g : (clusters, k, k) and (clusters, k) of the parameters fitted together
-    x, direction : (k,) their values, and along which the score is taken
-    size : information along it
+    ``size`` is the information along it, of all clusters (a, k, k) together.
     """
     part = (g - a @ x) @ direction
     fraction = np.clip(np.einsum("i,kij,j->k", direction, a, direction) / size, 0.0, 0.9)
@@ -130,11 +120,8 @@ def clustered_variance(a: Array, g: Array, x: Array, direction: Array, size: flo
 def pooled_variance(part: Array, fraction: Array, size: float) -> tuple[float, float]:
     """Return a variance over that from the noise, and its degrees of freedom.
 
-    Parameters
-    ----------
-    part : (clusters,) what is left of each cluster's score at the fit
-    fraction : (clusters,) of the information that comes from each; they sum up to 1
-    size : information in all, which is the variance of the score by the noise
+    Of each cluster there is what is left of its score at the fit (``part``) and its ``fraction`` of the
+    information; ``size`` is the information in all, which is the variance of the score by the noise.
     """
     m = len(part)
     variance = float(((part / (1.0 - fraction)) ** 2).sum()) * (m - 1) / m / size

@@ -28,29 +28,19 @@ that ratio."""
 
 
 class Slope(NamedTuple):
-    """Measured over simulated.
+    """Measured over simulated, by a slope through zero, or by a level."""
 
-    Parameters
-    ----------
-    ratio, std : of the slope through zero, and its standard deviation over runs; NaN where it is not clear
-        from 1, or does not describe the residual
-    level : of measured minus simulated, in the channel's unit; NaN where a factor is stated, or no level is
-        clear
-    """
-
-    ratio: float = math.nan
-    std: float = math.nan
-    level: float = math.nan
+    ratio: float = math.nan  #: NaN where it is not clear from 1, or does not describe the residual
+    std: float = math.nan  #: over runs
+    level: float = (
+        math.nan
+    )  #: measured minus simulated, in the channel's unit; NaN where a factor is stated or none clear
 
 
 def slope_through_zero(simulated: Array, measured: Array) -> float:
     """Return the slope ``b`` that minimises ``sum |measured - b simulated|``; NaN where nothing is simulated.
 
-    It is the median of ``measured / simulated``, each weighted by ``|simulated|``.
-
-    Parameters
-    ----------
-    simulated, measured : (n,) rows without NaN
+    It is the median of ``measured / simulated``, each weighted by ``|simulated|``, of rows (n,) without NaN.
 
     Examples
     --------

@@ -31,18 +31,13 @@ log-likelihood."""
 
 
 class TerrainMatch(NamedTuple):
-    """The terrain on which runs of a label are simulated.
+    """The terrain on which runs of a label are simulated."""
 
-    Parameters
-    ----------
-    terrain : label of the runs; empty for runs without a label or with several
-    soil : its soil of the package; None for the default terrain
-    effective_ratio : part of the measured tilt that acts as a slope, from 0 to 1; None on the default terrain
-    """
-
-    terrain: str
-    soil: str | None
-    effective_ratio: float | None
+    terrain: str  #: label of the runs; empty for runs without a label or with several
+    soil: str | None  #: its soil of the package; None for the default terrain
+    effective_ratio: (
+        float | None
+    )  #: part of the tilt that acts as a slope, 0 to 1; None on the default terrain
 
     @property
     def text(self) -> str:
@@ -145,12 +140,6 @@ def with_effective_tilt(
 
     A tilt that is no slope, of a body that rides over bumps, takes no traction; simulated as a slope it biases
     mass, resistance and slip.  The runs fit best with the part that acts, all parameters of the library freed.
-
-    Parameters
-    ----------
-    simulation : with terrains by label; that of runs without one stays as it is
-    signals : of runs
-    library : effects that are freed meanwhile
     """
     grounds, names = dict(simulation.grounds), names_of(library)
     for terrain, ground in simulation.grounds.items():

@@ -68,12 +68,7 @@ def unfit_runs(
 ) -> tuple[Excluded, ...]:
     """Return the unfit runs, each with the first reason that is found.
 
-    Parameters
-    ----------
-    signals : of all runs
-    info : of these runs around the simulation as it is given, in the same order
-    shift : of these runs, where it is known already
-    latencies : of these runs, where they are known; short runs measure them only together
+    Clocks (``shift``) and latencies are measured unless they are known; short runs measure latencies only together.
 
     Raises
     ------
@@ -306,12 +301,8 @@ def common_gains(responses: Sequence[Response]) -> Array:
 def stalled_runs(responses: Sequence[Response], has_clock: Sequence[bool], extra_s: float) -> dict[int, str]:
     """Return runs whose wheels turn while the body hardly responds, far longer than in the others, and why.
 
-    Parameters
-    ----------
-    responses : of all runs
-    has_clock : whether the clock of each is known
-    extra_s : by how much longer stretches have to be where it is not, and where the run does not follow the
-        wheels on the clock of all: a clock of its own looks like a short stall
+    Stretches have to be longer by ``extra_s`` where the clock of a run is not known and the run does not follow the
+    wheels on the clock of all: a clock of its own looks like a short stall.
     """
     if len(responses) < 2:
         return {}
@@ -367,13 +358,7 @@ def _stalled_rows(run: Response, expected: Array, least_ratio: Array, least_s: f
 
 
 def odd_runs(responses: Sequence[Response], among: Sequence[int]) -> dict[int, str]:
-    """Return runs that respond to their wheels unlike the others of their terrain, and why.
-
-    Parameters
-    ----------
-    responses : of all runs
-    among : places of those that are compared
-    """
+    """Return runs, among those at some places, that respond to their wheels unlike the others of their terrain."""
     reasons: dict[int, str] = {}
     for terrain in dict.fromkeys(responses[i].terrain for i in among):
         places = [i for i in among if responses[i].terrain == terrain]

@@ -48,33 +48,22 @@ SCATTERS = np.concatenate([[0.0], np.geomspace(1e-3, 1.0, 40)])
 
 
 class _RunValues(NamedTuple):
-    """Values (runs,) of a parameter by each run alone, and how far they scatter beyond the noise.
-
-    Parameters
-    ----------
-    value : over what the simulation has of it
-    weight : precision of each, 0 where a run shows nothing
-    """
+    """Values (runs,) of a parameter by each run alone, and how far they scatter beyond the noise."""
 
     name: str
-    value: Array
-    weight: Array
+    value: Array  #: over what the simulation has of it
+    weight: Array  #: precision of each, 0 where a run shows nothing
     scatter: float
     z: float
 
 
 class _OwnValues(NamedTuple):
-    """An effect of which each run has its own values, by parameter, and how well that fits.
-
-    Parameters
-    ----------
-    gain : fall of the loss from one value in all runs
-    """
+    """An effect of which each run has its own values, by parameter, and how well that fits."""
 
     effect: Effect
     runs: tuple[_RunValues, ...]
     loss: float
-    gain: float
+    gain: float  #: fall of the loss from one value in all runs
 
     @property
     def clearest(self) -> _RunValues:
@@ -153,12 +142,7 @@ def _at_common_fit(fit: CauseFit, name: str, std: Array) -> _RunValues:
 
 
 def _own_values(fit: CauseFit, effect: Effect, scatter: Sequence[float]) -> _OwnValues:
-    """Fit runs with values of their own of an effect, all else as it is assumed.
-
-    Parameters
-    ----------
-    scatter : of its parameters, to start from
-    """
+    """Fit runs with values of their own of an effect, all else as it is assumed, from a scatter of its parameters."""
     info, own = fit.info, tuple(p.name for p in effect.parameters)
     names = tuple(dict.fromkeys([*fit.names, *own]))
     beside = info.nuisances[~np.isin(info.nuisances, info.places(own))]
@@ -201,12 +185,9 @@ def _least_std(fit: CauseFit, own: Sequence[str]) -> Array:
 def _values_by_run(
     fit: CauseFit, name: str, names: Sequence[str], shared: Array, varies: Array, std: Array
 ) -> _RunValues:
-    """Return the values of a parameter by each run, with all that varies beside it marginalised.
+    """Return the values of a parameter by each run, with all that varies (places and std, (q,)) beside it marginalised.
 
-    Parameters
-    ----------
-    names, shared : parameters, and their values (m,) over where sensitivities were taken, that all runs share
-    varies, std : (q,) places of what varies, and its standard deviations
+    All runs share values (m,) of parameters by name, over where sensitivities were taken.
     """
     info, (place,) = fit.info, fit.info.places([name])
     random, std = varies[varies != place], std[varies != place]
@@ -295,18 +276,11 @@ EM_STEPS = 30  #: Enough from a start that is not far too small: variances then 
 
 
 class MixedFit(NamedTuple):
-    """A fit of runs.
+    """A fit of runs."""
 
-    Parameters
-    ----------
-    loss : minus twice the log-likelihood, up to what no choice of parameters changes
-    shared : (m,) values that all runs share
-    std : (q,) standard deviations of the values that each run has of its own
-    """
-
-    loss: float
-    shared: Array
-    std: Array
+    loss: float  #: minus twice the log-likelihood, up to what no choice of parameters changes
+    shared: Array  #: (m,) values that all runs share
+    std: Array  #: (q,) standard deviations of the values that each run has of its own
 
 
 def fit_mixed(
@@ -367,10 +341,7 @@ MEAN_PER_SCATTER = math.sqrt(3.0)  #: Mean over standard deviation of what is sp
 def with_conditions(problem: Problem, info: Evidence) -> Problem:
     """Return the problem with the error that conditions make which differ between its runs.
 
-    Parameters
-    ----------
-    problem : whose simulation has what conditions may make at the most
-    info : of its runs
+    Its simulation has what they may make at the most.
     """
     simulation = problem.simulation
     if not simulation.varied_error:

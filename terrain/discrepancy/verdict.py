@@ -50,28 +50,19 @@ class Value(NamedTuple):
 
 
 class Cause(NamedTuple):
-    """An effect that the measured runs have and the simulation lacks.
-
-    Parameters
-    ----------
-    name, aliases : of the effect
-    parameters : its values, over what the simulation has of them already
-    held_out_gain, gain_ci : ratio of the whitened squared residual that it removes from runs left out of its
-        fit, and its 95 % interval by bootstrap over runs
-    channels : where it shows, the clearest first
-    z, dispersion : its evidence, see :class:`terrain.discrepancy.selection.WaldTest`
-    caveat : what the values depend on, in words; empty where they are the same throughout
-    """
+    """An effect that the measured runs have and the simulation lacks."""
 
     name: str
     aliases: tuple[str, ...]
-    parameters: tuple[Value, ...]
-    held_out_gain: float
-    gain_ci: tuple[float, float]
-    channels: tuple[str, ...]
-    z: float
-    dispersion: float
-    caveat: str = ""
+    parameters: tuple[Value, ...]  #: values, over what the simulation has of them already
+    held_out_gain: (
+        float  #: ratio of the whitened squared residual that it removes from runs left out of its fit
+    )
+    gain_ci: tuple[float, float]  #: its 95 % interval by bootstrap over runs
+    channels: tuple[str, ...]  #: where it shows, the clearest first
+    z: float  #: its evidence, see :class:`terrain.discrepancy.selection.WaldTest`
+    dispersion: float  #: as there
+    caveat: str = ""  #: what the values depend on, in words; empty where they are the same throughout
 
 
 class RunGroup(NamedTuple):
@@ -83,81 +74,52 @@ class RunGroup(NamedTuple):
 
 
 class Varying(NamedTuple):
-    """An effect whose size differs from run to run.
-
-    Parameters
-    ----------
-    name, parameter, unit : of the effect
-    rivals : effects that explain the differences as well
-    mean, scatter : of the values over runs
-    z : evidence of the difference, as a standard normal number
-    groups : two groups of runs, the smaller value first; empty where values are spread
-    channel : where it shows most
-    """
+    """An effect whose size differs from run to run."""
 
     name: str
-    parameter: str
+    parameter: str  #: of the effect, that differs most clearly
     unit: str
-    rivals: tuple[str, ...]
-    mean: float
+    rivals: tuple[str, ...]  #: effects that explain the differences as well
+    mean: float  #: of the values over runs
     scatter: float
-    z: float
-    groups: tuple[RunGroup, ...]
-    channel: str
+    z: float  #: evidence of the difference, as a standard normal number
+    groups: tuple[
+        RunGroup, ...
+    ]  #: two groups of runs, the smaller value first; empty where values are spread
+    channel: str  #: where it shows most
 
 
 class SessionValue(NamedTuple):
-    """A parameter fitted to the runs of one session, beside the same causes as in all sessions.
-
-    Parameters
-    ----------
-    session, runs : name, and number of runs that were compared
-    value, ci : of the parameter, and its 95 % interval with the scatter of runs
-    text : value and interval in quantities of the robot's description
-    """
+    """A parameter fitted to the runs of one session, beside the same causes as in all sessions."""
 
     session: str
-    runs: int
+    runs: int  #: that were compared
     value: float
-    ci: tuple[float, float]
-    text: str
+    ci: tuple[float, float]  #: 95 % interval with the scatter of runs
+    text: str  #: value and interval in quantities of the robot's description
 
 
 class BySession(NamedTuple):
-    """A parameter of a named cause by session, of the sessions of one terrain.
-
-    Parameters
-    ----------
-    name, unit, terrain : of the parameter, and the label of the runs
-    sessions : values
-    p : probability of such differences where sessions agree; NaN for one session
-    between_std : standard deviation between sessions beyond that of their values; NaN for one session
-    agree : whether sessions may have one value (``p`` from :data:`AGREE_P`); one session does
-    """
+    """A parameter of a named cause by session, of the sessions of one terrain."""
 
     name: str
     unit: str
-    terrain: str
+    terrain: str  #: label of the runs
     sessions: tuple[SessionValue, ...]
-    p: float
-    between_std: float
-    agree: bool
+    p: float  #: probability of such differences where sessions agree; NaN for one session
+    between_std: (
+        float  #: standard deviation between sessions beyond that of their values; NaN for one session
+    )
+    agree: bool  #: whether sessions may have one value (``p`` from :data:`AGREE_P`); one session does
 
 
 class Unexplained(NamedTuple):
-    """A channel whose residual depends on an input, without an effect that explains it.
-
-    Parameters
-    ----------
-    channel, input : names
-    z : evidence, in standard deviations
-    residual_ratio : part of the channel's whitened squared residual that depends on it
-    """
+    """A channel whose residual depends on an input, without an effect that explains it."""
 
     channel: str
     input: str
-    z: float
-    residual_ratio: float
+    z: float  #: evidence, in standard deviations
+    residual_ratio: float  #: part of the channel's whitened squared residual that depends on the input
 
 
 class Limit(NamedTuple):
@@ -179,18 +141,11 @@ class RuledOut(NamedTuple):
 
 
 class Residual(NamedTuple):
-    """How far measured and simulated are apart in one channel, behind the common low-pass.
+    """How far measured and simulated are apart in one channel, behind the common low-pass."""
 
-    Parameters
-    ----------
-    rms : of measured minus simulated
-    noise : of what is left when all parameters of the library are freed
-    systematic : part of the square that is not noise, from 0 to 1
-    """
-
-    rms: float
-    noise: float
-    systematic: float
+    rms: float  #: of measured minus simulated
+    noise: float  #: of what is left when all parameters of the library are freed
+    systematic: float  #: part of the square that is not noise, from 0 to 1
 
 
 class NextDrive(NamedTuple):
@@ -227,47 +182,31 @@ class Covariance(NamedTuple):
 class Diagnosis:
     """What :func:`terrain.discrepancy.diagnose.diagnose` states.
 
-    Parameters
-    ----------
-    robot : name
-    verdict : ``explained`` where a cause is named, also when something else is left unexplained; ``varies``
-        where what was found has no value that all runs share
-    causes : named
-    covariance : of their parameters
-    ambiguous_sets : effects of which one is present, and which these runs cannot distinguish; best fit first
-    ambiguous_values : fitted values of each of them, by the effect's name
-    unexplained : channels that depend on an input without a known cause
-    detection_limits : of every effect
-    not_excited : those whose limit is beyond what an effect may be
-    ruled_out : effects that are not the answer
-    excluded_runs, clocks : by run
-    next_drive : None where nothing is to be distinguished
-    residual_before, residual_after : by channel, with the simulation given and with the causes built in
-    n_runs : that were compared
-    varying : effects whose size differs from run to run
-    faults : of channels, which were repaired before anything was compared
-    by_session : values of the named causes by terrain and session; empty where runs are of one session
+    The verdict is ``explained`` where a cause is named, also when something else is left unexplained, and
+    ``varies`` where what was found has no value that all runs share.
     """
 
     robot: str
     verdict: Verdict
     causes: tuple[Cause, ...]
-    covariance: Covariance
-    ambiguous_sets: tuple[tuple[str, ...], ...]
-    ambiguous_values: dict[str, tuple[Value, ...]]
+    covariance: Covariance  #: of the causes' parameters
+    ambiguous_sets: tuple[
+        tuple[str, ...], ...
+    ]  #: effects of which one is present, not distinguished; best fit first
+    ambiguous_values: dict[str, tuple[Value, ...]]  #: fitted values of each of them, by the effect's name
     unexplained: tuple[Unexplained, ...]
-    detection_limits: tuple[Limit, ...]
-    not_excited: tuple[Limit, ...]
+    detection_limits: tuple[Limit, ...]  #: of every effect
+    not_excited: tuple[Limit, ...]  #: those beyond what an effect may be
     ruled_out: tuple[RuledOut, ...]
     excluded_runs: tuple[Excluded, ...]
     clocks: tuple[Clock, ...]
-    next_drive: NextDrive | None
-    residual_before: dict[str, Residual]
-    residual_after: dict[str, Residual]
-    n_runs: int
+    next_drive: NextDrive | None  #: None where nothing is to be distinguished
+    residual_before: dict[str, Residual]  #: by channel, with the simulation given
+    residual_after: dict[str, Residual]  #: with the causes built in
+    n_runs: int  #: that were compared
     varying: tuple[Varying, ...] = ()
-    faults: tuple[Fault, ...] = ()
-    by_session: tuple[BySession, ...] = ()
+    faults: tuple[Fault, ...] = ()  #: of channels, which were repaired before anything was compared
+    by_session: tuple[BySession, ...] = ()  #: values of the named causes; empty where runs are of one session
 
     @property
     def values(self) -> dict[str, float]:
