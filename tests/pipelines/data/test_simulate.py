@@ -4,7 +4,7 @@ import pytest
 from pipelines.data.simulate import Settings
 from pipelines.data.simulate import run as simulate_with
 from pipelines.report.results import silent
-from terrain.errors import ConfigError, LogError
+from terrain.errors import LogError
 from terrain.files.names import data_folder
 from terrain.logs.read import find_runs, read_run
 from terrain.robots import load_robot
@@ -81,37 +81,6 @@ def test_options_reach_the_run(tmp_path):
     amps_per_n = HUSKY.wheel_radius_m / (0.044 * 78.71 * 0.7)
     slope_n = 75.0 * 9.80665 * np.sin(np.arctan(0.1))
     assert (current - level) / amps_per_n == pytest.approx(slope_n, rel=0.1)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"robot": "husky", "scenario": "crab"}, "scenario 'crab' is not for robot husky"),
-        ({"robot": "husky", "terrain": "course", "scenario": "course"}, "'course' is for swerve"),
-        ({"robot": "husky", "scenario": "slip"}, "robot husky"),
-        ({"robot": "husky", "gnss": True}, "has no receiver"),
-        ({"robot": "husky", "effect": ["steering_backlash=0.1"]}, "does not apply to"),
-        ({"effect": ["wheel_radius=9"]}, "-0.3 to 0.3 is accepted"),
-        ({"effect": ["wheel_radius=0.1", "encoder_scale=0.1"]}, "effect 'encoder_scale' is given twice"),
-        ({"scenario": "slip", "effect": ["wheel_radius=0.1"]}, "without effects"),
-        ({"robot": "ghost"}, "robot 'ghost' is unknown"),
-        ({"terrain": "lava"}, "soil 'lava' is unknown"),
-        ({"scenario": "dance"}, "scenario 'dance' is unknown"),
-        ({"terrain": "course"}, "go together"),
-        ({"scenario": "course"}, "go together"),
-        ({"terrain": "all", "scenario": "course"}, "go together"),
-        ({"duration_s": 0.5}, "duration_s is 0.5, too short"),
-        ({"duration_s": float("nan")}, "duration_s is nan"),
-        ({"grade_deg": 31.0}, "--grade is 31"),
-        ({"camera_lost": ["9:4"]}, "START:END"),
-        ({"scenario": "six_positions"}, "give the terrain 'bench', not 'grass'"),
-    ],
-)
-def test_what_is_not_accepted_is_refused_and_nothing_is_written(tmp_path, options, message):
-    given = {"robot": "agrimaro", "terrain": "grass", "scenario": "straight", "out": tmp_path / "runs"}
-    with pytest.raises(ConfigError, match=message):
-        simulate_runs(**given | options)
-    assert not (tmp_path / "runs").exists()
 
 
 def test_a_run_that_is_there_is_left_alone_and_nothing_else_is_written(tmp_path):

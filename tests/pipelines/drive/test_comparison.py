@@ -18,6 +18,7 @@ from terrain.control.drive_metrics import METRICS, Comparison, drive_history, ev
 from terrain.control.situations import make_situation
 from terrain.control.slip_table import load_slip_table
 from terrain.control.switching import TerrainEstimate
+from terrain.errors import ConfigError
 from terrain.robots import load_robot
 
 SHORT = Settings(
@@ -161,3 +162,10 @@ def test_the_report_names_every_controller_and_metric_and_what_is_not_known():
     assert (len(result.to_pandas()), set(result.to_pandas()["controller"])) == (4 * len(names), set(names))
     one = replace(result, seeds=(0,), rows={name: each[:1] for name, each in rows.items()})
     assert "one seed, which gives no interval" in one.report.answer
+
+
+def test_a_controller_that_needs_a_classifier_is_not_driven_without():
+    situation = make_situation("straight", ROBOT, "grass", 0)
+    for name in ("classified", "classified+track", "thesis:classified"):
+        with pytest.raises(ConfigError, match=f"'{name.replace('+', '.')}' needs a classifier"):
+            drive_once(INPUTS, make_controller(name, TABLE, 0.05), situation)

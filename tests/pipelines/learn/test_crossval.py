@@ -3,20 +3,16 @@
 import json
 import re
 from dataclasses import fields
-from typing import get_args
 
 import numpy as np
 import pytest
 from sklearn.model_selection import cross_val_predict, cross_validate
 
-from features import recipes
-from features.protocols import PROTOCOLS, folds_of, samples_of
+from features.protocols import folds_of, samples_of
 from features.recipes import feature_matrix, make_recipe
 from pipelines.data.datasets import load_runs
-from pipelines.learn import settings as learn_settings
 from pipelines.learn.crossval import EvaluationSettings, Settings, crossval, run
 from pipelines.learn.evaluate import evaluate
-from pipelines.learn.settings import ProtocolName
 from pipelines.report.numbers import format_counts
 from pipelines.report.results import as_json
 from terrain.classify.held_out import Examples
@@ -48,12 +44,6 @@ def runs_at_speeds(drive):
 @pytest.fixture(scope="module")
 def with_extras(runs_at_speeds, settings):
     return crossval(runs_at_speeds, settings(extras=True))
-
-
-def test_protocols_and_recipes_of_the_command_line_are_those_that_there_are():
-    """They are written twice, so that help need not load what offers them."""
-    assert get_args(ProtocolName) == tuple(PROTOCOLS)
-    assert learn_settings.RECIPES == recipes.RECIPES
 
 
 def test_the_report_has_what_is_promised_and_is_json(report):
@@ -240,22 +230,7 @@ def test_a_terrain_left_out_has_areas_their_intervals_and_both_rates(runs, setti
     assert 0.8 < found.known_kept <= 1.0
 
 
-def test_settings_that_make_no_sense_are_refused():
-    for options, sentence in (
-        ({"protocol": "lucky"}, "--protocol is 'lucky': input should be 'grouped', 'leave-one-run-out', "),
-        ({"repeats": 0}, "--repeats is 0: input should be greater than or equal to 1"),
-        ({"protocol": "fast-slow", "repeats": 3}, "^'fast-slow' has a single fold assignment"),
-        ({"recipe": ("svm",), "model": ("models:/field/1",)}, "--model and --recipe do not go together"),
-        ({"recipe": ("oracle",)}, "there is no recipe 'oracle'; there are svm"),
-        ({"recipe": ("svm@radar", "svm")}, "unknown signal set 'radar'"),
-        ({"signal_sets": ("sonar",)}, "unknown signal set 'sonar'; there are imu, wheels"),
-        *(({"speed": text}, "LOW:HIGH") for text in ("fast", "0.3:0.1", "-1:2", "0:inf")),
-        ({"cache": "c", "recipe": ("cnn",)}, "--cache is for recipe 'svm' on"),
-        ({"cache": "c", "protocol": "published"}, "--cache holds features of windows"),
-        ({"cache": "c", "merge_duplicates": True}, "--cache keeps each run by itself"),
-    ):
-        with pytest.raises(ConfigError, match=sentence):
-            Settings(data="runs", **options)
+def test_a_protocol_has_its_window():
     with pytest.raises(ConfigError, match="window length_s is -1"):
         _ = EvaluationSettings(window_s=-1).rule
     assert EvaluationSettings(protocol="published").rule.length_s == 1.7

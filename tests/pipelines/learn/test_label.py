@@ -87,41 +87,6 @@ def test_labels_are_removed_in_an_interval_and_a_whole_run_is_labelled_to_its_la
     assert labels_of(folder) == [(0.0, pytest.approx(4.0), "ICE")]
 
 
-NO_INTERVAL, NEW_FOLDER = (
-    "a label needs --from and --to in s, or --all",
-    "sets labels in the new folder --out",
-)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"run": "SNOW_03", "whole": True, "terrain": "ICE"}, "there is no run 'SNOW_03'"),
-        ({"from_s": 3.0, "to_s": 4.5, "terrain": "ICE"}, "is from 0 to 4 s: 3 to 4.5 s is not within"),
-        ({"from_s": -1.0, "to_s": 2.0, "terrain": "ICE"}, "is not within"),
-        ({"from_s": 2.0, "to_s": 2.0, "terrain": "ICE"}, "ends before it starts"),
-        ({"from_s": 2.0, "to_s": float("nan"), "terrain": "ICE"}, "--to is nan"),
-        ({"from_s": 2.0, "terrain": "ICE"}, NO_INTERVAL),
-        ({"from_s": 2.0, "whole": True, "terrain": "ICE"}, "leave out --from"),
-        ({"from_s": 2.0, "to_s": 3.0, "whole": True, "terrain": "ICE"}, NO_INTERVAL),
-        ({"terrain": "ICE"}, NO_INTERVAL),
-        ({"whole": True}, "needs --terrain NAME, or --remove"),
-        ({"whole": True, "terrain": "../ICE"}, "use letters"),
-        ({"whole": True, "terrain": "ICE", "remove": True}, "give one of the two"),
-        ({"run": None, "whole": True, "terrain": "ICE"}, "needs --run"),
-        ({"model": "a", "answers": "b", "out": "c"}, "--model proposes labels"),
-        ({"model": "a", "terrain": "ICE", "whole": True}, "--model proposes labels"),
-        ({"answers": "b"}, NEW_FOLDER),
-        ({"out": "c"}, NEW_FOLDER),
-    ],
-)
-def test_what_is_not_accepted_changes_nothing(folder, options, message):
-    before = (folder / "SNOW_01" / "run.json").read_bytes()
-    with pytest.raises(ConfigError, match=message):
-        labelled(folder, **options)
-    assert (folder / "SNOW_01" / "run.json").read_bytes() == before
-
-
 def test_places_without_runs_and_two_runs_of_one_id_are_refused(folder, tmp_path):
     with pytest.raises(LogError, match="does not exist"):
         found(tmp_path / "nowhere")

@@ -150,16 +150,3 @@ def test_predictions_are_written_by_the_ending_of_the_file(tracked, drive, tmp_p
     assert table["terrain_set"].tolist() == [" ".join(row.terrain_set) for row in result.windows]
     assert {"run_id", "start_s", "probability", "status_traction"} <= set(table.columns)
     assert "of 12 labelled ones are right" in result.report.answer
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({}, "--model is missing"),
-        ({"model": "m", "changes": "x"}, "--model and --changes do not go together"),
-        ({"model": "m", "out": "p.xlsx"}, r"--out is p\.xlsx: a name that ends in \.parquet or \.csv is"),
-    ],
-)
-def test_settings_that_do_not_go_together_are_refused(options, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        Settings(data="runs", **options)

@@ -21,7 +21,7 @@ from pipelines.learn.settings import RecipeSettings
 from pipelines.learn.train import Settings, run
 from pipelines.report.results import as_json
 from terrain.classify.held_out import channel_drops
-from terrain.errors import ConfigError, ModelError, TerrainError
+from terrain.errors import ModelError, TerrainError
 from terrain.logs.write import write_run
 
 
@@ -40,27 +40,6 @@ def test_training_is_evaluated_on_held_out_runs_and_names_the_model(tracked):
     assert drops == sorted(drops, reverse=True)
     assert result.ui.startswith("mlflow ui --backend-store-uri sqlite:////")
     assert result.ui in str(result.report)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        *(({"name": name}, f"model name '{name}'") for name in ("", "a/b", "a:b", "a@b", "a b", "a.b")),
-        ({"protocol": "published"}, "there is no setting 'protocol'"),
-        ({"cache": "c", "recipe": "cnn"}, "--cache is for recipe 'svm'"),
-        ({"search": 4, "feature": ("a:b",)}, "--search is for recipe 'svm' .* with --feature"),
-        ({"search": 4, "recipe": "cnn"}, "--search is for recipe 'svm'"),
-        ({"search": 4, "params": "best.json"}, "--search and --params do not go together"),
-        ({"recipe": "cnn", "params": "best.json"}, "--params has hyper-parameters of the SVM"),
-        ({"cache": "c", "merge_duplicates": True}, "--cache keeps each run by itself"),
-        ({"data": None}, "--data is missing"),
-        ({"kept": "model"}, "--register trains nothing"),
-    ],
-)
-def test_settings_that_do_not_go_together_are_refused(options, sentence):
-    given = {"name": "m", "data": "runs"} | options
-    with pytest.raises(ConfigError, match=sentence):
-        Settings(**{name: value for name, value in given.items() if value is not None})
 
 
 def test_a_tracking_folder_that_cannot_be_written_is_reported_before_any_work(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 
 from pipelines.serve.serve import Settings, run
 from pipelines.serve.service import Service
-from terrain.errors import ConfigError, TerrainError
+from terrain.errors import TerrainError
 from terrain.files.names import data_folder
 
 from .strangers import ask, hello, running
@@ -104,21 +104,3 @@ def test_damaged_states_of_robots_do_not_keep_the_service_from_starting(model_fo
                 assert (welcome["type"], welcome["restored"]) == ("welcome", None)
         trouble = json.loads(service.get("/ready")[1])["trouble"]
         assert {"state of bytes", "state of half", "state of deep", "state of folder"} <= set(trouble)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"can": "can0", "replay": "runs"}, "--can and --replay are two modes: one of them is accepted"),
-        ({"can": "can0", "port": 1}, "--port is an option of the WebSocket service, not of --can"),
-        ({"replay": "runs", "duration_s": 1.0}, "--duration is an option of --can, not of --replay"),
-        ({"speed": 4.0}, "--speed is an option of --replay, not of the WebSocket service"),
-        *(
-            ({"replay": "runs", "speed": text}, "--speed is")
-            for text in ("0", "-1", "inf", "nan", "fast", "")
-        ),
-    ],
-)
-def test_options_that_are_no_speed_or_of_another_mode_are_refused(options, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        Settings(**options)

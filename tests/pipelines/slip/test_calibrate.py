@@ -7,7 +7,6 @@ from studies.intervals import HIDDEN, NOMINAL, drive_hidden
 
 from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
-from terrain.errors import ConfigError, DataError
 from terrain.estimation.feed import measurement_table
 from terrain.logs.write import write_run
 from terrain.robots import description_file, load_robot
@@ -118,25 +117,3 @@ def test_runs_tell_what_they_can_and_why_not_the_rest(tmp_path, kept):
     why = "never move" if kept == "stand alone" else "no run has a camera (stream 'odometry')"
     for parameter in ("steering.zero_2_rad", "motors.reduction_ratio", "camera.time_constant_s"):
         assert why in found[parameter].note
-
-
-def test_what_is_refused(tmp_path):
-    write_run(drive_hidden("straight", 1, "grass", 8.0), tmp_path / "runs")
-    taken, other = tmp_path / "taken.yaml", tmp_path / "rover.yaml"
-    taken.write_text("mine")
-    other.write_text(SOURCE.replace("name: agrimaro", "name: rover"))
-    new, of_another = tmp_path / "new.yaml", "is one of robot 'agrimaro', and 'rover' is calibrated"
-    for options, error, sentence in (
-        ({"out": taken}, ConfigError, "is there already, and is left as it is"),
-        ({"out": tmp_path / "robot.json"}, ConfigError, "a name that ends in .yaml or .yml is required"),
-        ({"out": new}, DataError, "nothing of robot agrimaro can be calibrated from this: no run"),
-        ({"robot": "husky"}, DataError, "drive 'skid_steer' is not calibrated from logs"),
-        ({"robot": str(other)}, DataError, of_another),
-        ({"robot": None}, ConfigError, "--robot is missing: --what robot starts from one"),
-        ({"laws": ("bekker",)}, ConfigError, "--laws is for --what soil, not for --what robot"),
-        ({"figures": tmp_path}, ConfigError, "--figures is for --what soil"),
-    ):
-        with pytest.raises(error, match=sentence):
-            run(Settings(**({"data": tmp_path / "runs", "robot": "agrimaro"} | options)), silent)
-    assert taken.read_text() == "mine"
-    assert not new.exists()

@@ -125,18 +125,3 @@ def test_an_observer_gives_slip_of_tracks_and_a_path():
     assert set(row.slip) == {"slip_left_ratio", "slip_right_ratio"}
     assert {"slip", "estimator", "state"} <= set(tracks.runs[0].streams)
     assert [name.rpartition("_")[2] for name in tracks.result.pictures] == ["slip", "path"]
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        ({"filter": "tracked", "tuning": "thesis"}, "--tuning is for filters, not for --filter tracked"),
-        ({"filter": "skid", "slip_model": "m.yaml"}, "--slip-model is for observers, not for --filter skid"),
-        ({"filter": "vio15", "window_s": 0.5}, "--window is for --filter pose, not for --filter vio15"),
-        ({"filter": "tracked", "slip_model": "m.yaml"}, "filter 'tracked' takes no slip model"),
-        ({"filter": "pose", "delay_s": 6.0}, "--delay is 6.0: input should be less than or equal to 5"),
-    ],
-)
-def test_options_of_another_mode_are_refused(straight, options, sentence):
-    with pytest.raises(ConfigError, match=sentence):
-        estimate_runs([straight], **options)

@@ -9,10 +9,6 @@ import pytest
 from click.testing import CliRunner
 
 from pipelines.cli.main import app
-from pipelines.report.results import silent
-from pipelines.slip.calibrate import Settings, run
-from terrain.errors import ConfigError, DataError, TerrainError
-from terrain.logs.write import write_run
 from terrain.slip_learning.soil import LAWS, SINKAGES, WHEELS, Trials, forces_of, sinkage_of
 from terrain.terramechanics.inflow_wheel import FORCE
 from terrain.terramechanics.soil import load_soil
@@ -84,20 +80,3 @@ def test_the_soil_is_one_that_the_simulator_takes(fitted):
     assert soil.kphi_npmn2 == pytest.approx(file["fit"]["values"]["kphi_npmn2"], rel=1e-3)
     text = (out / "testbed_sand_smooth.yaml").read_text()
     assert (text.count("assumed"), text.count("95 %")) == (5, 4)
-
-
-def test_what_is_refused(make_run, tmp_path):
-    write_run(make_run(), tmp_path / "runs")
-    (tmp_path / "file").write_text("")
-    for changed, error, sentence in (
-        ({"laws": ("mud",)}, ConfigError, "--laws is 'mud': input should be 'simulator', 'bekker'"),
-        ({"laws": ("inflow", "simulator")}, ConfigError, "--laws ends in 'simulator'"),
-        ({"draws": 1}, ConfigError, "--draws is 1: input should be greater than or equal to 2"),
-        ({}, DataError, "none of 1 runs is a trial of a wheel testbed"),
-        ({"out": tmp_path / "file"}, TerrainError, "file: cannot be written"),
-        ({"robot": "husky"}, ConfigError, "--robot is not for --what soil"),
-    ):
-        with pytest.raises(error, match=sentence):
-            run(
-                Settings(data=tmp_path / "runs", what="soil", **({"out": tmp_path / "out"} | changed)), silent
-            )
