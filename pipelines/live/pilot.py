@@ -163,7 +163,7 @@ class LivePilot(Chain):
         Returns
         -------
         Command
-            its ``status`` has the fields of :class:`~terrain.control.robot_control.PilotStatus`
+            its ``status`` are the channels of the stream ``control``, as ``RobotControl.step`` gives them
         """
         time_s, readings = self._clocks.step(
             getattr(sample, "time_s", None), getattr(sample, "readings", None)

