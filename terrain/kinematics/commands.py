@@ -133,13 +133,10 @@ def wheel_commands(
 
     Parameters
     ----------
-    positions_m : (wheels, 2)
-    radius_m : of the wheels
-    speed_max_radps : limit of the wheels; twists beyond are shortened
-    rate_max_radps : limit of the steering's rate
+    positions_m, radius_m : (wheels, 2) and radius of the wheels
+    speed_max_radps, rate_max_radps : limits of the wheels, to which twists are shortened, and of the steering's rate
     dt_s : time from one twist to the next
-    twists : (n, 3)
-    steer_0 : (wheels,) steering before the first step, rad
+    twists, steer_0 : (n, 3), and (wheels,) the steering before the first
     far_rad : see :func:`wheel_command_step`
 
     Returns
@@ -192,13 +189,6 @@ def wheel_command_step(
     rolling directions contradict each other: as long as one wheel is further than ``far_rad`` from its aim,
     the speeds of all are multiplied by ``max(0, cos(error))`` of the worst one, so that none scrubs. The
     thesis gives no such law; it says only that steering takes time.
-
-    Parameters
-    ----------
-    positions_m : (wheels, 2)
-    radius_m, speed_max_radps, rate_max_radps, dt_s, far_rad : as in :func:`wheel_commands`
-    twist : (3,)
-    steer_rad : (wheels,) the last steering command
 
     Returns
     -------

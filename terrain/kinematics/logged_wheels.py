@@ -18,11 +18,6 @@ def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
 
     Wheel speeds that are there already are made anew; a run without motor rates comes back as it is.
 
-    Parameters
-    ----------
-    run : log
-    robot : gives reduction ratio and nominal wheel radius
-
     Raises
     ------
     ConfigError
@@ -41,9 +36,8 @@ def with_wheel_speeds(run: RunLog, robot: Robot) -> RunLog:
     if wheels is None or found is None:
         return run
     channels, compute = found
-    return replace(
-        run, streams=dict(run.streams) | {"wheels": Stream(wheels.time_s, compute(wheels.values), channels)}
-    )
+    speeds = Stream(wheels.time_s, compute(wheels.values), channels)
+    return replace(run, streams=dict(run.streams) | {"wheels": speeds})
 
 
 def wheel_speeds_from(
@@ -51,27 +45,20 @@ def wheel_speeds_from(
 ) -> tuple[tuple[str, ...], Callable[[Array], Array]] | None:
     """Return the channels of wheels with their speeds, and what computes these values (n, c) of those measured.
 
-    Parameters
-    ----------
-    channels : that are measured
-    robot : gives reduction ratio and nominal wheel radius
-
-    Returns
-    -------
-    None where there are no motor rates.  Speeds that are measured are left out, and come from the rates.
+    Speeds that are measured are left out, and come from the rates; None where there are no motor rates.
     """
     motors = [f"motor_{wheel}_radps" for wheel in robot.wheels]
-    if not motors or not set(motors) <= set(channels):
+    if not set(motors) <= set(channels):
         return None
     speeds = tuple(f"speed_{wheel}_mps" for wheel in robot.wheels)
     at = [channels.index(motor) for motor in motors]
-    kept = [i for i, channel in enumerate(channels) if channel not in speeds]
+    others = [i for i, channel in enumerate(channels) if channel not in speeds]
     ratio, radius_m = robot.motors.reduction_ratio, robot.wheel_radius_m
 
     def with_speeds(values: Array) -> Array:
-        return np.hstack([values[:, kept], values[:, at] / ratio * radius_m])
+        return np.hstack([values[:, others], values[:, at] / ratio * radius_m])
 
-    return (*(channels[i] for i in kept), *speeds), with_speeds
+    return (*(channels[i] for i in others), *speeds), with_speeds
 
 
 def speed_columns(channels: Sequence[str], robot: Robot | None) -> tuple[list[int], float]:
@@ -84,13 +71,7 @@ def speed_columns(channels: Sequence[str], robot: Robot | None) -> tuple[list[in
 
 
 def wheel_and_ground_speed(truth: Stream, robot: Robot) -> tuple[Array, Array]:
-    """Return the true wheel speed and speed over ground along each wheel, both (n, wheels) in m/s.
-
-    Parameters
-    ----------
-    truth : stream as ``terrain.simulation`` writes it
-    robot : gives the nominal radius and the positions of the wheels
-    """
+    """Return the true wheel speed, by the nominal radius, and speed over ground along each wheel, (n, wheels)."""
     steer = _wheel_columns(truth, robot, "steer_{}_rad")
     twist = np.column_stack([truth.channel(name) for name in TWIST])
     along, _ = wheel_frame_velocities(twist, robot.wheel_positions_m, steer)
@@ -102,12 +83,7 @@ def true_slip(truth: Stream, wheels: Sequence[str]) -> Array:
 
     The recorded one is signed along the wheel's own x axis; here its sign is that of traction in both
     directions (:func:`terrain.slip.traction_slip`).  It is that of the wheels' true radii, up to 2 where a
-    wheel turns against the motion, and NaN where wheel and robot are at rest.
-
-    Parameters
-    ----------
-    truth : stream as ``terrain.simulation`` writes it; a slip that is never defined has no channel
-    wheels : their names
+    wheel turns against the motion, and NaN where wheel and robot are at rest; one that is never defined has no channel.
     """
     recorded = np.full((len(truth), len(wheels)), np.nan)
     for i, wheel in enumerate(wheels):

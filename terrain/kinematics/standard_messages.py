@@ -196,20 +196,13 @@ _JOINTS = {"wheels": ("velocity", "_radps"), "steering": ("position", "_rad")}
 
 
 class StandardTopic(NamedTuple):
-    """A stream as standard messages.
+    """A stream as standard messages."""
 
-    Parameters
-    ----------
-    topic, kind : name and type
-    paths, numbers : places of numbers, and those (n, k) of each sample
-    fixed : what all messages hold, by path
-    """
-
-    topic: str
+    topic: str  #: name and type
     kind: str
-    paths: tuple[str, ...]
+    paths: tuple[str, ...]  #: places of numbers, and those (n, k) of each sample
     numbers: Array
-    fixed: Mapping[str, Any]
+    fixed: Mapping[str, Any]  #: what all messages hold, by path
 
 
 def standard_topic(name: str, stream: Stream) -> StandardTopic | None:

@@ -36,20 +36,13 @@ Range = tuple[float, float]
 class Region(NamedTuple):
     """Ranges, 1st to 99th percentile, of the runs that effects were found on.
 
-    Parameters
-    ----------
-    wheel_speed_mps : mean circumferential speed of the wheels, forward positive
-    yaw_rate_radps : that the wheels would turn the robot with, without slip
-    grade_rad : measured slope, uphill positive
-    terrains : labels of the runs
-
     A range is None where it was not measured, and so is what goes beyond it.
     """
 
-    wheel_speed_mps: Range | None
-    yaw_rate_radps: Range | None
-    grade_rad: Range | None
-    terrains: tuple[str, ...]
+    wheel_speed_mps: Range | None  #: mean circumferential speed of the wheels, forward positive
+    yaw_rate_radps: Range | None  #: that the wheels would turn the robot with, without slip
+    grade_rad: Range | None  #: measured slope, uphill positive
+    terrains: tuple[str, ...]  #: labels of the runs
 
 
 def outside(region: Region, driven: Region) -> str:

@@ -175,21 +175,6 @@ class Robot(ABC):
     description (:attr:`body`, :attr:`motors`, ...) is never None: where the description lacks it, asking for it raises
     ``ConfigError``.  Code that can do without asks :meth:`describes` first, or takes :meth:`completed`.
 
-    Parameters
-    ----------
-    name : what run logs call it
-    wheel_radius_m : nominal radius of a wheel
-    track_m : distance between the two sides; of a swerve robot, from the third wheel to the others' line
-    wheelbase_m : distance between front and rear wheel
-    mass_kg : total mass without payload
-    parts : sections of the description by name
-    effects : parameters of :mod:`terrain.effects` that are not 0, by name
-    effects_cov : (n, n) covariance of the effects in their order; NaN where unknown
-    region : of driving, that the effects were validated in; None where none is stated
-    assumed : numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
-    identified : what logs of it showed beside its nominal figures, as ``effective_track_m``
-    filters : filters and observers that its description lists; none where all of its drive apply
-
     Examples
     --------
     >>> from terrain.robots import load_robot
@@ -201,17 +186,26 @@ class Robot(ABC):
     terrain.errors.ConfigError: robot husky: its description has no section 'motors', which is needed here
     """
 
-    name: str
-    wheel_radius_m: float
-    track_m: float
-    wheelbase_m: float
-    mass_kg: float
-    parts: Mapping[str, Part] = field(default_factory=dict, hash=False)
+    name: str  #: what run logs call it
+    wheel_radius_m: float  #: nominal radius of a wheel
+    track_m: (
+        float  #: distance between the two sides; of a swerve robot, from the third wheel to the others' line
+    )
+    wheelbase_m: float  #: distance between front and rear wheel
+    mass_kg: float  #: total mass without payload
+    parts: Mapping[str, Part] = field(
+        default_factory=dict, hash=False
+    )  #: sections of the description by name
+    #: parameters of :mod:`terrain.effects` that are not 0, by name
     effects: Mapping[str, float] = field(default_factory=dict, hash=False)
+    #: (n, n) covariance of the effects in their order; NaN where unknown
     effects_cov: Array = field(default_factory=lambda: np.empty((0, 0)), compare=False)
-    region: Region | None = None
+    region: Region | None = None  #: of driving, that the effects were validated in; None where none is stated
+    #: numbers whose source begins with "assumed", as ``track_m`` and ``camera.lever_x_m``
     assumed: frozenset[str] = frozenset()
+    #: what logs of it showed beside its nominal figures, as ``effective_track_m``
     identified: Mapping[str, float] = field(default_factory=dict, hash=False)
+    #: filters and observers that its description lists; none where all of its drive apply
     filters: tuple[str, ...] = ()
 
     numbers: ClassVar[tuple[str, ...]] = ("wheel_radius_m", "track_m", "wheelbase_m", "mass_kg")

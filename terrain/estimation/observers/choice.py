@@ -56,11 +56,7 @@ def observers_of(robot: Robot) -> tuple[str, ...]:
 def make_observer(name: str, robot: Robot, slip_model: SlipModel | None = None) -> Observer:
     """Return an observer of a robot, before its first step.
 
-    Parameters
-    ----------
-    name : one of :data:`OBSERVERS`
-    robot : corrected
-    slip_model : of a tracked robot on its ground; of encoder odometry its effective track counts
+    Of encoder odometry the effective track of the slip model counts.
 
     Raises
     ------

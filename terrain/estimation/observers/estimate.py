@@ -25,24 +25,14 @@ WITHOUT_UNIT = frozenset(name for name in PARAMETERS if not name.endswith(("_rat
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObserverEstimate:
-    """Estimates of an observer over one run.
+    """Estimates of an observer over one run."""
 
-    Parameters
-    ----------
-    run : the log, as measured
-    robot : as the observer takes it, corrected
-    observer : that was run
-    track : its estimates
-    dropped : samples left out, as counts by stream and kind
-    missing : channels that the observer takes and the log never has
-    """
-
-    run: RunLog
-    robot: Robot
-    observer: Observer
-    track: ObserverTrack
-    dropped: Mapping[str, int]
-    missing: tuple[str, ...]
+    run: RunLog  #: the log, as measured
+    robot: Robot  #: as the observer takes it, corrected
+    observer: Observer  #: that was run
+    track: ObserverTrack  #: its estimates
+    dropped: Mapping[str, int]  #: samples left out, as counts by stream and kind
+    missing: tuple[str, ...]  #: channels that the observer takes and the log never has
 
     def true(self, channel: str) -> Array | None:
         """Return a quantity (n,) of the truth at the ticks; None where the log has none of that name."""
@@ -72,12 +62,6 @@ def observe_run(
     run: RunLog, robot: Robot, name: str, slip_model: SlipModel | None = None
 ) -> ObserverEstimate:
     """Correct one run for the effects of its robot, and run an observer over it.
-
-    Parameters
-    ----------
-    run : log of the robot, as measured
-    robot : its description
-    name, slip_model : as :func:`~terrain.estimation.observers.choice.make_observer` takes them
 
     Raises
     ------
@@ -135,46 +119,28 @@ SETTLED = (ObserverStatus.OK, ObserverStatus.UNEXCITED)
 
 @dataclass(frozen=True, slots=True)
 class ObservedSlip:
-    """One slip of a run; NaN where something is not known.
+    """One slip of a run; NaN where something is not known."""
 
-    Parameters
-    ----------
-    mean, std : while the robot moves and is observed: mean of the slip, and of its standard deviation
-    true_mean, rmse : of the truth, and of the error
-    nees : mean squared error over the variance stated, 1 where that is right
-    """
-
-    mean: float
+    mean: float  #: while the robot moves and is observed: mean of the slip, and of its standard deviation
     std: float
-    true_mean: float
+    true_mean: float  #: of the truth, and of the error
     rmse: float
-    nees: float
+    nees: float  #: mean squared error over the variance stated, 1 where that is right
 
 
 @dataclass(frozen=True, slots=True)
 class ObserverSummary:
-    """Figures of one run; NaN where something is not known.
+    """Figures of one run; NaN where something is not known."""
 
-    Parameters
-    ----------
-    run_id, filter : which run and which observer
-    slip : of each slip, by channel
-    position_rmse_m, position_end_m : error of the position over the run, and at its end
-    status_s : how long it had each status
-    dropped : samples left out, as counts by kind
-    missing : what the observer takes and the run never has
-    finite : whether positions are finite once the observer has started, and nothing is infinite
-    """
-
-    run_id: str
+    run_id: str  #: which run and which observer
     filter: str
-    slip: Mapping[str, ObservedSlip]
-    position_rmse_m: float
+    slip: Mapping[str, ObservedSlip]  #: of each slip, by channel
+    position_rmse_m: float  #: error of the position over the run, and at its end
     position_end_m: float
-    status_s: Mapping[str, float]
-    dropped: Mapping[str, int]
-    missing: tuple[str, ...]
-    finite: bool
+    status_s: Mapping[str, float]  #: how long it had each status
+    dropped: Mapping[str, int]  #: samples left out, as counts by kind
+    missing: tuple[str, ...]  #: what the observer takes and the run never has
+    finite: bool  #: whether positions are finite once the observer has started, and nothing is infinite
 
     @property
     def status_text(self) -> str:

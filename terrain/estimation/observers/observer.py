@@ -48,20 +48,13 @@ class ObserverStatus(StatusCode):
 
 
 class ObserverOutput(NamedTuple):
-    """What an observer knows at a tick.
+    """What an observer knows at a tick."""
 
-    Parameters
-    ----------
-    mean, std : (d,) estimates and one standard deviation of each, in the order of :attr:`Observer.states`
-    slip, slip_std : (k,) in the order of :attr:`Observer.slips`; NaN where it is not observed
-    status : number of an :class:`ObserverStatus`
-    """
-
-    mean: Array
+    mean: Array  #: (d,) estimates and one standard deviation of each, in the order of :attr:`Observer.states`
     std: Array
-    slip: Array
+    slip: Array  #: (k,) in the order of :attr:`Observer.slips`; NaN where it is not observed
     slip_std: Array
-    status: int
+    status: int  #: number of an :class:`ObserverStatus`
 
 
 class Observer(ABC):
@@ -135,25 +128,16 @@ class FilterObserver(Observer):
 
 
 class ObserverTrack(NamedTuple):
-    """Estimates of an observer over a run.
+    """Estimates of an observer over a run."""
 
-    Parameters
-    ----------
-    time_s : (n,)
-    states, slips : names of the columns
-    mean, std : (n, d)
-    slip, slip_std : (n, k); NaN where slip is not observed
-    status : (n,) numbers of :class:`ObserverStatus`
-    """
-
-    time_s: Array
-    states: tuple[str, ...]
+    time_s: Array  #: (n,)
+    states: tuple[str, ...]  #: names of the columns
     slips: tuple[str, ...]
-    mean: Array
+    mean: Array  #: (n, d)
     std: Array
-    slip: Array
+    slip: Array  #: (n, k); NaN where slip is not observed
     slip_std: Array
-    status: Array
+    status: Array  #: (n,) numbers of :class:`ObserverStatus`
 
     def state(self, name: str) -> Array:
         """Return the mean (n,) of one state; ``ValueError`` when there is none of that name."""
@@ -166,8 +150,7 @@ def observe(observer: Observer, time_s: Array, rows: Array) -> ObserverTrack:
     Parameters
     ----------
     observer : before its first step
-    time_s : (n,) rising stamps of the ticks
-    rows : (n, m) of :attr:`Observer.rows`; NaN where nothing was measured
+    time_s, rows : (n,) rising stamps of the ticks, and (n, m) of :attr:`Observer.rows`
     """
     steps_s = np.diff(time_s, prepend=time_s[:1]).tolist()
     outputs = [observer.step(row, dt_s) for dt_s, row in zip(steps_s, rows, strict=True)]

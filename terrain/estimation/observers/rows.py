@@ -239,21 +239,14 @@ def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Ar
 
 
 class LiveObserverEstimate(NamedTuple):
-    """What is known at one tick; arrays are the caller's to keep.
+    """What is known at one tick; arrays are the caller's to keep."""
 
-    Parameters
-    ----------
-    time_s : stamp of the wheels
-    mean, std, slip, slip_std : as of :class:`~terrain.estimation.observers.observer.ObserverOutput`
-    status : of the estimates
-    """
-
-    time_s: float
-    mean: Array
+    time_s: float  #: stamp of the wheels
+    mean: Array  #: as of :class:`~terrain.estimation.observers.observer.ObserverOutput`
     std: Array
     slip: Array
     slip_std: Array
-    status: ObserverStatus
+    status: ObserverStatus  #: of the estimates
 
 
 class LiveObserver:

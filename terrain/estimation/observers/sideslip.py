@@ -95,41 +95,28 @@ _STATES = (
 
 
 class SideslipSettings(NamedTuple):
-    """Noise of an observer of sideslip, and which of the three it is.
+    """Noise of an observer of sideslip, and which of the three it is."""
 
-    Parameters
-    ----------
-    by_dynamics, by_fixes, by_imu : see the table of this module
-    position_std_m, yaw_std_rad : of a fix
-    gyro_std_radps, accel_std_mps2 : of yaw rate and lateral specific force
-    imu_ahead_m : of the accelerometer ahead of the rear axle
-    slip_walk_radps : change of a slip angle within a second without dynamics
-    turn_walk_radps2, side_walk_mps2 : what the model lacks of r and w within a second; the lag of a tyre that rolls
-        into its slip is in it, which would otherwise be taken for a softer tyre
-    stiffness_walk_ratio, stiffness_std_ratio : of the nominal cornering stiffness: change within a second, and at first
-    stiffness_correlation : of both, between the axles
-    excited_mps2 : least lateral specific force for learning C
-    slowest_mps : below which there are no dynamics
-    reset_s : time for which fixes have to be rejected before the pose begins anew
-    """
-
-    by_dynamics: bool = True
+    by_dynamics: bool = True  #: see the table of this module
     by_fixes: bool = True
     by_imu: bool = True
-    position_std_m: float = 0.02
+    position_std_m: float = 0.02  #: of a fix
     yaw_std_rad: float = 0.005
-    gyro_std_radps: float = 0.003
+    gyro_std_radps: float = 0.003  #: of yaw rate and lateral specific force
     accel_std_mps2: float = 0.1
-    imu_ahead_m: float = 0.0
-    slip_walk_radps: float = 0.02
+    imu_ahead_m: float = 0.0  #: of the accelerometer ahead of the rear axle
+    slip_walk_radps: float = 0.02  #: change of a slip angle within a second without dynamics
+    #: what the model lacks of r and w within a second; the lag of a tyre that rolls into its slip is in it, which
+    #: would otherwise be taken for a softer tyre
     turn_walk_radps2: float = 0.1
     side_walk_mps2: float = 4.0
+    #: of the nominal cornering stiffness: change within a second, and at first
     stiffness_walk_ratio: float = 0.13
     stiffness_std_ratio: float = 0.3
-    stiffness_correlation: float = 0.8
-    excited_mps2: float = 1.0
-    slowest_mps: float = 0.3
-    reset_s: float = 1.0
+    stiffness_correlation: float = 0.8  #: of both, between the axles
+    excited_mps2: float = 1.0  #: least lateral specific force for learning C
+    slowest_mps: float = 0.3  #: below which there are no dynamics
+    reset_s: float = 1.0  #: time for which fixes have to be rejected before the pose begins anew
 
 
 SETTINGS = {

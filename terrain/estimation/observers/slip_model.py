@@ -82,22 +82,6 @@ STEEPEST_RAD = 1.2
 class SlipModel:
     """Numbers of the slip laws of one robot on one ground; without arguments there is no slip.
 
-    Parameters
-    ----------
-    turning_exponent : n of (27)
-    compaction_slip_ratio, grade_slip_ratio : intercept and slope (per rad) of (22)
-    turn_grade_m : lambda_x, speed back down by yaw rate and grade
-    side_slip_ratio : k of (26), per rad
-    angle : (8,) coefficients of (28) in rad, for SI units, in the order of :data:`REGRESSORS`
-    track_ratio : effective distance of the tracks over the described one, for a robot without a gyro
-    covariance : (16, 16) of :data:`PARAMETERS`
-    slip_std_ratio, angle_std_rad : residuals of V_x and V_y within a run, over the speed of the tracks
-    run_slip_std_ratio, run_angle_std_rad : b, what a whole run has in common
-    found : how the numbers were found
-    correlation_s : over which the residuals within a run are alike
-    turn_side_m : lambda_y, speed down to the side by yaw rate and roll
-    turn_shift_m : c, distance behind the middle of the point of turning, per rad of grade
-
     Raises
     ------
     ConfigError
@@ -109,22 +93,25 @@ class SlipModel:
     array([0.85, 0.  ])
     """
 
-    turning_exponent: float = 1.0
-    compaction_slip_ratio: float = 0.0
+    turning_exponent: float = 1.0  #: n of (27)
+    compaction_slip_ratio: float = 0.0  #: intercept and slope (per rad) of (22)
     grade_slip_ratio: float = 0.0
-    turn_grade_m: float = 0.0
-    side_slip_ratio: float = 0.0
+    turn_grade_m: float = 0.0  #: lambda_x, speed back down by yaw rate and grade
+    side_slip_ratio: float = 0.0  #: k of (26), per rad
+    #: (8,) coefficients of (28) in rad, for SI units, in the order of :data:`REGRESSORS`
     angle: Array = field(default_factory=lambda: np.zeros(N_ANGLE))
+    #: effective distance of the tracks over the described one, for a robot without a gyro
     track_ratio: float = 1.0
+    #: (16, 16) of :data:`PARAMETERS`
     covariance: Array = field(default_factory=lambda: np.zeros((N_MODEL, N_MODEL)))
-    slip_std_ratio: float = 0.0
+    slip_std_ratio: float = 0.0  #: residuals of V_x and V_y within a run, over the speed of the tracks
     angle_std_rad: float = 0.0
-    run_slip_std_ratio: float = 0.0
+    run_slip_std_ratio: float = 0.0  #: b, what a whole run has in common
     run_angle_std_rad: float = 0.0
-    found: str = "given"
-    correlation_s: float = 0.5
-    turn_side_m: float = 0.0
-    turn_shift_m: float = 0.0
+    found: str = "given"  #: how the numbers were found
+    correlation_s: float = 0.5  #: over which the residuals within a run are alike
+    turn_side_m: float = 0.0  #: lambda_y, speed down to the side by yaw rate and roll
+    turn_shift_m: float = 0.0  #: c, distance behind the middle of the point of turning, per rad of grade
 
     def __post_init__(self) -> None:
         for name, shape in (("angle", (N_ANGLE,)), ("covariance", (N_MODEL, N_MODEL))):

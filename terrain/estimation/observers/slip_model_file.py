@@ -37,19 +37,7 @@ DIGITS, ROUNDED = 6, 1e-4
 
 
 def write_slip_model(path: Path, model: SlipModel, robot: str) -> None:
-    """Write a slip model.
-
-    Parameters
-    ----------
-    path : of the new file
-    model : what was identified
-    robot : whose it is
-
-    Raises
-    ------
-    ConfigError
-        if the file is no YAML by its name, or is there already.
-    """
+    """Write the slip model of a robot; as :func:`check_slip_model_file`."""
     check_slip_model_file(path)
     std = np.sqrt(np.diag(model.covariance))
     scale = np.where(std > 0.0, std, 1.0)
@@ -70,13 +58,7 @@ def write_slip_model(path: Path, model: SlipModel, robot: str) -> None:
 
 
 def check_slip_model_file(path: Path) -> None:
-    """Refuse the place of a new slip model that is no YAML file by its name, or is there already.
-
-    Raises
-    ------
-    ConfigError
-        if it is.
-    """
+    """Refuse, by ``ConfigError``, the place of a new slip model that is no YAML file, or is there already."""
     if path.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"{path}: a slip model is a .yaml file")
     if path.exists():
@@ -85,11 +67,6 @@ def check_slip_model_file(path: Path) -> None:
 
 def read_slip_model(path: Path, robot: str) -> SlipModel:
     """Return the slip model of a file.
-
-    Parameters
-    ----------
-    path : of the file
-    robot : whose model is required
 
     Raises
     ------
@@ -132,9 +109,8 @@ def _correlation(place: str, rows: Any) -> Array:
     n = len(PARAMETERS)
     if rows is None:
         return np.eye(n)
-    if not isinstance(rows, list) or len(rows) != n or not all(isinstance(row, list) for row in rows):
-        raise ConfigError(f"{place}: {n} rows of {n} numbers are required")
-    if any(len(row) != n for row in rows):
+    is_table = isinstance(rows, list) and all(isinstance(row, list) and len(row) == n for row in rows)
+    if not is_table or len(rows) != n:
         raise ConfigError(f"{place}: {n} rows of {n} numbers are required")
     found = np.array([[_number(place, each) for each in row] for row in rows])
     one = np.abs(np.diag(found) - 1.0).max() <= ROUNDED and np.allclose(found, found.T, atol=ROUNDED)

@@ -104,32 +104,19 @@ _KNOWN_STD = 1e-6  # of what is taken as known: a filter has no state without a 
 
 @dataclass(frozen=True)
 class OdometrySettings:
-    """Noise and limits of the odometry of a tracked robot.
+    """Noise and limits of the odometry of a tracked robot."""
 
-    Parameters
-    ----------
-    gyro_threshold_radps : the gyro is used where it differs from the tracks by more; 0: always
-    gyro_noise_radps, gyro_bias_std_radps : of a sample, and of what is left of the bias
-    encoder_noise_mps : of a sample of the speed of a track
-    stand_mps : both tracks slower: the robot stands, or is pushed
-    pushed_radps : yaw rate above which a robot on standing tracks is pushed
-    min_speed_mps : tracks and ground slower: the slip of the track is NaN
-    fix_std_m, yaw_fix_std_rad : of a position along an axis, and of a heading
-    ratio_std : of the ratio of the tracks' yaw rate and the gyro's, from turn to turn
-    forget_s : time in which a parameter may change by its standard deviation at the start
-    """
-
-    gyro_threshold_radps: float = 0.0
-    gyro_noise_radps: float = 0.002
+    gyro_threshold_radps: float = 0.0  #: the gyro is used where it differs from the tracks by more; 0: always
+    gyro_noise_radps: float = 0.002  #: of a sample, and of what is left of the bias
     gyro_bias_std_radps: float = 0.0005
-    encoder_noise_mps: float = 0.001
-    stand_mps: float = 0.003
-    pushed_radps: float = 0.02
-    min_speed_mps: float = 0.005
-    fix_std_m: float = 0.02
+    encoder_noise_mps: float = 0.001  #: of a sample of the speed of a track
+    stand_mps: float = 0.003  #: both tracks slower: the robot stands, or is pushed
+    pushed_radps: float = 0.02  #: yaw rate above which a robot on standing tracks is pushed
+    min_speed_mps: float = 0.005  #: tracks and ground slower: the slip of the track is NaN
+    fix_std_m: float = 0.02  #: of a position along an axis, and of a heading
     yaw_fix_std_rad: float = 0.02
-    ratio_std: float = 0.1
-    forget_s: float = math.inf
+    ratio_std: float = 0.1  #: of the ratio of the tracks' yaw rate and the gyro's, from turn to turn
+    forget_s: float = math.inf  #: time in which a parameter may change by its standard deviation at the start
 
     def __post_init__(self) -> None:
         above = ("stand_mps", "min_speed_mps", "fix_std_m", "yaw_fix_std_rad", "ratio_std", "forget_s")

@@ -92,53 +92,36 @@ _FURTHEST_M = 1e8  # no position on Earth is further from an origin on it
 _FASTEST_RADPS = 50.0  # no gyro of a robot measures more
 _PUSHED_RADPS = 0.05  # above the bias of a gyro
 _LONGEST_S = 1e9  # at which clocks of a memory stop
-_STARTING, _STANDING, _PREDICTED = (ObserverStatus(k).value for k in (1, 2, 3))
-_REJECTED, _RESET, _UNEXCITED, _PUSHED, _BAD = (ObserverStatus(k).value for k in range(4, 9))
 
 
 @dataclass(frozen=True)
 class TrackedSettings:
-    """Gains, noise and limits; the defaults are the gains of the paper, both matrices the identity.
+    """Gains, noise and limits; the defaults are the gains of the paper, both matrices the identity."""
 
-    Parameters
-    ----------
-    observation_gain_ps : l_1, l_2 and l_3 of (8), of position and heading
-    adaptation_gain : lambda of (8), of the left and of the right track; not used where ``normalised``
-    normalised : adaptation gain ``((M' L^-2 M) + regularisation)^-1 / 4``, critically damped at every speed
-    least_speed_mps : of the regularisation: below about this speed of a track a normalised gain vanishes
-    position_std_m, yaw_std_rad : of a fix, one axis
-    eta_std_ratio : of a track's efficiency before anything is known, about 1
-    eta_walk_ratio : random walk of an efficiency while the robot moves, per square root of a second
-    eta_max_ratio : largest efficiency; the least is 0, see (4)
-    standing_mps : a slower track stands
-    speed_max_mps : a faster track is a wrong measurement
-    gate_std : deviation of a fix, in standard deviations of two fixes' difference, that noise may explain
-    n_reset : fixes rejected one after another after which the pose begins anew
-    predicted_after_s : time without a fix after which the status says so
-    longest_interval_s : between two fixes, for the later one to be compared with the earlier
-    longest_step_s : between two ticks, for the travel between them to be known
-    window_s : T of (14), the time constant with which excitation is forgotten
-    gyro_std_radps : error of the gyro's rate that stays the same between two fixes
-    """
-
+    #: l_1, l_2 and l_3 of (8), of position and heading
     observation_gain_ps: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    #: lambda of (8), of the left and of the right track; not used where ``normalised``
     adaptation_gain: tuple[float, float] = (1.0, 1.0)
+    #: adaptation gain ``((M' L^-2 M) + regularisation)^-1 / 4``, critically damped at every speed
     normalised: bool = False
+    #: of the regularisation: below about this speed of a track a normalised gain vanishes
     least_speed_mps: float = 0.05
-    position_std_m: float = 0.02
+    position_std_m: float = 0.02  #: of a fix, one axis
     yaw_std_rad: float = math.radians(0.5)
-    eta_std_ratio: float = 0.3
+    eta_std_ratio: float = 0.3  #: of a track's efficiency before anything is known, about 1
+    #: random walk of an efficiency while the robot moves, per square root of a second
     eta_walk_ratio: float = 0.002
-    eta_max_ratio: float = 2.0
-    standing_mps: float = 0.02
-    speed_max_mps: float = 10.0
+    eta_max_ratio: float = 2.0  #: largest efficiency; the least is 0, see (4)
+    standing_mps: float = 0.02  #: a slower track stands
+    speed_max_mps: float = 10.0  #: a faster track is a wrong measurement
+    #: deviation of a fix, in standard deviations of two fixes' difference, that noise may explain
     gate_std: float = 5.0
-    n_reset: int = 10
-    predicted_after_s: float = 0.5
-    longest_interval_s: float = 2.0
-    longest_step_s: float = 0.5
-    window_s: float = 5.0
-    gyro_std_radps: float = 0.002
+    n_reset: int = 10  #: fixes rejected one after another after which the pose begins anew
+    predicted_after_s: float = 0.5  #: time without a fix after which the status says so
+    longest_interval_s: float = 2.0  #: between two fixes, for the later one to be compared with the earlier
+    longest_step_s: float = 0.5  #: between two ticks, for the travel between them to be known
+    window_s: float = 5.0  #: T of (14), the time constant with which excitation is forgotten
+    gyro_std_radps: float = 0.002  #: error of the gyro's rate that stays the same between two fixes
 
 
 IN_MANOEUVRES = TrackedSettings(observation_gain_ps=(2.0, 2.0, 2.0), normalised=True, eta_walk_ratio=0.03)
@@ -151,15 +134,9 @@ is, are the defaults."""
 def normalised_gain(travel: Array, span_s: float, gain_ps: Array, least: float) -> Array:
     """Return the adaptation gain (2, 2) that damps the error system critically at every speed.
 
-    ``Lambda = (M' L^-2 M + r I)^-1 / 4`` with the mean regressor ``M = W / h``: for ``L = l I`` this is
-    ``(l^2 / 4) (M'M)^-1``, and position and heading with gains of their own are both critically damped.
-
-    Parameters
-    ----------
-    travel : (3, 2) W
-    span_s : h
-    gain_ps : (3,) diagonal of L
-    least : r, which keeps the gain finite where a track stands
+    ``Lambda = (M' L^-2 M + r I)^-1 / 4`` with the mean regressor ``M = W / h`` and r, which keeps the gain finite where
+    a track stands: for ``L = l I`` this is ``(l^2 / 4) (M'M)^-1``, and position and heading with gains of their own
+    are both critically damped.
 
     Examples
     --------
@@ -173,11 +150,7 @@ def normalised_gain(travel: Array, span_s: float, gain_ps: Array, least: float) 
 
 def n_parts(travel: Array, span_s: float, gain_ps: Array, adaptation: Array) -> int:
     """Return into how many parts an interval is cut."""
-    coupling = 0.0
-    for i in range(3):
-        for j in range(2):
-            for k in range(2):
-                coupling += travel[i, j] * adaptation[j, k] * travel[i, k]
+    coupling = float(np.sum(travel @ adaptation * travel))
     fastest = max(span_s * float(gain_ps.max()), math.sqrt(max(coupling, 0.0)))
     return max(1, min(MAX_PARTS, math.ceil(fastest / PART - 1e-9)))
 
@@ -195,20 +168,13 @@ def observe_interval(
 
     Parameters
     ----------
-    travel : (3, 2) W, of the left and the right track
-    span_s : h
-    gain_ps : (3,) diagonal of L
-    adaptation : (2, 2) Lambda
-    error : (3,) e at the start, measured pose less estimated
-    eta : (2,) efficiencies of the left and the right track at the start
-    moved : (3,) dz
+    travel, span_s, gain_ps, adaptation, moved : W (3, 2), h, the diagonal of L (3,), Lambda (2, 2) and dz (3,)
+    error, eta : e (3,), measured pose less estimated, and efficiencies (2,) at the start
 
     Returns
     -------
-    error : (3,) at the end
-    eta : (2,) at the end
-    errors_map : (5, 5) F
-    start_map, end_map : (5, 3) how the noise of the fix at the start, and of that at the end, enters
+    error, eta : at the end
+    whole, from_start, from_end : F (5, 5), and how the noise of either fix enters, (5, 3)
 
     Examples
     --------
@@ -244,11 +210,6 @@ class TrackedObserver(Observer):
     ----------
     robot : tracked
     settings : gains, noise and limits
-
-    Attributes
-    ----------
-    cov : (5, 5) of the errors of pose and efficiencies
-    eta : (2,) n^
 
     Raises
     ------

@@ -94,14 +94,6 @@ def test_the_normalised_gain_settles_as_fast_at_every_speed(speed_mps):
     assert settling_s(time_s, found, eta, 0.02) <= 4.0
 
 
-@pytest.mark.parametrize("drive_of", [STRAIGHT, CIRCLE])
-def test_raw_fixes_of_2_cm_leave_half_a_percent(drive_of):
-    time_s, rows, _, eta = drive(*drive_of, 150.0, np.random.default_rng(0), **RAW)
-    found = efficiencies(track_of(time_s, rows))
-    rmse = np.sqrt(np.mean((found - eta)[time_s > 30] ** 2, axis=0))
-    assert rmse.max() <= 0.005
-
-
 @pytest.mark.parametrize("settings", [PAPER, NORMALISED])
 @pytest.mark.parametrize("drive_of", [STRAIGHT, CIRCLE])
 def test_errors_are_as_large_as_stated(settings, drive_of):
@@ -274,62 +266,31 @@ def lyapunov(error, eta_error, adaptation):
     return 0.5 * (error @ error + eta_error @ np.linalg.solve(adaptation, eta_error))
 
 
-def plain_interval(travel, span, gain, adaptation, error, eta, moved):
-    """The implicit midpoint rule as a linear system in all five unknowns, part by part."""
-    n = n_parts(travel, span, gain, adaptation)
-    w, h, dz = travel / n, span / n, moved / n
-    rates = np.block([[-h * np.diag(gain), -w], [adaptation @ w.T, np.zeros((2, 2))]])
-    state = np.r_[error, eta]
-    for _ in range(n):
-        state = np.linalg.solve(np.eye(5) - rates / 2, (np.eye(5) + rates / 2) @ state + np.r_[dz, 0, 0])
-    return state[:3], state[3:]
-
-
-def random_case(rng):
-    left, right = rng.uniform(-3, 3, 2)
+def random_case(rng, normalised=False):
     span = 10 ** rng.uniform(-2, 1)
-    travel = span * regressor(rng.uniform(-4, 4), left, right)
-    return travel, span, 10 ** rng.uniform(-1, 1.5, 3), np.diag(10 ** rng.uniform(-2, 2, 2))
+    travel, gain = span * regressor(rng.uniform(-4, 4), *rng.uniform(-3, 3, 2)), 10 ** rng.uniform(-1, 1.5, 3)
+    if normalised:
+        return travel, span, gain, normalised_gain(travel, span, gain, 1e-3)
+    return travel, span, gain, np.diag(10 ** rng.uniform(-2, 2, 2))
 
 
-def test_the_lyapunov_function_never_grows():
-    rng, falls = np.random.default_rng(0), []
-    for _ in range(2000):
-        travel, span, gain, adaptation = random_case(rng)
+@pytest.mark.parametrize("normalised", [False, True])
+def test_the_lyapunov_function_never_grows(normalised):
+    rng, n_whole = np.random.default_rng(0), 0
+    for _ in range(1000):
+        travel, span, gain, adaptation = random_case(rng, normalised)
         error, eta, true = rng.normal(size=3), rng.uniform(0, 2, 2), rng.uniform(0, 2, 2)
         after, eta_after, *_ = observe_interval(travel, span, gain, adaptation, error, eta, travel @ true)
         before_v, after_v = (
             lyapunov(error, eta - true, adaptation),
             lyapunov(after, eta_after - true, adaptation),
         )
-        assert after_v <= before_v * (1 + 1e-12)
-        if n_parts(travel, span, gain, adaptation) == 1:
-            middle = (error + after) / 2
-            falls.append((after_v - before_v, -span * middle @ (gain * middle), before_v))
-    change, predicted, scale = np.array(falls).T
-    assert len(falls) > 50
-    np.testing.assert_array_less(abs(change - predicted), 1e-12 * scale + 1e-14)
-
-
-def test_a_full_adaptation_gain_does_not_let_it_grow_either():
-    rng = np.random.default_rng(1)
-    for _ in range(500):
-        travel, span, gain, _ = random_case(rng)
-        adaptation = normalised_gain(travel, span, gain, 1e-3)
-        error, eta, true = rng.normal(size=3), rng.uniform(0, 2, 2), rng.uniform(0, 2, 2)
-        after, eta_after, *_ = observe_interval(travel, span, gain, adaptation, error, eta, travel @ true)
-        grown = lyapunov(after, eta_after - true, adaptation) / lyapunov(error, eta - true, adaptation)
-        assert grown <= 1 + 1e-9
-
-
-def test_the_kernel_is_the_plain_rule():
-    rng = np.random.default_rng(2)
-    for _ in range(100):
-        travel, span, gain, adaptation = random_case(rng)
-        error, eta, moved = rng.normal(size=3), rng.uniform(0, 2, 2), rng.normal(size=3)
-        found = observe_interval(travel, span, gain, adaptation, error, eta, moved)
-        plain = plain_interval(travel, span, gain, adaptation, error, eta, moved)
-        np.testing.assert_allclose(np.r_[found[0], found[1]], np.concatenate(plain), rtol=1e-7, atol=1e-9)
+        assert after_v <= before_v * (1 + 1e-9)
+        if n_parts(travel, span, gain, adaptation) == 1 and not normalised:
+            n_whole, middle = n_whole + 1, (error + after) / 2
+            fall = -span * middle @ (gain * middle)
+            assert abs(after_v - before_v - fall) < 1e-12 * before_v + 1e-14
+    assert normalised or n_whole > 30
 
 
 def test_maps_of_the_errors_are_derivatives_of_the_step():
