@@ -12,10 +12,10 @@ signal goes through a low-pass too, and its own lag and the filter's together ar
 5. rows that follow from others: vibration, changes of the wheels' speeds, rest; of a robot that skids the
    gyro's mean since the last tick.
 
-A whole log (:func:`measurement_table`) is :func:`take_sample` and :func:`take_tick`, looped over what is left of it
-after samples that cannot be true are left out and counted; the live chain (:mod:`terrain.estimation.live`) takes the
-same steps.  What looks ahead in a log is the cleaning, the median periods and, unless ``causal``, latencies, the yaw
-at the start and the origin of positions.
+A whole log (:func:`measurement_table`) and the live chain (:mod:`terrain.estimation.live`) take the same compiled
+steps, one for each sample and one for each tick.  What looks ahead in a log is the cleaning, which leaves out and
+counts samples that cannot be true, the median periods and, unless ``causal``, latencies, the yaw at the start and the
+origin of positions.
 
 Rows that follow from others
 ----------------------------
@@ -338,7 +338,7 @@ def new_feed() -> Array:
 
 
 @_inner
-def sum_of_jumps(value: float, instant_s: float, line: Any, limit: Any) -> float:
+def _sum_of_jumps(value: float, instant_s: float, line: Any, limit: Any) -> float:
     """Return the sum of a signal's jumps: 0 after one that jumped back, and for a latched one after a gap."""
     step_s, change, before = instant_s - line.raw_s, value - line.raw, line.jumped_by
     line.raw, line.raw_s = value, instant_s
@@ -358,12 +358,12 @@ def sum_of_jumps(value: float, instant_s: float, line: Any, limit: Any) -> float
 
 
 @_inner
-def take(value: float, instant_s: float, came_s: float, line: Any, limit: Any) -> bool:
+def _take(value: float, instant_s: float, came_s: float, line: Any, limit: Any) -> bool:
     """Put a sample behind the low-pass of its signal; return True, and do not, where it jumped."""
     if math.isnan(value):
         return False
     if limit.policy != PASSING:
-        jumped_by = sum_of_jumps(value, instant_s, line, limit)
+        jumped_by = _sum_of_jumps(value, instant_s, line, limit)
         if limit.policy == LATCHED and jumped_by != 0.0:
             return True
         value -= jumped_by
@@ -382,7 +382,7 @@ def take(value: float, instant_s: float, came_s: float, line: Any, limit: Any) -
 
 
 @_inner
-def at_tick(time_s: float, line: Any, limit: Any) -> float:
+def _at_tick(time_s: float, line: Any, limit: Any) -> float:
     """Return a signal's value at a tick, the low-pass run on to it; NaN where too old or given before.
 
     From the sample to the tick its input is held, and the held value adds no delay: the tick's value is the
@@ -457,7 +457,7 @@ def _take_steering(sample: Array, came_s: float, settings: Any, feed: Any) -> bo
     jumped = False
     for i in range(3):
         angle = _unwrap(wrapped(sample[i] - settings.steering_zeros_rad[i]), feed.steer_turns[i])
-        jumped |= take(angle, came_s, came_s, feed.steer_rad[i], settings.steer_rad[i])
+        jumped |= _take(angle, came_s, came_s, feed.steer_rad[i], settings.steer_rad[i])
     return bool(jumped)
 
 
@@ -472,16 +472,16 @@ def _take_imu(sample: Array, instant_s: float, came_s: float, settings: Any, fee
     roll, pitch = sample[6], sample[7]
     for i in range(2):
         line, limit, angle = feed.tilt_rad[i], settings.tilt_rad[i], sample[6 + i]
-        if not math.isnan(angle) and sum_of_jumps(angle, instant_s, line, limit) != 0.0:
+        if not math.isnan(angle) and _sum_of_jumps(angle, instant_s, line, limit) != 0.0:
             roll = pitch = np.nan
     level_x, level_y = -GRAVITY_MPS2 * math.sin(pitch), GRAVITY_MPS2 * math.sin(roll) * math.cos(pitch)
     bias, scale, jumped = settings.accel_bias_mps2, settings.accel_scale_ratio, False
     for i, level in ((0, level_x), (1, level_y)):
         accel = (sample[3 + i] - bias[i]) / scale[i] - level
-        jumped |= take(accel, instant_s, came_s, feed.accel_mps2[i], settings.accel_mps2[i])
+        jumped |= _take(accel, instant_s, came_s, feed.accel_mps2[i], settings.accel_mps2[i])
     gyro, limit = feed.gyro_z_radps, settings.gyro_z_radps
     before_s, before_radps = gyro.instant_s, gyro.low_passed
-    if take(sample[2] - settings.gyro_bias_radps, instant_s, came_s, gyro, limit):
+    if _take(sample[2] - settings.gyro_bias_radps, instant_s, came_s, gyro, limit):
         jumped = True
     else:  # the angle since the last tick
         step_s = gyro.instant_s - before_s
@@ -489,7 +489,7 @@ def _take_imu(sample: Array, instant_s: float, came_s: float, settings: Any, fee
             feed.gyro_angle_rad += 0.5 * (before_radps + gyro.low_passed) * step_s
             feed.gyro_time_s += step_s
     yaw = _unwrap(sample[8], feed.imu_turns)
-    jumped |= take(yaw, instant_s, came_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
+    jumped |= _take(yaw, instant_s, came_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
     accel = (sample[5] - bias[2]) / scale[2] - GRAVITY_MPS2 * math.cos(roll) * math.cos(pitch)
     if not math.isnan(accel):
         step_s, square = instant_s - feed.vibration_s, accel * accel
@@ -523,14 +523,14 @@ def _take_odometry(
     along, left = r_00 * v_x + r_10 * v_y + r_20 * v_z, r_01 * v_x + r_11 * v_y + r_21 * v_z
     speed = _mask_frozen(np.array([along, left]), np.int64(FIRST_SPEED), moving, feed)
     line, turned_by = feed.camera_yaw_rad, feed.camera_yaw_rad.jumped_by
-    jumped = take(yaw - feed.camera_yaw_0_rad, instant_s, came_s, line, settings.camera_yaw_rad)
+    jumped = _take(yaw - feed.camera_yaw_0_rad, instant_s, came_s, line, settings.camera_yaw_rad)
     turned = line.jumped_by != turned_by  # that turns the speeds: they have not jumped themselves
     for i in range(2):
         if turned:
             feed.camera_speed_mps[i].raw = speed[i]
-        jumped |= take(speed[i], instant_s, came_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
+        jumped |= _take(speed[i], instant_s, came_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
     rate, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
-    jumped |= take(sample[11], instant_s, came_s, rate, limit)
+    jumped |= _take(sample[11], instant_s, came_s, rate, limit)
     return bool(jumped)
 
 
@@ -547,12 +547,12 @@ def _take_gnss(sample: Array, instant_s: float, came_s: float, settings: Any, fe
         feed.gnss_variance = std * std
     for i in range(2):
         place = sample[i] - feed.gnss_origin_m[i] if known else np.nan
-        take(place, instant_s, came_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
-        take(sample[2 + i], instant_s, came_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
+        _take(place, instant_s, came_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
+        _take(sample[2 + i], instant_s, came_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
 
 
 @_inner
-def take_sample(
+def _take_sample(
     stream: int, sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any
 ) -> None:
     """Take a sample (channels,) of any stream but the wheels, that was measured and arrived at two instants."""
@@ -666,7 +666,7 @@ def rest_at(time_s: float, left_mps: float, right_mps: float, gyro_radps: float,
 
 
 @_inner
-def take_tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
+def _take_tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
     """Write the row of a tick but for its yaw, which :func:`refer_yaw` counts from the start.
 
     ``wheels`` are the rates (3,) of the motors, or the speeds (2,) of the sides.
@@ -674,23 +674,23 @@ def take_tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) 
     row.side_mps[0] = row.side_mps[1] = row.rest_gyro_radps = np.nan
     _take_wheels(wheels, settings, feed, row)
     for i in range(3):
-        row.steer_rad[i] = at_tick(time_s, feed.steer_rad[i], settings.steer_rad[i])
+        row.steer_rad[i] = _at_tick(time_s, feed.steer_rad[i], settings.steer_rad[i])
         if not math.isnan(row.wheel_radps[i]):
             feed.rate_received_s[i] = time_s
         if not math.isnan(row.steer_rad[i]):
             feed.steer_received_s[i] = time_s
     for i in range(2):
-        row.accel_mps2[i] = at_tick(time_s, feed.accel_mps2[i], settings.accel_mps2[i])
-        row.camera_speed_mps[i] = at_tick(time_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
-        row.gnss_position_m[i] = at_tick(time_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
-        row.gnss_speed_mps[i] = at_tick(time_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
+        row.accel_mps2[i] = _at_tick(time_s, feed.accel_mps2[i], settings.accel_mps2[i])
+        row.camera_speed_mps[i] = _at_tick(time_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
+        row.gnss_position_m[i] = _at_tick(time_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
+        row.gnss_speed_mps[i] = _at_tick(time_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
         row.gnss_variance[i] = np.nan if math.isnan(row.gnss_position_m[i]) else feed.gnss_variance
         row.gnss_variance[2 + i] = np.nan if math.isnan(row.gnss_speed_mps[i]) else GNSS_SPEED_STD_MPS**2
-    row.gyro_z_radps = at_tick(time_s, feed.gyro_z_radps, settings.gyro_z_radps)
-    row.imu_yaw_rad = at_tick(time_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
+    row.gyro_z_radps = _at_tick(time_s, feed.gyro_z_radps, settings.gyro_z_radps)
+    row.imu_yaw_rad = _at_tick(time_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
     line, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
-    row.camera_yaw_rate_radps = at_tick(time_s, line, limit)
-    row.camera_yaw_rad = at_tick(time_s, feed.camera_yaw_rad, settings.camera_yaw_rad)
+    row.camera_yaw_rate_radps = _at_tick(time_s, line, limit)
+    row.camera_yaw_rad = _at_tick(time_s, feed.camera_yaw_rad, settings.camera_yaw_rad)
     if not settings.is_steered and not math.isnan(row.gyro_z_radps) and feed.gyro_time_s > 0.0:
         row.gyro_z_radps = feed.gyro_angle_rad / feed.gyro_time_s
     feed.gyro_angle_rad = feed.gyro_time_s = 0.0
@@ -759,14 +759,14 @@ def take_live(stream: int, sample: Array, complete: bool, came_s: float, setting
     if stream == ODOMETRY and sample[13] < MIN_CONFIDENCE_RATIO:
         feed.low_confidence[stream] += 1
         return
-    take_sample(stream, sample, came_s - settings.latency_s[stream], came_s, settings, feed)
+    _take_sample(stream, sample, came_s - settings.latency_s[stream], came_s, settings, feed)
 
 
 @_kernel
 def tick_live(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
     """Write the row of a tick, yaw counted from the averages so far."""
     settings, feed, row = settings[0], feed[0], row[0]
-    take_tick(time_s, wheels, settings, feed, row)
+    _take_tick(time_s, wheels, settings, feed, row)
     if settings.is_steered:
         _average_yaw(time_s, settings, feed, row)
         _refer_yaw(time_s, settings, feed, row)
@@ -792,23 +792,24 @@ def _run(
             k = due[stream]
             while k < came_s[stream].size and came_s[stream][k] <= time_s:
                 instant = instant_s[stream][k]
-                take_sample(stream, samples[stream][k], instant, came_s[stream][k], settings, feed)
+                _take_sample(stream, samples[stream][k], instant, came_s[stream][k], settings, feed)
                 k += 1
             due[stream] = k
         if n < clock.size:
-            take_tick(clock[n], wheels[n], settings, feed, rows[n])
+            _take_tick(clock[n], wheels[n], settings, feed, rows[n])
 
 
 @_kernel
 def _refer_all(clock: Array, causal: bool, settings: Any, feed: Any, rows: Any) -> None:
     """Count the yaw rows from the start: from the averages of all ticks, or ``causal`` of those so far."""
     settings, feed = settings[0], feed[0]
-    for refers in (False, True):
+    if not causal:
         for n in range(clock.size):
-            if refers == causal:
-                _average_yaw(clock[n], settings, feed, rows[n])
-            if refers:
-                _refer_yaw(clock[n], settings, feed, rows[n])
+            _average_yaw(clock[n], settings, feed, rows[n])
+    for n in range(clock.size):
+        if causal:
+            _average_yaw(clock[n], settings, feed, rows[n])
+        _refer_yaw(clock[n], settings, feed, rows[n])
 
 
 def forget_times(feed: Any) -> None:
@@ -849,9 +850,9 @@ def _on_clock(clock: Array, time_s: Array, signal: Array, line: Array, limit: Ar
     out, line, limit, k = np.empty(clock.size), line[0], limit[0], 0
     for n in range(clock.size):
         while k < time_s.size and time_s[k] <= clock[n] + TICK_S:
-            take(signal[k], time_s[k], time_s[k], line, limit)
+            _take(signal[k], time_s[k], time_s[k], line, limit)
             k += 1
-        out[n] = at_tick(clock[n], line, limit)
+        out[n] = _at_tick(clock[n], line, limit)
     return out
 
 
