@@ -41,11 +41,9 @@ from terrain.simulation.conditions import Conditions
 from terrain.simulation.sensors import BODY, over_ground, truth_stream, white_imu
 from terrain.slip import slip_angle
 
-STEP_S, LONGEST_DELAY_S = 0.001, 0.3
-"""Length of a step, and the longest dead time of the steering."""
-
+STEP_S, LONGEST_DELAY_S = 0.001, 0.3  # length of a step, and the longest dead time of the steering
+# Times between ticks of wheels and steering, between fixes, and between rows of the IMU and of the truth.
 TICK_S, FIX_S, TRUTH_S = 0.02, 0.1, 0.01
-"""Times between ticks of wheels and steering, between fixes, and between rows of the IMU and of the truth."""
 
 CAR_ROWS: tuple[str, ...] = (
     *("speed_rear_mps", "steer_front_rad", "position_x_m", "position_y_m", "yaw_rad"),
@@ -76,23 +74,17 @@ CAR_BODY = record(
 distance travelled, roll; acceleration along the body, lateral specific force of the centre of mass; slip angle of the
 tyres' carcass and side force of the axles; rates."""
 
+# A body, and the commands of the steering that are still to come.
 CAR_STATE = record({"body": CAR_BODY, "place": int, "commands_rad": (float, round(LONGEST_DELAY_S / STEP_S))})
-"""A body, and the commands of the steering that are still to come."""
 
 
 class Ground(NamedTuple):
-    """Ground along the drive.
+    """Ground along the drive."""
 
-    Parameters
-    ----------
-    distance_m : (n,) rising distances travelled; before the first and beyond the last, their values hold
-    grip_ratio : (n,) largest side force over load, above 0
-    roll_rad : (n,) side slope, left side up positive
-    """
-
+    # (n,) rising distances travelled; before the first and beyond the last, their values hold
     distance_m: Array
-    grip_ratio: Array
-    roll_rad: Array
+    grip_ratio: Array  # (n,) largest side force over load, above 0
+    roll_rad: Array  # (n,) side slope, left side up positive
 
 
 def level_ground(grip_ratio: float = 0.7, roll_rad: float = 0.0) -> Ground:
@@ -107,20 +99,12 @@ def level_ground(grip_ratio: float = 0.7, roll_rad: float = 0.0) -> Ground:
 
 
 class PlantSettings(NamedTuple):
-    """What a description of a robot does not have.
+    """What a description of a robot does not have."""
 
-    Parameters
-    ----------
-    steering_delay_s : dead time of the steering, up to :data:`LONGEST_DELAY_S`
-    acceleration_mps2 : bound of the acceleration of the drive
-    relaxation_m : relaxation length of the tyres; about half to once a wheel's radius
-    damping_ratio : of the tyre's carcass at rest
-    """
-
-    steering_delay_s: float = 0.05
-    acceleration_mps2: float = 1.5
-    relaxation_m: float = 0.3
-    damping_ratio: float = 0.7
+    steering_delay_s: float = 0.05  # dead time of the steering, up to :data:`LONGEST_DELAY_S`
+    acceleration_mps2: float = 1.5  # bound of the acceleration of the drive
+    relaxation_m: float = 0.3  # relaxation length of the tyres; about half to once a wheel's radius
+    damping_ratio: float = 0.7  # of the tyre's carcass at rest
 
 
 _GRID_M = 0.05
@@ -278,35 +262,22 @@ class SensorNoise(NamedTuple):
 
 
 class CarDrive(NamedTuple):
-    """How a car is driven.
+    """How a car is driven."""
 
-    Parameters
-    ----------
-    speed_mps : away from stops
-    stops : (distance travelled in m, time to stand in s) of each, in their order
-    duration_s : longest time
-    start : (x in m, y in m, yaw in rad) of the rear axle at rest
-    """
-
-    speed_mps: float
+    speed_mps: float  # away from stops
+    # (distance travelled in m, time to stand in s) of each, in their order
     stops: tuple[tuple[float, float], ...] = ()
-    duration_s: float = 60.0
+    duration_s: float = 60.0  # longest time
+    # (x in m, y in m, yaw in rad) of the rear axle at rest
     start: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class CarSample(NamedTuple):
-    """What a controller is given at a tick.
+    """What a controller is given at a tick."""
 
-    Parameters
-    ----------
-    time_s : of the tick
-    measured : (8,) of :data:`CAR_ROWS`; NaN where a sensor gave nothing at this tick
-    speed_desired_mps : by the drive, stops included
-    """
-
-    time_s: float
-    measured: Array
-    speed_desired_mps: float
+    time_s: float  # of the tick
+    measured: Array  # (8,) of :data:`CAR_ROWS`; NaN where a sensor gave nothing at this tick
+    speed_desired_mps: float  # by the drive, stops included
 
 
 class CarCommand(NamedTuple):

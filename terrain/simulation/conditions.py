@@ -37,30 +37,24 @@ class Conditions:
     All plants have load and slope, tracks an even one; tyres, roughness, variation and play are those of the dynamic
     plant alone.
 
-    Parameters
-    ----------
-    payload_kg, payload_m : load, and where it lies (x, y) from the empty robot's centre of mass, body axes
-    grade_ratio : (2,) mean gradient of the ground along world x and y, uphill positive
-    undulation_ratio, undulation_length_m : a gradient along world x that changes along the path; its wave length
-    radius_factors : (3,) true rolling radius of each wheel over the nominal one
-    roughness_factor : roughness over that of the soil's description
-    field_length_m : over which length the terrain changes along the path
-    leg_backlash_rad : by how much the third leg swings to either side on its hinge (thesis, conclusions)
-
     Raises
     ------
     ConfigError
         for a number that is not finite or out of its range.
     """
 
+    # load, and where it lies (x, y) from the empty robot's centre of mass, body axes
     payload_kg: float = 0.0
     payload_m: tuple[float, float] = (0.0, 0.0)
+    # (2,) mean gradient of the ground along world x and y, uphill positive
     grade_ratio: tuple[float, float] = (0.0, 0.0)
-    undulation_ratio: float = 0.0
+    undulation_ratio: float = 0.0  # a gradient along world x that changes along the path; its wave length
     undulation_length_m: float = 15.0
+    # (3,) true rolling radius of each wheel over the nominal one
     radius_factors: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    roughness_factor: float = 1.0
-    field_length_m: float = 0.5
+    roughness_factor: float = 1.0  # roughness over that of the soil's description
+    field_length_m: float = 0.5  # over which length the terrain changes along the path
+    # by how much the third leg swings to either side on its hinge (thesis, conclusions)
     leg_backlash_rad: float = 0.0
 
     def __post_init__(self) -> None:
@@ -132,20 +126,15 @@ def draw_conditions(
 class Faults:
     """What goes wrong with the sensors on purpose, beside what they do by themselves.
 
-    Parameters
-    ----------
-    camera_lost_s, gnss_lost_s : intervals (start, end) without a sample
-    by_chance : dropouts and jumps of the camera at the rates of its description
-
     Raises
     ------
     ConfigError
         if an interval does not end after it starts.
     """
 
-    camera_lost_s: tuple[tuple[float, float], ...] = ()
+    camera_lost_s: tuple[tuple[float, float], ...] = ()  # intervals (start, end) without a sample
     gnss_lost_s: tuple[tuple[float, float], ...] = ()
-    by_chance: bool = True
+    by_chance: bool = True  # dropouts and jumps of the camera at the rates of its description
 
     def __post_init__(self) -> None:
         for name in ("camera_lost_s", "gnss_lost_s"):
@@ -156,5 +145,4 @@ class Faults:
                     )
 
 
-NO_FAULTS: Faults = Faults()
-"""Nothing on purpose."""
+NO_FAULTS: Faults = Faults()  # nothing on purpose

@@ -11,8 +11,8 @@ import math
 from terrain.kernels import njit
 from terrain.records import Array
 
+# Damping of the contact as a lead on its deflection; it vanishes in steady rolling and so moves no slip.
 DEFLECTION_DAMPING_S = 0.005
-"""Damping of the contact as a lead on its deflection; it vanishes in steady rolling and so moves no slip."""
 
 
 @njit

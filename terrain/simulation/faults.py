@@ -35,8 +35,7 @@ _CHANNELS: Mapping[str, tuple[str, ...]] = {
     "odometry": CAMERA_CHANNELS,
 }
 
-STREAMS: tuple[str, ...] = tuple(_CHANNELS)
-"""Streams that faults act on; ``odometry`` is the camera's."""
+STREAMS: tuple[str, ...] = tuple(_CHANNELS)  # streams that faults act on; ``odometry`` is the camera's
 
 
 class Nature(Enum):
@@ -55,47 +54,31 @@ class Nature(Enum):
 
 @dataclass(slots=True)
 class StreamMemory:
-    """What is remembered of one stream.
+    """What is remembered of one stream."""
 
-    Parameters
-    ----------
-    rng : of all that is drawn for the stream
-    last : (c,) its last values before the fault began; None before the first sample
-    n_samples : number of its samples that the fault has acted on
-    pending : times at which samples that are held back are due, and the samples, in order
-    """
-
-    rng: np.random.Generator
-    last: Array | None = None
-    n_samples: int = 0
+    rng: np.random.Generator  # of all that is drawn for the stream
+    last: Array | None = None  # (c,) its last values before the fault began; None before the first sample
+    n_samples: int = 0  # number of its samples that the fault has acted on
+    # times at which samples that are held back are due, and the samples, in order
     pending: list[tuple[float, Reading]] = field(default_factory=list)
 
 
+# From what a stream gave at a step, in arrays that it may write to and maybe none, and the time of the step, to
+# what arrives of it; None for nothing.
 Change = Callable[[Reading, StreamMemory, float], Reading | None]
-"""From what a stream gave at a step, in arrays that it may write to and maybe none, and the time of the step, to what
-arrives of it; None for nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorFault:
-    """An entry of the catalogue.
+    """An entry of the catalogue."""
 
-    Parameters
-    ----------
-    name, kind : of the fault, and of the group that it is in
-    about : what it does, in one sentence
-    streams : that it touches
-    nature : what it makes of them
-    change : what it does to each of them
-    clock_s : by how much the clock of the whole robot is shifted: all stamps, and that of the step
-    """
-
-    name: str
+    name: str  # of the fault, and of the group that it is in
     kind: str
-    about: str
-    streams: tuple[str, ...]
-    nature: Nature
-    change: Change
+    about: str  # what it does, in one sentence
+    streams: tuple[str, ...]  # that it touches
+    nature: Nature  # what it makes of them
+    change: Change  # what it does to each of them
+    # by how much the clock of the whole robot is shifted: all stamps, and that of the step
     clock_s: float = 0.0
 
 
@@ -186,8 +169,7 @@ def _joined(readings: Sequence[Reading]) -> Reading:
     return Reading(*(np.concatenate(parts) for parts in zip(*readings, strict=True)))
 
 
-EVERY = 10
-"""Of the faults of single samples, one in so many samples has one."""
+EVERY = 10  # of the faults of single samples, one in so many samples has one
 
 _SLACK_S = 1e-9  # stamps and steps that differ by less are the same instant
 _QUATERNION = slice(
@@ -395,8 +377,8 @@ EITHER = (
 tells the truth on a straight drive; a heading of the IMU that was set is no slip; wheels that come so late are too slow
 for a control of slip."""
 
+# Number of columns of another robot's streams: one with four wheels, and sensors that report less.
 OTHER_WIDTH: Mapping[str, int] = {"wheels": 4, "steering": 4, "imu": 6, "odometry": 3}
-"""Number of columns of another robot's streams: one with four wheels, and sensors that report less."""
 
 
 def fault_catalogue(robot: Robot) -> dict[str, SensorFault]:

@@ -45,14 +45,10 @@ from terrain.simulation.sensors import Gnss, draw_imu_errors, imu_values, is_los
 from terrain.simulation.tracked import TrackedGround, run_tracked
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
-COURSE = "course"
-"""A path over all terrains, in place of the name of one."""
-
+COURSE = "course"  # A path over all terrains, in place of the name of one
+# Word for the IMU alone on a bench, in place of a scenario, and the terrain that goes with it.
 BENCH, BENCH_TERRAIN = "six_positions", "bench"
-"""Word for the IMU alone on a bench, in place of a scenario, and the terrain that goes with it."""
-
-SLIP = "slip"
-"""Word for drives that take the wheels through their slips, for ``terrain learn-slip``."""
+SLIP = "slip"  # word for drives that take the wheels through their slips, for ``terrain learn-slip``
 
 
 def simulate(
@@ -273,9 +269,9 @@ def run_id_of(terrain: str, scenario: str, number: int) -> str:
     return f"{terrain}_{number:02d}" if terrain == scenario else f"{terrain}_{scenario}_{number:02d}"
 
 
+# Time by hand from one position to the next, and standard deviation of how far a position is from its axis;
+# assumed.
 TURN_S, CROOKED_RAD = 1.5, 0.03
-"""Time by hand from one position to the next, and standard deviation of how far a position is from its axis;
-assumed."""
 
 POSITIONS = (
     # turns about body axes that bring one axis up after the other: z, -z, x, -x, y, -y
@@ -346,11 +342,9 @@ def six_positions_log(
     return RunLog(run_id, robot.name, streams, source="simulated, six positions on a bench")
 
 
+# Largest slip of the swept wheel, time from no slip to the largest and back, and time before the first sweep.
 SWEEP_SLIP, SWEEP_S, STEADY_S = 0.75, 6.0, 3.0
-"""Largest slip of the swept wheel, time from no slip to the largest and back, and time before the first sweep."""
-
-SWEEP_SPEED_MPS = 0.8
-"""Of a sweep: the swept wheel stays within its motor's speed up to a slip of 0.6."""
+SWEEP_SPEED_MPS = 0.8  # of a sweep: the swept wheel stays within its motor's speed up to a slip of 0.6
 
 
 class Drive(NamedTuple):

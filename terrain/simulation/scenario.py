@@ -4,8 +4,8 @@ A drive is made of legs.  A leg goes from the twist before it to its own in a ra
 holds it.  From rest and to rest the ratio of the three components of the twist stays constant, so the centre of
 rotation does not move during such a ramp and the steering angles do not change.
 
-Sources: Danzi, AgriMaRo thesis, 7.2.3 (``straight``: 1 m/s^2 to 1 m/s) and 6.2 (``complex``: curves, forward
-and backward, in both directions; the order and the speeds are assumed).
+Sources: Danzi, AgriMaRo thesis, 7.2.3 (``straight``: 1 m/s^2 to 1 m/s) and 6.2 (``complex``: curves, forward and
+backward, in both directions; the order and the speeds are assumed).
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -24,52 +23,23 @@ from terrain.kinematics.commands import scaled
 from terrain.records import Array, read_only
 from terrain.robots import BicycleRobot, Robot, SwerveRobot
 
-RATE_HZ = 50.0
-"""Rate of the twists: that of a run log's commands."""
-
-
-ACCEL_MPS2 = 1.0
-"""Change of the velocity in ramps, and the most in any; thesis 7.2.3."""
-
-YAW_ACCEL_RADPS2 = 1.0
-"""The most that the yaw rate changes in ramps: at the third wheel less than :data:`ACCEL_MPS2`."""
-
-STAND_S = 1.0
-"""Rest before the first leg, and the least after the last."""
-
-
-SPOT_RADPS = 0.6
-"""Yaw rate of ``spot_turn``, and the fastest turn on the spot of ``survey``."""
-
-PATCH_M = (6.0, 12.0)
-"""Length of a terrain patch of ``course``."""
-
+RATE_HZ = 50.0  # rate of the twists: that of a run log's commands
+ACCEL_MPS2 = 1.0  # change of the velocity in ramps, and the most in any; thesis 7.2.3
+YAW_ACCEL_RADPS2 = 1.0  # the most that the yaw rate changes in ramps: at the third wheel less than that
+STAND_S = 1.0  # rest before the first leg, and the least after the last
+SPOT_RADPS = 0.6  # yaw rate of ``spot_turn``, and the fastest turn on the spot of ``survey``
+PATCH_M = (6.0, 12.0)  # length of a terrain patch of ``course``
+# A slipping robot gets less far than commanded: ``course`` drives this much further than its patches are long, so
+# that with 20 % of slip the last one is crossed as well.
 SLIP_MARGIN = 1.25
-"""A slipping robot gets less far than commanded: ``course`` drives this much further than its patches are
-long, so that with 20 % of slip the last one is crossed as well."""
-
-
-YAW_RATE_RADPS = 0.3
-"""Of ``arc`` and the curves of ``complex``."""
-
-CIRCLE_M = 1.5
-"""Radius of ``circle``."""
-
-CIRCLE_MPS = 0.5
-"""Speed of ``circle``, unless a lower one is given."""
-
-BRAKE_S = 4.0
-"""Of ``brake``: how long the speed is held before the stop, and the rest after it."""
-
-
-LONGEST_S = 3600.0
-"""A run is held whole in memory, step by step: an hour is a gigabyte and a half."""
-
-_RAMPED = ("straight", "climb", "starts")
-"""Those whose acceleration can be chosen."""
-
+YAW_RATE_RADPS = 0.3  # of ``arc`` and the curves of ``complex``
+CIRCLE_M, CIRCLE_MPS = 1.5, 0.5  # radius of ``circle``, and its speed unless a lower one is given
+BRAKE_S = 4.0  # of ``brake``: how long the speed is held before the stop, and the rest after it
+LONGEST_S = 3600.0  # a run is held whole in memory, step by step: an hour is a gigabyte and a half
+_RAMPED = ("straight", "climb", "starts")  # those whose acceleration can be chosen
+# Speed where none is given, and the share of its fastest speed that a slower or car-like robot drives.
 CRUISING_MPS, CRUISING_SHARE = 1.0, 1.0 / 3.0
-"""Speed where none is given, and the share of its fastest speed that a slower or car-like robot drives."""
+AT_REST = read_only(np.zeros(3))
 
 
 class Patch(NamedTuple):
@@ -81,22 +51,13 @@ class Patch(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scenario:
-    """What is driven, and on what.
-
-    Parameters
-    ----------
-    name : of the drive
-    rate_hz : of the twists
-    time_s : (n,) from 0 to the duration, both included, at that rate
-    twist : (n, 3) desired ``(speed_x_mps, speed_y_mps, yaw_rate_radps)``, no wheel beyond the robot's limit
-    patches : terrains in order; the first starts at 0, the last has no end
-    """
+    """What is driven, and on what."""
 
     name: str
-    rate_hz: float
-    time_s: Array
-    twist: Array
-    patches: tuple[Patch, ...]
+    rate_hz: float  # of the twists
+    time_s: Array  # (n,) from 0 to the duration, both included, at that rate
+    twist: Array  # (n, 3) desired (speed_x_mps, speed_y_mps, yaw_rate_radps), no wheel beyond its limit
+    patches: tuple[Patch, ...]  # terrains in order; the first starts at 0, the last has no end
 
     def __post_init__(self) -> None:
         for name in ("time_s", "twist"):
@@ -113,11 +74,10 @@ class Scenario:
     @property
     def distance_m(self) -> Array:
         """Distance (n,) that the body's origin would have travelled, were the twists followed."""
-        return distance_travelled_m(self.time_s, self.twist)
+        return _distance_m(self.time_s, self.twist)
 
 
-def distance_travelled_m(time_s: Array, twist: Array) -> Array:
-    """Return the distance (n,) travelled by the body's origin with twists (n, 3) at times (n,)."""
+def _distance_m(time_s: Array, twist: Array) -> Array:
     speed_mps = np.hypot(twist[:, 0], twist[:, 1])
     steps_m = np.diff(time_s) * (speed_mps[1:] + speed_mps[:-1]) / 2
     return np.concatenate([[0.0], np.cumsum(steps_m)])
@@ -129,6 +89,9 @@ class Leg(NamedTuple):
     twist: Array
     hold_s: float
     accel_mps2: float = ACCEL_MPS2
+
+
+_STAND = Leg(AT_REST, STAND_S)
 
 
 class DriveRequest(NamedTuple):
@@ -146,6 +109,12 @@ class DriveRequest(NamedTuple):
         """The twist at the speed straight ahead."""
         return self.limit((self.speed_mps, 0.0, 0.0))
 
+    @property
+    def around(self) -> Array:
+        """The twist of ``circle``."""
+        speed_mps = min(self.speed_mps, CIRCLE_MPS)
+        return self.limit((speed_mps, 0.0, speed_mps / CIRCLE_M))
+
     def remaining_s(self, length_s: float, taken_s: float, at_least_s: float) -> float:
         """Return what is left of the time, once the parts of a fixed length are taken away."""
         if length_s < taken_s + at_least_s - 1e-9:
@@ -157,55 +126,33 @@ class DriveRequest(NamedTuple):
         return length_s - taken_s
 
 
-class NamedDrive(NamedTuple):
-    """A drive of fixed or drawn legs on one terrain.
-
-    Parameters
-    ----------
-    default_s : length in s, or what it follows from
-    legs : from a request and a length to the legs
-    smooth : whether its ramps start and end without a step of the acceleration
-    """
-
-    default_s: float | Callable[[DriveRequest], float]
-    legs: Callable[[DriveRequest, float], list[Leg]]
-    smooth: bool = False
-
-    def default_length_s(self, request: DriveRequest) -> float:
-        """Return how long the drive lasts unless a length is given."""
-        return self.default_s(request) if callable(self.default_s) else self.default_s
-
-
-AT_REST = read_only(np.zeros(3))
-
-
-def ramp_s(change: Any, accel_mps2: float = ACCEL_MPS2, smooth: bool = False) -> float:
+def _ramp_s(change: Any, accel_mps2: float = ACCEL_MPS2, smooth: bool = False) -> float:
     """Return how long a change of twist takes; the peak of a smooth one is pi/2 times its mean."""
     x_mps, y_mps, yaw_radps = change
     linear_s = float(max(math.hypot(x_mps, y_mps) / accel_mps2, abs(yaw_radps) / YAW_ACCEL_RADPS2))
     return linear_s * math.pi / 2 if smooth else linear_s
 
 
-def take_legs(legs: Iterator[Leg], length_s: float) -> tuple[list[Leg], float]:
+def _take(legs: Iterator[Leg], length_s: float) -> tuple[list[Leg], float]:
     """Take legs until they last this long; return them and by how much they last longer."""
     taken: list[Leg] = []
     end_s, before = 0.0, AT_REST
     while end_s < length_s:
         leg = next(legs)
-        end_s += ramp_s(leg.twist - before, leg.accel_mps2) + leg.hold_s
+        end_s += _ramp_s(leg.twist - before, leg.accel_mps2) + leg.hold_s
         before = leg.twist
         taken.append(leg)
     return taken, end_s - length_s
 
 
-def twists_of(legs: Sequence[Leg], time_s: Array, smooth: bool = False) -> Array:
+def _twists(legs: Sequence[Leg], time_s: Array, smooth: bool = False) -> Array:
     """Return the twist (n, 3) at each time, the last one held on after the end.
 
     The admissible region is convex: with both ends of a ramp in it, all of the ramp is.
     """
     knots_s, knots = [0.0], [AT_REST]
     for leg in legs:
-        change_s = ramp_s(leg.twist - knots[-1], leg.accel_mps2, smooth)
+        change_s = _ramp_s(leg.twist - knots[-1], leg.accel_mps2, smooth)
         for length_s, there in ((change_s, bool((leg.twist == knots[-1]).all())), (leg.hold_s, True)):
             if length_s > 0 or not there:  # a step takes no time
                 knots_s.append(knots_s[-1] + length_s)
@@ -219,27 +166,26 @@ def twists_of(legs: Sequence[Leg], time_s: Array, smooth: bool = False) -> Array
     return np.asarray(twists[before] + part[:, None] * (twists[before + 1] - twists[before]))
 
 
-def sample_times(length_s: float) -> Array:
-    """Return the times (n,) of the twists of a drive of this length."""
+def _times(length_s: float) -> Array:
     return np.arange(round(length_s * RATE_HZ) + 1) / RATE_HZ
 
 
-def survey(request: DriveRequest, length_s: float) -> list[Leg]:
+def _survey(request: DriveRequest, length_s: float) -> list[Leg]:
     """Draw legs, and brake in time to be at rest at the end."""
     fastest = request.limit((1.2 * request.speed_mps, 0.0, 0.0))
-    brake_s = max(ramp_s(fastest), SPOT_RADPS / YAW_ACCEL_RADPS2)
+    brake_s = max(_ramp_s(fastest), SPOT_RADPS / YAW_ACCEL_RADPS2)
     driven_s = request.remaining_s(length_s, brake_s + STAND_S, at_least_s=6.0)
-    legs, over_s = take_legs(_survey_legs(request), driven_s)
+    legs, over_s = _take(_survey_legs(request), driven_s)
     hold_s = legs[-1].hold_s - over_s
     if hold_s < 0:  # braking starts in the middle of a ramp, from the twist that was reached there
-        legs[-1] = legs[-1]._replace(twist=twists_of(legs, np.array([driven_s]))[0])
+        legs[-1] = legs[-1]._replace(twist=_twists(legs, np.array([driven_s]))[0])
     legs[-1] = legs[-1]._replace(hold_s=max(0.0, hold_s))
     return [*legs, Leg(AT_REST, length_s)]
 
 
 def _survey_legs(request: DriveRequest) -> Iterator[Leg]:
     rng = request.rng
-    yield Leg(AT_REST, STAND_S)
+    yield _STAND
     yield _stretch(request, 1.0, gentle_1pm=0.2)
     while True:
         kind = rng.choice(["stretch", "stop", "backward", "spot"], p=[0.7, 0.1, 0.1, 0.1])
@@ -253,7 +199,7 @@ def _survey_legs(request: DriveRequest) -> Iterator[Leg]:
         elif kind == "spot":
             yaw_radps = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, SPOT_RADPS)
             yield Leg(request.limit((0.0, 0.0, yaw_radps)), rng.uniform(3.0, 5.0))
-            yield Leg(AT_REST, 1.0)
+            yield _STAND
 
 
 def _stretch(request: DriveRequest, direction: float, gentle_1pm: float) -> Leg:
@@ -265,7 +211,7 @@ def _stretch(request: DriveRequest, direction: float, gentle_1pm: float) -> Leg:
     return Leg(twist, rng.uniform(4.0, 6.0), rng.uniform(0.5, 1.0))
 
 
-def course(
+def _course(
     request: DriveRequest, desired_s: float | None, terrains: tuple[str, ...]
 ) -> tuple[Array, Array, tuple[Patch, ...]]:
     """Lay patches and drive over them; a given duration lays as many as are reached in it."""
@@ -279,9 +225,15 @@ def course(
     else:
         length_s = desired_s
         request.remaining_s(length_s, STAND_S + 1.2 * request.speed_mps / 0.5, at_least_s=3.0)
-    time_s = sample_times(length_s)
-    twist = twists_of(take_legs(_course_legs(request), length_s)[0], time_s)
-    reached_m = distance_travelled_m(time_s, twist) / SLIP_MARGIN
+
+    def legs() -> Iterator[Leg]:
+        yield _STAND
+        while True:
+            yield _stretch(request, 1.0, gentle_1pm=0.15)
+
+    time_s = _times(length_s)
+    twist = _twists(_take(legs(), length_s)[0], time_s)
+    reached_m = _distance_m(time_s, twist) / SLIP_MARGIN
     if desired_s is None:
         n = int(np.searchsorted(reached_m, end_m)) + 1
         return time_s[:n], twist[:n], tuple(laid)
@@ -289,12 +241,6 @@ def course(
         patches, end_m = next(rounds)
         laid += patches
     return time_s, twist, tuple(patch for patch in laid if patch.start_m < reached_m[-1])
-
-
-def _course_legs(request: DriveRequest) -> Iterator[Leg]:
-    yield Leg(AT_REST, STAND_S)
-    while True:
-        yield _stretch(request, 1.0, gentle_1pm=0.15)
 
 
 def _rounds(terrains: tuple[str, ...], rng: np.random.Generator) -> Iterator[tuple[list[Patch], float]]:
@@ -312,31 +258,20 @@ def _rounds(terrains: tuple[str, ...], rng: np.random.Generator) -> Iterator[tup
         yield patches, start_m
 
 
-def _ahead(request: DriveRequest, length_s: float) -> list[Leg]:
+def _straight(request: DriveRequest, length_s: float) -> list[Leg]:
     taken_s = STAND_S + request.speed_mps / request.accel_mps2
     hold_s = request.remaining_s(length_s, taken_s, at_least_s=1.0)
-    return [Leg(AT_REST, STAND_S), Leg(request.ahead, hold_s, request.accel_mps2)]
+    return [_STAND, Leg(request.ahead, hold_s, request.accel_mps2)]
 
 
 def _brake(request: DriveRequest, length_s: float) -> list[Leg]:
     taken_s = STAND_S + request.speed_mps / ACCEL_MPS2 + BRAKE_S
     hold_s = request.remaining_s(length_s, taken_s, at_least_s=1.0)
-    return [Leg(AT_REST, STAND_S), Leg(request.ahead, hold_s), Leg(AT_REST, BRAKE_S, math.inf)]
-
-
-def _circle_twist(request: DriveRequest) -> Array:
-    speed_mps = min(request.speed_mps, CIRCLE_MPS)
-    return request.limit((speed_mps, 0.0, speed_mps / CIRCLE_M))
-
-
-def _circle_s(request: DriveRequest) -> float:
-    twist = _circle_twist(request)
-    return math.ceil(2 * STAND_S + 2 * ramp_s(twist) + 2 * math.pi / float(twist[2]))
+    return [_STAND, Leg(request.ahead, hold_s), Leg(AT_REST, BRAKE_S, math.inf)]
 
 
 def _circle(request: DriveRequest, length_s: float) -> list[Leg]:
-    twist = _circle_twist(request)
-    return _held(request, length_s, twist, at_least_s=2 * math.pi / float(twist[2]))
+    return _held(request, length_s, request.around, at_least_s=2 * math.pi / float(request.around[2]))
 
 
 def _arc(request: DriveRequest, length_s: float) -> list[Leg]:
@@ -345,8 +280,8 @@ def _arc(request: DriveRequest, length_s: float) -> list[Leg]:
 
 def _held(request: DriveRequest, length_s: float, twist: Array, at_least_s: float) -> list[Leg]:
     """Return a twist from rest and to rest."""
-    hold_s = request.remaining_s(length_s, 2 * STAND_S + 2 * ramp_s(twist), at_least_s)
-    return [Leg(AT_REST, STAND_S), Leg(twist, hold_s), Leg(AT_REST, STAND_S)]
+    hold_s = request.remaining_s(length_s, 2 * STAND_S + 2 * _ramp_s(twist), at_least_s)
+    return [_STAND, Leg(twist, hold_s), _STAND]
 
 
 def _starts(request: DriveRequest, length_s: float) -> list[Leg]:
@@ -359,86 +294,60 @@ def _starts(request: DriveRequest, length_s: float) -> list[Leg]:
 
 def _spot_turn(request: DriveRequest, length_s: float) -> list[Leg]:
     left = request.limit((0.0, 0.0, SPOT_RADPS))
-    around_s = 2 * ramp_s(left) + STAND_S
+    around_s = 2 * _ramp_s(left) + STAND_S
     n = 2 * max(1, int((length_s - STAND_S) / (2 * (around_s + 2.0))))
     hold_s = request.remaining_s(length_s, STAND_S + n * around_s, at_least_s=n * 1.0) / n
-    both = [Leg(left, hold_s), Leg(AT_REST, STAND_S), Leg(-left, hold_s), Leg(AT_REST, STAND_S)]
-    return [Leg(AT_REST, STAND_S), *both * (n // 2)]
+    return [_STAND, *[Leg(left, hold_s), _STAND, Leg(-left, hold_s), _STAND] * (n // 2)]
 
 
-_COMPLEX = (
-    # speed_x and speed_y in cruising speeds, yaw rate in YAW_RATE_RADPS, share of the time that is held
-    (1.0, 0.0, 0.0, 4.0),
-    (0.8, 0.0, 1.0, 4.0),
-    (0.8, 0.0, -1.0, 4.0),
-    (0.0, 0.0, 0.0, 1.0),
-    (-0.8, 0.0, 0.0, 3.0),
-    (-0.6, 0.0, 1.0, 4.0),
-    (-0.6, 0.0, -1.0, 4.0),
-    (0.0, 0.0, 0.0, 1.5),
-    (0.0, 0.5, 0.0, 3.0),
-    (0.0, 0.0, 0.0, 1.0),
-    (0.0, -0.5, 0.0, 3.0),
-    (0.0, 0.0, 0.0, 1.5),
-    (0.5, 0.5, 0.0, 3.0),
-    (0.0, 0.0, 0.0, 1.5),
-    (0.5, -0.5, 0.0, 3.0),
-)
-
-_ON_THE_SPOT = ((0.0, 0.0, 2.0, 4.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -2.0, 4.0))
-
+# speed_x and speed_y in cruising speeds, yaw rate in YAW_RATE_RADPS, share of the time that is held
+_CURVES = "1 0 0 4, .8 0 1 4, .8 0 -1 4, 0 0 0 1, -.8 0 0 3, -.6 0 1 4, -.6 0 -1 4, 0 0 0 1.5"
+_SIDEWAYS = "0 .5 0 3, 0 0 0 1, 0 -.5 0 3, 0 0 0 1.5, .5 .5 0 3, 0 0 0 1.5, .5 -.5 0 3"
+_ON_THE_SPOT = "0 0 2 4, 0 0 0 1, 0 0 -2 4"
+# the steering does not move through each reversal and turns at the start after each rest
 _CRAB = (
-    # the steering does not move through each reversal and turns at the start after each rest
-    (-0.6, 0.0, 0.0, 3.0),
-    (0.6, 0.0, 0.0, 3.0),
-    (0.0, 0.0, 0.0, 1.0),
-    (0.0, 0.5, 0.0, 3.0),
-    (0.0, -0.5, 0.0, 3.0),
-    (0.0, 0.0, 0.0, 1.0),
-    (0.4, 0.4, 0.0, 3.0),
-    (-0.4, -0.4, 0.0, 3.0),
-    (0.0, 0.0, 0.0, 1.0),
-    (-0.4, 0.4, 0.0, 3.0),
-    (0.4, -0.4, 0.0, 3.0),
+    "-.6 0 0 3, .6 0 0 3, 0 0 0 1, 0 .5 0 3, 0 -.5 0 3, 0 0 0 1, .4 .4 0 3, -.4 -.4 0 3, 0 0 0 1, -.4 .4 0 3, "
+    ".4 -.4 0 3"
 )
 
 
 def _complex(request: DriveRequest, length_s: float) -> list[Leg]:
-    if request.sideways:
-        return _tour(_COMPLEX, request, length_s)
-    ahead = tuple(leg for leg in _COMPLEX if not leg[1])
-    return _tour((*ahead[:8], *_ON_THE_SPOT), request, length_s)
+    return _tour(f"{_CURVES}, {_SIDEWAYS if request.sideways else _ON_THE_SPOT}", request, length_s)
 
 
-def _tour(
-    legs: tuple[tuple[float, float, float, float], ...], request: DriveRequest, length_s: float
-) -> list[Leg]:
-    table = np.array(legs)
+def _tour(legs: str, request: DriveRequest, length_s: float) -> list[Leg]:
+    table = np.array([leg.split() for leg in legs.split(",")], dtype=float)
     twists = request.limit(table[:, :3] * (request.speed_mps, request.speed_mps, YAW_RATE_RADPS))
-    ramps_s = sum(ramp_s(b - a, smooth=True) for a, b in pairwise([AT_REST, *twists, AT_REST]))
+    ramps_s = sum(_ramp_s(b - a, smooth=True) for a, b in pairwise([AT_REST, *twists, AT_REST]))
     shares = table[:, 3] / table[:, 3].sum()
     held_s = request.remaining_s(length_s, 2 * STAND_S + ramps_s, at_least_s=10.0)
     driven = [Leg(twist, share * held_s) for twist, share in zip(twists, shares, strict=True)]
-    return [Leg(AT_REST, STAND_S), *driven, Leg(AT_REST, STAND_S)]
+    return [_STAND, *driven, _STAND]
 
 
-DRIVES: dict[str, NamedDrive] = {
-    "stand": NamedDrive(20.0, lambda request, length_s: [Leg(AT_REST, length_s)]),
-    "straight": NamedDrive(20.0, _ahead),
-    "arc": NamedDrive(20.0, _arc),
-    "starts": NamedDrive(30.0, _starts),
-    "spot_turn": NamedDrive(30.0, _spot_turn),
-    "complex": NamedDrive(60.0, _complex, smooth=True),
-    "survey": NamedDrive(40.0, survey),
-    "climb": NamedDrive(15.0, _ahead),
-    "brake": NamedDrive(lambda request: STAND_S + request.speed_mps / ACCEL_MPS2 + 2 * BRAKE_S, _brake),
-    "circle": NamedDrive(_circle_s, _circle),
-    "crab": NamedDrive(45.0, partial(_tour, _CRAB), smooth=True),
+def _circle_s(request: DriveRequest) -> float:
+    return math.ceil(2 * STAND_S + 2 * _ramp_s(request.around) + 2 * math.pi / float(request.around[2]))
+
+
+_DRIVES: dict[
+    str, tuple[Callable[[DriveRequest, float], list[Leg]], float | Callable[[DriveRequest], float]]
+] = {
+    "stand": (lambda request, length_s: [Leg(AT_REST, length_s)], 20.0),
+    "straight": (_straight, 20.0),
+    "arc": (_arc, 20.0),
+    "starts": (_starts, 30.0),
+    "spot_turn": (_spot_turn, 30.0),
+    "complex": (_complex, 60.0),
+    "survey": (_survey, 40.0),
+    "climb": (_straight, 15.0),
+    "brake": (_brake, lambda request: STAND_S + request.speed_mps / ACCEL_MPS2 + 2 * BRAKE_S),
+    "circle": (_circle, _circle_s),
+    "crab": (lambda request, length_s: _tour(_CRAB, request, length_s), 45.0),
 }
-"""All drives on one terrain."""
+"""Legs of the drives on one terrain, and for how long they are driven by default."""
 
-SCENARIOS: tuple[str, ...] = (*DRIVES, "course")
-"""Names that :func:`make_scenario` accepts."""
+_SMOOTH = ("complex", "crab")  # their ramps start and end without a step of the acceleration
+SCENARIOS: tuple[str, ...] = (*_DRIVES, "course")  # names that :func:`make_scenario` accepts
 
 
 def make_scenario(
@@ -462,12 +371,12 @@ def make_scenario(
     - ``starts``: from rest at 1 m/s^2 to the speed, 3 s, and down at 1 m/s^2, again and again
     - ``spot_turn``: in place to the left, to the right, at 0.6 rad/s, several times
     - ``complex``: forward, curves to both sides, backward with curves, sideways, diagonally; smooth
-    - ``survey``: labelled runs: stretches of 4 to 6 s, straight and in gentle arcs, now and then a stop, a
-      stretch backward or a turn on the spot; drawn
+    - ``survey``: labelled runs: stretches of 4 to 6 s, straight and in gentle arcs, now and then a stop, a stretch
+      backward or a turn on the spot; drawn
     - ``course``: over patches of 6 to 12 m of every terrain in turn, in drawn order, at changing speed
 
-    Robots that cannot drive sideways have no ``crab``, and in ``complex`` turn on the spot instead; only
-    swerve robots have ``course``, and car-like ones no ``spot_turn``.
+    Robots that cannot drive sideways have no ``crab``, and in ``complex`` turn on the spot instead; only swerve robots
+    have ``course``, and car-like ones no ``spot_turn``.
 
     Parameters
     ----------
@@ -475,18 +384,16 @@ def make_scenario(
     robot : no twist saturates its wheels; without motors, which swerve robots need, they have no limit
     terrains : of the ground, one unless the scenario is ``course``; the names are not looked up
     duration_s : what the scenario is made for by default; taken to a whole number of samples
-    speed_mps : cruising speed, by default 1 m/s, of a slower or car-like robot a third of its fastest;
-        ``survey`` and ``course`` draw from 0.4 to 1.2 times it, backward and sideways
-        ``complex`` is slower, and so is all of ``crab``
+    speed_mps : cruising speed, by default 1 m/s, of a slower or car-like robot a third of its fastest; ``survey`` and
+        ``course`` draw from 0.4 to 1.2 times it, backward and sideways ``complex`` is slower, and so is all of ``crab``
     seed : of everything drawn; the same gives the same bytes
     accel_mps2 : of the ramps of ``straight``, ``climb`` and ``starts``; infinite, they are steps
 
     Raises
     ------
     ConfigError
-        for an unknown name, terrains that do not fit it, a duration too short for it, a speed beyond the
-        robot, an acceleration that is none or that the scenario does not take, or a scenario that the robot
-        cannot drive.
+        for an unknown name, terrains that do not fit it, a duration too short for it, a speed beyond the robot, an
+        acceleration that is none or that the scenario does not take, or a scenario that the robot cannot drive.
 
     Examples
     --------
@@ -504,46 +411,46 @@ def make_scenario(
         raise ConfigError(
             f"scenario {name!r} is driven on one terrain, {len(grounds)} are given: use 'course'"
         )
-    if not _can_drive(robot, name):
+    car = isinstance(robot, BicycleRobot)
+    able = {"crab": robot.sideways, "course": isinstance(robot, SwerveRobot), "spot_turn": not car}
+    if not able.get(name, True):
         raise ConfigError(f"scenario {name!r} is not for robot {robot.name} with the drive {robot.drive!r}")
-    able, accel_mps2 = _ability(robot, speed_mps), _checked_accel(name, accel_mps2)
-    request = DriveRequest(name, *able, _generator(seed), accel_mps2, robot.sideways)
-    desired_s = _checked_duration(duration_s)
+    if not (_is_number(accel_mps2) or accel_mps2 == math.inf) or not accel_mps2 > 0:
+        raise ConfigError(f"accel_mps2 is {accel_mps2!r}, a number above zero is required, inf for steps")
+    if accel_mps2 != ACCEL_MPS2 and name not in _RAMPED:
+        raise ConfigError(
+            f"accel_mps2 is {accel_mps2:g}: scenario {name!r} has ramps of its own, "
+            f"only {', '.join(_RAMPED)} take it"
+        )
+    if duration_s is not None and not (_is_number(duration_s) and 1 / RATE_HZ <= duration_s <= LONGEST_S):
+        raise ConfigError(
+            f"duration_s is {duration_s!r}, a time from {1 / RATE_HZ:g} to {LONGEST_S:g} s is required"
+        )
+    if not isinstance(seed, np.random.Generator):
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+            raise ConfigError(f"seed is {seed!r}, a whole number from 0 up is required")
+        seed = np.random.default_rng(seed)
+    request = DriveRequest(name, *_ability(robot, speed_mps), seed, float(accel_mps2), robot.sideways)
     if name == "course":
-        time_s, twist, patches = course(request, desired_s, grounds)
+        time_s, twist, patches = _course(request, duration_s, grounds)
     else:
-        drive = DRIVES[name]
-        length_s = drive.default_length_s(request) if desired_s is None else desired_s
-        time_s = sample_times(length_s)
-        twist = twists_of(drive.legs(request, length_s), time_s, drive.smooth)
+        legs, default_s = _DRIVES[name]
+        length_s = duration_s if duration_s else default_s(request) if callable(default_s) else default_s
+        time_s = _times(length_s)
+        twist = _twists(legs(request, length_s), time_s, name in _SMOOTH)
         patches = (Patch(0.0, grounds[0]),)
     return Scenario(name, RATE_HZ, time_s, twist, patches)
 
 
-def _can_drive(robot: Robot, name: str) -> bool:
-    able = {
-        "crab": robot.sideways,
-        "course": isinstance(robot, SwerveRobot),
-        "spot_turn": not isinstance(robot, BicycleRobot),
-    }
-    return able.get(name, True)
-
-
-def _checked_duration(duration_s: float | None) -> float | None:
-    if duration_s is None:
-        return None
-    if not _is_number(duration_s) or not 1 / RATE_HZ <= duration_s <= LONGEST_S:
-        raise ConfigError(
-            f"duration_s is {duration_s!r}, a time from {1 / RATE_HZ:g} to {LONGEST_S:g} s is required"
-        )
-    return float(duration_s)
-
-
 def _ability(robot: Robot, speed_mps: float | None) -> tuple[float, Callable[[Any], Array]]:
     """Return the speed, checked, and what shortens a twist to what the robot can."""
-    positions_m, radius_m = robot.wheel_positions_m, robot.wheel_radius_m
+    positions_m, radius_m, car = (
+        robot.wheel_positions_m,
+        robot.wheel_radius_m,
+        isinstance(robot, BicycleRobot),
+    )
     motors = robot.motors if isinstance(robot, SwerveRobot) else robot.completed.motors
-    speed_max_radps, car = motors.speed_max_radps, isinstance(robot, BicycleRobot)
+    speed_max_radps = motors.speed_max_radps
     if isinstance(robot, BicycleRobot):
         speed_max_radps = min(speed_max_radps, robot.speed_max_mps / radius_m)
     if speed_mps is None:
@@ -560,28 +467,6 @@ def _ability(robot: Robot, speed_mps: float | None) -> tuple[float, Callable[[An
     return float(speed_mps), lambda twist: scaled(positions_m, radius_m, twist, speed_max_radps)
 
 
-def _checked_accel(name: str, accel_mps2: float) -> float:
-    if not (_is_number(accel_mps2) or accel_mps2 == math.inf) or not accel_mps2 > 0:
-        raise ConfigError(f"accel_mps2 is {accel_mps2!r}, a number above zero is required, inf for steps")
-    if accel_mps2 != ACCEL_MPS2 and name not in _RAMPED:
-        raise ConfigError(
-            f"accel_mps2 is {accel_mps2:g}: scenario {name!r} has ramps of its own, "
-            f"only {', '.join(_RAMPED)} take it"
-        )
-    return float(accel_mps2)
-
-
-def _generator(seed: int | np.random.Generator) -> np.random.Generator:
-    if isinstance(seed, np.random.Generator):
-        return seed
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise ConfigError(f"seed is {seed!r}, a whole number from 0 up is required")
-    return np.random.default_rng(seed)
-
-
 def _is_number(value: Any) -> bool:
-    return (
-        isinstance(value, int | float | np.integer | np.floating)
-        and not isinstance(value, bool)
-        and math.isfinite(value)
-    )
+    number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    return number and math.isfinite(value)

@@ -34,9 +34,9 @@ from terrain.records import Array, Reading, Stream
 from terrain.robots import Robot, Sensors
 from terrain.simulation.conditions import Faults
 
+# Step of the rows in a closed loop and of the dynamic plant, whose fastest mode is that of the contact, near 170
+# rad/s: a sixth of a radian a step.
 STEP_S = 0.001
-"""Step of the rows in a closed loop and of the dynamic plant, whose fastest mode is that of the contact, near
-170 rad/s: a sixth of a radian a step."""
 
 BODY = record(
     numbers(
@@ -218,8 +218,7 @@ def is_lost(time_s: Array, intervals_s: Sequence[tuple[float, float]]) -> Array:
     return lost
 
 
-STANDSTILL_RADPS = 1e-3
-"""Motor rate below which the Hall sensors count no step."""
+STANDSTILL_RADPS = 1e-3  # motor rate below which the Hall sensors count no step
 
 
 def add_rate_noise(rate: Array, noise: Array, standstill: float) -> Array:
@@ -281,11 +280,11 @@ def steering_sensor(motion: Motion, robot: Robot, rng: np.random.Generator) -> S
     return Sensor(motion, STEERING_CHANNELS, stamps, write)
 
 
-IMU_BANDWIDTH_HZ = {"accel": 62.5, "gyro": 47.0}
-"""Bandwidths of the BNO055 in its fusion modes (Bosch data sheet)."""
-
-TILT_NOISE_RAD = 0.001
-"""Sample noise of the fused roll and pitch; assumed."""
+IMU_BANDWIDTH_HZ = {
+    "accel": 62.5,
+    "gyro": 47.0,
+}  # bandwidths of the BNO055 in its fusion modes (Bosch data sheet)
+TILT_NOISE_RAD = 0.001  # sample noise of the fused roll and pitch; assumed
 
 
 def described_calibration(sensors: Sensors) -> tuple[Array, Array, Array]:
@@ -298,27 +297,17 @@ def described_calibration(sensors: Sensors) -> tuple[Array, Array, Array]:
 
 
 class ImuErrors(NamedTuple):
-    """What an IMU adds to n samples.
+    """What an IMU adds to n samples."""
 
-    Parameters
-    ----------
-    accel_scale_ratio : (3,) factor on the specific force
-    yaw_scale_ratio : factor on yaw rate and fused yaw
-    rate_bias_radps, rate_noise_radps : (n, 3) of the gyro
-    accel_bias_mps2, accel_noise_mps2 : (3,) and (n, 3) of the accelerometer
-    tilt_bias_rad, tilt_noise_rad : (2,) and (n, 2) of the fused roll and pitch
-    yaw_bias_rad, yaw_noise_rad : (n,) of the fused yaw, which sums the errors of the yaw rate
-    """
-
-    accel_scale_ratio: Array
-    yaw_scale_ratio: float
-    rate_bias_radps: Array
+    accel_scale_ratio: Array  # (3,) factor on the specific force
+    yaw_scale_ratio: float  # factor on yaw rate and fused yaw
+    rate_bias_radps: Array  # (n, 3) of the gyro
     rate_noise_radps: Array
-    accel_bias_mps2: Array
+    accel_bias_mps2: Array  # (3,) and (n, 3) of the accelerometer
     accel_noise_mps2: Array
-    tilt_bias_rad: Array
+    tilt_bias_rad: Array  # (2,) and (n, 2) of the fused roll and pitch
     tilt_noise_rad: Array
-    yaw_bias_rad: Array
+    yaw_bias_rad: Array  # (n,) of the fused yaw, which sums the errors of the yaw rate
     yaw_noise_rad: Array
 
 
@@ -440,11 +429,9 @@ def _force_and_rates(record: Array, up: Array, first: int, height_m: float, out:
             out[i, 4] = (row.yaw_rate_radps * y - change_x) / z
 
 
-JUMP_SAMPLES = 4
-"""Number of samples with a wrong speed at a relocalisation of the camera; assumed."""
-
+JUMP_SAMPLES = 4  # number of samples with a wrong speed at a relocalisation of the camera; assumed
+# First columns of a camera's errors: of yaw, velocity and rate, both in the camera's axes; and their number.
 YAW_ERROR, VELOCITY_ERROR, RATE_ERROR, N_ERRORS = 0, 1, 4, 7
-"""First columns of a camera's errors: of yaw, velocity and rate, both in the camera's axes; and their number."""
 
 _SEEN = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "roll_rad", "pitch_rad", "yaw_rad")
 
@@ -599,11 +586,11 @@ def over_ground(rows: Array) -> Array:
     return np.column_stack([ahead * cos - left * sin, ahead * sin + left * cos])
 
 
+# Rate and noise of raw fixes (Deremetz et al., ICRA 2017, section VI), and of a compass (half a degree, assumed).
 RAW_HZ, RAW_STD_M, COMPASS_STD_RAD = 10.0, 0.02, 0.0087
-"""Rate and noise of raw fixes (Deremetz et al., ICRA 2017, section VI), and of a compass (half a degree, assumed)."""
-
-SPEED_FACTOR_PS = 1.5
-"""Noise of a velocity over that of the position, as the Doppler speed of the other receiver."""
+SPEED_FACTOR_PS = (
+    1.5  # noise of a velocity over that of the position, as the Doppler speed of the other receiver
+)
 
 
 def raw_fixes(
@@ -630,11 +617,8 @@ def raw_fixes(
     }
 
 
-TRUTH_HZ = 100.0
-"""Rate of the stream: a compromise with the size of files."""
-
-GYRO_BIAS = "gyro_bias_z_radps"
-"""Channel of the true bias of the yaw gyro."""
+TRUTH_HZ = 100.0  # rate of the stream: a compromise with the size of files
+GYRO_BIAS = "gyro_bias_z_radps"  # channel of the true bias of the yaw gyro
 
 _WHEEL_TRUTH = (
     *("wheel_radps", "steer_rad", "slip_ratio", "slip_angle_rad", "normal_n", "traction_n", "torque_nm"),

@@ -96,49 +96,30 @@ from terrain.slip import slip_angle, slip_ratio
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import compaction_resistance, plate_sinkage
 
-STEP_S = 0.01
-"""From step to step; no sensor is sampled faster."""
-
+STEP_S = 0.01  # from step to step; no sensor is sampled faster
+# Newton steps, halvings of each, and the residual over the weight at which the balance is reached.
 ITERATIONS, HALVINGS, TOLERANCE = 60, 40, 1e-8
-"""Newton steps, halvings of each, and the residual over the weight at which the balance is reached."""
-
-NUDGE = 1e-7
-"""Change of a speed, in m/s, over which the Jacobian is taken."""
-
-ELEMENTS = 16
-"""Elements along a track: forces are within 1 % of those of 200."""
-
+NUDGE = 1e-7  # change of a speed, in m/s, over which the Jacobian is taken
+ELEMENTS = 16  # elements along a track: forces are within 1 % of those of 200
+# Belt speed that a stopped track counts as having, sliding speed below which friction has no direction of its own,
+# and speed over which resistances against motion take their full size.
 CREEP_MPS, SLIDING_MPS, ROLLING_MPS = 1e-3, 1e-5, 2e-3
-"""Belt speed that a stopped track counts as having, sliding speed below which friction has no direction of its own, and
-speed over which resistances against motion take their full size."""
-
+# Of loose dry sand: 14 to 16 kN/m^3 (Terzaghi, Peck and Mesri, Soil Mechanics in Engineering Practice).
 UNIT_WEIGHT_NPM3 = 15000.0
-"""Of loose dry sand: 14 to 16 kN/m^3 (Terzaghi, Peck and Mesri, Soil Mechanics in Engineering Practice)."""
-
+# Sideways distance over which the earth pressure builds up; assumed, as the shear modulus of loose sand.
 MOBILISED_M = 0.02
-"""Sideways distance over which the earth pressure builds up; assumed, as the shear modulus of loose sand."""
 
 
 class PrescribedSlip(NamedTuple):
-    """Slip of the two tracks; none by default.
+    """Slip of the two tracks; none by default."""
 
-    Parameters
-    ----------
-    eta_left_ratio, eta_right_ratio : ground speed over belt speed
-    slip_ratio : a_0, of straight motion on the level, positive in traction
-    grade_slip_ratio : a_1, a rad of grade along the motion
-    side_slip_ratio : c, slip angle a rad of roll
-    turning_loss_ratio : k
-    turning_exponent : n of Endo's law
-    """
-
-    eta_left_ratio: float = 1.0
+    eta_left_ratio: float = 1.0  # ground speed over belt speed
     eta_right_ratio: float = 1.0
-    slip_ratio: float = 0.0
-    grade_slip_ratio: float = 0.0
-    side_slip_ratio: float = 0.0
-    turning_loss_ratio: float = 0.0
-    turning_exponent: float = 1.0
+    slip_ratio: float = 0.0  # a_0, of straight motion on the level, positive in traction
+    grade_slip_ratio: float = 0.0  # a_1, a rad of grade along the motion
+    side_slip_ratio: float = 0.0  # c, slip angle a rad of roll
+    turning_loss_ratio: float = 0.0  # k
+    turning_exponent: float = 1.0  # n of Endo's law
 
 
 class Stretch(NamedTuple):
@@ -530,38 +511,27 @@ def drive_tracks(tracks: Array, slope: Array, belt_mps: Array, states: Array, dt
 
 
 class TrackedSensors(NamedTuple):
-    """Rates and noise of a tracked robot's sensors: standard deviations of white noise, all assumed but one.
+    """Rates and noise of a tracked robot's sensors: standard deviations of white noise, all assumed but one."""
 
-    Parameters
-    ----------
-    encoder_mps : of each speed
-    gyro_radps, gyro_bias_radps : of each sample, and of the bias from run to run
-    accel_mps2, tilt_rad, yaw_rad : of the IMU; its heading is the integral of its gyro
-    gnss_hz, gnss_m : raw satellite fixes; 2 cm and 10 Hz, Deremetz et al., section VI
-    compass_rad : of the heading beside each fix
-    pose_hz, pose_m, pose_rad : cameras around the field
-    belt_lag_s : of the belts behind their commands
-    """
-
-    encoder_mps: float = 0.001
-    gyro_radps: float = 0.003
+    encoder_mps: float = 0.001  # of each speed
+    gyro_radps: float = 0.003  # of each sample, and of the bias from run to run
     gyro_bias_radps: float = 0.0005
-    accel_mps2: float = 0.05
+    accel_mps2: float = 0.05  # of the IMU; its heading is the integral of its gyro
     tilt_rad: float = 0.002
     yaw_rad: float = 0.001
-    gnss_hz: float = RAW_HZ
+    gnss_hz: float = RAW_HZ  # raw satellite fixes; 2 cm and 10 Hz, Deremetz et al., section VI
     gnss_m: float = RAW_STD_M
-    compass_rad: float = COMPASS_STD_RAD
-    pose_hz: float = 100.0
+    compass_rad: float = COMPASS_STD_RAD  # of the heading beside each fix
+    pose_hz: float = 100.0  # cameras around the field
     pose_m: float = 0.001
     pose_rad: float = 0.002
-    belt_lag_s: float = 0.1
+    belt_lag_s: float = 0.1  # of the belts behind their commands
 
 
 NOISY = TrackedSensors()
 
+# Sensors without noise, and belts without a lag.
 QUIET = TrackedSensors(**{name: 0.0 for name in TrackedSensors._fields if not name.endswith("_hz")})
-"""Sensors without noise, and belts without a lag."""
 
 
 def run_tracked(

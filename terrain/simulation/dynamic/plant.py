@@ -60,26 +60,18 @@ from terrain.simulation.sensors import STEP_S
 from terrain.terramechanics.soil import Soil
 from terrain.terramechanics.traction import GROUND, ground_record, wheel_ground
 
-FIELD_STEP_M = 0.1
-"""Grid of the variation of the terrain along the path."""
-
+FIELD_STEP_M = 0.1  # grid of the variation of the terrain along the path
+# Cells of terrain up to the farthest point that the fastest wheel can reach; 24 h at 2 m/s take 3.5 million.
 MAX_FIELD_CELLS = 5 * 10**6
-"""Cells of terrain up to the farthest point that the fastest wheel can reach; 24 h at 2 m/s take 3.5
-million."""
-
-MAX_DELAY_STEPS = 500
-"""Steps of the longest delay of the steering, half a second."""
-
-CONTACT_LIMIT_PS2 = 4.0 / (STEP_S * (STEP_S + 2.0 * DEFLECTION_DAMPING_S))
-"""Largest stable ``k`` in 1/s^2."""
-
+MAX_DELAY_STEPS = 500  # steps of the longest delay of the steering, half a second
+CONTACT_LIMIT_PS2 = 4.0 / (STEP_S * (STEP_S + 2.0 * DEFLECTION_DAMPING_S))  # largest stable ``k`` in 1/s^2
+# Load transfer and rough ground load a wheel with up to so many times its share of the weight.
 LOAD_MARGIN_RATIO = 2.0
-"""Load transfer and rough ground load a wheel with up to so many times its share of the weight."""
 
 _SMALL_SLIP = 1e-4
 
+# A soil under the wheels, its ISO 8608 roughness, and the path length at which it begins, the first at 0.
 PATCH = record({"ground": GROUND, "roughness_m3": float, "start_m": float})
-"""A soil under the wheels, its ISO 8608 roughness, and the path length at which it begins, the first at 0."""
 
 PLANT = record(
     {
@@ -126,16 +118,10 @@ angles of the encoders that have not reached the wheels yet."""
 
 
 class TerrainProfile(NamedTuple):
-    """The terrain of one run along the path.
+    """The terrain of one run along the path."""
 
-    Parameters
-    ----------
-    patches : (patches,) of :data:`PATCH`
-    field : (2, 3, cells) factors along the path on thrust and on resistance, for each wheel
-    """
-
-    patches: Array
-    field: Array
+    patches: Array  # (patches,) of :data:`PATCH`
+    field: Array  # (2, 3, cells) factors along the path on thrust and on resistance, for each wheel
 
 
 def uniform_profile(

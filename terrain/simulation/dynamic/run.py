@@ -43,15 +43,11 @@ from terrain.simulation.sensors import (
 )
 from terrain.terramechanics.soil import Soil
 
-MIN_LABEL_S = 0.5
-"""A shorter stay on one ground gets no label."""
-
+MIN_LABEL_S = 0.5  # A shorter stay on one ground gets no label
+# No wheel turns so many times as fast as its motor can: then the steps are too long for the robot, as with a load
+# of 1000 t on 90 kg.
 MAX_WHEEL_SPEEDS = 100.0
-"""No wheel turns so many times as fast as its motor can: then the steps are too long for the robot, as with a load of
-1000 t on 90 kg."""
-
-MAX_COMMAND_DELAY_S = 0.5
-"""Longest delay of a command to the wheels; a later one is no control."""
+MAX_COMMAND_DELAY_S = 0.5  # longest delay of a command to the wheels; a later one is no control
 
 _PURPOSES = ("terrain", "road", "start", "wheels", "steering", "imu", "camera", "gnss")
 

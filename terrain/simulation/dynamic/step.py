@@ -43,25 +43,19 @@ from terrain.simulation.dynamic.plant import FIELD_STEP_M, TerrainProfile
 from terrain.simulation.sensors import BODY_ROW, STEP_S
 from terrain.terramechanics.traction import wheel_ground
 
+# Speed over which a resistance takes its full size: it opposes rolling and does not push a robot at rest.
 ROLLING_SPEED_MPS = 0.02
-"""Speed over which a resistance takes its full size: it opposes rolling and does not push a robot at rest."""
-
-LEG_RATE_RADPS = 0.5
-"""How fast the third leg swings through its play; assumed, it crosses one degree in 35 ms."""
-
+LEG_RATE_RADPS = (
+    0.5  # how fast the third leg swings through its play; assumed, it crosses one degree in 35 ms
+)
+# Moment about its hinge below which the third leg stays where it is; assumed, 7 N on the wheel: a start at 1 m/s^2
+# gives three times as much, steady rolling less.
 LEG_FRICTION_NM = 5.0
-"""Moment about its hinge below which the third leg stays where it is; assumed, 7 N on the wheel: a start at
-1 m/s^2 gives three times as much, steady rolling less."""
-
-STIFFEST = -0.9
-"""Least creep over the slip of the ground."""
-
-
-ROUGHNESS_WAVENUMBER = 0.1
-"""Reference wave number of ISO 8608 in cycles/m."""
-
-ROUGHNESS_CUTOFF = 0.01
-"""Longest wave of the ground that counts as roughness, in cycles/m (ISO 8608's lower end)."""
+STIFFEST = -0.9  # least creep over the slip of the ground
+ROUGHNESS_WAVENUMBER = 0.1  # reference wave number of ISO 8608 in cycles/m
+ROUGHNESS_CUTOFF = (
+    0.01  # longest wave of the ground that counts as roughness, in cycles/m (ISO 8608's lower end)
+)
 
 
 def settle(plant: Array, profile: TerrainProfile, state: Array) -> None:

@@ -33,14 +33,11 @@ from terrain.robots import Robot
 from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, decayed, slopes, steered
 from terrain.simulation.planar.skid import slip_along
 
-SLOW_MPS = 0.01
-"""Speed below which tyres damp a sideways motion as at it: in less than a millisecond."""
-
-LEAST_RATIO = 0.1
-"""The effective wheelbase over the wheelbase at the least, and what is left of an axle's compliance."""
-
-STEEPEST_RAD = 1.3
-"""Steering angle at the most, where its tangent is 3.6."""
+SLOW_MPS = 0.01  # speed below which tyres damp a sideways motion as at it: in less than a millisecond
+LEAST_RATIO = (
+    0.1  # the effective wheelbase over the wheelbase at the least, and what is left of an axle's compliance
+)
+STEEPEST_RAD = 1.3  # steering angle at the most, where its tangent is 3.6
 
 _AXLES = "wheelbase_m com_ahead_m front_cornering_npr rear_cornering_npr yaw_inertia_kgm2"
 AXLES = record({"body": BODY} | numbers(_AXLES))

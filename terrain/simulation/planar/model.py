@@ -60,43 +60,32 @@ BODY = record(
 """Numbers that every drive has: of the robot, of its sensors' latencies, and of its ground, with the slip over the
 traction at slips evenly spaced from 0 to 1; whether a camera above the field measures its poses."""
 
+# Lag of a swerve robot's IMU behind its latency: bandwidths of 47 and 62.5 Hz (Bosch BNO055 data sheet).
 IMU_LAG_S = 0.003
-"""Lag of a swerve robot's IMU behind its latency: bandwidths of 47 and 62.5 Hz (Bosch BNO055 data sheet)."""
-
+# Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the distance.
 SCRUB_SHARE = 0.4
-"""Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the distance."""
-
+# Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has no
+# section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6.
 WIDTH_RATIO, CONTACT_RATIO = 0.6, 0.6
-"""Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has no
-section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6."""
-
-_MORE = 1.01
-"""Load for which growth with load is taken."""
+_MORE = 1.01  # load for which growth with load is taken
 
 
 class Ground(NamedTuple):
-    """A terrain in the planar simulation.
+    """A terrain in the planar simulation."""
 
-    Parameters
-    ----------
-    slip_ratio : slip a traction of the robot's whole weight would take, were the thrust curve straight
-    grip_ratio : largest traction over weight, of the shear curve
-    rolling_ratio : resistance over weight
-    scrub_ratio : resistance to turning of a skid-steer robot, over weight
-    thrust_ratio : traction over weight at slips evenly spaced from 0 to 1, which takes the place of ``slip_ratio``;
-        without any the thrust curve is straight
-    load_ratio : by how much the traction at a slip grows with a load, as a share of the load's own share
-    effective_ratio : share of the measured tilt that is a slope to drive up; the rest is a body that rides over bumps
-    roller_ratio : friction of the rollers of omni wheels over the load, at a speed across of the wheels' own
-    """
-
+    # slip a traction of the robot's whole weight would take, were the thrust curve straight
     slip_ratio: float = 0.3
-    grip_ratio: float = 0.5
-    rolling_ratio: float = 0.05
-    scrub_ratio: float = 0.2
+    grip_ratio: float = 0.5  # largest traction over weight, of the shear curve
+    rolling_ratio: float = 0.05  # resistance over weight
+    scrub_ratio: float = 0.2  # resistance to turning of a skid-steer robot, over weight
+    # traction over weight at slips evenly spaced from 0 to 1, which takes the place of ``slip_ratio``; without any
+    # the thrust curve is straight
     thrust_ratio: tuple[float, ...] = ()
+    # by how much the traction at a slip grows with a load, as a share of the load's own share
     load_ratio: float = 0.0
+    # share of the measured tilt that is a slope to drive up; the rest is a body that rides over bumps
     effective_ratio: float = 1.0
+    # friction of the rollers of omni wheels over the load, at a speed across of the wheels' own
     roller_ratio: float = 0.0
 
 
@@ -144,21 +133,15 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
 
 
 class Drive(NamedTuple):
-    """What a drive is made of: all that is to be written for a new one.
+    """What a drive is made of: all that is to be written for a new one."""
 
-    Parameters
-    ----------
-    record : of its numbers, with the field ``body`` of :data:`BODY`
-    numbers : from a robot and a ground to its other fields by name
-    move : the kernel, from that record (1,), the vector of effects, the step in s, wheel speeds and steering
-        (n, wheels), grade and roll (n,), and the disturbance (n, 3) or (0, 3) to rows (n,) of :data:`TRUTH`
-    drifts : whether the body goes sideways by what the ground adds, and on a side hill
-    """
-
-    record: np.dtype[Any]
+    record: np.dtype[Any]  # of its numbers, with the field ``body`` of :data:`BODY`
+    # from a robot and a ground to its other fields by name
     numbers: Callable[[Robot, Ground], Mapping[str, Any]]
+    # the kernel, from that record (1,), the vector of effects, the step in s, wheel speeds and steering (n, wheels),
+    # grade and roll (n,), and the disturbance (n, 3) or (0, 3) to rows (n,) of :data:`TRUTH`
     move: Callable[..., Array]
-    drifts: bool = True
+    drifts: bool = True  # whether the body goes sideways by what the ground adds, and on a side hill
 
 
 def body_numbers(robot: Robot, ground: Ground) -> Array:

@@ -18,8 +18,7 @@ from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import Robot
 
-WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0
-"""Rates of the loggers."""
+WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0  # rates of the loggers
 
 
 class Scatter(NamedTuple):
@@ -87,20 +86,12 @@ def load_noise() -> Noise:
 
 
 class ModelError(NamedTuple):
-    """How far the planar simulation on a soil of the package is off the dynamic plant, by parameter.
+    """How far the planar simulation on a soil of the package is off the dynamic plant, by parameter."""
 
-    Parameters
-    ----------
-    common : value that each parameter seems to have where nothing is hidden
-    varied : the same of the mean over runs whose conditions differ
-    scatter : of single runs whose conditions differ
-    probes : what the residual depends on, by channel and input
-    """
-
-    common: dict[str, float]
-    varied: dict[str, float]
-    scatter: dict[str, float]
-    probes: dict[tuple[str, str], float]
+    common: dict[str, float]  # value that each parameter seems to have where nothing is hidden
+    varied: dict[str, float]  # the same of the mean over runs whose conditions differ
+    scatter: dict[str, float]  # of single runs whose conditions differ
+    probes: dict[tuple[str, str], float]  # what the residual depends on, by channel and input
 
 
 def load_model_error() -> ModelError:

@@ -45,15 +45,14 @@ from terrain.robots import Robot
 from terrain.simulation.contact import softness
 from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, slopes
 
+# Speed below which slip is no more over the speed itself, and over which a resistance takes its full size; assumed:
+# a fifth of the slowest measured drive.
 ROLLING_MPS = 0.02
-"""Speed below which slip is no more over the speed itself, and over which a resistance takes its full size; assumed: a
-fifth of the slowest measured drive."""
-
+# Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest.
 STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
-"""Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest."""
-
-SUBSTEPS = 4
-"""Implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond."""
+SUBSTEPS = (
+    4  # implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond
+)
 
 ROLLERS = record(
     {"body": BODY, "wheel_load_ratio": (float, 3), **numbers("wheel_distance_m roller_ratio")}

@@ -75,27 +75,18 @@ from terrain.simulation.sensors import (
 )
 from terrain.slip import slip_angle, slip_ratio
 
+# Each of the two lags in a row by which a wheel follows its command, and that of the steering; assumed.
 DRIVE_S, STEER_S = 0.06, 0.08
-"""Each of the two lags in a row by which a wheel follows its command, and that of the steering; assumed."""
-
-DRIVE_MPS2 = 4.0
-"""The most that a wheel speeds up; assumed, 2 g of grip would be needed for more."""
-
-STEP_S = 0.01
-"""From step to step: no sensor is sampled faster."""
-
+DRIVE_MPS2 = 4.0  # the most that a wheel speeds up; assumed, 2 g of grip would be needed for more
+STEP_S = 0.01  # from step to step: no sensor is sampled faster
+# Causes that no effect of the library describes: wheel speed x (1 + e sin(wheel angle)), each wheel with its own
+# phase, and spikes of the current at crawling speed.
 OUTSIDE: tuple[str, ...] = ("wheel_eccentricity_ratio", "stick_slip_a")
-"""Causes that no effect of the library describes: wheel speed x (1 + e sin(wheel angle)), each wheel with its own
-phase, and spikes of the current at crawling speed."""
-
+# Speed below which stick-slip shows as spikes of the current, their mean rate, and the length of each.
 CRAWL_MPS, SPIKE_HZ, SPIKE_S = 0.25, 5.0, 0.06
-"""Speed below which stick-slip shows as spikes of the current, their mean rate, and the length of each."""
-
-STANDSTILL_MPS = 1e-6
-"""Speed below which an encoder counts nothing: its low-pass ends there."""
-
+STANDSTILL_MPS = 1e-6  # speed below which an encoder counts nothing: its low-pass ends there
+# Channel of the truth of an omni robot, whose body slips otherwise than any of its wheels.
 BODY_SLIP = "slip_body_ratio"
-"""Channel of the truth of an omni robot, whose body slips otherwise than any of its wheels."""
 
 _PURPOSES = ("scatter", "hills", "ground", "wheels", "steering", "imu", "camera", "outside", "lidar")
 

@@ -27,18 +27,15 @@ from terrain.robots import TrackedRobot
 from terrain.simulation.contact import shear_softness, softness
 from terrain.simulation.planar.model import BODY, TRUTH, Drive, delayed, lagged, slopes
 
+# Speed over which a resistance takes its full size: it opposes motion and does not push a robot at rest.
 STANDSTILL_MPS = 0.05
-"""Speed over which a resistance takes its full size: it opposes motion and does not push a robot at rest."""
-
+# Slip that forces take at the most, of either sign; assumed: a straight thrust curve has no end of its own.
 MAX_SLIP = 0.9
-"""Slip that forces take at the most, of either sign; assumed: a straight thrust curve has no end of its own."""
-
+# Shorter time constants are none; one that falls faster than the second, in s/s, is taken as even.
 SHORTEST_S, FALLS_MOST = 1e-6, -0.9
-"""Shorter time constants are none; one that falls faster than the second, in s/s, is taken as even."""
-
+# Exponent n of the turning slip; assumed, Endo et al. fitted one to each ground, and ``turning_slip_power`` does on
+# tracks.
 ENDO_POWER = 0.5
-"""Exponent n of the turning slip; assumed, Endo et al. fitted one to each ground, and ``turning_slip_power`` does on
-tracks."""
 
 SIDES = record({"body": BODY, "tracked": bool})
 

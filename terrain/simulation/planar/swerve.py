@@ -30,12 +30,11 @@ from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_softness, sof
 from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, decayed, slopes, steered
 from terrain.simulation.planar.omni import STIFFEST, STIFFEST_GROUND
 
+# Speed over which a resistance takes its full size, as in the dynamic simulation: it opposes motion and does not
+# push a robot at rest.
 ROLLING_MPS = 0.02
-"""Speed over which a resistance takes its full size, as in the dynamic simulation: it opposes motion and does not
-push a robot at rest."""
-
+# Relaxation length of a contact that has none, and what a body without yaw inertia weighs at its wheels.
 SHORTEST_M, LIGHTEST_KG = 1e-3, 1e-3
-"""Relaxation length of a contact that has none, and what a body without yaw inertia weighs at its wheels."""
 
 CONTACT = record(
     {
