@@ -33,7 +33,7 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kernels import filled, njit, numbers, record
+from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.logs.schema import GNSS_CHANNELS
 from terrain.records import Array, Label, Stream
 from terrain.robots import BicycleRobot, Robot, as_drive
@@ -163,7 +163,7 @@ def side_force(slip_rad: float, stiffness_npr: float, limit_n: float) -> float:
     return -math.copysign(limit_n * -math.expm1(-stiffness_npr * abs(slip_rad) / limit_n), slip_rad)
 
 
-@njit
+@inner
 def _axle(
     car: Any, slip: float, ahead: float, side: float, stiffness: float, limit: float, mass: float
 ) -> tuple[float, float]:
@@ -178,7 +178,7 @@ def _axle(
     return math.atan(carcass), min(max(force, -limit), limit)
 
 
-@njit
+@inner
 def step(car: Any, grid: Array, state: Any, steer_command: float, speed_command: float) -> None:
     """Advance the state in place by :data:`STEP_S`."""
     body, command = state.body, steer_command

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from terrain.kernels import njit
+from terrain.kernels import inner, njit
 from terrain.records import Array
 
 # Damping of the contact as a lead on its deflection; it vanishes in steady rolling and so moves no slip.
@@ -56,7 +56,7 @@ def softness(soft_ratio: Array, slip: float) -> float:
     return float(soft_ratio[i] + (at - i) * (soft_ratio[i + 1] - soft_ratio[i]))
 
 
-@njit
+@inner
 def shear_softness(force_ratio: float, grip_ratio: float) -> float:
     """Return slip over traction of a shear curve that starts with 1."""
     return shear_slip(force_ratio, grip_ratio) / force_ratio if abs(force_ratio) > 1e-9 else 1.0

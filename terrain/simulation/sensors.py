@@ -25,7 +25,7 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import on_samples
-from terrain.kernels import njit, numbers, record
+from terrain.kernels import inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import to_camera
 from terrain.kinematics.wheels import point_velocity
@@ -527,7 +527,7 @@ def camera_samples(
         row[13] = 1.0
 
 
-@njit
+@inner
 def _rotated(
     w: float, x: float, y: float, z: float, a: float, b: float, c: float
 ) -> tuple[float, float, float]:

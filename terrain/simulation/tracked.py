@@ -73,7 +73,7 @@ from scipy.signal import lfilter
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kernels import filled, njit, numbers, record
+from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.commands import wheel_motion
 from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, Label, Stream
@@ -307,7 +307,7 @@ def inner_share(twist: Array, y: float) -> float:
     return 0.5 * (1.0 + math.copysign(tight, side))
 
 
-@njit
+@inner
 def _add_track(
     tracks: Any,
     belt_mps: float,
@@ -354,7 +354,7 @@ def _add_track(
     out[2] += y * resists
 
 
-@njit
+@inner
 def _earth_pressure(tracks: Any, depth_m: float, heap_m2: float) -> float:
     """Return the force on each metre of a side that pushes soil of a depth, and of a heap on it."""
     if tracks.bulldozing_ratio == 0.0:
@@ -458,7 +458,7 @@ def _residual(
     return math.sqrt(total)
 
 
-@njit
+@inner
 def step(tracks: Any, slope: Array, state: Any, belt_mps: Array, after: Any, dt_s: float) -> None:
     """Write the state a step later.
 

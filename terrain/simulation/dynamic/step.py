@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.kernels import njit
+from terrain.kernels import inner, njit
 from terrain.kinematics.wheels import point_velocity
 from terrain.records import Array
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
@@ -101,7 +101,7 @@ def advance(
         step(plant[0], profile, state[0], wheel_radps[held], steer_rad[held], road_noise[k], rows[k], STEP_S)
 
 
-@njit
+@inner
 def step(
     plant: Any,
     profile: TerrainProfile,
@@ -136,7 +136,7 @@ def step(
         state.leg_rad = _swing(plant, state.leg_rad, leg_nm, dt)
 
 
-@njit
+@inner
 def _wheel_force(
     plant: Any,
     profile: TerrainProfile,
@@ -217,7 +217,7 @@ def _wheel_force(
     return cos_steer * pull - sin_steer * side, sin_steer * pull + cos_steer * side
 
 
-@njit
+@inner
 def _step_body(
     plant: Any,
     state: Any,
@@ -243,7 +243,7 @@ def _step_body(
     state.accel_x_mps2, state.accel_y_mps2 = accel_x, accel_y
 
 
-@njit
+@inner
 def _write_body(plant: Any, state: Any, accel_x: float, accel_y: float, spin: float, row: Any) -> None:
     """Speeds and accelerations at the origin; the ride of the plane through the three corners."""
     base_m, track_m = plant.wheels_m[1, 0] - plant.wheels_m[0, 0], -plant.wheels_m[2, 1]
@@ -264,7 +264,7 @@ def _write_body(plant: Any, state: Any, accel_x: float, accel_y: float, spin: fl
     row.path_m, row.leg_rad = state.path_m, state.leg_rad
 
 
-@njit
+@inner
 def _creep(plant: Any, ground: Any, normal_n: float, slip: float, thrust_n: float) -> float:
     """Return what a contact creeps by beside the slip of the ground, over that slip."""
     if abs(slip) < 1e-6 or normal_n <= 0.0:
@@ -280,7 +280,7 @@ def _creep(plant: Any, ground: Any, normal_n: float, slip: float, thrust_n: floa
     return float(max(creep / slip, STIFFEST))
 
 
-@njit
+@inner
 def _swing(plant: Any, leg_rad: float, moment_nm: float, dt: float) -> float:
     """Swing the third leg through its play to where its wheel is pushed, if that is hard enough."""
     if abs(moment_nm) <= LEG_FRICTION_NM:
@@ -289,7 +289,7 @@ def _swing(plant: Any, leg_rad: float, moment_nm: float, dt: float) -> float:
     return float(min(max(turned_rad, -plant.leg_backlash_rad), plant.leg_backlash_rad))
 
 
-@njit
+@inner
 def terrain_gradient(plant: Any, path_m: float, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
     """Return the gradient of the ground in body axes, uphill positive."""
     undulation = plant.undulation_ratio * math.sin(2 * math.pi * path_m / plant.undulation_length_m)
@@ -297,7 +297,7 @@ def terrain_gradient(plant: Any, path_m: float, cos_yaw: float, sin_yaw: float) 
     return cos_yaw * world_x + sin_yaw * world_y, -sin_yaw * world_x + cos_yaw * world_y
 
 
-@njit
+@inner
 def patch_index(patches: Array, path_m: float) -> int:
     """Return the number of the patch at a path length."""
     patch = 0
@@ -306,7 +306,7 @@ def patch_index(patches: Array, path_m: float) -> int:
     return patch
 
 
-@njit
+@inner
 def ride_over(
     plant: Any, w: Any, i: int, roughness_m3: float, speed: float, noise: float, dt: float
 ) -> float:
@@ -327,7 +327,7 @@ def ride_over(
     return float(force_n)
 
 
-@njit
+@inner
 def steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
     """Steering motor to its command with bounded rate and acceleration; the wheel hangs on it with play."""
     error = command_rad - w.steer_motor_rad
@@ -345,7 +345,7 @@ def steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
     )
 
 
-@njit
+@inner
 def linkage_heading(plant: Any, state: Any, i: int, dt: float) -> float:
     """Return the heading of a wheel behind delay, play and offset of its linkage."""
     w = state.wheels[i]
@@ -361,7 +361,7 @@ def linkage_heading(plant: Any, state: Any, i: int, dt: float) -> float:
     return float(w.heading_rad + plant.steer_offset_rad[i])
 
 
-@njit
+@inner
 def drive_wheel(plant: Any, w: Any, command_radps: float, load_nm: float, dt: float) -> None:
     """Speed loop, motor and wheel; then the rate that the motor driver reports."""
     command = min(max(command_radps, -plant.speed_max_radps), plant.speed_max_radps)

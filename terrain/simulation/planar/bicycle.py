@@ -27,10 +27,10 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import EFFECTS
-from terrain.kernels import njit, numbers, record
+from terrain.kernels import inner, njit, numbers, record
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, decayed, slopes, steered
+from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, Inputs, decayed, slopes, steered
 from terrain.simulation.planar.skid import slip_along
 
 SLOW_MPS = 0.01  # speed below which tyres damp a sideways motion as at it: in less than a millisecond
@@ -48,17 +48,9 @@ def _numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
 
 
 @njit
-def _move(
-    params: Array,
-    vector: Array,
-    dt: float,
-    wheel_speed_mps: Array,
-    steer_rad: Array,
-    grade_rad: Array,
-    roll_rad: Array,
-    disturbance: Array,
-) -> Array:
+def _move(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
     """Return motion and traction: the last wheel is the rear one, the first angle that of the front wheel."""
+    wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
     body, p, n = params[0].body, vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     out = np.zeros(n, TRUTH)
     u = wheel_speed_mps[:, -1] * (1.0 + p.wheel_radius_ratio)
@@ -73,7 +65,7 @@ def _move(
     return out
 
 
-@njit
+@inner
 def _turn(car: Any, p: Any, dt: float, steer: Array, roll_rad: Array, out: Array) -> None:
     """Fill in yaw rate and lateral speed of the rear axle of a body that drives at its ``speed_x_mps``."""
     nominal = car.body.mass_kg
@@ -119,7 +111,7 @@ def _turn(car: Any, p: Any, dt: float, steer: Array, roll_rad: Array, out: Array
         out[k].speed_y_mps, out[k].yaw_rate_radps = c - a * w, w
 
 
-@njit
+@inner
 def _front(mass: float, wheelbase: float, a: float, front: float, rear: float, v: float) -> float:
     """Return the compliance of the front axle at a speed: one with which the body does not spin."""
     fast = v * abs(v)

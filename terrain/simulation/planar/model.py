@@ -31,7 +31,7 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
-from terrain.kernels import filled, njit, numbers, record
+from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.records import Array
 from terrain.robots import Robot, SwerveRobot
 from terrain.terramechanics.soil import Soil
@@ -132,15 +132,18 @@ def planar_ground(robot: Robot, soil: Soil) -> Ground:
     )
 
 
+Inputs = tuple[Array, Array, Array, Array, Array]
+"""Wheel speeds and steering (n, wheels), grade and roll (n,), and the disturbance (n, 3) or (0, 3)."""
+
+
 class Drive(NamedTuple):
     """What a drive is made of: all that is to be written for a new one."""
 
     record: np.dtype[Any]  # of its numbers, with the field ``body`` of :data:`BODY`
     # from a robot and a ground to its other fields by name
     numbers: Callable[[Robot, Ground], Mapping[str, Any]]
-    # the kernel, from that record (1,), the vector of effects, the step in s, wheel speeds and steering (n, wheels),
-    # grade and roll (n,), and the disturbance (n, 3) or (0, 3) to rows (n,) of :data:`TRUTH`
-    move: Callable[..., Array]
+    # the kernel, from that record (1,), the vector of effects, the step in s and inputs to rows (n,) of :data:`TRUTH`
+    move: Callable[[Array, Array, float, Inputs], Array]
     drifts: bool = True  # whether the body goes sideways by what the ground adds, and on a side hill
 
 
@@ -246,7 +249,7 @@ def delayed(values: Array, late: float, rate: float) -> Array:
     return out
 
 
-@njit
+@inner
 def _between(values: Array, at: float) -> float:
     """Return a signal between its samples; its ends are held."""
     n = values.size
@@ -285,7 +288,7 @@ def lagged(values: Array, tau_s: float, dt: float) -> Array:
     return out
 
 
-@njit
+@inner
 def steered(angle: Array, delay_s: float, backlash_rad: float, dt: float) -> Array:
     """Return the angle (n,) of a wheel behind the delay of its linkage and a play of half a width, from its middle."""
     if delay_s != 0.0:
@@ -298,7 +301,7 @@ def steered(angle: Array, delay_s: float, backlash_rad: float, dt: float) -> Arr
     return angle
 
 
-@njit
+@inner
 def decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, float]:
     """Return ``a, b`` of ``exp(A dt) = a 1 + b A`` of a matrix (2, 2) that does not grow.
 

@@ -11,10 +11,10 @@ import numpy as np
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import EFFECTS
 from terrain.kernels import filled, njit
-from terrain.records import Array, read_only
+from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.planar.bicycle import BICYCLE
-from terrain.simulation.planar.model import Drive, Ground, body_numbers, slopes
+from terrain.simulation.planar.model import Drive, Ground, Inputs, body_numbers, slopes
 from terrain.simulation.planar.omni import OMNI
 from terrain.simulation.planar.skid import SKID
 from terrain.simulation.planar.swerve import SWERVE
@@ -28,7 +28,7 @@ DRIVES: Mapping[str, Drive] = {
 }
 """By the name of a robot's drive."""
 
-UNDISTURBED = read_only(np.zeros((0, 3)))
+UNDISTURBED = np.zeros((0, 3))  # not read-only: that were another type of array, and kernels compiled twice
 
 
 class Planar(NamedTuple):
@@ -74,24 +74,16 @@ def move(
         none: (0, 3)
     """
     inputs = wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance
-    truth = planar.drive.move(planar.params, vector, dt, *inputs)
-    _finish(planar.body, vector, dt, grade_rad, roll_rad, disturbance, planar.drive.drifts, truth)
+    truth = planar.drive.move(planar.params, vector, dt, inputs)
+    _finish(planar.body, vector, dt, inputs, planar.drive.drifts, truth)
     return truth
 
 
 @njit
-def _finish(
-    params: Array,
-    vector: Array,
-    dt: float,
-    grade_rad: Array,
-    roll_rad: Array,
-    disturbance: Array,
-    drifts: bool,
-    truth: Array,
-) -> None:
+def _finish(params: Array, vector: Array, dt: float, inputs: Inputs, drifts: bool, truth: Array) -> None:
     """Add what side hill and ground do to the motion, and the specific force along x."""
     p, effective_ratio = vector.view(EFFECTS)[0], params[0].effective_ratio
+    _, _, grade_rad, roll_rad, disturbance = inputs
     for k in range(truth.shape[0]):
         row = truth[k]
         fast = math.sqrt(row.speed_x_mps * row.speed_x_mps + row.speed_y_mps * row.speed_y_mps)

@@ -38,12 +38,12 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import EFFECTS
-from terrain.kernels import njit, numbers, record
+from terrain.kernels import inner, njit, numbers, record
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.contact import softness
-from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, slopes
+from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, Inputs, slopes
 
 # Speed below which slip is no more over the speed itself, and over which a resistance takes its full size; assumed:
 # a fifth of the slowest measured drive.
@@ -77,17 +77,9 @@ def _numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
 
 
 @njit
-def _move(
-    params: Array,
-    vector: Array,
-    dt: float,
-    wheel_speed_mps: Array,
-    steer_rad: Array,
-    grade_rad: Array,
-    roll_rad: Array,
-    disturbance: Array,
-) -> Array:
+def _move(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
     """Return motion and net traction along x; the current is the sum of the magnitudes of :func:`currents_of`."""
+    wheel_speed_mps, _steer_rad, grade_rad, roll_rad, disturbance = inputs
     rollers, p, n = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     body, out = rollers.body, np.zeros(n, TRUTH)
     along, across, load = _placed(rollers, p)
@@ -182,7 +174,7 @@ def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array,
     return out
 
 
-@njit
+@inner
 def _placed(rollers: Any, p: Any) -> tuple[Array, Array, Array]:
     """Return ``along`` and ``across`` (wheels, 3) and the loads (wheels,) with wheels and load as p has them.
 
@@ -206,14 +198,14 @@ def _placed(rollers: Any, p: Any) -> tuple[Array, Array, Array]:
     return along, across, load / total
 
 
-@njit
+@inner
 def _stiffness(body: Any, p: Any, slip_ratio: float) -> float:
     """Return traction over load and slip of the ground, with the effect that makes it softer."""
     soft = max(softness(body.soft_ratio, slip_ratio), STIFFEST_GROUND)
     return float(1.0 / max(soft + p.force_slip_ratio, STIFFEST * soft))
 
 
-@njit
+@inner
 def _fastest(along: Array, wheel_speed_mps: Array, twist: Array) -> float:
     """Return the speed U that slip is over: of wheels (wheels,) or their centres, never below a minimum."""
     of_wheels, of_centres, n = 0.0, 0.0, wheel_speed_mps.shape[0]
@@ -223,13 +215,13 @@ def _fastest(along: Array, wheel_speed_mps: Array, twist: Array) -> float:
     return math.sqrt(max(of_wheels, of_centres) / n + ROLLING_MPS * ROLLING_MPS)
 
 
-@njit
+@inner
 def _dot(row: Array, twist: Array) -> float:
     product: float = row[0] * twist[0] + row[1] * twist[1] + row[2] * twist[2]
     return product
 
 
-@njit
+@inner
 def _solve(matrix: Array, pushed: Array, out: Array) -> None:
     """Solve a symmetric positive system of three in place of ``out``, by Cramer's rule."""
     a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
@@ -243,7 +235,7 @@ def _solve(matrix: Array, pushed: Array, out: Array) -> None:
     out[2] = (p2 * x + q2 * y + r2 * z) * by
 
 
-@njit
+@inner
 def _body_slip(rollers: Any, wheel_speed_mps: Array, v_x: float, v_y: float) -> float:
     """Return the slip of the body along what the wheels roll; 0 where neither moves, and in place."""
     x, y = 0.0, 0.0

@@ -17,7 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.kernels import njit
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.kinematics.commands import wheel_motion
+from terrain.kinematics.commands import WheelMotion, wheel_motion
 from terrain.kinematics.wheels import point_velocity, wheel_frame_velocities
 from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
 from terrain.records import Array, Label, Stream
@@ -91,30 +91,56 @@ BODY_SLIP = "slip_body_ratio"
 _PURPOSES = ("scatter", "hills", "ground", "wheels", "steering", "imu", "camera", "outside", "lidar")
 
 
-class Logged(NamedTuple):
-    """A run before its loggers.
+class _Drive:
+    """A drive before its loggers.
 
     ``p`` are the effects by name, ``truth`` and ``pose`` the motion at each step of ``dt``, ``wheel_speed_mps`` and
     ``steer_rad`` as encoders without error show them, ``true_speed_mps`` circumferential speeds with the true radii,
     ``active`` the factor on the noise of a moving robot, and ``ideal`` the channels of sensors without noise.
     """
 
-    robot: Robot
-    planar: Planar
-    vector: Array
-    p: Any
-    dt: float
-    noise: Noise | None
-    rngs: Mapping[str, np.random.Generator]
-    truth: Array
-    pose: Array
-    grade_rad: Array
-    roll_rad: Array
-    wheel_speed_mps: Array
-    true_speed_mps: Array
-    steer_rad: Array
-    active: Array
-    ideal: Array
+    def __init__(
+        self,
+        planar: Planar,
+        vector: Array,
+        dt: float,
+        noise: Noise | None,
+        rngs: Mapping[str, np.random.Generator],
+    ) -> None:
+        self.robot, self.planar, self.vector, self.p = planar.robot, planar, vector, vector.view(EFFECTS)[0]
+        self.dt, self.noise, self.rngs = dt, noise, rngs
+
+    def follow(self, desired: WheelMotion, conditions: Conditions, eccentric: float) -> None:
+        """Let the robot follow commands over hills."""
+        robot, p, dt, noise, rngs = self.robot, self.p, self.dt, self.noise, self.rngs
+        parts, fastest = round(1.0 / (RATE_HZ * dt)), robot.steering_rate_max_radps
+        speed, steer = follow_commands(desired.wheel_speed_mps, desired.steer_rad, parts, dt, fastest)
+        n, wheels = speed.shape
+        active, disturbance = np.zeros(n), np.zeros((0, 3))
+        if noise is not None:
+            active = activity(np.abs(speed).mean(axis=1), noise)
+            std = np.array([noise.along_ratio, noise.across_ratio, noise.yaw_radps])
+            tau_s = np.array([noise.along_s, noise.across_s, noise.yaw_s])
+            disturbance = coloured(rngs["ground"].standard_normal((3, n)), std, tau_s, dt).T.copy()
+            disturbance[:, 2] *= active
+        turned = speed
+        if eccentric:
+            phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, wheels)
+            angle = np.cumsum(speed, axis=0) * dt / robot.wheel_radius_m
+            turned = speed * (1.0 + eccentric * np.sin(angle + phase))
+        grade = roll = np.zeros(n)
+        truth = move(self.planar, self.vector, dt, turned, steer, grade, roll, disturbance)
+        pose, slope = _path(truth, dt), np.array(conditions.grade_ratio)
+        grade, roll = _tilt_along(pose, slope, _undulations(conditions, rngs["hills"]))
+        if grade.any() or roll.any():
+            truth = move(self.planar, self.vector, dt, turned, steer, grade, roll, disturbance)
+            pose = _path(truth, dt)
+        sides = np.full(wheels, 1.0 - 0.5 * p["one_sided_radius_ratio"])
+        sides[-1] = 1.0 + 0.5 * p["one_sided_radius_ratio"]
+        self.true_speed_mps = turned * (1.0 + p["wheel_radius_ratio"]) * sides * _encoder_scales(robot, p)
+        self.truth, self.pose, self.grade_rad, self.roll_rad = truth, pose, grade, roll
+        self.wheel_speed_mps, self.steer_rad, self.active = speed, steer, active
+        self.ideal = sense(self.planar, self.vector, dt, truth)
 
     def samples(self, rate_hz: float) -> tuple[Array, Array]:
         """Return steps and stamps (k,) of a logger."""
@@ -129,7 +155,7 @@ class Logged(NamedTuple):
         """Return a signal (n,) as the logger of IMU and camera stamps it, behind a latency."""
         late = (self.p["clock_offset_s"] + latency_s) / self.dt
         rate = self.p["clock_rate_ratio"]
-        return delayed(values, late, rate) if late != 0.0 or rate != 0.0 else values
+        return np.asarray(delayed(values, late, rate)) if late != 0.0 or rate != 0.0 else values
 
 
 def run_planar(
@@ -177,8 +203,8 @@ def run_planar(
         for name in nuisances_of(robot.drive):
             vector[INDEX[name]] += getattr(scatter, name) * rngs["scatter"].standard_normal()
     desired = wheel_motion(robot, twist, 1.0 / RATE_HZ)
-    planar = make_planar(robot, ground)
-    run = _driven(planar, vector, step_s, noise, rngs, desired, conditions, outside)
+    run = _Drive(make_planar(robot, ground), vector, step_s, noise, rngs)
+    run.follow(desired, conditions, outside.get("wheel_eccentricity_ratio", 0.0))
     rows = [*("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), *wheel_channels("wheel_radps", robot.wheels)]
     commands = [desired.twist, desired.wheel_radps, desired.steer_rad[:, : len(robot.steer_rows)]]
     streams = {"wheels": _wheels(run, outside.get("stick_slip_a", 0.0), logs_currents)}
@@ -237,52 +263,6 @@ def with_silent_parts(robot: Robot) -> Robot:
             unknown = [item.name for item in fields(part) if math.isnan(getattr(part, item.name))]
             silent[name] = replace(part, **dict.fromkeys(unknown, 0.0))  # type: ignore[arg-type]
     return robot.with_parts(**silent)
-
-
-def _driven(
-    planar: Planar,
-    vector: Array,
-    dt: float,
-    noise: Noise | None,
-    rngs: Mapping[str, np.random.Generator],
-    desired: Any,
-    conditions: Conditions,
-    outside: Mapping[str, float],
-) -> Logged:
-    """Let a robot follow commands over hills."""
-    robot, p = planar.robot, vector.view(EFFECTS)[0]
-    parts = round(1.0 / (RATE_HZ * dt))
-    wheel_speed, steer = follow_commands(
-        desired.wheel_speed_mps, desired.steer_rad, parts, dt, robot.steering_rate_max_radps
-    )
-    n, wheels = wheel_speed.shape
-    active, disturbance = np.zeros(n), np.zeros((0, 3))
-    if noise is not None:
-        active = activity(np.abs(wheel_speed).mean(axis=1), noise)
-        std = np.array([noise.along_ratio, noise.across_ratio, noise.yaw_radps])
-        tau_s = np.array([noise.along_s, noise.across_s, noise.yaw_s])
-        disturbance = coloured(rngs["ground"].standard_normal((3, n)), std, tau_s, dt).T.copy()
-        disturbance[:, 2] *= active
-    turned = wheel_speed
-    if eccentric := outside.get("wheel_eccentricity_ratio", 0.0):
-        phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, wheels)
-        angle = np.cumsum(wheel_speed, axis=0) * dt / robot.wheel_radius_m
-        turned = wheel_speed * (1.0 + eccentric * np.sin(angle + phase))
-    level = np.zeros(n)
-    truth = move(planar, vector, dt, turned, steer, level, level, disturbance)
-    pose = _path(truth, dt)
-    grade, roll = _tilt_along(pose, np.array(conditions.grade_ratio), _undulations(conditions, rngs["hills"]))
-    if grade.any() or roll.any():
-        truth = move(planar, vector, dt, turned, steer, grade, roll, disturbance)
-        pose = _path(truth, dt)
-    sides = np.full(wheels, 1.0 - 0.5 * p["one_sided_radius_ratio"])
-    sides[-1] = 1.0 + 0.5 * p["one_sided_radius_ratio"]
-    rolled = turned * (1.0 + p["wheel_radius_ratio"]) * sides * _encoder_scales(robot, p)
-    ideal = sense(planar, vector, dt, truth)
-    return Logged(
-        *(robot, planar, vector, p, dt, noise, rngs, truth, pose, grade, roll),
-        *(wheel_speed, rolled, steer, active, ideal),
-    )
 
 
 @njit
@@ -358,7 +338,7 @@ def _tilt_along(pose: Array, grade_ratio: Array, waves: Array) -> tuple[Array, A
     return grade, roll
 
 
-def _wheels(run: Logged, stick_slip_a: float, logs_currents: bool) -> Stream:
+def _wheels(run: _Drive, stick_slip_a: float, logs_currents: bool) -> Stream:
     """Return the stream of wheel speeds and, where they are logged, motor currents."""
     robot, noise, p, wheels = run.robot, run.noise, run.p, len(run.robot.wheels)
     sensors, motors, rng = robot.sensors, robot.motors, run.rngs["wheels"]
@@ -399,14 +379,14 @@ def _wheels(run: Logged, stick_slip_a: float, logs_currents: bool) -> Stream:
     return Stream(time_s, np.hstack([speed, currents]), channels)
 
 
-def _omni_currents(run: Logged) -> Array:
+def _omni_currents(run: _Drive) -> Array:
     """Return the current (n, wheels) of each motor: of the motion before the ground disturbs it."""
     wheels = np.ascontiguousarray(run.true_speed_mps / (1.0 + run.p["wheel_radius_ratio"]))
     truth = move(run.planar, run.vector, run.dt, wheels, run.steer_rad, run.grade_rad, run.roll_rad)
     return np.asarray(currents_of(run.planar.params, run.vector, run.dt, wheels, truth))
 
 
-def _spikes(run: Logged, size_a: float) -> Array:
+def _spikes(run: _Drive, size_a: float) -> Array:
     """Return spikes (n,) of the sum of the currents while the wheels crawl."""
     speed = run.wheel_speed_mps.mean(axis=1)
     crawls = (np.abs(speed) < CRAWL_MPS) & (np.abs(speed) > 0.02)
@@ -465,7 +445,7 @@ def encoder_speed(
     return out
 
 
-def _steering(run: Logged) -> Stream:
+def _steering(run: _Drive) -> Stream:
     """Return the stream of steering angles."""
     sensors, channels = run.robot.sensors, run.robot.steer_channels
     rows, time_s = run.samples(WHEELS_HZ)
@@ -478,7 +458,7 @@ def _steering(run: Logged) -> Stream:
     return Stream(time_s, angle, channels)
 
 
-def _imu(run: Logged) -> Stream:
+def _imu(run: _Drive) -> Stream:
     """Return the stream of the IMU: gyro and accelerometer along x have clock and latency already."""
     rows, time_s = run.samples(IMU_HZ)
     latency_s = run.robot.sensors.imu_latency_s + run.p["imu_latency_s"]
@@ -501,7 +481,7 @@ def _imu(run: Logged) -> Stream:
     return Stream(time_s, values, IMU_CHANNELS)
 
 
-def _imu_errors(run: Logged, active: Array) -> ImuErrors:
+def _imu_errors(run: _Drive, active: Array) -> ImuErrors:
     """Return the errors of the IMU: those described, and vibration while the robot moves; ``active`` (n,)."""
     sensors, noise, n, rng = run.robot.sensors, run.noise, len(active), run.rngs["imu"]
     scale, accel_bias, gyro_bias = described_calibration(sensors)
@@ -529,7 +509,7 @@ def _imu_errors(run: Logged, active: Array) -> ImuErrors:
     )
 
 
-def _pose(run: Logged) -> Stream:
+def _pose(run: _Drive) -> Stream:
     """Return the poses that a camera above measures of an omni robot: the world's axes, its own noise."""
     camera, p = run.robot.camera, run.p
     rows, time_s = run.samples(CAMERA_HZ)
@@ -545,7 +525,7 @@ def _pose(run: Logged) -> Stream:
     return Stream(time_s, seen, POSE_CHANNELS)
 
 
-def _camera(run: Logged) -> Stream:
+def _camera(run: _Drive) -> Stream:
     """Return the stream of the camera: poses of a swerve robot, else speeds in body axes."""
     camera, noise, rng = run.robot.camera, run.noise, run.rngs["camera"]
     rows, time_s = run.samples(CAMERA_HZ)
@@ -582,7 +562,7 @@ def _camera(run: Logged) -> Stream:
     return Stream(time_s, values, CAMERA_CHANNELS)
 
 
-def _lidar(run: Logged) -> Stream:
+def _lidar(run: _Drive) -> Stream:
     """Return the rate of a heading that does not depend on the gyro, from central differences."""
     rows, time_s = run.samples(CAMERA_HZ)
     rate = run.channel(HEADING)[rows]
@@ -592,7 +572,7 @@ def _lidar(run: Logged) -> Stream:
     return Stream(time_s, rate[:, None], ("yaw_rate_radps",))
 
 
-def _body(run: Logged) -> tuple[Array, Array]:
+def _body(run: _Drive) -> tuple[Array, Array]:
     """Return stamps and the body (n,) at them, of :data:`~terrain.simulation.sensors.BODY`."""
     rows, time_s = run.samples(IMU_HZ)
     at, grade, body = run.truth[rows], run.grade_rad[rows], np.zeros(len(rows), BODY)
@@ -606,7 +586,7 @@ def _body(run: Logged) -> tuple[Array, Array]:
     return time_s, body
 
 
-def _truth(run: Logged, time_s: Array, body: Array) -> Stream:
+def _truth(run: _Drive, time_s: Array, body: Array) -> Stream:
     """Return the stream of true quantities."""
     robot, (rows, _) = run.robot, run.samples(IMU_HZ)
     steer = run.steer_rad[rows]

@@ -21,11 +21,11 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import EFFECTS, SLIDING_RADPS
-from terrain.kernels import njit, record
+from terrain.kernels import inner, njit, record
 from terrain.records import Array
 from terrain.robots import TrackedRobot
 from terrain.simulation.contact import shear_softness, softness
-from terrain.simulation.planar.model import BODY, TRUTH, Drive, delayed, lagged, slopes
+from terrain.simulation.planar.model import BODY, TRUTH, Drive, Inputs, delayed, lagged, slopes
 
 # Speed over which a resistance takes its full size: it opposes motion and does not push a robot at rest.
 STANDSTILL_MPS = 0.05
@@ -52,7 +52,7 @@ def direction(speed_mps: float) -> float:
     return speed_mps / math.sqrt(speed_mps * speed_mps + STANDSTILL_MPS * STANDSTILL_MPS)
 
 
-@njit
+@inner
 def _remaining(before_s: float, after_s: float, dt: float) -> float:
     """Return what a step leaves of an offset where the time constant runs straight: ``v' = -v / tau``."""
     change = math.log(after_s / before_s)
@@ -61,7 +61,7 @@ def _remaining(before_s: float, after_s: float, dt: float) -> float:
     return math.exp(-dt * change / (after_s - before_s))
 
 
-@njit
+@inner
 def slip_along(
     body: Any, p: Any, dt: float, u: Array, scrub_n: Array, grade_rad: Array, disturbance: Array, fast: bool
 ) -> tuple[Array, Array, Array]:
@@ -115,16 +115,8 @@ def slip_along(
 
 
 @njit
-def _move(
-    params: Array,
-    vector: Array,
-    dt: float,
-    wheel_speed_mps: Array,
-    steer_rad: Array,
-    grade_rad: Array,
-    roll_rad: Array,
-    disturbance: Array,
-) -> Array:
+def _move(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
+    wheel_speed_mps, _steer_rad, grade_rad, _roll_rad, disturbance = inputs
     body, p, n = params[0].body, vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     out = np.zeros(n, TRUTH)
     mass = body.mass_kg * (1.0 + p.payload_ratio)
@@ -150,7 +142,7 @@ def _move(
     return out
 
 
-@njit
+@inner
 def _differed(sides: Any, p: Any, dt: float, wheel_speed_mps: Array) -> tuple[Array, Array, Array, Array]:
     """Return speed without slip, yaw rate, how tight the turn is and the difference of the sides (n,)."""
     n = wheel_speed_mps.shape[0]

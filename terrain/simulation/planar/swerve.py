@@ -22,12 +22,12 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import EFFECTS
-from terrain.kernels import njit, numbers, record
+from terrain.kernels import inner, njit, numbers, record
 from terrain.kinematics.wheels import velocity_matrix
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_softness, softness
-from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, decayed, slopes, steered
+from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground, Inputs, decayed, slopes, steered
 from terrain.simulation.planar.omni import STIFFEST, STIFFEST_GROUND
 
 # Speed over which a resistance takes its full size, as in the dynamic simulation: it opposes motion and does not
@@ -61,16 +61,8 @@ def _numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
 
 
 @njit
-def _move(
-    params: Array,
-    vector: Array,
-    dt: float,
-    wheel_speed_mps: Array,
-    steer_rad: Array,
-    grade_rad: Array,
-    roll_rad: Array,
-    disturbance: Array,
-) -> Array:
+def _move(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
+    wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
     contact, p, n = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     body, out = contact.body, np.zeros(n, TRUTH)
     u, pace, mean_wheel_speed, heading = _no_slip(contact, p, dt, wheel_speed_mps, steer_rad)
@@ -159,7 +151,7 @@ def _move(
     return out
 
 
-@njit
+@inner
 def _no_slip(
     contact: Any, p: Any, dt: float, wheel_speed_mps: Array, steer_rad: Array
 ) -> tuple[Array, Array, Array, Array]:
