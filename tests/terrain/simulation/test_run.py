@@ -193,8 +193,9 @@ RAILS = record({"body": BODY, "gauge_m": float})
 
 
 @njit
-def _on_rails(params, vector, dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance):
+def _on_rails(params, vector, dt, inputs):
     """Wheels on rails: the body moves as fast as they roll, less what a grade takes, and never turns."""
+    wheel_speed_mps, _, grade_rad, _, _ = inputs
     rails, p, n = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
     out = np.zeros(n, TRUTH)
     for k in range(n):

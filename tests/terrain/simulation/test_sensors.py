@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, poisson
 
 from terrain.constants import GRAVITY_MPS2
@@ -273,23 +272,6 @@ def test_current_times_its_constants_is_the_torque():
     np.testing.assert_allclose(back, torque[::20], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("grade_x", "grade_y"), [(0.15, 0.0), (-0.1, 0.0), (0.0, 0.12), (0.0, -0.2), (0.1, 0.1)]
-)
-def test_at_rest_on_a_slope_the_imu_reads_gravity(grade_x, grade_y):
-    motion = motion_of(0.5, grade_x_ratio=grade_x, grade_y_ratio=grade_y)
-    imu, bias = imu_stream(motion, SILENT_IMU, rng())
-    force = columns_of(imu, "accel_{}_mps2", "xyz")[-1]
-    up = np.array([grade_x, grade_y, 1.0])  # nose up and left up: positive
-    np.testing.assert_allclose(force, G * up / np.linalg.norm(up), atol=1e-9)
-    truth = wheels_truth(motion, bias, imu.time_s)
-    roll, pitch = truth.channel("roll_rad")[-1], truth.channel("pitch_rad")[-1]
-    np.testing.assert_allclose(
-        Rotation.from_euler("ZYX", [0.4, pitch, roll]).apply(force), [0.0, 0.0, G], atol=1e-9
-    )
-    assert np.sign([-pitch, roll]).tolist() == np.sign([grade_x, grade_y]).tolist()
-
-
 def test_the_gyro_follows_the_tilt_on_an_even_slope_and_on_undulation():
     time_s = clock(10.0)
     yaw = 0.5 * time_s
@@ -344,20 +326,6 @@ def test_the_camera_without_noise_gives_the_ideal_odometry_stream():
     )
     assert found.channels == seen.channels
     np.testing.assert_allclose(found.values, seen.values, rtol=0, atol=1e-12)
-
-
-def test_a_lost_camera_is_missing_for_exactly_that_long_and_else_the_same():
-    motion = circle(10.0)
-    whole = camera_stream(motion, ROBOT, rng(3), QUIET)
-    lost = camera_stream(
-        motion, ROBOT, rng(3), Faults(camera_lost_s=((2.0, 5.0), (7.0, 7.5)), by_chance=False)
-    )
-    t = whole.time_s
-    kept = ~(((t >= 2.0) & (t < 5.0)) | ((t >= 7.0) & (t < 7.5)))
-    assert (~kept).sum() == 3.5 * 200
-    np.testing.assert_array_equal(lost.time_s, t[kept])
-    np.testing.assert_array_equal(lost.values, whole.values[kept])
-    assert len(camera_stream(motion, ROBOT, rng(3), Faults(camera_lost_s=((0.0, math.inf),)))) == 0
 
 
 def test_dropouts_and_jumps_come_by_chance_at_their_rates():

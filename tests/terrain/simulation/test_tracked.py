@@ -24,7 +24,6 @@ from terrain.simulation.tracked import (
     slipped_twist,
     tilt_at,
     track_forces,
-    track_loads,
     tracks_on,
     twist_on_soil,
 )
@@ -94,17 +93,6 @@ def test_friction_takes_energy_from_any_motion():
         assert out @ twist < 0.0
 
 
-def test_loads_carry_the_weight_and_balance_the_moment_of_gravity():
-    grade, roll = tilt_at(math.radians(15.0), math.radians(50.0), 0.0)
-    left, right, ahead = track_loads(tracks_on(PATAKO, SAND)[0], grade, roll)
-    weight = PATAKO.mass_kg * GRAVITY_MPS2
-    assert left + right == pytest.approx(weight * math.cos(math.radians(15.0)))
-    across, along = -weight * math.sin(roll) * math.cos(grade), -weight * math.sin(grade)
-    assert (left - right) * PATAKO.half_track_m == pytest.approx(across * PATAKO.com_height_m)
-    assert (left + right) * ahead == pytest.approx(along * PATAKO.com_height_m)
-    assert right > left > 0.0  # uphill is to the left: the right track carries more
-
-
 @pytest.mark.parametrize("slope_deg", [0.0, 10.0, 20.0])
 def test_a_climb_slips_as_the_balance_of_forces_asks(slope_deg):
     """Two routes: motion in time, and the slip at which the shear curve gives grade and compaction."""
@@ -144,14 +132,6 @@ def test_bulldozing_resists_turning_and_grows_with_what_is_swept():
     early = steady(SAND, [0.0, 0.1], seconds=0.3)[2]
     late = steady(SAND, [0.0, 0.1], seconds=8.0)[2]
     assert plain > early > late > 0.5 * plain
-
-
-def test_any_step_gives_the_same_motion():
-    def after(dt):
-        belts = np.tile([0.02, 0.12], (round(2.0 / dt) + 1, 1))
-        return list(driven(belts, SAND, [0.2, 0.5], dt)[-1])[:5]
-
-    assert after(0.01) == pytest.approx(after(0.0025), abs=1e-3)
 
 
 def test_prescribed_slip_moves_the_robot_as_the_paper_states():

@@ -317,34 +317,6 @@ def test_a_hidden_effect_shows_with_its_sign_and_size(name):
         assert not corrected(robot).effects
 
 
-@pytest.mark.parametrize(
-    "slip", [{"force_slip_ratio": 3.0}, {"shear_slip_ratio": 3.0}, {"force_slip_ratio": -0.3}]
-)
-def test_creep_of_any_magnitude_does_not_oscillate(slip):
-    run = driven("straight", "asphalt", LEVEL, tuple(slip.items()))
-    clean = driven("straight", "asphalt", LEVEL)
-    rate, plain = (
-        np.abs(np.diff(log.streams["truth"].channel("wheel_1_radps"))).max() for log in (run, clean)
-    )
-    assert rate < 2 * plain
-    grown = slips(run, ROBOT) - slips(clean, ROBOT)
-    assert abs(grown) < 0.1
-
-
-def test_the_fused_yaw_has_the_gyros_scale_and_bias():
-    clean = driven("spot_turn", "tiles", LEVEL)
-    for effects in ({"gyro_scale_ratio": 0.1}, {"gyro_bias_radps": 0.05}):
-        run = driven("spot_turn", "tiles", LEVEL, tuple(effects.items()))
-        yaw, plain = (np.unwrap(log.streams["imu"].channel("yaw_rad")) for log in (run, clean))
-        time_s = run.streams["imu"].time_s
-        added = effects.get("gyro_bias_radps", 0.0) * time_s
-        scale = 1.0 + effects.get("gyro_scale_ratio", 0.0)
-        true = truth(clean, "yaw_rad", time_s)
-        np.testing.assert_allclose(yaw, plain + (scale - 1.0) * true + added, atol=2e-3)
-        back = corrected_log(run, replace(ROBOT, effects=effects)).streams["imu"].channel("yaw_rad")
-        np.testing.assert_allclose(np.unwrap(back), plain, atol=0.03)
-
-
 def test_absent_effects_leave_every_byte():
     none = dict.fromkeys((p.name for e in library_of("swerve") for p in e.parameters), 0.0)
     drive = make_scenario("complex", ROBOT, "grass", 30.0)

@@ -110,19 +110,6 @@ def test_the_truth_agrees_with_itself():
     assert wheels_of(truth, "normal_{}_n").sum(axis=1).mean() == pytest.approx(mass_n, rel=0.01)
 
 
-@pytest.mark.parametrize("added", ["camera", "gnss"])
-def test_an_added_fault_or_sensor_changes_no_other_stream(added):
-    options = {
-        "camera": {"faults": Faults(camera_lost_s=((1.0, 3.0),), by_chance=False)},
-        "gnss": {"gnss": Gnss(), "faults": Faults(gnss_lost_s=((2.0, 3.0),))},
-    }[added]
-    plain, changed = (run_of("straight", "grass", 5, 6.0, **given) for given in ({}, options))
-    assert ("gnss" in changed.streams) == (added == "gnss")
-    assert (len(plain.streams["odometry"]) > len(changed.streams["odometry"])) == (added == "camera")
-    for name in ("wheels", "steering", "imu", "commands", "truth"):
-        np.testing.assert_array_equal(plain.streams[name].values, changed.streams[name].values)
-
-
 def test_labels_cover_stretches_with_all_wheels_on_one_terrain():
     time_s = np.arange(601) / 50
     twist = np.column_stack([np.minimum(time_s, 1.0), np.zeros((601, 2))])
@@ -328,23 +315,6 @@ def test_wheels_stand_until_the_first_command_arrives(delay_s):
     assert (run.streams["commands"].values[:, 3:6] == 3.0).all()  # as decided, not as delayed
     np.testing.assert_allclose(wheels_of(truth, "wheel_{}_radps")[-1], 3.0, atol=0.1)
     np.testing.assert_allclose(wheels_of(truth, "steer_{}_rad")[-1], 0.2, atol=0.025)
-
-
-def test_leg_backlash_deflects_the_robot_unseen_by_the_steering_encoder():
-    runs = [
-        run_of(
-            "starts", "grass", seed=1, duration_s=20.0, conditions=Conditions(leg_backlash_rad=backlash_rad)
-        )
-        for backlash_rad in (0.0, 0.03)
-    ]
-    firm, loose = (run.streams["truth"] for run in runs)
-    assert np.abs(firm.channel("steer_3_rad")).max() <= ROBOT.steering.dead_band_rad
-    leg = loose.channel("steer_3_rad") - firm.channel("steer_3_rad")  # it steers straight ahead in both
-    assert np.abs(leg).max() == pytest.approx(0.03, abs=1e-9)
-    assert np.ptp(leg) == pytest.approx(0.06, abs=1e-9)
-    np.testing.assert_array_equal(runs[0].streams["steering"].values, runs[1].streams["steering"].values)
-    drift_m = loose.channel("position_y_m") - firm.channel("position_y_m")
-    assert np.abs(drift_m).max() > 0.02  # it goes off to the side
 
 
 @pytest.mark.parametrize(

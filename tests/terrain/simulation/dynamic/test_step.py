@@ -93,11 +93,6 @@ def ramp(duration_s, radps=5.0, rise_s=1.0):
     )
 
 
-def smoothly(plant, wheel_radps):
-    """Return what happens straight ahead under commands (n,) at 1 kHz: those that come in steps jerk."""
-    return drive(plant, np.repeat(wheel_radps[:, None], 3, axis=1), substeps=1)
-
-
 def steady_slip(plant, radps=5.0, duration_s=10.0):
     return wheels(drive(plant, ramp(duration_s, radps), settled=True))["slip_ratio"][-1]
 
@@ -422,27 +417,6 @@ def test_motor_work_in_curves_is_dissipated_by_lateral_slip_too(leg_backlash_rad
     assert given == pytest.approx(stored + friction + rolling + slipping + sliding, rel=5e-3)
 
 
-def test_the_third_leg_swings_to_where_its_wheel_is_pushed_and_no_further():
-    backlash_rad = 0.03
-    plant = plant_of(load_soil("grass"), leg_backlash_rad=backlash_rad)
-    desired = np.interp(np.arange(3500) * STEP_S, [0.0, 0.5, 1.5, 2.5, 3.5], [0.0, 0.0, 5.0, 5.0, 0.0])
-    motion = smoothly(plant, desired)
-    leg, heading, t = (
-        motion.record["leg_rad"],
-        wheels(motion)["steer_rad"],
-        np.arange(len(motion.record)) * STEP_S,
-    )
-    assert np.abs(np.diff(leg)).max() <= LEG_RATE_RADPS * STEP_S * (1 + 1e-9)
-    assert not leg[t < 0.5].any()
-    # a start pushes the wheel, on the right, forward: the leg to the left
-    assert (leg[(t > 0.9) & (t < 1.5)] == backlash_rad).all()
-    assert (leg[(t > 2.9) & (t < 3.4)] == -backlash_rad).all()  # braking: the opposite side
-    crossing_s = (np.flatnonzero(leg == backlash_rad)[0] - np.flatnonzero(leg)[0] + 1) * STEP_S
-    assert crossing_s >= backlash_rad / LEG_RATE_RADPS - STEP_S
-    np.testing.assert_array_equal(heading[:, 2], leg)  # nothing was steered
-    assert not heading[:, :2].any()
-
-
 @pytest.mark.parametrize("name", ["snow", "grass"])
 def test_the_ground_gives_no_more_than_friction(name):
     soil, grade = load_soil(name), np.array([0.05, 0.1])
@@ -489,22 +463,6 @@ def test_the_speed_loop_reaches_its_speed_and_does_not_wind_up():
     torque = wheels(drive(weak, np.vstack([np.full((100, 3), 5.0), np.full((20, 3), -9.0)])))["torque_nm"]
     np.testing.assert_allclose(torque[500:2000], 2.0, rtol=1e-6)
     assert (torque[2100:] < -1.9).all()
-
-
-def test_steering_keeps_its_limits_overshoots_nothing_and_hangs_in_its_play():
-    steer = np.tile([1.2, -0.7, 0.05], (100, 1))
-    steer[60:] = 0.0
-    motion = drive(plant_of(load_soil("tiles"), backlash_rad=0.02), np.zeros((100, 3)), steer)
-    angle = wheels(motion)["steer_rad"]
-    assert np.abs(np.diff(angle, axis=0)).max() <= 2.0944 * STEP_S * (1 + 1e-9)
-    assert np.abs(np.diff(angle[:1150, 0], n=2)).max() < 2.1 * STEP_S  # it picks the wheel up, no more
-    # it stops short by the backlash in both directions
-    np.testing.assert_allclose(angle[1199], [1.18, -0.68, 0.03], atol=1.5e-3)
-    np.testing.assert_allclose(angle[-1], [0.02, -0.02, 0.02], atol=1.5e-3)
-    assert (angle.max(axis=0) <= [1.1815, 0.0, 0.0315]).all()
-    # fastest move: the rate limit and two ramps, but for the last hundredth
-    fastest_s = 1.2 / 2.0944 + 2.0944 / 20 - math.sqrt(2 * 0.01 / 20)
-    assert np.flatnonzero(angle[:, 0] > 1.17)[0] * STEP_S == pytest.approx(fastest_s, abs=0.005)
 
 
 @pytest.mark.parametrize("speed_mps", [0.5, 1.6])
@@ -564,14 +522,6 @@ def test_the_roots_of_the_step_are_on_the_unit_circle_at_the_limit():
         rate = np.array([1.0 - STEP_S * k * damping_s, -STEP_S * k])  # of x and u
         step = np.array([rate, STEP_S * rate + [0.0, 1.0]])
         assert (np.abs(np.linalg.eigvals(step)).max() < 1.0) == stable
-
-
-@pytest.mark.parametrize("soil", SOILS)
-def test_wheels_roll_evenly_below_the_limit_and_change_their_sign_above_it(soil):
-    """Above it, the torque of the motors could not do this: 60 Nm move a wheel by 0.4 rad/s in a step."""
-    plant = plant_of(load_soil(soil))
-    assert change_of_rate_radps(driven(loaded(plant, 0.93))) < 0.01
-    assert change_of_rate_radps(driven(loaded(plant, 1.07))) > 0.4
 
 
 @pytest.mark.parametrize("soil", SOILS)

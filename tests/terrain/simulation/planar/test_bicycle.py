@@ -54,16 +54,6 @@ def test_a_steady_turn_has_the_effective_wheelbase_and_slides_to_its_outside(spe
     np.testing.assert_allclose(out[VY], -abs(speed) * lag_ratio * speed * turn, rtol=1e-6)
 
 
-@pytest.mark.parametrize("speed", [-1.5, 2.0])
-def test_on_a_side_slope_it_drifts_downhill_driving_ahead_and_back(speed):
-    out = moved(np.full(600, speed), 0.0, roll=0.1)[-1]
-    down, k = GRAVITY_MPS2 * math.sin(0.1), understeer(CAR)
-    turn = -abs(speed) * k * down / (CAR.wheelbase_m + k * speed * abs(speed))
-    share = CAR.mass_kg * CAR.com_behind_front_m / (CAR.wheelbase_m * CAR.rear_cornering_npr)
-    np.testing.assert_allclose(out[[VY, W]], [-abs(speed) * share * (speed * turn + down), turn], rtol=1e-6)
-    assert out[VY] < 0.0  # the left side is up
-
-
 def test_at_rest_it_rests_and_creeping_it_is_the_kinematic_bicycle():
     rest = moved(np.zeros(200), 0.3, roll=0.2)
     np.testing.assert_array_equal(rest[:, [VX, VY, W]], 0.0)

@@ -25,7 +25,7 @@ from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.motion import make_planar, move
 from terrain.simulation.planar.replay import replay, sense
-from terrain.simulation.planar.skid import ENDO_POWER, SLIDING_RADPS, STANDSTILL_MPS, direction
+from terrain.simulation.planar.skid import ENDO_POWER, STANDSTILL_MPS, direction
 from terrain.simulation.planar.swerve import ROLLING_MPS
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
@@ -256,61 +256,6 @@ def test_a_turning_robot_slips_to_the_outside_of_the_turn_and_slows_down():
     assert (speeds(skid(HUSKY, 0.5, 4.0), {"turn_drag_s2": 3.0})[SPEED_X] > 0).all()
 
 
-def test_a_track_acts_narrower_in_fast_arcs_and_not_in_turns_in_place():
-    values = {"effective_track_ratio": 0.8, "track_narrowing_s2pm2": 0.05}
-    for speed, turn in ((2.0, 1.2), (-2.0, 1.2), (0.7, -2.0)):
-        w = turn / 1.8
-        x = 0.05 * speed**2 * w**2 / (1 + (w / SLIDING_RADPS) ** 2)
-        shown = speeds(skid(HUSKY, speed, turn), values)
-        assert shown[GYRO][-1] == pytest.approx(w * (1 + x / (1 + x)))
-        assert shown[SPEED_X][-1] == pytest.approx(speed)
-    # neither in place nor straight ahead does it change anything
-    for wheels in (skid(HUSKY, 0.0, 2.0), skid(HUSKY, 3.0, 0.0)):
-        alone = {"effective_track_ratio": 0.8}
-        np.testing.assert_allclose(speeds(wheels, values)[GYRO], speeds(wheels, alone)[GYRO])
-    # the track is halved at the most
-    most = speeds(skid(HUSKY, 9.0, 9.0), values)[GYRO][-1]
-    assert 5.0 < most < 10.0
-
-
-def test_side_slip_builds_up_as_inertia_against_friction():
-    """m (dv_y/dt + w v) = -K v_y with m/K = 0.2 s, by Euler's small steps; one value for both parameters."""
-    dt, tau = 1e-3, 0.2
-    t = dt * np.arange(6000)
-    turn, speed = 0.6 * np.sin(2.0 * t), 0.5 + 0.2 * np.sin(1.3 * t)
-    v_y = np.zeros(t.size)
-    for k in range(t.size - 1):
-        v_y[k + 1] = v_y[k] + dt * (-turn[k] * speed[k] - v_y[k] / tau)
-    both = {"turn_side_slip_s": tau, "side_slip_build_up_s": tau}
-    shown = replayed(still(HUSKY), both, skid(HUSKY, speed, turn), dt=dt)
-    np.testing.assert_allclose(shown[SPEED_Y], v_y, atol=2e-4)
-    at_once = replayed(still(HUSKY), {"turn_side_slip_s": tau}, skid(HUSKY, speed, turn), dt=dt)
-    assert np.abs(at_once[SPEED_Y] - v_y).max() > 0.01
-    alone = replayed(still(HUSKY), {"side_slip_build_up_s": tau}, skid(HUSKY, speed, turn), dt=dt)
-    assert not alone[SPEED_Y].any()
-
-
-def test_the_scale_of_an_encoder_is_that_of_its_wheel():
-    robot = still(AGRIMARO)
-    twist = np.array([0.5, 0.1, 0.2])
-    wheel, steer = inverse(robot.wheel_positions_m, robot.wheel_radius_m, twist, np.zeros(3))
-    rolled = wheel * robot.wheel_radius_m
-    for i in range(3):
-        lost = rolled.copy()
-        lost[i] /= 1.05
-        shown = replayed(robot, {f"wheel_scale_{i + 1}_ratio": 0.05}, at_rate(lost), at_rate(steer))
-        for channel, value in zip((SPEED_X, SPEED_Y, GYRO), twist, strict=True):
-            np.testing.assert_allclose(shown[channel], value, atol=1e-7)
-    values = dict.fromkeys((f"wheel_scale_{i}_ratio" for i in (1, 2, 3)), 0.05)
-    every = replayed(robot, values, at_rate(rolled), at_rate(steer))
-    radius = replayed(robot, {"wheel_radius_ratio": 0.05}, at_rate(rolled), at_rate(steer))
-    np.testing.assert_allclose(every[SPEED_X], radius[SPEED_X], rtol=1e-12)
-    sides = values | {"wheel_scale_1_ratio": -0.03, "wheel_scale_2_ratio": -0.03, "wheel_scale_3_ratio": 0.03}
-    every = replayed(robot, sides, at_rate(rolled), at_rate(steer))
-    one_sided = replayed(robot, {"one_sided_radius_ratio": 0.06}, at_rate(rolled), at_rate(steer))
-    np.testing.assert_allclose(every[GYRO], one_sided[GYRO], rtol=1e-12)
-
-
 def test_steering_effects_match_their_formulas():
     robot = still(AGRIMARO)
     wheel, steer = inverse(
@@ -436,17 +381,6 @@ def test_turning_takes_current_of_the_difference_of_the_sides():
     speeding = replayed(HUSKY, {}, skid(HUSKY, np.full(N, 0.6), spin * TIME_S))
     moment = planar.body["yaw_inertia_kgm2"][0] * spin
     assert speeding[TURNING_CURRENT][N // 2] * n_per_a == pytest.approx(2 * moment / HUSKY.track_m)
-
-
-@pytest.mark.parametrize("drive", ROBOTS)
-def test_standing_wheels_give_no_motion_and_no_current(drive):
-    robot = ROBOTS[drive]
-    shown = replayed(robot, {}, at_rate([0.0] * len(robot.wheels)), ground=Ground())
-    for channel in CHANNELS:
-        np.testing.assert_allclose(shown[channel], 0.0, atol=1e-12)
-    on_a_slope = replayed(robot, {}, at_rate([0.0] * len(robot.wheels)), grade=0.1, ground=Ground())
-    np.testing.assert_allclose(on_a_slope[SPEED_X], 0.0, atol=1e-12)
-    assert on_a_slope[CURRENT][-1] > 0.0  # motors hold it
 
 
 def test_sensors_that_are_right_show_the_truth():

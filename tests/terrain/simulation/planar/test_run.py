@@ -165,24 +165,6 @@ def test_tilt_follows_the_heading_and_gravity_the_tilt(robot):
         assert 0.01 < np.std(tilt) < 0.1
 
 
-def test_every_run_scatters_by_itself():
-    still = np.zeros((101, 3))
-    biases = []
-    for seed in range(150):
-        imu = simulate(HUSKY, still, Ground(), seed, scatter=SCATTER).streams["imu"]
-        biases.append(
-            [imu.channel(name).mean() for name in ("gyro_z_radps", "accel_x_mps2", "pitch_rad", "roll_rad")]
-        )
-    std = [
-        SCATTER.gyro_bias_radps,
-        SCATTER.accel_bias_mps2,
-        SCATTER.pitch_offset_rad,
-        SCATTER.roll_offset_rad,
-    ]
-    np.testing.assert_allclose(np.std(biases, axis=0), std, rtol=0.25)
-    assert (simulate(HUSKY, still, Ground(), 0).streams["imu"].values[:, 2] == 0).all()
-
-
 def density(values, rate_hz):
     return welch(values, rate_hz, nperseg=2048, detrend="linear")
 
