@@ -32,8 +32,7 @@ from terrain.errors import DataError
 from terrain.identify import deal, folds
 from terrain.records import Array
 
-TAIL = 0.025
-"""Probability on each side of an interval."""
+TAIL = 0.025  #: Probability on each side of an interval
 
 _BISECTIONS = 40
 
@@ -161,46 +160,28 @@ N_DRAWS = 1000
 
 @dataclass(frozen=True, slots=True)
 class PredictionFigures:
-    """How well slip is predicted, without any measurement from outside.
+    """How well slip is predicted, without any measurement from outside."""
 
-    Parameters
-    ----------
-    held_out : what is on the other side of each split: ``runs``, ``regimes`` (speeds and directions), or
-        the name of what was never trained on
-    n_runs, n_windows : that were predicted
-    rms, rms_interval : error of the slip of the body, and its 95 % interval over runs
-    bias : mean error
-    coverage : ratio of windows whose slip is inside the 95 % interval of its prediction
-    width : median width of these intervals
-    by_terrain : rms error on each terrain
-    """
-
+    #: what is on the other side of each split: ``runs``, ``regimes`` (speeds and directions), or the name of what was
+    #: never trained on
     held_out: str
-    n_runs: int
+    n_runs: int  #: n_runs, n_windows: that were predicted
     n_windows: int
-    rms: float
+    rms: float  #: rms, rms_interval: error of the slip of the body, and its 95 % interval over runs
     rms_interval: tuple[float, float]
-    bias: float
-    coverage: float
-    width: float
-    by_terrain: Mapping[str, float]
+    bias: float  #: mean error
+    coverage: float  #: ratio of windows whose slip is inside the 95 % interval of its prediction
+    width: float  #: median width of these intervals
+    by_terrain: Mapping[str, float]  #: rms error on each terrain
 
 
 class Cases(NamedTuple):
-    """Windows with their measured slip, and what predicts it.
+    """Windows with their measured slip, and what predicts it."""
 
-    Parameters
-    ----------
-    matrix : (n, columns) means of wheel speeds and currents
-    columns : of the matrix
-    slip : (n,) measured, of the body
-    run_id, terrain, session, regime : (n,) of each window
-    """
-
-    matrix: Array
-    columns: ResponseColumns
-    slip: Array
-    run_id: Array
+    matrix: Array  #: (n, columns) means of wheel speeds and currents
+    columns: ResponseColumns  #: of the matrix
+    slip: Array  #: (n,) measured, of the body
+    run_id: Array  #: run_id, terrain, session, regime: (n,) of each window
     terrain: Array
     session: Array
     regime: Array

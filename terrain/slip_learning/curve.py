@@ -117,8 +117,7 @@ SLIP_OFFSET_STD = 0.004
 """Prior standard deviation of the offset of all slips of a run: half a percent of rolling radius a wheel
 (data/spread), of three wheels."""
 
-NO_CURVE = "none"
-"""Name of the reference model of :func:`select_law`, which does not depend on the slip."""
+NO_CURVE = "none"  #: Name of the reference model of :func:`select_law`, which does not depend on the slip
 
 _PRIOR = {"shape_ratio": (1.65, 1.0), "curvature_ratio": (0.5, 2.0)}
 """Mean and standard deviation: Pacejka's usual C of pure longitudinal slip, and E up to 1; they matter where
@@ -268,11 +267,8 @@ def select_law(runs: Sequence[RunBins]) -> tuple[str, tuple[float, ...], dict[st
     return law, of_all[law], {**scores, **select(score, [NO_CURVE], each)[1]}
 
 
-INTERVAL = 0.9
-"""Probability with which an interval contains the peak slip."""
-
-EDGE_SLIP = 0.03
-"""A maximum this near the end of the observed slips may still rise beyond it."""
+INTERVAL = 0.9  #: Probability with which an interval contains the peak slip
+EDGE_SLIP = 0.03  #: A maximum this near the end of the observed slips may still rise beyond it
 
 NEAR_PEAK_RATIO = 0.95
 """Part of the largest net traction that defines the peak slip of a curve without a peak."""
@@ -390,25 +386,17 @@ def expanded_interval(
     )
 
 
-MIN_RUNS = 3
-"""Fewer runs do not show how runs differ."""
-
-MIN_RANGE_SLIP = 0.1
-"""Slips over less than this are a point of a curve and no curve."""
-
-MIN_BINS = 8
-"""Bins of all runs together that a curve is fitted to."""
+MIN_RUNS = 3  #: Fewer runs do not show how runs differ
+MIN_RANGE_SLIP = 0.1  #: Slips over less than this are a point of a curve and no curve
+MIN_BINS = 8  #: Bins of all runs together that a curve is fitted to
 
 WORKING_TRACTION_RATIO = 0.035
 """Net traction over load that a start requires: an acceleration of a third of a m/s^2, with which a robot is
 behind by a tenth of the distance 5 s after a start to 1 m/s.  More traction costs slip for as long as the
 start lasts."""
 
-MIN_THRUST_RATIO = 0.02
-"""Ice gives more: a curve that stays below is one without traction."""
-
-N_BOOTSTRAP = 300
-"""Draws of the bootstrap over runs."""
+MIN_THRUST_RATIO = 0.02  #: Ice gives more: a curve that stays below is one without traction
+N_BOOTSTRAP = 300  #: Draws of the bootstrap over runs
 
 
 class Band(NamedTuple):
@@ -433,37 +421,25 @@ class Resistances(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlipCurve:
-    """What was learned of one terrain.
+    """What was learned of one terrain."""
 
-    Parameters
-    ----------
-    law : ``janosi`` or ``magic``
-    parameters : by :data:`terrain.slip_learning.curve.LAW_PARAMETERS`
-    resistance_ratio, resistance_std : rolling and compaction resistance over load
-    slip_range : smallest and largest slip that two runs or more reach
-    peak : of net traction
-    peak_interval : contains the peak slip with 90 %
-    balance_slip_ratio, balance_std : where thrust and resistance are equal; NaN where they nowhere are
-    working_slip_ratio, working_std : slip of the net traction :data:`WORKING_TRACTION_RATIO`; NaN where no
-        observed slip gives it
-    band : of the law over the bootstrap
-    n_runs : the curve is fitted to
-    scores : mean log likelihood of a left-out run, by law; and ``none``, of one thrust for all slips
-    """
-
-    law: str
-    parameters: tuple[float, ...]
-    resistance_ratio: float
+    law: str  #: ``janosi`` or ``magic``
+    parameters: tuple[float, ...]  #: by :data:`terrain.slip_learning.curve.LAW_PARAMETERS`
+    resistance_ratio: float  #: resistance_ratio, resistance_std: rolling and compaction resistance over load
     resistance_std: float
-    slip_range: tuple[float, float]
-    peak: Peak
-    peak_interval: tuple[float, float]
+    slip_range: tuple[float, float]  #: smallest and largest slip that two runs or more reach
+    peak: Peak  #: of net traction
+    peak_interval: tuple[float, float]  #: contains the peak slip with 90 %
+    #: balance_slip_ratio, balance_std: where thrust and resistance are equal; NaN where they nowhere are
     balance_slip_ratio: float
     balance_std: float
+    #: working_slip_ratio, working_std: slip of the net traction :data:`WORKING_TRACTION_RATIO`; NaN where no observed
+    #: slip gives it
     working_slip_ratio: float
     working_std: float
-    band: Band
-    n_runs: int
+    band: Band  #: of the law over the bootstrap
+    n_runs: int  #: the curve is fitted to
+    #: mean log likelihood of a left-out run, by law; and ``none``, of one thrust for all slips
     scores: Mapping[str, float]
 
     def __post_init__(self) -> None:

@@ -43,14 +43,9 @@ from terrain.kinematics.wheels import TWIST, wheel_frame_velocities
 from terrain.records import Array, Label, RunLog, SlipTrack, StateTrack
 from terrain.robots import Robot
 
-MIN_SPEED_MPS = 0.2
-"""At lower speeds, an error of 1 cm/s in the speed is over 5 % of slip."""
-
-MAX_SIDE_RATIO = 0.5
-"""Lateral over longitudinal slip above which a wheel's longitudinal thrust is not used."""
-
-SMALL_SLIP = 0.02
-"""Lateral slip up to which the reduction of the longitudinal thrust is negligible."""
+MIN_SPEED_MPS = 0.2  #: At lower speeds, an error of 1 cm/s in the speed is over 5 % of slip
+MAX_SIDE_RATIO = 0.5  #: Lateral over longitudinal slip above which a wheel's longitudinal thrust is not used
+SMALL_SLIP = 0.02  #: Lateral slip up to which the reduction of the longitudinal thrust is negligible
 
 
 @njit
@@ -79,14 +74,12 @@ def contact_slip(
     return out
 
 
-MAX_SLIP_STD = 0.05
-"""A less certain slip carries no information on a curve that rises within 0.1 to 0.3."""
+MAX_SLIP_STD = 0.05  #: A less certain slip carries no information on a curve that rises within 0.1 to 0.3
 
 MAX_SLIP_ANGLE_RAD = 0.15
 """For the balance: the components of side forces along the direction of travel are then within a ninth."""
 
-MAX_YAW_RATE_RADPS = 0.1
-"""For the balance, which leaves side forces out."""
+MAX_YAW_RATE_RADPS = 0.1  #: For the balance, which leaves side forces out
 
 MIN_LOAD_RATIO = 0.35
 """Load relative to that of the standing robot below which a wheel is about to lift and its F / N is noise."""
@@ -98,52 +91,30 @@ samples would bend the curve down."""
 MAX_SLIP_RATE_PS = 3.0
 """Slip that changes faster is smeared by the 50 ms of the low-pass filter over more than 0.15."""
 
-MAX_THRUST_RATE_PS = 1.0
-"""Thrust over load that changes faster belongs to a slip that is not known to 50 ms."""
-
-LABEL_EDGE_S = 0.3
-"""After this the low-pass filter holds e^-6 of the terrain before, which is negligible."""
-
-FRICTION_RATE_RADPS = 0.1
-"""Rate over which bearing friction takes its full value, as in the simulation."""
-
-RATE_SMOOTHING_S = 0.06
-"""Centred mean under the wheel's acceleration: Hall steps and noise of three samples."""
+MAX_THRUST_RATE_PS = 1.0  #: Thrust over load that changes faster belongs to a slip that is not known to 50 ms
+LABEL_EDGE_S = 0.3  #: After this the low-pass filter holds e^-6 of the terrain before, which is negligible
+FRICTION_RATE_RADPS = 0.1  #: Rate over which bearing friction takes its full value, as in the simulation
+RATE_SMOOTHING_S = 0.06  #: Centred mean under the wheel's acceleration: Hall steps and noise of three samples
 
 
 class WheelForces(NamedTuple):
-    """Thrust, load and slip of each wheel over a run; positive in traction, forward or in reverse.
+    """Thrust, load and slip of each wheel over a run; positive in traction, forward or in reverse."""
 
-    Parameters
-    ----------
-    time_s : (n,) clock of the wheels
-    slip_ratio, slip_std : (n, wheels) of the contact, its lateral part included; NaN where unknown
-    thrust_n : (n, wheels) force of the terrain along that slip, before any resistance
-    load_npkg : (n, wheels) load over the robot's mass
-    reference_speed_mps : (n, wheels) denominator of the slip, the larger of wheel circumferential speed and
-        speed over ground
-    total_thrust_n : (n,) sum of the thrusts along the direction of travel
-    speed_mps : (n,) of the body over ground
-    grade_mps2 : (n,) component of gravity against the direction of travel: uphill positive
-    normal_mps2 : (n,) specific force normal to the terrain
-    thrust_std_n : of one thrust, by the noise of the current
-    conditions : by name, whether (n, wheels) a sample meets a condition of its use
-    balance_valid : (n,) whether an instant may be used in the balance of the body
-    """
-
-    time_s: Array
+    time_s: Array  #: (n,) clock of the wheels
+    #: slip_ratio, slip_std: (n, wheels) of the contact, its lateral part included; NaN where unknown
     slip_ratio: Array
     slip_std: Array
-    thrust_n: Array
-    load_npkg: Array
+    thrust_n: Array  #: (n, wheels) force of the terrain along that slip, before any resistance
+    load_npkg: Array  #: (n, wheels) load over the robot's mass
+    #: (n, wheels) denominator of the slip, the larger of wheel circumferential speed and speed over ground
     reference_speed_mps: Array
-    total_thrust_n: Array
-    speed_mps: Array
-    grade_mps2: Array
-    normal_mps2: Array
-    thrust_std_n: float
-    conditions: Mapping[str, Array]
-    balance_valid: Array
+    total_thrust_n: Array  #: (n,) sum of the thrusts along the direction of travel
+    speed_mps: Array  #: (n,) of the body over ground
+    grade_mps2: Array  #: (n,) component of gravity against the direction of travel: uphill positive
+    normal_mps2: Array  #: (n,) specific force normal to the terrain
+    thrust_std_n: float  #: of one thrust, by the noise of the current
+    conditions: Mapping[str, Array]  #: by name, whether (n, wheels) a sample meets a condition of its use
+    balance_valid: Array  #: (n,) whether an instant may be used in the balance of the body
 
     @property
     def valid(self) -> Array:
@@ -326,14 +297,9 @@ def valid_intervals(time_s: Array, valid: Array, length_s: float) -> list[slice]
     ]
 
 
-BALANCE_S = 0.5
-"""Length of a mean; vertical oscillation of the body at 7 Hz averages out."""
-
-CORRELATED_MEANS = 4.0
-"""Means whose errors are alike, over 2 s of terrain."""
-
-MIN_MEANS = 4
-"""Fewer means are too few for a median."""
+BALANCE_S = 0.5  #: Length of a mean; vertical oscillation of the body at 7 Hz averages out
+CORRELATED_MEANS = 4.0  #: Means whose errors are alike, over 2 s of terrain
+MIN_MEANS = 4  #: Fewer means are too few for a median
 
 THRUST_STD_RATIO = 0.03
 """Error that all thrusts of a run share: of the torque constant with the motor's temperature, and of currents
@@ -342,8 +308,7 @@ that are sampled in step with the commands."""
 MASS_STD_RATIO = 0.15
 """Prior of the mass, relative to the described robot: payloads up to a third of it (data/spread)."""
 
-MAX_MASS_STDS = 4.0
-"""A mass further than this from its prior is not used: outside 36 to 144 kg for 90."""
+MAX_MASS_STDS = 4.0  #: A mass further than this from its prior is not used: outside 36 to 144 kg for 90
 
 TILT_STD_RAD = 0.01
 """Error of a grade by the attitude: mounting, and the body's tilt on its springs and on rough terrain."""
@@ -414,8 +379,7 @@ def _mass(prior_kg: float, d_thrust: Array, d_force: Array, d_accel: Array) -> t
 SAMPLE_S = 0.2
 """Length of a sample: ten of the wheels' own, which reduces the ripple of Hall steps to a third."""
 
-LAG_S = 0.02
-"""One sampling period of the wheels: to this is known which slip a thrust belongs to."""
+LAG_S = 0.02  #: One sampling period of the wheels: to this is known which slip a thrust belongs to
 
 BIN_EDGES = (
     *(-0.02, 0.0, 0.01, 0.02, 0.03, 0.04, 0.05, 0.07, 0.09, 0.12, 0.15, 0.18, 0.21, 0.24, 0.27),
@@ -423,8 +387,7 @@ BIN_EDGES = (
 )
 """Bins of slip: narrow where the curve of hard terrain bends."""
 
-MIN_IN_BIN = 2
-"""Samples that make a bin."""
+MIN_IN_BIN = 2  #: Samples that make a bin
 
 BIN_STD_RATIO, BIN_STD = 0.03, 0.003
 """Error of the mean of even a full bin, relative to its thrust and as thrust over load: terrain varies along
@@ -432,20 +395,15 @@ the path by 3 % (data/soils), and no law is exact.  It keeps bins with many samp
 
 
 class TractionSamples(NamedTuple):
-    """Samples of one run on one terrain, (k,) each.
+    """Samples of one run on one terrain, (k,) each."""
 
-    Parameters
-    ----------
-    slip_ratio, slip_std : of the contact
-    traction_ratio, traction_std : thrust over load
-    lag_std : change of the thrust over load within :data:`LAG_S`; unlike noise it does not average out
-    """
-
-    slip_ratio: Array
+    slip_ratio: Array  #: slip_ratio, slip_std: of the contact
     slip_std: Array
-    traction_ratio: Array
+    traction_ratio: Array  #: traction_ratio, traction_std: thrust over load
     traction_std: Array
-    lag_std: Array
+    lag_std: (
+        Array  #: change of the thrust over load within :data:`LAG_S`; unlike noise it does not average out
+    )
 
 
 class RunBins(NamedTuple):

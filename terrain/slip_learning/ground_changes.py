@@ -22,11 +22,8 @@ from terrain.slip_learning.measured import MeasuredSlip, measured_slip, outside_
 
 WINDOW_S, STRIDE_S = 0.5, 0.1
 
-SETTLING_S = 0.4
-"""Windows that begin earlier have the start in them."""
-
-MIN_WINDOWS = 5
-"""On each side of the instant."""
+SETTLING_S = 0.4  #: Windows that begin earlier have the start in them
+MIN_WINDOWS = 5  #: On each side of the instant
 
 MIN_STEP, MIN_CLEAR = 0.06, 1.5
 """Least difference of the levels, and over the scatter about them: twice the spread of the slip of a run on
@@ -69,26 +66,18 @@ def step_of(found: MeasuredSlip, robot: Robot) -> SlipStep | None:
 
 @dataclass(frozen=True, slots=True)
 class WatchedRun:
-    """Changes that were found in a run, and what an outside measurement shows.
+    """Changes that were found in a run, and what an outside measurement shows."""
 
-    Parameters
-    ----------
-    run_id : of the run
-    changes : as they were found, in order of time
-    judged : whether the motion was measured from outside
-    step : of the slip measured from outside; None where it does not change, or nothing measured it
-    found : whether an alarm came while the robot crossed the border, or as long after; None without a step
-    delay_s : of that alarm behind the middle of the crossing; NaN without one
-    n_early : alarms before the crossing; all of them where the slip does not change
-    """
-
-    run_id: str
-    changes: tuple[GroundChange, ...]
-    judged: bool
-    step: SlipStep | None
+    run_id: str  #: of the run
+    changes: tuple[GroundChange, ...]  #: as they were found, in order of time
+    judged: bool  #: whether the motion was measured from outside
+    step: (
+        SlipStep | None
+    )  #: of the slip measured from outside; None where it does not change, or nothing measured it
+    #: whether an alarm came while the robot crossed the border, or as long after; None without a step
     found: bool | None
-    delay_s: float
-    n_early: int
+    delay_s: float  #: of that alarm behind the middle of the crossing; NaN without one
+    n_early: int  #: alarms before the crossing; all of them where the slip does not change
 
 
 def quiet_detector(

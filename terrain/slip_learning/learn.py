@@ -34,8 +34,7 @@ from terrain.slip_learning.forces import (
     wheel_forces,
 )
 
-FILTER = "vio15"
-"""Filter whose state holds the slip speed of each wheel."""
+FILTER = "vio15"  #: Filter whose state holds the slip speed of each wheel
 
 
 class TerrainRun(NamedTuple):
@@ -55,24 +54,14 @@ class TerrainRun(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LearnedTerrain:
-    """What was learned of one terrain.
+    """What was learned of one terrain."""
 
-    Parameters
-    ----------
-    terrain : its name
-    runs : on it
-    status : whether the targets are learned
-    reason : why ``curve`` or ``targets`` are None; empty otherwise
-    curve : None where the runs do not suffice for one
-    targets : None without a curve, or where the curve contradicts itself
-    """
-
-    terrain: str
-    runs: tuple[TerrainRun, ...]
-    status: TargetStatus
-    reason: str = ""
-    curve: SlipCurve | None = None
-    targets: Targets | None = None
+    terrain: str  #: its name
+    runs: tuple[TerrainRun, ...]  #: on it
+    status: TargetStatus  #: whether the targets are learned
+    reason: str = ""  #: why ``curve`` or ``targets`` are None; empty otherwise
+    curve: SlipCurve | None = None  #: None where the runs do not suffice for one
+    targets: Targets | None = None  #: None without a curve, or where the curve contradicts itself
 
     @property
     def runs_with_bins(self) -> tuple[TerrainRun, ...]:

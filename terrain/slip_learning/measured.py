@@ -90,8 +90,7 @@ SOURCES: dict[str, tuple[tuple[str, ...], ...]] = {
 }
 """Streams that measure motion from outside, the most direct first, and the channels of which each needs one set."""
 
-MAX_GAP_S = 0.5
-"""Longer without a sample, what was driven meanwhile is not known well enough to be summed."""
+MAX_GAP_S = 0.5  #: Longer without a sample, what was driven meanwhile is not known well enough to be summed
 
 MAX_SPEED_RATIO, MAX_JUMP_M = 3.0, 0.05
 """A pose that is further from the one before than so many times what the fastest wheel rolled, and this, has
@@ -100,22 +99,13 @@ jumped; a robot that slides is not faster than its wheels were."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Travelled:
-    """Distances travelled forward and to the left, and the angle turned.
+    """Distances travelled forward and to the left, and the angle turned."""
 
-    Parameters
-    ----------
-    source : stream that measured it
-    time_s : (n,) of the samples
-    values : (n, 3) in m, m and rad, from 0 at the first sample of each part
-    part : (n,) number of the part that a sample is in; distances of two parts are not related
-    n_jumps, n_gaps : why parts begin
-    """
-
-    source: str
-    time_s: Array
-    values: Array
-    part: Array
-    n_jumps: int
+    source: str  #: stream that measured it
+    time_s: Array  #: (n,) of the samples
+    values: Array  #: (n, 3) in m, m and rad, from 0 at the first sample of each part
+    part: Array  #: (n,) number of the part that a sample is in; distances of two parts are not related
+    n_jumps: int  #: n_jumps, n_gaps: why parts begin
     n_gaps: int
 
     def __post_init__(self) -> None:
@@ -261,8 +251,7 @@ def _twist_stream(stream: Stream, robot: Robot) -> Stream:
     return Stream(stream.time_s, np.column_stack([*origin, turn_radps]), TWIST)
 
 
-MAX_CORRELATION = 0.95
-"""Of residuals; beyond, too few independent samples are left for a variance."""
+MAX_CORRELATION = 0.95  #: Of residuals; beyond, too few independent samples are left for a variance
 
 
 @njit
@@ -323,54 +312,38 @@ MIN_SPEED_MPS = 0.03
 """Wheel speed and ground speed both lower: standing.  A camera's noise over 2 s is 0.1 % of it, so that the
 smallest robots are judged too; slip over shorter windows has the larger error that it states."""
 
-MAX_SLIP_STD = 0.2
-"""A slip that is less certain is not stated."""
+MAX_SLIP_STD = 0.2  #: A slip that is less certain is not stated
 
 STEADY_RATIO, STEADY_STD = 0.1, 3.0
 """Speeds of the halves of a window that differ by more than this share of it, and by more than so many
 standard deviations, are no steady motion."""
 
 MIN_SAMPLES = 6
-COVERAGE = 0.8
-"""Of a window, by samples of either stream."""
+COVERAGE = 0.8  #: Of a window, by samples of either stream
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredSlip:
-    """Slip over k windows of a run; NaN where it is not known.
+    """Slip over k windows of a run; NaN where it is not known."""
 
-    Parameters
-    ----------
-    run_id : of the run
-    source : stream that measured the motion from outside
-    wheels : their names
-    start_s, end_s : (k,) of the windows, on the clock of the wheels
-    wheel_speed_mps, ground_speed_mps : (k, wheels) circumferential speed, and speed of its centre along it
-    slip_ratio, slip_std : (k, wheels)
-    twist, twist_std : (k, 3) as measured from outside
-    rolled_twist : (k, 3) of wheels that would not slip
-    body_slip, body_slip_std, body_side : (k,)
-    steady : (k,) whether both halves of a window have one speed
-    n_jumps, n_gaps : of the outside measurement
-    """
-
-    run_id: str
-    source: str
-    wheels: tuple[str, ...]
-    start_s: Array
+    run_id: str  #: of the run
+    source: str  #: stream that measured the motion from outside
+    wheels: tuple[str, ...]  #: their names
+    start_s: Array  #: start_s, end_s: (k,) of the windows, on the clock of the wheels
     end_s: Array
+    #: wheel_speed_mps, ground_speed_mps: (k, wheels) circumferential speed, and speed of its centre along it
     wheel_speed_mps: Array
     ground_speed_mps: Array
-    slip_ratio: Array
+    slip_ratio: Array  #: slip_ratio, slip_std: (k, wheels)
     slip_std: Array
-    twist: Array
+    twist: Array  #: twist, twist_std: (k, 3) as measured from outside
     twist_std: Array
-    rolled_twist: Array
-    body_slip: Array
+    rolled_twist: Array  #: (k, 3) of wheels that would not slip
+    body_slip: Array  #: body_slip, body_slip_std, body_side: (k,)
     body_slip_std: Array
     body_side: Array
-    steady: Array
-    n_jumps: int = 0
+    steady: Array  #: (k,) whether both halves of a window have one speed
+    n_jumps: int = 0  #: n_jumps, n_gaps: of the outside measurement
     n_gaps: int = 0
 
     def __post_init__(self) -> None:
@@ -610,18 +583,14 @@ DELAY_SEARCH_S = (-0.4, 1.2)
 but two clocks."""
 
 DELAY_STEP_S = 0.02
-DELAY_WINDOW_S = 0.3
-"""Over which twists are taken: a start takes 0.2 to 0.5 s."""
+DELAY_WINDOW_S = 0.3  #: Over which twists are taken: a start takes 0.2 to 0.5 s
 
 REST_S = 1.0
 """A log whose wheels stand at its first sample is taken to be of a robot at rest for so long before it: most
 recordings begin with the start that shows the delay."""
 
-MIN_KNOWN = 0.3
-"""Of the windows of a run, with every delay of the search."""
-
-MAX_DELAY_STD_S = 0.1
-"""A delay that is less certain is not applied."""
+MIN_KNOWN = 0.3  #: Of the windows of a run, with every delay of the search
+MAX_DELAY_STD_S = 0.1  #: A delay that is less certain is not applied
 
 
 def delay_sentence(delay: Delay) -> str:
@@ -798,40 +767,28 @@ def measure_steady(
 N_FOLDS = 5
 N_DRAWS = 1000
 
-MIN_TURN_RADPS = 0.2
-"""Of wheels, from which their yaw rate is compared with that measured from outside."""
+MIN_TURN_RADPS = 0.2  #: Of wheels, from which their yaw rate is compared with that measured from outside
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceSlip:
-    """Slip of a robot on a surface; NaN where it is not known.
+    """Slip of a robot on a surface; NaN where it is not known."""
 
-    Parameters
-    ----------
-    terrain : name of the surface; empty for runs without a label
-    n_runs, n_windows : with a slip in steady motion
-    n_standing : windows without a slip because the robot stood, or because it was too uncertain
-    slip_ratio, interval : median over runs of the slip of the body, and its 95 % interval over runs
-    spread : quartiles of the windows
-    std : median standard deviation of a window's slip
-    held_out : largest difference of the median of a fifth of the runs from that of the others
-    wheel_slip : median of each wheel, positive in traction whichever direction it rolls in
-    turn_ratio : median yaw rate measured from outside over that of wheels without slip
-    spinning : runs with a wheel that spins or lifts, and which
-    """
-
-    terrain: str
-    n_runs: int
+    terrain: str  #: name of the surface; empty for runs without a label
+    n_runs: int  #: n_runs, n_windows: with a slip in steady motion
     n_windows: int
-    n_standing: int
+    n_standing: int  #: windows without a slip because the robot stood, or because it was too uncertain
+    #: slip_ratio, interval: median over runs of the slip of the body, and its 95 % interval over runs
     slip_ratio: float
     interval: tuple[float, float]
-    spread: tuple[float, float]
-    std: float
-    held_out: float
-    wheel_slip: tuple[float, ...]
-    turn_ratio: float
-    spinning: tuple[str, ...]
+    spread: tuple[float, float]  #: quartiles of the windows
+    std: float  #: median standard deviation of a window's slip
+    held_out: float  #: largest difference of the median of a fifth of the runs from that of the others
+    wheel_slip: tuple[
+        float, ...
+    ]  #: median of each wheel, positive in traction whichever direction it rolls in
+    turn_ratio: float  #: median yaw rate measured from outside over that of wheels without slip
+    spinning: tuple[str, ...]  #: runs with a wheel that spins or lifts, and which
 
 
 def surface_slip(terrain: str, runs: Sequence[MeasuredSlip], rng: np.random.Generator) -> SurfaceSlip:
@@ -889,18 +846,11 @@ def _held_out(medians: Array, runs: Sequence[MeasuredSlip]) -> float:
 
 
 class OperatingPoints(NamedTuple):
-    """Points of runs, (n,) each; NaN where it is not known.
+    """Points of runs, (n,) each; NaN where it is not known."""
 
-    Parameters
-    ----------
-    slip_ratio : median of the body over a run's windows in steady motion
-    current_a : median over these of the mean of the wheels
-    thrust_ratio : mean thrust of a wheel over its share of the weight
-    """
-
-    slip_ratio: Array
-    current_a: Array
-    thrust_ratio: Array
+    slip_ratio: Array  #: median of the body over a run's windows in steady motion
+    current_a: Array  #: median over these of the mean of the wheels
+    thrust_ratio: Array  #: mean thrust of a wheel over its share of the weight
 
 
 def operating_points(runs: Sequence[RunLog], slips: Sequence[MeasuredSlip], robot: Robot) -> OperatingPoints:

@@ -37,37 +37,31 @@ N_FOLDS = 5
 MIN_RUNS = 10
 """Of a surface: two unknowns of the load, the scale and its own friction over several directions."""
 
-_FREE = -7.0
-"""Logarithm of a roller ratio that counts as none: 0.001."""
+_FREE = -7.0  #: Logarithm of a roller ratio that counts as none: 0.001
 
 
 @dataclass(frozen=True, slots=True)
 class RollerFindings:
-    """What was found of an omni robot.
+    """What was found of an omni robot."""
 
-    Parameters
-    ----------
-    load_ratio, load_interval : share of the weight on each wheel, and the 95 % interval of each
-    scale_error, scale_interval : kappa: slip that is the same in all directions on all surfaces, an effective
-        radius or a scale of the outside measurement
-    roller_ratio, roller_interval : friction of the rollers over the stiffness of traction, by surface
-    held_out_rms, plain_rms : of the slip of runs: left by the law on runs that were held out, and about the
-        mean of the surface
-    other_surface : the surface that explains a group that was not fitted best, by name
-    other_loads : share of the weight on each wheel in groups that were not fitted, by name
-    other_rms : of their slip and sideways speed, with the load of the others and with their own, by name
-    """
-
+    #: load_ratio, load_interval: share of the weight on each wheel, and the 95 % interval of each
     load_ratio: tuple[float, ...]
     load_interval: tuple[tuple[float, float], ...]
+    #: scale_error, scale_interval: kappa: slip that is the same in all directions on all surfaces, an effective
+    #: radius or a scale of the outside measurement
     scale_error: float
     scale_interval: tuple[float, float]
+    #: roller_ratio, roller_interval: friction of the rollers over the stiffness of traction, by surface
     roller_ratio: Mapping[str, float]
     roller_interval: Mapping[str, tuple[float, float]]
+    #: held_out_rms, plain_rms: of the slip of runs: left by the law on runs that were held out, and about the mean of
+    #: the surface
     held_out_rms: Mapping[str, float]
     plain_rms: Mapping[str, float]
-    other_surface: Mapping[str, str]
+    other_surface: Mapping[str, str]  #: the surface that explains a group that was not fitted best, by name
+    #: share of the weight on each wheel in groups that were not fitted, by name
     other_loads: Mapping[str, tuple[float, ...]]
+    #: of their slip and sideways speed, with the load of the others and with their own, by name
     other_rms: Mapping[str, tuple[float, float]]
 
     @property
@@ -350,20 +344,12 @@ def distances_of(found: Measured, robot: Robot, seed: int) -> dict[str, Distance
 
 
 class NamedSurface(NamedTuple):
-    """Which surface the rollers of an omni robot say that runs of a group were on.
+    """Which surface the rollers of an omni robot say that runs of a group were on."""
 
-    Parameters
-    ----------
-    group : surface or, of runs that were not fitted, session
-    n_runs : of the group; where ``n_right`` is known those with a label of a fitted surface
-    n_right : whose windows are mostly named as their label; None without such labels
-    windows : by the surface that they are named
-    """
-
-    group: str
-    n_runs: int
-    n_right: int | None
-    windows: Mapping[str, int]
+    group: str  #: surface or, of runs that were not fitted, session
+    n_runs: int  #: of the group; where ``n_right`` is known those with a label of a fitted surface
+    n_right: int | None  #: whose windows are mostly named as their label; None without such labels
+    windows: Mapping[str, int]  #: by the surface that they are named
 
     @property
     def text(self) -> str:

@@ -71,35 +71,26 @@ WHEELS: dict[str, Wheel] = {
 }
 """By the name of the robot: Pavlov and Johnson, repository robomechanics/3d-terramechanics."""
 
-MIN_SETTINGS = 20
-"""Settings of slip and angle below which a law with twenty parameters is not fitted."""
+MIN_SETTINGS = 20  #: Settings of slip and angle below which a law with twenty parameters is not fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trials:
-    """Trials of one wheel, each array (n,).
+    """Trials of one wheel, each array (n,)."""
 
-    Parameters
-    ----------
-    wheel_radps, travel_mps, slip_angle_rad : measured motion; the commanded angle, which the wheel keeps
-    slip_ratio : of the speeds of wheel and travel
-    load_n, pull_n, side_n : what the ground does to the wheel: up, ahead, and to the side of the angle's sign
-    sinkage_m : of the lowest point
-    slip_setting, angle_setting : commanded wheel speed in mm/s and angle in degrees
-    n_trials : number of trials behind an entry
-    """
-
+    #: wheel_radps, travel_mps, slip_angle_rad: measured motion; the commanded angle, which the wheel keeps
     wheel_radps: Array
     travel_mps: Array
     slip_angle_rad: Array
-    slip_ratio: Array
+    slip_ratio: Array  #: of the speeds of wheel and travel
+    #: load_n, pull_n, side_n: what the ground does to the wheel: up, ahead, and to the side of the angle's sign
     load_n: Array
     pull_n: Array
     side_n: Array
-    sinkage_m: Array
-    slip_setting: Array
+    sinkage_m: Array  #: of the lowest point
+    slip_setting: Array  #: slip_setting, angle_setting: commanded wheel speed in mm/s and angle in degrees
     angle_setting: Array
-    n_trials: Array
+    n_trials: Array  #: number of trials behind an entry
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -216,24 +207,14 @@ SINKAGES: dict[str, dict[str, tuple[float, float]]] = {"travel": TRAVEL, "lyasko
 
 
 class Law(NamedTuple):
-    """A law of the forces and one of the sinkage.
+    """A law of the forces and one of the sinkage."""
 
-    Parameters
-    ----------
-    name : of both
-    sinkage : one of :data:`SINKAGES`
-    free : parameters of :data:`~terrain.terramechanics.inflow_wheel.FORCE` that are fitted
-    fixed : value of each other one that is not where its fit would begin
-    tied : whether the side face's pressure is that of the friction angle
-    text : what it is, for readers
-    """
-
-    name: str
-    sinkage: str
-    free: tuple[str, ...]
-    fixed: Mapping[str, float]
-    tied: bool
-    text: str
+    name: str  #: of both
+    sinkage: str  #: one of :data:`SINKAGES`
+    free: tuple[str, ...]  #: parameters of :data:`~terrain.terramechanics.inflow_wheel.FORCE` that are fitted
+    fixed: Mapping[str, float]  #: value of each other one that is not where its fit would begin
+    tied: bool  #: whether the side face's pressure is that of the friction angle
+    text: str  #: what it is, for readers
 
 
 _ARC = ("pressure_exponent", "peak_ratio", "peak_slip_ratio", "exit_ratio", "tan_friction", "shear_modulus_m")
@@ -313,8 +294,7 @@ def forces_of(law: Law, values: Array, trials: Trials, wheel: Wheel, sinkage_m: 
 
 SINKAGE_MISFIT_M = 2e-3
 FORCE_MISFIT_RATIO = 0.1
-_STARTS = (0.0, -0.7, 0.7)
-"""In standard deviations of the priors: where fits begin; the best one counts."""
+_STARTS = (0.0, -0.7, 0.7)  #: In standard deviations of the priors: where fits begin; the best one counts
 
 
 class LawFit(NamedTuple):
@@ -372,25 +352,16 @@ def predict(fit: LawFit, trials: Trials, given: str = "load") -> Prediction:
 
 
 class SoilParameter(NamedTuple):
-    """A parameter of a law.
+    """A parameter of a law."""
 
-    Parameters
-    ----------
-    name : ends in its unit, or in ``ratio`` or ``exponent``
-    value : of the fit to all trials
-    interval : 95 %: what holds both the bootstrap over settings of slip and angle, which knows nothing of what the
-        prior pulls, and what the fit with its prior leaves open
-    prior_std : standard deviation that the prior holds it with
-    informed_ratio : standard deviation with the trials over that without them
-    identified : whether the trials narrow it to less than half, away from its bounds
-    """
-
-    name: str
-    value: float
+    name: str  #: ends in its unit, or in ``ratio`` or ``exponent``
+    value: float  #: of the fit to all trials
+    #: 95 %: what holds both the bootstrap over settings of slip and angle, which knows nothing of what the prior
+    #: pulls, and what the fit with its prior leaves open
     interval: tuple[float, float]
-    prior_std: float
-    informed_ratio: float
-    identified: bool
+    prior_std: float  #: standard deviation that the prior holds it with
+    informed_ratio: float  #: standard deviation with the trials over that without them
+    identified: bool  #: whether the trials narrow it to less than half, away from its bounds
 
 
 def parameters_of(
@@ -448,19 +419,16 @@ def cohesion_profile(
 
 
 class ModulusSpread(NamedTuple):
-    """Pressure in Pa at a depth of one wheel width that carries the measured load at the measured sinkage.
+    """Pressure in Pa at a depth of one wheel width that carries the measured load at the measured sinkage."""
 
-    Parameters
-    ----------
-    rolling_pa : median of trials that roll straight ahead, |slip| below 0.3 and angle below 8 degrees
-    smallest_pa, largest_pa : 5 and 95 % over all trials
-    load_error_ratio : root mean square of the logarithm of the load by the median modulus over the measured
-    """
-
-    rolling_pa: float
-    smallest_pa: float
+    rolling_pa: (
+        float  #: median of trials that roll straight ahead, |slip| below 0.3 and angle below 8 degrees
+    )
+    smallest_pa: float  #: smallest_pa, largest_pa: 5 and 95 % over all trials
     largest_pa: float
-    load_error_ratio: float
+    load_error_ratio: (
+        float  #: root mean square of the logarithm of the load by the median modulus over the measured
+    )
 
 
 def modulus_spread(fit: LawFit, trials: Trials) -> ModulusSpread:
@@ -481,11 +449,8 @@ PARAMETERS = {
 }
 """Of the simulator's law: where the search begins, and its bounds; they are identified by their logarithms."""
 
-MAX_ANGLE_DEG, MIN_SLIP = 31.0, -0.6
-"""Of trials that roll nearly straight, as a robot's wheels do."""
-
-SINKAGE_M = 5e-3
-"""Error of the sinkage that weighs as much as one of the forces of a tenth of the load."""
+MAX_ANGLE_DEG, MIN_SLIP = 31.0, -0.6  #: Of trials that roll nearly straight, as a robot's wheels do
+SINKAGE_M = 5e-3  #: Error of the sinkage that weighs as much as one of the forces of a tenth of the load
 
 
 class PlainFit(NamedTuple):
@@ -620,13 +585,11 @@ ANGLES_DEG = {"0 to 30 deg": (0.0, 31.0), "45 to 75 deg": (31.0, 76.0), "90 deg"
 BAR_RATIO = 0.15
 """Root mean square error of each force over the load, on slips or angles left out, that is aimed at."""
 
-AXLE_ANGLE_DEG = 89.0
-"""From here on a wheel is dragged along its axle, and stands deeper than its axle."""
+AXLE_ANGLE_DEG = 89.0  #: From here on a wheel is dragged along its axle, and stands deeper than its axle
 
 COHESIONS_PA = (0.0, 250.0, 500.0, 1000.0)
 SIMULATOR_TEXT = "the law of terrain simulate: one limit, one rise, along the resultant slip"
-DEGREE = 4
-"""Of the polynomial that laws are compared with."""
+DEGREE = 4  #: Of the polynomial that laws are compared with
 
 
 class Misfit(NamedTuple):
@@ -746,20 +709,12 @@ def held_out_predictions(
 
 
 class HeldOut(NamedTuple):
-    """Errors of predictions with the slip, or the angle, of each trial left out of the fit.
+    """Errors of predictions with the slip, or the angle, of each trial left out of the fit."""
 
-    Parameters
-    ----------
-    load : sinkage predicted, from slip, angle and load alone
-    sinkage : sinkage measured
-    below_axle_angle : of ``load``, trials but those dragged along the axle
-    reached : whether both forces of ``load`` are within :data:`BAR_RATIO`
-    """
-
-    load: Misfit
-    sinkage: Misfit
-    below_axle_angle: Misfit
-    reached: bool
+    load: Misfit  #: sinkage predicted, from slip, angle and load alone
+    sinkage: Misfit  #: sinkage measured
+    below_axle_angle: Misfit  #: of ``load``, trials but those dragged along the axle
+    reached: bool  #: whether both forces of ``load`` are within :data:`BAR_RATIO`
 
 
 class LawRow(NamedTuple):
@@ -780,62 +735,41 @@ class Checked(NamedTuple):
 
 
 class SoilFile(NamedTuple):
-    """The soil that the simulator takes.
+    """The soil that the simulator takes."""
 
-    Parameters
-    ----------
-    file : that was written; None without ``--out``
-    fit : of the simulator's law to trials that roll nearly straight, with the friction of the last law
-    misfit : of that law on those trials
-    """
-
-    file: Path | None
-    fit: PlainFit
-    misfit: Misfit
+    file: Path | None  #: that was written; None without ``--out``
+    fit: PlainFit  #: of the simulator's law to trials that roll nearly straight, with the friction of the last law
+    misfit: Misfit  #: of that law on those trials
 
 
 @dataclass(frozen=True, slots=True)
 class WheelResult:
-    """One wheel.
+    """One wheel."""
 
-    Parameters
-    ----------
-    wheel, n_trials, n_settings : which, and how much of it
-    load_range_n, sinkage_range_m : smallest and largest mean of a trial
-    coupling : of the testbed, by which the measured traction is corrected; its trials are judged nowhere
-    deeper_than_axle : number of trials whose sinkage is over the wheel's radius
-    laws : compared, in the order in which they were asked for
-    law : the last one, whose figures follow
-    parameters : by name
-    by_slip, by_angle : errors by the commanded wheel speed in mm/s, and the slip angle in degrees, left out
-    regimes : errors by regime, slips left out and load known
-    cohesion, modulus : friction by cohesion, and the modulus of the soil as it seems from each trial
-    surrogate_slip, surrogate_angle : errors of a polynomial of slip and angle, for reference
-    checked : on the trials of ``--check``; None without any
-    not_identified : a sentence for each thing that these trials cannot say
-    soil : that was written for the simulator
-    """
-
-    wheel: str
+    wheel: str  #: wheel, n_trials, n_settings: which, and how much of it
     n_trials: int
     n_settings: int
-    load_range_n: tuple[float, float]
+    load_range_n: tuple[float, float]  #: load_range_n, sinkage_range_m: smallest and largest mean of a trial
     sinkage_range_m: tuple[float, float]
-    coupling: Coupling
-    deeper_than_axle: int
-    laws: tuple[LawRow, ...]
-    law: str
-    parameters: Mapping[str, SoilParameter]
+    coupling: Coupling  #: of the testbed, by which the measured traction is corrected; its trials are judged nowhere
+    deeper_than_axle: int  #: number of trials whose sinkage is over the wheel's radius
+    laws: tuple[LawRow, ...]  #: compared, in the order in which they were asked for
+    law: str  #: the last one, whose figures follow
+    parameters: Mapping[str, SoilParameter]  #: by name
+    #: by_slip, by_angle: errors by the commanded wheel speed in mm/s, and the slip angle in degrees, left out
     by_slip: Mapping[float, Misfit]
     by_angle: Mapping[float, Misfit]
-    regimes: Mapping[str, Misfit]
+    regimes: Mapping[str, Misfit]  #: errors by regime, slips left out and load known
+    #: cohesion, modulus: friction by cohesion, and the modulus of the soil as it seems from each trial
     cohesion: tuple[CohesionRow, ...]
     modulus: ModulusSpread
-    surrogate_slip: Misfit
+    surrogate_slip: (
+        Misfit  #: surrogate_slip, surrogate_angle: errors of a polynomial of slip and angle, for reference
+    )
     surrogate_angle: Misfit
-    checked: Checked | None
-    not_identified: tuple[str, ...]
-    soil: SoilFile
+    checked: Checked | None  #: on the trials of ``--check``; None without any
+    not_identified: tuple[str, ...]  #: a sentence for each thing that these trials cannot say
+    soil: SoilFile  #: that was written for the simulator
 
     @property
     def verdict(self) -> str:

@@ -37,8 +37,7 @@ LAWS: dict[str, tuple[str, ...]] = {
 """The numbers of each traction law."""
 
 RESISTANCE = ("rolling_resistance_ratio", "slip_sinkage_ratio")
-ROLLERS = "roller_friction_ratio"
-"""Of omni wheels: friction of their rollers over the load; may be left out."""
+ROLLERS = "roller_friction_ratio"  #: Of omni wheels: friction of their rollers over the load; may be left out
 
 SINKAGE = ("kc_npmn1", "kphi_npmn2", "sinkage_exponent_ratio")
 
@@ -76,39 +75,27 @@ class Scatter(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Soil:
-    """One kind of ground; numbers that its law does not have, or that are not given, are NaN.
+    """One kind of ground; numbers that its law does not have, or that are not given, are NaN."""
 
-    Parameters
-    ----------
-    name : the terrain's label
-    law : ``janosi`` or ``magic``
-    rolling_resistance_ratio : resistance of the rolling wheel over its load, without compaction
-    slip_sinkage_ratio : exponent by which sinkage grows with slip; 0 where it does not
-    roughness_m3 : ISO 8608 displacement spectral density at 0.1 cycles/m, of waviness 2
-    cohesion_pa, friction_angle_rad, shear_modulus_m : c and phi of Mohr and Coulomb, K of Janosi and Hanamoto
-    stiffness_ratio, shape_ratio, peak_friction_ratio, curvature_ratio : B, C, D, E of the Magic Formula
-    kc_npmn1, kphi_npmn2, sinkage_exponent_ratio : kc, kphi and n of Bekker
-    roller_friction_ratio : of omni wheels' rollers over the load, with any law
-    scatter : how numbers differ from run to run and along a run
-    """
-
-    name: str
-    law: str
-    rolling_resistance_ratio: float
-    slip_sinkage_ratio: float
-    roughness_m3: float
+    name: str  #: the terrain's label
+    law: str  #: ``janosi`` or ``magic``
+    rolling_resistance_ratio: float  #: resistance of the rolling wheel over its load, without compaction
+    slip_sinkage_ratio: float  #: exponent by which sinkage grows with slip; 0 where it does not
+    roughness_m3: float  #: ISO 8608 displacement spectral density at 0.1 cycles/m, of waviness 2
+    #: cohesion_pa, friction_angle_rad, shear_modulus_m: c and phi of Mohr and Coulomb, K of Janosi and Hanamoto
     cohesion_pa: float = math.nan
     friction_angle_rad: float = math.nan
     shear_modulus_m: float = math.nan
+    #: stiffness_ratio, shape_ratio, peak_friction_ratio, curvature_ratio: B, C, D, E of the Magic Formula
     stiffness_ratio: float = math.nan
     shape_ratio: float = math.nan
     peak_friction_ratio: float = math.nan
     curvature_ratio: float = math.nan
-    kc_npmn1: float = math.nan
+    kc_npmn1: float = math.nan  #: kc_npmn1, kphi_npmn2, sinkage_exponent_ratio: kc, kphi and n of Bekker
     kphi_npmn2: float = math.nan
     sinkage_exponent_ratio: float = math.nan
-    roller_friction_ratio: float = math.nan
-    scatter: tuple[Scatter, ...] = ()
+    roller_friction_ratio: float = math.nan  #: of omni wheels' rollers over the load, with any law
+    scatter: tuple[Scatter, ...] = ()  #: how numbers differ from run to run and along a run
 
     @property
     def thrust_field_ratio(self) -> float:

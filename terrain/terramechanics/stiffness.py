@@ -28,23 +28,15 @@ from terrain.terramechanics.traction import ground_record, net_pull, wheel_groun
 
 TABLE = "stiffness.yaml"
 
-N_SLIPS = 100
-"""Slips from 0 to 0.99 among which the largest net pull is found."""
+N_SLIPS = 100  #: Slips from 0 to 0.99 among which the largest net pull is found
 
 
 class GroundResponse(NamedTuple):
-    """What a ground does under a wheel.
+    """What a ground does under a wheel."""
 
-    Parameters
-    ----------
-    level : by which :func:`response_of` orders grounds first
-    sinkage_m : of the wheel that rolls without slip
-    difficulty_ratio : resistance over the largest thrust
-    """
-
-    level: StiffnessLevel
-    sinkage_m: float
-    difficulty_ratio: float
+    level: StiffnessLevel  #: by which :func:`response_of` orders grounds first
+    sinkage_m: float  #: of the wheel that rolls without slip
+    difficulty_ratio: float  #: resistance over the largest thrust
 
 
 def stiffness_level(soil: Soil) -> StiffnessLevel:

@@ -50,8 +50,7 @@ GROUND = record(
 """A soil under a wheel: whether it is a road, the wheel, and the numbers of :class:`Soil`, with tan(phi) and
 k = kc + b kphi."""
 
-_SMALL = 0.01
-"""Below this s l / K a series is nearer the truth than a difference of nearly equal numbers."""
+_SMALL = 0.01  #: Below this s l / K a series is nearer the truth than a difference of nearly equal numbers
 
 _N_BRACKETS = 1000
 """Steps of slip in which a balance is sought: a reach within the 0.001 beside a peak goes unseen."""

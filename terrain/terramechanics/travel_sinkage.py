@@ -44,8 +44,7 @@ does not grow with depth.  The others are factors and exponents of the order of 
 LYASKO: dict[str, tuple[float, float]] = {"rolling_m": (0.0144, 0.0072), "slip_exponent": (1.0, 1.0)}
 DING: dict[str, tuple[float, float]] = {"pressure_kpa": (50.0, 50.0), "exponent_slip": (0.5, 0.5)}
 
-DEEPEST_RATIO = 1.9
-"""Deepest sinkage over the radius: at 2 the wheel is under the soil."""
+DEEPEST_RATIO = 1.9  #: Deepest sinkage over the radius: at 2 the wheel is under the soil
 
 
 def travel_sinkage(
