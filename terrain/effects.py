@@ -33,6 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from enum import Enum
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -460,6 +461,10 @@ def _undo_camera_yaw(block: Block, angle_rad: float) -> None:
 
 KINEMATICS = "kinematics of a planar robot"
 
+_contact = partial(effect, stage=Stage.CONTACT)
+_sensor = partial(effect, sensed_only=True, stage=Stage.SENSORS)
+_described_sensor = partial(effect, sensed_only=True, stage=Stage.DESCRIPTION)
+
 
 def _steering_offset(wheel: int) -> Effect:
     name = f"steering_offset_{wheel}"
@@ -585,7 +590,7 @@ OTHER_LOGGER = (
 )  #: Streams that are not stamped by the logger of the wheels.
 #: They change what a log holds of a motion; most of them nothing else.
 SENSORS: tuple[Effect, ...] = (
-    effect(
+    _described_sensor(
         "gyro_bias",
         # 3 deg/s, the zero error of MEMS gyros as data sheets have it (Bosch BMI055: 1 deg/s)
         Parameter("radps", -0.05, 0.05, 0.001, scatter_rank=1),
@@ -598,10 +603,8 @@ SENSORS: tuple[Effect, ...] = (
         inverse=Inverse(
             ("imu",), "gyro - b where the description has no home; fused yaw - b t", undo=_undo_gyro
         ),
-        sensed_only=True,
-        stage=Stage.DESCRIPTION,
     ),
-    effect(
+    _sensor(
         "gyro_scale",
         # data sheets of MEMS gyros have 1 to 4 %; a part that is off by more than 15 % is broken
         Parameter("ratio", -0.15, 0.15, 0.01, as_percent=True, is_error=True),
@@ -611,12 +614,10 @@ SENSORS: tuple[Effect, ...] = (
         (GYRO,),
         "turns, and an absolute heading on a skid-steer robot",
         inverse=Inverse(("imu",), "(gyro - bias) / (1 + k) + bias; fused yaw / (1 + k)", undo=_undo_gyro),
-        sensed_only=True,
-        stage=Stage.SENSORS,
         twins=(("effective_track", HEADING),),
         words=_sided(100.0, "a gyro that reads {number} % too {side}", "much", "little"),
     ),
-    effect(
+    _described_sensor(
         "accel_bias",
         Parameter("mps2", -2.0, 2.0, 0.02, scatter_rank=2),
         "accelerometer = a_x + g sin th + b",
@@ -626,8 +627,6 @@ SENSORS: tuple[Effect, ...] = (
         "several runs, since every power-on has a bias of its own",
         homes=(Home("sensors", "accel_bias_x_mps2", Combine.ADDED, scaled_by="accel_scale_x_ratio"),),
         inverse=Inverse(("imu",), "accelerometer - b", ("accel_x_",), Combine.SUBTRACTED, without_home=True),
-        sensed_only=True,
-        stage=Stage.DESCRIPTION,
         aliases=("accelerometer_mounting_pitch",),
     ),
     effect(
@@ -644,7 +643,7 @@ SENSORS: tuple[Effect, ...] = (
         stage=Stage.DESCRIPTION,
         words=_late("the IMU"),
     ),
-    effect(
+    _described_sensor(
         "camera_latency",
         # measured: 0.16 s (Husky) and 0.3 to 0.5 s (Warthog), poses of a lidar's scans, DRIVE
         Parameter("s", 0.0, 1.0, 0.005),
@@ -654,11 +653,9 @@ SENSORS: tuple[Effect, ...] = (
         (SPEED_X, SPEED_Y, HEADING),
         "accelerations at two frequencies",
         homes=(Home("camera", "latency_s", Combine.ADDED),),
-        sensed_only=True,
-        stage=Stage.DESCRIPTION,
         words=_late("the camera or lidar"),
     ),
-    effect(
+    _sensor(
         "camera_yaw",
         Parameter("rad", -0.3, 0.3, 0.005),
         "camera = R(-a) (v_x, v_y): mounted turned to the left by -a, v_y grows by a v",
@@ -672,22 +669,15 @@ SENSORS: tuple[Effect, ...] = (
             undo=_undo_camera_yaw,
             act=_act_camera_yaw,
         ),
-        sensed_only=True,
-        stage=Stage.SENSORS,
         words=_sided(math.degrees(1.0), "the camera turned {number}° to the {side}", "right", "left"),
     ),
     Effect(
         "lever_arm",
         tuple(
             Parameter(
-                f"lever_{axis}_m",
-                -1.0,
-                1.0,
-                0.02,
-                homes=(Home("camera", f"lever_{axis}_m", Combine.ADDED),),
-                is_error=True,
+                f"{name}_m", -1.0, 1.0, 0.02, (Home("camera", f"{name}_m", Combine.ADDED),), is_error=True
             )
-            for axis in ("x", "y")
+            for name in ("lever_x", "lever_y")
         ),
         "v_x - l_y w, v_y + l_x w at the camera",
         KINEMATICS,
@@ -798,7 +788,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         "arcs of several yaw rates",
         words=_turn_drag,
     ),
-    effect(
+    _contact(
         "force_slip",
         Parameter("ratio", -0.3, 3.0, 0.02, scatter_rank=8),
         "v = u - |u| c f",
@@ -806,9 +796,8 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         EVERY,
         (SPEED_X, SPEED_Y),
         "slopes and accelerations",
-        stage=Stage.CONTACT,
     ),
-    effect(
+    _contact(
         "shear_slip",
         Parameter("ratio", 0.0, 3.0, 0.02),
         "f = f_max (1 - K/(s l) (1 - exp(-s l/K))), with K/l = c f_max / 2 so that c is its slip per force "
@@ -817,9 +806,8 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         WITH_IMU,
         (SPEED_X, SPEED_Y),
         "tractions over half of f_max, of both small and large size",
-        stage=Stage.CONTACT,
     ),
-    effect(
+    _contact(
         "slip_resistance",
         Parameter("ratio", 0.0, 5.0, 0.05),
         "resistance grows by b |s| W",
@@ -827,9 +815,8 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         BOTH,
         (CURRENT, SPEED_X),
         "a range of slip",
-        stage=Stage.CONTACT,
     ),
-    effect(
+    _contact(
         "rolling_resistance",
         # without currents it shows by the slip that it takes, as a smaller wheel radius does
         Parameter("ratio", -0.05, 0.5, 0.005, scatter_rank=7),
@@ -838,9 +825,8 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         BOTH,
         (CURRENT, SPEED_X),
         "several speeds, forward and backward",
-        stage=Stage.CONTACT,
     ),
-    effect(
+    _contact(
         "viscous_drag",
         Parameter("nspm", 0.0, 500.0, 3.0),
         "resistance grows by c v",
@@ -848,7 +834,6 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         BOTH,
         (CURRENT, SPEED_X),
         "three speeds",
-        stage=Stage.CONTACT,
     ),
 )
 
@@ -889,7 +874,7 @@ SIDEWAYS: tuple[Effect, ...] = (
         (CURRENT, TURNING_CURRENT, SPEED_X),
         "turns",
     ),
-    effect(
+    _contact(
         "side_hill_slip",
         Parameter("ratio", 0.0, 5.0, 0.05),
         "v_y = -c ph |v|",
@@ -897,7 +882,6 @@ SIDEWAYS: tuple[Effect, ...] = (
         WITH_IMU,
         (SPEED_Y,),
         "both signs of roll",
-        stage=Stage.CONTACT,
     ),
 )
 
@@ -918,7 +902,7 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         twins=(("motor_constant", SPEED_X),),
         beside=((OMNI, "roller_friction"),),
     ),
-    effect(
+    _described_sensor(
         "motor_constant",
         Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True, is_error=True),
         "current (1 + q)",
@@ -928,11 +912,9 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         "accelerations and slopes",
         homes=(Home("motors", "torque_constant_nmpa", Combine.OVER),),
         inverse=Inverse(("wheels",), "current / (1 + q)", ("current_",), Combine.OVER, without_home=True),
-        sensed_only=True,
-        stage=Stage.DESCRIPTION,
         twins=(("payload", SPEED_X),),
     ),
-    effect(
+    _sensor(
         "motor_drift",
         Parameter("ratio", -0.5, 1.0, 0.01, as_percent=True),
         "current (1 + q t / 60 s) from the start of a run",
@@ -947,10 +929,8 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
             undo=_undo_motor_drift,
             act=_act_motor_drift,
         ),
-        sensed_only=True,
-        stage=Stage.SENSORS,
     ),
-    effect(
+    _sensor(
         "current_offset",
         # zero of a Hall sensor: up to 2 % of a range of 50 to 200 A
         Parameter("a", -4.0, 4.0, 0.05),
@@ -960,8 +940,6 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         (CURRENT,),
         "standstill, and driving forward and backward",
         inverse=Inverse(("wheels",), "current of each motor - b", ("current_",), Combine.SUBTRACTED),
-        sensed_only=True,
-        stage=Stage.SENSORS,
     ),
 )
 
@@ -982,11 +960,7 @@ OMNI_WHEELS: tuple[Effect, ...] = (
         # measured: 16 mm ahead by weights (Robotino)
         tuple(
             Parameter(
-                f"load_shift_{axis}_m",
-                -0.05,
-                0.05,
-                0.001,
-                homes=(Home("body", f"com_{axis}_m", Combine.ADDED),),
+                f"load_shift_{axis}_m", -0.05, 0.05, 0.001, (Home("body", f"com_{axis}_m", Combine.ADDED),)
             )
             for axis in ("x", "y")
         ),
