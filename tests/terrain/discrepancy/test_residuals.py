@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from terrain.discrepancy.compared import binned_means, noise_spectrum, run_means, spectrum
-from terrain.discrepancy.evidence import evidence_at
+from terrain.discrepancy.evidence import evidence_at, fit_change
 from terrain.discrepancy.noise import noise_of
 from terrain.discrepancy.residuals import (
     SETTLE_S,
@@ -17,7 +17,6 @@ from terrain.discrepancy.residuals import (
     prepare_inputs,
     rows_of,
 )
-from terrain.discrepancy.selection import fit_change
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SPEED_X, STEPS, vector_of
@@ -283,22 +282,10 @@ def test_intervals_of_zero_mean_noise_have_their_nominal_coverage():
     assert 0.02 < np.mean(missed_bins) < 0.09
 
 
-def test_the_mean_of_a_short_run_scatters_no_more_than_the_noise_itself():
-    """25 rows of noise that remembers 33 of them: as many runs averaged would say far too much."""
-    rng, n, kept = np.random.default_rng(4), 25, 0.97
-    noise = np.empty((600, n))
-    noise[:, 0] = rng.standard_normal(600) / np.sqrt(1 - kept**2)
-    for i in range(1, n):
-        noise[:, i] = kept * noise[:, i - 1] + rng.standard_normal(600)
-    mean, half = run_means(list(noise), [np.ones(n)] * 600, np.array([1.0, -kept]))
-    assert 0.03 < np.mean(np.abs(mean) > half) < 0.08
-    assert half[0] < 1.96 / np.sqrt(1 - kept**2)
-
-
 def test_bins_require_rows_and_intervals_require_runs():
     x = np.linspace(0, 1, 200)
     centres, means, halves = binned_means([x, x], [np.ones(200), np.full(200, np.nan)])
     assert len(centres) == 6
     assert np.isnan(halves).all()
-    np.testing.assert_allclose(means, 1.0)
+    assert_allclose(means, 1.0)
     assert binned_means([np.full(9, np.nan)], [np.ones(9)])[0].size == 0

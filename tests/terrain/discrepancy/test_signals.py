@@ -165,18 +165,15 @@ def test_what_is_slow_late_or_not_there_sets_the_clock_and_what_is_known(husky):
 
 
 def test_a_run_that_cannot_be_compared_is_refused_in_one_sentence(husky, agrimaro):
-    wheels = husky.streams["wheels"]
+    wheels, imu = husky.streams["wheels"], husky.streams["imu"]
     short = replace(husky, streams={name: kept(s, s.time_s < 3.0) for name, s in husky.streams.items()})
-    apart = with_stream(
-        husky, "imu", replace(husky.streams["imu"], time_s=husky.streams["imu"].time_s + 30.0)
-    )
-    one_side = with_stream(husky, "wheels", Stream(wheels.time_s, wheels.values[:, :1], wheels.channels[:1]))
-    speeds = Stream(wheels.time_s, wheels.values[:, :2], wheels.channels[:2])
+    apart = with_stream(husky, "imu", replace(imu, time_s=imu.time_s + 30.0))
+    side, speeds = (Stream(wheels.time_s, wheels.values[:, :n], wheels.channels[:n]) for n in (1, 2))
     for run, robot, message in (
         (husky, AGRIMARO, "is of the robot 'husky', the simulation is of 'agrimaro'"),
         (with_stream(husky, "wheels", None), HUSKY, "no stream 'wheels'"),
         (with_stream(agrimaro, "steering", None), AGRIMARO, "no stream 'steering'"),
-        (one_side, HUSKY, "a speed of each of left, right is required"),
+        (with_stream(husky, "wheels", side), HUSKY, "a speed of each of left, right is required"),
         (short, HUSKY, "have 3.0 s in common, at least 4 s"),
         (apart, HUSKY, "have 0.0 s in common"),
         (replace(husky, streams={"wheels": speeds}), HUSKY, "none of its channels is simulated"),

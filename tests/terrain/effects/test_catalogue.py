@@ -11,23 +11,17 @@ import pytest
 
 import terrain
 from terrain.effects import (
-    ACCEL,
     BOTH,
     CHANNELS,
     CURRENT,
     EVERY,
-    GYRO,
-    HEADING,
     INDEX,
     LIBRARY,
     NUISANCES,
     PARAMETER,
     PARAMETERS,
-    SPEED_X,
-    SPEED_Y,
     SWERVE,
     TILT_OFFSETS,
-    TURNING_CURRENT,
     Stage,
     effect_named,
     library_of,
@@ -50,15 +44,7 @@ ROBOTS = {
     "omni": load_robot("robotino"),
     "bicycle": load_robot("adap2e"),
 }
-NOISE = {
-    GYRO: 0.01,
-    SPEED_X: 0.005,
-    SPEED_Y: 0.005,
-    ACCEL: 0.1,
-    CURRENT: 1.0,
-    TURNING_CURRENT: 1.0,
-    HEADING: 0.02,
-}
+NOISE = dict(zip(CHANNELS, (0.01, 0.005, 0.005, 0.1, 1.0, 1.0, 0.02), strict=True))
 """About what sensors of these robots show of nothing."""
 
 SMALL_ROBOT = {"omni": {CURRENT: 0.15}}
@@ -124,42 +110,30 @@ def responses():
     return found
 
 
-def test_names_are_unique_and_the_neutral_value_lies_within_the_bounds():
+def test_names_are_unique_and_entries_are_whole():
     names = [name for effect in LIBRARY for name in (effect.name, *effect.aliases)]
     parameters = [p.name for effect in LIBRARY for p in effect.parameters]
     assert len(set(names)) == len(names)
     assert len(set(parameters)) == len(parameters)
     assert set(PARAMETERS) == {*parameters, *NUISANCES}
     assert [INDEX[name] for name in PARAMETERS] == list(range(len(PARAMETERS)))
+    ranks = [p.scatter_rank for p in (*PARAMETER.values(), *TILT_OFFSETS) if p.scatter_rank]
+    assert sorted(ranks) == list(range(1, len(NUISANCES) + 1))
+    assert set(NUISANCES) == set(load_scatter()._fields)
     for effect in LIBRARY:
         assert set(effect.drives) <= set(EVERY)
         assert set(effect.channels) <= set(CHANNELS)
-        assert effect.formula
-        assert effect.source
-        assert effect.needs
+        assert all((effect.formula, effect.source, effect.needs))
+        assert (effect.stage is None) == (SWERVE not in effect.drives)
+        robot = ROBOTS["swerve" if SWERVE in effect.drives else effect.drives[0]]
         for p in effect.parameters:
             assert p.low <= 0.0 < p.high
             assert 0.0 < p.step < 0.1 * p.high
             assert p.unit in ("ratio", "rad", "s", "s2", "s2pm", "s2pm2", "m", "a", "radps", "mps2", "nspm")
-
-
-def test_homes_are_numbers_of_a_description():
-    for effect in LIBRARY:
-        robot = ROBOTS["swerve" if SWERVE in effect.drives else effect.drives[0]]
-        for p in effect.parameters:
-            for home in p.homes:
+            assert p.homes or effect.stage is not Stage.DESCRIPTION
+            for home in p.homes:  # a number of a description
                 part = getattr(robot, home.section) if home.section else robot
                 assert isinstance(getattr(part, home.field), float), p.name
-        if effect.stage is Stage.DESCRIPTION:
-            assert all(p.homes for p in effect.parameters)
-        assert (effect.stage is None) == (SWERVE not in effect.drives)
-
-
-def test_ranks_of_scatter_are_those_of_the_scatter_that_is_published():
-    assert tuple(name for name in NUISANCES if name in load_scatter()._fields) == NUISANCES
-    assert set(NUISANCES) == set(load_scatter()._fields)
-    ranks = [p.scatter_rank for p in (*PARAMETER.values(), *TILT_OFFSETS) if p.scatter_rank]
-    assert sorted(ranks) == list(range(1, len(NUISANCES) + 1))
 
 
 ADDED = r'''
@@ -265,20 +239,19 @@ def test_what_acts_on_every_robot_shows_most_in_the_same_channels_of_others(resp
 
 
 def test_twins_are_mutual_and_differ_in_their_distinguishing_channel(responses):
+    """One of the two shows in the channel that parts them, the other does not."""
     for effect in LIBRARY:
         for name, channel in effect.twins:
             twin = effect_named(name)
             assert (effect.name, channel) in twin.twins
-            drives = (
+            shared = (
                 set(effect.drives) & set(twin.drives) & set(BOTH)
             )  # weight changes no slip of omni wheels
-            assert drives
-            for drive in drives:  # one of the two shows in the channel that parts them, the other does not
-                c = CHANNELS.index(channel)
-                one, other = (
-                    responses[drive, e.name] / responses[drive, e.name].max() for e in (effect, twin)
-                )
-                assert min(one[c], other[c]) < 1e-3 < NOTICEABLE < max(one[c], other[c])
+            assert shared
+            for drive in shared:
+                c, both = CHANNELS.index(channel), (responses[drive, e.name] for e in (effect, twin))
+                less, more = sorted(each[c] / each.max() for each in both)
+                assert less < 1e-3 < NOTICEABLE < more
 
 
 def test_an_alias_is_the_effect():
