@@ -308,6 +308,8 @@ NO_TABLE = {"messages": {"topic": "/a"}, "time": None, "channels": {}}
         (AT, {"messages": {"topic": "/a"}}, "'messages' leave out time, channels and position"),
         (AT, NO_TABLE, "has no channels"),
         (AT, NO_TABLE | {"messages": {"topic": "/a", "topics": "/a"}}, "key 'topics' is unknown"),
+        (None, "{robot: r, run_id: a, streams: {imu: {file: ., "
+               "time: {column: t, unit: s}, channels: {a_m: {column: a, unit: m}}}}}", "names no file"),
         (None, "a: [", "is no YAML"),
         (None, "", "the file is None"),
         (None, "- 1", "the file is"),

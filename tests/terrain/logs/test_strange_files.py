@@ -12,10 +12,9 @@ from pyarrow import parquet
 
 from pipelines.data.datasets import load_runs
 from terrain.control.slip_table import load_slip_table
-from terrain.errors import ConfigError, LogError, TerrainError
+from terrain.errors import LogError, TerrainError
 from terrain.files.names import data_folder
 from terrain.logs import tables
-from terrain.logs.mapping import load_mapping
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.robots import load_robot, packaged_robot
@@ -112,26 +111,6 @@ def test_pipes_and_folders_are_no_logs(tmp_path, folder, borealtc_dir):
     (borealtc_dir / "ICE" / "imu_01.csv").unlink()
     os.mkfifo(borealtc_dir / "ICE" / "imu_01.csv")
     assert "imu_01.csv: is a pipe" in refusal(load_runs, borealtc_dir)
-
-
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"robot": "../husky.yaml"}, "map.yaml: robot '../husky.yaml' is no plain name"),
-        ({"file": "{0}/imu.csv"}, "has a brace without its partner"),
-        ({"file": "a\0b"}, "names no file"),
-        ({"file": "."}, "names no file"),
-    ],
-)
-def test_a_mapping_names_a_robot_and_files(tmp_path, change, sentence):
-    time = {"column": "time", "unit": "s"}
-    gyro = {"gyro_z_radps": {"column": "wz", "unit": "rad/s"}}
-    imu = {"file": change.get("file", "{n}.csv"), "time": time, "channels": gyro}
-    mapping = {"robot": change.get("robot", "husky"), "run_id": "a", "streams": {"imu": imu}}
-    (tmp_path / "map.yaml").write_text(yaml.safe_dump(mapping))
-    with pytest.raises(ConfigError) as error:
-        load_mapping(tmp_path / "map.yaml")
-    assert sentence in str(error.value)
 
 
 def test_numbers_beyond_all_bounds_are_no_samples(tmp_path):
