@@ -367,6 +367,26 @@ def _undo_motor_drift(block: Block, e: float) -> None:
     block.values[:, currents] /= factor
 
 
+def _undo_yaw_delay(block: Block, delay_s: float) -> None:
+    """Delay the difference of the sides' wheel speeds, and leave their mean."""
+    names = ("speed_left_mps", "speed_right_mps")
+    if not set(names) <= set(block.channels) or not block.time_s.size:
+        return
+    left, right = (block.channels.index(name) for name in names)
+    half = 0.5 * (block.values[:, right] - block.values[:, left])
+    before_s, before = block.memory.get("yaw_delay", (np.empty(0), np.empty(0)))
+    known, earlier = np.isfinite(half) & np.isfinite(block.time_s), before_s < np.min(block.time_s)
+    time_s = np.concatenate([before_s[earlier], block.time_s[known]])
+    if not time_s.size:
+        return
+    seen = np.concatenate([before[earlier], half[known]])
+    change = np.interp(block.time_s - delay_s, time_s, seen) - half
+    block.values[:, left] -= change
+    block.values[:, right] += change
+    first = max(int(np.searchsorted(time_s, time_s[-1] - delay_s)) - 1, 0)
+    block.memory["yaw_delay"] = time_s[first:], seen[first:]
+
+
 def _undo_steering_backlash(block: Block, half_rad: float) -> None:
     for channel in set(block.robot.steer_channels) & set(block.channels):
         last_rad, follower = block.memory.get(channel, (math.nan, math.nan))
@@ -577,7 +597,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         SKIDDING,
         (GYRO, SPEED_Y, HEADING),
         "steps of the yaw rate",
-        inverse=Inverse(("wheels",), "right minus left wheel speed of t - T; of whole runs only"),
+        inverse=Inverse(("wheels",), "right minus left wheel speed of t - T", undo=_undo_yaw_delay),
         words=_late("the robot turning"),
     ),
 )

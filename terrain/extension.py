@@ -299,27 +299,7 @@ def corrected_log(run: RunLog, robot: Robot) -> RunLog:
         name: Stream(*correction(name, stream.channels, stream.time_s, stream.values), stream.channels)
         for name, stream in run.streams.items()
     }
-    delay_s = robot.effects.get("yaw_delay_s", 0.0)
-    if delay_s and "wheels" in streams:
-        streams["wheels"] = _delay_turning(streams["wheels"], delay_s)
     return replace(run, streams=streams)
-
-
-def _delay_turning(wheels: Stream, delay_s: float) -> Stream:
-    """Delay the difference of the sides' wheel speeds, and leave their mean."""
-    names = [f"speed_{side}_mps" for side in ("left", "right")]
-    if not set(names) <= set(wheels.channels):
-        return wheels
-    left, right = (wheels.channel(name) for name in names)
-    half = 0.5 * (right - left)
-    known = np.isfinite(half)
-    if not known.any():
-        return wheels
-    change = np.interp(wheels.time_s - delay_s, wheels.time_s[known], half[known]) - half
-    values = np.array(wheels.values)
-    values[:, wheels.channels.index(names[0])] -= change
-    values[:, wheels.channels.index(names[1])] += change
-    return Stream(wheels.time_s, values, wheels.channels)
 
 
 class Correction:

@@ -246,7 +246,12 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
         "wheels": Stream(time_s, np.column_stack(measured), channels),
         "imu": Stream(time_s + 0.3, gyro[:, None], ("gyro_z_radps",)),
     }
-    back = corrected_log(RunLog("a", "husky", streams), replace(BARE, effects=effects))
+    robot = replace(BARE, effects=effects)
+    back, live = corrected_log(RunLog("a", "husky", streams), robot), Correction(robot, 0.0)
+    blocks = [slice(at, at + 3) for at in range(0, 600, 3)]
+    values = streams["wheels"].values
+    parts = [live("wheels", channels, time_s[each], values[each])[1] for each in blocks]
+    np.testing.assert_allclose(np.concatenate(parts), back.streams["wheels"].values[:600], atol=1e-12)
     np.testing.assert_allclose(back.streams["imu"].time_s, time_s, atol=1e-12)
     np.testing.assert_allclose(back.streams["imu"].values[:, 0], turn, atol=1e-12)
     wheels = back.streams["wheels"].values
