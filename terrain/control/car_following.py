@@ -210,14 +210,7 @@ class SlipSource(StrEnum):
 
 
 def sideslip_observer(robot: BicycleRobot, source: SlipSource) -> Observer:
-    """Return the observer of a source; of ``none``, one whose slip stays 0.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> sideslip_observer(load_robot("adap2e"), SlipSource.GRIP).name
-    'sideslip-multi'
-    """
+    """Return the observer of a source; of ``none``, one whose slip stays 0."""
     if source is SlipSource.NONE:
         return Sideslip(robot, "sideslip-kinematic", SETTINGS["sideslip-kinematic"]._replace(by_fixes=False))
     name = SlipSource.MULTI if source is SlipSource.GRIP else source
@@ -249,14 +242,9 @@ def grip_step(
     slip_std: Array,
     dt_s: float,
 ) -> Grip:
-    """Return the next grip.
+    """Return the next grip, by the lateral specific force u r + g sin a and estimated slips (2,).
 
-    Parameters
-    ----------
-    robot, grip : whose tyres; as it was
-    force_mps2 : lateral specific force, u r + g sin a
-    slips, slip_std : (2,) as estimated; NaN shows nothing
-    dt_s : since the step before
+    NaN shows nothing.
 
     Examples
     --------
@@ -274,11 +262,11 @@ def grip_step(
     used = abs(force_mps2) / GRAVITY_MPS2
     if used < _SHOWS:
         return Grip(mu, variance)
-    base = robot.com_ahead_m + robot.com_behind_front_m
-    arms = robot.com_ahead_m, robot.com_behind_front_m
     stiffness = robot.front_cornering_npr, robot.rear_cornering_npr
-    for slip, std, arm, c_0 in zip(slips.tolist(), slip_std.tolist(), arms, stiffness, strict=True):
-        load = robot.mass_kg * GRAVITY_MPS2 * arm / base
+    loads = GRAVITY_MPS2 * _axle_masses(robot)
+    for slip, std, load, c_0 in zip(
+        slips.tolist(), slip_std.tolist(), loads.tolist(), stiffness, strict=True
+    ):
         if not (abs(slip) < 1.5 and std < 1.0) or slip * force_mps2 > 0.0:
             continue
         slope = c_0 / load
@@ -337,9 +325,13 @@ def expected_slips(
     row = path.row_at(distance_m)
     curvature, roll = float(path.curvature_pm[row]), _roll_at(path, row, roll_rad)
     force = speed_mps * speed_mps * curvature + GRAVITY_MPS2 * math.sin(roll)
-    base = robot.com_ahead_m + robot.com_behind_front_m
+    return np.clip(-_axle_masses(robot) * force / stiffness_npr, -0.2, 0.2)
+
+
+def _axle_masses(robot: BicycleRobot) -> Array:
+    """Return the mass (2,) in kg that front and rear axle carry."""
     arms = np.array([robot.com_ahead_m, robot.com_behind_front_m])
-    return np.clip(-robot.mass_kg * arms / base * force / stiffness_npr, -0.2, 0.2)
+    return np.asarray(robot.mass_kg * arms / arms.sum())
 
 
 class FollowedTick(NamedTuple):
