@@ -84,7 +84,7 @@ class GroupedStack(GroupedClassifier):
             raise DataError("no window was held out by both the SVM and the network; add runs")
         held_out, truth = both[:, rows], np.searchsorted(self.classes_, y[rows])
         run = groups[rows].astype(str)
-        crossed = _cross_joined(held_out, truth, run, self.seed)
+        crossed = cross_joined(held_out, truth, run, self.seed)
         losses = np.stack([-log_of_truth(each, truth) for each in (*held_out, crossed)])
         used = chosen_of(losses, run) if self.choose else "stack"
         alone = {"svm": np.array([1.0, 0.0]), "cnn": np.array([0.0, 1.0])}
@@ -132,7 +132,7 @@ def log_of_truth(probability: Array, class_index: Array) -> Array:
     return np.asarray(np.log(np.maximum(probability[np.arange(len(class_index)), class_index], TINY)))
 
 
-def _cross_joined(probability: Array, class_index: Array, run: Array, seed: int) -> Array:
+def cross_joined(probability: Array, class_index: Array, run: Array, seed: int) -> Array:
     """Return stacked probabilities of each run with weights that were fitted to other runs."""
     n_folds = min(N_CROSS_FOLDS, len(np.unique(run)))
     if n_folds < 2:

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 
 from features.extractor import (
-    MIN_WHEEL_DIFFERENCE_MPS,
     FeatureExtractor,
     SampleExtractor,
     derived_channels,
@@ -189,15 +188,6 @@ def test_the_effective_track_width_is_recovered_from_streams_of_two_rates(track_
     # In the fastest turns the eighths of 13 wheel samples are not quite the eighths of 200 IMU samples.
     assert gain * track_m == pytest.approx(1.0, abs=0.1)
     assert np.mean(gain) * track_m == pytest.approx(1.0, abs=0.015)
-
-
-def test_without_a_turn_there_is_no_turning_slip():
-    imu, wheels = turning_windows(0.6)
-    straight = wheels.copy()
-    straight[:, 1] = straight[:, 0] + 0.9 * MIN_WHEEL_DIFFERENCE_MPS
-    assert np.isnan(by_name(imu, straight)["turning.yaw_per_wheel_difference"]).all()
-    one_sided = by_name(imu, wheels[:, [0, 2]], ("speed_front_mps", "current_front_a"))
-    assert "turning.yaw_per_wheel_difference" not in one_sided
 
 
 def test_per_speed_features_match_their_definitions():

@@ -117,18 +117,6 @@ def test_published_windows_lie_inside_partitions_and_classes_are_balanced_by_str
     assert not np.array_equal(folds[0].test, folds[N_FOLDS].test)
 
 
-def test_published_has_no_rule_of_steady_motion_and_grouped_has():
-    runs = [
-        commanded(f"{terrain}_{speed}", terrain, speed, length_s=24.0)
-        for terrain in ("ICE", "SAND")
-        for speed in (0.0, 0.6)
-    ]
-    assert set(samples_under("published", runs).run_id) == {run.run_id for run in runs}
-    samples = samples_under("grouped", runs)
-    assert set(samples.run_id) == {"ICE_0.6", "SAND_0.6"}
-    assert samples.dropped == {"not moving": 24}
-
-
 def test_what_cannot_be_split_is_refused(drive, drive_all):
     unlabelled = [drive(f"r{i}", "GRASS", i, label=None) for i in range(6)]
     one_class, unnamed = drive_all(("GRASS",), 6), drive_all(n_runs=2)

@@ -11,7 +11,6 @@ from features.windows import (
     cut_windows,
     label_windows,
     layout_of,
-    regular_starts,
 )
 from terrain.errors import ConfigError, DataError
 from terrain.records import Label, RunLog, Stream
@@ -86,18 +85,6 @@ def test_a_fault_drops_the_windows_that_it_touches_and_no_other(stream, change, 
     assert reason in DROP_REASONS
 
 
-@pytest.mark.parametrize("factor", [0.7, 1.5])
-def test_a_stretch_at_another_rate_is_no_window_of_this_length(factor):
-    imu = make_run(duration_s=20.0).streams["imu"]
-    steps = np.full(len(imu), 0.02)
-    steps[300:500] = 0.02 / factor
-    slow = Stream(np.cumsum(steps) - 0.02, imu.values, imu.channels)
-    cut = cut_windows([make_run(duration_s=20.0, imu=slow)])
-    assert set(cut.dropped) == {"wrong rate"}
-    spans = [np.ptp(slow.time_s[w.astype(int)]) for w in cut.windows.values["imu"][:, 0]]
-    assert max(abs(span - 1.98) for span in spans) <= 0.2 + 0.02
-
-
 def test_steady_motion_is_judged_on_means_of_the_faster_wheel():
     rng = np.random.default_rng(1)
     time_s = np.arange(0, 8, 0.1)
@@ -128,20 +115,6 @@ def test_a_window_across_a_boundary_of_labels_has_no_label():
         *("ice", "ice", "", "snow", "snow", ""),
     ]
     assert list(cut_windows([run]).windows.terrain) == ["ice", "", "snow", "snow"]
-
-
-@given(
-    start_s=st.floats(-1e3, 1e3),
-    n=st.integers(0, 50),
-    length_s=st.floats(0.1, 5),
-    step_s=st.floats(0.05, 5),
-)
-def test_regular_starts_are_all_that_fit(start_s, n, length_s, step_s):
-    end_s = start_s + n * step_s + length_s * 0.999
-    starts_s = regular_starts(start_s, end_s, length_s, step_s)
-    assert (starts_s + length_s <= end_s + 2e-6).all()
-    following_s = start_s + step_s * len(starts_s)
-    assert following_s + length_s > end_s - 1e-6
 
 
 @pytest.mark.parametrize("name", ["length_s", "stride_s", "max_gap_periods"])

@@ -12,7 +12,6 @@ from terrain.classify.coverage import (
     EDGE_STEP_MPS,
     MAX_SPEEDS,
     MIN_WIDTH_MPS,
-    HeldOutSupport,
     Manoeuvre,
     coverage_of,
     errors_left,
@@ -21,7 +20,6 @@ from terrain.classify.coverage import (
     held_out_support,
     manoeuvres,
     speed_edges,
-    support_accuracy,
 )
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import FoldResult, HeldOut
@@ -120,33 +118,6 @@ def test_errors_and_expected_driving_raise_a_gain_and_support_lowers_it(law):
     assert expected_gain(law, *cells(n_errors=40.0))[0] > gain
     assert expected_gain(law, *cells(ratio=0.4))[0] == pytest.approx(2 * gain)
     assert expected_gain(law, *cells(runs=9.0))[0] < gain
-
-
-def drawn(seed, n=80, repeats=3):
-    rng = np.random.default_rng(seed)
-    runs = rng.integers(0, 8, (2, repeats, n))
-    probability = rng.random((repeats, n))
-    right = rng.random((repeats, n)) < 0.3 + 0.6 * runs[0] / 8
-    place = np.sort(rng.integers(0, 10, n))
-    return (
-        HeldOutSupport(right, runs[0], runs[1], probability, probability > 0.5),
-        place.astype(str),
-        np.where(place < 5, "ice", "mud"),
-    )
-
-
-@given(st.integers(0, 1000))
-def test_levels_and_marks_divide_windows_and_errors(seed):
-    held_out, run_id, terrain = drawn(seed)
-    levels, *marks, _ = support_accuracy(held_out, run_id, terrain, np.random.default_rng(0))
-    for parts in (list(levels.values()), marks):
-        assert sum(part.windows_ratio for part in parts) == pytest.approx(1)
-        assert sum(part.errors_ratio for part in parts) == pytest.approx(1)
-        mean = sum(part.windows_ratio * (part.accuracy or 0) for part in parts)
-        assert mean == pytest.approx(held_out.correct.mean())
-        for part in parts:
-            low, high = part.windows_ratio_ci
-            assert low <= high
 
 
 @pytest.mark.parametrize("speeds", [(0.2, 0.4, 0.6, 0.8), (0.24, 0.39, 0.63, 0.79), (0.5,), (0.3, 2.0)])

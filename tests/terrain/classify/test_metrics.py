@@ -135,22 +135,6 @@ def test_figures_of_hand_made_predictions():
     assert figures(runs, start_s, y, answers[:1], folds[:2]).accuracy_spread is None
 
 
-@pytest.mark.parametrize(
-    ("runs", "first", "answers", "accuracy", "size"),
-    [
-        # run x1 in fold 12 and run x11 in fold 2: both would be x112 if names and numbers were just joined
-        (["x1"] * 3 + ["x11"] * 3, 3, ["ice"] * 3 + ["mud"] * 3, 1.0, 2.0),
-        # blocks of one run: a vote would otherwise reach into the block that another fold tested
-        (["a"] * 6 + ["b"], 3, ["mud"] * 3 + ["ice"] * 3 + ["mud"], 4 / 7, 13 / 7),
-    ],
-)
-def test_votes_stay_within_a_run_and_a_fold(runs, first, answers, accuracy, size):
-    y = ["ice"] * 3 + ["mud"] * 3 if "x1" in runs else ["ice"] * 6 + ["mud"]
-    folds = [Fold(0, 12, NONE, np.arange(first)), Fold(0, 2, NONE, np.arange(first, len(y)))]
-    found = figures(runs, range(len(y)), y, [answers], folds)
-    assert (found.vote_accuracy, found.vote_windows) == (accuracy, pytest.approx(size))
-
-
 def once(n):
     return np.ones((1, n))
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.classify.network import SampleColumns
-from terrain.classify.stack import GroupedStack, chosen_of, fit_weights, joined
+from terrain.classify.stack import GroupedStack, chosen_of, cross_joined, fit_weights, joined
 from terrain.errors import DataError
 
 COLUMNS = (SampleColumns("imu", ("accel_z_mps2",), 50.0, 50),)
@@ -77,3 +77,24 @@ def test_rows_without_features_are_refused():
         quick().fit(X[:, N_FEATURES:], y, run)
     with pytest.raises(DataError, match="all windows are 'ice'"):
         quick().fit(X, np.full(len(y), "ice"), run)
+
+
+def test_what_does_not_help_is_not_kept():
+    best = quick(choose=True).fit(*draw("features"))
+    assert best.best_.used == "svm"
+    assert best.network_ is None
+    X = draw("features", seed=2)[0]
+    assert np.array_equal(best.predict_proba(X), best.svm_.predict_proba(X[:, :N_FEATURES]))
+
+
+def test_the_loss_of_a_stack_is_by_weights_of_other_runs():
+    rng = np.random.default_rng(0)
+    both, truth, run = (
+        rng.dirichlet(np.ones(3), (2, 60)),
+        rng.integers(3, size=60),
+        np.repeat(np.arange(3), 20),
+    )
+    crossed = cross_joined(both, truth, run, 0)
+    for other in range(3):
+        weights = fit_weights(both[:, run != other], truth[run != other])
+        np.testing.assert_allclose(crossed[run == other], joined(both[:, run == other], weights))

@@ -102,8 +102,3 @@ def test_a_wrong_class_of_the_right_level_costs_little():
     assert apart.cost_ci[0] <= apart.cost <= apart.cost_ci[1]
     assert -1.0 <= apart.clusters.interval[0] <= apart.clusters.interval[1] <= 1.0
     assert apart.levels == {"asphalt": "HARD", "concrete": "HARD", "snow": "SOFT"}
-
-
-def test_without_two_known_levels_there_are_no_figures():
-    assert figures_of(TERRAIN, TERRAIN, known={"asphalt": HARD, "concrete": HARD}) is None
-    assert figures_of(TERRAIN, TERRAIN, known=dict.fromkeys(KNOWN, HARD)) is None

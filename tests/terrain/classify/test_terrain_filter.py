@@ -67,17 +67,6 @@ def test_refused_windows_only_let_time_pass():
     np.testing.assert_allclose(forgotten.probability, THREE.grounds, atol=1e-12)
 
 
-def test_a_finer_stride_brings_no_more_evidence():
-    row = np.array([0.6, 0.3, 0.1])
-    long = THREE._replace(dwell_s=1e9, evidence_s=2.0)
-    begin = FilterBelief(THREE.grounds, 0.0)
-    coarse = filter_step(begin, row, 2.0, long)
-    fine = begin
-    for _ in range(16):
-        fine = filter_step(fine, row, 0.125, long)
-    np.testing.assert_allclose(fine.probability, coarse.probability, atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
