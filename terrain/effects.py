@@ -1318,11 +1318,7 @@ def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict
 def read_effects(place: str, described: Any, drive: str) -> tuple[dict[str, float], Array]:
     """Return the values of a section by parameter, and their covariance (n, n) in the same order, NaN without one.
 
-    Parameters
-    ----------
-    place : file and section, as messages name them
-    described : what the file holds
-    drive : of the robot
+    ``place`` is file and section, as messages name them.
 
     Raises
     ------

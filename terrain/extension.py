@@ -305,10 +305,7 @@ def corrected_log(run: RunLog, robot: Robot) -> RunLog:
 class Correction:
     """Takes a robot's effects off samples, a run in one block or block by block.
 
-    Parameters
-    ----------
-    robot : with its effects
-    start_s : first stamp of the wheels, from which drifts count; the first stamp that comes by default
+    Drifts count from the first stamp of the wheels, ``start_s``, by default from the first stamp that comes.
     """
 
     def __init__(self, robot: Robot, start_s: float = math.nan) -> None:
@@ -327,13 +324,7 @@ class Correction:
     def __call__(
         self, name: str, channels: tuple[str, ...], time_s: Array, values: Array
     ) -> tuple[Array, Array]:
-        """Return stamps (k,) and values (k, c) of the samples that follow on those given before.
-
-        Parameters
-        ----------
-        name, channels : of the stream
-        time_s, values : (k,), (k, c) as measured
-        """
+        """Return stamps (k,) and values (k, c) of the samples of a stream that follow on those given before."""
         if math.isnan(self._start_s):
             finite = time_s[np.isfinite(time_s)]
             if not finite.size:
@@ -440,10 +431,9 @@ def extended_yaml(
 
     Parameters
     ----------
-    robot_name : name of a robot or path of its YAML file
-    values : by parameter
-    covariance : (n, n) of the values in their order
-    intervals : 95 % of each value, by parameter
+    robot_name : or path of its YAML file
+    values, covariance : by parameter, and (n, n) in their order
+    intervals : 95 % of each value
     source : of the numbers, in words
     region : of driving, that they were validated in
 

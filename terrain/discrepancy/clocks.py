@@ -242,13 +242,7 @@ def latencies_of(signals: Sequence[Signals], simulation: Simulation, seed: int =
 
     The gyro measures the IMU; heading rate and speed measure the camera, which is the earlier of the two: a
     body may move late, and no channel can be early.  A gyro that is late behind the speed alone may be that
-    of a body that turns late; only a heading distinguishes the two.
-
-    Parameters
-    ----------
-    signals : of all runs
-    simulation : its prediction may be wrong in size and in sign
-    seed : of the bootstrap
+    of a body that turns late; only a heading distinguishes the two.  The prediction may be wrong in size and in sign.
     """
     pairs, lags = [_run_pairs(run, simulation) for run in signals], {}
     for name in CLOCKED:

@@ -261,13 +261,9 @@ def binned_means(inputs: Sequence[Array], residuals: Sequence[Array]) -> BinnedM
 
 
 def run_means(residuals: Sequence[Array], sizes: Sequence[Array], weights: Array) -> tuple[Array, Array]:
-    """Return the mean of each run and half its 95 % interval, if all but the mean is coloured noise.
+    """Return the mean of each run (m,) and half its 95 % interval, if all but the mean is coloured noise.
 
-    Parameters
-    ----------
-    residuals : (m,) of each run
-    sizes : (m,) of the noise
-    weights : of the filter that whitens it
+    ``sizes`` (m,) are those of the noise, ``weights`` those of the filter that whitens it.
     """
     covariance = np.fft.irfft(1.0 / np.abs(np.fft.rfft(weights, COVARIANCE_ROWS)) ** 2)
     means, halves = [], []

@@ -67,11 +67,8 @@ def responses_of(
 ) -> tuple[Response, ...]:
     """Return the responses of runs, each channel on its clock.
 
-    Parameters
-    ----------
-    rows : of all runs
-    latencies : of all runs together; without them the medians of those that each run measures
-    shift : of each run, where it measures one of its own
+    The clock is the run's own, where it measures one, else that of all runs together; without it the median of those
+    that each run measures.
     """
     lag_s = np.full((len(rows), len(CLOCKED)), np.nan) if shift is None else shift.lag_s
     rate = 0.0 if shift is None else shift.rate
@@ -330,6 +327,13 @@ def _fault_words(change: Change, robot: Robot) -> tuple[str, str]:
         what = f"{name} {what}"
         hint = f"unit: {unit}" if unit and unit not in NOT_IN_MAPPINGS else f"scale: {change.factor:.4g}"
     return what, f"multiply {logged} by {change.factor:.4g} (mapping file: {hint})"
+
+
+def _fault(change: Change, has: Sequence[int], every: Sequence[str], seen: str, robot: Robot) -> Fault:
+    """Return the fault of a change in some of the runs, with how it is seen."""
+    ids = tuple(every[i] for i in has)
+    what, repair = _fault_words(change, robot)
+    return Fault(change, ids, f"{what} {in_runs(ids, every)}{seen}; {repair}", repair)
 
 
 def _unit_words(change: Change) -> tuple[str, str]:
@@ -635,24 +639,23 @@ def _unit_fault(
     robot: Robot,
 ) -> Fault:
     """Return the fault of a change in words; it is left out where other readings are as good."""
-    every = [run.run_id for run in responses]
-    ids, middle = tuple(every[i] for i in has), _middle(logs[list(has)])
-    seen = ", ".join(
+    middle = _middle(logs[list(has)])
+    gains = [
         GAIN_WORDS[c].format(math.exp(middle[place]))
         for c, place in _PLACE.items()
         if math.isfinite(middle[place]) and (c == AMPS) is (change.column is Column.CURRENTS)
-    )
-    what, repair = _fault_words(change, robot)
-    sentence = f"{what} {in_runs(ids, every)}: {seen}"
-    if not rivals:
-        return Fault(change, ids, f"{sentence}; {repair}", repair)
-    others = " or ".join(" and ".join(_fault_words(each, robot)[0] for each in reading) for reading in rivals)
-    sentence = f"{sentence}; another reading is as good ({others})"
-    measured = next((each for reading in (changes, *rivals) for each in reading if not each.of_wheels), None)
-    if measured is None:  # of the wheels in either case: without them there is nothing to compare
-        return Fault(change, ids, f"{sentence}; {repair}", repair)
-    left_out = f"{KINDS[measured.column].logged} is left out; state the units that the logger has"
-    return Fault(measured._replace(factor=math.nan), ids, f"{sentence}, so that {left_out}", left_out)
+    ]
+    seen = f": {', '.join(gains)}"
+    if rivals:
+        words = (" and ".join(_fault_words(each, robot)[0] for each in reading) for reading in rivals)
+        seen += f"; another reading is as good ({' or '.join(words)})"
+    fault = _fault(change, has, [run.run_id for run in responses], seen, robot)
+    measured = [each for reading in (changes, *rivals) for each in reading if not each.of_wheels]
+    if not rivals or not measured:  # of the wheels in either case: without them there is nothing to compare
+        return fault
+    left_out = f"{KINDS[measured[0].column].logged} is left out; state the units that the logger has"
+    sentence = f"{fault.sentence.removesuffix(f'; {fault.repair}')}, so that {left_out}"
+    return Fault(measured[0]._replace(factor=math.nan), fault.run_ids, sentence, left_out)
 
 
 # -- Constant offsets of sensors that no bias of the catalogue reaches: sensors not zeroed, or turned ------
@@ -673,10 +676,8 @@ def offset_faults(responses: Sequence[Response], robot: Robot) -> tuple[Fault, .
         if has.size < max(MIN_FAULTY_RATIO * np.isfinite(offsets[:, 0]).sum(), 1):
             continue
         change = Change(FaultKind.OFFSET, column, offset=-float(np.median(offsets[has, 0])))
-        ids = tuple(every[i] for i in has)
-        what, repair = _fault_words(change, robot)
-        where = f"{in_runs(ids, every)}, where a sensor's is below {kind.largest:g}"
-        faults.append(Fault(change, ids, f"{what} {where}; {repair}", repair))
+        below = f", where a sensor's is below {kind.largest:g}"
+        faults.append(_fault(change, has.tolist(), every, below, robot))
     return tuple(faults)
 
 
@@ -753,11 +754,7 @@ def faults_of(
 ) -> tuple[Fault, ...]:
     """Return the faults of channels, in the order in which they are to be repaired: signs, units, offsets.
 
-    Parameters
-    ----------
-    signals, rows : of all runs, in the same order; the rows with the prediction of the simulation
-    simulation, low_pass : of the rows
-    shift, latencies : clocks of the runs where they are known already; from the runs otherwise
+    Clocks are those of the runs, where they are not known already.
     """
     latencies = latencies_of(signals, simulation) if latencies is None else latencies
     logs = _Logs(tuple(signals), tuple(rows), simulation, low_pass, latencies, shift)
@@ -788,10 +785,8 @@ def _turned(logs: _Logs) -> Fault | None:
     change, rivals, every = found[0].change, found[1], [run.run_id for run in logs.rows]
     best = logs.tried(change, before, range(len(every)))
     has = _runs_with(best, every, before.correlation)
-    seen = _gain_sentence(best, before, [i for i in has if best.mends[i]])
-    what, repair = _fault_words(change, robot)
+    seen = f": {_gain_sentence(best, before, [i for i in has if best.mends[i]])}"
     if rivals:
         words = " or ".join(_fault_words(rival.change, robot)[0] for rival in rivals)
         seen += f" (these channels cannot distinguish it from another reading: {words})"
-    ids = tuple(every[i] for i in has)
-    return Fault(change, ids, f"{what} {in_runs(ids, every)}: {seen}; {repair}", repair)
+    return _fault(change, has, every, seen, robot)

@@ -128,17 +128,8 @@ def _window(cutoff_hz: float, rate_hz: float) -> Array:
 def rows_of(
     signals: Signals, planar: Planar, vector: Array, parameters: Sequence[str], low_pass: LowPass
 ) -> Rows:
-    """Return a low-pass filtered run, and the sensitivities to the parameters named.
+    """Return a low-pass filtered run, and the sensitivities to the parameters named, at a vector of them.
 
-    Parameters
-    ----------
-    signals, planar : the run, and the simulation
-    vector : (len(PARAMETERS),) where the prediction and its sensitivities are taken
-    parameters : names
-    low_pass : of all runs
-
-    Notes
-    -----
     The prediction contains the noise of its input, the wheel speeds, and so does the residual, with the
     opposite sign.  A sensitivity along the same wheel speeds contains it too, and where a robot hardly
     changes its motion the noise is most of it: residual and sensitivity are correlated by their noise, and

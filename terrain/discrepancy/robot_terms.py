@@ -40,13 +40,7 @@ SMALL = {"rad": "mrad", "radps": "mrad/s", "s": "ms", "m": "mm"}
 
 
 def in_robot_terms(effect: str, values: Sequence[Value], robot: Robot) -> str:
-    """Return what an effect with its values makes of the robot, as the object of "with".
-
-    Parameters
-    ----------
-    effect : name
-    values : found, over what the robot has of the effect already
-    robot : as it was tested
+    """Return what an effect, with values over what the robot has of it already, makes of the robot, after "with".
 
     Examples
     --------

@@ -18,19 +18,6 @@ from terrain.simulation.planar.motion import Planar, make_planar
 class Simulation:
     """What :func:`terrain.discrepancy.diagnose.diagnose` compares measured runs with.
 
-    Parameters
-    ----------
-    robot : of the runs
-    ground : default terrain
-    grounds : terrains by the label of a run
-    effects : parameters of the effects that are built in already; those not named are 0
-    scatter : standard deviation from run to run of parameters in :data:`NUISANCES`; those not named are 0
-    model_error : how large the simulation's own error is in units of parameters, the same in all runs; what
-        is no larger is not stated
-    varied_error, varied_scatter : mean over runs and scatter of them that conditions may make which differ
-        from run to run, in units of parameters: see :mod:`terrain.discrepancy.varying`
-    probe_error : how much the residual of a channel depends on an input by the simulation's own error
-
     Raises
     ------
     ConfigError
@@ -38,13 +25,21 @@ class Simulation:
     """
 
     robot: Robot
-    ground: Ground = field(default_factory=Ground)
-    effects: Mapping[str, float] = field(default_factory=dict)
+    ground: Ground = field(default_factory=Ground)  #: default terrain
+    effects: Mapping[str, float] = field(
+        default_factory=dict
+    )  #: that are built in already; those not named are 0
+    #: standard deviation from run to run of parameters in NUISANCES; those not named are 0
     scatter: Mapping[str, float] = field(default_factory=dict)
-    grounds: Mapping[str, Ground] = field(default_factory=dict)
+    grounds: Mapping[str, Ground] = field(default_factory=dict)  #: terrains by the label of a run
+    #: how large the simulation's own error is in units of parameters, the same in all runs; what is no larger is not
+    #: stated
     model_error: Mapping[str, float] = field(default_factory=dict)
+    #: mean over runs and scatter of them that conditions may make which differ from run to run, in units of parameters:
+    #: see :mod:`terrain.discrepancy.varying`
     varied_error: Mapping[str, float] = field(default_factory=dict)
     varied_scatter: Mapping[str, float] = field(default_factory=dict)
+    #: how much the residual of a channel depends on an input by the simulation's own error
     probe_error: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

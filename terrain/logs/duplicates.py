@@ -193,10 +193,6 @@ def shared_stretches(runs: Sequence[RunLog]) -> tuple[SharedStretch, ...]:
 
     Of more than two copies, each is found beside some other one, not beside all.
 
-    Parameters
-    ----------
-    runs : with ids of their own
-
     Examples
     --------
     >>> from terrain.records import Stream
@@ -370,12 +366,7 @@ class DistinctRuns(NamedTuple):
 
 
 def distinct_runs(runs: Sequence[RunLog], *, merge: bool) -> DistinctRuns:
-    """Return runs of which no two hold the same measurements.
-
-    Parameters
-    ----------
-    runs : of one data set
-    merge : make one run of those that share a stretch, which then counts once; else they are refused
+    """Return runs of which no two hold the same measurements; merged, those that share a stretch count once.
 
     Raises
     ------
@@ -433,11 +424,6 @@ def merge_runs(runs: Sequence[RunLog], stretches: Sequence[SharedStretch]) -> li
     Of the runs of a group, the first with labels is kept whole; what others hold besides follows it, on its
     clock, with gaps.  A merged run bears the id of the run that was kept whole; what a gap touches is in no
     window.
-
-    Parameters
-    ----------
-    runs : with ids of their own
-    stretches : that they share, as :func:`~terrain.logs.duplicates.shared_stretches` finds them
 
     Raises
     ------

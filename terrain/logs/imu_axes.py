@@ -148,12 +148,7 @@ POWER_SIGN = "currents turned from the sign of the power"
 
 
 def current_sign(current_a: Array, speed_radps: Array) -> str:
-    """Return how a current is signed, where not by direction: as a magnitude, or as the power; else empty.
-
-    Parameters
-    ----------
-    current_a : (n, sides) motor currents
-    speed_radps : (n, sides) of their wheels
+    """Return how currents (n, sides) are signed, where not by direction: as a magnitude, or as the power; else empty.
 
     Examples
     --------

@@ -187,11 +187,6 @@ def _first(check: str, place: str, measured: float, *cases: Case) -> Check:
 def judge(run: RunLog, scale: Scale = UNKNOWN_ROBOT) -> tuple[Check, ...]:
     """Return the verdict on a run in each respect; several of one where several apply.
 
-    Parameters
-    ----------
-    run : as a reader returns it
-    scale : what is known of the robot
-
     Examples
     --------
     An accelerometer in g:
