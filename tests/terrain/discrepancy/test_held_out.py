@@ -14,7 +14,6 @@ from terrain.discrepancy.diagnosed_runs import acting_causes, extend, extended_e
 from terrain.discrepancy.faults import Change, Column, Fault, FaultKind
 from terrain.discrepancy.held_out import (
     DRIVEN,
-    accuracy_change,
     black_box_reference,
     gain_of_signals,
     repair_held_out,
@@ -89,24 +88,6 @@ def test_without_scatter_the_gain_is_that_of_the_whitened_squares(longer):
     )
     # channels have all the same rows here
     assert found.reduction == pytest.approx(1.0 - after / before, rel=1e-9)
-
-
-def test_few_runs_are_cut_into_thirds_and_the_same_seed_gives_the_same_gain(longer):
-    few, again, other = (gain(longer[:2], LONGER, seed) for seed in (3, 3, 4))
-    assert (few.refused, few.clusters) == (False, "thirds of runs")
-    assert as_json(few) == as_json(again)
-    assert few.ci != other.ci
-
-
-def test_the_interval_of_an_accuracy_is_over_runs():
-    rng = np.random.default_rng(0)
-    run_id = np.repeat([f"r{i}" for i in range(20)], 10)
-    before = rng.random(200) < 0.6
-    correct = np.repeat(rng.random(20) < 0.5, 10)  # whole runs become correct
-    low, high = accuracy_change(before, before | correct, run_id, 0).change_ci
-    assert low < (before | correct).mean() - before.mean() < high
-    spread = np.array([(correct & ~before)[run_id == name].mean() for name in np.unique(run_id)]).std()
-    assert high - low == pytest.approx(2 * 1.96 * spread / np.sqrt(20), rel=0.2)
 
 
 # -- Which runs are held out of a diagnosis, and which of them have the faults that were found in the others --

@@ -101,18 +101,6 @@ def test_a_set_of_causes_is_not_reached_twice(three, monkeypatch):
     assert fitted == [{"payload"}, {"payload", "camera_yaw"}, with_third, {"payload", "gyro_bias"}]
 
 
-def test_without_its_entry_in_the_library_a_distinct_cause_stays_unexplained(posed, solve):
-    fit = solve(posed({"camera_yaw_rad": 0.05}, ["camera_latency", "gyro_bias", "accel_bias", "scrub"]))
-    assert (fit.causes, fit.names, fit.change.shape) == ((), (), (0,))
-
-
-def test_names_come_once_and_in_order():
-    lever, payload = effect_named("lever_arm"), effect_named("payload")
-    assert names_of([lever, payload, lever]) == ("lever_x_m", "lever_y_m", "payload_ratio")
-    assert set(names_of(LIBRARY)) <= set(INDEX)
-    assert names_of([]) == ()
-
-
 @pytest.mark.parametrize(
     ("hidden", "library", "seeds"),
     [
@@ -216,11 +204,6 @@ def test_it_leaves_the_least_square_where_runs_differ(of_tracks):
     assert square(best) <= square(float(fit.change[0]))
     # six runs determine a mean to 0.41 of their scatter, 0.4, at the best
     assert 0.08 < float(np.sqrt(one.cov[0, 0])) < 0.4
-
-
-def test_runs_that_are_alike_keep_their_value(of_tracks):
-    problem, fit = of_tracks([0.5] * 4)
-    assert pooled(problem, fit) is fit
 
 
 # -- Which effects fit as well in the place of a cause, by the losses and squares of their fits ------------

@@ -12,8 +12,7 @@ from terrain.discrepancy.clocks import latencies_of, shifts_of
 from terrain.discrepancy.faults import responses_of
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.unfit import clocks_of, common_gains, odd_runs, stalled_runs, unfit_runs
-from terrain.effects import CHANNELS, GYRO, SPEED_X
+from terrain.discrepancy.unfit import clocks_of, odd_runs, stalled_runs, unfit_runs
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
@@ -113,14 +112,6 @@ def test_a_clock_offset_of_one_run_is_found_to_a_hundredth_of_a_second(sound, ev
     # clocks that are known are taken
     assert unfit_runs(signals, info, shift) == unfit
     assert clocks_of(info, shift) == clocks
-
-
-def test_a_clock_requires_excitation_and_a_common_offset_is_no_fault(sound, evidence):
-    signals, info = evidence([late(run, 0.3) for run in [*sound[:3], drive(seed=7, name="stand")]])
-    assert unfit_runs(signals, info) == ()
-    *known, unknown = clocks_of(info)
-    assert_allclose([clock.offset_s for clock in known], 0.3, atol=0.01)
-    assert np.isnan([unknown.offset_s, unknown.std_s]).all()
 
 
 def test_clocks_out_of_the_search_exclude_a_run_and_are_refused_for_most_runs(sound, excluded):
@@ -236,13 +227,6 @@ def test_runs_that_scatter_have_no_outlier_and_none_stalls(n, scatter):
     compared = responses(runs_of(n, scatter))
     assert odd_runs(compared, range(n)) == {}
     assert stalls(compared) == {}
-
-
-def test_the_common_response_is_that_of_the_runs_and_not_of_the_simulation():
-    gain = dict(zip(CHANNELS, common_gains(responses(runs_of(20, 0.1))), strict=True))
-    assert gain[GYRO] == pytest.approx(1 / (1 + TRACK), rel=0.1)
-    assert gain[SPEED_X] == pytest.approx(1.0, rel=0.05)
-    assert np.isnan(common_gains(responses(runs_of(2, 0.1)))).all()
 
 
 def test_four_stalled_runs_of_forty_are_named_also_those_that_stall_later():

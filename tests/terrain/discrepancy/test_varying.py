@@ -12,7 +12,6 @@ from terrain.discrepancy.diagnose import diagnose
 from terrain.discrepancy.varying import fit_mixed, run_scatter, varying_effects, with_conditions
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import effect_named
-from terrain.errors import ConfigError
 from terrain.robots import load_robot
 
 SIMULATION = simulation_of(load_robot("husky"))
@@ -125,13 +124,6 @@ def test_loads_that_differ_are_news_only_to_a_simulation_that_knows_of_none(runs
     assert list(diagnose(runs(SAME, PAYLOAD), LOADED, library).values) == [PAYLOAD]
     assert diagnose(runs(SPREAD, PAYLOAD), LOADED, library).verdict in (Verdict.NONE, Verdict.NOT_EXCITED)
     assert diagnose(runs(SPREAD, PAYLOAD), SIMULATION, library).verdict is not Verdict.NONE
-
-
-@pytest.mark.parametrize("kind", ["model_error", "varied_error", "varied_scatter"])
-@pytest.mark.parametrize("sizes", [{"nonsense": 1.0}, {PAYLOAD: -0.1}, {PAYLOAD: np.nan}])
-def test_a_size_is_of_a_parameter_and_not_below_zero(kind, sizes):
-    with pytest.raises(ConfigError, match=kind):
-        replace(LOADED, **{kind: sizes})
 
 
 # -- The likelihood of runs whose parameters vary, by two routes, and its maximum ----------------------------

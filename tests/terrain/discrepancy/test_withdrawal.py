@@ -18,7 +18,6 @@ from terrain.discrepancy.withdrawal import (
     constancy_of_cause,
     raw_gain,
     reasons_to_withdraw,
-    shown_beside,
     shown_channels,
 )
 from terrain.effects import BOUNDS, CHANNELS, effect_named
@@ -165,12 +164,3 @@ def test_what_runs_deviate_by_themselves_is_not_free(hide, pose, solve):
     effects = channel_effects(fit, fit.causes[0])
     gained = sum(channel.without - channel.with_cause for channel in effects.values())
     assert gained == pytest.approx(2 * g @ x - x @ a @ x, rel=1e-6)
-
-
-def test_beside_a_track_a_wheel_radius_shows_in_the_speed(hide, pose, solve):
-    problem = pose(hide({"effective_track_ratio": 0.5}), ("effective_track", "wheel_radius"))
-    fit = solve(problem)
-    track, radius = problem.library
-    assert fit.causes == (track,)
-    assert shown_beside(fit, radius) == "speed_x_mps"
-    assert shown_beside(fit, track) == "yaw_rate_radps"
