@@ -55,12 +55,17 @@ def stands_first(at):
 
 
 def test_a_constant_value_is_one_number_within_its_own_error():
+    ratios = []
     for seed in range(20):
         of = constancy(constant, seed=seed)
         assert (of.certain, of.varies, of.caveat) == (False, False, "")
+        loose = constancy(constant, noise=200.0, inflation=200.0**2, seed=seed)  # far apart, by noise alone
+        assert (loose.certain, loose.varies, loose.caveat) == (False, False, "")
+        ratios.append(loose.ratio)
         for split, n in (("time", 3), ("runs", 2)):
             assert (np.abs(of.values[split] - SIZE) < 4.5 * of.std[split]).all()
             assert_allclose(of.std[split], np.sqrt(n / (N_RUNS * N_ROWS)) / 30.0, rtol=0.25)
+    assert max(ratios) > VARIES_RATIO
 
 
 def test_a_value_that_grows_from_nothing_along_a_run_is_none():

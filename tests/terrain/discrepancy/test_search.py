@@ -224,16 +224,18 @@ def test_it_leaves_the_least_square_where_runs_differ(of_tracks):
     ],
 )
 def test_an_effect_that_is_little_behind_is_a_rival(monkeypatch, behind, square, inflation, alike, is_rival):
+    """The better of two judges counts: by one a cause that absorbs noise is ahead."""
     cause, other = effect_named("payload"), effect_named("motor_constant")
-    judge = replace_able = SimpleNamespace(vector=(0.0,), model_std=np.zeros(1))
+    info, start = (SimpleNamespace(vector=(0.0,), model_std=np.zeros(1)) for _ in range(2))
 
     def fit(problem, judge, base, parameters):
         own = parameters == names_of([cause])
-        return Refit(0.0 if own else behind, 1000.0 + square * (not own), np.array([0.1]), np.array([0.01]))
+        loss = 0.0 if own else behind + 100.0 * (judge is start)
+        return Refit(loss, 1000.0 + square * (not own), np.array([0.1]), np.array([0.01]))
 
-    monkeypatch.setattr(search_module, "replace", lambda *_, **__: replace_able)
+    monkeypatch.setattr(search_module, "replace", lambda *_, **__: None)
     monkeypatch.setattr(search_module, "fit_again", fit)
     monkeypatch.setattr(search_module, "_near", lambda *_: [(other, alike)])
     monkeypatch.setattr(search_module, "wald_test", lambda *_: SimpleNamespace(inflation=inflation))
-    rivals = rivals_of(None, judge, judge, [cause])[cause.name]
+    rivals = rivals_of(None, info, start, [cause])[cause.name]
     assert [rival.effect.name for rival in rivals] == [other.name] * is_rival
