@@ -424,8 +424,21 @@ def _swap_for_better(
     problem: Problem, info: Evidence, base: Array, causes: list[Effect]
 ) -> tuple[list[Effect], Evidence]:
     """Replace a cause by an effect that fits better, as long as there is one."""
+
+    def penalised_loss(effects: Sequence[Effect]) -> float:
+        names = names_of(effects)
+        return loss_of(info, names) + PARAMETER_LOSS * len(names)
+
     for _ in range(MAX_CAUSES):
-        better = _better(info, causes, problem.library)
+        least, better = penalised_loss(causes) - RIVAL_LOSS, None
+        for i, cause in enumerate(causes):
+            others = names_of([other for other in causes if other is not cause])
+            for effect in problem.library:
+                if effect in causes or not wald_test(info, others, effect).significant:
+                    continue
+                changed = [*causes[:i], effect, *causes[i + 1 :]]
+                if (loss := penalised_loss(changed)) < least:
+                    least, better = loss, changed
         if better is None:
             break
         swapped, at = _refit_significant(problem, info, base, better)
@@ -470,25 +483,6 @@ def _weakest(info: Evidence, causes: Sequence[Effect]) -> int | None:
         z.append(np.inf if test.significant else test.z)
     weakest = int(np.argmin(z))
     return weakest if np.isfinite(z[weakest]) else None
-
-
-def _better(info: Evidence, causes: Sequence[Effect], library: Sequence[Effect]) -> list[Effect] | None:
-    """Return the causes with one replaced by an effect that fits better, if there is one."""
-
-    def penalised_loss(effects: Sequence[Effect]) -> float:
-        names = names_of(effects)
-        return loss_of(info, names) + PARAMETER_LOSS * len(names)
-
-    least, best = penalised_loss(causes) - RIVAL_LOSS, None
-    for i, cause in enumerate(causes):
-        others = names_of([other for other in causes if other is not cause])
-        for effect in library:
-            if effect in causes or not wald_test(info, others, effect).significant:
-                continue
-            swapped = [*causes[:i], effect, *causes[i + 1 :]]
-            if (loss := penalised_loss(swapped)) < least:
-                least, best = loss, swapped
-    return best
 
 
 # -- Values of named causes that one simulation has for all runs -------------------------------------------

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from studies.blind_trials.trial import simulation_of
 
-from terrain.discrepancy import withdrawal
-from terrain.discrepancy.probes import ProbeResult, probe_residuals
-from terrain.discrepancy.search import cause_fit
-from terrain.discrepancy.withdrawal import (
+from terrain.discrepancy import diagnose
+from terrain.discrepancy.diagnose import (
     PROBE_ALIKE,
     PROBE_RATIO,
     ChannelEffect,
@@ -20,6 +18,8 @@ from terrain.discrepancy.withdrawal import (
     reasons_to_withdraw,
     shown_channels,
 )
+from terrain.discrepancy.probes import ProbeResult, probe_residuals
+from terrain.discrepancy.search import cause_fit
 from terrain.effects import BOUNDS, CHANNELS, effect_named
 from terrain.robots import load_robot
 from terrain.simulation.planar.noise import Scatter
@@ -84,7 +84,7 @@ def test_a_bound_near_zero_has_an_edge_of_its_own(value, at_bound):
     assert BOUNDS[names[0]] == (-0.05, 0.5)
     fit = SimpleNamespace(names=names, change=np.array([value]))
     problem = SimpleNamespace(simulation=SimpleNamespace(effects={}))
-    assert bool(withdrawal._at_bound(problem, fit, effect)) == at_bound
+    assert bool(diagnose._at_bound(problem, fit, effect)) == at_bound
 
 
 def test_a_value_that_grows_along_a_run(hide, pose, solve):
@@ -128,7 +128,7 @@ def test_a_channel_that_it_makes_worse_and_a_main_channel_that_gains_nothing(
     yaw, monkeypatch, main, other, expected
 ):
     given = {"speed_y_mps": ChannelEffect(*main), "current_a": ChannelEffect(*other)}
-    monkeypatch.setattr(withdrawal, "channel_effects", lambda *_: given)
+    monkeypatch.setattr(diagnose, "channel_effects", lambda *_: given)
     text = reason(*yaw)
     assert expected in text
     assert bool(text) == bool(expected)
