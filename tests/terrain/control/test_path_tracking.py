@@ -110,6 +110,10 @@ def test_corrections_do_not_depend_on_the_origin_and_are_mirror_symmetric():
         [poses[:, :2] @ [[cos, sin], [-sin, cos]] + shift, poses[:, 2] + turn + 4 * math.pi]
     )
     np.testing.assert_allclose(tracked(turned, ground, desired), rows, atol=1e-9)
+    across = poses + np.array([0.0, 0.0, math.pi - 0.2 - poses[0, 2]])  # a heading that passes half a turn
+    wrapped = across - np.array([0.0, 0.0, 2.0 * math.pi]) * (across[:, 2:] > math.pi)
+    assert np.ptp(wrapped[:, 2]) > 6.0
+    np.testing.assert_allclose(tracked(wrapped, ground, desired), tracked(across, ground, desired), atol=1e-9)
     mirror = np.array([1.0, -1.0, -1.0])
     flipped = tracked(poses * mirror, ground * mirror, desired * mirror)
     np.testing.assert_allclose(flipped[:, :3], rows[:, :3] * mirror, atol=1e-9)
