@@ -527,7 +527,16 @@ def _wheel_scale(wheel: int) -> Effect:
     )
 
 
-WHEELS_AND_STEERING: tuple[Effect, ...] = (
+#: Streams that are not stamped by the logger of the wheels.
+OTHER_LOGGER = ("imu", "odometry", "gnss", "lidar")
+
+LAW = "this project's; docs/measured_slip.md has how it holds on measured runs"
+
+SINGLE_TRACK = "linear single-track model: Rajamani, Vehicle Dynamics and Control"
+
+#: Every known effect.  The order is no ranking, but results list effects in it.
+LIBRARY: tuple[Effect, ...] = (
+    # Wheels and steering
     effect(
         "wheel_radius",
         Parameter("ratio", -0.3, 0.3, 0.01, scatter_rank=5, as_percent=True, is_error=True),
@@ -600,16 +609,7 @@ WHEELS_AND_STEERING: tuple[Effect, ...] = (
         inverse=Inverse(("wheels",), "right minus left wheel speed of t - T", undo=_undo_yaw_delay),
         words=_late("the robot turning"),
     ),
-)
-
-OTHER_LOGGER = (
-    "imu",
-    "odometry",
-    "gnss",
-    "lidar",
-)  #: Streams that are not stamped by the logger of the wheels.
-#: They change what a log holds of a motion; most of them nothing else.
-SENSORS: tuple[Effect, ...] = (
+    # Sensors: they change what a log holds of a motion; most of them nothing else
     _described_sensor(
         "gyro_bias",
         # 3 deg/s, the zero error of MEMS gyros as data sheets have it (Bosch BMI055: 1 deg/s)
@@ -744,9 +744,7 @@ SENSORS: tuple[Effect, ...] = (
         homes=(Home("sensors", "encoder_time_constant_s", Combine.ADDED),),
         stage=Stage.DESCRIPTION,
     ),
-)
-
-SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
+    # Slip and resistance
     effect(
         "effective_track",
         Parameter("ratio", -0.5, 4.0, 0.02, scatter_rank=9, as_percent=True, is_error=True),
@@ -855,57 +853,7 @@ SLIP_AND_RESISTANCE: tuple[Effect, ...] = (
         (CURRENT, SPEED_X),
         "three speeds",
     ),
-)
-
-SIDEWAYS: tuple[Effect, ...] = (
-    effect(
-        "turn_side_slip",
-        # measured: 0.11 to 0.19 s (Husky; Warthog on asphalt, gravel and sand), DRIVE, as turn_drag
-        Parameter("s", -0.5, 0.5, 0.005),
-        "v_y = -c v_x w: to the outside of a turn",
-        "m (dv_y/dt + w v_x) = -K v_y with c = m/K; the centre of rotation lies c v_x ahead: Mandow et al., "
-        "Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007",
-        SKIDDING,
-        (SPEED_Y,),
-        "arcs of several speeds, to both sides",
-        words=_sided(
-            EXAMPLE_MPS * EXAMPLE_RADPS,
-            f"a slide of {{number}} m/s to the {{side}} at {EXAMPLE_MPS:g} m/s and {EXAMPLE_RADPS:g} rad/s",
-            *("outside", "inside"),
-        ),
-    ),
-    effect(
-        "side_slip_build_up",
-        # with the friction of turn_side_slip its time constant would be c, 0.2 s at the most where measured
-        Parameter("s", 0.0, 1.0, 0.01, one_sided=True),
-        "T dv_y/dt + v_y = -c v_x w",
-        "first-order lag of the lateral motion: the inertia in m (dv_y/dt + w v_x) = -K v_y",
-        SKIDDING,
-        (SPEED_Y,),
-        "steps of the yaw rate while driving",
-        modifies="turn_side_slip",
-    ),
-    effect(
-        "scrub",
-        Parameter("ratio", -0.2, 1.0, 0.005),
-        "resistance to rolling and to turning grow by k q W",
-        "scrub of skidding wheels; the form in q as EKF practice has it",
-        SKIDDING,
-        (CURRENT, TURNING_CURRENT, SPEED_X),
-        "turns",
-    ),
-    _contact(
-        "side_hill_slip",
-        Parameter("ratio", 0.0, 5.0, 0.05),
-        "v_y = -c ph |v|",
-        "Yamauchi et al., (2), with the sign that gravity sets",
-        WITH_IMU,
-        (SPEED_Y,),
-        "both signs of roll",
-    ),
-)
-
-LOAD_AND_MOTORS: tuple[Effect, ...] = (
+    # Load and motors
     effect(
         "payload",
         Parameter("ratio", -0.5, 1.5, 0.02, as_percent=True),
@@ -961,11 +909,53 @@ LOAD_AND_MOTORS: tuple[Effect, ...] = (
         "standstill, and driving forward and backward",
         inverse=Inverse(("wheels",), "current of each motor - b", ("current_",), Combine.SUBTRACTED),
     ),
-)
-
-LAW = "this project's; docs/measured_slip.md has how it holds on measured runs"
-#: What makes omni robots slip, and what looks like it.
-OMNI_WHEELS: tuple[Effect, ...] = (
+    # Sideways motion
+    effect(
+        "turn_side_slip",
+        # measured: 0.11 to 0.19 s (Husky; Warthog on asphalt, gravel and sand), DRIVE, as turn_drag
+        Parameter("s", -0.5, 0.5, 0.005),
+        "v_y = -c v_x w: to the outside of a turn",
+        "m (dv_y/dt + w v_x) = -K v_y with c = m/K; the centre of rotation lies c v_x ahead: Mandow et al., "
+        "Experimental kinematics for wheeled skid-steer mobile robots, IROS 2007",
+        SKIDDING,
+        (SPEED_Y,),
+        "arcs of several speeds, to both sides",
+        words=_sided(
+            EXAMPLE_MPS * EXAMPLE_RADPS,
+            f"a slide of {{number}} m/s to the {{side}} at {EXAMPLE_MPS:g} m/s and {EXAMPLE_RADPS:g} rad/s",
+            *("outside", "inside"),
+        ),
+    ),
+    effect(
+        "side_slip_build_up",
+        # with the friction of turn_side_slip its time constant would be c, 0.2 s at the most where measured
+        Parameter("s", 0.0, 1.0, 0.01, one_sided=True),
+        "T dv_y/dt + v_y = -c v_x w",
+        "first-order lag of the lateral motion: the inertia in m (dv_y/dt + w v_x) = -K v_y",
+        SKIDDING,
+        (SPEED_Y,),
+        "steps of the yaw rate while driving",
+        modifies="turn_side_slip",
+    ),
+    effect(
+        "scrub",
+        Parameter("ratio", -0.2, 1.0, 0.005),
+        "resistance to rolling and to turning grow by k q W",
+        "scrub of skidding wheels; the form in q as EKF practice has it",
+        SKIDDING,
+        (CURRENT, TURNING_CURRENT, SPEED_X),
+        "turns",
+    ),
+    _contact(
+        "side_hill_slip",
+        Parameter("ratio", 0.0, 5.0, 0.05),
+        "v_y = -c ph |v|",
+        "Yamauchi et al., (2), with the sign that gravity sets",
+        WITH_IMU,
+        (SPEED_Y,),
+        "both signs of roll",
+    ),
+    # What makes omni robots slip, and what looks like it
     effect(
         "roller_friction",
         Parameter("ratio", 0.0, 1.5, 0.01),
@@ -1014,11 +1004,7 @@ OMNI_WHEELS: tuple[Effect, ...] = (
         inverse=Inverse(("pose",), "positions / (1 + s)", ("position_",), Combine.OVER),
         sensed_only=True,
     ),
-)
-
-SINGLE_TRACK = "linear single-track model: Rajamani, Vehicle Dynamics and Control"
-#: What makes a car-like robot turn otherwise than its wheels point.
-CAR: tuple[Effect, ...] = (
+    # What makes a car-like robot turn otherwise than its wheels point
     effect(
         "steering_offset_front",
         Parameter("rad", -0.3, 0.3, 0.005),
@@ -1055,16 +1041,6 @@ CAR: tuple[Effect, ...] = (
         "fast arcs to both sides, side slopes and steps of the steering",
         homes=(Home("", "front_cornering_npr", Combine.TIMES), Home("", "rear_cornering_npr", Combine.TIMES)),
     ),
-)
-#: Every known effect.  The order is no ranking, but results list effects in it.
-LIBRARY: tuple[Effect, ...] = (
-    *WHEELS_AND_STEERING,
-    *SENSORS,
-    *SLIP_AND_RESISTANCE,
-    *LOAD_AND_MOTORS,
-    *SIDEWAYS,
-    *OMNI_WHEELS,
-    *CAR,
 )
 #: Errors of the measured tilt.  They belong to no effect, and are only ever estimated run by run.
 TILT_OFFSETS: tuple[Parameter, ...] = (

@@ -157,8 +157,9 @@ entry = """
 place = Path(importlib.util.find_spec("terrain").origin).parent / "effects.py"
 module = sys.modules["terrain.effects"] = types.ModuleType("terrain.effects")
 source = place.read_text()
-assert source.count("    *CAR,\n") == 1
-exec(compile(source.replace("    *CAR,\n", "    *CAR,\n" + entry), str(place), "exec"), module.__dict__)
+assert source.count("LIBRARY: tuple[Effect, ...] = (\n") == 1
+source = source.replace("LIBRARY: tuple[Effect, ...] = (\n", "LIBRARY: tuple[Effect, ...] = (\n" + entry)
+exec(compile(source, str(place), "exec"), module.__dict__)
 
 from dataclasses import replace
 import numpy as np
@@ -178,7 +179,7 @@ for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_O
     assert name in table
 assert name not in effects.nuisances_of("skid_steer")
 assert effects.read_effects_of(["worn=0.05"], "swerve") == {name: 0.05}
-assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[-2].name == "gear_wear"
+assert Simulation(robot, effects={name: 0.05}, scatter={name: 0.1}).library[0].name == "gear_wear"
 entry = {"value": 0.05, "unit": "ratio", "source": "test"}
 assert effects.read_effects("here", {"schema": 1, "worn_ratio": entry}, "swerve")[0] == {name: 0.05}
 for extended in (corrected(replace(robot, effects={name: 0.05})), _built(robot, {name: 0.05})):
