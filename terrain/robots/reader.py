@@ -107,13 +107,7 @@ def description_file(name_or_path: str | Path) -> Path:
 
 
 def robot_names() -> tuple[str, ...]:
-    """Return the names of the robots that travel with the package.
-
-    Examples
-    --------
-    >>> "husky" in robot_names()
-    True
-    """
+    """Return the names of the robots that travel with the package."""
     return tuple(sorted(file.stem for file in data_folder("robots").glob("*.yaml")))
 
 
@@ -161,11 +155,16 @@ def robot_from(file: str, described: Any) -> Robot:
         if described.get(section) is not None
     }
     assumed = frozenset(_assumed(described, kind.numbers))
-    identified = _identified(f"{file}: identified", described.get("identified", {}))
-    filters = _filters(f"{file}: filters", described.get("filters", []))
-    robot = kind.described(
-        name, numbers, parts=parts, assumed=assumed, identified=identified, filters=filters
-    )
+    shown_by_logs, filters = described.get("identified", {}), described.get("filters", [])
+    check_keys(f"{file}: identified", shown_by_logs, [], optional=tuple(IDENTIFIED))
+    identified = {
+        key: number(f"{file}: identified: {key}", entry, _unit(key), IDENTIFIED[key])
+        for key, entry in shown_by_logs.items()
+    }
+    if not isinstance(filters, list) or not all(isinstance(name, str) and name for name in filters):
+        raise ConfigError(f"{file}: filters is {shown(filters)}, a list of names is required")
+    also = {"parts": parts, "assumed": assumed, "identified": identified, "filters": tuple(filters)}
+    robot = kind.described(name, numbers, **also)
     if "effects" in described:
         effects, cov = read_effects(f"{file}: effects", described["effects"], drive)
         stated = described["effects"].get("region")
@@ -183,19 +182,6 @@ def _assumed(described: dict[str, Any], numbers: tuple[str, ...]) -> Iterator[st
         for key, entry in entries.items():
             if entry["source"].strip().lower().startswith("assumed"):
                 yield f"{prefix}{key}"
-
-
-def _filters(place: str, described: Any) -> tuple[str, ...]:
-    if not isinstance(described, list) or not all(isinstance(name, str) and name for name in described):
-        raise ConfigError(f"{place} is {shown(described)}, a list of names is required")
-    return tuple(described)
-
-
-def _identified(place: str, described: Any) -> dict[str, float]:
-    check_keys(place, described, [], optional=tuple(IDENTIFIED))
-    return {
-        key: number(f"{place}: {key}", entry, _unit(key), IDENTIFIED[key]) for key, entry in described.items()
-    }
 
 
 def _part(place: str, kind: Any, described: Any) -> Any:

@@ -410,12 +410,6 @@ class Robot(ABC):
         }
         return replace(self, parts={**neutral, **self.parts})
 
-    def with_track(self, track_m: float) -> Self:
-        """Return the robot with its adjustable track set."""
-        changed = replace(self, track_m=float(track_m))
-        changed.check_geometry(f"robot {self.name}")
-        return changed
-
     def check_geometry(self, place: str) -> None:
         """Refuse dimensions that no body can have; ``place`` is what messages call the robot."""
         if self.wheelbase_m <= 0 or self.track_m <= 0:
@@ -523,10 +517,10 @@ class SwerveRobot(Robot):
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> load_robot("agrimaro").with_track(1.0).wheel_positions_m
+    >>> load_robot("agrimaro").wheel_positions_m
     array([[-0.5075,  0.    ],
            [ 0.5075,  0.    ],
-           [ 0.    , -1.    ]])
+           [ 0.    , -0.756 ]])
     """
 
     drive: ClassVar[str] = "swerve"

@@ -104,15 +104,6 @@ def with_estimates(found: ObserverEstimate) -> RunLog:
     return replace(run, streams=streams, filter=found.observer.name)
 
 
-def seconds_by_status(track: ObserverTrack) -> dict[str, float]:
-    """Return for how long an observer had each status that it had."""
-    steps_s = np.diff(track.time_s, append=track.time_s[-1:])
-    return {
-        ObserverStatus(code).label: float(steps_s[track.status == code].sum())
-        for code in np.unique(track.status).tolist()
-    }
-
-
 SETTLED = (ObserverStatus.OK, ObserverStatus.UNEXCITED)
 """Statuses in which slip is judged; a part that is not excited may be the cornering stiffness alone."""
 
@@ -156,6 +147,7 @@ def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
     track = found.track
     started = track.status != ObserverStatus.STARTING
     settled = np.isin(track.status, SETTLED)
+    steps_s = np.diff(track.time_s, append=track.time_s[-1:])
     slips = {
         name: _slip(track.slip[settled, k], track.slip_std[settled, k], found.true(name), settled)
         for k, name in enumerate(track.slips)
@@ -167,7 +159,10 @@ def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
         slip=slips,
         position_rmse_m=_root_mean_square(error_m),
         position_end_m=float(error_m[-1]) if len(error_m) else math.nan,
-        status_s=seconds_by_status(track),
+        status_s={
+            ObserverStatus(code).label: float(steps_s[track.status == code].sum())
+            for code in np.unique(track.status).tolist()
+        },
         dropped=dict(found.dropped),
         missing=found.missing,
         finite=bool(np.isfinite(track.mean[started][:, :2]).all())

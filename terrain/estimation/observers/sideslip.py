@@ -48,7 +48,6 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.errors import ConfigError
 from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
 from terrain.estimation.observers.observer import (
     LONGEST_STEP_S,
@@ -81,6 +80,19 @@ C_LOW_NPR, C_HIGH_RATIO = 1000.0, 2.0
 """Least cornering stiffness of an axle, which at a slip of 0.5 rad carries 500 N; largest over the nominal one."""
 FASTEST_MPS, FASTEST_RADPS, MOST_MPS2 = 60.0, 20.0, 50.0
 """More than a car, its gyro and its accelerometer measure."""
+POSITION_STD_M, YAW_STD_RAD, GYRO_STD_RADPS, ACCEL_STD_MPS2 = 0.02, 0.005, 0.003, 0.1
+"""Of a fix along an axis, and of samples."""
+SLIP_WALK_RADPS = 0.02
+"""Change of a slip angle within a second without dynamics."""
+TURN_WALK_RADPS2, SIDE_WALK_MPS2 = 0.1, 4.0
+"""What the model lacks of r and w within a second; the lag of a tyre that rolls into its slip is in it, which would
+otherwise be taken for a softer tyre."""
+STIFFNESS_STD_RATIO, STIFFNESS_WALK_RATIO, STIFFNESS_CORRELATION = 0.3, 0.13, 0.8
+"""Of the nominal cornering stiffness: at first, its change within a second, and of both between the axles."""
+EXCITED_MPS2 = 1.0
+"""Least lateral specific force for learning C."""
+RESET_S = 1.0
+"""Time for which fixes have to be rejected before the pose begins anew."""
 POSITION_WALK_M, YAW_WALK_RAD = 0.01, 0.002
 """Change of the pose within a second beside the motion of the model."""
 SLIP_ERROR_RAD = 0.03
@@ -95,28 +107,12 @@ _STATES = (
 
 
 class SideslipSettings(NamedTuple):
-    """Noise of an observer of sideslip, and which of the three it is."""
+    """Which of the three observers it is: the columns of the table of this module."""
 
-    by_dynamics: bool = True  #: see the table of this module
+    by_dynamics: bool = True
     by_fixes: bool = True
     by_imu: bool = True
-    position_std_m: float = 0.02  #: of a fix
-    yaw_std_rad: float = 0.005
-    gyro_std_radps: float = 0.003  #: of yaw rate and lateral specific force
-    accel_std_mps2: float = 0.1
-    imu_ahead_m: float = 0.0  #: of the accelerometer ahead of the rear axle
-    slip_walk_radps: float = 0.02  #: change of a slip angle within a second without dynamics
-    #: what the model lacks of r and w within a second; the lag of a tyre that rolls into its slip is in it, which
-    #: would otherwise be taken for a softer tyre
-    turn_walk_radps2: float = 0.1
-    side_walk_mps2: float = 4.0
-    #: of the nominal cornering stiffness: change within a second, and at first
-    stiffness_walk_ratio: float = 0.13
-    stiffness_std_ratio: float = 0.3
-    stiffness_correlation: float = 0.8  #: of both, between the axles
-    excited_mps2: float = 1.0  #: least lateral specific force for learning C
     slowest_mps: float = 0.3  #: below which there are no dynamics
-    reset_s: float = 1.0  #: time for which fixes have to be rejected before the pose begins anew
 
 
 SETTINGS = {
@@ -127,8 +123,8 @@ SETTINGS = {
 """The three observers by name."""
 
 # Places in `params`: those of the robot, and as inputs those of a tick.
-_BASE, _AHEAD, _BEHIND, _MASS, _INERTIA, _C_FRONT, _C_REAR, _IMU_AHEAD, _BY_FIXES = range(9)
-_SPEED, _STEER, _ROLL, _SPEED_BEFORE, _STEER_BEFORE, _BY_DYNAMICS, _EXCITED = range(9, 16)
+_BASE, _AHEAD, _BEHIND, _MASS, _INERTIA, _C_FRONT, _C_REAR, _BY_FIXES = range(8)
+_SPEED, _STEER, _ROLL, _SPEED_BEFORE, _STEER_BEFORE, _BY_DYNAMICS, _EXCITED = range(8, 15)
 _INPUTS = ("speed", "steer", "roll", "speed_before", "steer_before", "by_dynamics", "is_excited")
 
 
@@ -211,7 +207,7 @@ def _measure(x: Array, _dt: float, params: Array, z: Array) -> None:
     sign = -1.0 if params[_SPEED] < 0.0 else 1.0
     slip_f, slip_r = slip_angles(x[3], x[4], params[_STEER], sign, params)
     turning, force = force_rates(slip_f, slip_r, x[5], x[6], params)
-    z[4] = force - (params[_AHEAD] - params[_IMU_AHEAD]) * turning
+    z[4] = force - params[_AHEAD] * turning
 
 
 @njit
@@ -230,11 +226,6 @@ class Sideslip(FilterObserver):
     name : one of :data:`SETTINGS`
     settings : in place of those
 
-    Raises
-    ------
-    ConfigError
-        if a setting is not accepted.
-
     Examples
     --------
     >>> from terrain.robots import load_robot
@@ -249,37 +240,11 @@ class Sideslip(FilterObserver):
 
     def __init__(self, robot: BicycleRobot, name: str, settings: SideslipSettings | None = None) -> None:
         self.settings = settings = SETTINGS[name] if settings is None else settings
-        for key, value in settings._asdict().items():
-            may_be_zero = key not in (
-                "position_std_m",
-                "yaw_std_rad",
-                "gyro_std_radps",
-                "accel_std_mps2",
-                "reset_s",
-            )
-            if not (0.0 <= value < math.inf or (key == "imu_ahead_m" and abs(value) < math.inf)):
-                raise ConfigError(f"{name}: {key} is {value:g}, a finite number from zero up is required")
-            if value == 0.0 and not may_be_zero:
-                raise ConfigError(f"{name}: {key} is 0, a number above zero is required")
-        if not settings.stiffness_correlation < 1.0:
-            raise ConfigError(
-                f"{name}: stiffness_correlation is {settings.stiffness_correlation:g}, below 1 is required"
-            )
         self._nominal = np.array([robot.front_cornering_npr, robot.rear_cornering_npr])
         geometry = (robot.wheelbase_m, robot.com_ahead_m, robot.com_behind_front_m)
-        by_fixes = float(settings.by_fixes)
-        params = (
-            *geometry,
-            robot.mass_kg,
-            robot.yaw_inertia_kgm2,
-            *self._nominal,
-            settings.imu_ahead_m,
-            by_fixes,
-        )
-        axles = np.sqrt(
-            0.5 * np.array([1.0 + settings.stiffness_correlation, 1.0 - settings.stiffness_correlation])
-        )
-        self._stiffness_walk = (settings.stiffness_walk_ratio * axles) ** 2
+        params = (*geometry, robot.mass_kg, robot.yaw_inertia_kgm2, *self._nominal, settings.by_fixes)
+        axles = np.sqrt([0.5 + 0.5 * STIFFNESS_CORRELATION, 0.5 - 0.5 * STIFFNESS_CORRELATION])
+        self._stiffness_walk = (STIFFNESS_WALK_RATIO * axles) ** 2
         model = FilterModel(
             name=name,
             states=_STATES,
@@ -292,10 +257,8 @@ class Sideslip(FilterObserver):
             ),
             propagate=_propagate,
             observe=_observe,
-            params=np.array(params),
-            initial_std=np.array(
-                [1e4, 1e4, math.pi, *FIRST_STD, *(settings.stiffness_std_ratio * axles + 1e-6)]
-            ),
+            params=np.array(params, dtype=float),
+            initial_std=np.array([1e4, 1e4, math.pi, *FIRST_STD, *(STIFFNESS_STD_RATIO * axles)]),
             initial_mean=np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0]),
             inputs=_INPUTS,
             references=("position",),
@@ -303,9 +266,10 @@ class Sideslip(FilterObserver):
             angle_states=("yaw_rad",),
             angle_rows=("yaw_rad",),
         )
-        std = (settings.position_std_m, settings.position_std_m, settings.yaw_std_rad)
-        noise = Noise(np.zeros(7), np.square([*std, settings.gyro_std_radps, settings.accel_std_mps2]))
-        super().__init__(model, noise, FilterSettings(_GATE_PROBABILITY, settings.reset_s))
+        std = (POSITION_STD_M, POSITION_STD_M, YAW_STD_RAD, GYRO_STD_RADPS, ACCEL_STD_MPS2)
+        super().__init__(
+            model, Noise(np.zeros(7), np.square(std)), FilterSettings(_GATE_PROBABILITY, RESET_S)
+        )
         motion = ("yaw_rate_radps", "speed_y_mps", "cornering_front_npr", "cornering_rear_npr")
         self.states = (*_STATES[:3], *(motion if settings.by_dynamics else ()))
         self._base_m, self._ahead_m, self._behind_m = geometry
@@ -337,7 +301,7 @@ class Sideslip(FilterObserver):
             z[4] = accel if abs(accel) < MOST_MPS2 else math.nan
         by_dynamics = self.settings.by_dynamics and moves
         force = speed * z[3] + GRAVITY_MPS2 * math.sin(self._roll_rad)
-        is_excited = by_dynamics and abs(force) > self.settings.excited_mps2
+        is_excited = by_dynamics and abs(force) > EXCITED_MPS2
         fix = self.advance(
             dt_s,
             z,
@@ -384,10 +348,10 @@ class Sideslip(FilterObserver):
         if not settings.by_fixes:
             walk[:3] += np.array([size, size, size / self._base_m]) * SLIP_ERROR_RAD
         if settings.by_dynamics and size >= settings.slowest_mps:
-            walk[3:5] = settings.turn_walk_radps2 * self._base_m / size, settings.side_walk_mps2 / size
+            walk[3:5] = TURN_WALK_RADPS2 * self._base_m / size, SIDE_WALK_MPS2 / size
         else:
             arm = math.hypot(self._ahead_m, self._behind_m) / self._base_m
-            walk[3:5] = math.sqrt(2.0) * settings.slip_walk_radps, arm * settings.slip_walk_radps
+            walk[3:5] = math.sqrt(2.0) * SLIP_WALK_RADPS, arm * SLIP_WALK_RADPS
         walk = np.square(walk)
         if is_excited:
             walk[5:] = self._stiffness_walk

@@ -41,7 +41,7 @@ NaN outside, while the filter goes on with what it has.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -102,8 +102,7 @@ _RESIDUALS = slice(_D - 2, _D)
 _KNOWN_STD = 1e-6  # of what is taken as known: a filter has no state without a variance
 
 
-@dataclass(frozen=True)
-class OdometrySettings:
+class OdometrySettings(NamedTuple):
     """Noise and limits of the odometry of a tracked robot."""
 
     gyro_threshold_radps: float = 0.0  #: the gyro is used where it differs from the tracks by more; 0: always
@@ -118,15 +117,8 @@ class OdometrySettings:
     ratio_std: float = 0.1  #: of the ratio of the tracks' yaw rate and the gyro's, from turn to turn
     forget_s: float = math.inf  #: time in which a parameter may change by its standard deviation at the start
 
-    def __post_init__(self) -> None:
-        above = ("stand_mps", "min_speed_mps", "fix_std_m", "yaw_fix_std_rad", "ratio_std", "forget_s")
-        for name in (item.name for item in fields(self)):
-            value, is_above = getattr(self, name), name in above
-            infinite = value == math.inf and name not in ("gyro_threshold_radps", "forget_s")
-            if not (value > 0.0 or (value == 0.0 and not is_above)) or infinite:
-                accepted = "a number above zero" if is_above else "a number from zero up"
-                raise ConfigError(f"odometry: {name} is {value!r}, {accepted} is required")
 
+DEFAULTS = OdometrySettings()
 
 # Places in `params`: half the distance of the tracks, the correlation time, and as inputs those of a tick.
 _HALF, _CORRELATION, _LEFT, _RIGHT, _GYRO, _ROLL, _PITCH, _DISPLACEMENT = range(8)
@@ -231,7 +223,7 @@ class SlipOdometry(FilterObserver):
         self,
         robot: TrackedRobot,
         model: SlipModel,
-        settings: OdometrySettings = OdometrySettings(),
+        settings: OdometrySettings = DEFAULTS,
         name: str = "slip-odometry",
         slips: tuple[str, ...] = SLIPS,
     ) -> None:
@@ -412,8 +404,8 @@ class SlipOdometry(FilterObserver):
 def plain_odometry(
     name: str,
     robot: TrackedRobot,
-    model: SlipModel = SlipModel(),  # noqa: B008
-    settings: OdometrySettings = OdometrySettings(),
+    model: SlipModel | None = None,
+    settings: OdometrySettings = DEFAULTS,
 ) -> SlipOdometry:
     """Return one of the odometries that know no slip, or of turns alone; see the table of this module.
 
@@ -429,6 +421,7 @@ def plain_odometry(
     >>> plain_odometry("encoder-odometry", load_robot("patako"), SlipModel(track_ratio=1.5)).slips
     ()
     """
+    model = model or SlipModel()
     covariance = np.zeros((N_MODEL, N_MODEL))
     covariance[TRACK_RATIO, TRACK_RATIO] = TRACK_STD_RATIO**2
     threshold = settings.gyro_threshold_radps or GYRODOMETRY_THRESHOLD_RADPS
@@ -440,7 +433,7 @@ def plain_odometry(
         run_angle_std_rad=UNKNOWN_ANGLE_RAD,
     )
     if name != "endo":
-        settings = replace(
-            settings, gyro_threshold_radps=math.inf if name == "encoder-odometry" else threshold
+        settings = settings._replace(
+            gyro_threshold_radps=math.inf if name == "encoder-odometry" else threshold
         )
     return SlipOdometry(robot, known, settings, name, SLIPS[:2] if name == "endo" else ())

@@ -10,18 +10,17 @@ from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differ
 from terrain.estimation.observers.choice import OBSERVERS, make_observer, observers_of
 from terrain.estimation.observers.estimate import (
     observe_run,
-    seconds_by_status,
     summarize_observer,
     with_estimates,
 )
 from terrain.estimation.observers.observer import FilterObserver, ObserverOutput, ObserverStatus, observe
-from terrain.estimation.observers.rows import ROWS, LiveObserver, rows_of
+from terrain.estimation.observers.rows import ROWS, rows_of
 from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel, model_of
 from terrain.estimation.observers.slip_model_file import read_slip_model, write_slip_model
 from terrain.kernels import njit
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
-from terrain.records import Reading, RunLog, Stream
+from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate
 from terrain.simulation.tracked import PrescribedSlip
@@ -82,22 +81,6 @@ def test_any_input_leaves_an_observer_that_finds_back(name):
         assert output.mean[0] == pytest.approx(0.012 * k, abs=0.1)
 
 
-@pytest.mark.parametrize("name", [name for name in OBSERVERS if ROBOTS[name] is UGV])
-def test_live_is_the_batch(name, straight):
-    batch = observe_run(straight, UGV, name, SlipModel())
-    channels = {stream: straight.streams[stream].channels for stream in straight.streams}
-    live, estimates = LiveObserver(made(name), UGV, channels), []
-    for begin in np.arange(0.0, 5.0, 0.1):
-        arrived = {}
-        for stream, values in straight.streams.items():
-            new = (values.time_s >= begin - 1e-9) & (values.time_s < begin + 0.1 - 1e-9)
-            arrived[stream] = Reading(values.time_s[new], values.values[new])
-        estimates += live.step(arrived)
-    assert len(estimates) == 250
-    assert np.array([each.mean for each in estimates]).tobytes() == batch.track.mean[:250].tobytes()
-    assert [each.status for each in estimates] == batch.track.status[:250].tolist()
-
-
 def test_a_robot_has_the_observers_of_its_description():
     assert observers_of(HUSKY) == ()
     only = replace(UGV, filters=("tracked",))
@@ -124,7 +107,7 @@ def test_figures_of_a_run_are_those_of_its_truth(straight):
     estimate = observe_run(straight, UGV, "tracked")
     figures = summarize_observer(estimate)
     assert figures.slip["slip_left_ratio"].true_mean == pytest.approx(0.15)
-    assert figures.status_s == seconds_by_status(estimate.track)
+    assert set(figures.status_s) <= {"starting", "standing", "ok"}
     assert sum(figures.status_s.values()) == pytest.approx(20.0)
     assert figures.finite
     assert figures.position_rmse_m < 0.05

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrain.angles import wrapped
-from terrain.errors import ConfigError
+from terrain.estimation.observers import sideslip
 from terrain.estimation.observers.observer import ObserverStatus, observe
 from terrain.estimation.observers.sideslip import FIRST_STD, RATE, ROWS, SETTINGS, Sideslip
 from terrain.robots import load_robot
@@ -65,13 +65,13 @@ def derivative(function, x):
 def plain(rows, s):
     """The filter in plain numpy, for forward motion: dynamics by differences, joint updates, no gates."""
     x = np.array([*rows[0, 2:5], np.tan(rows[0, 1]), AHEAD / L * np.tan(rows[0, 1]), 1.0, 0.0])
-    axles = np.sqrt([0.5 + 0.5 * s.stiffness_correlation, 0.5 - 0.5 * s.stiffness_correlation])
+    axles = np.sqrt([0.5 + 0.5 * sideslip.STIFFNESS_CORRELATION, 0.5 - 0.5 * sideslip.STIFFNESS_CORRELATION])
     std = [
-        s.position_std_m,
-        s.position_std_m,
-        s.yaw_std_rad,
+        sideslip.POSITION_STD_M,
+        sideslip.POSITION_STD_M,
+        sideslip.YAW_STD_RAD,
         *FIRST_STD,
-        *(s.stiffness_std_ratio * axles + 1e-6),
+        *(sideslip.STIFFNESS_STD_RATIO * axles),
     ]
     cov, out, before = np.diag(np.square(std)), [], rows[0]
     mixed = np.array([[1.0, 1.0], [1.0, -1.0]])
@@ -81,7 +81,7 @@ def plain(rows, s):
         moves = u >= s.slowest_mps
         dynamic = s.by_dynamics and moves
         u_before = u_before if dynamic and u_before >= s.slowest_mps else u
-        excited = dynamic and abs(u * rate + G * np.sin(roll)) > s.excited_mps2
+        excited = dynamic and abs(u * rate + G * np.sin(roll)) > sideslip.EXCITED_MPS2
 
         def slips(r, w, u=u, steer=steer):
             return np.arctan([(w + BEHIND * r) / u, (w - AHEAD * r) / u]) - [steer, 0.0]
@@ -120,7 +120,7 @@ def plain(rows, s):
 
         def measure(x, u=u):
             turning, force = forces(u / L * x[3], u * x[4], x[5:])
-            return np.array([*x[:3], u / L * x[3], force - (AHEAD - s.imu_ahead_m) * turning])
+            return np.array([*x[:3], u / L * x[3], force - AHEAD * turning])
 
         if k and u >= 0.05:
             by = derivative(move, x)
@@ -131,10 +131,10 @@ def plain(rows, s):
                 not s.by_fixes
             )
             arm = np.hypot(AHEAD, BEHIND) / L
-            walk[3:5] = np.array([np.sqrt(2.0), arm]) * s.slip_walk_radps
+            walk[3:5] = np.array([np.sqrt(2.0), arm]) * sideslip.SLIP_WALK_RADPS
             if dynamic:
-                walk[3:5] = s.turn_walk_radps2 * L / u, s.side_walk_mps2 / u
-            walk[5:] = s.stiffness_walk_ratio * axles * excited
+                walk[3:5] = sideslip.TURN_WALK_RADPS2 * L / u, sideslip.SIDE_WALK_MPS2 / u
+            walk[5:] = sideslip.STIFFNESS_WALK_RATIO * axles * excited
             x, cov = move(x), by @ cov @ by.T + TICK_S * np.diag(walk**2)
         if u >= 0.05:
             z = np.array([*row[2:5], *([rate, accel] if s.by_imu and moves else [np.nan, np.nan])])
@@ -142,7 +142,10 @@ def plain(rows, s):
             by[:, 5:] *= excited
             seen = np.isfinite(z)
             error = (z - measure(x))[seen]
-            h, r = by[seen], np.square([0.02, 0.02, 0.005, s.gyro_std_radps, s.accel_std_mps2])[seen]
+            h, r = (
+                by[seen],
+                np.square([0.02, 0.02, 0.005, sideslip.GYRO_STD_RADPS, sideslip.ACCEL_STD_MPS2])[seen],
+            )
             gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + np.diag(r))
             x, rest = x + gain @ error, np.eye(7) - gain @ h
             cov = rest @ cov @ rest.T + gain * r @ gain.T
@@ -270,12 +273,3 @@ def test_reversing_has_the_slip_of_its_own_direction(name):
     rows[:, 2], rows[:, 3] = -2.0 * time_s, 2.0 * expected * time_s
     rows[:, 7] = G * np.sin(roll_rad)
     assert observed(name, time_s, rows).slip[-1] == pytest.approx(expected, rel=0.2)
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [{"reset_s": 0.0}, {"side_walk_mps2": np.nan}, {"gyro_std_radps": -1.0}, {"stiffness_correlation": 1.0}],
-)
-def test_settings_that_cannot_be_are_refused(wrong):
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        Sideslip(ROBOT, "sideslip-multi", SETTINGS["sideslip-multi"]._replace(**wrong))
