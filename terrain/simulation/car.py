@@ -61,7 +61,7 @@ CAR = record(
     )
     | {"delay_steps": int}
 )
-"""A robot with its :class:`PlantSettings`."""
+"""A robot with its :data:`SETTINGS`."""
 
 CAR_BODY = record(
     numbers(
@@ -88,42 +88,20 @@ class Ground(NamedTuple):
 
 
 def level_ground(grip_ratio: float = 0.7, roll_rad: float = 0.0) -> Ground:
-    """Return ground that is the same everywhere.
-
-    Examples
-    --------
-    >>> level_ground(0.5).grip_ratio
-    array([0.5])
-    """
+    """Return ground that is the same everywhere."""
     return Ground(np.zeros(1), np.array([grip_ratio]), np.array([roll_rad]))
 
 
-class PlantSettings(NamedTuple):
-    """What a description of a robot does not have."""
-
-    steering_delay_s: float = 0.05  # dead time of the steering, up to :data:`LONGEST_DELAY_S`
-    acceleration_mps2: float = 1.5  # bound of the acceleration of the drive
-    relaxation_m: float = 0.3  # relaxation length of the tyres; about half to once a wheel's radius
-    damping_ratio: float = 0.7  # of the tyre's carcass at rest
+# What a description of a robot does not have: bound of the acceleration of the drive, relaxation length of the tyres
+# (about half to once a wheel's radius), damping of the tyre's carcass at rest, dead time of the steering in steps.
+SETTINGS = {"acceleration_mps2": 1.5, "relaxation_m": 0.3, "damping_ratio": 0.7, "delay_steps": 50}
+_GRID_M, _FADE_MPS = 0.05, 0.5
 
 
-_GRID_M = 0.05
-_FADE_MPS = 0.5
-
-
-def car_record(robot: BicycleRobot, settings: PlantSettings) -> Array:
-    """Return the parameters of :func:`advance`, (1,) of :data:`CAR`; ``ConfigError`` for a setting out of its range."""
-    if not 0.0 <= settings.steering_delay_s <= LONGEST_DELAY_S:
-        raise ConfigError(
-            f"steering_delay_s is {settings.steering_delay_s:g}, 0 to {LONGEST_DELAY_S:g} s is accepted"
-        )
-    if not (settings.acceleration_mps2 > 0 and settings.relaxation_m > 0 and settings.damping_ratio >= 0):
-        raise ConfigError(
-            "acceleration and relaxation length above zero, and a damping from zero, are needed"
-        )
-    parts, names = (robot, settings), CAR.names or ()
-    described = {name: getattr(part, name) for part in parts for name in names if hasattr(part, name)}
-    return filled(CAR, **described, delay_steps=round(settings.steering_delay_s / STEP_S))
+def car_record(robot: BicycleRobot, **changed: float) -> Array:
+    """Return the parameters of :func:`advance`, (1,) of :data:`CAR`, with changed :data:`SETTINGS`, if any."""
+    described = {name: getattr(robot, name) for name in CAR.names or () if hasattr(robot, name)}
+    return filled(CAR, **(described | SETTINGS | changed))
 
 
 def ground_grid(ground: Ground) -> Array:
@@ -237,7 +215,7 @@ def advance(
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> car, state = car_record(load_robot("adap2e"), PlantSettings()), initial_state()
+    >>> car, state = car_record(load_robot("adap2e")), initial_state()
     >>> rows = np.empty(200, CAR_BODY)
     >>> advance(car, ground_grid(level_ground()), state, 0.1, 1.0, rows, 10)
     >>> float(state["body"]["speed_mps"][0]), round(float(state["body"]["steer_rad"][0]), 3)
@@ -291,31 +269,17 @@ class CarCommand(NamedTuple):
 Controller = Callable[[CarSample], CarCommand]
 
 
-def open_loop(time_s: Array, steer_rad: Array) -> Controller:
-    """Return a controller that plays a steering angle (n,) over time (n,), at the speed of the drive.
-
-    Examples
-    --------
-    >>> straight = open_loop(np.zeros(1), np.zeros(1))
-    >>> straight(CarSample(0.0, np.zeros(8), 2.0))
-    CarCommand(steer_rad=0.0, speed_mps=2.0, finished=False)
-    """
-    return lambda sample: CarCommand(
-        float(np.interp(sample.time_s, time_s, steer_rad)), sample.speed_desired_mps
-    )
-
-
 class _Stops:
     """The desired speed of a drive, of what was driven so far."""
 
-    def __init__(self, drive: CarDrive, acceleration_mps2: float) -> None:
-        self._drive, self._brakes, self._next, self._stood_s = drive, acceleration_mps2, 0, 0.0
+    def __init__(self, drive: CarDrive) -> None:
+        self._drive, self._next, self._stood_s = drive, 0, 0.0
 
     def desired(self, distance_m: float, speed_mps: float) -> float:
         stops = self._drive.stops
         if self._next < len(stops):
             where_m, stand_s = stops[self._next]
-            if distance_m + speed_mps**2 / (2 * self._brakes) >= where_m:
+            if distance_m + speed_mps**2 / (2 * SETTINGS["acceleration_mps2"]) >= where_m:
                 self._stood_s += TICK_S if speed_mps == 0.0 else 0.0
                 if self._stood_s <= stand_s:
                     return 0.0
@@ -333,7 +297,6 @@ def run_car(
     effects: Mapping[str, float],
     controller: Controller,
     noise: SensorNoise = SensorNoise(),  # noqa: B008
-    settings: PlantSettings = PlantSettings(),  # noqa: B008
 ) -> tuple[dict[str, Stream], tuple[Label, ...]]:
     """Return streams and labels of a drive, for :func:`terrain.simulation.run.simulate`, which describes the rest.
 
@@ -342,7 +305,7 @@ def run_car(
     Raises
     ------
     ConfigError
-        if settings, ground or speed are not accepted, there are conditions or effects, or the controller commands no
+        if ground or speed are not accepted, there are conditions or effects, or the controller commands no
         finite numbers.
     """
     robot = as_drive(BicycleRobot, robot, "robot {name}: drive {drive!r} is no car for this ground")
@@ -350,12 +313,12 @@ def run_car(
         raise ConfigError(
             f"robot {robot.name}: on ground along its drive it has neither conditions nor effects"
         )
-    car, grid, rng = car_record(robot, settings), ground_grid(ground), np.random.default_rng(seed)
+    car, grid, rng = car_record(robot), ground_grid(ground), np.random.default_rng(seed)
     if not 0.0 <= drive.speed_mps <= robot.speed_max_mps:
         raise ConfigError(
             f"speed is {drive.speed_mps:g} m/s, 0 to {robot.speed_max_mps:g} is the robot's range"
         )
-    stops, state = _Stops(drive, settings.acceleration_mps2), initial_state(*drive.start)
+    stops, state = _Stops(drive), initial_state(*drive.start)
     per_tick, n_ticks = round(TICK_S / TRUTH_S), max(2, int(drive.duration_s / TICK_S))
     rows, steps = np.empty(1 + n_ticks * per_tick, CAR_BODY), round(TRUTH_S / STEP_S)
     body = state["body"][0]

@@ -82,7 +82,7 @@ def simulate(
     options : of the plant: :func:`~terrain.simulation.dynamic.run.run_dynamic` (gnss, controller, command_delay_s),
         :func:`~terrain.simulation.planar.run.run_planar` (scatter, noise, outside, heading, fixes, terrain, step_s),
         :func:`~terrain.simulation.tracked.run_tracked` (slope, yaw_rad, sensors),
-        :func:`~terrain.simulation.car.run_car` (controller, noise, settings)
+        :func:`~terrain.simulation.car.run_car` (controller, noise)
 
     Returns
     -------

@@ -25,8 +25,11 @@ from terrain.terramechanics.soil import load_soil
 AGRIMARO, HUSKY, ROBOTINO, CAR, PATAKO = map(
     load_robot, ("agrimaro", "husky", "robotino", "adap2e", "patako")
 )
-WEAVE = car.open_loop(np.arange(0.0, 30.0, 0.1), 0.1 * np.sin(np.arange(0.0, 30.0, 0.1)))
 NOISE = {"noise": load_noise(), "scatter": load_scatter()}
+
+
+def weave(sample):
+    return car.CarCommand(0.1 * np.sin(sample.time_s), sample.speed_desired_mps)
 
 
 def turning(speed_mps=0.5, turn_radps=0.3, seconds=8.0):
@@ -44,7 +47,7 @@ PLANTS = {
     "omni": (ROBOTINO, turning(0.15), Ground(), NOISE),
     "bicycle": (CAR, turning(), Ground(), NOISE | {"fixes": True}),
     "tracks": (PATAKO, np.tile([0.03, 0.08], (401, 1)), load_soil("dry_sand"), {}),
-    "car": (CAR, car.CarDrive(2.0, duration_s=8.0), car.level_ground(0.7, 0.1), {"controller": WEAVE}),
+    "car": (CAR, car.CarDrive(2.0, duration_s=8.0), car.level_ground(0.7, 0.1), {"controller": weave}),
 }
 
 
@@ -157,13 +160,13 @@ def test_an_effect_of_the_sensors_and_another_logger_leave_all_else_alone():
     ("robot", "drive", "ground", "options", "message"),
     [
         (HUSKY, np.zeros((9, 2)), load_soil("dry_sand"), {}, "robot husky: drive 'skid_steer' has no tracks"),
-        (HUSKY, car.CarDrive(1.0), car.level_ground(), {"controller": WEAVE}, "'skid_steer' is no car"),
+        (HUSKY, car.CarDrive(1.0), car.level_ground(), {"controller": weave}, "'skid_steer' is no car"),
         (PATAKO, np.zeros((9, 2)), load_soil("dry_sand"), {"effects": {"payload_ratio": 0.1}}, "no effects"),
         (
             CAR,
             car.CarDrive(1.0),
             car.level_ground(),
-            {"controller": WEAVE, "conditions": Conditions(payload_kg=1.0)},
+            {"controller": weave, "conditions": Conditions(payload_kg=1.0)},
             "neither conditions nor effects",
         ),
     ],
