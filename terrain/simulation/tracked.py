@@ -268,14 +268,7 @@ def track_forces(
 ) -> None:
     """Write the force along x, that along y and the moment (3,) of the ground and of gravity on the body.
 
-    Parameters
-    ----------
-    tracks : a record of :data:`TRACKS`
-    belt_mps : (2,) speeds of the belts, left and right
-    twist : (3,) speeds of the body's origin in body axes and yaw rate
-    grade_rad, roll_rad : of the body, uphill and left side up positive
-    heap_m2 : cross-section of the soil beside the inner track
-    out : (3,)
+    Belts are left and right, (2,); the twist (3,) is in body axes; grade and roll are uphill and left side up positive.
     """
     weight = tracks.mass_kg * GRAVITY_MPS2
     out[0], out[1] = -weight * math.sin(grade_rad), -weight * math.sin(roll_rad) * math.cos(grade_rad)
@@ -397,15 +390,7 @@ def slipped_twist(
 def twist_on_soil(
     tracks: Any, state: Any, belt_mps: Array, grade_rad: float, roll_rad: float, dt_s: float
 ) -> Array:
-    """Return the twist (3,) after a step on a soil.
-
-    Parameters
-    ----------
-    tracks, state : records of :data:`TRACKS`, and of :data:`STATE` before the step
-    belt_mps : (2,) speeds of the belts
-    grade_rad, roll_rad : of the body
-    dt_s : step
-    """
+    """Return the twist (3,) after a step on a soil, of records of :data:`TRACKS`, and of :data:`STATE` before it."""
     before = np.array([state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps])
     twist, residual = before.copy(), np.empty(3)
     tilt_and_heap = grade_rad, roll_rad, state.heap_m2
@@ -460,16 +445,7 @@ def _residual(
 
 @inner
 def step(tracks: Any, slope: Array, state: Any, belt_mps: Array, after: Any, dt_s: float) -> None:
-    """Write the state a step later.
-
-    Parameters
-    ----------
-    tracks : a record of :data:`TRACKS`
-    slope : (2,) its angle and the heading of uphill
-    state, after : records of :data:`STATE`
-    belt_mps : (2,) speeds of the belts at the end of the step
-    dt_s : step
-    """
+    """Write the state a step later."""
     grade, roll = tilt_at(slope[0], slope[1], state.yaw_rad)
     after.heap_m2 = state.heap_m2
     if tracks.sheared:
@@ -494,15 +470,7 @@ def step(tracks: Any, slope: Array, state: Any, belt_mps: Array, after: Any, dt_
 
 @njit
 def drive_tracks(tracks: Array, slope: Array, belt_mps: Array, states: Array, dt_s: float) -> None:
-    """Write all states of a drive but the first, which is its start.
-
-    Parameters
-    ----------
-    tracks : (k,) of :data:`TRACKS`, one ground after the other; the last one goes on for ever
-    slope, dt_s : as :func:`step` has them
-    belt_mps : (n, 2)
-    states : (n,) of :data:`STATE`
-    """
+    """Write all states (n,) of a drive but the first, which is its start, on one ground after the other."""
     for k in range(1, belt_mps.shape[0]):
         which = 0
         while which < tracks.size - 1 and states[k - 1].travelled_m >= tracks[which].until_m:

@@ -65,15 +65,7 @@ def _remaining(before_s: float, after_s: float, dt: float) -> float:
 def slip_along(
     body: Any, p: Any, dt: float, u: Array, scrub_n: Array, grade_rad: Array, disturbance: Array, fast: bool
 ) -> tuple[Array, Array, Array]:
-    """Return speed over ground, resistance with the slope, and slip (n,).
-
-    Parameters
-    ----------
-    body, p : records of :data:`~terrain.simulation.planar.model.BODY` and of effects
-    u, scrub_n : (n,) speed without slip, and what resists in turns
-    dt, grade_rad, disturbance : as :func:`~terrain.simulation.planar.motion.move` has them
-    fast : whether the time constant runs straight, too
-    """
+    """Return speed over ground, resistance with the slope, and slip (n,)."""
     n = u.size
     weight = body.mass_kg * GRAVITY_MPS2
     mass = body.mass_kg * (1.0 + p.payload_ratio)
