@@ -89,8 +89,10 @@ def test_robot_stops_exactly_and_holds_on_a_slope_without_creep():
 
 def test_steering_has_dead_time_rate_and_limit():
     rows, _ = drive(1.0, 2.0, 2.0, car.level_ground(), delay_steps=100)
-    steer = rows["steer_rad"]
-    assert (steer[:9] == 0.0).all()
+    steer, fine = rows["steer_rad"], np.empty(110, car.CAR_BODY)
+    delayed = car.car_record(ROBOT, delay_steps=100), car.ground_grid(car.level_ground()), car.initial_state()
+    car.advance(*delayed, 1.0, 2.0, fine, 1)
+    assert np.flatnonzero(fine["steer_rad"])[0] == 100
     assert np.diff(steer).max() <= ROBOT.steering_rate_radps * 0.01 + 1e-9
     assert steer[-1] == pytest.approx(ROBOT.steering_max_rad, rel=1e-3)
     assert (steer <= ROBOT.steering_max_rad).all()

@@ -127,6 +127,15 @@ def test_a_step_from_any_motion_reaches_the_balance():
     assert np.mean(np.array(off) < 1e-4) > 0.99
 
 
+def test_in_a_steady_turn_the_ground_gives_the_force_to_the_inside():
+    v_x, v_y, w = twist = steady(FIRM, [0.8, 1.6], seconds=4.0)
+    along, across, moment = forces(FIRM, [0.8, 1.6], twist)
+    mass = PATAKO.mass_kg
+    assert [along / mass, across / mass] == pytest.approx([-w * v_y, w * v_x], abs=1e-3)
+    assert abs(moment) < 1e-3 * mass
+    assert w * v_x > 0.3
+
+
 def test_bulldozing_resists_turning_and_grows_with_what_is_swept():
     plain = steady(replace(SAND, kphi_npmn2=math.nan, kc_npmn1=math.nan), [0.0, 0.1], seconds=0.3)[2]
     early = steady(SAND, [0.0, 0.1], seconds=0.3)[2]
