@@ -128,8 +128,11 @@ def _move(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
         row.force_n = (
             mass * ((twist[0] - started_x) / dt - twist[2] * 0.5 * (twist[1] + started_y)) - slope[0]
         )
-    out["current_a"][:] = np.abs(currents_of(params, vector, dt, wheel_speed_mps, out)).sum(axis=1)
-    for k in range(n):  # what the ground adds to the motion takes no force
+    currents_a = currents_of(params, vector, dt, wheel_speed_mps, out)
+    for k in range(n):
+        for i in range(body.n_wheels):
+            out[k].current_a += abs(currents_a[k, i])
+        # what the ground adds to the motion takes no force
         if disturbance.shape[0] > 0:
             out[k].speed_x_mps *= 1.0 - disturbance[k, 0]
             out[k].speed_y_mps *= 1.0 - disturbance[k, 0]
