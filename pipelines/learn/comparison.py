@@ -86,7 +86,7 @@ def side_by_side(
         return found[0][0]
     (_, held_out), motion, levels = found[0], window_motion(samples.windows), None
     if motion is not None and settings.protocol != "published":
-        true_runs = held_out_support(held_out, samples.run_id, motion).true_runs
+        true_runs = held_out_support(held_out, samples.run_id, motion)[0]
         levels = support_levels(np.median(true_runs, axis=0))[held_out.tested]
     outcomes = [Outcome.of(each, samples.run_id) for _, each in found]
     differences = compare_with_first([name for name, *_ in contenders], outcomes, settings.seed, levels)

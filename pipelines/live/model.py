@@ -17,7 +17,7 @@ import numpy as np
 from features.motion import window_motion
 from features.windows import Layout, SteadyMotion, WindowRule
 from pipelines.report.results import described
-from terrain.classify.limits import Novelty, SupportTable, conformal_sets, support_of
+from terrain.classify.limits import SUPPORTED, Novelty, SupportTable, conformal_sets, supported_probability
 from terrain.classify.terrain_filter import TerrainFilter
 from terrain.records import Array, Windows
 
@@ -112,7 +112,7 @@ def assess(model: TerrainModel, windows: Windows) -> Assessed:
         unknown = ~(novelty <= model.novelty.threshold)
     if model.support is not None and (motion := window_motion(windows)) is not None:
         near = model.support.near_runs(motion.speed_mps, motion.yaw_rate_radps)
-        supported = support_of(probability, near).supported.astype(float)
+        supported = (supported_probability(probability, near) >= SUPPORTED).astype(float)
     return Assessed(probability, novelty, unknown, supported)
 
 

@@ -26,7 +26,14 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from terrain.classify.held_out import HeldOut
-from terrain.classify.limits import Motion, SupportLevel, learn_support, support_levels, support_of
+from terrain.classify.limits import (
+    SUPPORTED,
+    Motion,
+    SupportLevel,
+    learn_support,
+    support_levels,
+    supported_probability,
+)
 from terrain.classify.metrics import N_BOOTSTRAP, Interval, confidence_auc, drawn_runs, ratio_over_runs
 from terrain.records import Array
 
@@ -110,25 +117,16 @@ def regime_name(edges_mps: tuple[float, ...], number: int) -> str:
     return f"{Manoeuvre(manoeuvre).name.lower()} at {low:g} to {high:g} m/s"
 
 
-class HeldOutSupport(NamedTuple):
-    """Support of held-out windows by the training runs of their folds, each (repeats, n).
+def held_out_support(held_out: HeldOut, run_id: Array, motion: Motion) -> tuple[Array, Array]:
+    """Return the support of each window (repeats, n), of a run and with a motion, by the training windows of its fold.
 
-    Whether the prediction is right; training runs near the motion of the window, of the true terrain and of the
-    predicted one; and the supported probability of the latter, and whether that suffices.
+    Returns
+    -------
+    training runs of the true terrain near its motion, and the supported probability of the predicted one; NaN where
+    it was not held out
     """
-
-    correct: Array
-    true_runs: Array
-    predicted_runs: Array
-    probability: Array
-    supported: Array
-
-
-def held_out_support(held_out: HeldOut, run_id: Array, motion: Motion) -> HeldOutSupport:
-    """Return the support of each window, of a run and with a motion, by the training windows of its fold."""
     shape, terrain = held_out.probability.shape[:2], held_out.truth
-    true_runs, predicted_runs = np.zeros((2, *shape), dtype=int)
-    probability, supported = np.full(shape, np.nan), np.zeros(shape, dtype=bool)
+    true_runs, probability = np.zeros(shape, dtype=int), np.full(shape, np.nan)
     classes = [str(name) for name in held_out.classes]
     true = np.searchsorted(held_out.classes, terrain)
     for (repeat, _, train, test), stated, *_ in held_out.results:
@@ -136,10 +134,8 @@ def held_out_support(held_out: HeldOut, run_id: Array, motion: Motion) -> HeldOu
         table = learn_support(driven.speed_mps, driven.yaw_rate_radps, terrain[train], run_id[train], classes)
         near = table.near_runs(there.speed_mps, there.yaw_rate_radps)
         true_runs[repeat, test] = near[np.arange(len(test)), true[test]]
-        predicted_runs[repeat, test], probability[repeat, test], supported[repeat, test] = support_of(
-            stated, near
-        )
-    return HeldOutSupport(held_out.correct, true_runs, predicted_runs, probability, supported)
+        probability[repeat, test] = supported_probability(stated, near)
+    return true_runs, probability
 
 
 class PartFigures(NamedTuple):
@@ -157,18 +153,21 @@ class PartFigures(NamedTuple):
 
 
 def support_accuracy(
-    held_out: HeldOutSupport, run_id: Array, terrain: Array, rng: np.random.Generator
-) -> tuple[dict[str, PartFigures], PartFigures, PartFigures, float | None]:
-    """Return the accuracy of held-out windows of runs and true terrains (n,) by their support.
+    correct: Array,
+    true_runs: Array,
+    probability: Array,
+    run_id: Array,
+    terrain: Array,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    """Return the accuracy of held-out windows (repeats, n) of runs and true terrains (n,) by their support, by name.
 
-    Returns
-    -------
-    by_true_terrain : by :class:`~terrain.classify.limits.SupportLevel` of the true terrain: needs labels
-    unsupported, supported : by the mark of the prediction, without a label
-    auc : area from the supported probability to correctness; None where all are right
+    ``accuracy_by_support`` is by :class:`~terrain.classify.limits.SupportLevel` of the true terrain: needs labels;
+    ``unsupported`` and ``supported`` by the mark of the prediction, without a label; ``supported_auc`` is the area from
+    the supported probability to correctness, None where all are right.
     """
     weights, place = drawn_runs(run_id, terrain, N_BOOTSTRAP, rng)
-    level, wrong = support_levels(held_out.true_runs), ~held_out.correct
+    level, wrong, supported = support_levels(true_runs), ~correct, probability >= SUPPORTED
 
     def total(windows: Array) -> Array:
         return np.asarray(weights @ np.bincount(place, windows.sum(axis=0), weights.shape[1]))
@@ -183,17 +182,19 @@ def support_accuracy(
             ratio or 0.0, interval or (0.0, 0.0), *accuracy, *ratio_over_runs(wrong_inside, errors)
         )
 
-    areas = [
-        confidence_auc(probability, right.astype(float), np.ones((1, right.size)))[0]
-        for probability, right in zip(held_out.probability, held_out.correct, strict=True)
-    ]
-    known = np.isfinite(areas)
-    return (
-        {each.value: part(level == each.value) for each in SupportLevel},
-        part(~held_out.supported),
-        part(held_out.supported),
-        float(np.mean(np.array(areas)[known])) if known.any() else None,
+    repeats = zip(probability, correct.astype(float), strict=True)
+    areas = np.array(
+        [confidence_auc(stated, right, np.ones((1, right.size)))[0] for stated, right in repeats]
     )
+    known = np.isfinite(areas)
+    return {
+        "accuracy_by_support": tuple(
+            {"support": each.value, **part(level == each.value)._asdict()} for each in SupportLevel
+        ),
+        "unsupported": part(~supported),
+        "supported": part(supported),
+        "supported_auc": float(areas[known].mean()) if known.any() else None,
+    }
 
 
 def errors_left(law: Array, n_runs: Array) -> Array:
@@ -306,11 +307,12 @@ def coverage_of(
     -------
     support : a :class:`SupportRow` of each terrain in each regime, those without a window among them
     next_drives : :class:`NextDrive`, best first; empty where the data cannot show what more runs gain
-    accuracy_by_support, unsupported, supported, supported_auc : as :func:`support_accuracy`
+    and what :func:`support_accuracy` gives
     """
     classes, tested = [str(name) for name in held_out.classes], np.flatnonzero(held_out.tested)
     table = learn_support(motion.speed_mps, motion.yaw_rate_radps, held_out.truth, run_id, classes)
-    support = HeldOutSupport(*(each[:, tested] for each in held_out_support(held_out, run_id, motion)))
+    true_runs, probability = (each[:, tested] for each in held_out_support(held_out, run_id, motion))
+    correct = held_out.correct[:, tested]
     run_id, terrain, motion = run_id[tested], held_out.truth[tested], motion.of(tested)
     near = table.near_runs(motion.speed_mps, motion.yaw_rate_radps)
     edges_mps = speed_edges(motion.speed_mps)
@@ -324,16 +326,16 @@ def coverage_of(
             of_class, of_regime = terrain == name, regime == number
             inside = of_class & of_regime
             n = int(inside.sum())
-            right = float(support.correct[:, inside].mean()) if n else None
+            right = float(correct[:, inside].mean()) if n else None
             named = regime_name(edges_mps, int(number))
             rows.append(SupportRow(name, named, n, len(np.unique(run_id[inside])), right))
             expected = float(inside.mean() + of_class.mean() * of_regime.mean()) / 2
             at = inside if n else of_regime  # the motions of other terrains show where coverage lacks
             all_runs = float(near[at, column].mean())
-            errors = float((~support.correct[:, inside]).mean(axis=0).sum()) if n else 0.0
-            true_runs = float(support.true_runs[:, inside].mean()) if n else all_runs
-            cells.append((expected, n, errors, true_runs, all_runs))
-    law = fit_growth(support.true_runs.ravel(), support.correct.ravel())
+            errors = float((~correct[:, inside]).mean(axis=0).sum()) if n else 0.0
+            held_out_runs = float(true_runs[:, inside].mean()) if n else all_runs
+            cells.append((expected, n, errors, held_out_runs, all_runs))
+    law = fit_growth(true_runs.ravel(), correct.ravel())
     gain = np.zeros(len(cells)) if law is None else expected_gain(law, *np.array(cells, dtype=float).T)
     lasts_s = max(RUN_WINDOWS * window_s, MIN_RUN_S)
     drives = []
@@ -342,12 +344,7 @@ def coverage_of(
             name, driven, n, _, right = rows[i]
             asked = name, driven, ADDED_RUNS, lasts_s, float(gain[i])
             drives.append(NextDrive(*asked, cells[i][-1], n, right))
-    levels, without, supported, auc = support_accuracy(support, run_id, terrain, np.random.default_rng(seed))
-    return {
-        "support": tuple(rows),
-        "next_drives": tuple(drives),
-        "accuracy_by_support": tuple({"support": level, **part._asdict()} for level, part in levels.items()),
-        "unsupported": without,
-        "supported": supported,
-        "supported_auc": auc,
-    }
+    by_support = support_accuracy(
+        correct, true_runs, probability, run_id, terrain, np.random.default_rng(seed)
+    )
+    return {"support": tuple(rows), "next_drives": tuple(drives), **by_support}

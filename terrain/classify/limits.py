@@ -295,14 +295,6 @@ class SupportLevel(StrEnum):
     ENOUGH = f"{ENOUGH_RUNS} runs and more"
 
 
-class WindowSupport(NamedTuple):
-    """Of predictions (n,): training runs near the motion, supported probability, and whether that suffices."""
-
-    n_runs: Array
-    probability: Array
-    supported: Array
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SupportTable:
     """Training runs (classes, speed cells, yaw cells) near each cell of motion; none beyond the last cells."""
@@ -366,19 +358,19 @@ def learn_support(
     return SupportTable(tuple(str(name) for name in classes), counts)
 
 
-def support_of(probability: Array, near_runs: Array) -> WindowSupport:
-    """Return the support of the most probable terrain of each window, both (n, k) of the same classes.
+def supported_probability(probability: Array, near_runs: Array) -> Array:
+    """Return ``p n / (1 + n)`` (n,) of the most probable terrain of each window, both (n, k) of the same classes.
+
+    A prediction of less than :data:`SUPPORTED` is unsupported.
 
     Examples
     --------
-    >>> found = support_of(np.array([[0.9, 0.1], [0.9, 0.1], [0.4, 0.6]]), np.array([[4, 4], [0, 9], [9, 2]]))
-    >>> found.n_runs.tolist(), found.probability.round(2).tolist(), found.supported.tolist()
-    ([4, 0, 2], [0.72, 0.0, 0.4], [True, False, False])
+    >>> supported_probability(np.array([[0.9, 0.1], [0.9, 0.1], [0.4, 0.6]]), np.array([[4, 4], [0, 9], [9, 2]]))
+    array([0.72, 0.  , 0.4 ])
     """
     rows, best = np.arange(len(probability)), probability.argmax(axis=1)
     n_runs = near_runs[rows, best]
-    supported = probability[rows, best] * n_runs / (1.0 + n_runs)
-    return WindowSupport(n_runs, supported, supported >= SUPPORTED)
+    return np.asarray(probability[rows, best] * n_runs / (1.0 + n_runs))
 
 
 def support_levels(n_runs: Array) -> Array:

@@ -26,7 +26,7 @@ from pipelines.report.settings import JobsSettings, setting
 from pipelines.report.tree import Column, Report, Table
 from terrain.classify.folds import Fold
 from terrain.classify.held_out import Examples
-from terrain.classify.limits import Motion, learn_support, support_of
+from terrain.classify.limits import SUPPORTED, Motion, learn_support, supported_probability
 from terrain.classify.metrics import Difference, Outcome, compare_outcomes
 from terrain.classify.proposals import ACCEPTED, Proposal, questions
 from terrain.errors import DataError
@@ -174,7 +174,7 @@ def _proposal(
             seen.speed_mps, seen.yaw_rate_radps, examples.terrain[rows[known]], runs[known], fitted.classes_
         )
         near = table.near_runs(now.speed_mps, now.yaw_rate_radps)
-        supported = float(support_of(probability, near).supported.mean())
+        supported = float((supported_probability(probability, near) >= SUPPORTED).mean())
     confidence = float(probability[:, best].mean())
     return Proposal(run, 0.0, float(len(of)), str(fitted.classes_[best]), confidence, supported, 0.0, len(of))
 

@@ -37,7 +37,7 @@ class Evaluated(NamedTuple):
         return SimpleNamespace(**coverage_of(*self, 2.0, 0))
 
     def runs_near(self):
-        return held_out_support(*self).true_runs[0]
+        return held_out_support(*self)[0][0]
 
 
 def evaluated(runs, folds=3, seed=0):

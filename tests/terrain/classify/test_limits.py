@@ -23,7 +23,7 @@ from terrain.classify.limits import (
     largest_margin,
     learn_novelty,
     learn_support,
-    support_of,
+    supported_probability,
 )
 from terrain.errors import DataError
 
@@ -174,11 +174,9 @@ def test_a_table_of_another_form_is_refused_in_one_sentence(changed):
 @given(st.floats(0.5, 1), st.integers(0, 50))
 def test_the_supported_probability_never_exceeds_the_probability_and_grows_with_runs(probability, n_runs):
     stated = np.array([[probability, 1 - probability]])
-    few, more = (support_of(stated, np.array([[n, 99]])) for n in (n_runs, n_runs + 1))
-    assert few.probability[0] < more.probability[0] <= probability
-    assert few.supported[0] == (few.probability[0] >= SUPPORTED)
-    if n_runs == 0:
-        assert not few.supported[0]
+    few, more = (supported_probability(stated, np.array([[n, 99]]))[0] for n in (n_runs, n_runs + 1))
+    assert few < more <= probability
+    assert n_runs > 0 or few < SUPPORTED
 
 
 def draw_scores(rng, n_runs):
