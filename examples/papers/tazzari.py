@@ -32,7 +32,7 @@ from terrain.simulation.tracked import (
     STEP_S,
     PrescribedSlip,
     TrackedSensors,
-    drive,
+    drive_tracks,
     rut_depth,
     tracks_on,
 )
@@ -594,7 +594,7 @@ def closed_loop(seed: np.random.SeedSequence, duration_s: float, compensated: bo
         used = command.eta
         for _ in range(round(TICK_S / STEP_S)):
             belts = keep * belts + (1.0 - keep) * np.array([command.left_mps, command.right_mps])
-            drive(tracks, np.array(LEVEL), np.array([belts, belts]), state, STEP_S)
+            drive_tracks(tracks, np.array(LEVEL), np.array([belts, belts]), state, STEP_S)
             state[0] = state[1]
         row = np.full(6, np.nan)
         row[:2] = belts + NOISY.encoder_mps * rng.standard_normal(2)
