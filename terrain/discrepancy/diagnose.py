@@ -20,7 +20,7 @@ from terrain.discrepancy.clocks import Latencies, Shift, latencies_of, shifts_of
 from terrain.discrepancy.constancy import CAVEAT_RATIO, Constancy, constancy_of, values_by_session
 from terrain.discrepancy.evidence import Evidence, fit_change, move_point, partial_information
 from terrain.discrepancy.faults import Fault, faults_of, repaired
-from terrain.discrepancy.next_drive import next_drive
+from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.robot_terms import UNITS
@@ -102,11 +102,10 @@ def diagnose(
     named, sets = _named_and_ambiguous(fit)
     causes, parameters = tuple(cause_of(fit, effect) for effect in named), names_of(named)
     limits = limits_of(fit, problem.library)
-    most = {name: max(abs(low), high) for name, (low, high) in BOUNDS.items()}
     missed = tuple(
         limit
         for limit in limits
-        if limit.detection_limit > EXCITED_RATIO * most[limit.name] and limit.name not in parameters
+        if limit.detection_limit > EXCITED_RATIO * MOST[limit.name] and limit.name not in parameters
     )
     at = [fit.names.index(name) for name in parameters]
     inflation = np.array([fit.tests[effect.name].inflation for effect in named for _ in effect.parameters])
@@ -451,9 +450,8 @@ class Prepared(NamedTuple):
     problem: Problem  #: of these runs, faults repaired
     faults: tuple[Fault, ...]  #: that were found and repaired, in all runs that were given
     excluded: tuple[Excluded, ...]  #: runs that are unfit
-    seeds: Mapping[
-        str, float
-    ]  #: lags of sensors, by parameter, so large that a search has to start from them
+    seeds: Mapping[str, float]
+    """Lags of sensors, by parameter, so large that a search has to start from them."""
     aligned: Evidence  #: of the runs with these lags built in
     shift: Shift  #: clocks of the runs behind that
 

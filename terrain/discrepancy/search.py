@@ -60,9 +60,8 @@ class Problem(NamedTuple):
     simulation: Simulation
     low_pass: LowPass
     library: tuple[Effect, ...]
-    varying: Mapping[str, float] = MappingProxyType(
-        {}
-    )  #: scatter by parameter, beside that of the simulation
+    varying: Mapping[str, float] = MappingProxyType({})
+    """Scatter by parameter, beside that of the simulation."""
 
     @property
     def scatter(self) -> dict[str, float]:

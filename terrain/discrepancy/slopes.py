@@ -32,9 +32,8 @@ class Slope(NamedTuple):
 
     ratio: float = math.nan  #: NaN where it is not clear from 1, or does not describe the residual
     std: float = math.nan  #: over runs
-    level: float = (
-        math.nan
-    )  #: measured minus simulated, in the channel's unit; NaN where a factor is stated or none clear
+    level: float = math.nan
+    """Measured minus simulated, in the channel's unit; NaN where a factor is stated or none clear."""
 
 
 def slope_through_zero(simulated: Array, measured: Array) -> float:

@@ -35,9 +35,8 @@ class TerrainMatch(NamedTuple):
 
     terrain: str  #: label of the runs; empty for runs without a label or with several
     soil: str | None  #: its soil of the package; None for the default terrain
-    effective_ratio: (
-        float | None
-    )  #: part of the tilt that acts as a slope, 0 to 1; None on the default terrain
+    effective_ratio: float | None
+    """Part of the tilt that acts as a slope, 0 to 1; None on the default terrain."""
 
     @property
     def text(self) -> str:

@@ -83,9 +83,8 @@ class Varying(NamedTuple):
     mean: float  #: of the values over runs
     scatter: float
     z: float  #: evidence of the difference, as a standard normal number
-    groups: tuple[
-        RunGroup, ...
-    ]  #: two groups of runs, the smaller value first; empty where values are spread
+    groups: tuple[RunGroup, ...]
+    """Two groups of runs, the smaller value first; empty where values are spread."""
     channel: str  #: where it shows most
 
 
@@ -190,9 +189,8 @@ class Diagnosis:
     verdict: Verdict
     causes: tuple[Cause, ...]
     covariance: Covariance  #: of the causes' parameters
-    ambiguous_sets: tuple[
-        tuple[str, ...], ...
-    ]  #: effects of which one is present, not distinguished; best fit first
+    ambiguous_sets: tuple[tuple[str, ...], ...]
+    """Effects of which one is present, not distinguished; best fit first."""
     ambiguous_values: dict[str, tuple[Value, ...]]  #: fitted values of each of them, by the effect's name
     unexplained: tuple[Unexplained, ...]
     detection_limits: tuple[Limit, ...]  #: of every effect

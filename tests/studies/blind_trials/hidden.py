@@ -86,10 +86,8 @@ OUTSIDE_SIZES = {"wheel_eccentricity_ratio": (0.01, 0.04), "stick_slip_a": (5.0,
 """Ranges of the amplitudes of what no library has: a wheel's centre 2 to 8 mm off, spikes of a few ampere."""
 ENTRY_TAKEN_OUT = (3.0, 10.0)  #: range over the limit, of those whose entry is taken out
 
-TRACK, TRACK_RATIO = (
-    "effective_track",
-    "effective_track_ratio",
-)  #: what scatters as well on a skid-steer robot
+TRACK, TRACK_RATIO = ("effective_track", "effective_track_ratio")
+"""What scatters as well on a skid-steer robot."""
 
 
 class Case(NamedTuple):
@@ -250,10 +248,8 @@ def _after(run: RunLog, lead_s: float, clock_rate_ratio: float) -> RunLog:
 
 # -- Values of an effect that differ from run to run, as they do on measured robots ------------------------
 
-SCATTER_RATIO = (
-    0.1,
-    0.35,
-)  #: range of the deviation from run to run over the value, as measured robots show it
+SCATTER_RATIO = (0.1, 0.35)
+"""Range of the deviation from run to run over the value, as measured robots show it."""
 
 
 def factors(rng: np.random.Generator, ratio: float, n_runs: int) -> Array:
@@ -294,10 +290,8 @@ def scattered_values(
 
 # -- Logs whose stamps are late, and logs of stalled runs --------------------------------------------------
 
-WHEELS_LOGGER = (
-    "wheels",
-    "steering",
-)  #: streams that one logger stamps; others: terrain.effects.OTHER_LOGGER
+WHEELS_LOGGER = ("wheels", "steering")
+"""Streams that one logger stamps; others: terrain.effects.OTHER_LOGGER."""
 LOGGER_LATE_S = (0.15, 0.4)  #: range of its delay: wheels of measured robots are 0.26 to 0.28 s late
 SENSOR_LATE_S = (0.1, 0.3)  #: range of the delay of one sensor: a measured lidar is 0.16 s late
 STALLED_RATIO = (0.05, 0.15)  #: range of the ratio of runs that are stalled; one at the least

@@ -2,7 +2,6 @@
 
 import doctest
 import math
-from dataclasses import replace
 from importlib import import_module
 from itertools import count
 
@@ -32,7 +31,7 @@ from studies.blind_trials.hidden import (
     value_is_right,
     with_fault,
 )
-from studies.blind_trials.limits import POWER, TEST_SIZE, Limits, confusable_class, limits_of
+from studies.blind_trials.limits import POWER, TEST_SIZE, Limits, limits_of
 from studies.blind_trials.scoring import table_of
 from studies.blind_trials.trial import GROSS, run_trial, simulation_of, stage_of
 from terrain.discrepancy.diagnose import POWER_Z, diagnose
@@ -301,15 +300,6 @@ def test_limits_fall_with_more_runs_and_rise_where_little_is_driven(world):
     assert along / limits.of(lever) == pytest.approx(math.sqrt(own[0] / own[1]))
 
 
-def test_an_effect_is_of_its_own_class_and_a_class_is_mutual(world):
-    robot, _, limits = world
-    classes = {e.name: confusable_class(limits, e, robot.drive) for e in library_of(robot.drive)}
-    for name, members in classes.items():
-        assert name in members
-        assert all(name in classes[other] for other in members)
-    assert "gyro_bias" not in classes["payload"]
-
-
 def test_nothing_of_the_truth_leaks_into_the_runs(world):
     robot, drives, _ = world
     some = drives._replace(twists=drives.twists[:2], hills=drives.hills[:2])
@@ -429,22 +419,6 @@ def test_a_fault_changes_its_channels_and_no_others_by_what_its_name_states(robo
 
 
 # -- One blind trial: what it depends on, and what it counts when the diagnosis refuses the runs -----------
-
-
-def test_cases_take_the_robots_in_turn_and_row_found_every_effect():
-    cases = cases_of(Row.FOUND, 70, 7, 8)
-    assert [case.robot for case in cases[:4]] == ["agrimaro", "husky"] * 2
-    for robot, drive in (("agrimaro", "swerve"), ("husky", "skid_steer")):
-        n = sum(not effect.modifies for effect in library_of(drive))
-        assert {case.number // 2 % n for case in cases if case.robot == robot} == set(range(n))
-
-
-@pytest.mark.slow
-def test_a_trial_depends_on_its_seed_and_number_alone():
-    cases = cases_of(Row.STRONG, 4, 3, 3)
-    one, again = (replace(run_trial(cases[1]), seconds=0.0) for _ in range(2))
-    assert one == again
-    assert run_trial(cases[3]).hidden != one.hidden
 
 
 def test_refused_runs_count_as_a_false_alarm(monkeypatch):

@@ -114,9 +114,8 @@ class Trial:
     present: tuple[str, ...] = ()  #: ids of those that have the effect if only some do
     fault: str = ""  #: name of the one written into the logs
     # -- the answer
-    verdict: Verdict = (
-        Verdict.REFUSED
-    )  #: by default where the runs were not accepted, as too few seemed to be fit
+    verdict: Verdict = Verdict.REFUSED
+    """By default where the runs were not accepted, as too few seemed to be fit."""
     refusal: str = ""  #: why they were refused
     named: tuple[str, ...] = ()
     sets: tuple[tuple[str, ...], ...] = ()
