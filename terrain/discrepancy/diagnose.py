@@ -521,10 +521,8 @@ def cause_of(fit: CauseFit, effect: Effect) -> Cause:
     low, high = gain_interval(test.gain)
     constant, parameter = constancy_of_cause(fit, effect), effect.parameters[0]
     caveats = [constant.caveat] if constant.caveat else []
-    scatter = run_scatter(fit, parameter.name)
-    if len(effect.parameters) == 1 and scatter > CAVEAT_RATIO * abs(
-        float(fit.change[fit.names.index(parameter.name)])
-    ):
+    scatter, value = run_scatter(fit, parameter.name), fit.change[fit.names.index(parameter.name)]
+    if len(effect.parameters) == 1 and scatter > CAVEAT_RATIO * abs(float(value)):
         unit = UNITS.get(parameter.unit, parameter.unit)
         caveats.append(f"it differs from run to run by {scatter:.2g} {unit}".strip())
     return Cause(
