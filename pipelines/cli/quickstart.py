@@ -6,6 +6,7 @@ ends with give all figures.
 
 from __future__ import annotations
 
+import math
 import shlex
 import subprocess
 import sys
@@ -230,5 +231,5 @@ def _slip(rows: Sequence[TerrainSlip]) -> Section:
         *(Column("RMSE", ".4f"), Column("NEES", ".2f")),
     )
     table = Table(columns, [tuple(row) for row in rows], title="steady slip of the simulated runs")
-    worst = max((row.slip_rmse or 0.0) for row in rows)
+    worst = max((row.slip_rmse for row in rows if math.isfinite(row.slip_rmse)), default=0.0)
     return Section(f"Slip, at most {format_value(worst, '.4f')} off", [table])

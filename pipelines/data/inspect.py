@@ -126,6 +126,7 @@ def report(result: Inspection) -> Report:
     levels = Counter(str(worst(each.plausibility)) for each in result.runs)
     found = f"{len(faults)} faults" if faults else "no fault"
     rows = [_row(each, name) for each in result.runs for name in each.streams]
+    more = "" if len(rows) <= MAX_ROWS else f"of {len(rows)} streams"
     notable = sorted(rows, key=lambda row: (not (row[4] or row[6] or row[7]), row[0]))
     dropped = [
         f"{each.run_id}: dropped {format_counts(each.dropped)}" for each in result.runs if each.dropped
@@ -137,9 +138,7 @@ def report(result: Inspection) -> Report:
         lead=f"digest {result.digest[:12]}",
         parts=[
             *(Text(each, "warning") for each in faults[:6]),
-            Table(
-                COLUMNS, notable[:MAX_ROWS], note="" if len(rows) <= MAX_ROWS else f"of {len(rows)} streams"
-            ),
+            Table(COLUMNS, notable[:MAX_ROWS], note=more),
         ],
         details=sections(
             ("All faults", faults),

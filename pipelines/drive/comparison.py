@@ -193,18 +193,16 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
     def ramp(rise_mps2: float | None) -> Controller:
         return make_controller("ramp", table, settings.delay_s, rise_mps2)
 
+    def try_ramp(rise_mps2: float) -> list[Drive]:
+        return drive_all("", [ramp(rise_mps2)], silent)["ramp"]
+
     others = [each for each in controllers if each.name != "ramp"]
     drives = drive_all("drive", others) if others else {}
     ramp_mps2 = None
     if "ramp" in names:
         ramp_mps2 = settings.ramp_mps2
         if ramp_mps2 is None:
-            ramp_mps2 = matching_ramp(
-                drives,
-                lambda rise_mps2: drive_all("", [ramp(rise_mps2)], silent)["ramp"],
-                settings.scenario,
-                settings.accel_mps2,
-            )
+            ramp_mps2 = matching_ramp(drives, try_ramp, settings.scenario, settings.accel_mps2)
         drives |= drive_all("drive ramp", [ramp(ramp_mps2)])
         ramp_mps2 = ramp(ramp_mps2).pilot.ramp_mps2
     add_energies(drives)

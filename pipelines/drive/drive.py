@@ -46,9 +46,7 @@ class DrivenSettings(JobsSettings):
         None, "Cruising speed in m/s; 1 by default, with --path 3.", option="--speed", gt=0.0
     )
     seeds: int | None = setting(
-        None,
-        "Number of seeds: each draws load, soil, tyres and noise; 20 by default, with --faults 1.",
-        ge=1,
+        None, "Number of seeds: each draws load, soil, tyres and noise; 20 by default, with --faults 1.", ge=1
     )
     first_seed: int = setting(0, "First seed.", option="--seed", ge=0)
     out: Path | None = setting(None, "Folder of the page, with --path also of the table of the drive.")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -126,12 +126,13 @@ def drive_faults(
         for place in places
         for duration_s in sorted(settings.durations_s)
     ]
-    tasks = [(case, references[Place(*case[2:])]) for case in cases]
-    found = parallel(evaluate_case, (loop,), tasks, settings.jobs, "drive with faults", progress)
-    rows: list[FaultRow] = list(found)
+
+    def of_cases(function: Callable[..., Any], cases: Sequence[FaultCase], task: str) -> list[Any]:
+        each = [(case, references[Place(*case[2:])]) for case in cases]
+        return list(parallel(function, (loop,), each, settings.jobs, task, progress)) if each else []
+
+    rows: list[FaultRow] = of_cases(evaluate_case, cases, "drive with faults")
     shown = drawn_cases(rows, settings.draw) if settings.out is not None or settings.draw else []
-    tasks = [(case, references[Place(*case[2:])]) for case in shown]
-    drawn = parallel(fault_figure, (loop,), tasks, settings.jobs, "draw", progress) if shown else ()
     return FaultsResult(
         robot=robot.name,
         table=slips.name,
@@ -144,7 +145,7 @@ def drive_faults(
         bars=count_bars([row.bars for row in rows]),
         n_rows=len(rows),
         n_met=sum(not row.unmet for row in rows),
-        drawn=tuple(drawn),
+        drawn=tuple(of_cases(fault_figure, shown, "draw")),
     )
 
 
@@ -222,6 +223,18 @@ DRIVES = (
 )
 
 
+BY_FAULT = (
+    "Bars that are not met, over durations and seeds; in brackets how many of the drives, where it is not all. "
+    "Faults are dead (the stream carries no information), lying (a wrong one), tolerable (it still carries the "
+    "motion: the controller has to go on) or degraded (it may do either)."
+)
+FROM_THE_FAULT = "All figures count from when a fault would begin."
+MODELS = (
+    "Robot and terrain are models. A fault changes what arrives at the controller; the sensors and the motion are "
+    "those of the drive without it, until the commands differ."
+)
+
+
 def report(result: FaultsResult) -> Report:
     """Return how many drives meet all bars, the bars and faults that are not met, and behind it every drive."""
     headings = list(dict.fromkeys(map(_place, result.clean)))
@@ -239,6 +252,14 @@ def report(result: FaultsResult) -> Report:
     for name, rows in by_fault.items():
         at = [[row for row in rows if _place(row.case) == heading] for heading in headings]
         overview.append((name, result.abouts[name], rows[0].nature, *map(bars_text, at), _named(rows)))
+    heads: list[Column | str] = [
+        "fault",
+        Column("what it does", long=True),
+        "nature",
+        *headings,
+        "sensors named",
+    ]
+    provenance = [("seeds", ", ".join(map(str, result.seeds))), ("versions", versions())]
     return Report(
         title=f"{result.robot}: sensor faults in the closed loop",
         answer=f"{answer}.",
@@ -249,33 +270,11 @@ def report(result: FaultsResult) -> Report:
         picture=result.drawn[0] if result.drawn else None,
         parts=[Table(("bar", "met", "unmet", "not judged", Column("what it asks for", long=True)), bars)],
         details=sections(
-            (
-                "Bars met and not met, by fault",
-                [
-                    Table(
-                        ("fault", Column("what it does", long=True), "nature", *headings, "sensors named"),
-                        overview,
-                        note="Bars that are not met, over durations and seeds; in brackets how many of the "
-                        "drives, where it is not all. Faults are dead (the stream carries no information), "
-                        "lying (a wrong one), tolerable (it still carries the motion: the controller has to go "
-                        "on) or degraded (it may do either).",
-                    )
-                ],
-            ),
-            (
-                "Without a fault",
-                [Table(CLEAN, result.clean, note="All figures count from when a fault would begin.")],
-            ),
+            ("Bars met and not met, by fault", [Table(heads, overview, note=BY_FAULT)]),
+            ("Without a fault", [Table(CLEAN, result.clean, note=FROM_THE_FAULT)]),
             ("Some drives", result.drawn[1:]),
             ("All drives", [Table(DRIVES, result.rows)]),
-            (
-                "Where these numbers come from",
-                [
-                    "Robot and terrain are models. A fault changes what arrives at the controller; the sensors "
-                    "and the motion are those of the drive without it, until the commands differ.",
-                    Pairs([("seeds", ", ".join(map(str, result.seeds))), ("versions", versions())]),
-                ],
-            ),
+            ("Where these numbers come from", [MODELS, Pairs(provenance)]),
         ),
     )
 

@@ -91,15 +91,9 @@ class PathResult(Result, eq=False):
         import pandas as pd
 
         drive = self.drive
-        columns = {
-            "time_s": drive.time_s,
-            "distance_m": drive.distance_m,
-            "lateral_m": drive.lateral_m,
-            "position_x_m": drive.position_m[:, 0],
-            "position_y_m": drive.position_m[:, 1],
-            "speed_mps": drive.speed_mps,
-            "steer_front_rad": drive.steer_rad,
-        }
+        columns = {name: getattr(drive, name) for name in ("time_s", "distance_m", "lateral_m")}
+        columns |= {f"position_{axis}_m": drive.position_m[:, i] for i, axis in enumerate("xy")}
+        columns |= {"speed_mps": drive.speed_mps, "steer_front_rad": drive.steer_rad}
         for j, wheel in enumerate(WHEELS):
             columns |= {
                 f"slip_{wheel}_rad": drive.slip_rad[:, j],

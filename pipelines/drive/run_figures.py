@@ -34,13 +34,9 @@ class DriveCurves(NamedTuple):
 
     true_s: Array  # of the true speed and slip, (n,)
     true_mps: Array
-    slip: Array  # mean of the wheels
-    slip_least: Array
-    slip_largest: Array
+    slips: Array  # of each wheel, (n, wheels)
     control_s: Array  # of the pilot's channels, (m,)
-    control: Mapping[str, Array]
-    aimed: Array  # target slip with its floor, negative in braking
-    is_open_loop: bool  # no slip was estimated
+    control: Mapping[str, Array]  # the target slip with its floor is negative in braking
     terrains: Mapping[str, Sequence[Span]]  # ``true`` and ``classified`` over time; empty on one terrain
 
 
@@ -62,27 +58,16 @@ def drive_curves(run: RunLog, table: SlipTable) -> DriveCurves:
         for each in (truth.time_s, control.time_s)
     )
     channels = {name: control.channel(name)[ticks] for name in control.channels}
-    aimed, control_s, codes = channels["aimed_ratio"], control.time_s[ticks], channels["terrain_code"]
+    control_s, codes = control.time_s[ticks], channels["terrain_code"]
     if not np.isfinite(channels["balance_ratio"]).any():  # the thesis reports the magnitude of its target
-        aimed = np.where(channels["drive_state_code"] == DriveState.BRAKING, -aimed, aimed)
+        brakes, aimed = channels["drive_state_code"] == DriveState.BRAKING, channels["aimed_ratio"]
+        channels["aimed_ratio"] = np.where(brakes, -aimed, aimed)
     terrains = {}
     if len(run.terrains) > 1:
         terrains["true"] = [(label.start_s, label.end_s, label.terrain) for label in run.labels]
         if (codes >= 0).any():
             terrains["classified"] = spans(control_s, codes, dict(enumerate(table.targets)))
-    slips = slips[seen]
-    return DriveCurves(
-        truth.time_s[seen],
-        speed[seen],
-        slips.mean(axis=1),
-        slips.min(axis=1),
-        slips.max(axis=1),
-        control_s,
-        channels,
-        aimed,
-        not np.isfinite(channels["slip_ratio"]).any(),
-        terrains,
-    )
+    return DriveCurves(truth.time_s[seen], speed[seen], slips[seen], control_s, channels, terrains)
 
 
 def run_figures(examples: Mapping[str, DriveCurves]) -> list[Figure]:
@@ -93,7 +78,11 @@ def run_figures(examples: Mapping[str, DriveCurves]) -> list[Figure]:
         float(np.nanmax([*each.true_mps, *each.control["desired_mps"]])) for each in examples.values()
     )
     slips = np.concatenate(
-        [part for each in examples.values() for part in (each.slip_least, each.slip_largest, each.aimed)]
+        [
+            part
+            for each in examples.values()
+            for part in (each.slips.min(axis=1), each.slips.max(axis=1), each.control["aimed_ratio"])
+        ]
     )
     least, largest = float(np.nanmin([-0.02, *slips])), float(np.nanmax([0.1, *slips]))
     margin = 0.1 * (largest - least)
@@ -111,15 +100,13 @@ def _run_figure(
         Line("commanded, fastest wheel", drive.control_s, control["driven_mps"], VERMILION),
         Line("true, over ground", drive.true_s, drive.true_mps, BLUE),
     ]
+    least, largest = drive.slips.min(axis=1), drive.slips.max(axis=1)
     slip: list[Mark] = [
-        Band("true, least to largest wheel", drive.true_s, drive.slip_least, drive.slip_largest, BLUE),
-        Line("true, mean of the wheels", drive.true_s, drive.slip, BLUE),
-        *([] if drive.is_open_loop else _control_marks(drive)),
+        Band("true, least to largest wheel", drive.true_s, least, largest, BLUE),
+        Line("true, mean of the wheels", drive.true_s, drive.slips.mean(axis=1), BLUE),
+        *(_control_marks(drive) if np.isfinite(control["slip_ratio"]).any() else []),
     ]
-    panels = [
-        Panel(moves, "speed [m/s]", y_range=speeds_mps),
-        Panel(slip, "slip ratio", y_range=slips),
-    ]
+    panels = [Panel(moves, "speed [m/s]", y_range=speeds_mps), Panel(slip, "slip ratio", y_range=slips)]
     for kind, strip in drive.terrains.items():
         panels.append(Panel([Strip(strip)], f"{kind} terrain"))
     return Figure(name, panels, CAPTION, x_label="time [s]")
@@ -135,7 +122,7 @@ def _control_marks(drive: DriveCurves) -> list[Mark]:
     for label, values, colour, dashed in (
         ("estimated, largest wheel", estimated, ORANGE, False),
         ("target", control["target_ratio"], GREEN, False),
-        ("target with its floor", drive.aimed, GREY, True),
+        ("target with its floor", control["aimed_ratio"], GREY, True),
         ("slip of steady motion", control["balance_ratio"], PINK, True),
     ):
         if np.isfinite(values).any():

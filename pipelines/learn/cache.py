@@ -68,10 +68,7 @@ def loaders_of(source: AlignedRunsSettings) -> list[RunLoader]:
 
 
 def cached_data(
-    loaders: Sequence[RunLoader],
-    settings: LearnSettings,
-    cache_dir: Path,
-    progress: Progress = silent,
+    loaders: Sequence[RunLoader], settings: LearnSettings, cache_dir: Path, progress: Progress = silent
 ) -> tuple[TrainingData, list[str]]:
     """Return the labelled windows of runs by their features, out of a cache as far as they are there.
 

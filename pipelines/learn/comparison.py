@@ -166,6 +166,21 @@ def report(result: ComparisonResult) -> Report:
         points = (None, None, None) if compared is None else _points(compared.accuracy)
         rows.append((each.recipe, each.accuracy, each.macro_run_accuracy, each.confidence_auc, *points))
     left_out = f"{plural(len(result.excluded_runs), 'run')} left out: one of the models was trained on them"
+    ratios = [Column(name, PERCENT) for name in ("accuracy", "mean over runs")]
+    columns: list[Column | str] = [
+        result.kind,
+        *ratios,
+        Column("confidence", ".2f"),
+        DIFFERENCE,
+        INTERVAL,
+        "is",
+    ]
+    note = f"Differences are to {first.recipe}; confidence: area from confidence to correctness."
+    pairs = [Section(f"{each.b} less {each.a}", partial(_paired, each)) for each in result.differences]
+    alone = [
+        Section(f"{each.recipe} alone", [recall_table(each), *notes(*each.notes)])
+        for each in result.contenders
+    ]
     return Report(
         title=f"{enumerated([each.recipe for each in result.contenders])} on {what}",
         answer=(
@@ -179,23 +194,10 @@ def report(result: ComparisonResult) -> Report:
         ),
         picture=recall_figure(result.contenders),
         parts=[
-            Table(
-                (
-                    *(result.kind, Column("accuracy", PERCENT), Column("mean over runs", PERCENT)),
-                    *(Column("confidence", ".2f"), DIFFERENCE, INTERVAL, "is"),
-                ),
-                rows,
-                note=f"Differences are to {first.recipe}; confidence: area from confidence to correctness.",
-            ),
+            Table(columns, rows, note=note),
             *notes(*result.notes, *([left_out] if result.excluded_runs else ())),
         ],
-        details=[
-            *(Section(f"{each.b} less {each.a}", partial(_paired, each)) for each in result.differences),
-            *(
-                Section(f"{each.recipe} alone", [recall_table(each), *notes(*each.notes)])
-                for each in result.contenders
-            ),
-        ],
+        details=[*pairs, *alone],
         next_step=f"terrain train --data {result.data or 'DIR'} --recipe RECIPE --name NAME"
         if result.kind == "recipes"
         else f"terrain predict --model {best.b if apart > 0 else best.a} --data DIR",

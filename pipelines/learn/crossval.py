@@ -89,15 +89,9 @@ def crossval(
     settings = settings.with_(extras=settings.extras and not several)
     for name in settings.recipes:
         recipe = recipe_of(settings, name)
-        samples = samples_of(
-            runs,
-            settings.rule,
-            recipe[0].signal_sets if several else settings.signal_sets,
-            settings.protocol,
-            speed_mps=settings.speed_mps,
-            merge_duplicates=settings.merge_duplicates,
-            skip_short=settings.skip_short,
-        )
+        used, speed_mps = recipe[0].signal_sets if several else settings.signal_sets, settings.speed_mps
+        asked = settings.rule, used, settings.protocol
+        samples = samples_of(runs, *asked, speed_mps=speed_mps, **settings.reading)
         contenders.append((name, recipe, samples))
     return side_by_side(contenders, settings, progress)
 

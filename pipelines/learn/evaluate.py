@@ -133,13 +133,10 @@ def evaluate_recipe(
     if beside and samples.runs:
         asks = [*following(recipe[:-1], windows, samples.runs, settings.rule, folds, seed)]
     elif channels:
-        truth = samples.terrain
-        asks = [
-            None
-            if fold.repeat
-            else partial(channel_drops, features[fold.test], truth[fold.test], channels, seed, fold.number)
-            for fold in folds
-        ]
+        asks = []
+        for fold in folds:
+            held = features[fold.test], samples.terrain[fold.test]
+            asks.append(None if fold.repeat else partial(channel_drops, *held, channels, seed, fold.number))
     held_out = evaluate(recipe[-1], examples, folds, settings.jobs, protocol, progress, asks, bool(channels))
     found: dict[str, Any] = {}
     notes = []

@@ -52,34 +52,21 @@ MAX_MODEL_BYTES = 256 * MEBIBYTE  #: Of a file as it lies on disk; those of this
 MAX_UNPACKED_BYTES = 1024 * MEBIBYTE
 """Of all that a model's archive unpacks to: megabytes of zeros pack to kilobytes."""
 
-TRUSTED_TYPES: tuple[str, ...] = (
-    "builtins.frozenset",
-    "features.extractor.Feature",
-    "features.extractor.FeatureExtractor",
-    "features.response.ResponseExtractor",
-    "features.extractor.SampleExtractor",
-    "features.windows.Layout",
-    "numpy.dtype",
-    "features.recipes.WindowPipeline",
-    "terrain.classify.network.Augmentation",
-    "terrain.classify.network.GroupedNetwork",
-    "terrain.classify.network.NetworkChoice",
-    "terrain.classify.network.Trial",
-    "terrain.classify.response.GroundResponse",
-    "terrain.classify.network.SampleColumns",
-    "terrain.classify.limits.Novelty",
-    "terrain.classify.grouped.OwnClassifier",
-    "terrain.classify.response.Process",
-    "terrain.classify.response.GroupedResponse",
-    "terrain.classify.response.ResponseChoice",
-    "terrain.classify.response.ResponseColumns",
-    "terrain.classify.stack.GroupedStack",
-    "terrain.classify.stack.StackChoice",
-    "terrain.classify.limits.SupportTable",
-    "terrain.classify.svm.Candidate",
-    "terrain.classify.svm.GroupedSVC",
-    "terrain.classify.grouped.Preparation",
-)
+_TRUSTED = {
+    "builtins": "frozenset",
+    "features.extractor": "Feature FeatureExtractor SampleExtractor",
+    "features.recipes": "WindowPipeline",
+    "features.response": "ResponseExtractor",
+    "features.windows": "Layout",
+    "numpy": "dtype",
+    "terrain.classify.grouped": "OwnClassifier Preparation",
+    "terrain.classify.limits": "Novelty SupportTable",
+    "terrain.classify.network": "Augmentation GroupedNetwork NetworkChoice SampleColumns Trial",
+    "terrain.classify.response": "GroundResponse GroupedResponse Process ResponseChoice ResponseColumns",
+    "terrain.classify.stack": "GroupedStack StackChoice",
+    "terrain.classify.svm": "Candidate GroupedSVC",
+}
+TRUSTED_TYPES = tuple(f"{module}.{name}" for module, names in _TRUSTED.items() for name in names.split())
 """Types beyond those that skops trusts itself which a model of this package may hold."""
 
 
@@ -289,13 +276,10 @@ def read_files(folder: Path) -> tuple[ModelInfo, dict[str, bytes]]:
 def drawn_window(info: ModelInfo) -> Windows:
     """Return a window of noise with the channels and rates of a model, to try it with."""
     rng = np.random.default_rng(0)
-    return _windows(
-        info,
-        {
-            stream: rng.standard_normal((1, len(names), info.layout.n_samples(stream, info.window_s)))
-            for stream, names in info.channels.items()
-        },
-    )
+    sizes = {
+        name: (1, len(of), info.layout.n_samples(name, info.window_s)) for name, of in info.channels.items()
+    }
+    return _windows(info, {stream: rng.standard_normal(size) for stream, size in sizes.items()})
 
 
 def _windows(info: ModelInfo, values: Mapping[str, Array]) -> Windows:

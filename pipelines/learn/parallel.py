@@ -66,13 +66,8 @@ def scheduler_address(compute: str) -> str | None:
     kind, _, place = compute.partition(":")
     with suppress(ValueError):  # of a port that is no port
         where = urlsplit(place if "://" in place else f"tcp://{place}")
-        if (
-            kind == "dask"
-            and where.scheme in ("tcp", "tls")
-            and where.hostname
-            and where.port
-            and not where.path
-        ):
+        is_scheduler = where.scheme in ("tcp", "tls") and where.hostname and where.port and not where.path
+        if kind == "dask" and is_scheduler:
             return where.geturl()
     raise ConfigError(
         f"--compute is {compute!r}: 'local' or the address of a Dask scheduler is accepted, "

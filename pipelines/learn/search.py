@@ -153,11 +153,8 @@ def _suggest(optuna: Any, trials: Sequence[Trial], n_trials: int, seed: int) -> 
         for name, (low, high) in SPACE.items()
     }
     for trial in trials:
-        study.add_trial(
-            optuna.trial.create_trial(
-                params=trial.params._asdict(), distributions=distributions, value=trial.accuracy
-            )
-        )
+        of = {"params": trial.params._asdict(), "distributions": distributions, "value": trial.accuracy}
+        study.add_trial(optuna.trial.create_trial(**of))
     asked = [study.ask(distributions).params for _ in range(min(BATCH, n_trials - len(trials)))]
     return [Candidate(**{name: float(f"{value:.4g}") for name, value in each.items()}) for each in asked]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, model_validator
 
@@ -94,6 +94,11 @@ class WindowSettings(Settings):
         default_s = PUBLISHED_WINDOW_S if getattr(self, "protocol", "") == "published" else WINDOW_S
         length_s = default_s if self.window_s is None else self.window_s
         return WindowRule(length_s, self.stride_s, WindowRule().steady if self.steady else None)
+
+    @property
+    def reading(self) -> dict[str, Any]:
+        """How runs are taken, as :func:`features.protocols.samples_of` has it."""
+        return {"merge_duplicates": self.merge_duplicates, "skip_short": self.skip_short}
 
 
 class LearnSettings(WindowSettings, JobsSettings):

@@ -195,10 +195,7 @@ def train(
     info = info_of(data, settings, dataset)
     model, missing = with_limits(recipe, info, samples, data.features, data.motion)
     evaluation = replace(
-        evaluation,
-        dataset=dataset,
-        data_digest=data.digest,
-        notes=(*evaluation.notes, *missing, *notes),
+        evaluation, dataset=dataset, data_digest=data.digest, notes=(*evaluation.notes, *missing, *notes)
     )
     info = replace(model.info, commit=code_commit(), run_accuracy=run_accuracies(data, evaluation))
     record = TrainingRecord(
@@ -275,11 +272,7 @@ def report(result: TrainResult) -> Report:
         card,
         title=f"Training on {result.dataset}",
         answer=f"{result.verdict}; {card.answer}",
-        parts=[
-            *card.parts[:1],
-            *parts,
-            *(Text(text, "note") for text in result.crossval.notes[:3]),
-        ],
+        parts=[*card.parts[:1], *parts, *(Text(text, "note") for text in result.crossval.notes[:3])],
         details=[Section("Limits", card.parts[1:]), *card.details],
         next_step=f"terrain predict --data runs/ --model {result.model_uri}",
     )

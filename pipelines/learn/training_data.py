@@ -82,13 +82,7 @@ class TrainingData:
 
 def data_of_runs(runs: Sequence[RunLog], settings: RecipeSettings) -> TrainingData:
     """Return what a recipe is fitted on, of runs; errors as :func:`features.protocols.samples_of`."""
-    samples = samples_of(
-        runs,
-        settings.rule,
-        settings.signal_sets,
-        merge_duplicates=settings.merge_duplicates,
-        skip_short=settings.skip_short,
-    )
+    samples = samples_of(runs, settings.rule, settings.signal_sets, **settings.reading)
     windows, recipe = samples.windows, recipe_of(settings, settings.recipe)
     return TrainingData(
         samples,

@@ -159,8 +159,7 @@ class Report:
         path = Path(path)
         check_file(path, "--report", ENDINGS)
         atomic_write(
-            path,
-            _written(self, "pages.markdown_text" if path.suffix.lower() == ".md" else "pages.html_page"),
+            path, _written(self, "pages.markdown_text" if path.suffix.lower() == ".md" else "pages.html_page")
         )
         return path
 

@@ -18,15 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pipelines.data.can_frames import (
-    RECEIVED,
-    SIGNALS,
-    Layout,
-    Receiver,
-    encode,
-    library,
-    load_layout,
-)
+from pipelines.data.can_frames import RECEIVED, SIGNALS, Layout, Receiver, encode, library, load_layout
 from pipelines.live.chain import Chain, CommandStatus
 from pipelines.live.session import chain_of
 from pipelines.report.numbers import format_value

@@ -212,11 +212,7 @@ def chain_of_run(
 
 
 def replay_run(
-    run: RunLog,
-    chain: Chain,
-    settings: Settings,
-    progress: Progress = silent,
-    stop: Event | None = None,
+    run: RunLog, chain: Chain, settings: Settings, progress: Progress = silent, stop: Event | None = None
 ) -> ReplayedRun:
     """Send one run through a live chain, each step when it is due.
 
@@ -271,19 +267,15 @@ def replay_run(
 
 def report(result: ReplayResult) -> Report:
     """Return what was found in the runs and how fast, a row a run, and what the chains did not use."""
-    accuracy = (
-        f", {format_value(result.accuracy, PERCENT)} of {result.n_judged} with a label classified rightly"
-        if result.accuracy is not None
-        else ""
-    )
-    panels = [
-        Panel(
-            [Strip([(w.start_s, w.end_s, w.believed or UNKNOWN) for w in run.windows])],
-            title=run.run_id,
-        )
-        for run in result.runs[:MAX_STRIPS]
-        if run.windows
-    ]
+    accuracy = ""
+    if result.accuracy is not None:
+        right = format_value(result.accuracy, PERCENT)
+        accuracy = f", {right} of {result.n_judged} with a label classified rightly"
+    panels = []
+    for run in result.runs[:MAX_STRIPS]:
+        if run.windows:
+            strip = Strip([(w.start_s, w.end_s, w.believed or UNKNOWN) for w in run.windows])
+            panels.append(Panel([strip], title=run.run_id))
     unused = [f"{run.run_id}: not used {format_counts(run.dropped)}" for run in result.runs if run.dropped]
     notes = [Text(f"skipped: {sentence}", "warning") for sentence in result.skipped]
     if result.interrupted:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from pipelines.slip.tracks import (
     SLIP,
     TRUTH_COLOUR,
     Keep,
-    Tracked,
+    Pictures,
     TracksResult,
     estimate_each,
     estimated,
@@ -72,9 +72,9 @@ def estimate_all(
     def robot_of(run: RunLog) -> Robot:
         return robot or packaged_robot(run.robot)
 
-    def estimate(run: RunLog) -> Tracked:
+    def estimate(run: RunLog) -> tuple[Any, RunLog, Pictures]:
         found = estimate_run(run, robot_of(run), name, tuning=tuning, tuned=noise)
-        return Tracked(summarize(found), enriched(found), partial(figures_of, found))
+        return summarize(found), enriched(found), partial(figures_of, found)
 
     found = estimate_each(runs, name, estimate, progress, keep)
     apart = offsets_apart_s(runs, lambda run: robot_of(run).track_m) if name == "skid" else {}

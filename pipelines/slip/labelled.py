@@ -21,15 +21,15 @@ ROBOT, SCENARIO, FILTER, RUNS_A_TERRAIN = "agrimaro", "survey", "vio15", 6
 class TerrainSlip(NamedTuple):
     """Steady slip of the simulated runs of a terrain: mean estimate, mean truth, RMSE, and mean NEES.
 
-    None where the slip was nowhere steady.
+    NaN where the slip was nowhere steady.
     """
 
     terrain: str
     n_runs: int
-    slip_mean: float | None
-    slip_true_mean: float | None
-    slip_rmse: float | None
-    nees: float | None
+    slip_mean: float
+    slip_true_mean: float
+    slip_rmse: float
+    nees: float
 
 
 def labelled_runs(
@@ -69,11 +69,6 @@ def labelled_runs(
 def _row(terrain: str, summaries: Sequence[EstimateSummary]) -> TerrainSlip:
     pairs = [(row.slip_mean, row.slip_true_mean) for row in summaries if math.isfinite(row.slip_true_mean)]
     estimated, true = np.array(pairs).T if pairs else (np.array([math.nan]), np.array([math.nan]))
-    values = {
-        "slip_mean": float(estimated.mean()),
-        "slip_true_mean": float(true.mean()),
-        "slip_rmse": float(np.sqrt(np.mean((estimated - true) ** 2))),
-        "nees": float(np.mean([row.nees for row in summaries])),
-    }
-    known = {key: value if math.isfinite(value) else None for key, value in values.items()}
-    return TerrainSlip(terrain, len(summaries), **known)
+    rmse, nees = np.sqrt(np.mean((estimated - true) ** 2)), np.mean([row.nees for row in summaries])
+    means = float(estimated.mean()), float(true.mean())
+    return TerrainSlip(terrain, len(summaries), *means, float(rmse), float(nees))

@@ -52,11 +52,7 @@ def run(settings: Settings, progress: Progress) -> LearnedSlipTable:
     table.save(settings.out)
     files = () if settings.figures is None else write_figures(table.pictures, settings.figures)
     written = replace(
-        table,
-        table=settings.out,
-        dataset=settings.dataset,
-        figures=files,
-        skipped=(*skipped, *table.skipped),
+        table, table=settings.out, dataset=settings.dataset, figures=files, skipped=(*skipped, *table.skipped)
     )
     if isinstance(written, LearnedCurves):
         log_curves(written)

@@ -239,22 +239,21 @@ def _pictures(
         with np.errstate(invalid="ignore", divide="ignore"):
             at = np.degrees(np.arctan2(left, ahead)) if sideways else turn / np.abs(ahead)
         by_window.append(Points(name, at, np.concatenate(slips)))
-    label = f"slip ratio of the body over {window_s:g} s"
+    label, title = (
+        f"slip ratio of the body over {window_s:g} s",
+        f"Slip of {robot.name}, measured from outside",
+    )
     reach, motion = 3.0, "yaw rate of the wheels over their speed [rad/m]"
     if sideways:
         reach, motion = 180.0, "direction of travel in the body's axes [degrees]"
     windows = Panel(by_window, "slip ratio of the body", x_range=(-reach, reach))
-    drawn = {
-        "slip_by_surface": (
-            "by surface",
-            Panel([bars]),
-            "The median over runs and its 95 % interval.",
-            label,
-        ),
-        "slip_by_run": ("a run a point", Panel(by_run, "surface"), "The median of each run.", label),
-        "slip_by_motion": ("by how it was driven", windows, "A window of steady motion a point.", motion),
-    }
+
+    def figure(how: str, panel: Panel, caption: str, x_label: str = label) -> Figure:
+        return Figure(f"{title}, {how}", [panel], caption, x_label=x_label)
+
+    every_run, every_window = "The median of each run.", "A window of steady motion a point."
     return {
-        name: Figure(f"Slip of {robot.name}, measured from outside, {how}", [panel], caption, x_label=x_label)
-        for name, (how, panel, caption, x_label) in drawn.items()
+        "slip_by_surface": figure("by surface", Panel([bars]), "The median over runs and its 95 % interval."),
+        "slip_by_run": figure("a run a point", Panel(by_run, "surface"), every_run),
+        "slip_by_motion": figure("by how it was driven", windows, every_window, motion),
     }

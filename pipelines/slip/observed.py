@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from pipelines.slip.tracks import (
     SLIP,
     TRUTH_COLOUR,
     Keep,
-    Tracked,
+    Pictures,
     TracksResult,
     estimate_each,
     estimated,
@@ -66,10 +66,10 @@ def estimate_all(
     if file is not None and name not in (*BY_MODEL, "encoder-odometry"):
         raise ConfigError(f"filter {name!r} takes no slip model: leave --slip-model out")
 
-    def observe(run: RunLog) -> Tracked:
+    def observe(run: RunLog) -> tuple[Any, RunLog, Pictures]:
         own = robot or packaged_robot(run.robot)
         found = observe_run(run, own, name, None if file is None else read_slip_model(file, own.name))
-        return Tracked(summarize_observer(found), with_estimates(found), partial(figures_of, found))
+        return summarize_observer(found), with_estimates(found), partial(figures_of, found)
 
     return ObserverResult(**estimate_each(runs, name, observe, progress, keep), slip_model=file)
 

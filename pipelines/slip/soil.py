@@ -177,11 +177,7 @@ MISFITS = (Column("", of="name"), Column("trials", of="misfit.n_trials"), *_erro
 
 def _laws_table(wheel: WheelResult) -> Table:
     rows: list[dict[str, Any]] = [
-        {
-            **law._asdict(),
-            "given": given,
-            **{out: getattr(getattr(law, out), given) for out in HELD_OUT},
-        }
+        law._asdict() | {"given": given} | {out: getattr(getattr(law, out), given) for out in HELD_OUT}
         for law in wheel.laws
         for given in GIVEN
         if math.isfinite(getattr(law.slip, given).pull_ratio)

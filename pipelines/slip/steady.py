@@ -131,8 +131,7 @@ def report(result: SteadyTargets) -> Report:
         result.pictures.get("operating_points"),
         parts,
         sections(
-            ("Reasons", [f"{row['terrain']}: {row['reason']}" for row in rows]),
-            ("Not used", result.skipped),
+            ("Reasons", [f"{row['terrain']}: {row['reason']}" for row in rows]), ("Not used", result.skipped)
         ),
         result.next_step,
         f"{plural(result.n_runs, 'run')}, windows of {result.window_s:g} s",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import field
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 from pipelines.report.figure import Band, Figure, Line, Mark
 from pipelines.report.results import Progress, Result, described
@@ -13,8 +13,8 @@ from pipelines.report.tree import Column, Part, Report, sections
 from pipelines.slip.shown import first_rows
 from terrain.records import Array, RunLog
 
-Keep = Callable[[RunLog, Callable[[], Mapping[str, Figure]]], None]
-"""Gets each run with its estimates, and what makes its pictures by name."""
+Pictures = Callable[[], Mapping[str, Figure]]  #: Makes the pictures of a run, by name
+Keep = Callable[[RunLog, Pictures], None]  #: Gets each run with its estimates, and what makes its pictures
 
 MAX_PICTURED = 3  #: Runs whose pictures a page has; ``--figures`` writes those of all
 TRUTH_COLOUR = 6  #: Grey, for what was true, of every estimate
@@ -36,30 +36,25 @@ class TracksResult(Result, kw_only=True):
         return tuple(getattr(self, self.rows))
 
 
-class Tracked(NamedTuple):
-    """Figures of a run, the run with its estimates, and what makes its pictures by name."""
-
-    summary: Any
-    run: RunLog
-    pictures: Callable[[], dict[str, Figure]]
-
-
 def estimate_each(
     runs: Sequence[RunLog],
     name: str,
-    estimate: Callable[[RunLog], Tracked],
+    estimate: Callable[[RunLog], tuple[Any, RunLog, Pictures]],
     progress: Progress,
     keep: Keep | None,
 ) -> dict[str, Any]:
-    """Return of a result the name of its ``filter``, the figures of ``runs``, and ``pictures`` of the first ones."""
+    """Return of a result the name of its ``filter``, the figures of ``runs``, and ``pictures`` of the first ones.
+
+    ``estimate`` gives the figures of a run, the run with its estimates, and what makes its pictures.
+    """
     rows: list[Any] = []
     pictures: dict[str, Figure] = {}
     for done, run in enumerate(runs, start=1):
-        found = estimate(run)
-        rows.append(found.summary)
+        summary, tracked, draw = estimate(run)
+        rows.append(summary)
         if keep is not None:
-            keep(found.run, found.pictures)
-        pictures |= found.pictures() if done <= MAX_PICTURED else {}
+            keep(tracked, draw)
+        pictures |= draw() if done <= MAX_PICTURED else {}
         progress(f"estimate {name}", done, len(runs))
     return {"filter": name, "runs": tuple(rows), "pictures": pictures}
 
