@@ -333,32 +333,34 @@ def peak_interval(
     draws: Array,
     runs: Sequence[RunBins],
     peak: Peak,
-    thrust_ratio: Callable[[Array], Array],
-    high_slip: float,
+    tilted_net: Callable[[float, Array], Array],
+    slip_range: tuple[float, float],
 ) -> tuple[float, float]:
     """Return the 90 % interval of a peak slip.
 
-    What all runs share is the radius' error and a tilt of the curve by :data:`SHAPE_STD_RATIO`: near a peak
-    ``f = f_0 (1 - a (s - s_0)^2)``, with a by the thrust at two thirds of s_0, and the tilt is over the peak's slip;
-    without a peak the tilt over the observed slips raises f here against f there.
+    What all runs share is the radius' error, and a tilt of the curve by :data:`SHAPE_STD_RATIO` over the peak's slip,
+    or over the observed slips where there is no peak; it moves a flat peak further to one side than to the other.
 
     Parameters
     ----------
     draws : (m,) peak slips of the bootstrap over runs
     runs : behind the curve
     peak : of the curve
-    thrust_ratio : thrust over load of the curve at each of an array of slips
-    high_slip : largest slip observed
+    tilted_net : net traction at each of an array of slips, of the thrust of the curve times 1 and a tilt a slip
+    slip_range : smallest and largest slip observed
     """
-    slip = peak.slip_ratio
-    below, here, third = thrust_ratio(np.array([slip - 1e-3, slip, 2 / 3 * slip]))
-    if peak.status is PeakStatus.NO_PEAK:
-        slope = max((here - below) / 1e-3, 1e-6)
-        shape_std = SHAPE_STD_RATIO * here * (high_slip - slip) / high_slip / slope
-    else:
-        shape_std = SHAPE_STD_RATIO / (2 * max(1.0 - third / here, 1e-4) / (slip / 3) ** 2 * slip)
-    shared = math.hypot(SYSTEMATIC_SLIP_STD, float(min(shape_std, slip / 2)))
-    return expanded_interval(draws, n_informative_runs(runs, peak, high_slip), slip, shared)
+    quantile = float(ndtri(0.5 + INTERVAL / 2))
+    over = peak.slip_ratio if peak.status is PeakStatus.PEAK else slip_range[1]
+    tilt = quantile * SHAPE_STD_RATIO / max(over, EDGE_SLIP)
+    less, more = (
+        abs(net_peak(partial(tilted_net, by), *slip_range, peak.status, 1001).slip_ratio - peak.slip_ratio)
+        for by in (-tilt, tilt)
+    )
+    shared = (
+        math.hypot(less, quantile * SYSTEMATIC_SLIP_STD),
+        math.hypot(more, quantile * SYSTEMATIC_SLIP_STD),
+    )
+    return expanded_interval(draws, n_informative_runs(runs, peak, slip_range[1]), peak.slip_ratio, shared)
 
 
 def n_informative_runs(runs: Sequence[RunBins], peak: Peak, high_slip: float) -> int:
@@ -368,22 +370,18 @@ def n_informative_runs(runs: Sequence[RunBins], peak: Peak, high_slip: float) ->
 
 
 def expanded_interval(
-    draws: Array, n_runs: int, centre: float, shared_std: float = SYSTEMATIC_SLIP_STD
+    draws: Array, n_runs: int, centre: float, shared: tuple[float, float]
 ) -> tuple[float, float]:
     """Return the 90 % interval of a slip by its bootstrap draws over ``n_runs`` runs.
 
     The percentiles are those of the normal law at ``sqrt(n / (n - 1)) t``, the quantile of Student's law with
-    n - 1 degrees of freedom; the error that all runs share is added to both sides in squares.
+    n - 1 degrees of freedom; what all runs share, 90 % below and above, is added in squares.
     """
     quantile = math.sqrt(n_runs / (n_runs - 1)) * float(stdtrit(n_runs - 1, 0.5 + INTERVAL / 2))
     tail = float(ndtr(-quantile))
     low, high = np.quantile(draws, [tail, 1 - tail])
-    shared = shared_std * float(ndtri(0.5 + INTERVAL / 2))
-    low, high = min(float(low), centre), max(float(high), centre)
-    return (
-        max(centre - math.hypot(centre - low, shared), 0.0),
-        min(centre + math.hypot(high - centre, shared), 1.0),
-    )
+    below, above = max(centre - float(low), 0.0), max(float(high) - centre, 0.0)
+    return max(centre - math.hypot(below, shared[0]), 0.0), min(centre + math.hypot(above, shared[1]), 1.0)
 
 
 MIN_RUNS = 3  #: Fewer runs do not show how runs differ
@@ -468,6 +466,9 @@ class _Model(NamedTuple):
     def net_traction(self, slip_ratio: Array) -> Array:
         return self.thrust(slip_ratio) - self.resistance_ratio
 
+    def tilted_net(self, tilt: float, slip_ratio: Array) -> Array:
+        return self.thrust(slip_ratio) * (1.0 + tilt * slip_ratio) - self.resistance_ratio
+
     def slip_of(self, net_ratio: float, high_slip: float = 1.0) -> float:
         """Return the smallest slip with a net traction; NaN where no slip has it."""
         return slip_at(self.law, self.parameters, self.resistance_ratio + net_ratio, high_slip)
@@ -513,7 +514,7 @@ def learn_curve(
         resistance_std=rho_std,
         slip_range=(low, high),
         peak=peak,
-        peak_interval=peak_interval(peaks, runs, peak, model.thrust, high),
+        peak_interval=peak_interval(peaks, runs, peak, model.tilted_net, (low, high)),
         balance_slip_ratio=model.slip_of(0.0),
         balance_std=_std_over_runs([draw.slip_of(0.0) for draw in draws], len(runs)),
         working_slip_ratio=model.slip_of(WORKING_TRACTION_RATIO, high),

@@ -143,9 +143,9 @@ def test_points_without_a_curve_are_invalid():
 
 def test_interval_of_few_runs_is_wider_than_its_percentiles():
     draws = np.random.default_rng(0).normal(0.3, 0.02, 4000)
-    low, high = expanded_interval(draws, 5, 0.3)
+    low, high = expanded_interval(draws, 5, 0.3, (0.0, 0.0))
     assert high - low > 1.25 * (np.quantile(draws, 0.95) - np.quantile(draws, 0.05))
-    assert expanded_interval(np.full(50, 0.3), 5, 0.3) == pytest.approx((0.2918, 0.3082), abs=1e-3)
+    assert expanded_interval(np.full(50, 0.3), 5, 0.3, (0.01, 0.02)) == pytest.approx((0.29, 0.32))
 
 
 def test_resistance_is_weighted_by_the_accuracy_of_each_run():
