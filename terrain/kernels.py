@@ -239,9 +239,24 @@ def _make_folder(folder: Path) -> None:
 def inner(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """Compile a function that compiled functions call, and nothing else: :func:`njit`, a fifth faster.
 
-    It has no entry for Python: a call from there ends the process.
+    It has no entry for Python, from where its ``py_func`` is called; a call of itself raises a TypeError.
     """
-    compiled = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        kernel = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)(function)
+        if isinstance(kernel, Dispatcher):  # numba would call the entry that is not there
+
+            def refuse(*_: Any, **__: Any) -> None:
+                raise TypeError(
+                    f"{function.__qualname__} is called by compiled functions only; call its py_func"
+                )
+
+            def keep(found: Any) -> None:
+                kernel.overloads[tuple(found.signature.args)] = found
+
+            vars(kernel).update(_compile_for_args=refuse, add_overload=keep)
+        return kernel
+
     return compiled if function is None else compiled(function)
 
 

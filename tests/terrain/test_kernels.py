@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import terrain
-from terrain.kernels import content_digest, njit, record
+from terrain.kernels import content_digest, inner, njit, record
 
 CALLER = """from terrain.kernels import njit
 from kern.callee import FACTOR, scaled
@@ -124,3 +124,21 @@ def test_what_a_called_function_reads_is_content():
 
     first, second = (njit(caller(njit(reading({"number": value})))) for value in (1.0, 2.0))
     assert content_digest(first.py_func) != content_digest(second.py_func)
+
+
+@inner
+def halved(x):
+    return 0.5 * x
+
+
+@njit
+def quartered(x):
+    return halved(halved(x))
+
+
+def test_a_kernel_for_kernels_refuses_to_be_called_from_python():
+    for _ in range(2):
+        with pytest.raises(TypeError, match="halved is called by compiled functions only"):
+            halved(1.0)
+        assert quartered(1.0) == 0.25
+    assert halved.py_func(1.0) == 0.5
