@@ -32,7 +32,6 @@ from features.statistics import (
     spectrum_names,
 )
 from features.windows import MAX_RATE_DEVIATION, Layout, left_right, rows_of, wheel_stream
-from terrain.classify.network import SampleColumns
 from terrain.errors import ConfigError, DataError
 from terrain.logs.schema import SIGNAL_SETS, UNIT_SYMBOLS, check_signal_sets, signal_set_of, unit_of
 from terrain.records import Array, Windows
@@ -455,6 +454,8 @@ class SampleExtractor(FeatureExtractor):
 
     def fit(self, X: Windows, y: Any = None) -> SampleExtractor:
         """Learn which channels and rates the windows have; errors as of the features."""
+        from terrain.classify.network import SampleColumns
+
         super().fit(X, y)
         rates_hz, n_samples = self.layout_.rate_hz, self.n_samples_
         self.columns_ = tuple(

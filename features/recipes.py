@@ -16,11 +16,7 @@ from features.extractor import (
     SampleExtractor,
     WindowFunction,
 )
-from features.response import ResponseExtractor
 from terrain.classify.grouped import OwnClassifier
-from terrain.classify.network import GroupedNetwork
-from terrain.classify.response import GroupedResponse
-from terrain.classify.stack import GroupedStack
 from terrain.classify.svm import CANDIDATES, GroupedSVC
 from terrain.errors import ConfigError
 from terrain.logs.schema import SIGNAL_SETS
@@ -104,11 +100,18 @@ def make_recipe(
     if recipe == "svm":
         classifier = GroupedSVC(candidates, gap=gap, seed=seed)
     elif recipe == "cnn":
+        from terrain.classify.network import GroupedNetwork
+
         features, classifier = SampleExtractor(*sets), GroupedNetwork(gap=gap, seed=seed)
     elif recipe == "response":  # responses are compared at the speeds of the wheels
+        from features.response import ResponseExtractor
+        from terrain.classify.response import GroupedResponse
+
         with_speeds = tuple(dict.fromkeys((*sets[0], "wheels")))
         features, classifier = ResponseExtractor(with_speeds, sets[1]), GroupedResponse()
     elif isinstance(recipe, str):
+        from terrain.classify.stack import GroupedStack
+
         features = SampleExtractor(*sets, with_features=True)
         classifier = GroupedStack(choose=recipe == "best", candidates=candidates, gap=gap, seed=seed)
     else:

@@ -10,7 +10,7 @@ from pathlib import Path
 from pipelines.data.bag_files import Bag, decoder_of, find_bags, messages_of, open_bag, topics_of
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
-from terrain.logs.labels import RecordedWindow, whole_run_label, window_of_text
+from terrain.logs.labels import RecordedWindow, window_of_text
 from terrain.logs.run_topics import (
     RUN_TOPIC,
     STRING,
@@ -20,7 +20,7 @@ from terrain.logs.run_topics import (
     run_of,
     string_of,
 )
-from terrain.logs.samples import checked_names, refuse_apart, short_name
+from terrain.logs.samples import checked_names, refuse_apart, short_name, whole_run_label
 from terrain.logs.tables import MAX_VALUES
 from terrain.logs.topics import (
     Faults,

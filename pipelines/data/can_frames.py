@@ -31,9 +31,8 @@ from terrain.errors import ConfigError, LogError, one_line
 from terrain.files.documents import read_yaml
 from terrain.files.names import data_folder
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
-from terrain.logs.labels import whole_run_label
 from terrain.logs.parts import Assembler, Part
-from terrain.logs.samples import checked_stream
+from terrain.logs.samples import checked_stream, whole_run_label
 from terrain.logs.schema import UNIT_SCALES, canonical_unit, check_unit, unit_of
 from terrain.records import Reading, RunLog, Stream
 

@@ -6,6 +6,7 @@ import logging
 import math
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -36,6 +37,16 @@ ACCEPTED = (
 )
 """What a refusal lists."""
 
+FOUND_BY: dict[str, tuple[str, tuple[str, ...]]] = {
+    "runs": ("read.find_runs", ("run.json", "*/run.json")),
+    "borealtc": ("borealtc.find_runs", ("*/imu_*.csv", "*/pro_*.csv")),
+    "drive": ("drive.find_sessions", ("samples.csv.gz", "*/samples.csv.gz")),
+    "robotino": ("robotino.find_runs", tuple(f"{'../' * n}camera_params.json" for n in range(4))),
+    "drive-recording": ("drive_recording.find_recordings", ("*.csv.gz", "*/*.csv.gz")),
+    "testbed": ("testbed.find_runs", ("smooth.csv", "grouser.csv")),
+}
+"""What finds the runs of each layout, and patterns of its files: without one of these it is not even imported."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -50,11 +61,12 @@ class RunLoader(NamedTuple):
 
     def __call__(self) -> RunLog:
         """Return the run; errors as :func:`load_runs`."""
-        from terrain.robots import robot_named
-
         run = self.read(repair=self.repair)
         wheels = run.streams.get("wheels")
-        if wheels is not None and any(channel.startswith("motor_") for channel in wheels.channels):
+        by_motor = wheels is not None and any(channel.startswith("motor_") for channel in wheels.channels)
+        if by_motor or self.align:
+            from terrain.robots import robot_named
+        if by_motor:
             from terrain.kinematics.logged_wheels import with_wheel_speeds
 
             run = with_wheel_speeds(run, robot_named(run.robot, self.robot))
@@ -155,9 +167,11 @@ def run_loaders(settings: RunsSettings) -> list[RunLoader]:
     LogError, ConfigError
         as :func:`load`, where no run is found or a setting is not accepted.
     """
-    from terrain.robots import load_robot
+    robot = None
+    if settings.robot is not None:
+        from terrain.robots import load_robot
 
-    robot = None if settings.robot is None else load_robot(settings.robot)
+        robot = load_robot(settings.robot)
     readers = _readers(settings.data, settings.layout, settings.mapping, robot)
     if not readers:
         raise LogError(f"{settings.data}: holds no run; {ACCEPTED}")
@@ -210,21 +224,15 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
         return _mapped(folder, mapping, robot)
     if layout == "csv":
         raise ConfigError("the layout 'csv' needs a mapping file")
-    from terrain.logs import borealtc, drive, drive_recording, read, robotino, testbed
-    from terrain.robots import robot_named
-
-    finders: dict[str, Callable[[Path], list[Any]]] = {
-        "runs": read.find_runs,
-        "borealtc": borealtc.find_runs,
-        "drive": drive.find_sessions,
-        "drive-recording": drive_recording.find_recordings,
-        "robotino": robotino.find_runs,
-        "testbed": testbed.find_runs,
-    }
-    if layout == "auto" and robotino.find_root(folder) is not None:
-        del finders["drive-recording"]  # files of a Robotino have its ending, and a camera's file above them
-    asked = finders if layout == "auto" else {layout: finders[layout]}
-    found = {name: readers for name, find in asked.items() if (readers := find(folder))}
+    asked = [layout]
+    if layout == "auto":
+        files = folder.resolve()
+        asked = [
+            name for name, (_, parts) in FOUND_BY.items() if any(any(files.glob(each)) for each in parts)
+        ]
+        if "robotino" in asked:  # its files have the ending of recordings, below the file of a camera
+            asked = [name for name in asked if name != "drive-recording"]
+    found = {name: readers for name in asked if (readers := _of_logs(FOUND_BY[name][0])(folder))}
     if len(found) > 1:
         raise LogError(f"{folder}: mixes the layouts {' and '.join(found)}; choose one with --format")
     if not found and layout == "auto":
@@ -232,10 +240,21 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
 
         return bag_runs.find_runs(folder, None, robot)
     if "drive" in found:
-        return drive.find_runs(folder, drive_robot(robot))
+        return _of_logs("drive.find_runs")(folder, drive_robot(robot))
     if "drive-recording" in found:
-        return drive_recording.find_runs(folder, lambda name: drive_robot(robot_named(name, robot)))
+        from terrain.robots import robot_named
+
+        return _of_logs("drive_recording.find_runs")(
+            folder, lambda name: drive_robot(robot_named(name, robot))
+        )
     return next(iter(found.values()), [])
+
+
+def _of_logs(name: str) -> Callable[..., list[Any]]:
+    """Return a function of :mod:`terrain.logs`."""
+    module, _, function = name.partition(".")
+    found: Callable[..., list[Any]] = getattr(import_module(f"terrain.logs.{module}"), function)
+    return found
 
 
 def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:

@@ -219,7 +219,7 @@ def _checked_answers(file: Path, runs: Sequence[RunLog], *, new_class: bool) -> 
     """Return the proposals of a table with their answers; an empty one leaves a proposal to its confidence."""
     from terrain.classify.proposals import Proposal, check_answers
     from terrain.files.documents import first_fault
-    from terrain.logs.labels import whole_run_label
+    from terrain.logs.samples import whole_run_label
     from terrain.logs.tables import text_rows
 
     proposal = TypeAdapter(Proposal, config=ConfigDict(allow_inf_nan=False))

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from pipelines.data.settings import AlignedRunsSettings
 from pipelines.report.settings import Names, setting
@@ -26,12 +26,10 @@ EXAMPLE = "terrain estimate --data raw/ --filter vio15 --out runs/"
 RESULTS = ("pipelines.slip.filtered", "pipelines.slip.observed", "pipelines.slip.measured")
 """Modules of the modes, with their results."""
 
-Filter = Literal[
-    "encoder12",
-    "slip14",
-    "vio12",
-    "vio15",
-    "skid",
+ByFilter = Literal["encoder12", "slip14", "vio12", "vio15", "skid"]
+"""Filters, the numbers being those of their states."""
+
+ByObserver = Literal[
     "tracked",
     "slip-odometry",
     "slip-learning",
@@ -41,10 +39,11 @@ Filter = Literal[
     "sideslip-kinematic",
     "sideslip-dynamic",
     "sideslip-multi",
-    "pose",
 ]
-"""Filters, the numbers being those of their states; observers of slip of tracked robots, and of car-like
-ones; and ``pose``, slip against an outside measurement of motion."""
+"""Observers of slip of tracked robots, and of car-like ones."""
+
+Filter = Literal[ByFilter, ByObserver, "pose"]
+"""One of them; or ``pose``, slip against an outside measurement of motion."""
 
 Tuning = Literal["physical", "thesis", "likelihood"]  #: Sources of a filter's noise
 
@@ -221,9 +220,7 @@ def _estimated(
     keep: Keep | None,
 ) -> TracksResult:
     """Estimate by the mode that the filter names."""
-    from terrain.estimation.observers.choice import OBSERVERS
-
-    number = 2 if options.filter == "pose" else int(options.filter in OBSERVERS)
+    number = 2 if options.filter == "pose" else int(options.filter in get_args(ByObserver))
     for each, (purpose, group) in enumerate(GROUPS.items()):
         if each != number:
             options.refuse(group.model_fields, f"is for {purpose}, not for --filter {options.filter}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -34,14 +34,13 @@ from terrain.estimation.estimate import (
     tuning_of,
 )
 from terrain.estimation.models.skid import stuck_intervals
-from terrain.estimation.tuning import TunedNoise, tuned_noise
 from terrain.kinematics.wheels import no_slip_twist
-from terrain.logs.clock import offsets_apart_s
 from terrain.records import GATED, Array, RunLog
 from terrain.robots import Robot, packaged_robot
 
 if TYPE_CHECKING:
     from pipelines.slip.estimate import EstimateOptions
+    from terrain.estimation.tuning import TunedNoise
 
 
 class FilterResult(TracksResult, kw_only=True):
@@ -67,6 +66,8 @@ def estimate_all(
         raise ConfigError(f"runs to tune on go with the tuning 'likelihood', not {tuning!r}")
     noise, tuned = None, None
     if tuning == "likelihood":
+        from terrain.estimation.tuning import tuned_noise
+
         noise, tuned = tuned_noise(runs, robot, name, options.tune_on)
 
     def robot_of(run: RunLog) -> Robot:
@@ -77,16 +78,22 @@ def estimate_all(
         return summarize(found), enriched(found), partial(figures_of, found)
 
     found = estimate_each(runs, name, estimate, progress, keep)
-    apart = offsets_apart_s(runs, lambda run: robot_of(run).track_m) if name == "skid" else {}
-    clocks = []
-    if apart:
-        worst = max(apart, key=lambda run_id: abs(apart[run_id]))
-        clocks.append(
-            f"the clocks of wheels and IMU are apart in {len(apart)} of {len(runs)} runs, by "
-            f"{apart[worst]:+.2f} s in {worst}: tracks and yaw rates of these are wrong; --align brings the "
-            "wheels onto the IMU's clock"
-        )
-    return FilterResult(**found, tuning=tuning, tuned=tuned, clocks=tuple(clocks))
+    clocks = _clocks_apart(runs, robot_of) if name == "skid" else ()
+    return FilterResult(**found, tuning=tuning, tuned=tuned, clocks=clocks)
+
+
+def _clocks_apart(runs: Sequence[RunLog], robot_of: Callable[[RunLog], Robot]) -> tuple[str, ...]:
+    """Return a sentence where the clocks of wheels and IMU are apart, as the turns of a robot that skids show it."""
+    from terrain.logs.clock import offsets_apart_s
+
+    apart = offsets_apart_s(runs, lambda run: robot_of(run).track_m)
+    if not apart:
+        return ()
+    worst = max(apart, key=lambda run_id: abs(apart[run_id]))
+    return (
+        f"the clocks of wheels and IMU are apart in {len(apart)} of {len(runs)} runs, by {apart[worst]:+.2f} s in "
+        f"{worst}: tracks and yaw rates of these are wrong; --align brings the wheels onto the IMU's clock",
+    )
 
 
 RUNS = (

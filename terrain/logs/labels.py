@@ -13,7 +13,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
-import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 from terrain.errors import ConfigError, LogError
@@ -21,7 +20,7 @@ from terrain.files.atomic import atomic_write
 from terrain.files.documents import accepted, read_json
 from terrain.files.names import MEBIBYTE, read_regular
 from terrain.logs.read import read_run, read_run_head, run_folders
-from terrain.logs.samples import short_name
+from terrain.logs.samples import short_name, whole_run_label
 from terrain.logs.schema import TIME_TOLERANCE_S
 from terrain.records import Label, Stream
 
@@ -87,20 +86,6 @@ class RunWindows(NamedTuple):
     n_windows: int | None
     n_doubtful: int
     n_without_label: int
-
-
-def whole_run_label(streams: Mapping[str, Stream], terrain: str) -> Label:
-    """Return the label that covers every sample of a run, the last one with its sampling period.
-
-    Examples
-    --------
-    >>> whole_run_label({"imu": Stream([0.0, 0.5, 1.0], [[0.0]] * 3, ("gyro_z_radps",))}, "SNOW")
-    Label(start_s=0.0, end_s=1.5, terrain='SNOW')
-    """
-    last = max(streams.values(), key=lambda stream: float(stream.time_s[-1]))
-    period_s = float(np.median(np.diff(last.time_s)))
-    start_s = min(float(stream.time_s[0]) for stream in streams.values())
-    return Label(start_s, float(last.time_s[-1]) + period_s, terrain)
 
 
 def label_intervals(

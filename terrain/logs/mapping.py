@@ -27,7 +27,6 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 from terrain.errors import ConfigError, LogError, library
 from terrain.files.documents import accepted, read_yaml
 from terrain.files.names import check_name, has_control_characters, normal_name, shown
-from terrain.logs.labels import whole_run_label
 from terrain.logs.samples import (
     check_log_file,
     checked_names,
@@ -35,6 +34,7 @@ from terrain.logs.samples import (
     refuse_apart,
     short_name,
     to_si,
+    whole_run_label,
 )
 from terrain.logs.schema import UNIT_SCALES, canonical_unit, check_unit, unit_of
 from terrain.logs.tables import TextLayout, read_table, row_number

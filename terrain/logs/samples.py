@@ -20,7 +20,7 @@ import numpy as np
 from terrain.errors import DataError, LogError
 from terrain.files.names import check_inside, check_name, check_regular, has_control_characters, shown
 from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES
-from terrain.records import Array, RunLog, Stream
+from terrain.records import Array, Label, RunLog, Stream
 
 MAX_MAGNITUDE = 1e12
 """No quantity of a vehicle is larger in its SI unit (a position on Earth in m has 8 digits, a time since 1970
@@ -208,3 +208,17 @@ def refuse_apart(run_id: str, streams: Mapping[str, Stream]) -> None:
     if max(s.time_s[0] for s in streams.values()) >= min(s.time_s[-1] for s in streams.values()):
         spans = ", ".join(f"{n} {s.time_s[0]:.15g} to {s.time_s[-1]:.15g} s" for n, s in streams.items())
         raise LogError(f"{run_id}: the streams do not overlap in time ({spans})")
+
+
+def whole_run_label(streams: Mapping[str, Stream], terrain: str) -> Label:
+    """Return the label that covers every sample of a run, the last one with its sampling period.
+
+    Examples
+    --------
+    >>> whole_run_label({"imu": Stream([0.0, 0.5, 1.0], [[0.0]] * 3, ("gyro_z_radps",))}, "SNOW")
+    Label(start_s=0.0, end_s=1.5, terrain='SNOW')
+    """
+    last = max(streams.values(), key=lambda stream: float(stream.time_s[-1]))
+    period_s = float(np.median(np.diff(last.time_s)))
+    start_s = min(float(stream.time_s[0]) for stream in streams.values())
+    return Label(start_s, float(last.time_s[-1]) + period_s, terrain)
