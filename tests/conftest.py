@@ -212,10 +212,7 @@ def runs():
     return driven_runs()
 
 
-COLUMNS = {
-    "imu": ["wx", "wy", "wz", "ax", "ay", "az"],
-    "pro": ["velL", "velR", "curL", "curR"],
-}
+COLUMNS = {"imu": ["wx", "wy", "wz", "ax", "ay", "az"], "pro": ["velL", "velR", "curL", "curR"]}
 
 
 def write_borealtc(run, folder):

@@ -10,12 +10,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
 
-from tracked_speed import (
-    TrackSpeedSettings,
-    TrackSpeedStatus,
-    check_track_speed,
-    track_speed_step,
-)
+from tracked_speed import TrackSpeedSettings, TrackSpeedStatus, check_track_speed, track_speed_step
 
 from terrain.errors import ConfigError
 from terrain.estimation.observers.tracked import TrackedObserver, TrackedSettings

@@ -18,13 +18,7 @@ from terrain.terramechanics.traction import bekker_pressure, janosi_force, mobil
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
 
-from tracks import (
-    grade_resistance,
-    janosi_slip,
-    shear_of_ratio,
-    straight_slip_line,
-    track_balance,
-)
+from tracks import grade_resistance, janosi_slip, shear_of_ratio, straight_slip_line, track_balance
 
 ROBOT = load_robot("patako")
 SAND = load_soil("toyoura_sand")

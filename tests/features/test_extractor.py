@@ -7,13 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from sklearn.base import clone
 
-from features.extractor import (
-    FeatureExtractor,
-    SampleExtractor,
-    derived_channels,
-    is_centred,
-    speed_features,
-)
+from features.extractor import FeatureExtractor, SampleExtractor, derived_channels, is_centred, speed_features
 from features.stream import WindowStream
 from features.windows import WindowRule, cut_windows, layout_of
 from terrain.errors import ConfigError, DataError

@@ -112,7 +112,7 @@ def test_nan_in_slip_is_a_value_and_drops_nothing():
 def test_a_window_across_a_boundary_of_labels_has_no_label():
     run = RunLog("a", "husky", make_run().streams, (Label(0, 3, "ice"), Label(3, 8, "snow")))
     assert label_windows(run, np.array([0.0, 1.0, 1.5, 3.0, 6.0, 6.5]), 2.0).tolist() == [
-        *("ice", "ice", "", "snow", "snow", ""),
+        *("ice", "ice", "", "snow", "snow", "")
     ]
     assert list(cut_windows([run]).windows.terrain) == ["ice", "", "snow", "snow"]
 

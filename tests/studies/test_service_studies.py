@@ -132,12 +132,7 @@ def test_a_window_by_another_robots_clock_is_one_of_another_robot(end_s, n):
 
 @pytest.mark.parametrize(
     ("answers", "steps", "unanswered"),
-    [
-        (["step 1", "step 2"], 1, 0),
-        (["too-fast", "step 2"], 1, 0),
-        (["too-fast"], 0, 0),
-        (["step 1"], 0, 1),
-    ],
+    [(["step 1", "step 2"], 1, 0), (["too-fast", "step 2"], 1, 0), (["too-fast"], 0, 0), (["step 1"], 0, 1)],
 )
 def test_an_answer_is_that_of_its_request(monkeypatch, answers, steps, unanswered):
     monkeypatch.setattr(soak, "ANSWER_S", 0.05)

@@ -129,53 +129,6 @@ def test_sign_of_slip_is_that_along_the_wheel(steer, rolls, goes, traction):
     np.testing.assert_allclose(encoders, slip)
 
 
-def test_each_wheel_slips_along_its_own_path_in_a_turn():
-    turn = 0.6
-    mean = np.zeros(9)
-    mean[:3] = 0.5, 0.1, turn
-    x, y = ROBOT.wheel_positions_m.T
-    velocity = np.column_stack([0.5 - turn * y, 0.1 + turn * x])
-    mean[3:6] = np.arctan2(velocity[:, 1], velocity[:, 0])  # every wheel points where it goes
-    ground = np.hypot(*velocity.T)
-    mean[6:] = ground * (1 / (1 - np.array([0.1, 0.2, 0.3])) - 1)
-    track = make_track(mean, WITH_SLIP)
-    slip = wheel_slip(track, make_table(track, ground), ROBOT)
-    np.testing.assert_allclose(slip.slip_ratio, [[0.1, 0.2, 0.3]])
-    assert slip.wheels == ("1", "2", "3")
-    encoders = wheel_slip(make_track(mean[:6], WITHOUT), make_table(track, ground + mean[6:]), ROBOT)
-    np.testing.assert_allclose(encoders.slip_ratio, slip.slip_ratio)
-
-
-@pytest.mark.parametrize("slip_speed", [0.12, -0.15])  # traction, braking
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize("with_slip", [True, False])
-def test_uncertainty_of_slip_is_that_of_the_state(slip_speed, sign, with_slip):
-    """First order against a Monte Carlo of the states, correlations and all."""
-    rng = np.random.default_rng(5)
-    states = WITH_SLIP if with_slip else WITHOUT
-    mean = np.array([0.7 * sign, 0.15, 0.3, 0.4, -0.3, 0.2, *[slip_speed * sign] * 3])[: len(states)]
-    root = 0.004 * rng.standard_normal((len(states), len(states)))
-    cov = root @ root.T
-    track = make_track(mean, states, cov)
-    wheel_speed_std = 0.01
-    along = track_ground(mean)
-    wheel_speed = along + slip_speed * sign
-    slip = wheel_slip(track, make_table(track, wheel_speed), ROBOT, wheel_speed_std_mps=wheel_speed_std)
-    n = 40000
-    drawn = make_track(rng.multivariate_normal(mean, cov, n), states)
-    wheel_speeds = make_table(drawn, wheel_speed + wheel_speed_std * rng.standard_normal((n, 3)))
-    scatter = wheel_slip(drawn, wheel_speeds, ROBOT)
-    assert np.sign(slip.slip_ratio[0]).tolist() == [np.sign(slip_speed * sign)] * 3
-    # 0.5 % by chance, the rest is second order at 3 % of relative noise
-    np.testing.assert_allclose(scatter.slip_ratio.std(axis=0), slip.slip_std[0], rtol=0.03)
-
-
-def track_ground(mean):
-    x, y = ROBOT.wheel_positions_m.T
-    steer = mean[3:6]
-    return (mean[0] - mean[2] * y) * np.cos(steer) + (mean[1] + mean[2] * x) * np.sin(steer)
-
-
 def test_wheel_speed_uncertainty_is_by_default_the_robots_own():
     track = make_track([0.8, *[0.0] * 5], WITHOUT)
     table = make_table(track, 1.0)

@@ -8,7 +8,6 @@ import sys
 import numpy as np
 import pytest
 
-from pipelines.report.numbers import format_value
 from terrain.files.names import data_folder
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
@@ -91,18 +90,6 @@ def test_a_fault_of_the_package_keeps_its_traceback(terrain, place, drive, monke
     monkeypatch.setattr("pipelines.learn.crossval.crossval", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         terrain("crossval", "--data", data)
-
-
-def test_crossval_writes_what_it_prints(terrain, place, drive_all):
-    data = keep(drive_all(duration_s=12.0), place)
-    words = ("crossval", "--data", data, "--repeats", 1, "--no-extras", "--jobs", 1, "--seed", 4)
-    code, out, _ = terrain(*words, "--json", place / "new" / "report.json")
-    assert code == 0
-    report = json.loads((place / "new" / "report.json").read_text())
-    assert (report["dataset"], report["seed"], report["n_windows"]) == ("data", 4, 72)
-    assert out.startswith(format_value(report["accuracy"], ".1%"))
-    assert "72 windows of 2 s from 12 runs" in out
-    assert sorted(path.name for path in place.iterdir()) == ["data", "new"]  # no tracking without training
 
 
 def test_predict_prints_terrain_probability_and_target_slip(terrain, place, drive, tracked):

@@ -1,7 +1,6 @@
 """Quickstart: the whole job in one command; what it predicts is held out for real, and its report says so."""
 
 import json
-from dataclasses import replace
 
 import pytest
 
@@ -51,18 +50,6 @@ def test_the_runs_that_are_predicted_took_no_part(held_out):
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     assert found["imported"]["n_runs"] == 9
     assert "crossval" not in found["train"]
-
-
-@pytest.mark.slow
-def test_copies_of_runs_are_refused_or_merged(in_tracked, drive_all, tmp_path):
-    runs = drive_all(n_runs=3, duration_s=16.0)
-    for each in [*runs, replace(runs[0], run_id="copy")]:
-        write_run(each, tmp_path / "data")
-    asked = Settings(data=tmp_path / "data", out=tmp_path / "out", name="copied", n_jobs=1)
-    with pytest.raises(DataError, match="--merge-duplicates"):
-        run(asked)
-    result = run(asked.with_(merge_duplicates=True))
-    assert result.crossval.n_runs + len(result.held_out) == 9
 
 
 def test_other_runs_in_the_folder_are_not_overwritten(make_run, tmp_path, monkeypatch):

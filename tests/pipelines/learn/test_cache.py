@@ -6,7 +6,6 @@ import weakref
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 
 from features.motion import window_motion
@@ -18,8 +17,6 @@ from pipelines.learn import cache
 from pipelines.learn.cache import cached_data
 from pipelines.learn.crossval import EvaluationSettings, Settings
 from pipelines.learn.recipes import recipe_of
-from pipelines.learn.settings import RecipeSettings
-from pipelines.learn.training_data import data_of_runs
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.digest import joint_digest
 from terrain.logs.write import write_run
@@ -70,18 +67,6 @@ def test_cached_features_are_those_of_the_runs_bit_for_bit(runs_dir, cached):
             assert there.tobytes() == here.tobytes()
     assert cached(SETTINGS.with_(window_s=1.0))[2] == 8  # beside the first
     assert cached()[2] == 0
-
-
-@pytest.mark.parametrize("recipe", ["svm", "svm@imu"])
-def test_what_is_trained_is_the_same_from_two_processes(runs_dir, cached, recipe):
-    asked = RecipeSettings(steady=False, n_jobs=2, recipe=recipe)
-    there, here = cached(asked)[0], data_of_runs(load_runs(runs_dir), asked)
-    assert there.runs == here.runs
-    fitted = [
-        each.recipe[-1].fit(each.rows, each.samples.terrain, here.samples.run_id) for each in (there, here)
-    ]
-    first, second = (each.predict_proba(here.rows[:5]) for each in fitted)
-    assert np.array_equal(first, second)
 
 
 def test_an_interrupted_cache_goes_on_and_ends_the_same(cached, tmp_path, monkeypatch):

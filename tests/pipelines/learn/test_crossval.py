@@ -11,14 +11,13 @@ from sklearn.model_selection import cross_val_predict, cross_validate
 from features.protocols import folds_of, samples_of
 from features.recipes import feature_matrix, make_recipe
 from pipelines.data.datasets import load_runs
-from pipelines.learn.crossval import EvaluationSettings, Settings, crossval, run
+from pipelines.learn.crossval import EvaluationSettings, crossval
 from pipelines.learn.evaluate import evaluate
 from pipelines.report.numbers import format_counts
 from pipelines.report.results import as_json
 from terrain.classify.held_out import Examples
 from terrain.classify.limits import SupportLevel
 from terrain.errors import ConfigError
-from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 
 SPEEDS = (0.3, 0.4, 0.7, 0.8)
@@ -99,30 +98,6 @@ def test_scikit_learn_cross_validates_whole_recipes_to_the_same_answers(drive, d
         assert score == pytest.approx(right.mean())
         assert 0 < estimator[-1].n_inner_fits_ <= 20
         assert estimator[-1].best_._asdict() == result.chosen
-
-
-@pytest.mark.slow
-def test_where_labels_only_identify_runs_grouped_gives_chance_and_published_does_not(drive, settings):
-    def mislabelled(seed):
-        """Eight runs, each with a vibration of its own; their labels do not depend on it."""
-        rng = np.random.default_rng(seed)
-        names = rng.permutation(["ICE"] * 4 + ["MUD"] * 4)
-        levels = rng.permutation(np.geomspace(0.3, 3.0, 8))
-        colours = rng.permutation(np.linspace(0.05, 0.9, 8))
-        return [
-            drive(f"run_{i}", "GRASS", int(rng.integers(2**31)), 16.0, rng.uniform(0.3, 0.9), level=levels[i],
-                  smoothness=colours[i], label=str(names[i]))
-            for i in range(8)
-        ]  # fmt: skip
-
-    grouped = [crossval(mislabelled(seed), settings()).accuracy for seed in range(3)]
-    published = crossval(mislabelled(0), settings(protocol="published"))
-    # Eight tosses of a coin have a standard deviation of 0.18, the mean of three draws one of 0.10; that
-    # a held-out run leaves more runs of the other name in training pulls below one half.
-    assert np.mean(grouped) < 0.68
-    assert published.accuracy > 0.9
-    assert any("both sides of the split" in note for note in published.notes)
-    assert published.support is None  # runs lie on both sides
 
 
 def test_what_is_learned_slow_and_does_not_apply_fast_is_detected(drive, settings):
@@ -244,12 +219,3 @@ def test_terrains_of_vulpi_are_classified_on_held_out_runs(datasets_dir, setting
     assert found.n_runs == 18
     assert any(note.startswith("DIRT_ROAD: one run only") for note in found.notes)
     assert f"windows left out: {format_counts(found.dropped)}" in found.notes
-
-
-def test_cached_features_give_the_figures_of_the_runs(drive_all, tmp_path):
-    for each in drive_all(("ASPHALT", "GRASS"), 3, duration_s=12.0):
-        write_run(each, tmp_path / "data")
-    asked = {"data": tmp_path / "data", "repeats": 1, "extras": False, "n_jobs": 1}
-    plain = run(Settings(**asked)).as_json() | {"data_digest": None}
-    for _ in ("written", "read"):
-        assert run(Settings(**asked, cache=tmp_path / "cache")).as_json() | {"data_digest": None} == plain

@@ -11,13 +11,7 @@ import numpy as np
 import pytest
 
 from features.windows import cut_windows
-from pipelines.live.classifying import (
-    AT_MOST,
-    MAX_WAITING,
-    Classifier,
-    WindowOutput,
-    classify_window,
-)
+from pipelines.live.classifying import AT_MOST, MAX_WAITING, Classifier, WindowOutput, classify_window
 from pipelines.live.observer import Observer
 from terrain.estimation.live import LiveFilter
 from terrain.kinematics.logged_wheels import with_wheel_speeds

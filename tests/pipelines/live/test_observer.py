@@ -67,22 +67,6 @@ def test_a_raw_log_is_filtered_by_predict_and_live_alike(swerve_model, grass):
     assert observer.belief.terrain == ""
 
 
-@pytest.mark.parametrize("set_name", [pytest.param("borealtc", marks=pytest.mark.slow), "vulpi"])
-def test_live_equals_the_log_on_all_measured_runs(set_name, trained):
-    if not (DATA / set_name).is_dir():
-        pytest.skip(f"TERRAIN_DATA has no {set_name}")
-    runs = load_runs(DATA / set_name)
-    model = trained(runs[:: max(len(runs) // 9, 1)])
-    result = predict(runs, model, TABLE, skip_short=True)
-    by_run = {run.run_id: [] for run in runs}
-    for row in result.windows:
-        by_run[row.run_id].append(row)
-    for run in runs:
-        found = observed(Observer(model, channels=channels_of(run)), run, rate_hz=10.0)
-        assert_same(found, by_run[run.run_id])
-    assert result.n_windows > 200
-
-
 def test_a_skid_steer_robot_is_filtered_where_its_model_needs_the_filter(trained):
     if not (DATA / "vulpi").is_dir():
         pytest.skip("TERRAIN_DATA has no vulpi")

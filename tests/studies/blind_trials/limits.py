@@ -187,13 +187,7 @@ def limits_of(robot: Robot, drives: Drives, sensing: Sensing | None = None) -> L
 
 
 def _gram(
-    robot: Robot,
-    planar: Planar,
-    noise: Noise,
-    run: RunLog,
-    names: Sequence[str],
-    sensing: Sensing,
-    lead: int,
+    robot: Robot, planar: Planar, noise: Noise, run: RunLog, names: Sequence[str], sensing: Sensing, lead: int
 ) -> Array:
     """Return the information (k, k) of one run from a step on, nothing free."""
     truth = run.streams["truth"]

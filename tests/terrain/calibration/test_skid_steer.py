@@ -7,13 +7,7 @@ from studies.intervals import NOMINAL_M
 from studies.intervals import skid_run as driven
 
 from pipelines.data.datasets import load_runs
-from terrain.calibration.skid_steer import (
-    LIDAR_DELAY,
-    RADIUS,
-    TRACK,
-    WHEELS_DELAY,
-    identify,
-)
+from terrain.calibration.skid_steer import LIDAR_DELAY, RADIUS, TRACK, WHEELS_DELAY, identify
 from terrain.records import Stream
 from terrain.robots import load_robot
 

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.classify.folds import Fold, split_runs
-from terrain.classify.held_out import (
-    CURVE_DRAWS,
-    Applicability,
-    drawn_folds,
-    left_out_folds,
-    slow_fast_split,
-)
+from terrain.classify.held_out import CURVE_DRAWS, Applicability, drawn_folds, left_out_folds, slow_fast_split
 from terrain.errors import DataError
 
 
@@ -64,11 +58,7 @@ def test_two_terrains_and_few_runs_are_refused():
         left_out_folds(TERRAIN[few], RUN_ID[few], 5, 1, 0)
 
 
-PLAN = {
-    "ASPHALT": (0.3, 0.4, 0.7, 0.8),
-    "GRASS": (0.9, 0.5, 1.0, 0.6),
-    "GRAVEL": (0.1, 0.2, 0.3, 0.4, 0.5),
-}
+PLAN = {"ASPHALT": (0.3, 0.4, 0.7, 0.8), "GRASS": (0.9, 0.5, 1.0, 0.6), "GRAVEL": (0.1, 0.2, 0.3, 0.4, 0.5)}
 
 
 def windows_of(plan, duration_s=32.0, stride_s=2.0):

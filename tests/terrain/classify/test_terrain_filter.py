@@ -4,13 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from terrain.classify.terrain_filter import (
-    FilterBelief,
-    TerrainFilter,
-    check_filter,
-    filter_run,
-    filter_step,
-)
+from terrain.classify.terrain_filter import FilterBelief, TerrainFilter, check_filter, filter_run, filter_step
 from terrain.errors import ConfigError, DataError
 
 THREE = TerrainFilter((0.5, 0.3, 0.2))

@@ -5,13 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from terrain.control.path_tracking import (
-    SETTINGS,
-    TrackState,
-    TrackStatus,
-    check_tracking,
-    track_step,
-)
+from terrain.control.path_tracking import SETTINGS, TrackState, TrackStatus, check_tracking, track_step
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 

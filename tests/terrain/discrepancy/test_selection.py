@@ -7,14 +7,7 @@ from scipy.stats import norm
 from scipy.stats import t as student
 
 from terrain.discrepancy.evidence import N_BLOCKS, Evidence, fit_change, grams_of
-from terrain.discrepancy.selection import (
-    TRUST_DOF,
-    held_out_gain,
-    pooled_variance,
-    wald_test,
-    z_of,
-    z_of_t,
-)
+from terrain.discrepancy.selection import TRUST_DOF, held_out_gain, pooled_variance, wald_test, z_of, z_of_t
 from terrain.effects import INDEX, effect_named
 
 PARAMETERS = ("payload_ratio", "gyro_bias_radps", "lever_x_m", "lever_y_m", "wheel_radius_ratio")

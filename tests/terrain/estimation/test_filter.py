@@ -7,13 +7,7 @@ from hypothesis import strategies as st
 
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.consistency import sample_from_model
-from terrain.estimation.filter import (
-    Filter,
-    FilterModel,
-    FilterSettings,
-    Noise,
-    run_filter,
-)
+from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise, run_filter
 from terrain.kernels import njit
 from terrain.records import ABSENT, GATED, REOPENED, USED
 
@@ -170,26 +164,6 @@ CARRIAGE_NOISE = Noise(np.array([1e-3, 0.1]) ** 2, np.array([0.05, 0.05]) ** 2)
 
 def ridden(n=400, seed=0):
     return sample_from_model(CARRIAGE, CARRIAGE_NOISE, n, DT_S, np.random.default_rng(seed))
-
-
-def test_on_a_linear_model_it_is_the_least_squares_answer():
-    """The Kalman filter's last mean is that of all data at once, solved without any recursion."""
-    time_s, _, z = ridden(60)
-    n, q = time_s.size, np.array([1e-3, 0.1])
-    rows, values = [np.eye(2 * n)[:2]], [np.zeros(2)]  # x_0 = 0 +- 1
-    for k in range(n):
-        at, pick = np.zeros((2, 2 * n)), np.zeros((2, 2 * n))
-        pick[:, 2 * k : 2 * k + 2] = np.eye(2) / 0.05
-        rows, values = [*rows, pick], [*values, z[k] / 0.05]
-        if k:
-            at[:, 2 * k - 2 : 2 * k] = [[-1, -DT_S], [0, -1]]
-            at[:, 2 * k : 2 * k + 2] = np.eye(2)
-            rows, values = [*rows, at / (q * np.sqrt(DT_S))[:, None]], [*values, np.zeros(2)]
-    a = np.vstack(rows)
-    solved = np.linalg.lstsq(a, np.concatenate(values), rcond=None)[0]
-    track = run_filter(CARRIAGE, CARRIAGE_NOISE, time_s, z, ALL_BELIEVED)
-    np.testing.assert_allclose(track.mean[-1], solved[-2:], rtol=1e-8)
-    np.testing.assert_allclose(track.cov[-1], np.linalg.inv(a.T @ a)[-2:, -2:], rtol=1e-7)
 
 
 def spoilt(seed=0):

@@ -177,8 +177,14 @@ def stamp(change, n=1):
     return edit
 
 
+def spikes(time_s, values):
+    values[200::97] += 1e4
+    return time_s, values
+
+
 FAULTS = {
     "NaN": put(np.nan),
+    "spikes": spikes,
     "infinite": put(np.inf, channel=2),
     "gap of 0.5 s": gap(0.5),
     "gap of 3 s": gap(3.0),
@@ -200,8 +206,11 @@ FAULTS = {
         if (stream, fault) != ("wheels", "a stamp ahead")  # a gap that a log may have: live has to take it
     ],
 )
-def test_faults_cost_live_what_they_cost_the_batch(stream, fault):
-    assert_equal(edited(log(), stream, FAULTS[fault]))
+def test_faults_cost_live_what_they_cost_the_batch_and_slip_comes_back(stream, fault):
+    estimates = assert_equal(edited(log(), stream, FAULTS[fault]))
+    assert np.isfinite(column(estimates, "mean")).all()
+    late = column(estimates, "time_s") > MIDDLE_S + 5.0
+    assert np.nanmean(column(estimates, "slip_ratio")[late]) == pytest.approx(0.125, abs=0.01)
 
 
 def test_a_clock_that_is_set_back_is_believed_when_the_next_stamp_follows():
@@ -237,8 +246,7 @@ def test_the_queue_of_samples_ahead_of_the_wheels_is_bounded():
 
 
 numbers = st.one_of(
-    st.floats(-3.0, 3.0),
-    st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e9, -1e9, 1e300, -1e300, 5e-324]),
+    st.floats(-3.0, 3.0), st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e9, -1e9, 1e300, -1e300, 5e-324])
 )
 
 

@@ -2,22 +2,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.feed import (
-    CAMERA_ROWS,
-    GNSS_ROWS,
-    REST_ROW,
-    ROWS_OF_DRIVE,
-    measurement_table,
-)
+from terrain.estimation.feed import CAMERA_ROWS, GNSS_ROWS, REST_ROW, ROWS_OF_DRIVE, measurement_table
 from terrain.kinematics.camera import odometry_stream
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
-from terrain.signals import low_passed
 
 ROBOT = load_robot("agrimaro")
 HUSKY = load_robot("husky")
@@ -165,35 +157,6 @@ def test_a_robot_at_rest_on_a_slope_does_not_accelerate(roll, pitch):
 
 
 # the low-pass
-
-
-def plain_low_pass(time_s, value, tau, gap):
-    """The low-pass's equation solved by an integrator, segment by segment."""
-    out = [value[0]]
-    for k in range(1, len(value)):
-        if time_s[k] - time_s[k - 1] > gap:
-            out.append(value[k])
-            continue
-        line = np.poly1d(np.polyfit(time_s[k - 1 : k + 1], value[k - 1 : k + 1], 1))
-        solved = solve_ivp(
-            lambda t, y, line=line: (line(t) - y) / tau,
-            time_s[k - 1 : k + 1],
-            [out[-1]],
-            rtol=1e-10,
-            atol=1e-12,
-        )
-        out.append(solved.y[0, -1])
-    return np.array(out)
-
-
-@pytest.mark.parametrize("tau", [0.005, 0.05, 0.4])
-def test_low_pass_solves_its_equation_on_any_stamps(tau):
-    rng = np.random.default_rng(3)
-    time_s = np.cumsum(rng.exponential(0.02, 40))
-    value = rng.standard_normal(40)
-    np.testing.assert_allclose(
-        low_passed(time_s, value, tau, 0.05), plain_low_pass(time_s, value, tau, 0.05), atol=1e-6
-    )
 
 
 def test_all_signals_share_the_delay_of_the_encoders():
@@ -396,25 +359,3 @@ def test_logs_without_a_clock_are_refused():
 def test_invalid_options_are_refused(options, message):
     with pytest.raises(ConfigError, match=message):
         measurement_table(RUN, ROBOT, **options)
-
-
-def test_a_causal_table_does_not_depend_on_later_samples():
-    robot = bare(
-        sensors={"imu_latency_s": 0.005, "encoder_time_constant_s": 0.05}, camera={"latency_s": 0.006}
-    )
-    whole, plain = measurement_table(RUN, robot, causal=True), measurement_table(RUN, robot)
-    for end_s in (0.5, 1.5, 3.0):
-        cut = RUN
-        for name in RUN.streams:
-            cut = change(cut, name, lambda t, v, _, end_s=end_s: (t[t <= end_s], v[t <= end_s]))
-        table = measurement_table(cut, robot, causal=True)
-        n = table.time_s.size
-        np.testing.assert_allclose(table.z, whole.z[:n], rtol=0, atol=1e-12)
-        np.testing.assert_array_equal(table.gnss_variance, whole.gnss_variance[:n])
-        ahead = (
-            rows_of(measurement_table(cut, robot), "camera_yaw_rad") != rows_of(plain, "camera_yaw_rad")[:n]
-        )
-        assert ahead.any()  # the other one does
-    within = 6 * NOISE + 0.4 * 0.02  # a latency and a period at 0.4 rad/s
-    apart = rows_of(whole, *CAMERA_ROWS)[60:] - rows_of(plain, *CAMERA_ROWS)[60:]
-    assert np.ptp(apart, axis=0).max() < within

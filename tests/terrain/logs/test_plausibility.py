@@ -5,12 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipelines.data.convert import Settings as ConvertSettings
-from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs, verdict
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
-from terrain.errors import LogError
 from terrain.logs.plausibility import Level, Scale, doubt_sentences, doubts_of, judge, worst
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
@@ -184,21 +181,6 @@ def test_the_sign_of_measured_gyros_is_judged_right_wherever_it_is_judged(measur
     judged = [b.level != Level.UNKNOWN for b in before]
     assert np.mean(judged) > 0.8
     assert all(a.level == Level.IMPLAUSIBLE for a, j in zip(after, judged, strict=True) if j)
-
-
-def test_import_refuses_an_implausible_run_and_repair_counts_it(tmp_path):
-    for run_id, run in (("SNOW_01", sound_run()), ("SNOW_02", changed("imu", ACCEL))):
-        write_run(replace(run, run_id=run_id), tmp_path / "data")
-    settings = ConvertSettings(data=tmp_path / "data", out=tmp_path / "out")
-    with pytest.raises(LogError, match=r"SNOW_02: implausible gravity.*9\.81 is expected") as refused:
-        convert(settings)
-    assert "\n" not in str(refused.value)
-    assert not (tmp_path / "out" / "SNOW_01").exists()
-    result = convert(settings.model_copy(update={"repair": True}))
-    assert result.n_runs == 2
-    assert result.dropped == {"implausible gravity": 1}
-    assert load_runs(tmp_path / "out")[1].dropped == {"implausible gravity": 1}
-    assert [doubt.run_id for doubt in result.doubts] == ["SNOW_02"]
 
 
 def test_inspect_has_every_check_and_its_figure(tmp_path):

@@ -17,9 +17,7 @@ def run_of(name, value, imu_hz=100.0, wheels_hz=6.5, duration_s=40.0):
         return Stream(time_s, np.full((len(time_s), 1), value), (channel,))
 
     return RunLog(
-        name,
-        "husky",
-        {"imu": stream(imu_hz, "gyro_z_radps"), "wheels": stream(wheels_hz, "speed_left_mps")},
+        name, "husky", {"imu": stream(imu_hz, "gyro_z_radps"), "wheels": stream(wheels_hz, "speed_left_mps")}
     )
 
 

@@ -93,14 +93,6 @@ def test_a_scenario_lasts_exactly_as_long_as_it_should(name, default_s):
             assert resting(drive)[-1] == (chosen not in UNENDED)
 
 
-def test_straight_is_the_run_of_the_thesis():
-    drive = make("straight", speed_mps=0.8)
-    expected = np.clip(drive.time_s - 1.0, 0.0, 0.8)
-    np.testing.assert_allclose(drive.twist[:, 0], expected, atol=1e-12)
-    assert (drive.twist[:, 1:] == 0).all()
-    assert drive.distance_m[-1] == pytest.approx(0.8 * 18.2 + 0.32, abs=1e-3)
-
-
 def test_complex_holds_every_kind_of_motion():
     drive = make("complex")
     x, y, yaw = drive.twist.T

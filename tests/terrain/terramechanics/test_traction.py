@@ -85,12 +85,6 @@ def test_laws_of_ground_that_shears(slip, more, limit_n, length_m, k_m):
     assert janosi_force(0.0, limit_n, length_m, k_m) == 0
 
 
-def test_the_curve_is_smooth_where_series_and_closed_form_meet():
-    x = 0.01 * (1 + np.linspace(-1e-6, 1e-6, 21))
-    slope = np.diff([mobilised_ratio(value) for value in x]) / np.diff(x)
-    np.testing.assert_allclose(slope, 0.5 - 0.01 / 3 + 0.01**2 / 8, rtol=1e-4)
-
-
 @given(
     slip=slips,
     normal_n=st.floats(0.0, 1e4),

@@ -49,12 +49,7 @@ def gated_until(name, amount, duration_s=4.0):
     """Return uses of a sensor, tick by tick, whose rows are off by an amount from 6 s on."""
     model, noise, table = parts()
     sensors = dict(model.sensors)
-    session, schedule_row, uses, times_s = (
-        Filter(model, noise, SETTINGS),
-        schedule_of(model, noise),
-        [],
-        [],
-    )
+    session, schedule_row, uses, times_s = (Filter(model, noise, SETTINGS), schedule_of(model, noise), [], [])
     off = [model.rows.index(row) for row in sensors[name]]
     z = table.columns(model.rows).copy()
     z[np.ix_(table.time_s > 6.0, off)] += amount

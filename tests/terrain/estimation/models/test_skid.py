@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 
 from terrain.angles import wrapped
-from terrain.errors import ConfigError
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.filter import run_filter
 from terrain.estimation.models.skid import (
@@ -130,10 +129,3 @@ def test_simulated_drives_are_within_their_stated_error(soil, scenario, seed):
         assert np.nanmean(error**2 / track.cov[:, j, j]) < 2.0, state
     assert np.nanmax(np.abs(wrapped(track.state("yaw_rad") - found.truth[:, 2]))) < 0.1
     assert (found.motion != Motion.STUCK).all()
-
-
-def test_a_swerve_robot_is_refused():
-    with pytest.raises(
-        ConfigError, match="robot agrimaro has the drive 'swerve': this filter is for 'skid_steer'"
-    ):
-        make_skid_filter(load_robot("agrimaro"))

@@ -8,11 +8,7 @@ import pytest
 from terrain.errors import ConfigError
 from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
 from terrain.estimation.observers.choice import OBSERVERS, make_observer, observers_of
-from terrain.estimation.observers.estimate import (
-    observe_run,
-    summarize_observer,
-    with_estimates,
-)
+from terrain.estimation.observers.estimate import observe_run, summarize_observer, with_estimates
 from terrain.estimation.observers.observer import FilterObserver, ObserverOutput, ObserverStatus, observe
 from terrain.estimation.observers.rows import ROWS, rows_of
 from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel, model_of

@@ -12,12 +12,7 @@ from terrain.estimation.observers import sideslip
 from terrain.estimation.observers.observer import ObserverStatus, observe
 from terrain.estimation.observers.sideslip import FIRST_STD, RATE, ROWS, SETTINGS, Sideslip
 from terrain.robots import load_robot
-from terrain.simulation.car import (
-    CAR_ROWS,
-    CarCommand,
-    CarDrive,
-    level_ground,
-)
+from terrain.simulation.car import CAR_ROWS, CarCommand, CarDrive, level_ground
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("adap2e")
