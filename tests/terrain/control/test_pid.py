@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from terrain.constants import GRAVITY_MPS2
 from terrain.control.pid import (
     LONGEST_STEP_S,
     Gains,
@@ -22,15 +21,7 @@ from terrain.control.pid import (
 )
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.errors import ConfigError
-from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.dynamic.plant import make_plant, start_state, uniform_profile
-from terrain.simulation.dynamic.step import advance
-from terrain.simulation.sensors import BODY_ROW
-from terrain.terramechanics.soil import load_soil
-from terrain.terramechanics.traction import equilibrium_slip
 
-ROBOT = load_robot("agrimaro")
 DT_S, NAN = 0.02, math.nan
 
 
@@ -225,39 +216,3 @@ def test_a_wheel_that_rolls_against_its_command_is_not_corrected_and_its_integra
     found, state = step(gains, state, -5.0, -0.7, 0.0, command=-5.0)
     assert (found.desired_ratio, found.status) == (-0.05, ThesisStatus.OK)
     assert found.correction_radps > 0  # turns back more slowly
-
-
-def driven(gains, target, duration_s=60.0, wheel_speed_mps=1.0, delay_rows=50):
-    """Return the speed over ground (n,) each millisecond: level grass, the truth fed back 50 ms late."""
-    substeps = round(DT_S * 1000)
-    plant, profile = make_plant(ROBOT, Conditions()), uniform_profile(ROBOT, load_soil("grass"))
-    state, memory, n = start_state(np.zeros(3)), [WheelPid()] * 3, round(duration_s / DT_S)
-    record = np.zeros(n * substeps, BODY_ROW)
-    speed, accel, rate = record["speed_x_mps"], record["accel_x_mps2"], record["wheels"]["wheel_radps"]
-    targets, still = np.array([target, -0.15, target]), np.zeros((1, 3))
-    for k in range(n):
-        command, added = np.full(3, min(k * DT_S, 1.0) * wheel_speed_mps / ROBOT.wheel_radius_m), np.zeros(3)
-        seen = k * substeps - 1 - delay_rows
-        if seen >= 0:
-            v, a = np.full(3, speed[seen]), np.full(3, accel[seen])
-            rows = command, rate[seen], v, a
-            wheels, memory = wheels_step(gains, memory, rows, abs(speed[seen]), targets, DT_S)
-            added = np.array([wheel.correction_radps for wheel in wheels])
-        rows = slice(k * substeps, (k + 1) * substeps)
-        sent, noise = (command + added)[None], np.zeros((substeps, 3))
-        advance(plant, profile, state, sent, still, substeps, noise, record[rows])
-    return speed
-
-
-def test_on_grass_a_target_below_the_balance_slip_stops_the_robot_and_one_above_it_runs_away():
-    body = ROBOT.body
-    load_n = ROBOT.mass_kg / 3 * GRAVITY_MPS2
-    geometry = ROBOT.wheel_radius_m, body.tyre_width_m, body.contact_length_m
-    balance = equilibrium_slip(load_soil("grass"), load_n, 0.0, *geometry)
-    assert balance == pytest.approx(0.126, abs=0.001)
-    free_mps = 1.0 - balance
-    clamp_radps = 5.0  # a whole 1 m/s of wheel speed in either direction
-    gains = Gains(0.5, 0.5, 0.0, clamp_radps)
-    assert driven(gains, 0.05)[-1000:].mean() < 0.5 * free_mps
-    assert driven(gains, 0.2)[-1000:].mean() > 1.5 * free_mps
-    assert driven(gains, balance)[-1000:].mean() == pytest.approx(free_mps, rel=0.1)

@@ -142,69 +142,7 @@ def test_ideal_sensors_give_the_motion():
     np.testing.assert_allclose(table.gnss_variance[fresh, 0], 0.02**2)
 
 
-@pytest.mark.parametrize(("roll", "pitch"), [(0.0, -0.3), (0.2, 0.0), (0.25, 0.2), (-0.1, -0.15)])
-def test_a_robot_at_rest_on_a_slope_does_not_accelerate(roll, pitch):
-    run = turning_run(1.0, rate=1e-9, speed=0.0, roll=roll, pitch=pitch)
-    force = (
-        run.streams["imu"].channel("accel_x_mps2").mean(),
-        run.streams["imu"].channel("accel_y_mps2").mean(),
-    )
-    # the specific force at rest points up: forward with the nose up, to the left with the left side up
-    assert np.sign(force[0]) == np.sign(-pitch) or abs(pitch) < 1e-9
-    assert np.sign(force[1]) == np.sign(roll) or abs(roll) < 1e-9
-    accel = rows_of(measurement_table(run, bare()), "accel_x_mps2", "accel_y_mps2")
-    assert np.abs(accel).max() < 6 * NOISE * GRAVITY_MPS2
-
-
 # the low-pass
-
-
-def test_all_signals_share_the_delay_of_the_encoders():
-    """One ramp in every signal comes out of every row by the encoder's lag late, at once with the wheels."""
-    encoder_s, camera_s = 0.05, 0.02
-    robot = bare(
-        camera={"time_constant_s": camera_s, "latency_s": 0.028, "lever_x_m": 0.0, "lever_y_m": 0.0},
-        sensors={"encoder_time_constant_s": encoder_s, "imu_latency_s": 0.005},
-    )
-    run = turning_run(rate=1e-6, speed=0.0)
-
-    def ramp(latency_s, lag_s, columns, factor=1.0):
-        def edit(time_s, values, channels):
-            settled = time_s - latency_s - lag_s  # of a long ramp: its start is forgotten
-            for channel in columns:
-                values[:, channels.index(channel)] += factor * settled
-            return time_s, values
-
-        return edit
-
-    run = change(run, "wheels", ramp(0.0, encoder_s, ["motor_1_radps"], 10.0))
-    run = change(run, "imu", ramp(0.005, 0.0, ["gyro_z_radps", "accel_x_mps2"]))
-    run = change(run, "imu", ramp(0.005, 0.0, ["yaw_rad"], 0.2))
-    run = change(run, "steering", ramp(0.0, 0.0, ["angle_1_rad"], 0.2))
-    run = change(run, "odometry", ramp(0.028, camera_s, ["velocity_z_mps"], -1.0))
-    table = measurement_table(run, robot)
-    late = (table.time_s > 1.0) & (table.time_s < 5.9)
-    wheel = rows_of(table, "wheel_1_radps")[late, 0]
-    np.testing.assert_allclose(wheel, table.time_s[late] - encoder_s, atol=1e-9)
-    for row, slope, start in (
-        ("gyro_z_radps", 1.0, 0.0),
-        ("accel_x_mps2", 1.0, 0.0),
-        ("camera_speed_x_mps", 1.0, 0.0),
-        ("steer_1_rad", 0.2, 0.1),
-    ):
-        signal = rows_of(table, row)[late, 0]
-        if row == "steer_1_rad":
-            signal = signal - 0.1 * np.sin(table.time_s[late] - encoder_s)
-        np.testing.assert_allclose(signal, start + slope * wheel, atol=1e-3, err_msg=row)
-    raw = measurement_table(run, robot, time_constant_s=0.0)
-    ahead = rows_of(raw, "gyro_z_radps")[late, 0] - wheel
-    np.testing.assert_allclose(
-        ahead, encoder_s - 0.005, atol=1e-3
-    )  # a raw sample is held over half its period
-    longer = measurement_table(run, robot, time_constant_s=0.2)
-    np.testing.assert_allclose(
-        rows_of(longer, "camera_speed_x_mps")[late, 0], table.time_s[late] - 0.22, atol=8e-3
-    )
 
 
 def test_smoothing_of_the_thesis_is_there_to_be_compared():
@@ -253,24 +191,6 @@ def test_camera_samples_of_low_confidence_are_dropped():
     table = measurement_table(run, bare())
     assert table.dropped == {"odometry: low confidence": 200}
     assert np.isnan(rows_of(table, *CAMERA_ROWS)[(table.time_s > 2.03) & (table.time_s < 3)]).all()
-
-
-def test_a_jump_is_taken_out_before_the_low_pass_smears_it():
-    plain = measurement_table(RUN, bare())
-    relocalised = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 2.02), 3.0, "velocity_z_mps"))
-    table = measurement_table(relocalised, bare())
-    assert table.dropped == {"odometry: jump": 4}
-    np.testing.assert_allclose(table.z, plain.z, atol=0.03)
-
-    jumped = change(RUN, "odometry", set_rows(lambda t: t >= 2.0, 3.0, "velocity_z_mps"))
-    table = measurement_table(jumped, bare())
-    late = table.time_s > 2.05
-    assert table.dropped["odometry: jump"] == 10  # then the channel is frozen
-    assert np.isnan(rows_of(table, "camera_speed_x_mps")[late]).all()  # a speed over ground cannot jump
-    assert np.isfinite(rows_of(table, "camera_yaw_rate_radps", "camera_yaw_rad")[late]).all()
-    back = change(RUN, "odometry", set_rows(lambda t: (t >= 2.0) & (t < 3.0), 3.0, "velocity_z_mps"))
-    table = measurement_table(back, bare())
-    assert np.isfinite(rows_of(table, "camera_speed_x_mps")[table.time_s > 3.05]).all()
 
 
 def test_stamps_that_do_not_increase_cost_their_sample_only():

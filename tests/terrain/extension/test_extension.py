@@ -11,7 +11,6 @@ import terrain
 from terrain.effects import Stage, in_plant, on_samples, parameters_of
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import enriched, estimate_run, filter_run, summarize
-from terrain.estimation.feed import measurement_table
 from terrain.estimation.live import LiveFilter
 from terrain.extension import (
     Correction,
@@ -155,40 +154,6 @@ def test_what_an_effect_does_to_samples_of_a_sensor_its_correction_takes_off_the
     seen = on_samples("wheels", channels, effects)(np.arange(3.0), values.copy())[1]
     assert not np.isclose(seen[1:], values[1:]).any()
     np.testing.assert_allclose(correction("wheels", channels, np.arange(3.0), seen)[1], values, atol=1e-12)
-
-
-def test_a_correction_is_the_inverse_of_what_sensors_do():
-    """All streams come back but for the noise of the sensors, which is scaled with them."""
-    effects = {
-        "camera_yaw_rad": 0.2,
-        "gyro_scale_ratio": -0.1,
-        "gyro_bias_radps": 0.02,
-        "accel_bias_mps2": 0.3,
-    }
-    effects |= {"clock_offset_s": -0.1, "clock_rate_ratio": 0.003, "current_offset_a": 0.8}
-    effects |= {"wheel_scale_2_ratio": -0.04, "motor_drift_ratio": 0.3, "motor_constant_ratio": 0.1}
-    clean, run = run_of(), run_of(effects=effects)
-    back, robot = corrected_log(run, extended(**effects)), corrected(extended(**effects))
-    for name, stream in clean.streams.items():
-        np.testing.assert_allclose(back.streams[name].time_s, stream.time_s, atol=1e-9)
-    camera, other = clean.streams["odometry"], back.streams["odometry"]
-    np.testing.assert_allclose(other.values[:, :7], camera.values[:, :7], atol=0.02)
-    np.testing.assert_allclose(other.values, camera.values, atol=8 * ROBOT.camera.yaw_rate_std_radps)
-    table, plain = measurement_table(back, robot), measurement_table(clean, ROBOT)
-    worst = {
-        "accel": 1e-9,
-        "gyro": 1e-3,
-        "imu_yaw": 0.01,
-        "camera_speed": 0.01,
-        "camera_yaw": 0.02,
-        "wheel": 4e-3,
-    }
-    for row, column, desired in zip(table.rows, table.z.T, plain.z.T, strict=True):
-        allowed = next((limit for start, limit in worst.items() if row.startswith(start)), 1e-9)
-        np.testing.assert_allclose(column, desired, atol=allowed, err_msg=row)
-    per_a = robot.motors.torque_constant_nmpa / ROBOT.motors.torque_constant_nmpa
-    current = per_a * back.streams["wheels"].values[:, 3:]
-    np.testing.assert_allclose(current, clean.streams["wheels"].values[:, 3:], atol=0.15)
 
 
 def test_a_pose_of_a_camera_whose_scale_and_angle_are_off_comes_back():

@@ -108,18 +108,6 @@ def test_wheels_that_contradict_each_other_are_fitted_and_have_a_residual():
     assert abs(twist[0] - 0.5) > 0.01
 
 
-def test_the_wheel_order_of_equation_2_3_does_not_fit_the_geometry_of_7_2():
-    """The erratum: (2.3) puts wheel 1 at +w/2, 7.2 puts it at -w/2; without yaw the order is of no account."""
-    of_2_3 = WHEELS_M[[1, 0, 2]]
-    for twist, is_wrong in (([0.5, 0.0, 0.6], True), ([0.5, 0.2, 0.0], False)):
-        wheel, steer = inverse(WHEELS_M, RADIUS_M, twist, np.zeros(3))
-        right, residual_mps = no_slip_twist(WHEELS_M, steer, RADIUS_M * wheel)
-        np.testing.assert_allclose(right, twist, atol=1e-12)
-        assert residual_mps < 1e-12
-        wrong, contradiction_mps = no_slip_twist(of_2_3, steer, RADIUS_M * wheel)
-        assert (abs(wrong[2] - twist[2]) > 0.3) == (contradiction_mps > 0.1) == is_wrong
-
-
 @pytest.mark.parametrize(
     ("place", "rolls_across", "twist"),
     [((WHEELS_M, np.zeros(3)), False, [0.1, 0, 0]), (PLACE, True, [0, 0, 0.8])],

@@ -146,14 +146,3 @@ def test_a_description_that_cannot_be_is_refused_in_one_sentence(tmp_path, husky
 def test_an_unknown_robot_is_named(name):
     with pytest.raises(ConfigError, match=name.replace(".", r"\.")):
         load_robot(name)
-
-
-def test_a_key_given_twice_is_refused_and_yaml_cannot_run_code(tmp_path, husky_yaml):
-    path = tmp_path / "mine.yaml"
-    path.write_text(yaml.safe_dump(husky_yaml) + "drive: swerve\n")
-    with pytest.raises(ConfigError, match="'drive' is given twice"):
-        load_robot(path)
-    path.write_text(f"!!python/object/apply:pathlib.Path.touch [{tmp_path}/touched]")
-    with pytest.raises(ConfigError, match="is no YAML"):
-        load_robot(path)
-    assert not (tmp_path / "touched").exists()

@@ -54,12 +54,11 @@ def wheels_of(stream, pattern):
 
 
 def test_the_truth_agrees_with_itself():
-    """Slip, slip angle and acceleration once more, from the positions and speeds beside them."""
+    """Slip and slip angle once more, from the speeds beside them."""
     run = run_of("complex", "grass", 3, conditions=HILLY)
     truth = run.streams["truth"]
-    t = truth.time_s
     v = np.column_stack([truth.channel("speed_x_mps"), truth.channel("speed_y_mps")])
-    turn, yaw = truth.channel("yaw_rate_radps"), truth.channel("yaw_rad")
+    turn = truth.channel("yaw_rate_radps")
     steer, radius = wheels_of(truth, "steer_{}_rad"), 0.2 * np.array(HILLY.radius_factors)
     centre = v[:, :, None] + turn[:, None, None] * np.array(
         [-ROBOT.wheel_positions_m[:, 1], ROBOT.wheel_positions_m[:, 0]]
@@ -75,16 +74,6 @@ def test_the_truth_agrees_with_itself():
     angle = wheels_of(truth, "slip_angle_{}_rad")
     moving = np.hypot(along, across) > 0.051
     np.testing.assert_allclose(angle[moving], np.arctan2(across, abs(along))[moving], atol=1e-9)
-    # central differences over 20 ms: within what the acceleration changes in that time
-    accel = np.gradient(v, t, axis=0) + turn[:, None] * np.column_stack([-v[:, 1], v[:, 0]])
-    true_accel = np.column_stack([truth.channel("accel_x_mps2"), truth.channel("accel_y_mps2")])
-    assert np.sqrt(((accel - true_accel) ** 2).mean()) < 0.05 * true_accel.std()
-    c, s = np.cos(yaw), np.sin(yaw)
-    world = np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]])
-    moved = np.cumsum(0.5 * (world[1:] + world[:-1]) * np.diff(t)[:, None], axis=0)
-    place = np.column_stack([truth.channel("position_x_m"), truth.channel("position_y_m")])
-    np.testing.assert_allclose(moved, place[1:] - place[0], atol=5e-3)
-    assert np.ptp(place, axis=0).min() > 1.0
     mass_n = 105.0 * 9.80665
     assert wheels_of(truth, "normal_{}_n").sum(axis=1).mean() == pytest.approx(mass_n, rel=0.01)
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.effects import (
@@ -13,7 +12,6 @@ from terrain.effects import (
     CHANNELS,
     CURRENT,
     GYRO,
-    HEADING,
     SPEED_X,
     SPEED_Y,
     TURNING_CURRENT,
@@ -24,7 +22,7 @@ from terrain.robots import load_robot
 from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.motion import make_planar, move
-from terrain.simulation.planar.replay import replay, sense
+from terrain.simulation.planar.replay import replay
 from terrain.simulation.planar.skid import ENDO_POWER, STANDSTILL_MPS, direction
 from terrain.simulation.planar.swerve import ROLLING_MPS
 
@@ -281,52 +279,6 @@ def test_steering_effects_match_their_formulas():
     )
 
 
-def test_sensor_effects_match_their_formulas():
-    wheel_speed = skid(HUSKY, 0.5 + 0.2 * np.sin(1.5 * TIME_S), 0.4 * np.sin(1.1 * TIME_S))
-    robot = still(HUSKY)
-    plain = replayed(robot, {}, wheel_speed)
-
-    def change(**values):
-        return replayed(robot, values, wheel_speed)
-
-    w, v = plain[GYRO], plain[SPEED_X]
-    np.testing.assert_allclose(change(gyro_bias_radps=0.02)[GYRO], w + 0.02)
-    np.testing.assert_allclose(change(gyro_scale_ratio=0.1)[GYRO], 1.1 * w)
-    np.testing.assert_allclose(change(gyro_scale_ratio=0.1)[HEADING], w)
-    np.testing.assert_allclose(change(accel_bias_mps2=0.1)[ACCEL], plain[ACCEL] + 0.1)
-    turned = change(camera_yaw_rad=0.1)
-    np.testing.assert_allclose(turned[SPEED_X] + 1j * turned[SPEED_Y], v * np.exp(0.1j))
-    lever = change(lever_x_m=0.3, lever_y_m=-0.2)
-    np.testing.assert_allclose(lever[SPEED_X], v + 0.2 * w)
-    np.testing.assert_allclose(lever[SPEED_Y], plain[SPEED_Y] + 0.3 * w)
-    late = change(camera_latency_s=0.1)
-    np.testing.assert_allclose(late[SPEED_X][5:], v[:-5], atol=1e-12)
-    np.testing.assert_allclose(late[GYRO], w)
-    np.testing.assert_array_equal(late[ACCEL], plain[ACCEL])
-    imu = change(imu_latency_s=0.06)
-    for channel in (GYRO, ACCEL):
-        np.testing.assert_allclose(imu[channel][3:], plain[channel][:-3], atol=1e-12)
-    np.testing.assert_allclose(imu[SPEED_X], v, atol=1e-12)
-    np.testing.assert_allclose(imu[HEADING], w)
-    early = change(clock_offset_s=-0.06)  # wheels whose logger is late: all else is ahead of them
-    for channel in (GYRO, SPEED_X, ACCEL, HEADING):
-        np.testing.assert_allclose(early[channel][:-3], plain[channel][3:], atol=1e-12)
-        np.testing.assert_array_equal(early[channel][-3:], plain[channel][-1])
-    np.testing.assert_array_equal(early[CURRENT], plain[CURRENT])
-    offset = change(clock_offset_s=0.06)
-    np.testing.assert_allclose(offset[GYRO][3:], w[:-3], atol=1e-12)
-    np.testing.assert_allclose(offset[CURRENT], plain[CURRENT])
-    rated = change(clock_rate_ratio=0.01)[GYRO]
-    np.testing.assert_allclose(rated[5:], CubicSpline(TIME_S, w)(0.99 * TIME_S)[5:], atol=1e-7)
-    np.testing.assert_allclose(change(yaw_delay_s=0.04)[GYRO][2:], w[:-2], atol=1e-12)
-    lagged, lag_s = wheel_speed.copy(), 0.1
-    for k in range(1, N):  # T y' + y = x by the trapezoidal rule
-        push = 0.5 * DT * (wheel_speed[k - 1] + wheel_speed[k] - lagged[k - 1])
-        lagged[k] = (lag_s * lagged[k - 1] + push) / (lag_s + 0.5 * DT)
-    undone = replayed(robot, {"encoder_lag_s": lag_s}, lagged)
-    np.testing.assert_allclose(undone[SPEED_X][60:-1], v[60:-1], atol=1e-3)
-
-
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_forces_and_currents_balance(robot):
     ground = Ground(slip_ratio=0.3, rolling_ratio=0.06, scrub_ratio=0.0)
@@ -381,20 +333,3 @@ def test_turning_takes_current_of_the_difference_of_the_sides():
     speeding = replayed(HUSKY, {}, skid(HUSKY, np.full(N, 0.6), spin * TIME_S))
     moment = planar.body["yaw_inertia_kgm2"][0] * spin
     assert speeding[TURNING_CURRENT][N // 2] * n_per_a == pytest.approx(2 * moment / HUSKY.track_m)
-
-
-def test_sensors_that_are_right_show_the_truth():
-    planar, p = make_planar(still(HUSKY), Ground()), vector_of({})
-    wheel_speed, steer, grade, roll = rich(HUSKY)
-    truth = move(planar, p, DT, wheel_speed, steer, grade, roll)
-    shown = sense(planar, p, DT, truth)
-    for channel, name in (
-        (GYRO, "yaw_rate_radps"),
-        (SPEED_X, "speed_x_mps"),
-        (SPEED_Y, "speed_y_mps"),
-        (ACCEL, "accel_x_mps2"),
-        (CURRENT, "current_a"),
-        (TURNING_CURRENT, "turning_current_a"),
-        (HEADING, "yaw_rate_radps"),
-    ):
-        np.testing.assert_array_equal(shown[:, CHANNELS.index(channel)], truth[name])

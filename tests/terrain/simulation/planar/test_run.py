@@ -88,7 +88,10 @@ def replayed(run, robot, values, ground):
 
 
 OWN = {
-    "skid_steer": [{"turn_side_slip_s": 0.15, "side_slip_build_up_s": 0.2, "turn_drag_s2": 0.9}],
+    "skid_steer": [
+        {"turn_side_slip_s": 0.15, "side_slip_build_up_s": 0.2, "turn_drag_s2": 0.9},
+        {"yaw_delay_s": 0.04},
+    ],
     "swerve": [{"wheel_scale_2_ratio": 0.05}],
 }
 """Effects that robots of one drive alone have."""
@@ -105,6 +108,7 @@ EFFECTS = [
         "side_hill_slip_ratio": 1.0,
     },
     {"gyro_scale_ratio": 0.1, "gyro_bias_radps": 0.02, "lever_y_m": 0.2, "camera_yaw_rad": 0.1},
+    {"accel_bias_mps2": 0.1, "lever_x_m": 0.3, "camera_latency_s": 0.1},
 ]
 
 
