@@ -79,14 +79,6 @@ def test_rows_without_features_are_refused():
         quick().fit(X, np.full(len(y), "ice"), run)
 
 
-def test_what_does_not_help_is_not_kept():
-    best = quick(choose=True).fit(*draw("features"))
-    assert best.best_.used == "svm"
-    assert best.network_ is None
-    X = draw("features", seed=2)[0]
-    assert np.array_equal(best.predict_proba(X), best.svm_.predict_proba(X[:, :N_FEATURES]))
-
-
 def test_the_loss_of_a_stack_is_by_weights_of_other_runs():
     rng = np.random.default_rng(0)
     both, truth, run = (

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from studies.blind_trials.drives import car_drives, rich_drives
-from studies.blind_trials.hidden import Row, cases_of, hidden_runs
+from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.limits import confusable_class, limits_of
-from studies.blind_trials.trial import run_trial, simulation_of
+from studies.blind_trials.trial import simulation_of
 
 import terrain.discrepancy.diagnose as diagnose_module
 from pipelines.report.results import as_json
@@ -259,13 +259,3 @@ def test_inputs_of_a_tilt_that_is_no_slope_are_no_evidence(worlds, monkeypatch):
         simulation = replace(worlds("husky").simulation, grounds={"grass": Ground(effective_ratio=ratio)})
         problem = SimpleNamespace(simulation=simulation, signals=(SimpleNamespace(terrain="grass"),))
         assert [name for _, name in diagnose_module._probes(problem, fit)] == names
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("row", [Row.TRACKED, Row.CAR])
-def test_blind_trials_name_what_is_hidden_and_nothing_else(row):
-    trials = [run_trial(case) for case in cases_of(row, 12, 77, 8)]
-    assert not any(t.wrong for t in trials)
-    hidden = [t for t in trials if t.causes]
-    assert len(hidden) < len(trials)
-    assert sum(t.found(t.causes[0]) for t in hidden) >= len(hidden) - 1

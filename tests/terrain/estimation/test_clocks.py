@@ -41,17 +41,6 @@ class Robot:
         return [self.step() for _ in range(n)]
 
 
-def test_stamps_that_agree_are_left_as_they_are():
-    robot = Robot()
-    robot.late_s["imu"] = 0.2
-    for _ in range(5):
-        now_s, ages = robot.step()
-        assert now_s == pytest.approx(robot.true_s)
-        assert ages == pytest.approx({"wheels": 0.0, "imu": 0.2})
-    assert robot.clocks.counts == {}
-    assert robot.clocks.lateness_s == pytest.approx({"wheels": 0.0, "imu": 0.2})
-
-
 @pytest.mark.parametrize("step_s", STEPS_S)
 @pytest.mark.parametrize("late_s", [0.0, 0.1])
 def test_the_clock_of_one_stream_is_found_again_after_three_readings(step_s, late_s):

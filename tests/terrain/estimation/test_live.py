@@ -135,16 +135,6 @@ def test_live_equals_batch(scenario, duration_s, robot, name, yaw):
         np.testing.assert_array_equal(column(estimates, what), raw)
 
 
-def test_how_samples_are_bundled_does_not_matter():
-    run = log()
-    _, plain = live(run)
-    for rate_hz in (7.0, 211.0):
-        _, bundled = live(run, rate_hz=rate_hz)
-        for one, other in zip(plain, bundled, strict=True):
-            for a, b in zip(one, other, strict=True):
-                np.testing.assert_array_equal(a, b)
-
-
 def edited(run, name, edit):
     stream = run.streams[name]
     time_s, values = edit(np.array(stream.time_s), np.array(stream.values))

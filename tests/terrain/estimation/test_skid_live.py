@@ -5,7 +5,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.feed import ROWS
@@ -86,13 +85,6 @@ def test_live_equals_batch_where_the_robot_is_stuck():
     (interval,) = stuck_intervals(found.track.time_s, found.motion)
     assert 8.0 <= interval.start_s < 11.0
     assert interval.end_s == pytest.approx(16.0, abs=0.6)
-
-
-def test_live_equals_batch_on_measured_snow(datasets_dir):
-    for run in load_runs(datasets_dir / "borealtc"):
-        if run.run_id not in ("SNOW_03", "SNOW_05", "SNOW_14"):
-            continue
-        assert_equal(run, rate_hz={"wheels": 6.5, "imu": 100.0})
 
 
 @pytest.mark.parametrize(

@@ -45,11 +45,3 @@ def test_a_robot_that_stands_or_drives_too_shortly_shows_no_axes():
     short = driving(np.random.default_rng(0), 4.0)
     assert find_axes([short], PERIOD_S) == AS_LOGGED
     assert find_axes([], PERIOD_S, default=ImuAxes((-1.0, -1.0, 1.0), -1.0)).gyro_z == -1.0
-
-
-def test_what_is_turned_is_counted():
-    assert AS_LOGGED.repairs() == {}
-    assert ImuAxes((1.0, -1.0, -1.0), -1.0).repairs() == {
-        "imu axes turned": 2,
-        "yaw rates with their sign turned": 1,
-    }

@@ -1,7 +1,6 @@
 """Robots: what each drive is, sections of descriptions, and descriptions that cannot be."""
 
 import math
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -66,13 +65,6 @@ def test_a_completed_robot_keeps_its_parts_and_adds_neutral_ones():
     assert complete.sensors.imu_latency_s == complete.camera.lever_x_m == bare.encoder_lag_s == 0.0
     assert np.isnan([complete.sensors.gyro_std_radps, complete.camera.speed_std_mps]).all()
     assert AGRIMARO.completed == AGRIMARO
-
-
-def test_a_robot_is_pickled_with_its_parts_and_effects():
-    robot = replace(AGRIMARO.without("camera"), effects={"payload_ratio": 0.1}, effects_cov=np.eye(1))
-    back = pickle.loads(pickle.dumps(robot))
-    assert back == robot
-    assert (back.effects_cov, back.steering) == (robot.effects_cov, robot.steering)
 
 
 def test_a_part_or_a_drive_of_the_wrong_kind_is_refused():

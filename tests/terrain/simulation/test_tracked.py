@@ -143,17 +143,6 @@ def test_bulldozing_resists_turning_and_grows_with_what_is_swept():
     assert plain > early > late > 0.5 * plain
 
 
-def test_prescribed_slip_moves_the_robot_as_the_paper_states():
-    run = simulate(UGV, np.tile([0.4, 0.6], (501, 1)), PrescribedSlip(1.1, 0.8), 0, sensors=QUIET)
-    truth, pose = run.streams["truth"], run.streams["pose"]
-    assert truth.channel("speed_x_mps")[1:] == pytest.approx(np.full(1000, (0.44 + 0.48) / 2))
-    assert truth.channel("yaw_rate_radps")[1:] == pytest.approx(np.full(1000, 0.48 - 0.44))
-    assert truth.channel("slip_right_ratio")[-1] == pytest.approx(0.2)
-    assert truth.channel("slip_left_ratio")[-1] == pytest.approx(-0.1 / 1.1)
-    radius = 0.46 / 0.04
-    assert pose.channel("position_y_m")[-1] == pytest.approx(radius * (1 - math.cos(0.4)), rel=1e-3)
-
-
 @pytest.mark.parametrize("power", [0.5, 1.0, 1.5])
 @pytest.mark.parametrize("belts", [(0.02, 0.1), (-0.03, 0.1), (0.05, -0.2)])
 def test_prescribed_turning_slip_is_endos_law_and_continuous_where_a_track_stops(power, belts):

@@ -216,12 +216,3 @@ def test_equilibrium_is_the_first_root_of_the_net_pull_on_both_sides(name):
     assert math.isnan(equilibrium_slip(soil, NORMAL_N, best_n + 1.0, *GEOMETRY))
     assert math.isnan(equilibrium_slip(soil, NORMAL_N, level_n - 1000.0, *GEOMETRY))
     assert math.isnan(equilibrium_slip(soil, 0.0, 0.0, *GEOMETRY))
-
-
-def test_slip_sinkage_makes_sand_a_trap():
-    sand = load_soil("dry_sand")
-    sinking = replace(sand, slip_sinkage_ratio=1.0)
-    at = np.array([0.0, 0.3, 0.6])
-    loss_n = net_pull(sand, NORMAL_N, at, *GEOMETRY) - net_pull(sinking, NORMAL_N, at, *GEOMETRY)
-    assert loss_n[0] == 0.0
-    assert (np.diff(loss_n) > 0).all()
