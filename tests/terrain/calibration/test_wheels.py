@@ -32,14 +32,6 @@ def test_side_slip_is_no_noise_that_averages_out(drive, nominal, truth):
     assert np.abs(np.mean(plain, axis=0)).max() > max(5 * np.abs(np.mean(errors, axis=0)).max(), 0.003)
 
 
-def test_forward_and_backward_driving_agree_on_a_side_slope(drive, nominal, truth):
-    tilted = Conditions(grade_ratio=(0.02, 0.05))
-    stretches = stretches_of([drive("complex", seed, conditions=tilted) for seed in (1, 2)], nominal)
-    for finding in steering_zeros(stretches, nominal):
-        assert finding.low <= truth(finding.parameter) <= finding.high
-        assert finding.high - finding.low < 0.003
-
-
 def test_steering_zeros_do_not_depend_on_load_and_tyres(drive, nominal, truth):
     runs = [
         drive("complex", 1, conditions=Conditions(radius_factors=(1.006, 0.996, 1.0))),

@@ -105,20 +105,6 @@ def test_a_nuisance_is_a_parameter_too_and_its_scatter_widens_its_variance(info,
     assert_allclose(here.a / np.outer(scale, scale), firm.a.sum(0) / np.outer(scale, scale), atol=1e-9)
 
 
-def test_near_is_the_same_form_at_another_point_by_the_same_noise(problem, info):
-    names = list(NAMES[:3])
-    here = problem.near(info, info.vector, names)
-    a, g = info.total(names)
-    scale = np.sqrt(here.a.diagonal())
-    assert_allclose(here.a / np.outer(scale, scale), a / np.outer(scale, scale))
-    assert_allclose(here.g / scale, g / scale, atol=1e-9)
-    there = move_point(info.vector, names, np.array([0.05, 0.02, 0.02]))
-    direct, near = problem.at(there, names, info.statistics), problem.near(info, there, names)
-    assert_allclose(near.a, direct.total(names)[0], rtol=0.02, atol=0.01 * near.a.max())
-    for white, expected in zip(near.white_residual, direct.white, strict=True):
-        assert_allclose(white, expected[-1])
-
-
 def test_two_points_differ_in_misfit_as_their_likelihoods_do(problem, info):
     """By sums of squares a mass, which enlarges the noise of the wheels, would be ahead or behind by far more."""
     names = ["camera_yaw_rad", "payload_ratio"]

@@ -28,18 +28,6 @@ def columns(rows, *names):
     return np.column_stack([rows[name] for name in names])
 
 
-@pytest.mark.parametrize(("steer_rad", "speed_mps", "roll_deg"), [(0.1, 4.0, 0.0), (-0.05, 5.0, 12.0)])
-def test_steady_cornering_balances_forces_and_moments(steer_rad, speed_mps, roll_deg):
-    rows, _ = drive(steer_rad, speed_mps, 12.0, car.level_ground(0.8, np.deg2rad(roll_deg)))
-    end = rows[-1]
-    front = end["side_front_n"] * np.cos(end["steer_rad"])
-    push = speed_mps * end["yaw_rate_radps"] + GRAVITY_MPS2 * np.sin(np.deg2rad(roll_deg))
-    assert front + end["side_rear_n"] == pytest.approx(ROBOT.mass_kg * push, rel=1e-6)
-    assert ROBOT.com_behind_front_m * front == pytest.approx(ROBOT.com_ahead_m * end["side_rear_n"])
-    at_rear = end["side_speed_mps"] - ROBOT.com_ahead_m * end["yaw_rate_radps"]
-    assert end["slip_rear_rad"] == pytest.approx(np.arctan(at_rear / speed_mps), rel=1e-6)
-
-
 def test_plant_agrees_with_an_integration_of_its_equations():
     speed, grip, roll, steer = 4.0, 0.6, 0.1, 0.12
     mass, inertia = ROBOT.mass_kg, ROBOT.yaw_inertia_kgm2

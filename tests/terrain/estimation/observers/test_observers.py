@@ -24,6 +24,7 @@ from terrain.simulation.tracked import PrescribedSlip
 UGV, CAR, HUSKY = (load_robot(name) for name in ("orchard_ugv", "adap2e", "husky"))
 ROBOTS = {name: UGV if name in observers_of(UGV) else CAR for name in OBSERVERS}
 ANY = pytest.mark.parametrize("name", OBSERVERS)
+FIX = ("position_x_m", "position_y_m", "yaw_rad")
 
 
 def made(name):
@@ -48,6 +49,20 @@ def test_an_observer_keeps_to_the_interface_before_anything_is_measured(name):
     assert np.isnan(output.slip).all()  # what was never observed
 
 
+def straight_rows(name):
+    """Return rows (3000, m) of motion ahead at 0.6 m/s without slip, at 50 Hz, with a fix every fifth tick."""
+    names, still = (
+        made(name).rows,
+        ("yaw_rate_radps", "roll_rad", "pitch_rad", "steer_front_rad", "accel_y_mps2"),
+    )
+    rows = np.tile(np.where(np.isin(names, still), 0.0, 0.6), (3000, 1))
+    for column, speed_mps in zip(FIX, (0.6, 0.0, 0.0), strict=True):
+        if column in names:
+            rows[:, names.index(column)] = np.nan
+            rows[::5, names.index(column)] = 0.02 * speed_mps * np.arange(0, 3000, 5)
+    return rows
+
+
 @ANY
 def test_any_input_leaves_an_observer_that_finds_back(name):
     observer, rng = made(name), np.random.default_rng(5)
@@ -61,20 +76,39 @@ def test_any_input_leaves_an_observer_that_finds_back(name):
         assert row.tobytes() == given.tobytes()
         assert ObserverStatus(output.status) in ObserverStatus
         assert not np.isinf(np.concatenate(output[:4])).any()
-    turning = np.isin(
-        observer.rows, ("yaw_rate_radps", "roll_rad", "pitch_rad", "steer_front_rad", "accel_y_mps2")
-    )
-    straight = np.where(turning, 0.0, 0.6)  # at 0.6 m/s ahead, without slip
-    for k in range(3000):
-        row = straight.copy()
-        for column, value in (("position_x_m", 0.012 * k), ("position_y_m", 0.0), ("yaw_rad", 0.0)):
-            if column in observer.rows:
-                row[observer.rows.index(column)] = value if k % 5 == 0 else np.nan
+    for row in straight_rows(name):
         output = observer.step(row, 0.02)
     assert output.status in (ObserverStatus.OK, ObserverStatus.UNEXCITED, ObserverStatus.PREDICTED)
     if "position_x_m" in observer.rows:
         assert np.abs(output.slip).max() < 0.02
-        assert output.mean[0] == pytest.approx(0.012 * k, abs=0.1)
+        assert output.mean[0] == pytest.approx(0.012 * 2999, abs=0.1)
+
+
+@pytest.mark.parametrize("name", [name for name in OBSERVERS if set(FIX) <= set(made(name).rows)])
+def test_a_fix_that_cannot_be_is_rejected_a_lasting_one_resets_the_pose_alone_and_lost_ones_cost_no_slip(
+    name,
+):
+    at, rows, tracks = [made(name).rows.index(column) for column in FIX], straight_rows(name), []
+
+    def faulty(ticks, change):
+        log = rows.copy()
+        log[ticks, at] = log[ticks, at] + change
+        tracks.append(observe(made(name), 0.02 * np.arange(len(log)), log))
+        return tracks[-1]
+
+    clean = faulty(0, 0.0)
+    for shift in ((5.0, 0.0, 0.0), (0.0, 0.0, np.pi), (np.inf, 0.0, 0.0)):
+        rejected = np.flatnonzero(faulty(1000, shift).status == ObserverStatus.REJECTED).tolist()
+        assert rejected == [1000] or (rejected == [] and np.isinf(shift[0]))
+    lasting = faulty(slice(1500, None), (5.0, 0.0, 0.0))
+    assert (lasting.status[1500:1545] == ObserverStatus.REJECTED).sum() == 9
+    assert (lasting.status == ObserverStatus.RESET).sum() == 1
+    assert lasting.mean[-1, 0] - clean.mean[-1, 0] == pytest.approx(5.0, abs=1e-3)
+    lost = faulty(slice(1500, 2500), np.nan)
+    needs_fixes = name in ("tracked", "sideslip-kinematic", "sideslip-multi")
+    assert (lost.status[2400] == ObserverStatus.PREDICTED) == needs_fixes
+    for track in tracks:
+        assert np.abs(track.slip[1000:] - clean.slip[1000:]).max() < 1e-3
 
 
 def test_a_robot_has_the_observers_of_its_description():

@@ -7,7 +7,6 @@ import functools
 import numpy as np
 import pytest
 
-from terrain.angles import wrapped
 from terrain.estimation.observers import sideslip
 from terrain.estimation.observers.observer import ObserverStatus, observe
 from terrain.estimation.observers.sideslip import FIRST_STD, RATE, ROWS, SETTINGS, Sideslip
@@ -220,28 +219,6 @@ def test_at_rest_everything_is_as_it_was(name):
         assert np.ptp(track.slip[quiet], axis=0).max() == 0.0
         assert np.ptp(track.mean[quiet], axis=0).max() == 0.0
     assert np.nanmax(np.abs(track.slip)) < np.radians(4.0)
-
-
-@ANY
-def test_jumps_flips_and_lost_fixes_have_their_statuses(name):
-    time_s, rows, _ = drive(4.0, seed=8)
-    fixes = np.flatnonzero(np.isfinite(rows[:, 2]))
-    faulty, jump, flip = rows.copy(), fixes[100], fixes[120]
-    lost, moved = fixes[140:160], fixes[200:]
-    faulty[jump, 2] += 5.0
-    faulty[flip, 4] = wrapped(faulty[flip, 4] + np.pi)
-    faulty[lost, 2:5] = np.nan
-    faulty[moved, 2] += 7.0
-    track, clean = observed(name, time_s, faulty), observed(name, time_s, rows)
-    rejected, reset = ObserverStatus.REJECTED, ObserverStatus.RESET
-    assert track.status[jump] == track.status[flip] == rejected
-    assert (track.status[moved[:10]] == rejected).all()
-    assert (track.status[moved] == reset).sum() == 1
-    assert track.mean[fixes[-1], 0] - clean.mean[fixes[-1], 0] == pytest.approx(7.0, abs=0.05)
-    assert np.nanmax(np.abs(track.slip - clean.slip)) < np.radians(3.0)
-    assert np.abs(track.slip - clean.slip)[fixes[230] :].max() < np.radians(0.5)
-    if name != "sideslip-dynamic":
-        assert (track.status[lost[-3] : lost[-1]] == ObserverStatus.PREDICTED).any()
 
 
 def test_without_a_gyro_slip_follows_the_pose_and_stiffness_stays():

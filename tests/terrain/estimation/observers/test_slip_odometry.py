@@ -349,18 +349,3 @@ def test_what_is_not_excited_stays_unknown():
     assert abs(known["compaction_slip_ratio"][0] - 0.08) < 3 * known["compaction_slip_ratio"][1]
     for name in ("turning_exponent", "grade_slip_ratio", "side_slip_ratio", "angle_roll_rad", "track_ratio"):
         assert np.isnan(known[name][0])
-
-
-def test_jumps_are_rejected_and_a_lasting_one_resets_the_pose_only():
-    def jumps(rows):
-        rows[400, 5:7] += 5.0  # one fix of 10 Hz
-        rows[800:, 5] += 3.0
-
-    run = simulate(ROBOT, course(4), HIDDEN, 5)
-    _, track, _ = learning(run, change=jumps)
-    assert track.status[400] == ObserverStatus.REJECTED
-    assert (track.status[800:890:5] == ObserverStatus.REJECTED).sum() == 10
-    assert (track.status == ObserverStatus.RESET).sum() == 1
-    assert np.nanmax(np.abs(np.diff(track.state("compaction_slip_ratio"))[780:])) < 0.01
-    truth = run.streams["pose"].values[::2][: len(track.time_s)]
-    assert np.abs(track.mean[-1, :2] - truth[-1, :2] - [3.0, 0.0]).max() < 0.06

@@ -165,30 +165,6 @@ def test_standing_for_minutes_nothing_drifts():
     assert (abs(after.mean[:3] - place) < 4 * after.std[:3]).all()
 
 
-@pytest.mark.parametrize("fault", ["jump", "flip", "infinite"])
-def test_a_fix_that_cannot_be_is_rejected_and_a_lasting_one_begins_the_pose_anew(fault):
-    shift = {"jump": [5.0, 0.0, 0.0], "flip": [0.0, 0.0, math.pi], "infinite": [math.inf, 0.0, 0.0]}[fault]
-    time_s, rows, *_ = drive(*CIRCLE, 80.0, np.random.default_rng(0), **RAW)
-    once, lasting = np.array(rows), np.array(rows)
-    once[time_s == 40, 2:5] += shift
-    lasting[time_s >= 40, 2:5] += shift
-    clean, track, kept = (track_of(time_s, log) for log in (rows, once, lasting))
-    assert names(track).count("REJECTED") == 1
-    assert names(track)[40 * HZ] == "REJECTED"
-    before, after = efficiencies(track)[40 * HZ - 1 : 40 * HZ + 1]
-    np.testing.assert_array_equal(before, after)
-    np.testing.assert_allclose(efficiencies(track)[-1], efficiencies(clean)[-1], atol=1e-3)
-    if fault == "infinite":
-        assert "RESET" not in names(kept)
-        return
-    reset = names(kept).index("RESET")
-    assert names(kept).count("RESET") == 1
-    assert names(kept).count("REJECTED") == PAPER.n_reset - 1
-    np.testing.assert_array_equal(efficiencies(kept)[reset], efficiencies(kept)[40 * HZ - 1])
-    off = kept.mean[reset, :2] - lasting[reset, 2:4]
-    assert abs(off).max() == 0
-
-
 def test_a_track_that_stands_keeps_its_efficiency():
     n = 60 * HZ + 1
     left = np.where(np.arange(n) < 40 * HZ, 0.5, 0.0)

@@ -3,7 +3,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy.integrate import quad, solve_ivp
+from scipy.integrate import quad
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.robots import load_robot
@@ -267,48 +267,6 @@ def test_a_drive_with_everything_in_it_is_that_of_the_plain_form():
     np.testing.assert_allclose(motion.record["ride_roll_rad"], roll, rtol=0, atol=1e-9)
     pitch = (plain["ride"][:, 0] - plain["ride"][:, 1]) / 1.015
     np.testing.assert_allclose(motion.record["ride_pitch_rad"], pitch, rtol=0, atol=1e-9)
-
-
-def test_a_straight_start_is_that_of_the_equations_integrated_by_scipy():
-    """With the centre of mass on the ground no load is transferred: one wheel stands for all."""
-    soil = load_soil("grass")
-    plant = plant_of(soil, com_height_m=0.0)
-    load_n = plant.mass_kg * GRAVITY_MPS2 / 3
-    radius, sigma, ground = (
-        ROBOT.wheel_radius_m,
-        plant.relaxation_length_m,
-        plant.profile.patches["ground"][0],
-    )
-
-    def change(t, state):
-        v, rate, deflection, torque, integral, estimate = state
-        wheel_speed = rate * radius
-        creep = wheel_speed - v - max(abs(wheel_speed), abs(v)) / sigma * deflection
-        thrust, _, resistance, _ = wheel_ground(
-            ground, load_n, (deflection + DEFLECTION_DAMPING_S * creep) / sigma, 0.0
-        )
-        lag = 5.0 * min(t, 1.0) - estimate
-        return [
-            3 * (thrust - resistance * math.tanh(v / ROLLING_SPEED_MPS)) / plant.mass_kg,
-            (torque - plant.friction_nm * math.tanh(rate / 0.1) - thrust * radius) / plant.wheel_inertia_kgm2,
-            creep,
-            (plant.speed_gain_nmspr * lag + integral - torque) / plant.torque_time_constant_s,
-            plant.speed_integral_nmpr * lag,
-            (rate - estimate) / plant.speed_estimate_time_constant_s,
-        ]
-
-    exact = solve_ivp(
-        change, (0, 3), np.zeros(6), method="LSODA", rtol=1e-8, atol=1e-10, max_step=0.005, dense_output=True
-    )
-    # commands are held, not drawn out: at 1 kHz they are a ramp
-    wheel = ramp(60.0, rise_s=20.0)
-    motion = drive(plant, wheel, substeps=1)
-    v, rate = exact.sol(np.arange(len(motion.record)) * STEP_S)[:2]
-    assert np.abs(motion.record["speed_x_mps"] - v).max() < 0.004
-    assert np.abs(wheels(motion)["wheel_radps"] - rate[:, None]).max() < 0.03
-    assert np.abs(motion.record["speed_y_mps"]).max() < 1e-9
-    late = np.arange(len(motion.record)) * STEP_S > 2.5
-    assert np.abs(motion.record["speed_x_mps"] - v)[late].max() < 3e-5
 
 
 @pytest.mark.parametrize("name", ["asphalt", "grass", "clay", "dry_sand"])

@@ -42,18 +42,6 @@ def understeer(robot, added=0.0):
     return own + added
 
 
-@pytest.mark.parametrize("speed", [-2.0, -0.3, 0.05, 1.0, 4.0, 8.0])
-@pytest.mark.parametrize("added", [0.0, 0.05])
-def test_a_steady_turn_has_the_effective_wheelbase_and_slides_to_its_outside(speed, added):
-    angle, values = 0.2, {"understeer_s2pm": added}
-    out = moved(np.full(800, speed), angle, values=values)[-1]
-    k = understeer(CAR, added)
-    turn = speed * math.tan(angle) / (CAR.wheelbase_m + k * speed * abs(speed))
-    lag_ratio = CAR.mass_kg * CAR.com_behind_front_m / (CAR.wheelbase_m * CAR.rear_cornering_npr)
-    np.testing.assert_allclose(out[[VX, W]], [speed, turn], rtol=1e-6)
-    np.testing.assert_allclose(out[VY], -abs(speed) * lag_ratio * speed * turn, rtol=1e-6)
-
-
 def test_at_rest_it_rests_and_creeping_it_is_the_kinematic_bicycle():
     rest = moved(np.zeros(200), 0.3, roll=0.2)
     np.testing.assert_array_equal(rest[:, [VX, VY, W]], 0.0)
