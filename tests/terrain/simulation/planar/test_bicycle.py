@@ -9,16 +9,12 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.discrepancy.signals import signals_of
-from terrain.effects import CHANNELS, GYRO, SPEED_X, SPEED_Y, library_of, vector_of
+from terrain.effects import library_of, vector_of
 from terrain.extension import apply_homes
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
 from terrain.simulation.planar.bicycle import LEAST_RATIO
 from terrain.simulation.planar.model import Ground
 from terrain.simulation.planar.motion import make_planar, move
-from terrain.simulation.planar.replay import replay
-from terrain.simulation.run import simulate
 
 CAR = replace(load_robot("adap2e"), com_ahead_m=0.5, front_cornering_npr=12000.0, rear_cornering_npr=18000.0)
 FREE = Ground(slip_ratio=0.0, rolling_ratio=0.0)
@@ -128,29 +124,3 @@ def test_effects_are_other_numbers_of_the_robot():
     loaded, soft = moved(*drive, values={"payload_ratio": 0.25}), 1.0 / 1.25 - 1.0
     same = moved(*drive, values={"cornering_stiffness_ratio": soft})
     np.testing.assert_allclose(loaded[:, [VY, W]], same[:, [VY, W]], atol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {},
-        {"understeer_s2pm": 0.04, "cornering_stiffness_ratio": -0.3, "steering_offset_front_rad": 0.03},
-        {"steering_delay_s": 0.12, "encoder_lag_s": 0.1, "clock_offset_s": 0.1},
-        {"side_hill_slip_ratio": 0.3, "lever_x_m": 0.4, "lever_y_m": -0.2},
-    ],
-    ids=lambda values: next(iter(values), "none"),
-)
-def test_a_replay_of_a_log_is_the_run(values):
-    t = 0.02 * np.arange(1001)
-    speed, turn = 1.5 * np.sin(0.5 * t) ** 2, 0.3 * np.sin(0.9 * t)
-    twist = np.column_stack([speed, np.zeros_like(t), speed * turn])
-    run = simulate(CAR, twist, FREE, 0, effects=values, conditions=Conditions(grade_ratio=(0.05, 0.05)))
-    signals = signals_of(run, CAR)
-    assert signals.wheel_speed_mps.shape[1] == signals.steer_rad.shape[1] == 1
-    inputs = signals.wheel_speed_mps, signals.steer_rad, signals.grade_rad, signals.roll_rad
-    planar = make_planar(CAR, FREE)
-    shown = replay(planar, vector_of(values), signals.dt_s, *(np.ascontiguousarray(each) for each in inputs))
-    for channel, std in ((GYRO, 3e-3), (SPEED_X, 3e-3), (SPEED_Y, 3e-3)):  # a third of the noise of a log
-        c = CHANNELS.index(channel)
-        off = (shown[:, c] - signals.measured[:, c])[50:-50]
-        assert np.sqrt(np.mean(off**2)) < std, channel
