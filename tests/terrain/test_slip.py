@@ -100,35 +100,6 @@ def test_slip_angle_is_positive_to_the_left_for_both_rolling_directions():
 # from a filter's track
 
 
-@pytest.mark.parametrize(
-    ("steer", "rolls", "goes"),
-    [
-        (0.0, 1, 1),
-        (0.3, 1, 1),
-        (-1.5, 1, 1),
-        (0.0, -1, -1),  # the robot backs
-        (np.pi, -1, 1),  # it goes forward on wheels that are turned round and roll backward
-        (2.5, -1, 1),
-        (np.pi, 1, -1),  # both
-    ],
-)
-@pytest.mark.parametrize("traction", [0.125, -0.2])
-def test_sign_of_slip_is_that_along_the_wheel(steer, rolls, goes, traction):
-    """A wheel slips by +12.5 % as it pushes the robot on; along its own axis that may be the reverse."""
-    ground = 0.8 * rolls
-    velocity = ground * np.array([np.cos(steer), np.sin(steer)])
-    assert np.sign(velocity[0]) == goes
-    wheel_speed = ground / (1 - traction) if traction > 0 else ground * (1 + traction)
-    mean = [*velocity, 0.0, *[steer] * 3, *[wheel_speed - ground] * 3]
-    track = make_track(mean, WITH_SLIP)
-    table = make_table(track, wheel_speed)
-    slip = wheel_slip(track, table, ROBOT).slip_ratio
-    np.testing.assert_allclose(slip, rolls * traction)
-    np.testing.assert_allclose(slip * np.sign(ground), traction)
-    encoders = wheel_slip(make_track(mean[:6], WITHOUT), table, ROBOT).slip_ratio
-    np.testing.assert_allclose(encoders, slip)
-
-
 def test_wheel_speed_uncertainty_is_by_default_the_robots_own():
     track = make_track([0.8, *[0.0] * 5], WITHOUT)
     table = make_table(track, 1.0)

@@ -104,21 +104,6 @@ def test_a_camera_outage_of_3_s_makes_slip_stale_and_less_certain_but_close(seed
     assert abs(thesis.blind.slip_ratio[lost][-20:].mean()) < 0.02
 
 
-@pytest.mark.slow
-def test_on_the_full_simulator_errors_are_what_the_filter_says():
-    runs = [
-        drive(scenario, terrain, seed, vary=True, duration_s=25.0)
-        for terrain in ("grass", "tiles", "tilled_loam", "firm_soil_gravel", "clay")
-        for scenario in ("survey", "straight")
-        for seed in range(5)
-    ]
-    errors = np.array([summarize(estimate_run(run, ROBOT, "vio15")).nees for run in runs])
-    assert 0.5 <= np.mean(errors) <= 2.0
-    by_terrain = errors.reshape(5, -1).mean(axis=1)
-    assert (by_terrain > 0.3).all()
-    assert (by_terrain < [1.5, 1.5, 8.0, 1.5, 1.5]).all()  # on loam a wheel's slip swings with every bump
-
-
 def spoilt(run, stream, change):
     streams = dict(run.streams)
     old = streams[stream]
