@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -116,12 +117,9 @@ def run(settings: Settings, progress: Progress = silent) -> QuickstartResult:
         # without an evaluation given, that of the training shares its fits with the worth of the channels
         trained = train(data_of_runs(training, asked), asked, dataset, progress)
         predicted = predict(held_out or runs, read_model(trained.model_uri), load_slip_table())
-    result = QuickstartResult(
-        dataset=dataset,
-        data_digest=trained.data_digest,
-        commit=trained.commit,
-        seed=settings.seed,
-        crossval=trained.crossval,
+    result = QuickstartResult.of(
+        trained,
+        settings,
         train=trained,
         predict=predicted,
         imported=kept,
@@ -204,11 +202,9 @@ def report(result: QuickstartResult) -> Report:
         if result.held_out
         else "The runs are too few to hold one out: predictions are those of training runs."
     )
-    return Report(
-        f"From logs to slip: {result.dataset}",
-        evaluation.answer,
-        picture=evaluation.picture,
-        lead=evaluation.lead,
+    return replace(
+        evaluation,
+        title=f"From logs to slip: {result.dataset}",
         parts=[
             Section("", [Text(training.answer), Text(predicted_runs), Text(predicted.answer)]),
             *([slip[0].parts[0]] if slip else evaluation.parts[:1]),

@@ -207,14 +207,11 @@ def compare(settings: Settings, inputs: DriveInputs, progress: Progress = silent
         ramp_mps2 = ramp(ramp_mps2).pilot.ramp_mps2
     add_energies(drives)
     rows = {name: tuple(one.metrics for one in drives[name]) for name in names}
-    return DriveResult(
-        scenario=settings.scenario,
-        terrain=settings.terrain,
+    return DriveResult.of(
+        settings,
         robot=inputs.robot.name,
         table=table.name,
         seeds=tuple(settings.all_seeds),
-        delay_s=settings.delay_s,
-        grade_deg=settings.grade_deg,
         ramp_mps2=ramp_mps2,
         controllers=Comparison(settings.scenario, rows).means,
         rows=rows,

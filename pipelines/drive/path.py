@@ -118,12 +118,11 @@ def run(settings: Settings, progress: Progress) -> PathResult:
     drive, ticks = drive_along(robot, path, settings, speed_mps)
     progress("drive", 1, 1)
     files = () if settings.out is None else (settings.out / PAGE_FILE, settings.out / "drive.csv")
-    result = PathResult(
+    result = PathResult.of(
+        settings,
+        path,
         robot=robot.name,
-        path=settings.path,
-        observer=settings.observer,
         seed=settings.first_seed,
-        length_m=path.length_m,
         n_points_merged=path.n_merged,
         speed_mps=speed_mps,
         **path_figures(drive, settings, speed_mps),

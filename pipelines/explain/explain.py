@@ -169,13 +169,12 @@ def explain(
             gained = replace(gained, comparisons={**gained.comparisons, "classifier": compared})
         values, cov, _ = extended_effects(robot, diagnosis)
         extended = replace(robot, effects=values, effects_cov=cov, region=region_of(diagnosed.fit, robot))
-    return ExplainResult(
+    return ExplainResult.of(
+        asked,
         data=data,
         data_digest=data_digest(runs),
         description=description,
-        terrain=asked.terrain,
         effects=tuple(effect.name for effect in library),
-        seed=seed,
         robot=robot,
         diagnosed=diagnosed,
         gain=gained,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from timeit import repeat
@@ -235,11 +236,9 @@ def report(result: ModelResult) -> Report:
             ("scaling, selection and calibration", "fitted inside of each training part of the evaluation"),
         ]
     )
-    return Report(
+    return replace(
+        evaluated,
         title=title,
-        answer=evaluated.answer,
-        lead=evaluated.lead,
-        picture=evaluated.picture,
         parts=[*evaluated.parts[:1], Section("Not for", limits[:3])],
         details=[
             Section("Not for, further", limits[3:]),

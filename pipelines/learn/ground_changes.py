@@ -69,11 +69,10 @@ def find_changes(
     with_step = [run for run in watched if run.step is not None]
     without = [run for run in watched if run.judged and run.step is None]
     delays = np.array([run.delay_s for run in with_step if run.found])
-    return ChangesResult(
+    return ChangesResult.of(
+        detector,
         robot=described_robot.name,
         n_calibration_runs=detector.n_runs,
-        threshold=detector.threshold,
-        false_alarm_ratio=detector.false_alarm_ratio,
         runs=tuple(watched),
         n_steps=len(with_step),
         found_ratio=float(np.mean([run.found for run in with_step])) if with_step else float("nan"),

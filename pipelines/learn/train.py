@@ -223,14 +223,11 @@ def train(
                 f"{error}; the model is kept in {kept}: register it by "
                 f"terrain train --register {kept} --name {settings.name}"
             ) from error
-    return TrainResult(
-        **vars(registered),
-        dataset=dataset,
-        data_digest=data.digest,
-        commit=info.commit,
+    return TrainResult.of(
+        registered,
+        info,
+        record,
         n_windows=len(samples.windows),
-        chosen=record.chosen,
-        importance=importance,
         crossval=evaluation,
         search=searched,
         ui=ui_line(),

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, dataclass_transform
+from typing import TYPE_CHECKING, Any, Self, dataclass_transform
 
 from terrain.files.atomic import atomic_write
 
@@ -99,11 +99,24 @@ class Result:
     --------
     >>> class Length(Result):
     ...     length_m: float = described("of the path", "m")
-    >>> Length(1.5).as_json()
-    {'length_m': 1.5}
+    >>> Length(1.5).as_json(), Length.of(Length(2.5)).length_m
+    ({'length_m': 1.5}, 2.5)
     >>> Length.schema()["properties"]
     {'length_m': {'description': 'of the path', 'unit': 'm'}}
     """
+
+    @classmethod
+    def of(cls, *sources: Any, **values: Any) -> Self:
+        """Return a result of values and, by their names, of the first of the sources, as settings, that has a field.
+
+        A field with a default is that, unless its value is given.
+        """
+        all_fields = fields(cls)  # type: ignore[arg-type]
+        needed = {each.name for each in all_fields if each.default is each.default_factory is MISSING}
+        for source in sources:
+            names = [name for name in needed - values.keys() if hasattr(source, name)]
+            values |= {name: getattr(source, name) for name in names}
+        return cls(**values)
 
     @property
     def report(self) -> Report:

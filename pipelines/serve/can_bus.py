@@ -341,13 +341,13 @@ def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
     bridge, link = Bridge(layout, robot, chain), Link(lambda: open_bus(interface, channel, settings.bitrate))
     with stopping(bridge.stop):
         bridge.run(link, settings.rate_hz, settings.duration_s)
-    return BridgeResult(
+    return BridgeResult.of(
+        bridge,
         interface=interface,
         channel=channel,
         dbc=layout.name,
         robot=robot.name,
         duration_s=round(bridge.duration_s, 3),
-        frames_in=bridge.frames_in,
         frames_used=bridge.receiver.n_used,
         frames_out=link.n_out,
         samples=dict(sorted(bridge.samples.items())),
@@ -355,7 +355,6 @@ def run(settings: Settings, progress: Progress = silent) -> BridgeResult:
         bus_errors=dict(sorted(link.errors.items())),
         clipped=dict(sorted(bridge.clipped.items())),
         states=dict(sorted(bridge.states.items())),
-        ticks_missed=bridge.ticks_missed,
         wheels_to_correction=latency_of(bridge.latencies_s),
         step=latency_of(bridge.steps_s),
     )

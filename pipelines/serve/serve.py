@@ -215,11 +215,8 @@ def run(settings: Settings, progress: Progress = silent) -> Result:
     service = import_module("pipelines.serve.service").Service(settings)
     served = service.hub.served
     assert served.model is not None  # a service begins with one
-    about = {
-        name: getattr(served.model.info, name)
-        for name in ("classes", "channels", "rate_hz", "filter", "robots")
-    }
-    result = ServiceResult(model=served.model_name, table=served.table.name, robot=settings.robot, **about)
+    info, table = served.model.info, served.table.name
+    result = ServiceResult.of(info, settings, model=served.model_name, table=table)
     if settings.check:
         service.close()
         return result

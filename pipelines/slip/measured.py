@@ -103,11 +103,11 @@ def estimate_all(
             slip = measured_slip(run, robot, **over, whole=True).track.as_stream()
             keep(replace(run, streams={**run.streams, "slip": slip}), dict)
             progress("write runs", done, len(found.runs))
-    return MeasuredSlipResult(
+    return MeasuredSlipResult.of(
+        options,
+        found,
         robot=robot.name,
-        **asked,
         sources=dict(sorted(Counter(slip.source for slip in found.slips).items())),
-        delays=found.delays,
         surfaces=surfaces,
         predictions=tuple(predicted),
         rollers=findings,

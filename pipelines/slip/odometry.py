@@ -76,14 +76,8 @@ def calibrate(settings: Settings, progress: Progress) -> OdometryResult:
     model, flat = values.pop("model"), values.pop("flat")
     if settings.out is not None:
         write_slip_model(settings.out, model, robot.name)
-    return OdometryResult(
-        **values,
-        robot=robot.name,
-        seed=settings.seed,
-        folds=settings.folds,
-        written=settings.out,
-        notes=(FLAT,) if flat else (),
-    )
+    notes = (FLAT,) if flat else ()
+    return OdometryResult.of(settings, **values, robot=robot.name, written=settings.out, notes=notes)
 
 
 KINDS = (

@@ -111,12 +111,9 @@ def calibrate(settings: Settings, progress: Progress) -> SoilResult:
     files = [str(result.soil.file) for result in results if result.soil.file is not None]
     if settings.figures is not None:
         files += write_figures(pictures, settings.figures)
-    return SoilResult(
-        out=out,
-        dataset=settings.dataset,
+    return SoilResult.of(
+        settings,
         data_digest=data_digest(runs),
-        seed=settings.seed,
-        draws=settings.draws,
         bar_ratio=BAR_RATIO,
         wheels=tuple(results),
         files=tuple(files),
