@@ -14,9 +14,8 @@ EXAMPLE = runs.EXAMPLE
 class Settings(runs.Settings):
     """What is inspected."""
 
-    data: Path = setting(
-        ..., "Folder of runs, an MCAP file, or a model: its folder or models:/NAME.", option="DATA"
-    )
+    data: Path = setting(..., option="DATA")
+    """Folder of runs, an MCAP file, or a model: its folder or models:/NAME."""
 
 
 def run(settings: Settings, progress: Progress = silent) -> Result:

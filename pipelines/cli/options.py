@@ -22,9 +22,8 @@ class Output(Settings):
     """Output."""
 
     json_file: Path | None = setting(None, "Write the result as JSON.", "--json")
-    report_file: Path | None = setting(
-        None, "Write the report as a page (.html) or as Markdown (.md).", "--report"
-    )
+    report_file: Path | None = setting(None, option="--report")
+    """Write the report as a page (.html) or as Markdown (.md)."""
     details: bool = setting(False, "Print the details, too.")
 
 
@@ -117,7 +116,7 @@ def _metavar(kind: Any) -> str:
 
 def _text(field: FieldInfo) -> str:
     """Return the help of a field with its default; none is shown of a flag."""
-    text, default = field.description or "", field.default
+    text, default = " ".join((field.description or "").split()), field.default
     if field.is_required() or default is None or isinstance(default, bool) or default in ("", ()):
         return text
     shown = ",".join(map(str, default)) if isinstance(default, tuple) else default

@@ -43,9 +43,8 @@ class Settings(JobsSettings):
     out: Path = setting(Path("terrain-report"), "Folder of the runs and the report.")
     name: str = setting("quickstart", "Name of the registered model.")
     seed: int = setting(0, "Deals runs into folds; of the simulation, too.", ge=0)
-    merge_duplicates: bool = setting(
-        False, "Treat runs that hold the same measurements as one run instead of refusing them."
-    )
+    merge_duplicates: bool = setting(False)
+    """Treat runs that hold the same measurements as one run instead of refusing them."""
     runs_a_terrain: int = setting(6, "Simulated runs of each terrain.", ge=2, option="--runs")
 
 

@@ -31,11 +31,9 @@ class Settings(RunsSettings):
     data: Path = setting(..., "Folder to read, or a file of MCAP or a bag.", option="FOLDER")
     mapping: Path | None = setting(None, MAPPING_TEXT)
     out: Path = setting(..., "Folder of the new runs; what is there is left as it is.")
-    to: Target = setting(
-        "runs",
-        "What is written: runs, folders that all commands read; mcap, a file a run; ros2 or ros2-mcap, a bag a "
-        "run in SQLite or MCAP; csv, a folder of tables a run.",
-    )
+    to: Target = setting("runs")
+    """What is written: runs, folders that all commands read; mcap, a file a run; ros2 or ros2-mcap, a bag a run in
+    SQLite or MCAP; csv, a folder of tables a run."""
 
 
 class ConvertResult(Result):

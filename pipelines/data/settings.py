@@ -33,9 +33,8 @@ class ReadSettings(Settings):
     """How files are read."""
 
     layout: Layout = setting("auto", "Layout of the folder.", option="--format")
-    mapping: Path | None = setting(
-        None, "YAML file that describes how to read CSV files, or with --format bag topics; with can a DBC."
-    )
+    mapping: Path | None = setting(None)
+    """YAML file that describes how to read CSV files, or with --format bag topics; with can a DBC."""
     repair: bool = setting(False, "Drop and count what a strict read refuses.")
 
 
@@ -43,10 +42,8 @@ class RunsSettings(ReadSettings):
     """The runs that a command works on."""
 
     data: Path = setting(..., "Folder of runs in any readable layout, or an MCAP file.")
-    robot: str | None = setting(
-        None,
-        "Robot of logs that do not name theirs (DRIVE, CAN, bags), by name or its YAML file; of DRIVE the husky.",
-    )
+    robot: str | None = setting(None)
+    """Robot of logs that do not name theirs (DRIVE, CAN, bags), by name or its YAML file; of DRIVE the husky."""
 
     @property
     def dataset(self) -> str:

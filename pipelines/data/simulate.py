@@ -21,27 +21,22 @@ class Settings(BaseSettings):
 
     robot: str = setting(..., "Robot by name, or its YAML file.")
     terrain: str = setting(..., "Name of a soil, 'all' for each in turn, 'course' or 'bench'.")
-    scenario: str = setting(
-        ...,
-        "stand, straight, arc, starts, climb, brake, circle, crab, spot_turn, complex, survey; slip, for "
-        "learn-slip; course on 'course', six_positions on 'bench'.",
-    )
+    scenario: str = setting(...)
+    """stand, straight, arc, starts, climb, brake, circle, crab, spot_turn, complex, survey; slip, for learn-slip;
+    course on 'course', six_positions on 'bench'."""
     out: Path = setting(..., "Folder of the new run folders.")
     runs: int = setting(1, "Number of runs for each terrain.", ge=1)
     duration_s: float | None = setting(None, "Length of a run in s.", option="--duration")
     seed: int = setting(0, "Seed of everything that is drawn.", ge=0)
     vary: bool = setting(False, "Draw soil, slope, load and tyres anew for each run.")
-    grade_deg: float = setting(
-        0.0, "Slope along the start's heading in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0
-    )
+    grade_deg: float = setting(0.0, option="--grade", ge=-30.0, le=30.0)
+    """Slope along the start's heading in degrees, uphill > 0."""
     payload_kg: float = setting(0.0, "Load in kg.", option="--payload", ge=0.0)
-    camera_lost: tuple[str, ...] = setting(
-        (), "START:END in s without the camera; may be given again.", repeated=True
-    )
+    camera_lost: tuple[str, ...] = setting((), repeated=True)
+    """START:END in s without the camera; may be given again."""
     gnss: bool = setting(False, "With an RTK receiver on board.")
-    effect: tuple[str, ...] = setting(
-        (), "NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again.", repeated=True
-    )
+    effect: tuple[str, ...] = setting((), repeated=True)
+    """NAME=VALUE of an effect that acts, as wheel_radius=0.03; may be given again."""
 
 
 def _interval(text: str) -> tuple[float, float]:

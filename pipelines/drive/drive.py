@@ -35,19 +35,14 @@ class DrivenSettings(JobsSettings):
     """Robot, terrain and seeds."""
 
     robot: str = setting("agrimaro", "Robot by name, or its YAML file; a car-like one with --path.")
-    terrain: str = setting(
-        "grass", "Name of a soil, its YAML file, or 'course' for all; with --faults some, by commas."
-    )
-    table: Path | None = setting(
-        None,
-        "Table of target slips; by default the packaged one, with --faults one that is learned in simulation.",
-    )
-    speed_mps: float | None = setting(
-        None, "Cruising speed in m/s; 1 by default, with --path 3.", option="--speed", gt=0.0
-    )
-    seeds: int | None = setting(
-        None, "Number of seeds: each draws load, soil, tyres and noise; 20 by default, with --faults 1.", ge=1
-    )
+    terrain: str = setting("grass")
+    """Name of a soil, its YAML file, or 'course' for all; with --faults some, by commas."""
+    table: Path | None = setting(None)
+    """Table of target slips; by default the packaged one, with --faults one that is learned in simulation."""
+    speed_mps: float | None = setting(None, option="--speed", gt=0.0)
+    """Cruising speed in m/s; 1 by default, with --path 3."""
+    seeds: int | None = setting(None, ge=1)
+    """Number of seeds: each draws load, soil, tyres and noise; 20 by default, with --faults 1."""
     first_seed: int = setting(0, "First seed.", option="--seed", ge=0)
     out: Path | None = setting(None, "Folder of the page, with --path also of the table of the drive.")
 
@@ -55,38 +50,26 @@ class DrivenSettings(JobsSettings):
 class ComparisonSettings(BaseSettings):
     """Comparison of controllers."""
 
-    scenario: str = setting(
-        "starts",
-        "starts, straight, slope (the steepest; else level), brake, circle, crab; course and mixed on the "
-        "terrain 'course'; or any of simulate.",
-    )
-    controllers: Names = setting(
-        CONTROLLERS,
-        "By commas: plain, ramp, thesis; the traction controller on the target of fallback, classified, "
-        "true_terrain, known:NAME (of that terrain) or target:SLIP; the thesis' PID on the targets of "
-        "thesis:classified or thesis:true_terrain; NAME+track with path tracking.",
-    )
-    model: str | None = setting(
-        None,
-        "Classifier of 'classified' and 'thesis:classified': models:/NAME@champion or a folder; one is "
-        "trained by default.",
-    )
+    scenario: str = setting("starts")
+    """starts, straight, slope (the steepest; else level), brake, circle, crab; course and mixed on the terrain
+    'course'; or any of simulate."""
+    controllers: Names = setting(CONTROLLERS)
+    """By commas: plain, ramp, thesis; the traction controller on the target of fallback, classified, true_terrain,
+    known:NAME (of that terrain) or target:SLIP; the thesis' PID on the targets of thesis:classified or
+    thesis:true_terrain; NAME+track with path tracking."""
+    model: str | None = setting(None)
+    """Classifier of 'classified' and 'thesis:classified': models:/NAME@champion or a folder; one is trained by
+    default."""
     delay_s: float = setting(0.05, "From a sample to the wheel in s.", option="--delay", ge=0.0, le=0.5)
-    ramp_mps2: float | None = setting(
-        None,
-        "Rise of speed of 'ramp' in m/s^2; by default the one that travels as far as the traction controller.",
-        option="--ramp",
-    )
+    ramp_mps2: float | None = setting(None, option="--ramp")
+    """Rise of speed of 'ramp' in m/s^2; by default the one that travels as far as the traction controller."""
     duration_s: float | None = setting(None, "Length of a drive in s.", option="--duration")
     accel_mps2: float = setting(1.0, "Rise of the desired speed in m/s^2; inf for a step.", option="--accel")
     grade_deg: float = setting(0.0, "Slope in degrees, uphill > 0.", option="--grade", ge=-30.0, le=30.0)
     radius_factors: Annotated[tuple[Ratio, ...], ByCommas] | None = setting(
-        None,
-        "True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default.",
-        option="--radius",
-        min_length=3,
-        max_length=3,
+        None, option="--radius", min_length=3, max_length=3
     )
+    """True radius of each wheel over the nominal one, as in 1,1.02,1; drawn by default."""
     leg_backlash_rad: float = setting(0.0, "Backlash of the third leg in rad.", option="--leg-backlash")
     plant: str | None = setting(None, "Robot as it really is, where it differs from --robot.")
 
@@ -111,38 +94,26 @@ class FaultSettings(BaseSettings):
     faults: Names = setting((), "Drive through these faults: names or kinds of them, by commas, or 'all'.")
     situations: Names = setting(SITUATIONS, f"By commas: {', '.join(SITUATIONS)}.")
     stop_terrains: Names = setting(("wet_floor",), "Soils of stop, by commas.", option="--stop-terrain")
-    durations_s: Annotated[tuple[Duration, ...], ByCommas] = setting(
-        (3.0, math.inf), "For how long a fault acts in s, by commas; inf for good.", option="--durations"
-    )
-    draw: Names = setting(
-        (), "Faults whose drives are drawn, by commas; by default, with --out, the worst of each kind."
-    )
+    durations_s: Annotated[tuple[Duration, ...], ByCommas] = setting((3.0, math.inf), option="--durations")
+    """For how long a fault acts in s, by commas; inf for good."""
+    draw: Names = setting(())
+    """Faults whose drives are drawn, by commas; by default, with --out, the worst of each kind."""
 
 
 class PathSettings(BaseSettings):
     """A car-like robot along a path (--path)."""
 
-    path: Path | None = setting(
-        None,
-        "Follow the path of this CSV file: points in their order, columns x_m and y_m, and roll_rad where it "
-        "is known.",
-    )
+    path: Path | None = setting(None)
+    """Follow the path of this CSV file: points in their order, columns x_m and y_m, and roll_rad where it is known."""
     observer: SlipSourceName = setting("multi", "What gives the sideslip.")
-    slope_deg: float = setting(
-        0.0,
-        "Side slope in degrees, left side up > 0; with roll_rad in the file, that.",
-        option="--slope",
-        ge=-30.0,
-        le=30.0,
-    )
+    slope_deg: float = setting(0.0, option="--slope", ge=-30.0, le=30.0)
+    """Side slope in degrees, left side up > 0; with roll_rad in the file, that."""
     grip: float = setting(0.7, "Largest side force over load.", gt=0.0, le=1.5)
     offset: float = setting(0.0, "Desired distance to the left of the path in m.", ge=-100.0, le=100.0)
-    stop: Annotated[tuple[float, ...], ByCommas] = setting(
-        (), "Distances in m at which to stop for 3 s, by commas."
-    )
-    point_std: float = setting(
-        0.0, "Standard deviation of the points in m: 0.02 for points of an RTK receiver.", ge=0.0, le=10.0
-    )
+    stop: Annotated[tuple[float, ...], ByCommas] = setting(())
+    """Distances in m at which to stop for 3 s, by commas."""
+    point_std: float = setting(0.0, ge=0.0, le=10.0)
+    """Standard deviation of the points in m: 0.02 for points of an RTK receiver."""
 
     @field_validator("stop")
     @classmethod

@@ -28,16 +28,13 @@ PAGE_FILE, EXTENDED_FILE, NEXT_FILE = "report.html", "extended.yaml", "next_driv
 class ExplainOptions(BaseSettings):
     """What may be named, of which runs, and how the gain is measured."""
 
-    effects: Names | None = setting(
-        None, "Effects that may be named, by commas; all by default.", min_length=1
-    )
+    effects: Names | None = setting(None, min_length=1)
+    """Effects that may be named, by commas; all by default."""
     terrain: str | None = setting(None, "Use only runs of this label.")
-    hold_out: int | None = setting(
-        None, "Runs held out to measure the gain; a quarter of six or more by default.", ge=0
-    )
-    classifier: bool = setting(
-        False, "Also train a classifier in simulation, before and after; takes a minute."
-    )
+    hold_out: int | None = setting(None, ge=0)
+    """Runs held out to measure the gain; a quarter of six or more by default."""
+    classifier: bool = setting(False)
+    """Also train a classifier in simulation, before and after; takes a minute."""
     seed: int = setting(0, "Of the choice of held-out runs, and of the bootstrap.", ge=0)
 
 
@@ -47,9 +44,8 @@ class Settings(ExplainOptions, AlignedRunsSettings):
     robot: str = setting(..., "Robot whose simulation is tested: name or YAML file.")
     out: Path = setting(..., "Folder of the page and of the extended robot.")
     model: str | None = setting(None, "Extended description of that robot, tested in its place.")
-    pictures: str = setting(
-        "6", "Most runs that the page draws: a number, or 'all'.", pattern="^([0-9]+|all)$"
-    )
+    pictures: str = setting("6", pattern="^([0-9]+|all)$")
+    """Most runs that the page draws: a number, or 'all'."""
 
 
 def run(settings: Settings, progress: Progress) -> ExplainResult:

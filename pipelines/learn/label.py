@@ -34,9 +34,8 @@ class Settings(BaseSettings):
 
     data: Path = setting(..., "A run folder, or a folder of run folders.", option="FOLDER")
     run: str | None = setting(None, "Id of the run that is listed or labelled.")
-    from_s: float | None = setting(
-        None, "Start of the label in s, on the clock of the run.", "--from", allow_inf_nan=False
-    )
+    from_s: float | None = setting(None, option="--from", allow_inf_nan=False)
+    """Start of the label in s, on the clock of the run."""
     to_s: float | None = setting(None, "End of the label in s.", "--to", allow_inf_nan=False)
     whole: bool = setting(False, "Label the whole run.", option="--all")
     terrain: str | None = setting(None, "Terrain that the label names; an empty one removes labels.")

@@ -50,21 +50,18 @@ class PredictionSettings(BaseSettings):
 
     model: str = setting("", "models:/NAME@champion, models:/NAME/3, or a model folder.")
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
-    filter_stride_s: float | None = setting(
-        None, "From window to window in s, as the filter of a live chain has them (0.25).", "--filter-stride"
-    )
+    filter_stride_s: float | None = setting(None, option="--filter-stride")
+    """From window to window in s, as the filter of a live chain has them (0.25)."""
     out: Path | None = setting(None, "File of the predictions: .parquet or .csv.")
 
 
 class ChangesSettings(BaseSettings):
     """Changes of the ground, from the currents of the wheels."""
 
-    changes: Path | None = setting(
-        None, "Folder of runs on one ground each, of the same robot, that say what is no change."
-    )
-    false_alarms: float = setting(
-        0.02, "Share of the runs on one ground that may give an alarm.", gt=0.0, lt=0.5
-    )
+    changes: Path | None = setting(None)
+    """Folder of runs on one ground each, of the same robot, that say what is no change."""
+    false_alarms: float = setting(0.02, gt=0.0, lt=0.5)
+    """Share of the runs on one ground that may give an alarm."""
 
 
 class Settings(PredictionSettings, ChangesSettings, AlignedRunsSettings):

@@ -77,13 +77,11 @@ class WindowSettings(Settings):
     stride_s: float | None = setting(None, "From window to window in s; one length by default.", "--stride")
     steady: bool = setting(True, "Keep windows of steady motion only.")
     signal_sets: Annotated[Names, AfterValidator(check_signal_sets)] = setting(
-        SIGNAL_SETS,
-        "Signal sets to use, by commas; leave one out to see what it is worth.",
-        option="--signals",
+        SIGNAL_SETS, option="--signals"
     )
-    merge_duplicates: bool = setting(
-        False, "Treat runs that hold the same measurements as one run instead of refusing them."
-    )
+    """Signal sets to use, by commas; leave one out to see what it is worth."""
+    merge_duplicates: bool = setting(False)
+    """Treat runs that hold the same measurements as one run instead of refusing them."""
     skip_short: bool = setting(False, "Leave out and count runs shorter than a window.", option="")
 
     @property
@@ -106,11 +104,8 @@ class LearnSettings(WindowSettings, JobsSettings):
 
     repeats: int | None = setting(None, "Fold assignments (5).", ge=1)
     seed: int = setting(0, "Deals runs into folds.", ge=0)
-    feature: tuple[str, ...] = setting(
-        (),
-        "MODULE:NAME of a function of a window of your own, beside the features; may be given again.",
-        repeated=True,
-    )
+    feature: tuple[str, ...] = setting((), repeated=True)
+    """MODULE:NAME of a function of a window of your own, beside the features; may be given again."""
     params: Path | None = setting(None, "Result of a search, in place of the SVM's own choice.")
     cache: Path | None = setting(None, "Folder of cached features; one that was interrupted goes on.")
 
@@ -155,14 +150,12 @@ class EvaluationSettings(LearnSettings):
     recipe: Annotated[tuple[str, ...], AfterValidator(split_recipes)] = setting(
         (), f"Recipes to evaluate (svm), by commas or repeated: {RECIPE_TEXT}", repeated=True
     )
-    model: tuple[str, ...] = setting(
-        (), "Model folder or URI in place of recipes; may be given again.", repeated=True
-    )
+    model: tuple[str, ...] = setting((), repeated=True)
+    """Model folder or URI in place of recipes; may be given again."""
     protocol: ProtocolName = setting("grouped", "Which windows train and which test.")
     extras: bool = setting(True, "Speed alone, slow against fast, learning curve, terrain over time.")
-    speed: str | None = setting(
-        None, "LOW:HIGH in m/s: runs commanded at such a speed alone (or, without commands, driven at)."
-    )
+    speed: str | None = setting(None)
+    """LOW:HIGH in m/s: runs commanded at such a speed alone (or, without commands, driven at)."""
 
     @model_validator(mode="after")
     def _check_protocol(self) -> Self:

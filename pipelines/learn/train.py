@@ -49,13 +49,11 @@ class TrainingSettings(RecipeSettings):
 
     name: str = setting(..., "Name of the registered model.")
     out: Path | None = setting(None, "Folder of the model, beside MLflow.")
-    search: int = setting(
-        0, "Candidates of the SVM's hyper-parameters that are tried before.", ge=0, le=10_000
-    )
+    search: int = setting(0, ge=0, le=10_000)
+    """Candidates of the SVM's hyper-parameters that are tried before."""
     trials: Path | None = setting(None, "Folder of the search (search-NAME); one that lies there goes on.")
-    kept: Path | None = setting(
-        None, "Folder of a trained model that is registered, in place of training.", "--register"
-    )
+    kept: Path | None = setting(None, option="--register")
+    """Folder of a trained model that is registered, in place of training."""
 
     @model_validator(mode="after")
     def _check_training(self) -> Self:

@@ -32,13 +32,15 @@ ByCommas = BeforeValidator(separated)  #: Of a tuple: it may be given as one tex
 Names = Annotated[tuple[str, ...], ByCommas]  #: Texts, by commas
 
 
-def setting(default: Any, text: str, option: str | None = None, repeated: bool = False, **bounds: Any) -> Any:
+def setting(
+    default: Any, text: str | None = None, option: str | None = None, repeated: bool = False, **bounds: Any
+) -> Any:
     """Return a field of a settings model.
 
     Parameters
     ----------
     default : its only default; ``...`` where it has to be given
-    text : its help
+    text : its help; one that is long stands below the field instead, as its docstring
     option : how it is given on the command line, as ``--window``; ``--name-of-the-field`` by default; without
         dashes an argument that is given by its place, as ``FOLDER``; empty for a field without one
     repeated : of a tuple: each value has an option of its own
@@ -67,6 +69,7 @@ class Settings(BaseModel):
         extra="forbid",
         arbitrary_types_allowed=True,
         populate_by_name=True,
+        use_attribute_docstrings=True,
         alias_generator=lambda name: f"--{name.replace('_', '-')}",
     )
 

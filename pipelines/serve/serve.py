@@ -42,20 +42,15 @@ LONGEST_TOKEN = 512
 class ServedSettings(BaseSettings):
     """What is served."""
 
-    model: str | None = setting(
-        None,
-        "models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can, --replay).",
-    )
+    model: str | None = setting(None)
+    """models:/NAME@champion, models:/NAME/3, or a model folder; without one terrain is unknown (--can, --replay)."""
     table: Path | None = setting(None, "Table of target slips; the packaged one by default.")
-    filter_stride_s: float | None = setting(
-        None, "Windows so far apart in s (0.25), filtered over time; as trained otherwise.", "--filter-stride"
-    )
-    robot: str | None = setting(
-        None, "Robot by name, or its YAML file: its description is used for robots of its name."
-    )
-    rate_hz: float = setting(
-        50.0, "Steps a second of the live chain on a bus or over a log.", "--rate", ge=1.0, le=1000.0
-    )
+    filter_stride_s: float | None = setting(None, option="--filter-stride")
+    """Windows so far apart in s (0.25), filtered over time; as trained otherwise."""
+    robot: str | None = setting(None)
+    """Robot by name, or its YAML file: its description is used for robots of its name."""
+    rate_hz: float = setting(50.0, option="--rate", ge=1.0, le=1000.0)
+    """Steps a second of the live chain on a bus or over a log."""
 
 
 def loaded(settings: ServedSettings, name: str | None) -> TerrainModel | None:
@@ -73,9 +68,8 @@ class ServiceSettings(BaseSettings):
 
     host: str = setting("127.0.0.1", "Address to listen on; a token is required for others than loopback.")
     port: int = setting(8765, "Port to listen on; 0 for a free one.", ge=0, le=65535)
-    token_file: Path | None = setting(
-        None, "File with the token that is required; TERRAIN_TOKEN holds it otherwise."
-    )
+    token_file: Path | None = setting(None)
+    """File with the token that is required; TERRAIN_TOKEN holds it otherwise."""
     max_sessions: int = setting(64, "Robots at once.", ge=1, le=10_000)
     state: Path | None = setting(None, "Folder of what outlives a restart: biases and terrain of each robot.")
     record: Path | None = setting(None, "Folder of the recordings of sessions that ask for it.")
@@ -85,29 +79,22 @@ class ServiceSettings(BaseSettings):
 class CanSettings(BaseSettings):
     """A CAN bus in place of the WebSocket service."""
 
-    can: str | None = setting(
-        None, "Bus as INTERFACE:CHANNEL of python-can, as socketcan:can0; can0 alone is of socketcan."
-    )
+    can: str | None = setting(None)
+    """Bus as INTERFACE:CHANNEL of python-can, as socketcan:can0; can0 alone is of socketcan."""
     bitrate: int | None = setting(None, "Bit rate in bit/s, of interfaces that set it; not socketcan.", gt=0)
     dbc: Path | None = setting(None, "DBC with the signals of docs/can.md; AgriMaRo's by default.")
     controller: Literal["traction", "thesis"] = setting("traction", "traction, or thesis: PID on each wheel.")
-    duration_s: float | None = setting(
-        None, "Stops after so many s; by default when it is interrupted.", option="--duration", ge=0.0
-    )
+    duration_s: float | None = setting(None, option="--duration", ge=0.0)
+    """Stops after so many s; by default when it is interrupted."""
 
 
 class ReplaySettings(ReadSettings):
     """A log in place of robots."""
 
-    replay: Path | None = setting(
-        None, "Log, in any layout that convert reads, that is sent through the live chain."
-    )
-    speed: float | None = setting(
-        None,
-        "Times the log's own speed, as 1 or 4; by default as fast as it goes.",
-        gt=0.0,
-        allow_inf_nan=False,
-    )
+    replay: Path | None = setting(None)
+    """Log, in any layout that convert reads, that is sent through the live chain."""
+    speed: float | None = setting(None, gt=0.0, allow_inf_nan=False)
+    """Times the log's own speed, as 1 or 4; by default as fast as it goes."""
 
 
 class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):

@@ -30,31 +30,25 @@ Length = Annotated[float, Field(ge=0.2, le=3600.0)]
 class RobotSettings(BaseSettings):
     """The ground of a robot's runs (--what robot)."""
 
-    hard: Names | None = setting(
-        None, "Labels of hard ground, by commas; those that slip next to nothing by default."
-    )
+    hard: Names | None = setting(None)
+    """Labels of hard ground, by commas; those that slip next to nothing by default."""
 
 
 class OdometrySettings(BaseSettings):
     """Odometry of a tracked robot (--what odometry)."""
 
-    lengths: Annotated[tuple[Length, ...], ByCommas] = setting(
-        (2.0, 6.0),
-        "Seconds after which poses are compared, by commas; windows of DRIVE have their own.",
-        min_length=1,
-    )
+    lengths: Annotated[tuple[Length, ...], ByCommas] = setting((2.0, 6.0), min_length=1)
+    """Seconds after which poses are compared, by commas; windows of DRIVE have their own."""
     folds: int = setting(5, "Folds of whole runs.", ge=2)
 
 
 class SoilSettings(BaseSettings):
     """Soil of a wheel testbed (--what soil)."""
 
-    laws: Annotated[tuple[Law, ...], ByCommas] = setting(
-        get_args(Law), "Laws to compare, by commas; the last one is reported in full.", min_length=1
-    )
-    check: Path | None = setting(
-        None, "Folder of further trials, which the last law predicts and no fit has."
-    )
+    laws: Annotated[tuple[Law, ...], ByCommas] = setting(get_args(Law), min_length=1)
+    """Laws to compare, by commas; the last one is reported in full."""
+    check: Path | None = setting(None)
+    """Folder of further trials, which the last law predicts and no fit has."""
     draws: int = setting(60, "Bootstrap samples behind the intervals.", ge=2, le=10_000)
     figures: Path | None = setting(None, "Folder of pictures.")
 
@@ -69,14 +63,11 @@ class SoilSettings(BaseSettings):
 class Settings(SoilSettings, OdometrySettings, RobotSettings, RunsSettings):
     """What is calibrated, and what is written."""
 
-    what: Literal["robot", "odometry", "soil"] = setting(
-        "robot",
-        "A robot's description; slip-compensated odometry of a tracked robot; the soil of a wheel testbed.",
-    )
+    what: Literal["robot", "odometry", "soil"] = setting("robot")
+    """A robot's description; slip-compensated odometry of a tracked robot; the soil of a wheel testbed."""
     robot: str | None = setting(None, "Robot by name, or its YAML file, to start from; of a soil none.")
-    out: Path | None = setting(
-        None, "New YAML file of the robot or of the slip model; of a soil a folder with a file a wheel."
-    )
+    out: Path | None = setting(None)
+    """New YAML file of the robot or of the slip model; of a soil a folder with a file a wheel."""
     seed: int = setting(0, "Of folds and bootstrap; a robot's calibration draws nothing.", ge=0)
 
 

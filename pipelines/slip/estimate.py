@@ -58,11 +58,8 @@ class NoiseSettings(BaseSettings):
 class SlipModelSettings(BaseSettings):
     """Slip model of observers."""
 
-    slip_model: Path | None = setting(
-        None,
-        "Slip model of a tracked robot on its ground, for slip-odometry and endo (terrain calibrate "
-        "--what odometry).",
-    )
+    slip_model: Path | None = setting(None)
+    """Slip model of a tracked robot on its ground, for slip-odometry and endo (terrain calibrate --what odometry)."""
 
 
 class PoseSettings(BaseSettings):
@@ -70,17 +67,11 @@ class PoseSettings(BaseSettings):
 
     window_s: float = setting(2.0, "Window length in s.", "--window", gt=0.0)
     stride_s: float = setting(1.0, "From window to window in s.", "--stride", gt=0.0)
-    delay_s: float | None = setting(
-        None,
-        "Delay of the outside measurement in s; by default it is found, a session at a time.",
-        "--delay",
-        ge=-5.0,
-        le=5.0,
-    )
+    delay_s: float | None = setting(None, option="--delay", ge=-5.0, le=5.0)
+    """Delay of the outside measurement in s; by default it is found, a session at a time."""
     predict: bool = setting(False, "Predict slip from currents and wheel speeds, on held-out runs.")
-    hold_out: Names = setting(
-        (), "Sessions that predictions never train on, by commas; runs without a label never are."
-    )
+    hold_out: Names = setting(())
+    """Sessions that predictions never train on, by commas; runs without a label never are."""
     rollers: bool = setting(False, "Of omni robots: rollers' friction by surface, load of the wheels.")
     seed: int = setting(0, "Deals and draws runs.", ge=0)
 
