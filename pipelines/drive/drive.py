@@ -139,15 +139,12 @@ class Settings(PathSettings, FaultSettings, ComparisonSettings, DrivenSettings):
         """Refuse options that the mode would not use."""
         if self.faults and self.path is not None:
             raise ValueError("--faults and --path are two kinds of drives: give one of them")
-        compared = ComparisonSettings.model_fields
-        if self.path is not None:
-            self.refuse((*compared, "terrain", "table", "seeds", "n_jobs"), "is accepted without --path")
-        else:
-            self.refuse(PathSettings.model_fields, "is accepted with --path FILE")
-        if self.faults:
-            self.refuse((*compared, "speed_mps"), "is accepted without --faults")
-        else:
-            self.refuse(FaultSettings.model_fields, "is accepted with --faults NAME")
+        mode = "--path FILE" if self.path is not None else "--faults NAME" if self.faults else ""
+        modes: dict[str, type[BaseSettings]] = {"--path FILE": PathSettings, "--faults NAME": FaultSettings}
+        if mode:
+            also = ("speed_mps",) if self.faults else ("terrain", "table", "seeds", "n_jobs")
+            self.refuse((*ComparisonSettings.model_fields, *also), f"is accepted without {mode.split()[0]}")
+        self.refuse_others(mode, modes, "is accepted with {of}")
         return self
 
     @property

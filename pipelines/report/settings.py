@@ -8,7 +8,7 @@ Nothing heavy is imported here, nor by a module of settings: ``--help`` reads th
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -89,6 +89,12 @@ class Settings(BaseModel):
             field = type(self).model_fields[name]
             if getattr(self, name) != field.default:
                 raise ConfigError(f"{field.alias} {why}")
+
+    def refuse_others(self, mode: str, modes: Mapping[str, type[Settings]], why: str) -> None:
+        """Refuse options of other modes than the one asked for; in the reason ``{of}`` is theirs, ``{mode}`` that."""
+        for name, group in modes.items():
+            if name != mode:
+                self.refuse(group.model_fields, why.format(of=name, mode=mode))
 
 
 class JobsSettings(Settings):

@@ -108,9 +108,8 @@ class Settings(ReplaySettings, CanSettings, ServiceSettings, ServedSettings):
         if len(asked) > 1:
             raise ValueError(f"{' and '.join(asked)} are two modes: one of them is accepted")
         mode = asked[0] if asked else "the WebSocket service"
-        for name, group in (modes | {"the WebSocket service": ServiceSettings}).items():
-            if name != mode:
-                self.refuse(group.model_fields, f"is an option of {name}, not of {mode}")
+        modes["the WebSocket service"] = ServiceSettings
+        self.refuse_others(mode, modes, "is an option of {of}, not of {mode}")
         return self
 
 

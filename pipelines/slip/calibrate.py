@@ -80,9 +80,7 @@ GROUPS: dict[str, type[BaseSettings]] = {
 
 def run(settings: Settings, progress: Progress) -> Result:
     """Calibrate, and write what was found."""
-    for what, group in GROUPS.items():
-        if what != settings.what:
-            settings.refuse(group.model_fields, f"is for --what {what}, not for --what {settings.what}")
+    settings.refuse_others(settings.what, GROUPS, "is for --what {of}, not for --what {mode}")
     if settings.what == "soil":
         settings.refuse(("robot",), "is not for --what soil, whose trials name their wheels")
     elif settings.robot is None:

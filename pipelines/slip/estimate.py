@@ -212,8 +212,6 @@ def _estimated(
 ) -> TracksResult:
     """Estimate by the mode that the filter names."""
     number = 2 if options.filter == "pose" else int(options.filter in get_args(ByObserver))
-    for each, (purpose, group) in enumerate(GROUPS.items()):
-        if each != number:
-            options.refuse(group.model_fields, f"is for {purpose}, not for --filter {options.filter}")
+    options.refuse_others([*GROUPS][number], GROUPS, f"is for {{of}}, not for --filter {options.filter}")
     result: TracksResult = import_module(RESULTS[number]).estimate_all(runs, robot, options, progress, keep)
     return result
