@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from pipelines.drive.drive import Settings
 from pipelines.drive.run_figures import DriveCurves, drive_curves, run_figures
 from pipelines.learn.parallel import parallel
 from pipelines.live.classifying import Classifier
@@ -60,9 +61,6 @@ from terrain.control.switching import KnownTerrain, TerrainSource
 from terrain.errors import ConfigError
 from terrain.records import RunLog
 from terrain.robots import Robot, load_robot
-
-if TYPE_CHECKING:
-    from pipelines.drive.drive import Settings
 
 PICTURED = 3  #: Metrics of the first picture
 

@@ -10,11 +10,11 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from pipelines.drive.drive import ALL
+from pipelines.drive.drive import ALL, Settings
 from pipelines.learn.parallel import parallel
 from pipelines.live.pilot import LivePilot
 from pipelines.report.figure import Figure, Line, Panel, Strip
@@ -48,9 +48,6 @@ from terrain.control.switching import KnownTerrain
 from terrain.errors import ConfigError
 from terrain.robots import Robot, SwerveRobot, as_drive, load_robot
 from terrain.simulation.faults import fault_catalogue, select_faults
-
-if TYPE_CHECKING:
-    from pipelines.drive.drive import Settings
 
 DELAY_S = PilotSettings().delay_s  #: From a sample to the wheel
 LEARNING_SEED = 5000  #: Of the simulated runs that targets are learned from; seeds of drives are far below

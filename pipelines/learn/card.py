@@ -12,7 +12,7 @@ from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 from timeit import repeat
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -34,14 +34,12 @@ from pipelines.report.numbers import NOT_KNOWN, enumerated, format_value, senten
 from pipelines.report.results import Result, described
 from pipelines.report.tree import Column, Pairs, Report, Section, Table, Text
 from terrain.classify.held_out import ChannelImportance, run_speeds
+from terrain.classify.limits import Motion
 from terrain.errors import ModelError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import parse_document
 from terrain.files.names import printable
-
-if TYPE_CHECKING:
-    from terrain.classify.limits import Motion
-    from terrain.records import Windows
+from terrain.records import Windows
 
 N_TIMED = 50  #: Windows whose time is measured, one by one; the median is stated
 WEAK_BELOW = 0.5  #: A terrain that is recognised less often is named among the limits

@@ -19,12 +19,13 @@ from contextlib import suppress
 from io import BytesIO
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from pipelines.data.bag_files import McapWriter
 from pipelines.live.chain import CommandStatus, Step
+from pipelines.live.classifying import WindowOutput
 from terrain.control.switching import SWITCHING
 from terrain.logs.labels import RecordedWindow
 from terrain.logs.read import RunHead
@@ -33,9 +34,6 @@ from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, RunRecorder, check_r
 from terrain.logs.samples import BAD_TIME
 from terrain.logs.write import run_folder
 from terrain.records import Array, Reading
-
-if TYPE_CHECKING:
-    from pipelines.live.classifying import WindowOutput
 
 FLUSH_S = 1.0
 """Time between two writings of a recording: with the time that one takes, what a killed process loses."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pipelines.report.figure import Bars, Figure, Panel, Points
 from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Part, Report, Table, Text, sections
+from pipelines.slip.estimate import EstimateOptions
 from pipelines.slip.tracks import Keep, TracksResult
 from terrain.errors import DataError
 from terrain.records import RunLog
@@ -38,9 +39,6 @@ from terrain.slip_learning.rollers import (
     named_surfaces,
     rollers_of,
 )
-
-if TYPE_CHECKING:
-    from pipelines.slip.estimate import EstimateOptions
 
 SHORT_S, SHORT_STRIDE_S = 0.5, 0.1  #: Windows of the stream ``slip`` that runs are written with
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from pipelines.report.figure import Figure, Line, Mark, Panel, Points, Strip, sp
 from pipelines.report.numbers import enumerated, format_value, plural
 from pipelines.report.results import Progress, described
 from pipelines.report.tree import Column, Report
+from pipelines.slip.estimate import EstimateOptions
 from pipelines.slip.tracks import (
     SLIP,
     TRUTH_COLOUR,
@@ -38,9 +39,6 @@ from terrain.estimation.observers.observer import ObserverStatus
 from terrain.estimation.observers.slip_model_file import read_slip_model
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, packaged_robot
-
-if TYPE_CHECKING:
-    from pipelines.slip.estimate import EstimateOptions
 
 LATE_S = 2.0
 """Time from the start that does not set the limits of an axis: estimates begin where nothing is known."""

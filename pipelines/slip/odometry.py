@@ -7,19 +7,17 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipelines.data.datasets import drive_robot, load
 from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Report, Table, Text, sections
+from pipelines.slip.calibrate import Settings
 from terrain.calibration.odometry import LegScores, ParameterFound, judge_odometry
 from terrain.estimation.observers.slip_model_file import check_slip_model_file, write_slip_model
 from terrain.logs.drive import FILE_NAME, WindowPoses, find_sessions, read_window_poses
 from terrain.robots import TrackedRobot, as_drive, load_robot
-
-if TYPE_CHECKING:
-    from pipelines.slip.calibrate import Settings
 
 FLAT = "no slope was driven, or no tilt measured: what slopes do is not fitted"
 

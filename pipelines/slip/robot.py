@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipelines.data.datasets import load_runs
 from pipelines.report.numbers import plural
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.settings import check_file
 from pipelines.report.tree import Column, Report, Text, sections
+from pipelines.slip.calibrate import Settings
 from pipelines.slip.shown import first_rows
 from terrain.calibration.description import described_with, description_yaml, findings_of, hard_grounds
 from terrain.calibration.finding import Finding
@@ -18,9 +19,6 @@ from terrain.calibration.sensors import measurement_variances
 from terrain.errors import ConfigError, DataError
 from terrain.files.atomic import atomic_write
 from terrain.robots import SwerveRobot, read_description, robot_from
-
-if TYPE_CHECKING:
-    from pipelines.slip.calibrate import Settings
 
 
 class CalibrationResult(Result):

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pipelines.report.tree import Column, Table
+from pipelines.report.figure import Figure
+from pipelines.report.tree import Column, Part, Table
 from terrain.files.atomic import atomic_write
-
-if TYPE_CHECKING:
-    from pipelines.report.figure import Figure
-    from pipelines.report.tree import Part
 
 SHOWN_ROWS = 8  #: Rows of a table that is continued in the details
 

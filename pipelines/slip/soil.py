@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from pipelines.report.numbers import format_value
 from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Part, Report, Section, Table, Text, sections
+from pipelines.slip.calibrate import Settings
 from pipelines.slip.shown import write_figures
 from terrain.errors import DataError
 from terrain.files.atomic import atomic_write, ensure_writable
@@ -33,9 +34,6 @@ from terrain.slip_learning.soil import (
     soil_yaml,
     trials_of,
 )
-
-if TYPE_CHECKING:
-    from pipelines.slip.calibrate import Settings
 
 ERROR = ".1%"
 
