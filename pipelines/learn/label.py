@@ -285,12 +285,7 @@ def _doubtful_report(result: DoubtfulResult) -> Report:
         Column("probability", ".2f", of="probability"),
         Column("label", of="label"),
     )
-    of_run = (
-        Column("run", of="run_id"),
-        Column("windows", of="n_windows"),
-        Column("low confidence", of="n_doubtful"),
-        Column("without label", of="n_without_label"),
-    )
+    of_run = ("run", "windows", "low confidence", "without label")
     n_windows = sum(run.n_windows or 0 for run in result.runs)
     return Report(
         title="Windows of low confidence",
@@ -316,15 +311,9 @@ def _label_report(result: LabelResult) -> Report:
 def _proposals_report(result: ProposalsResult) -> Report:
     from terrain.classify.proposals import questions
 
-    columns = (
-        Column("run", of="run_id"),
-        Column("from s", ".1f", of="start_s"),
-        Column("to s", ".1f", of="end_s"),
-        Column("proposed", of="terrain"),
-        Column("confidence", ".2f", of="confidence"),
-        Column("supported", ".1%", of="supported_ratio"),
-        Column("unknown", ".1%", of="unknown_ratio"),
-    )
+    ends = [Column(name, ".1f") for name in ("from s", "to s")]
+    ratios = [Column(name, ".1%") for name in ("supported", "unknown")]
+    columns = ("run", *ends, "proposed", Column("confidence", ".2f"), *ratios)
     asked = [result.proposals[i] for i in questions(result.proposals, result.n_asked)]
     table = Table(columns, asked, title="worth an answer, the first the most")
     rest = len(result.proposals) - result.n_asked
