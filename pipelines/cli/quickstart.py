@@ -59,9 +59,7 @@ class QuickstartResult(Result):
     train: TrainResult = described("the registered model")
     predict: Predictions = described("of the runs that were held out")
     imported: Mapping[str, Any] = described("where the runs lie, and what reading them found")
-    slip: tuple[TerrainSlip, ...] | None = described(
-        "estimated and true slip by terrain; None of your own runs"
-    )
+    slip: tuple[TerrainSlip, ...] | None = described("estimated and true, by terrain; None of your own runs")
     commands: tuple[str, ...] = described("what to type for the same, step by step")
     report_file: Path = described("the page")
     held_out: tuple[str, ...] = described("runs that the model was neither evaluated nor trained on")

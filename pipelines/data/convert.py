@@ -59,9 +59,7 @@ class ExportResult(ConvertResult):
     """Files or bags for other programs that were written."""
 
     files: Mapping[str, str] = described("name of each run's file or folder, by run")
-    topics: Mapping[str, int] = described(
-        "number of messages of each topic, or rows of each table, of all runs"
-    )
+    topics: Mapping[str, int] = described("messages of each topic, or rows of each table, of all runs")
 
 
 def run(settings: Settings, progress: Progress = silent) -> ImportResult | ExportResult:

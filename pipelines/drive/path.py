@@ -73,9 +73,7 @@ class PathResult(Result, eq=False):
     limit_m: float = described("a tenth of the speed, the bound of Deremetz et al.", "m")
     within_limit: bool = described("whether the largest error is below it and the end was reached")
     slip_max_rad: float = described("largest true slip angle above 0.5 m/s", "rad")
-    slip_error_rad: float = described(
-        "root mean square error of the estimate; null without an observer", "rad"
-    )
+    slip_error_rad: float = described("root mean square error of the estimate; null without observer", "rad")
     stiffness_error_ratio: float = described("cornering stiffness, median error over the secant", "1")
     grip_ratio: float = described("largest side force over load as known at the end, with the preview", "1")
     grip_std: float = described("its standard deviation", "1")

@@ -70,9 +70,7 @@ class ExplainResult(Result, eq=False):
     notes: tuple[str, ...] = described("what a reader has to know of the terrains and sessions")
     next_command: str | None = described("simulates the next drive; null where none is suggested")
     powertrain: Powertrain | None = described("from commanded to measured wheel speeds, where logged")
-    model: str | None = described(
-        "extended description that was tested; null for the robot's own", default=None
-    )
+    model: str | None = described("extended description tested; null for the robot's own", default=None)
     skipped: tuple[str, ...] = described("a sentence for each run that could not be read", default=())
     page: Path | None = described("page that was written", default=None)
     extended_file: Path | None = None

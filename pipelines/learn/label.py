@@ -89,9 +89,7 @@ class DoubtfulResult(Result):
     """Windows of low confidence of all runs of a folder, in the order of the runs and of time."""
 
     data: Path = described("folder of the runs")
-    runs: tuple[RunWindows, ...] = described(
-        "of each run, how many windows there are, are doubtful, lack a label"
-    )
+    runs: tuple[RunWindows, ...] = described("of each run, how many windows there are, doubtful, unlabelled")
     windows: tuple[DoubtfulWindow, ...] = described("windows whose outputs do not count")
 
 

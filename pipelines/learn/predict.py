@@ -111,13 +111,9 @@ class Predictions(Result):
     n_windows: int = described("windows")
     n_runs: int = described("runs that they are of")
     classes: tuple[str, ...] = described("terrains that the model has learned")
-    accuracy: float | None = described(
-        "windows whose nearest terrain is their label; None without labels", "1"
-    )
+    accuracy: float | None = described("windows whose nearest terrain is the label; None without labels", "1")
     n_judged: int = described("windows whose label the model knows")
-    training_runs: tuple[str, ...] = described(
-        "runs that the model was trained on, whose accuracy does not measure its skill"
-    )
+    training_runs: tuple[str, ...] = described("runs that trained the model; their accuracy is not its skill")
     repaired: Mapping[str, int] = described("what a repairing reader dropped, by kind")
     unknown_labels: Mapping[str, int] = described("windows by labels that the model was not trained on")
     n_unknown_labels: int = described("their number")
@@ -129,9 +125,7 @@ class Predictions(Result):
     filtered: tuple[str, ...] = described("runs that the live chain filtered, as they had no estimates")
     filtered_accuracy: float | None = described("as the accuracy, of the terrain filtered over time", "1")
     n_unknown: int = described("windows that are like no terrain that was learned")
-    n_unsupported: int | None = described(
-        "windows whose prediction no training run supports; None where not counted"
-    )
+    n_unsupported: int | None = described("windows that no training run supports; None where not counted")
     model: str | None = described("as it was asked for", optional=True)
     dataset: str | None = described("name of the data", optional=True)
     skipped: tuple[str, ...] | None = described("runs that a repairing reader had to skip", optional=True)

@@ -34,9 +34,7 @@ class ModelInfo:
     channels: Mapping[str, tuple[str, ...]] = described("channels that a log must have, by stream")
     rate_hz: Mapping[str, float] = described("their rates", "Hz")
     run_digests: tuple[str, ...] = described("digest of each training run")
-    run_accuracy: Mapping[str, float] = described(
-        "accuracy on each training run when it was held out, by its digest", "1"
-    )
+    run_accuracy: Mapping[str, float] = described("of each training run when held out, by its digest", "1")
     package_version: str = described("of the package that trained it")
     recipe: str = described("what was trained")
     signal_sets: tuple[str, ...] = described("whose channels the features use")

@@ -75,7 +75,7 @@ class Replayed:
 
     n_windows: int = described("windows that were cut")
     accuracy: float | None = described(
-        "fraction of windows with a label that is a class that are classified rightly", "1"
+        "windows classified rightly, of those whose label is a class of the model", "1"
     )
     n_judged: int = described("number of those windows")
     duration_s: float = described("length of what was replayed", "s")
@@ -116,9 +116,7 @@ class ReplayedRun(Replayed):
     n_steps: int = described("steps of the chain")
     n_refused: int = described("windows without an output")
     terrains: Mapping[str, float] = described("fraction of the windows with an output, by terrain", "1")
-    believed: Mapping[str, float] = described(
-        "fraction of the steps by believed terrain; empty for unknown", "1"
-    )
+    believed: Mapping[str, float] = described("fraction of steps by believed terrain; empty for unknown", "1")
     dropped: Mapping[str, int] = described("what the chain did not use, as counts by kind")
     windows: tuple[ObservedWindow, ...] = described("each window as the chain saw it")
 

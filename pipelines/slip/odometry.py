@@ -36,9 +36,7 @@ class OdometryResult(Result):
     observed_point_m: tuple[float, float] = described("where the point that poses show lies in the body", "m")
     observed_angle_rad: float = described("by which the sensor of the poses is turned", "rad")
     delay_s: float = described("of the poses behind the gyro, as the robot's description has it", "s")
-    adaptive: LegScores | None = described(
-        "scores of the last windows of commands, by the adaptive observer and others"
-    )
+    adaptive: LegScores | None = described("of the last windows of commands, by adaptive observer and others")
     written: Path | None = described("file of the slip model")
     notes: tuple[str, ...] = described("what is missing, in words")
 
