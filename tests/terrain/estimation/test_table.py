@@ -2,12 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.feed import CAMERA_ROWS, GNSS_ROWS, REST_ROW, ROWS_OF_DRIVE, measurement_table
 from terrain.kinematics.camera import odometry_stream
+from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 
@@ -17,65 +17,41 @@ NOISE = 1e-4
 """On all of camera and IMU: small, so that answers are plain; never none, so that nothing is frozen."""
 
 
-def bare(robot=ROBOT, *, camera=None, sensors=None, steering=None):
-    """Return the robot with ideal sensors except for the given values."""
-    ideal = {"latency_s": 0.0, "time_constant_s": 0.0}
-    return robot.with_parts(
-        camera=replace(robot.camera, **ideal | (camera or {})),
-        sensors=replace(
-            robot.sensors, **{"encoder_time_constant_s": 0.0, "imu_latency_s": 0.0} | (sensors or {})
-        ),
-        steering=replace(robot.steering, **steering or {}),
+def bare(encoder_time_constant_s=0.0):
+    """Return the robot with ideal sensors but for the lag of its encoders."""
+    return ROBOT.with_parts(
+        camera=replace(ROBOT.camera, latency_s=0.0, time_constant_s=0.0),
+        sensors=replace(ROBOT.sensors, encoder_time_constant_s=encoder_time_constant_s, imu_latency_s=0.0),
     )
 
 
-def turning_run(duration_s=6.0, *, yaw_0=0.0, rate=0.4, speed=0.5, roll=0.0, pitch=0.0, seed=0):
-    """Return a run that drives an arc at constant rates; its sensors are ideal but for :data:`NOISE`."""
-    rng = np.random.default_rng(seed)
+def turning_run():
+    """Return a run on an arc at 0.5 m/s and 0.4 rad/s; its sensors are ideal but for :data:`NOISE`."""
+    rng, clocks = np.random.default_rng(0), [np.arange(6 * hz) / hz for hz in (50, 100, 200, 10)]
 
-    def clock(rate_hz):
-        return np.arange(round(duration_s * rate_hz)) / rate_hz
-
-    def noisy(columns):
+    def noisy(*columns):
         plain = np.column_stack(np.broadcast_arrays(*columns))
         return plain + NOISE * rng.standard_normal(plain.shape)
 
-    streams = {}
-    t = clock(50.0)
-    motor = np.full((t.size, 3), speed / ROBOT.wheel_radius_m * ROBOT.motors.reduction_ratio)
-    streams["wheels"] = Stream(t, motor, [f"motor_{i}_radps" for i in (1, 2, 3)])
-    steer = np.broadcast_to([0.1, -0.2, 3.1], (t.size, 3)) + 0.1 * np.sin(t)[:, None]
-    streams["steering"] = Stream(t, np.angle(np.exp(1j * steer)), [f"angle_{i}_rad" for i in (1, 2, 3)])
-    t = clock(100.0)
-    up = Rotation.from_euler("ZYX", [0.0, pitch, roll]).inv().apply([0.0, 0.0, GRAVITY_MPS2])
-    gyro = noisy([0 * t, 0.0, rate])
-    force = noisy([up[0] + 0 * t, up[1] + rate * speed, up[2]])
-    fused = noisy([roll + 0 * t, pitch, 0.7 + rate * t])
-    fused[:, 2] = np.angle(np.exp(1j * fused[:, 2]))
-    names = [f"gyro_{a}_radps" for a in "xyz"] + [f"accel_{a}_mps2" for a in "xyz"]
-    streams["imu"] = Stream(t, np.hstack([gyro, force, fused]), [*names, "roll_rad", "pitch_rad", "yaw_rad"])
-    t = clock(200.0)
-    yaw = yaw_0 + rate * t
-    position = speed / rate * np.column_stack([np.sin(yaw) - np.sin(yaw_0), np.cos(yaw_0) - np.cos(yaw)])
-    plain = noisy([*position.T, yaw, roll, pitch, speed, 0.0, rate]).T
-    streams["odometry"] = odometry_stream(
-        t, plain[:2].T, plain[[3, 4, 2]].T, plain[5:8].T, ROBOT.camera, yaw_0
-    )
-    t = clock(10.0)
-    yaw = yaw_0 + rate * t
-    position = speed / rate * np.column_stack([np.sin(yaw) - np.sin(yaw_0), np.cos(yaw_0) - np.cos(yaw)])
-    velocity = speed * np.column_stack([np.cos(yaw), np.sin(yaw)])
-    place = position + np.array([500.0, -80.0])
-    gnss = np.column_stack([place, velocity, np.zeros(t.size), np.ones(t.size)])
-    names = [
-        "position_x_m",
-        "position_y_m",
-        "velocity_x_mps",
-        "velocity_y_mps",
-        "std_position_m",
-        "fix_ratio",
-    ]
-    streams["gnss"] = Stream(t, gnss, names)
+    def arc(t):
+        return 1.25 * np.sin(0.4 * t), 1.25 - 1.25 * np.cos(0.4 * t)
+
+    t, imu_s, camera_s, gnss_s = clocks
+    motor = np.full((t.size, 3), 0.5 / ROBOT.wheel_radius_m * ROBOT.motors.reduction_ratio)
+    steer = np.array([0.1, -0.2, 3.1]) + 0.1 * np.sin(t)[:, None]
+    imu = noisy(0 * imu_s, 0.0, 0.4, 0.0, 0.2, GRAVITY_MPS2, 0.0, 0.0, 0.7 + 0.4 * imu_s)
+    imu[:, 8] = np.angle(np.exp(1j * imu[:, 8]))
+    seen = noisy(*arc(camera_s), 0.0, 0.0, 0.4 * camera_s, 0.5, 0.0, 0.4)
+    speeds = 0.5 * np.cos(0.4 * gnss_s), 0.5 * np.sin(0.4 * gnss_s)
+    places = np.add(np.column_stack(arc(gnss_s)), [500.0, -80.0])
+    fixes = np.column_stack([places, *speeds, 0 * gnss_s, np.ones(gnss_s.size)])
+    streams = {
+        "wheels": Stream(t, motor, [f"motor_{i}_radps" for i in (1, 2, 3)]),
+        "steering": Stream(t, np.angle(np.exp(1j * steer)), [f"angle_{i}_rad" for i in (1, 2, 3)]),
+        "imu": Stream(imu_s, imu, IMU_CHANNELS),
+        "odometry": odometry_stream(camera_s, seen[:, :2], seen[:, 2:5], seen[:, 5:], ROBOT.camera, 0.0),
+        "gnss": Stream(gnss_s, fixes, GNSS_CHANNELS),
+    }
     return RunLog("run", "agrimaro", streams)
 
 
@@ -142,13 +118,10 @@ def test_ideal_sensors_give_the_motion():
     np.testing.assert_allclose(table.gnss_variance[fresh, 0], 0.02**2)
 
 
-# the low-pass
-
-
 def test_smoothing_of_the_thesis_is_there_to_be_compared():
     alpha = 0.2
     raw = measurement_table(RUN, bare(), time_constant_s=0.0)
-    smooth = measurement_table(RUN, bare(sensors={"encoder_time_constant_s": 0.05}), ema_alpha=alpha)
+    smooth = measurement_table(RUN, bare(0.05), ema_alpha=alpha)
     expected = np.array(rows_of(raw, *CAMERA_ROWS))
     for k in range(1, len(expected)):
         expected[k] = alpha * expected[k - 1] + (1 - alpha) * expected[k]
@@ -179,18 +152,22 @@ def test_samples_that_are_no_numbers_are_left_out_and_counted():
     assert np.isnan(rows_of(table, *CAMERA_ROWS)[lost]).all()
 
 
-def test_an_invalid_quaternion_is_left_out_and_counted():
-    run = change(RUN, "odometry", set_rows(lambda t: t >= 4.0, 0.0, "quaternion_w_ratio"))
+@pytest.mark.parametrize(
+    ("start_s", "end_s", "value", "channel", "dropped"),
+    [
+        (4.0, 6.0, 0.0, "quaternion_w_ratio", {"odometry: no rotation": 20}),  # then the channel is frozen
+        (2.0, 3.0, 1 / 3, "confidence_ratio", {"odometry: low confidence": 200}),
+    ],
+)
+def test_a_camera_without_rotation_or_confidence_is_left_out_and_counted(
+    start_s, end_s, value, channel, dropped
+):
+    run = change(RUN, "odometry", set_rows(lambda t: (t >= start_s) & (t < end_s), value, channel))
     table = measurement_table(run, bare())
-    assert table.dropped == {"odometry: no rotation": 20}  # then the channel is frozen
-    assert np.isnan(rows_of(table, *CAMERA_ROWS)[table.time_s > 4.03]).all()
-
-
-def test_camera_samples_of_low_confidence_are_dropped():
-    run = change(RUN, "odometry", set_rows(lambda t: (t >= 2) & (t < 3), 1 / 3, "confidence_ratio"))
-    table = measurement_table(run, bare())
-    assert table.dropped == {"odometry: low confidence": 200}
-    assert np.isnan(rows_of(table, *CAMERA_ROWS)[(table.time_s > 2.03) & (table.time_s < 3)]).all()
+    assert table.dropped == dropped
+    assert np.isnan(
+        rows_of(table, *CAMERA_ROWS)[(table.time_s > start_s + 0.03) & (table.time_s < end_s)]
+    ).all()
 
 
 def test_stamps_that_do_not_increase_cost_their_sample_only():
@@ -221,9 +198,6 @@ def test_a_clock_that_starts_anew_keeps_the_longer_part():
     table = measurement_table(change(RUN, "wheels", reset), bare())
     assert table.dropped["wheels: stamp does not increase"] == 100
     assert table.time_s[-1] == pytest.approx(3.98)
-
-
-# yaw and position of the start
 
 
 # robots that skid, bad input
