@@ -9,9 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrain.errors import ConfigError
-from terrain.estimation.feed import GNSS_ROWS, ROWS_OF_DRIVE, measurement_table
+from terrain.estimation.estimate import estimate_run
+from terrain.estimation.feed import GNSS_ROWS, ROWS, ROWS_OF_DRIVE, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
 from terrain.estimation.live import CHANNELS, QUEUE, LiveFilter
+from terrain.estimation.models.skid import Motion, stuck_intervals
 from terrain.estimation.models.swerve import default_noise, make_filter, scheduled
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
@@ -37,6 +39,7 @@ ODD = ROBOT.with_parts(
     steering=replace(ROBOT.steering, zero_1_rad=3.0, zero_2_rad=-2.0, zero_3_rad=0.5),
     camera=replace(ROBOT.camera, time_constant_s=0.08, lever_x_m=0.1, latency_s=0.03),
 )
+HUSKY, SIDES = load_robot("husky"), ("speed_left_mps", "speed_right_mps")
 IDEAL = ROBOT.with_parts(sensors=replace(ROBOT.sensors, encoder_time_constant_s=0.0))
 MIDDLE_S = 8.0
 
@@ -203,6 +206,52 @@ def test_faults_cost_live_what_they_cost_the_batch_and_slip_comes_back(stream, f
     assert np.nanmean(column(estimates, "slip_ratio")[late]) == pytest.approx(0.125, abs=0.01)
 
 
+def spinning(time_s, values):
+    values[(time_s > 8.0) & (time_s < 16.0), :2] = [-0.2, 0.2]
+    return time_s, values
+
+
+def standing(time_s, values):
+    still = (time_s > 7.9) & (time_s < 16.1)
+    values[still, 2] = np.random.default_rng(2).normal(0, 0.01, still.sum())
+    return time_s, values
+
+
+@pytest.mark.parametrize(
+    ("scenario", "soil", "seed", "stuck"),
+    [
+        *(("survey", "grass", 31, False), ("complex", "tilled_loam", 32, False)),
+        *(("straight", "snow", 33, False), ("survey", "grass", 31, True)),
+    ],
+)
+def test_live_equals_batch_of_a_skid_steer_robot_to_the_last_bit(scenario, soil, seed, stuck):
+    """Where it is stuck, its gyro stands still, on wheels that turn it on the spot."""
+    run = simulate_run(HUSKY, soil, scenario, seed, duration_s=30.0)
+    if stuck:
+        run = edited(edited(run, "wheels", spinning), "imu", standing)
+    channels = {name: run.streams[name].channels for name in ("wheels", "imu")}
+    estimates = settled(LiveFilter(HUSKY, "skid", channels), (each.readings for each in replay(run, 50.0)))
+    found = estimate_run(run, HUSKY, "skid")
+    track, rows, since_s = found.track, column(estimates, "rows"), column(estimates, "stuck_since_s")
+    for what, desired in {
+        "time_s": track.time_s,
+        "mean": track.mean,
+        "std": np.column_stack([track.std(state) for state in track.states]),
+        "yaw_rate_radps": track.state("yaw_rate_radps"),
+        "speed_x_mps": track.state("speed_mps"),
+        "motion": found.motion,
+    }.items():
+        np.testing.assert_array_equal(column(estimates, what), desired, err_msg=what)
+    places = [ROWS.index(row) for row in found.model.rows]
+    np.testing.assert_array_equal(rows[:, places], found.table.columns(found.model.rows))
+    np.testing.assert_array_equal(np.isfinite(since_s), found.motion == Motion.STUCK)
+    intervals = stuck_intervals(track.time_s, found.motion)
+    assert set(since_s[np.isfinite(since_s)].tolist()) == {interval.start_s for interval in intervals}
+    if stuck:
+        assert 8.0 <= intervals[0].start_s < 11.0
+        assert intervals[0].end_s == pytest.approx(16.0, abs=0.6)
+
+
 def test_a_clock_that_is_set_back_is_believed_when_the_next_stamp_follows():
     run = log()
     estimator, estimates = LiveFilter(ROBOT), []
@@ -275,7 +324,7 @@ def garbage(draw, widths):
 def test_arbitrary_readings_neither_raise_nor_make_a_state_infinite(data, kind):
     name, yaw = kind
     widths = {"wheels": 2, "imu": 9} if name == "skid" else {each: len(c) for each, c in CHANNELS.items()}
-    estimator = LiveFilter(load_robot("husky") if name == "skid" else ROBOT, name, initial_yaw_rad=yaw)
+    estimator = LiveFilter(HUSKY if name == "skid" else ROBOT, name, initial_yaw_rad=yaw)
     estimator.step({"wheels": ("wheels", None)})
     assert estimator.dropped["wheels: unreadable"] == 1
     sound = [
@@ -316,15 +365,33 @@ def test_columns_go_by_name():
     assert np.isnan(estimate.current_a).all()
 
 
-def test_invalid_options_are_refused():
-    with pytest.raises(ConfigError, match="'motor_1_radps' must be among them"):
-        LiveFilter(ROBOT, channels={"wheels": ("current_1_a",)})
-    with pytest.raises(ConfigError, match="gnss_latency_s is -1"):
-        LiveFilter(ROBOT, gnss_latency_s=-1.0)
-    with pytest.raises(ConfigError, match="initial_yaw_rad is nan"):
-        LiveFilter(ROBOT, initial_yaw_rad=np.nan)
-    with pytest.raises(ConfigError, match="skid_steer"):
-        LiveFilter(load_robot("husky"))
+@pytest.mark.parametrize(
+    ("robot", "name", "options", "message"),
+    [
+        (ROBOT, "vio15", {"channels": {"wheels": ("current_1_a",)}}, "'motor_1_radps' must be among them"),
+        (ROBOT, "vio15", {"gnss_latency_s": -1.0}, "gnss_latency_s is -1"),
+        (ROBOT, "vio15", {"initial_yaw_rad": np.nan}, "initial_yaw_rad is nan"),
+        (HUSKY, "vio15", {}, "skid_steer"),
+        (ROBOT, "skid", {}, "robot agrimaro has the drive 'swerve': this filter is for 'skid_steer'"),
+        (HUSKY, "skid", {"channels": {"wheels": SIDES[:1]}}, "'speed_right_mps' must be among them"),
+        (
+            HUSKY,
+            "skid",
+            {"channels": {"wheels": SIDES, "imu": ("roll_rad",)}},
+            "'gyro_z_radps' must be among",
+        ),
+        (
+            HUSKY,
+            "skid",
+            {"rate_hz": {"imu": 0.0}},
+            "rate of 'imu' is 0.0 Hz, a number above zero is required",
+        ),
+        (HUSKY, "skid", {"rate_hz": {"wheels": np.nan}}, "rate of 'wheels' is nan Hz"),
+    ],
+)
+def test_invalid_options_are_refused(robot, name, options, message):
+    with pytest.raises(ConfigError, match=message):
+        LiveFilter(robot, name, **options)
 
 
 STARTS_S = np.arange(3.0, 15.0, 0.235)
