@@ -6,8 +6,8 @@ import logging
 import math
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pipelines.data.settings import AlignedRunsSettings, RunsSettings, chosen_runs
@@ -38,12 +38,15 @@ ACCEPTED = (
 """What a refusal lists."""
 
 FOUND_BY: dict[str, tuple[str, tuple[str, ...]]] = {
-    "runs": ("read.find_runs", ("run.json", "*/run.json")),
-    "borealtc": ("borealtc.find_runs", ("*/imu_*.csv", "*/pro_*.csv")),
-    "drive": ("drive.find_sessions", ("samples.csv.gz", "*/samples.csv.gz")),
-    "robotino": ("robotino.find_runs", tuple(f"{'../' * n}camera_params.json" for n in range(4))),
-    "drive-recording": ("drive_recording.find_recordings", ("*.csv.gz", "*/*.csv.gz")),
-    "testbed": ("testbed.find_runs", ("smooth.csv", "grouser.csv")),
+    "runs": ("terrain.logs.read:find_runs", ("run.json", "*/run.json")),
+    "borealtc": ("terrain.logs.borealtc:find_runs", ("*/imu_*.csv", "*/pro_*.csv")),
+    "drive": ("terrain.logs.drive:find_sessions", ("samples.csv.gz", "*/samples.csv.gz")),
+    "robotino": (
+        "terrain.logs.robotino:find_runs",
+        tuple(f"{'../' * n}camera_params.json" for n in range(4)),
+    ),
+    "drive-recording": ("terrain.logs.drive_recording:find_recordings", ("*.csv.gz", "*/*.csv.gz")),
+    "testbed": ("terrain.logs.testbed:find_runs", ("smooth.csv", "grouser.csv")),
 }
 """What finds the runs of each layout, and patterns of its files: without one of these it is not even imported."""
 
@@ -232,7 +235,7 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
         ]
         if "robotino" in asked:  # its files have the ending of recordings, below the file of a camera
             asked = [name for name in asked if name != "drive-recording"]
-    found = {name: readers for name in asked if (readers := _of_logs(FOUND_BY[name][0])(folder))}
+    found = {name: readers for name in asked if (readers := resolve_name(FOUND_BY[name][0])(folder))}
     if len(found) > 1:
         raise LogError(f"{folder}: mixes the layouts {' and '.join(found)}; choose one with --format")
     if not found and layout == "auto":
@@ -240,21 +243,15 @@ def _readers(folder: Path, layout: str, mapping: str | Path | None, robot: Robot
 
         return bag_runs.find_runs(folder, None, robot)
     if "drive" in found:
-        return _of_logs("drive.find_runs")(folder, drive_robot(robot))
+        from terrain.logs import drive
+
+        return drive.find_runs(folder, drive_robot(robot))
     if "drive-recording" in found:
+        from terrain.logs import drive_recording
         from terrain.robots import robot_named
 
-        return _of_logs("drive_recording.find_runs")(
-            folder, lambda name: drive_robot(robot_named(name, robot))
-        )
+        return drive_recording.find_runs(folder, lambda name: drive_robot(robot_named(name, robot)))
     return next(iter(found.values()), [])
-
-
-def _of_logs(name: str) -> Callable[..., list[Any]]:
-    """Return a function of :mod:`terrain.logs`."""
-    module, _, function = name.partition(".")
-    found: Callable[..., list[Any]] = getattr(import_module(f"terrain.logs.{module}"), function)
-    return found
 
 
 def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:

@@ -311,7 +311,7 @@ def _proposals_report(result: ProposalsResult) -> Report:
 
     ends = [Column(name, ".1f") for name in ("from s", "to s")]
     ratios = [Column(name, ".1%") for name in ("supported", "unknown")]
-    columns = ("run", *ends, "proposed", Column("confidence", ".2f"), *ratios)
+    columns: list[Column | str] = ["run", *ends, "proposed", Column("confidence", ".2f"), *ratios]
     asked = [result.proposals[i] for i in questions(result.proposals, result.n_asked)]
     table = Table(columns, asked, title="worth an answer, the first the most")
     rest = len(result.proposals) - result.n_asked

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from pipelines.report.figure import Figure
@@ -159,21 +159,20 @@ class Report:
         path = Path(path)
         check_file(path, "--report", ENDINGS)
         atomic_write(
-            path, _written(self, "pages.markdown_text" if path.suffix.lower() == ".md" else "pages.html_page")
+            path, _written(self, "pages:markdown_text" if path.suffix.lower() == ".md" else "pages:html_page")
         )
         return path
 
     def __str__(self) -> str:
-        return _written(self, "terminal.terminal_text")
+        return _written(self, "terminal:terminal_text")
 
     def _repr_html_(self) -> str:
-        return _written(self, "pages.html_fragment")
+        return _written(self, "pages:html_fragment")
 
 
 def _written(report: Report, writer: str) -> str:
     """Return what a function of one of the modules that import this one makes of a report."""
-    module, _, name = writer.partition(".")
-    text: str = getattr(import_module(f"pipelines.report.{module}"), name)(report)
+    text: str = resolve_name(f"pipelines.report.{writer}")(report)
     return text
 
 
