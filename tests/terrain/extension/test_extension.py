@@ -156,6 +156,13 @@ def test_what_an_effect_does_to_samples_of_a_sensor_its_correction_takes_off_the
     np.testing.assert_allclose(correction("wheels", channels, np.arange(3.0), seen)[1], values, atol=1e-12)
 
 
+def test_the_scale_of_a_gyro_acts_on_the_turn_and_not_on_its_bias():
+    robot, turn = extended(gyro_scale_ratio=-0.1, gyro_bias_radps=0.02), np.linspace(-1.0, 1.0, 9)
+    measured = (0.9 * turn + 0.02)[:, None]
+    _, back = Correction(robot, 0.0)("imu", ("gyro_z_radps",), np.arange(9.0), measured)
+    np.testing.assert_allclose(back[:, 0] - corrected(robot).sensors.gyro_bias_z_radps, turn, atol=1e-12)
+
+
 def test_a_pose_of_a_camera_whose_scale_and_angle_are_off_comes_back():
     effects = {"camera_scale_ratio": -0.08, "camera_yaw_rad": 0.05}
     drive = make_scenario("crab", OMNI, "tiles", 20.0)
