@@ -32,13 +32,11 @@ MEMORY_S = 2.0  #: Assumed correlation time of what a fit leaves.
 MAX_STEPS, CONVERGED_S = 12, 0.003  #: Of least squares.
 MIN_ROWS = 30  #: Samples of a pair, below which nothing is fitted.
 MIN_SUPPORT = 30  #: Finite samples, below which a signal is not laid out on a grid.
-EDGE_SIGMAS = (
-    3.0  #: So close to an end or a gap, in widths of the low-pass, it has too little to average: not used.
-)
+#: So close to an end or a gap, in widths of the low-pass, it has too little to average: not used.
+EDGE_SIGMAS = 3.0
 MAX_GAP_SIGMAS = 3.0  #: Across a longer gap, in widths of the low-pass, nothing is interpolated.
-MAX_SEARCH_SAMPLES = (
-    1500  #: A search looks at this many instants of a long run; least squares at all of them.
-)
+#: A search looks at this many instants of a long run; least squares at all of them.
+MAX_SEARCH_SAMPLES = 1500
 N_DRAWS = 200
 
 
@@ -77,6 +75,10 @@ class Delay(NamedTuple):
     n_runs: int
     status: DelayStatus
     fit: DelayFit | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what is written of it: all but the fit."""
+        return {name: value for name, value in self._asdict().items() if name != "fit"}
 
     @property
     def applied_s(self) -> float:

@@ -486,7 +486,7 @@ def innovations(trial: Trial) -> Finding:
 
 
 def _variances(estimates: Sequence[Estimate], row: str, straight_only: bool = False) -> list[float]:
-    values = [one.innovations.row(row)[0][_is_straight(one) | (not straight_only)] for one in estimates]
+    values = [one.innovations[row][0][_is_straight(one) | (not straight_only)] for one in estimates]
     return [float(np.nanvar(value)) for value in values]
 
 
@@ -529,8 +529,8 @@ def _innovation_figure(
 ) -> Figure:
     panels = []
     for row, label in rows:
-        value, _ = estimate.innovations.row(row)
-        time_s, reach = estimate.innovations.time_s, np.full(len(value), 2 * np.sqrt(variance_r[row]))
+        value, _ = estimate.innovations[row]
+        time_s, reach = estimate.track.time_s, np.full(len(value), 2 * np.sqrt(variance_r[row]))
         marks = (Band("± 2 std by R", time_s, -reach, reach, 6), Line("innovation", time_s, value, 0))
         panels.append(Panel(marks, title=f"{label}, variance {np.nanvar(value):.1e}"))
     return Figure("Innovations of the thesis' filter, tiles", tuple(panels), x_label="time [s]")

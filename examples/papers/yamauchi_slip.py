@@ -548,7 +548,7 @@ def fit_turning_angle(
     ----------
     samples : of turns, of several rates, slopes and headings
     half_track_m : d
-    drift : whether the two columns of :mod:`~terrain.calibration.turning_drift` come first; the sideways
+    drift : whether the two columns of :mod:`~terrain.calibration.odometry` come first; the sideways
         speed is fitted then, in place of the angle, which has no value at a forward speed of 0
     ridge : whether to regularise where the condition number asks for it
 

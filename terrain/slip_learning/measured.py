@@ -593,6 +593,9 @@ MIN_KNOWN = 0.3  #: Of the windows of a run, with every delay of the search
 MAX_DELAY_STD_S = 0.1  #: A delay that is less certain is not applied
 
 
+ROUND_OFF = 1e-20  #: Of the squares of a component of the wheels' twist, over those of the largest.
+
+
 def delay_sentence(delay: Delay) -> str:
     """Return by how much the outside measurement is late, in words."""
     if delay.status is not DelayStatus.ESTIMATED:
@@ -653,7 +656,8 @@ def _misfits(run: RunLog, robot: Robot, lags_s: Array, n_parts: int) -> list[Arr
 def _misfit(x: Array, y: Array) -> float:
     """Return the mean square of what a gain for each component leaves of y (k, 3) beside x (k, 3)."""
     power = (x**2).sum(axis=0)
-    gain = (y * x).sum(axis=0) / np.where(power > 0.0, power, 1.0)
+    moves = power > ROUND_OFF * power.max()  # of a straight drive the turn of the wheels is round-off
+    gain = np.where(moves, (y * x).sum(axis=0) / np.where(moves, power, 1.0), 0.0)
     return float(((y - gain * x) ** 2).sum() / len(x))
 
 

@@ -11,6 +11,7 @@ from terrain.effects import library_of
 from terrain.records import Label
 from terrain.robots import load_robot
 from terrain.simulation.planar.model import Ground, planar_ground
+from terrain.simulation.planar.motion import make_planar
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import load_soil
 
@@ -60,8 +61,16 @@ def test_a_run_is_simulated_on_the_soil_of_its_label_or_the_default_terrain():
     assert [match[:2] for match in matches] == [("", None), ("grass", "grass"), ("moon", None)]
     soil = planar_ground(AGRIMARO, load_soil("grass"))
     assert simulation.grounds["grass"]._replace(effective_ratio=1.0) == soil
-    assert simulation.planar_on("grass").slip_ratio == soil.slip_ratio
-    assert simulation.planar_on("moon").slip_ratio == simulation.planar.slip_ratio == Ground().slip_ratio
+    grass, moon, plain = (
+        each.params.tobytes()
+        for each in (
+            simulation.planar_on("grass"),
+            simulation.planar_on("moon"),
+            make_planar(AGRIMARO, Ground()),
+        )
+    )
+    assert grass == make_planar(AGRIMARO, simulation.grounds["grass"]).params.tobytes() != plain
+    assert moon == simulation.planar.params.tobytes() == plain
     assert simulation_for(unknown, AGRIMARO, LIBRARY)[0].grounds == {}
 
 
