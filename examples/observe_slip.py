@@ -5,8 +5,8 @@ python examples/observe_slip.py
 
 import numpy as np
 
-from terrain.estimation.observers.choice import make_observer
-from terrain.estimation.observers.rows import LiveObserver
+from terrain.estimation.live import LiveObserver
+from terrain.estimation.models.choice import make_observer
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate

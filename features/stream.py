@@ -22,8 +22,8 @@ import numpy as np
 
 from features.windows import TIME_TOLERANCE_S, Layout, WindowRule, cut_at, wheel_speeds
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.choice import Estimate, estimated_values
 from terrain.estimation.clocks import readable
+from terrain.estimation.live import Estimate, estimated_values
 from terrain.kinematics.logged_wheels import wheel_speeds_from
 from terrain.records import Array, Reading, Stream, Windows
 from terrain.robots import Robot
@@ -256,7 +256,7 @@ class WindowFeed:
     ----------
     rule, layout : of the windows
     channels : of each stream that is measured, in the order of the columns of its readings
-    estimated : of each stream that a filter adds (:func:`terrain.estimation.choice.estimated_channels`)
+    estimated : of each stream that a filter adds (:func:`terrain.estimation.live.estimated_channels`)
     robot : corrected; may be missing where every channel of the windows is measured; ``DataError`` where one is
         neither measured nor estimated
 

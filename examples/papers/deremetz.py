@@ -14,8 +14,8 @@ from multi_model import Gains, MultiModel
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.control.car_following import CarFollower, FollowedDrive, SlipSource, followed_drive
-from terrain.estimation.observers.observer import Observer
-from terrain.estimation.observers.sideslip import C_LOW_NPR, SETTINGS, Sideslip
+from terrain.estimation.models.observer import Observer
+from terrain.estimation.models.sideslip import C_LOW_NPR, SETTINGS, Sideslip
 from terrain.records import Array
 from terrain.robots import BicycleRobot, as_drive, load_robot
 from terrain.simulation.run import simulate

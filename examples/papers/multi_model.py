@@ -2,7 +2,7 @@
 
 One state: pose, yaw rate r and lateral velocity w of the centre of mass, slip angles b and cornering stiffness C of
 both axles.  With f the motion of the pose by the slip angles and g of (3), both as
-:mod:`terrain.estimation.observers.sideslip` has them, and e for measured minus estimated::
+:mod:`terrain.estimation.models.sideslip` has them, and e for measured minus estimated::
 
     dev' = f(dev, b) + K_dev e_dev         dyn' = g(dyn, b, C) + K_dyn e_dyn                   (8)
     b' = (K_b / K_a) J_f^T e_dev + (K_C / K_a) G_b^T e_dyn       C' = K_C G_C^T e_dyn          (9)
@@ -37,8 +37,8 @@ import numpy as np
 
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.observers.observer import Observer, ObserverOutput, ObserverStatus
-from terrain.estimation.observers.sideslip import (
+from terrain.estimation.models.observer import Observer, ObserverOutput, ObserverStatus
+from terrain.estimation.models.sideslip import (
     C_HIGH_RATIO,
     C_LOW_NPR,
     ROWS,

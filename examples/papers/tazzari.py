@@ -17,9 +17,8 @@ from tracks import janosi_slip
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
-from terrain.estimation.observers.observer import ObserverStatus, ObserverTrack, observe
-from terrain.estimation.observers.rows import rows_of
-from terrain.estimation.observers.tracked import TrackedObserver, TrackedSettings
+from terrain.estimation.models.observer import ObserverStatus, ObserverTrack, observe, rows_of
+from terrain.estimation.models.tracked import TrackedObserver, TrackedSettings
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
 from terrain.simulation.run import simulate

@@ -33,9 +33,8 @@ from yamauchi_slip import (
 from pipelines.report.figure import Figure, Line, Mark, Panel, Points
 from terrain.bootstrap import bootstrap_rows, percentile_interval
 from terrain.calibration.odometry import odometry_rows
-from terrain.estimation.observers.observer import Observer, ObserverTrack, observe
-from terrain.estimation.observers.rows import rows_of
-from terrain.estimation.observers.slip_model import (
+from terrain.estimation.models.observer import Observer, ObserverTrack, observe, rows_of
+from terrain.estimation.models.slip_model import (
     N_PARAMETERS,
     PARAMETERS,
     PRIOR_STD,
@@ -45,7 +44,7 @@ from terrain.estimation.observers.slip_model import (
     body_velocity,
     unknown_ground,
 )
-from terrain.estimation.observers.slip_odometry import OBSERVED_RATIO, SlipOdometry, plain_odometry
+from terrain.estimation.models.slip_odometry import OBSERVED_RATIO, SlipOdometry, plain_odometry
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
 from terrain.simulation.run import simulate

@@ -33,7 +33,7 @@ enter by their logarithm only there, where tanh is saturated or D tells nothing.
 that of straight runs.  lambda can be left out, as printed.
 
 **Slip angle in turns**: the regression (28) on eight variables, those of
-:data:`terrain.estimation.observers.slip_model.REGRESSORS`, in SI units and as seen in a left turn driven forward, and
+:data:`terrain.estimation.models.slip_model.REGRESSORS`, in SI units and as seen in a left turn driven forward, and
 so is the angle.  *Corrected*: input and gyro yaw rate are nearly collinear, as the gyro's is a constant part of the
 input's on one ground; condition number and variance inflation are reported, and a ridge is chosen by leaving runs out
 where they are high.  With poses that noise makes vary in all directions, p values of collinear variables say little;
@@ -64,7 +64,7 @@ from scipy import stats
 from terrain.angles import unwrapped
 from terrain.calibration.odometry import odometry_rows
 from terrain.errors import DataError
-from terrain.estimation.observers.slip_model import (
+from terrain.estimation.models.slip_model import (
     ANGLE,
     COMPACTION,
     EXPONENT,
@@ -599,7 +599,7 @@ class SlipIdentification(NamedTuple):
 
     Parameters
     ----------
-    model : for :func:`terrain.estimation.observers.slip_odometry.SlipOdometry`
+    model : for :func:`terrain.estimation.models.slip_odometry.SlipOdometry`
     straight, side : of straight motion
     turning, angle, track : of turns; the angle with the drift beside it, or as printed
     notes : what is missing, and why

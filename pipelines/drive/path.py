@@ -26,7 +26,7 @@ from terrain.control.car_following import (
 )
 from terrain.control.paths import GRID_M, PathStatus, ReferencePath, read_path
 from terrain.errors import ConfigError
-from terrain.estimation.observers.observer import ObserverStatus
+from terrain.estimation.models.observer import ObserverStatus
 from terrain.files.atomic import atomic_write
 from terrain.robots import BicycleRobot, as_drive, load_robot
 from terrain.simulation.car import CarDrive, Ground

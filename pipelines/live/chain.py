@@ -28,10 +28,9 @@ from terrain.control.switching import (
     update,
 )
 from terrain.control.traction import TractionStatus
-from terrain.estimation.choice import Estimate, Estimator
 from terrain.estimation.clocks import Clocks, ClockWatch
 from terrain.estimation.filter import Filter
-from terrain.estimation.live import BIASES
+from terrain.estimation.live import BIASES, Estimate, Estimator
 from terrain.records import Command, Sample
 
 COMMAND_VALID_S = 0.25

@@ -18,9 +18,8 @@ from pipelines.live.windows import feed_of
 from terrain.classify.terrain_filter import LiveTerrainFilter
 from terrain.control.switching import UNKNOWN, TerrainEstimate, TerrainSource
 from terrain.errors import DataError
-from terrain.estimation.choice import Estimate
 from terrain.estimation.clocks import last_stamp_s
-from terrain.estimation.live import CHANNELS
+from terrain.estimation.live import CHANNELS, Estimate
 from terrain.extension import correct_live
 from terrain.records import Reading, Sample, Windows
 from terrain.robots import Robot

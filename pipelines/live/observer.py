@@ -15,8 +15,8 @@ from pipelines.live.model import TerrainModel
 from pipelines.live.windows import live_estimator
 from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import SWITCHING, SwitchSettings, TerrainBelief, check_switching, drive_on
-from terrain.estimation.choice import Estimate
 from terrain.estimation.clocks import ClockWatch, last_stamp_s
+from terrain.estimation.live import Estimate
 from terrain.kinematics.logged_wheels import speed_columns
 from terrain.records import Reading, Sample
 from terrain.robots import Robot

@@ -21,7 +21,7 @@ from features.windows import (
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.terrain_filter import TerrainFilter, check_filter
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.choice import LIVE_FILTERS, Estimator, estimated_channels, make_live_filter
+from terrain.estimation.live import LIVE_FILTERS, Estimator, estimated_channels, make_live_filter
 from terrain.extension import correct_live
 from terrain.logs.replay import SENSORS, replay
 from terrain.logs.schema import ESTIMATED

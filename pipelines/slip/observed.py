@@ -26,8 +26,7 @@ from pipelines.slip.tracks import (
     tracks_report,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.observers.choice import BY_MODEL
-from terrain.estimation.observers.estimate import (
+from terrain.estimation.estimate import (
     SETTLED,
     ObserverEstimate,
     ObserverSummary,
@@ -35,8 +34,9 @@ from terrain.estimation.observers.estimate import (
     summarize_observer,
     with_estimates,
 )
-from terrain.estimation.observers.observer import ObserverStatus
-from terrain.estimation.observers.slip_model_file import read_slip_model
+from terrain.estimation.models.choice import BY_MODEL
+from terrain.estimation.models.observer import ObserverStatus
+from terrain.estimation.models.slip_model import read_slip_model
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, packaged_robot
 

@@ -15,7 +15,7 @@ from pipelines.report.results import Progress, Result, described
 from pipelines.report.tree import Column, Report, Table, Text, sections
 from pipelines.slip.calibrate import Settings
 from terrain.calibration.odometry import LegScores, ParameterFound, judge_odometry
-from terrain.estimation.observers.slip_model_file import check_slip_model_file, write_slip_model
+from terrain.estimation.models.slip_model import check_slip_model_file, write_slip_model
 from terrain.logs.drive import FILE_NAME, WindowPoses, find_sessions, read_window_poses
 from terrain.robots import TrackedRobot, as_drive, load_robot
 

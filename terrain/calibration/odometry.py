@@ -12,7 +12,7 @@ its sensor is turned by :math:`\gamma`; with the pose of the body :math:`(p, \ps
 
 and parameters minimise the distance from the measured end of each leg, bounded in its influence (soft L1, at
 the median distance that is left), with the prior of unknown ground
-(:func:`~terrain.estimation.observers.slip_model.unknown_ground`) as a ridge.  All kinds have the same
+(:func:`~terrain.estimation.models.slip_model.unknown_ground`) as a ridge.  All kinds have the same
 scale of the tracks, l and :math:`\gamma` fitted, which are no slip.
 
 **The adaptive observer** is judged on a command's last window by efficiencies of the first ones.  The lidar poses of
@@ -34,9 +34,8 @@ import numpy as np
 from terrain.angles import unwrapped
 from terrain.bootstrap import bootstrap_counts, percentile_interval
 from terrain.errors import DataError
-from terrain.estimation.observers.observer import ObserverStatus, observe
-from terrain.estimation.observers.rows import rows_of
-from terrain.estimation.observers.slip_model import (
+from terrain.estimation.models.observer import ObserverStatus, observe, rows_of
+from terrain.estimation.models.slip_model import (
     ANGLE,
     COMPACTION,
     EXPONENT,
@@ -55,8 +54,8 @@ from terrain.estimation.observers.slip_model import (
     next_displacement,
     unknown_ground,
 )
-from terrain.estimation.observers.slip_odometry import ROWS as ODOMETRY_ROWS
-from terrain.estimation.observers.tracked import ROWS, TrackedObserver, TrackedSettings
+from terrain.estimation.models.slip_odometry import ROWS as ODOMETRY_ROWS
+from terrain.estimation.models.tracked import ROWS, TrackedObserver, TrackedSettings
 from terrain.identify import Fit, Parameter, deal, folds, identify
 from terrain.kernels import njit
 from terrain.logs.drive import WindowPoses

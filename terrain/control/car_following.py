@@ -55,8 +55,8 @@ import numpy as np
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.paths import GRID_M, PathStatus, Place, ReferencePath
 from terrain.control.pid import LONGEST_STEP_S, checked
-from terrain.estimation.observers.observer import Observer, ObserverOutput, ObserverStatus
-from terrain.estimation.observers.sideslip import RATE, ROLL, SETTINGS, SPEED, Sideslip, X
+from terrain.estimation.models.observer import Observer, ObserverOutput, ObserverStatus
+from terrain.estimation.models.sideslip import RATE, ROLL, SETTINGS, SPEED, Sideslip, X
 from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot
 from terrain.simulation.car import CarCommand, CarSample

@@ -19,7 +19,7 @@ from terrain.records import Sample
 from terrain.status import StatusCode
 
 if TYPE_CHECKING:
-    from terrain.estimation.choice import Estimate
+    from terrain.estimation.live import Estimate
 
 #: A robot whose fastest wheel is to turn at least so fast drives: windows are cut from this speed on
 #: (``features.windows.SteadyMotion``).

@@ -856,6 +856,71 @@ def _on_clock(clock: Array, time_s: Array, signal: Array, line: Array, limit: Ar
     return out
 
 
+#: Samples of a stream that wait for the wheels; five seconds of a camera.
+QUEUE = 1024
+CLOCK_SET_S = 1.0  #: Samples that are so far behind, many in a row, are of a clock that was set back.
+Due = list[tuple[float, bool, Array]]
+"""Of samples their stamp, whether all of their numbers are finite, and those, NaN where they are not."""
+
+
+def places_among(names: Sequence[str], among: Sequence[str]) -> Array:
+    """Return the place of each name among others, -1 where it is not there."""
+    return np.array([list(among).index(name) if name in among else -1 for name in names])
+
+
+def check_channels(stream: str, names: Iterable[str], known: Sequence[str]) -> None:
+    """Raise ``ConfigError`` where a stream that is read sample by sample lacks a channel."""
+    for lacking in (name for name in names if name not in known):
+        raise ConfigError(f"channels of {stream!r} are {list(known)}: {lacking!r} must be among them")
+
+
+class SampleQueue:
+    """Samples of a stream that are not due, by stamp; of two that are not in order one goes.
+
+    ``columns`` say where each channel of the schema stands in the readings, -1 where it does not.
+    """
+
+    def __init__(self, columns: Array) -> None:
+        self._columns, self._is_lacking = columns, columns < 0
+        self.waiting: Due = []
+        self.counts: Counter[str] = Counter()
+        self.n_behind = 0  # samples in a row that are stamped long before the last that was taken
+
+    def push(self, time_s: Array, values: Array, last_s: float) -> None:
+        """Queue samples; ``last_s`` is the stamp of the last that was taken out."""
+        samples = np.ascontiguousarray(values[:, self._columns])  # one layout: one compiled form
+        samples[:, self._is_lacking] = np.nan
+        finite = np.isfinite(samples)
+        samples[~finite] = np.nan
+        finite[:, self._is_lacking] = True
+        waiting, complete = self.waiting, np.all(finite, axis=1).tolist()
+        for stamp_s, whole, sample in zip(time_s.tolist(), complete, samples, strict=True):
+            before_s = waiting[-1][0] if waiting else last_s
+            if not (math.isfinite(stamp_s) and stamp_s > before_s):
+                self.counts["stamp does not increase"] += 1
+                self.n_behind = self.n_behind + 1 if stamp_s <= last_s - CLOCK_SET_S else 0
+                earlier_s = waiting[-2][0] if len(waiting) > 1 else last_s
+                if not waiting or stamp_s == before_s or not stamp_s > earlier_s or stamp_s == math.inf:
+                    continue
+                waiting.pop()  # the one before was the one ahead
+            if len(waiting) == QUEUE:
+                self.counts["waited too long"] += QUEUE // 2
+                del waiting[: QUEUE // 2]
+            waiting.append((stamp_s, whole, sample))
+            self.n_behind = 0
+
+    def take(self, time_s: float) -> Due:
+        """Take out what came by a tick; what is stamped far ahead of it goes."""
+        waiting = self.waiting
+        n = next((k for k, (stamp_s, _, _) in enumerate(waiting) if stamp_s > time_s + TICK_S), len(waiting))
+        due = waiting[:n]
+        del waiting[:n]
+        while waiting and waiting[-1][0] > time_s + OFF_CLOCK_S:
+            self.counts["off the clock"] += 1
+            waiting.pop()
+        return due
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasurementTable:
     """What a filter measures at each tick of its clock; NaN where a sensor gave nothing."""

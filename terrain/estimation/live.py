@@ -1,15 +1,15 @@
-"""Live estimation of a robot's motion and slip, sample by sample.
+"""Live estimation of a robot's motion and slip, sample by sample, by any filter or observer.
 
-The chain of :func:`~terrain.estimation.feed.measurement_table` with ``causal=True``,
-:func:`~terrain.estimation.filter.run_filter` and :func:`~terrain.estimation.wheel_slip.wheel_slip`, with
-the same numbers, on memory of a fixed size.  Each sample of the wheels is a tick, whose estimate is known
-at once (:attr:`LiveFilter.latest`).  For what comes up to a quarter of a second late the estimator goes back to
-the tick before it, and takes all that has come since once more, in order: the same numbers as if nothing had
-been late.  Where the wheels give nothing, ticks go on by the caller's time.
+The chain of a whole log, :func:`~terrain.estimation.feed.measurement_table` with ``causal=True`` and
+:func:`~terrain.estimation.filter.run_filter`, or :func:`~terrain.estimation.models.observer.rows_of` and
+:func:`~terrain.estimation.models.observer.observe`, with the same numbers, on memory of a fixed size.  Each sample of
+the wheels is a tick, whose estimate is known at once (:attr:`Live.latest`).  For what comes up to a quarter of a second
+late the estimator goes back to the tick before it, and takes all that has come since once more, in order: the same
+numbers as if nothing had been late.  Where the wheels give nothing, a filter's ticks go on by the caller's time.
 
 An estimate **settles** when every stream that comes has reached its tick, or when nothing that is later is taken
-any more: from then on it does not change.  :meth:`LiveFilter.step` returns those that have settled, so that
-windows are made of the same numbers over a bad link as over a good one.
+any more: from then on it does not change.  :meth:`Live.step` returns those that have settled, so that windows are
+made of the same numbers over a bad link as over a good one.
 
 What differs from the batch is what has to look ahead there: a camera or IMU that repeats itself is left out from the
 first repetition on (the batch leaves repetitions shorter than ``FROZEN_S`` in); of stamps out of order the one goes
@@ -21,8 +21,10 @@ takes the log's medians); positions count from the first of all, also where a be
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,9 +40,15 @@ from terrain.estimation.feed import (
     ROWS,
     STREAMS,
     TICK_S,
+    Due,
+    SampleQueue,
+    check_channels,
+    places_among,
 )
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings, Noise
 from terrain.estimation.health import HealthMonitor
+from terrain.estimation.models.choice import OBSERVERS, make_observer
+from terrain.estimation.models.observer import Observer, ObserverFeed, ObserverStatus
 from terrain.estimation.models.skid import (
     Motion,
     make_skid_filter,
@@ -52,7 +60,7 @@ from terrain.estimation.models.skid import (
 from terrain.estimation.models.swerve import Schedule, default_noise, make_filter
 from terrain.estimation.wheel_slip import STALE_AFTER_S, SlipOfInstant
 from terrain.extension import Correction, RegionMonitor, check_corrected
-from terrain.logs.schema import WHEELS_CHANNELS
+from terrain.logs.schema import ESTIMATOR_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Reading
 from terrain.robots import Robot
 
@@ -63,7 +71,6 @@ CHANNELS: Mapping[str, tuple[str, ...]] = {"wheels": WHEELS_CHANNELS, **STREAMS}
 BIASES = ("gyro_bias_radps", "accel_bias_x_mps2", "accel_bias_y_mps2")
 N_TICKS = 64  #: Most ticks that are remembered; at 200 Hz a little more than :data:`REWIND_S`.
 N_STEPS = 1024  #: Most steps whose samples are remembered, where no tick says that they are old.
-QUEUE = 1024  #: Samples of a stream that wait for the wheels; five seconds of a camera.
 LATE_PERIODS = 1.5  #: So many periods without wheels make a tick without them.
 
 _JUST_BEFORE_S = 1e-6
@@ -106,15 +113,14 @@ class Tick(NamedTuple):
 
 
 class _History:
-    """The last ticks with all that was remembered after each, and the last samples of each stream.
+    """The last ticks with a snapshot of all that was remembered after each, and the last samples of each stream.
 
-    The first tick is none: what was remembered before any.  ``memories`` are arrays that are all an estimator
-    remembers.
+    The first tick is none: what was remembered before any.
     """
 
-    def __init__(self, memories: Sequence[Array]) -> None:
-        self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
-        self._ticks: deque[tuple[Tick, list[Array]]] = deque(maxlen=N_TICKS)
+    def __init__(self, snapshot: Callable[[], Any], restore: Callable[[Any], None]) -> None:
+        self._snapshot, self._restore = snapshot, restore
+        self._ticks: deque[tuple[Tick, Any]] = deque(maxlen=N_TICKS)
         self._samples: deque[tuple[float, dict[str, Samples]]] = deque(maxlen=N_STEPS)
         self.add_tick(Tick(-math.inf, None))
 
@@ -127,7 +133,7 @@ class _History:
 
     def add_tick(self, tick: Tick) -> None:
         """Remember a tick that was just done."""
-        self._ticks.append((tick, [memory.copy() for memory in self._memories]))
+        self._ticks.append((tick, self._snapshot()))
 
     def stamps(self, stream: str) -> set[float]:
         """Return the stamps of a stream that came."""
@@ -148,12 +154,11 @@ class _History:
         return bool(self._ticks) and time_s - TICK_S > max(self._ticks[0][0].time_s, self.last_s - REWIND_S)
 
     def go_back(self, time_s: float) -> list[Tick]:
-        """Put the memories back to the last tick before an instant; return the ticks after it."""
+        """Go back to what was remembered at the last tick before an instant; return the ticks after it."""
         later: list[Tick] = []
         while self.last_s >= time_s - TICK_S:
             later.append(self._ticks.pop()[0])
-        for memory, snapshot in zip(self._memories, self._ticks[-1][1], strict=True):
-            memory[:] = snapshot
+        self._restore(self._ticks[-1][1])
         return later[::-1]
 
     def since(self, stream: str, time_s: float) -> tuple[Array, Array] | None:
@@ -173,218 +178,76 @@ class _History:
         self._samples.clear()
 
 
-class _Queue:
-    """Samples of a stream that are not due, by stamp; of two that are not in order one goes.
-
-    ``columns`` say where each channel of the schema stands in the readings, -1 where it does not.
-    """
-
-    def __init__(self, columns: Array) -> None:
-        self._columns, self._is_lacking = columns, columns < 0
-        self.waiting: list[tuple[float, bool, Array]] = []
-        self.counts: Counter[str] = Counter()
-
-    def push(self, time_s: Array, values: Array, last_s: float) -> None:
-        """Queue samples; ``last_s`` is the stamp of the last that was taken out."""
-        samples = np.ascontiguousarray(values[:, self._columns])  # one layout: one compiled form
-        samples[:, self._is_lacking] = np.nan
-        finite = np.isfinite(samples)
-        samples[~finite] = np.nan
-        finite[:, self._is_lacking] = True
-        waiting, complete = self.waiting, np.all(finite, axis=1).tolist()
-        for stamp_s, whole, sample in zip(time_s.tolist(), complete, samples, strict=True):
-            before_s = waiting[-1][0] if waiting else last_s
-            if not (math.isfinite(stamp_s) and stamp_s > before_s):
-                self.counts["stamp does not increase"] += 1
-                earlier_s = waiting[-2][0] if len(waiting) > 1 else last_s
-                if not waiting or stamp_s == before_s or not stamp_s > earlier_s or stamp_s == math.inf:
-                    continue
-                waiting.pop()  # the one before was the one ahead
-            if len(waiting) == QUEUE:
-                self.counts["waited too long"] += QUEUE // 2
-                del waiting[: QUEUE // 2]
-            waiting.append((stamp_s, whole, sample))
-
-    def take(self, time_s: float) -> list[tuple[float, bool, Array]]:
-        """Take out what came by a tick; what is stamped far ahead of it goes."""
-        waiting = self.waiting
-        n = next((k for k, (stamp_s, _, _) in enumerate(waiting) if stamp_s > time_s + TICK_S), len(waiting))
-        due = waiting[:n]
-        del waiting[:n]
-        while waiting and waiting[-1][0] > time_s + OFF_CLOCK_S:
-            self.counts["off the clock"] += 1
-            waiting.pop()
-        return due
-
-
-class LiveFilter:
-    """Motion and slip from samples as they come.
-
-    Parameters
-    ----------
-    robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15, or one that
-        skids; corrected
-    filter_name : one of :data:`~terrain.estimation.estimate.FILTERS` that is the robot's
-    channels : names of the columns of the streams that are read, in their order; those of the schema
-    settings : when a measurement or a stamp is not believed
-    noise : in place of the physical
-    initial_yaw_rad : heading of the start in the world; without it the GNSS is not used
-    gnss_latency_s : age of a position when it arrives
-    rate_hz : of ``wheels`` and ``imu``, where they are not those of the robot's description
-    correction : of :func:`terrain.extension.correct_live`
+class Live(ABC):
+    """What takes the samples of a robot as they come: a queue a stream, ticks, and the way back for what is late.
 
     Attributes
     ----------
     latest : the last estimate; None before the first tick
     too_late : tick at which samples came last that were too late to be taken, and by how much
-
-    Raises
-    ------
-    ConfigError
-        if filter, robot and channels do not fit, the robot is not corrected, or a number is out of its range.
-    DataError
-        if the noise does not fit the filter.
-
-    Examples
-    --------
-    >>> from terrain.robots import load_robot
-    >>> estimator = LiveFilter(load_robot("agrimaro"))
-    >>> wheels = Reading(np.array([0.0]), np.array([[20.0, 20.0, 20.0, 1.0, 1.0, 1.0]]))
-    >>> _ = estimator.step({"wheels": wheels})
-    >>> estimator.latest.wheel_speed_mps, estimator.latest.slip_stale
-    (array([0.4, 0.4, 0.4]), True)
-    >>> skids = LiveFilter(load_robot("husky"), "skid")
-    >>> _ = skids.step({"wheels": Reading(np.array([0.0]), np.array([[0.4, 0.4]]))})
-    >>> round(skids.latest.speed_x_mps, 2), skids.latest.motion.name
-    (0.4, 'UNKNOWN')
+    filter : what is known of it may be kept over a restart; None of an observer, which starts from its first samples
     """
+
+    filter: Filter | None
+    name: str  #: of the filter or observer
+    states: tuple[str, ...]  #: name of each state, in the order of ``mean`` and ``std``
+    health: Mapping[str, str] = MappingProxyType(
+        {}
+    )  #: of each sensor at the last tick; empty where none is judged
+    latest: Any
+    _ticks_without_wheels = False  #: whether time goes on where the wheels give nothing
 
     def __init__(
         self,
-        robot: Robot,
-        filter_name: str = "vio15",
-        channels: Mapping[str, tuple[str, ...]] | None = None,
-        settings: FilterSettings = SETTINGS,
-        *,
-        noise: Noise | None = None,
-        initial_yaw_rad: float | None = None,
-        gnss_latency_s: float = GNSS_LATENCY_S,
-        rate_hz: Mapping[str, float] | None = None,
-        correction: Correction | None = None,
+        channels: Mapping[str, tuple[str, ...]],
+        queues: Mapping[str, SampleQueue],
+        period_s: float,
+        correction: Correction | None,
     ) -> None:
-        check_corrected(robot)
-        yaw_rad = initial_yaw_rad or 0.0
-        if not math.isfinite(yaw_rad):
-            raise ConfigError(f"initial_yaw_rad is {initial_yaw_rad}, a finite number is required")
-        for stream, rate in (rate_hz or {}).items():
-            if not 0.0 < rate < math.inf:
-                raise ConfigError(f"rate of {stream!r} is {rate} Hz, a number above zero is required")
-        skids = filter_name == "skid"
-        if channels is None:
-            channels = {**CHANNELS, "wheels": robot.rate_channels} if skids else CHANNELS
-        has_gnss = not skids and initial_yaw_rad is not None and "gnss" in channels
-        if skids:
-            self.model, usual = make_skid_filter(robot), skid_noise(robot)
-        else:
-            self.model = make_filter(filter_name, robot, with_gnss=has_gnss)
-            robot.require("motors", "steering", "sensors")
-            usual = default_noise(filter_name, robot, has_gnss)
-        states, model_rows = self.model.states, self.model.rows
-        is_scheduled = noise is None and bool(self.model.inputs)
-        self._schedule = Schedule(self.model, ROWS) if is_scheduled else None
-        self._robot, self._channels, self._correction, self._skids = robot, channels, correction, skids
-        self.filter = Filter(self.model, usual if noise is None else noise, settings)
-        self._connect(channels, has_gnss)
-        sensors = robot.completed.sensors
-        rates = {"wheels": sensors.wheels_rate_hz, "imu": sensors.imu_rate_hz, "gnss": 1.0 / GNSS_PERIOD_S}
-        rates["steering"] = sensors.steering_rate_hz
-        if robot.describes("camera"):
-            rates["odometry"] = robot.camera.rate_hz
-        period_s = {stream: 1.0 / rate for stream, rate in (rates | dict(rate_hz or {})).items()}
-        self._period_s = period_s["wheels"]
-        self._settings = rows.feed_settings(robot, period_s, yaw_rad, gnss_latency_s)
-        self._feed, self._row = rows.new_feed(), np.zeros(1, rows.ROW)
-        self._numbers = rows.measurements(self._row)
-        self._monitor = None if skids else HealthMonitor(robot, self.model)
-        self._slip = SlipOfInstant(robot, states)
-        self._motion = motion_memory()
-        memories = [self.filter.state, self._feed, self._motion]
-        self._history = _History(memories if self._monitor is None else [*memories, self._monitor.memory])
-        self._region = RegionMonitor(robot)
-        self._row_places = [ROWS.index(row) for row in model_rows]
-        self._gnss_places = [k for k, row in enumerate(model_rows) if row in GNSS_ROWS]
-        motion = ("speed_mps", "", "yaw_rate_radps", "", "") if skids else _MOTION
-        self._motion_places = places_among(motion, states).tolist()
-        self.latest: LiveEstimate | None = None
-        self._unsettled: deque[LiveEstimate] = deque()
+        self._channels, self._queues, self._correction = channels, dict(queues), correction
+        self._n_columns = {name: len(channels[name]) for name in ("wheels", *queues)}
+        self._no_wheels, self._period_s = np.full(len(channels["wheels"]), np.nan), period_s
+        self._history = _History(self._snapshot, self._restore)
+        self.latest = None
+        self._unsettled: deque[Any] = deque()
         self._settled_s = -math.inf
         self._newest_s: dict[str, float] = {}
         self._counted: Counter[str] = Counter()
         self.too_late = -math.inf, math.nan
 
-    def _connect(self, channels: Mapping[str, tuple[str, ...]], has_gnss: bool) -> None:
-        """Find each channel's column, and lay out the queues."""
-        needed = {"wheels": self._robot.rate_channels}
-        if self._skids and channels.get("imu"):
-            needed["imu"] = ("gyro_z_radps",)
-        for stream, names in needed.items():
-            known = channels.get(stream, ())
-            for lacking in (name for name in names if name not in known):
-                raise ConfigError(f"channels of {stream!r} are {list(known)}: {lacking!r} must be among them")
-        has = {"gnss": has_gnss, "odometry": self._robot.describes("camera")}
-        used = ("imu",) if self._skids else tuple(STREAMS)
-        read = [name for name in used if channels.get(name) and has.get(name, True)]
-        wheels = list(channels["wheels"])
-        self._n_columns = {name: len(channels[name]) for name in ("wheels", *read)}
-        self._rate_columns = [wheels.index(channel) for channel in self._robot.rate_channels]
-        self._current_columns = places_among([f"current_{wheel}_a" for wheel in self._robot.wheels], wheels)
-        self._queues = {name: _Queue(places_among(STREAMS[name], list(channels[name]))) for name in read}
-        self._no_wheels = np.full(len(wheels), np.nan)
+    @abstractmethod
+    def _follows(self, time_s: float) -> int:
+        """Return what a stamp of the wheels is: 1 taken, -1 of a clock set back, 0 not taken, and counted."""
 
-    @property
-    def name(self) -> str:
-        """Name of the filter."""
-        return self.model.name
+    @abstractmethod
+    def _forget(self) -> None:
+        """Begin anew after a clock was set back."""
 
-    @property
-    def states(self) -> tuple[str, ...]:
-        """Name of each state, in the order of ``mean`` and ``std``."""
-        return self.model.states
+    @abstractmethod
+    def _last_taken_s(self, name: str) -> float:
+        """Return the stamp of the last sample of a stream that was taken out of its queue."""
+
+    @abstractmethod
+    def _estimate(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Any:
+        """Do a tick: take the samples that are due, and return what is known then."""
+
+    @abstractmethod
+    def _snapshot(self) -> Any:
+        """Return all that is remembered."""
+
+    @abstractmethod
+    def _restore(self, memory: Any) -> None:
+        """Go back to a snapshot."""
 
     @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
         counts = dict(self._counted)
-        counts["wheels: not finite"] = int(self._feed["wheels_not_finite"][0])
-        counts["wheels: beyond the motors"] = int(self._feed["wheels_beyond"][0])
-        for stream, name in enumerate(STREAMS):
-            if name in self._queues:
-                counts |= {f"{name}: {kind}": n for kind, n in self._queues[name].counts.items()}
-                for kind in rows.COUNTS:
-                    counts[f"{name}: {kind.replace('_', ' ')}"] = int(self._feed[kind][0, stream])
-        return {kind: n for kind, n in (counts | self.filter.dropped).items() if n}
+        for name, queue in self._queues.items():
+            counts |= {f"{name}: {kind}": n for kind, n in queue.counts.items()}
+        return counts
 
-    @property
-    def health(self) -> dict[str, str]:
-        """Health of each sensor at the last tick, by name; empty where none is judged."""
-        return {} if self._monitor is None else self._monitor.names
-
-    def at(self, now_s: float) -> LiveEstimate | None:
-        """Return the last estimate, its means predicted to a later time; None before the first tick."""
-        seen = self.latest
-        if seen is None or not 1e-3 < now_s - seen.time_s < SETTINGS.max_gap_s:
-            return seen
-        d = len(self.states)
-        mean, params = np.empty(d), np.append(self.model.params, np.zeros(len(self.model.inputs)))
-        self.model.propagate(seen.mean, now_s - seen.time_s, params, mean, np.zeros((d, d)))
-        motion: dict[str, Any] = dict(zip(_MOTION, self._motion_of(mean), strict=True))
-        return seen._replace(mean=mean, **motion)
-
-    def _motion_of(self, mean: Array) -> list[float]:
-        """Return speeds, yaw rate and accelerations of a state; NaN of what it does not have."""
-        return [math.nan if place < 0 else float(mean[place]) for place in self._motion_places]
-
-    def step(self, readings: Mapping[str, Reading], now_s: float | None = None) -> list[LiveEstimate]:
+    def step(self, readings: Mapping[str, Reading], now_s: float | None = None) -> list[Any]:
         """Take in what arrived, and return the estimates at samples of the wheels that have settled.
 
         They are in order of time, unless the clock of the wheels was set back.  A stamp that jumps by more than
@@ -422,12 +285,12 @@ class LiveFilter:
                     self._newest_s[name] = max(stamps[-1], self._newest_s.get(name, -math.inf))
         if late_s < math.inf:
             ticks = self._go_back(late_s, ticks)
-        if now_s is not None and history.last_s > -math.inf:
+        if self._ticks_without_wheels and now_s is not None and history.last_s > -math.inf:
             reached_s = ticks[-1].time_s if ticks else history.last_s
             if LATE_PERIODS * self._period_s < now_s - reached_s < SETTINGS.max_gap_s:
                 ticks.append(Tick(now_s, None))
                 self._counted["ticks without wheels"] += 1
-        settled: list[LiveEstimate] = []
+        settled: list[Any] = []
         for tick in ticks:
             estimate = self._tick(tick, settled)
             if estimate is not None:
@@ -436,7 +299,7 @@ class LiveFilter:
                     self._unsettled.append(estimate)
         return settled + self.settle()
 
-    def settle(self, *, all_of_them: bool = False) -> list[LiveEstimate]:
+    def settle(self, *, all_of_them: bool = False) -> list[Any]:
         """Return the estimates that have settled since the last call, or all that are there, at a log's end."""
         if not self._unsettled:
             return []
@@ -451,9 +314,6 @@ class LiveFilter:
             settled.append(self._unsettled.popleft())
             self._settled_s = settled[-1].time_s
         return settled
-
-    def _last_taken_s(self, name: str) -> float:
-        return float(self._feed["last_s"][0, list(STREAMS).index(name)])
 
     def _taken(self, name: str, readings: Mapping[str, Reading], came: dict[str, Samples]) -> Samples | None:
         """Return what came of a stream, noted where it has stamps to go back to; None where nothing did.
@@ -511,26 +371,203 @@ class LiveFilter:
         spare = [tick for tick in done if tick.wheels is None and tick.time_s > reached_s]
         return sorted([*measured.values(), *spare], key=lambda tick: tick.time_s)
 
-    def _tick(self, tick: Tick, settled: list[LiveEstimate]) -> LiveEstimate | None:
+    def _tick(self, tick: Tick, settled: list[Any]) -> Any:
         """Do a tick; what was not settled before a clock was set back has settled."""
-        time_s, filter_ = tick.time_s, self.filter
-        wheels = self._no_wheels if tick.wheels is None else tick.wheels
-        follows = filter_.follows(time_s)
+        follows = self._follows(tick.time_s)
         if follows == 0:
-            filter_.step(time_s, np.full(len(self.model.rows), np.nan))  # to count it, and remember a jump
             return None
         if follows < 0:
             settled += self._unsettled
             self._unsettled.clear()
             self._newest_s.clear()
             self._settled_s = -math.inf
-            rows.forget_times(self._feed)
+            self._forget()
             for queue in self._queues.values():
                 queue.waiting.clear()
+        due = {name: queue.take(tick.time_s) for name, queue in self._queues.items()}
+        wheels = self._no_wheels if tick.wheels is None else tick.wheels
+        estimate = self._estimate(tick.time_s, wheels, due)
+        if follows < 0:
+            self._history.clear()
+        self._history.add_tick(tick)
+        return estimate
+
+
+class LiveFilter(Live):
+    """Motion and slip from samples as they come.
+
+    Parameters
+    ----------
+    robot : a swerve robot with motors, steering and sensors, and a camera for vio12 and vio15, or one that
+        skids; corrected
+    filter_name : one of :data:`~terrain.estimation.estimate.FILTERS` that is the robot's
+    channels : names of the columns of the streams that are read, in their order; those of the schema
+    settings : when a measurement or a stamp is not believed
+    noise : in place of the physical
+    initial_yaw_rad : heading of the start in the world; without it the GNSS is not used
+    gnss_latency_s : age of a position when it arrives
+    rate_hz : of ``wheels`` and ``imu``, where they are not those of the robot's description
+    correction : of :func:`terrain.extension.correct_live`
+
+    Raises
+    ------
+    ConfigError
+        if filter, robot and channels do not fit, the robot is not corrected, or a number is out of its range.
+    DataError
+        if the noise does not fit the filter.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> estimator = LiveFilter(load_robot("agrimaro"))
+    >>> wheels = Reading(np.array([0.0]), np.array([[20.0, 20.0, 20.0, 1.0, 1.0, 1.0]]))
+    >>> _ = estimator.step({"wheels": wheels})
+    >>> estimator.latest.wheel_speed_mps, estimator.latest.slip_stale
+    (array([0.4, 0.4, 0.4]), True)
+    >>> skids = LiveFilter(load_robot("husky"), "skid")
+    >>> _ = skids.step({"wheels": Reading(np.array([0.0]), np.array([[0.4, 0.4]]))})
+    >>> round(skids.latest.speed_x_mps, 2), skids.latest.motion.name
+    (0.4, 'UNKNOWN')
+    """
+
+    _ticks_without_wheels = True
+    filter: Filter
+    latest: LiveEstimate | None
+
+    def __init__(
+        self,
+        robot: Robot,
+        filter_name: str = "vio15",
+        channels: Mapping[str, tuple[str, ...]] | None = None,
+        settings: FilterSettings = SETTINGS,
+        *,
+        noise: Noise | None = None,
+        initial_yaw_rad: float | None = None,
+        gnss_latency_s: float = GNSS_LATENCY_S,
+        rate_hz: Mapping[str, float] | None = None,
+        correction: Correction | None = None,
+    ) -> None:
+        check_corrected(robot)
+        yaw_rad = initial_yaw_rad or 0.0
+        if not math.isfinite(yaw_rad):
+            raise ConfigError(f"initial_yaw_rad is {initial_yaw_rad}, a finite number is required")
+        for stream, rate in (rate_hz or {}).items():
+            if not 0.0 < rate < math.inf:
+                raise ConfigError(f"rate of {stream!r} is {rate} Hz, a number above zero is required")
+        skids = filter_name == "skid"
+        if channels is None:
+            channels = {**CHANNELS, "wheels": robot.rate_channels} if skids else CHANNELS
+        has_gnss = not skids and initial_yaw_rad is not None and "gnss" in channels
+        if skids:
+            self.model, usual = make_skid_filter(robot), skid_noise(robot)
+        else:
+            self.model = make_filter(filter_name, robot, with_gnss=has_gnss)
+            robot.require("motors", "steering", "sensors")
+            usual = default_noise(filter_name, robot, has_gnss)
+        states, model_rows = self.model.states, self.model.rows
+        is_scheduled = noise is None and bool(self.model.inputs)
+        self._schedule = Schedule(self.model, ROWS) if is_scheduled else None
+        self._robot, self._skids = robot, skids
+        self.filter = Filter(self.model, usual if noise is None else noise, settings)
+        sensors = robot.completed.sensors
+        rates = {"wheels": sensors.wheels_rate_hz, "imu": sensors.imu_rate_hz, "gnss": 1.0 / GNSS_PERIOD_S}
+        rates["steering"] = sensors.steering_rate_hz
+        if robot.describes("camera"):
+            rates["odometry"] = robot.camera.rate_hz
+        period_s = {stream: 1.0 / rate for stream, rate in (rates | dict(rate_hz or {})).items()}
+        self._settings = rows.feed_settings(robot, period_s, yaw_rad, gnss_latency_s)
+        self._feed, self._row = rows.new_feed(), np.zeros(1, rows.ROW)
+        self._numbers = rows.measurements(self._row)
+        self._monitor = None if skids else HealthMonitor(robot, self.model)
+        self._slip = SlipOfInstant(robot, states)
+        self._motion = motion_memory()
+        memories = [self.filter.state, self._feed, self._motion]
+        memories += [] if self._monitor is None else [self._monitor.memory]
+        self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
+        super().__init__(channels, self._queues_of(channels, has_gnss), period_s["wheels"], correction)
+        self._region = RegionMonitor(robot)
+        self._row_places = [ROWS.index(row) for row in model_rows]
+        self._gnss_places = [k for k, row in enumerate(model_rows) if row in GNSS_ROWS]
+        motion = ("speed_mps", "", "yaw_rate_radps", "", "") if skids else _MOTION
+        self._motion_places = places_among(motion, states).tolist()
+        self.name, self.states = self.model.name, states
+
+    def _queues_of(self, channels: Mapping[str, tuple[str, ...]], has_gnss: bool) -> dict[str, SampleQueue]:
+        """Find the columns of the wheels, and return a queue for each stream that is read."""
+        needed = {"wheels": self._robot.rate_channels}
+        if self._skids and channels.get("imu"):
+            needed["imu"] = ("gyro_z_radps",)
+        for stream, names in needed.items():
+            check_channels(stream, names, channels.get(stream, ()))
+        has = {"gnss": has_gnss, "odometry": self._robot.describes("camera")}
+        used = ("imu",) if self._skids else tuple(STREAMS)
+        wheels = list(channels["wheels"])
+        self._rate_columns = [wheels.index(channel) for channel in self._robot.rate_channels]
+        self._current_columns = places_among([f"current_{wheel}_a" for wheel in self._robot.wheels], wheels)
+        return {
+            name: SampleQueue(places_among(STREAMS[name], channels[name]))
+            for name in used
+            if channels.get(name) and has.get(name, True)
+        }
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
+        counts = super().dropped | self.filter.dropped
+        counts["wheels: not finite"] = int(self._feed["wheels_not_finite"][0])
+        counts["wheels: beyond the motors"] = int(self._feed["wheels_beyond"][0])
         for stream, name in enumerate(STREAMS):
             if name in self._queues:
-                for came_s, complete, sample in self._queues[name].take(time_s):
-                    rows.take_live(stream, sample, complete, came_s, self._settings, self._feed)
+                for kind in rows.COUNTS:
+                    counts[f"{name}: {kind.replace('_', ' ')}"] = int(self._feed[kind][0, stream])
+        return {kind: n for kind, n in counts.items() if n}
+
+    @property
+    def health(self) -> dict[str, str]:  # type: ignore[override]
+        """Health of each sensor at the last tick, by name; empty where none is judged."""
+        return {} if self._monitor is None else self._monitor.names
+
+    def at(self, now_s: float) -> LiveEstimate | None:
+        """Return the last estimate, its means predicted to a later time; None before the first tick."""
+        seen = self.latest
+        if seen is None or not 1e-3 < now_s - seen.time_s < SETTINGS.max_gap_s:
+            return seen
+        d = len(self.states)
+        mean, params = np.empty(d), np.append(self.model.params, np.zeros(len(self.model.inputs)))
+        self.model.propagate(seen.mean, now_s - seen.time_s, params, mean, np.zeros((d, d)))
+        motion: dict[str, Any] = dict(zip(_MOTION, self._motion_of(mean), strict=True))
+        return seen._replace(mean=mean, **motion)
+
+    def _motion_of(self, mean: Array) -> list[float]:
+        """Return speeds, yaw rate and accelerations of a state; NaN of what it does not have."""
+        return [math.nan if place < 0 else float(mean[place]) for place in self._motion_places]
+
+    def _follows(self, time_s: float) -> int:
+        follows = self.filter.follows(time_s)
+        if follows == 0:
+            self.filter.step(
+                time_s, np.full(len(self.model.rows), np.nan)
+            )  # to count it, and remember a jump
+        return follows
+
+    def _forget(self) -> None:
+        rows.forget_times(self._feed)
+
+    def _last_taken_s(self, name: str) -> float:
+        return float(self._feed["last_s"][0, list(STREAMS).index(name)])
+
+    def _snapshot(self) -> list[Array]:
+        return [memory.copy() for memory in self._memories]
+
+    def _restore(self, memory: list[Array]) -> None:
+        for one, snapshot in zip(self._memories, memory, strict=True):
+            one[:] = snapshot
+
+    def _estimate(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> LiveEstimate:
+        filter_, robot = self.filter, self._robot
+        for stream, name in enumerate(STREAMS):
+            for came_s, complete, sample in due.get(name, ()):
+                rows.take_live(stream, sample, complete, came_s, self._settings, self._feed)
         rates = wheels[self._rate_columns]
         if self._skids:
             rates[~np.isfinite(rates)] = np.nan
@@ -545,17 +582,6 @@ class LiveFilter:
         filter_.step(time_s, z, variance, walk, inputs)
         if self._monitor is not None:
             self._monitor.judge(time_s, wheels, rates, self._row, self._feed, filter_.state)
-        estimate = self._estimate(time_s, wheels, rates)
-        if follows < 0:
-            self._history.clear()
-        self._history.add_tick(tick)
-        if self._region.compares:
-            self._region.step(time_s, float(estimate.wheel_speed_mps.mean()), estimate.yaw_rate_radps)
-        return estimate
-
-    def _estimate(self, time_s: float, wheels: Array, rates: Array) -> LiveEstimate:
-        """Return what is known after a tick."""
-        filter_, robot = self.filter, self._robot
         mean, std = filter_.mean.copy(), np.sqrt(filter_.cov.diagonal())
         motion, age_s = Motion.UNKNOWN, filter_.reference_age_s
         slip_ratio = slip_std = motor_radps = np.full(len(robot.wheels), np.nan)
@@ -572,6 +598,8 @@ class LiveFilter:
             wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.motors.reduction_ratio)
             slip_ratio, slip_std = self._slip.at(time_s, filter_, self._row, self._feed)
         v_x, v_y, turn, a_x, a_y = self._motion_of(mean)
+        if self._region.compares:
+            self._region.step(time_s, float(wheel_speed_mps.mean()), turn)
         return LiveEstimate(
             time_s,
             mean,
@@ -595,6 +623,123 @@ class LiveFilter:
         )
 
 
-def places_among(names: Sequence[str], among: Sequence[str]) -> Array:
-    """Return the place of each name among others, -1 where it is not there."""
-    return np.array([among.index(name) if name in among else -1 for name in names])
+class LiveObserverEstimate(NamedTuple):
+    """What is known at one tick; arrays are the caller's to keep."""
+
+    time_s: float  #: stamp of the wheels
+    mean: Array  #: as of :class:`~terrain.estimation.models.observer.ObserverOutput`
+    std: Array
+    slip: Array
+    slip_std: Array
+    status: ObserverStatus  #: of the estimates
+
+
+class LiveObserver(Live):
+    """An observer, before its first step, of a corrected robot; columns of each stream are ``channels``.
+
+    ``ConfigError`` if the wheels have no speed that the observer takes.
+    """
+
+    filter: None = None
+    latest: LiveObserverEstimate | None
+
+    def __init__(
+        self,
+        observer: Observer,
+        robot: Robot,
+        channels: Mapping[str, tuple[str, ...]],
+        correction: Correction | None = None,
+    ) -> None:
+        self.observer, self._feed, self._last_s = (
+            observer,
+            ObserverFeed(robot, observer.rows, channels),
+            math.nan,
+        )
+        self.name, self.states = observer.name, observer.states
+        super().__init__(channels, self._feed.queues, 0.0, correction)
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """What was not taken so far, as counts by stream and kind."""
+        return super().dropped | self._feed.dropped
+
+    def _follows(self, time_s: float) -> int:
+        return self._feed.follows(time_s)
+
+    def _forget(self) -> None:
+        self._feed.begin()
+        self._last_s = math.nan
+
+    def _last_taken_s(self, name: str) -> float:
+        return self._feed.taken_s[name]
+
+    def _snapshot(self) -> tuple[float, Any, Any]:
+        return self._last_s, self._feed.snapshot(), self.observer.snapshot()
+
+    def _restore(self, memory: tuple[float, Any, Any]) -> None:
+        self._last_s, of_feed, of_observer = memory
+        self._feed.restore(of_feed)
+        self.observer.restore(of_observer)
+
+    def _estimate(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> LiveObserverEstimate:
+        dt_s = 0.0 if math.isnan(self._last_s) else time_s - self._last_s
+        self._last_s = time_s
+        output = self.observer.step(self._feed.tick(time_s, wheels, due), dt_s)
+        return LiveObserverEstimate(time_s, *output[:4], ObserverStatus(output.status))
+
+
+Estimate = LiveEstimate | LiveObserverEstimate
+Estimator = LiveFilter | LiveObserver
+
+#: Filters and observers that run sample by sample, by drive, without a file of their own; the first is used where
+#: none is named.
+LIVE_FILTERS: Mapping[str, tuple[str, ...]] = {
+    "swerve": ("vio15", "vio12", "slip14", "encoder12"),
+    "skid_steer": ("skid",),
+    "tracked": ("skid", "tracked", "slip-learning", "gyrodometry", "encoder-odometry"),
+    "bicycle": ("sideslip-multi", "sideslip-dynamic", "sideslip-kinematic"),
+}
+
+
+def make_live_filter(
+    name: str,
+    robot: Robot,
+    channels: Mapping[str, tuple[str, ...]],
+    rate_hz: Mapping[str, float],
+    correction: Correction | None = None,
+) -> Estimator:
+    """Return a filter of :data:`LIVE_FILTERS`, or an observer, of a corrected robot before its first sample.
+
+    ``channels`` of each stream that is measured are in the order of the columns of its readings; ``rate_hz`` are of the
+    streams where they are not those of the robot's description.  ``ConfigError`` if a channel that is needed is not
+    measured.
+    """
+    if name in OBSERVERS:
+        return LiveObserver(make_observer(name, robot), robot, channels, correction)
+    return LiveFilter(robot, name, channels, rate_hz=rate_hz if name == "skid" else {}, correction=correction)
+
+
+def estimated_channels(name: str, robot: Robot) -> dict[str, tuple[str, ...]]:
+    """Return the channels of the streams :data:`ESTIMATED` that a filter or an observer of a robot gives.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> estimated_channels("skid", load_robot("husky"))
+    {'estimator': ('yaw_rate_radps',), 'slip': ('slip_left_ratio', 'slip_right_ratio')}
+    """
+    if name in OBSERVERS:
+        observer = make_observer(name, robot)
+        return {"estimator": observer.states, "slip": observer.slips}
+    motion = ("yaw_rate_radps",) if name == "skid" else ESTIMATOR_CHANNELS
+    return {"estimator": motion, "slip": tuple(f"slip_{wheel}_ratio" for wheel in robot.wheels)}
+
+
+def estimated_values(stream: str, estimate: Estimate) -> Array:
+    """Return a row of one of :data:`ESTIMATED`, in the order of :func:`estimated_channels`."""
+    if isinstance(estimate, LiveObserverEstimate):
+        return estimate.slip if stream == "slip" else estimate.mean
+    if stream == "slip":
+        return estimate.slip_ratio
+    motion = [getattr(estimate, channel) for channel in ESTIMATOR_CHANNELS]
+    return np.array(motion if math.isfinite(estimate.speed_y_mps) else [estimate.yaw_rate_radps])

@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from terrain.estimation.observers.choice import OBSERVERS, make_observer, observers_of
-from terrain.estimation.observers.slip_model import SlipModel
+from terrain.estimation.models.choice import OBSERVERS, make_observer, observers_of
+from terrain.estimation.models.slip_model import SlipModel
 from terrain.robots import load_robot
 
 N_STEPS = 1000

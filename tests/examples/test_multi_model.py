@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "terrain" / "estimation" / "o
 from multi_model import SECTION_VI, Gains, MultiModel
 from test_sideslip import drive, true_slips
 
-from terrain.estimation.observers.observer import observe
+from terrain.estimation.models.observer import observe
 from terrain.robots import load_robot
 
 ROBOT = load_robot("adap2e")

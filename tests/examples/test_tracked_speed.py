@@ -13,7 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
 from tracked_speed import TrackSpeedSettings, TrackSpeedStatus, check_track_speed, track_speed_step
 
 from terrain.errors import ConfigError
-from terrain.estimation.observers.tracked import TrackedObserver, TrackedSettings
+from terrain.estimation.models.tracked import TrackedObserver, TrackedSettings
 from terrain.robots import load_robot
 
 ROBOT = load_robot("orchard_ugv")

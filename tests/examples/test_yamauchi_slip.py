@@ -22,7 +22,7 @@ from yamauchi_slip import (
 )
 
 from terrain.errors import DataError
-from terrain.estimation.observers.slip_model import PARAMETERS
+from terrain.estimation.models.slip_model import PARAMETERS
 from terrain.identify import Parameter, identify
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate

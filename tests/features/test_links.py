@@ -7,8 +7,8 @@ import pytest
 
 from features.stream import WindowFeed
 from features.windows import Layout, WindowRule
-from terrain.estimation.choice import estimated_channels, make_live_filter
 from terrain.estimation.clocks import REWIND_S, Clocks
+from terrain.estimation.live import estimated_channels, make_live_filter
 from terrain.records import Reading
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults

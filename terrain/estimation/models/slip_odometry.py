@@ -4,7 +4,7 @@ State: the pose :math:`x, y, \theta`, which moves by (5) to (7) of Yamauchi et a
 
 .. math:: x' = V_x \cos\theta - V_y \sin\theta, \quad y' = V_x \sin\theta + V_y \cos\theta, \quad \theta' = w,
 
-with the velocity that :mod:`~terrain.estimation.observers.slip_model` makes of the speeds of the tracks, the gyro and
+with the velocity that :mod:`~terrain.estimation.models.slip_model` makes of the speeds of the tracks, the gyro and
 the tilt, along arcs; all parameters of that model, the errors of the run and the bias of the gyro, which do not change
 within a run; and the residuals of V_x and V_y, which do, over their correlation time.  So an error that a whole run has
 in common grows with the distance, and noise with its root.
@@ -47,13 +47,13 @@ import numpy as np
 
 from terrain.errors import ConfigError
 from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
-from terrain.estimation.observers.observer import (
+from terrain.estimation.models.observer import (
     LONGEST_STEP_S,
     FilterObserver,
     ObserverOutput,
     ObserverStatus,
 )
-from terrain.estimation.observers.slip_model import (
+from terrain.estimation.models.slip_model import (
     GYRO_BIAS,
     N_MODEL,
     N_PARAMETERS,

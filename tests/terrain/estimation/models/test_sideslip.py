@@ -7,9 +7,9 @@ import functools
 import numpy as np
 import pytest
 
-from terrain.estimation.observers import sideslip
-from terrain.estimation.observers.observer import ObserverStatus, observe
-from terrain.estimation.observers.sideslip import FIRST_STD, RATE, ROWS, SETTINGS, Sideslip
+from terrain.estimation.models import sideslip
+from terrain.estimation.models.observer import ObserverStatus, observe
+from terrain.estimation.models.sideslip import FIRST_STD, RATE, ROWS, SETTINGS, Sideslip
 from terrain.robots import load_robot
 from terrain.simulation.car import CAR_ROWS, CarCommand, CarDrive, level_ground
 from terrain.simulation.run import simulate

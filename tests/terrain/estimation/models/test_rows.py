@@ -6,9 +6,18 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.observers import rows as observer_rows
-from terrain.estimation.observers.observer import Observer, ObserverOutput, ObserverStatus, observe
-from terrain.estimation.observers.rows import CHANNELS, ROWS, LiveObserver, RowFeed
+from terrain.estimation.feed import QUEUE
+from terrain.estimation.live import LiveObserver
+from terrain.estimation.models import observer as observer_rows
+from terrain.estimation.models.observer import (
+    CHANNELS,
+    ROWS,
+    Observer,
+    ObserverFeed,
+    ObserverOutput,
+    ObserverStatus,
+    observe,
+)
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate
@@ -23,7 +32,16 @@ def rows_of(run):
 
 
 def feed_of(run):
-    return RowFeed(UGV, NAMES, {name: stream.channels for name, stream in run.streams.items()})
+    return ObserverFeed(UGV, NAMES, {name: stream.channels for name, stream in run.streams.items()})
+
+
+def push(feed, name, time_s, values):
+    feed.queues[name].push(np.array(time_s), values, feed.taken_s[name])
+
+
+def tick(feed, time_s):
+    due = {name: queue.take(time_s) for name, queue in feed.queues.items()}
+    return feed.tick(time_s, np.array([0.4, 0.6]), due)
 
 
 def without(run, *names):
@@ -99,6 +117,7 @@ def test_live_is_the_batch_whatever_comes_together(run):
                 arrived[name] = Reading(stream.time_s[new], stream.values[new])
         found += live.step(arrived)
         now = later
+    found += live.settle(all_of_them=True)
     assert np.array([e.mean for e in found]).tobytes() == batch.mean.tobytes()
     assert [e.time_s for e in found] == time_s.tolist()
     assert live.dropped == {}
@@ -108,24 +127,24 @@ def test_samples_that_cannot_be_are_left_out_and_counted(run):
     channels = {name: stream.channels for name, stream in run.streams.items()}
     live = LiveObserver(Counting(), UGV, channels)
     imu = np.full((1, 9), 0.1)
-    assert live.step({"wheels": Reading(np.array([0.0, 0.02]), np.full((2, 2), 0.1))}) != []
-    live.step({"imu": Reading(np.array([0.01, 0.01]), np.vstack([imu, imu]))})
+    live.step({"wheels": Reading(np.array([0.0, 0.02]), np.full((2, 2), 0.1))})
+    assert live.latest.time_s == 0.02
+    live.step({"imu": Reading(np.array([0.03, 0.03]), np.vstack([imu, imu]))})
     live.step({"imu": Reading(np.array([0.02]), np.full((1, 4), 0.1)), "pose": "nothing"})
-    assert live.step({"wheels": Reading(np.array([0.02, 0.01]), np.full((2, 2), 0.1))}) == []
-    assert live.step({"wheels": Reading(np.array([math.nan]), np.full((1, 2), 0.1))}) == []
+    live.step({"wheels": Reading(np.array([0.02, 0.01, math.nan]), np.full((3, 2), 0.1))})
     assert live.dropped == {
-        "imu: not later than the sample before": 1,
-        "wheels: not later than the sample before": 3,
+        "imu: stamp does not increase": 1,
+        "wheels: stamp does not increase": 3,
         "imu: unreadable": 1,
         "pose: unreadable": 1,
     }
-    [estimate] = live.step({"wheels": Reading(np.array([0.04]), np.array([[math.inf, math.nan]]))})
-    assert estimate.status is ObserverStatus.OK
+    live.step({"wheels": Reading(np.array([0.04]), np.array([[math.inf, math.nan]]))})
+    assert live.latest.status is ObserverStatus.OK
 
 
 def test_a_log_without_what_the_observer_takes_is_refused(run):
     with pytest.raises(ConfigError, match="'speed_left_mps' must be among them"):
-        RowFeed(UGV, NAMES, {"wheels": ("motor_1_radps",)})
+        ObserverFeed(UGV, NAMES, {"wheels": ("motor_1_radps",)})
     with pytest.raises(DataError, match="has no stream wheels"):
         rows_of(without(run, "wheels"))
 
@@ -146,6 +165,7 @@ def test_a_clock_that_is_set_back_begins_anew_and_one_stamp_far_ahead_is_left_be
             )
             sample = Reading(np.array([stamp_s]), np.full((1, 9), 0.1))
             found += live.step({"imu": sample, "wheels": Reading(np.array([stamp_s]), np.full((1, 2), 0.5))})
+        found += live.settle(all_of_them=True)
         assert len(found) > 180
         assert live.dropped["time: clock set"] >= 1
         assert all(np.isfinite(each.mean).all() for each in found)
@@ -155,12 +175,11 @@ def test_stamps_that_are_no_time_and_channels_that_are_unknown_do_not_take_the_o
     feed = feed_of(run)
     imu = run.streams["imu"].values[:4].copy()
     imu[1, 2] = np.nan
-    feed.push("imu", np.array([0.0, np.inf, 0.005, 0.01]), imu)
-    row = feed.tick(0.02, np.array([0.4, 0.6]))
+    push(feed, "imu", [0.0, np.inf, 0.005, 0.01], imu)
     known = imu[[0, 2, 3], 2].mean()
-    assert row[NAMES.index("yaw_rate_radps")] == pytest.approx(known)
-    feed.push("imu", np.array([0.03]), np.where(np.arange(9) == 2, np.nan, imu[:1]))
-    row = feed.tick(0.04, np.array([0.4, 0.6]))
+    assert tick(feed, 0.02)[NAMES.index("yaw_rate_radps")] == pytest.approx(known)
+    push(feed, "imu", [0.03], np.where(np.arange(9) == 2, np.nan, imu[:1]))
+    row = tick(feed, 0.04)
     assert np.isfinite(row[NAMES.index("roll_rad")])
     assert row[NAMES.index("yaw_rate_radps")] == pytest.approx(imu[3, 2])  # held
 
@@ -195,15 +214,14 @@ def test_a_pose_that_is_lost_leaves_the_satellites_and_bad_fixes_are_none(run):
 def test_a_fix_that_waited_long_for_the_wheels_is_left_out_and_counted(run, tick_s, late):
     feed = feed_of(without(run, "pose"))
     for name in ("gnss", "compass"):
-        feed.push(name, np.array([0.1]), run.streams[name].values[:1])
-    row = feed.tick(tick_s, np.array([0.4, 0.6]))
+        push(feed, name, [0.1], run.streams[name].values[:1])
+    row = tick(feed, tick_s)
     assert np.isnan(row[2:5]).tolist() == [late] * 3
     assert feed.dropped == ({"gnss: late": 1, "compass: late": 1} if late else {})
 
 
 def test_samples_do_not_pile_up_while_no_wheels_come(run):
     feed = feed_of(run)
-    for k in range(5000):
-        feed.push("imu", np.array([0.01 * k]), np.full((1, 9), 0.1))
-    assert feed.dropped["imu: no wheels came"] > 4500
-    assert feed.tick(50.0, np.array([0.4, 0.6])) is not None
+    push(feed, "imu", 0.01 * np.arange(5000), np.full((5000, 9), 0.1))
+    assert feed.queues["imu"].counts["waited too long"] >= 5000 - QUEUE
+    assert np.isfinite(tick(feed, 50.0)[:2]).all()

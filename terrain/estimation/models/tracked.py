@@ -71,7 +71,7 @@ import numpy as np
 
 from terrain.angles import wrapped
 from terrain.errors import ConfigError
-from terrain.estimation.observers.observer import Observer, ObserverOutput, ObserverStatus
+from terrain.estimation.models.observer import Observer, ObserverOutput, ObserverStatus
 from terrain.records import Array
 from terrain.robots import TrackedRobot
 
@@ -218,7 +218,7 @@ class TrackedObserver(Observer):
 
     Examples
     --------
-    >>> from terrain.estimation.observers.observer import observe
+    >>> from terrain.estimation.models.observer import observe
     >>> from terrain.robots import load_robot
     >>> time_s = np.arange(0.0, 20.0, 0.1)
     >>> rows = np.tile([0.6, 0.6, 0.0, 0.0, 0.0, 0.0], (len(time_s), 1))

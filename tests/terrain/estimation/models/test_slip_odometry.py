@@ -10,8 +10,8 @@ from scipy.integrate import solve_ivp
 
 from terrain.calibration.odometry import odometry_rows
 from terrain.errors import ConfigError
-from terrain.estimation.observers.observer import ObserverStatus, observe
-from terrain.estimation.observers.slip_model import (
+from terrain.estimation.models.observer import ObserverStatus, observe
+from terrain.estimation.models.slip_model import (
     ANGLE,
     N_MODEL,
     N_PARAMETERS,
@@ -25,7 +25,7 @@ from terrain.estimation.observers.slip_model import (
     turn_weight,
     unknown_ground,
 )
-from terrain.estimation.observers.slip_odometry import (
+from terrain.estimation.models.slip_odometry import (
     BLIND_MPS,
     ROWS,
     OdometrySettings,

@@ -8,8 +8,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from terrain.errors import ConfigError
-from terrain.estimation.observers.observer import ObserverStatus, observe
-from terrain.estimation.observers.tracked import (
+from terrain.estimation.models.observer import ObserverStatus, observe
+from terrain.estimation.models.tracked import (
     TrackedObserver,
     TrackedSettings,
     n_parts,

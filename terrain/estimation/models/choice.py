@@ -7,11 +7,11 @@ from functools import partial
 from typing import Any
 
 from terrain.errors import ConfigError
-from terrain.estimation.observers import sideslip
-from terrain.estimation.observers.observer import Observer
-from terrain.estimation.observers.slip_model import SlipModel, unknown_ground
-from terrain.estimation.observers.slip_odometry import SlipOdometry, plain_odometry
-from terrain.estimation.observers.tracked import TrackedObserver
+from terrain.estimation.models import sideslip
+from terrain.estimation.models.observer import Observer
+from terrain.estimation.models.slip_model import SlipModel, unknown_ground
+from terrain.estimation.models.slip_odometry import SlipOdometry, plain_odometry
+from terrain.estimation.models.tracked import TrackedObserver
 from terrain.robots import BicycleRobot, Robot
 
 PLAIN = ("encoder-odometry", "gyrodometry", "endo")

@@ -49,7 +49,7 @@ import numpy as np
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
-from terrain.estimation.observers.observer import (
+from terrain.estimation.models.observer import (
     LONGEST_STEP_S,
     FilterObserver,
     ObserverOutput,
@@ -229,7 +229,7 @@ class Sideslip(FilterObserver):
     Examples
     --------
     >>> from terrain.robots import load_robot
-    >>> from terrain.estimation.observers.observer import observe
+    >>> from terrain.estimation.models.observer import observe
     >>> time_s, slope = np.arange(200) * 0.02, np.full((200, 8), np.nan)
     >>> slope[:, [0, 1, 5, 6, 7]] = 3.0, 0.0, 0.0, 0.2, 9.81 * np.sin(0.2)  # straight along a slope
     >>> observe(Sideslip(load_robot("adap2e"), "sideslip-dynamic"), time_s, slope).slip[-1].round(2)

@@ -6,13 +6,28 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
+from terrain.estimation.estimate import (
+    observe_run,
+    summarize_observer,
+    with_estimates,
+)
 from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
-from terrain.estimation.observers.choice import OBSERVERS, make_observer, observers_of
-from terrain.estimation.observers.estimate import observe_run, summarize_observer, with_estimates
-from terrain.estimation.observers.observer import FilterObserver, ObserverOutput, ObserverStatus, observe
-from terrain.estimation.observers.rows import ROWS, rows_of
-from terrain.estimation.observers.slip_model import PARAMETERS, SlipModel, model_of
-from terrain.estimation.observers.slip_model_file import read_slip_model, write_slip_model
+from terrain.estimation.models.choice import OBSERVERS, make_observer, observers_of
+from terrain.estimation.models.observer import (
+    ROWS,
+    FilterObserver,
+    ObserverOutput,
+    ObserverStatus,
+    observe,
+    rows_of,
+)
+from terrain.estimation.models.slip_model import (
+    PARAMETERS,
+    SlipModel,
+    model_of,
+    read_slip_model,
+    write_slip_model,
+)
 from terrain.kernels import njit
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run

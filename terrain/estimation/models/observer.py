@@ -1,0 +1,401 @@
+"""Observers of slip: one row of measurements in, what is known of the slip out; and what a row is made of.
+
+A row holds what was measured at a tick of the wheels (:data:`ROWS`), NaN where a sensor gave nothing; it may be late,
+wrong or absent, and what comes out is never infinite.  A whole log (:func:`rows_of`, :func:`observe`), a run sample by
+sample (:class:`~terrain.estimation.live.LiveObserver`) and a simulated robot call the same step.
+
+Most observers are a :class:`~terrain.estimation.filter.FilterModel` and what its inputs are:
+:class:`FilterObserver`.
+
+A tick is a sample of the wheels.  Of the IMU a row has the means of the samples since the tick before, or
+the last one for up to :data:`HELD_S`; of the steering the last one.  A fix, a pose or a position of
+satellites with the compass beside it, is in the row of the first tick after it, moved along its heading by
+the speed times its age.  Samples that are not later than those before them are left out and counted; values
+that are not finite are unknown.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from terrain.errors import DataError
+from terrain.estimation.feed import (
+    CLOCK_SET_S,
+    TICK_S,
+    Due,
+    SampleQueue,
+    check_channels,
+    places_among,
+)
+from terrain.estimation.filter import Filter, FilterModel, FilterSettings, Noise
+from terrain.records import GATED, REOPENED, USED, Array, RunLog
+from terrain.robots import Robot
+from terrain.status import StatusCode
+
+LONGEST_STEP_S = 1.0
+"""A longer time since the step before is no step: a robot may have done anything."""
+
+
+ROWS: tuple[str, ...] = (
+    *("speed_left_mps", "speed_right_mps", "speed_rear_mps", "steer_front_rad"),
+    *("position_x_m", "position_y_m", "yaw_rad"),
+    *("yaw_rate_radps", "roll_rad", "pitch_rad", "accel_y_mps2"),
+)
+"""Circumferential speeds of the tracks, and of a car's rear axle; its steering angle; position and heading of
+the body's origin in a fixed right-handed frame, from poses, or satellites and a compass, brought to the time
+of the tick; yaw rate of the gyro; roll (left side up positive) and pitch (nose up negative); specific force
+to the left."""
+
+HELD_S = 0.1
+"""How long the last sample of IMU and steering stands for one that is missing: ten of an IMU's."""
+
+TOGETHER_S = 0.06
+"""A compass belongs to a position that is no further from it in time: half a period of 10 Hz, and more."""
+
+LATE_S = 0.3
+"""A fix that is older when its tick comes is left out: it would have to be moved along an unknown path."""
+
+INACCURATE_M = 0.2
+"""Standard deviation of a satellite fix from which on it is no fix: a float solution has half a metre."""
+
+CLOCK_SET_SAMPLES = 10
+"""So many samples in a row, a second behind the newest, are of a clock that was set back."""
+
+CHANNELS: Mapping[str, tuple[str, ...]] = {
+    "steering": ("angle_front_rad",),
+    "imu": ("gyro_z_radps", "roll_rad", "pitch_rad", "accel_y_mps2"),
+    "pose": ("position_x_m", "position_y_m", "yaw_rad"),
+    "gnss": ("position_x_m", "position_y_m", "std_position_m"),
+    "compass": ("yaw_rad",),
+}
+"""Channels that are read of each stream beside the wheels; those that a log lacks are unknown."""
+
+_IMU_ROWS = ("yaw_rate_radps", "roll_rad", "pitch_rad", "accel_y_mps2")
+
+
+class ObserverStatus(StatusCode):
+    """What the estimates of an observer are worth at a tick."""
+
+    OK = 0
+    """Estimates follow measurements."""
+    STARTING = 1
+    """Nothing that estimates need was measured yet."""
+    STANDING = 2
+    """The robot stands; slip is as it was, and does not drift."""
+    PREDICTED = 3
+    """No fix for a while: slip is as it was, the pose is dead reckoning."""
+    REJECTED = 4
+    """A measurement that cannot be, a jump or a flip, was left out."""
+    RESET = 5
+    """The pose began anew where measurements persistently are; slip is as it was."""
+    UNEXCITED = 6
+    """A part of the slip is not observable in this motion, a stopped track say, and is as it was."""
+    PUSHED = 7
+    """The robot turns though its tracks stand."""
+    BAD_INPUT = 8
+    """Speeds or time are not numbers that can be; estimates are as they were."""
+
+
+class ObserverOutput(NamedTuple):
+    """What an observer knows at a tick."""
+
+    mean: Array  #: (d,) estimates and one standard deviation of each, in the order of :attr:`Observer.states`
+    std: Array
+    slip: Array  #: (k,) in the order of :attr:`Observer.slips`; NaN where it is not observed
+    slip_std: Array
+    status: int  #: number of an :class:`ObserverStatus`
+
+
+def _copies(memory: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is remembered by name, with arrays, counters and tables of its own."""
+    mutable = np.ndarray, dict
+    return {name: value.copy() if isinstance(value, mutable) else value for name, value in memory.items()}
+
+
+class Observer(ABC):
+    """An observer of slip in use.
+
+    Attributes
+    ----------
+    name : as ``terrain estimate --filter`` has it
+    states : name of each estimate, with its unit
+    slips : channels of the stream ``slip``: ``slip_<wheel>_ratio`` or, of an angle, ``slip_<wheel>_rad``
+    rows : what it takes at a tick, of :data:`ROWS`
+    """
+
+    name: str
+    states: tuple[str, ...]
+    slips: tuple[str, ...]
+    rows: tuple[str, ...]
+
+    @abstractmethod
+    def step(self, row: Array, dt_s: float) -> ObserverOutput:
+        """Take a row (m,) that comes a time after the one before, 0 at first; return what is known then."""
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that is remembered, for :meth:`restore`."""
+        return _copies(vars(self))
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go back to a snapshot."""
+        vars(self).update(_copies(memory))
+
+
+class FilterObserver(Observer):
+    """An observer that is a filter: a subclass makes its inputs of a row, and its slips of the state.
+
+    Parameters
+    ----------
+    model, noise, settings : of the filter
+
+    Attributes
+    ----------
+    filter : with its state, which is all that is remembered but the inputs of the last tick
+    age_s : (k,) time since each sensor was used, infinite before
+    """
+
+    def __init__(self, model: FilterModel, noise: Noise, settings: FilterSettings) -> None:
+        self.filter = Filter(model, noise, settings)
+        self.name = model.name
+        self.age_s = np.full(len(model.sensors), np.inf)
+        self._time_s = 0.0
+
+    def advance(
+        self,
+        dt_s: float,
+        z: Array,
+        inputs: Array,
+        walk: Array | None = None,
+        variance: Array | None = None,
+        n_judged: int | None = None,
+    ) -> ObserverStatus:
+        """Take a tick into the filter; return OK, or REJECTED or RESET where a sensor was left out or reopened.
+
+        Parameters are those of :meth:`terrain.estimation.filter.Filter.step`; the first ``n_judged`` sensors count.
+        """
+        self._time_s += dt_s
+        self.filter.step(self._time_s, z, variance, walk, inputs)
+        use = self.filter.use
+        self.age_s += dt_s
+        self.age_s[(use == USED) | (use == REOPENED)] = 0.0
+        use = use[:n_judged]
+        if (use == REOPENED).any():
+            return ObserverStatus.RESET
+        return ObserverStatus.REJECTED if (use == GATED).any() else ObserverStatus.OK
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that is remembered, for :meth:`restore`."""
+        return super().snapshot() | {"filter": self.filter.state.copy()}
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go back to a snapshot."""
+        self.filter.state[:] = memory["filter"]
+        super().restore({name: value for name, value in memory.items() if name != "filter"})
+
+    def place(self, states: slice, values: Array, std: Array) -> None:
+        """Set some states, with standard deviations, whatever was known of them; others stay."""
+        mean, cov = self.filter.mean, self.filter.cov
+        mean[states], cov[states, :], cov[:, states] = values, 0.0, 0.0
+        cov[states, states] = np.diag(np.square(std))
+
+
+class ObserverFeed:
+    """Rows of an observer from the samples of a robot as they come.
+
+    Parameters
+    ----------
+    robot : tracked or car-like
+    rows : those of :data:`ROWS` that the observer takes
+    channels : names of the columns of each stream; ``ConfigError`` if the wheels have no speed that the observer takes
+
+    Attributes
+    ----------
+    queues : of the streams beside the wheels that are read
+    taken_s : stamp of the last sample of each stream that was taken out of its queue
+    dropped : what was left out, as counts by stream and kind: wheels not later than the sample before, late or
+        inaccurate fixes, and clocks that were set back
+    """
+
+    def __init__(self, robot: Robot, rows: tuple[str, ...], channels: Mapping[str, tuple[str, ...]]) -> None:
+        wheels = channels.get("wheels", ())
+        check_channels("wheels", robot.rate_channels, wheels)
+        self._speeds = [(wheels.index(name), name) for name in robot.rate_channels]
+        read = {stream: names for stream, names in CHANNELS.items() if channels.get(stream)}
+        self.queues = {
+            stream: SampleQueue(places_among(names, channels[stream])) for stream, names in read.items()
+        }
+        self._rows = rows
+        self.dropped: Counter[str] = Counter()
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin anew: nothing was measured before."""
+        self.taken_s = dict.fromkeys((*self.queues, "wheels"), -math.inf)
+        self._held: dict[tuple[str, int], tuple[float, float]] = {}
+        self._heading, self._n_behind = (-math.inf, math.nan), 0
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return all that is remembered but the queues, for :meth:`restore`."""
+        return _copies(vars(self) | {"queues": None})
+
+    def restore(self, memory: Mapping[str, Any]) -> None:
+        """Go back to a snapshot."""
+        vars(self).update(_copies(memory) | {"queues": self.queues})
+
+    def follows(self, time_s: float) -> int:
+        """Return what a stamp of the wheels is: 1 taken, -1 of a clock that was set back, 0 not taken, and counted."""
+        before_s = self.taken_s["wheels"]
+        if math.isfinite(time_s) and time_s > before_s:
+            self._n_behind = 0
+            return 1
+        self._n_behind = self._n_behind + 1 if time_s <= before_s - CLOCK_SET_S else 0
+        if self._n_behind >= CLOCK_SET_SAMPLES:
+            self.dropped["time: clock set"] += 1
+            return -1
+        self.dropped["wheels: stamp does not increase"] += 1
+        return 0
+
+    def tick(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Array:
+        """Return the row (m,) at a sample of the wheels, of the samples of other streams that came since the last."""
+        self.taken_s["wheels"] = time_s
+        for name, samples in due.items():
+            if samples:
+                self.taken_s[name] = samples[-1][0]
+            elif self.queues[name].n_behind >= CLOCK_SET_SAMPLES:  # its own clock was set back
+                self.dropped["time: clock set"] += 1
+                self.taken_s[name], self.queues[name].n_behind = -math.inf, 0
+        row = dict.fromkeys(ROWS, math.nan)
+        row |= {name: float(wheels[column]) for column, name in self._speeds}
+        row["steer_front_rad"] = self._means("steering", time_s, due, last=True)[0]
+        row |= zip(_IMU_ROWS, self._means("imu", time_s, due), strict=True)
+        speeds = [row[name] for _, name in self._speeds]
+        row |= self._fix(time_s, sum(speeds) / len(speeds), due)
+        return np.array([row[name] for name in self._rows])
+
+    def _means(
+        self, stream: str, time_s: float, due: Mapping[str, Due], *, last: bool = False
+    ) -> list[float]:
+        """Return mean, or last, of what is known of each channel since the tick before; else the last known, held."""
+        samples, means = [(stamp_s, sample.tolist()) for stamp_s, _, sample in due.get(stream, ())], []
+        for k in range(len(CHANNELS[stream])):
+            known = [(stamp_s, sample[k]) for stamp_s, sample in samples if not math.isnan(sample[k])]
+            if known:
+                self._held[stream, k] = known[-1]
+            stamp_s, value = self._held.get((stream, k), (-math.inf, math.nan))
+            if known and not last:
+                value = sum(value for _, value in known) / len(known)
+            means.append(value if time_s - stamp_s <= HELD_S or (known and not last) else math.nan)
+        return means
+
+    def _known(self, stream: str, time_s: float, due: Mapping[str, Due]) -> tuple[float, list[float]] | None:
+        """Return the last sample since the tick before that is known, accurate and not late; None without."""
+        last = None
+        for stamp_s, _, values in due.get(stream, ()):
+            sample = values.tolist()
+            needed = sample[:2] if stream == "gnss" else sample
+            if any(math.isnan(value) for value in needed):
+                continue
+            if time_s - stamp_s > LATE_S:
+                self.dropped[f"{stream}: late"] += 1
+            elif stream == "gnss" and sample[2] > INACCURATE_M:
+                self.dropped["gnss: inaccurate"] += 1
+            else:
+                last = (stamp_s, sample)
+        return last
+
+    def _fix(self, time_s: float, speed_mps: float, due: Mapping[str, Due]) -> dict[str, float]:
+        """Return position and heading of the last fix since the tick before, brought to this one."""
+        pose, fix, heading = (self._known(name, time_s, due) for name in ("pose", "gnss", "compass"))
+        if heading is not None:
+            self._heading = (heading[0], heading[1][0])
+        if pose is not None:
+            stamp_s, (x, y, yaw) = pose
+        elif fix is not None:
+            stamp_s, (x, y, _) = fix
+            yaw = self._heading[1] if abs(stamp_s - self._heading[0]) <= TOGETHER_S else math.nan
+        elif heading is not None:
+            return {"yaw_rad": heading[1][0]}
+        else:
+            return {}
+        moved = speed_mps * (time_s - stamp_s)
+        if math.isfinite(moved) and math.isfinite(yaw):
+            x, y = x + moved * math.cos(yaw), y + moved * math.sin(yaw)
+        return {"position_x_m": x, "position_y_m": y, "yaw_rad": yaw}
+
+
+def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Array, dict[str, int]]:
+    """Return times (n,) and rows (n, m) of all ticks of a run, as they would come live, and what was dropped.
+
+    Raises
+    ------
+    ConfigError
+        if the wheels have no speed that the observer takes.
+    DataError
+        if the run has no wheels.
+    """
+    if "wheels" not in run.streams or len(run.streams["wheels"]) == 0:
+        raise DataError(f"{run.run_id}: it has no stream wheels")
+    feed = ObserverFeed(robot, rows, {name: stream.channels for name, stream in run.streams.items()})
+    wheels, times, found = run.streams["wheels"], [], []
+    edges = {
+        name: [0, *np.searchsorted(run.streams[name].time_s, wheels.time_s + TICK_S, side="right").tolist()]
+        for name in feed.queues
+    }
+    for k, time_s in enumerate(wheels.time_s.tolist()):
+        for name, queue in feed.queues.items():
+            new = slice(*edges[name][k : k + 2])
+            if new.start < new.stop:
+                stream = run.streams[name]
+                queue.push(stream.time_s[new], stream.values[new], feed.taken_s[name])
+        follows = feed.follows(time_s)
+        if follows < 0:
+            feed.begin()
+        if follows != 0:
+            due = {name: queue.take(time_s) for name, queue in feed.queues.items()}
+            times.append(time_s)
+            found.append(feed.tick(time_s, wheels.values[k], due))
+    dropped = {
+        f"{name}: {kind}": n for name, queue in feed.queues.items() for kind, n in queue.counts.items()
+    }
+    return np.array(times), np.array(found).reshape(len(found), len(rows)), dropped | feed.dropped
+
+
+class ObserverTrack(NamedTuple):
+    """Estimates of an observer over a run."""
+
+    time_s: Array  #: (n,)
+    states: tuple[str, ...]  #: names of the columns
+    slips: tuple[str, ...]
+    mean: Array  #: (n, d)
+    std: Array
+    slip: Array  #: (n, k); NaN where slip is not observed
+    slip_std: Array
+    status: Array  #: (n,) numbers of :class:`ObserverStatus`
+
+    def state(self, name: str) -> Array:
+        """Return the mean (n,) of one state; ``ValueError`` when there is none of that name."""
+        return self.mean[:, self.states.index(name)]
+
+
+def observe(observer: Observer, time_s: Array, rows: Array) -> ObserverTrack:
+    """Run an observer over the rows of a whole log.
+
+    Parameters
+    ----------
+    observer : before its first step
+    time_s, rows : (n,) rising stamps of the ticks, and (n, m) of :attr:`Observer.rows`
+    """
+    steps_s = np.diff(time_s, prepend=time_s[:1]).tolist()
+    outputs = [observer.step(row, dt_s) for dt_s, row in zip(steps_s, rows, strict=True)]
+    n, d, k = len(time_s), len(observer.states), len(observer.slips)
+    mean, std, slip, slip_std = (
+        np.array([output[i] for output in outputs]).reshape(n, size) for i, size in enumerate((d, d, k, k))
+    )
+    status = np.array([output.status for output in outputs], dtype=np.int64)
+    return ObserverTrack(time_s, observer.states, observer.slips, mean, std, slip, slip_std, status)

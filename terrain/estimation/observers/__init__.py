@@ -1,1 +1,0 @@
-"""Observers of slip: one a file, all behind one interface."""
