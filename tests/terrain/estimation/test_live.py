@@ -1,4 +1,4 @@
-"""Live estimation: the batch's numbers where the batch does not look ahead, and sense whatever comes."""
+"""Live by every filter and observer: the batch's numbers where it does not look ahead, and sense whatever comes."""
 
 from dataclasses import replace
 from functools import cache
@@ -10,10 +10,14 @@ from hypothesis import strategies as st
 
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import estimate_run
-from terrain.estimation.feed import GNSS_ROWS, ROWS, ROWS_OF_DRIVE, measurement_table
+from terrain.estimation.feed import GNSS_ROWS, QUEUE, ROWS, measurement_table
 from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, FilterSettings, Noise, run_filter
-from terrain.estimation.live import CHANNELS, QUEUE, LiveFilter
+from terrain.estimation.live import CHANNELS, LiveFilter, LiveObserver
+from terrain.estimation.models.choice import OBSERVERS, make_observer
+from terrain.estimation.models.observer import CHANNELS as OBSERVED
+from terrain.estimation.models.observer import observe, rows_of
 from terrain.estimation.models.skid import Motion, stuck_intervals
+from terrain.estimation.models.slip_model import SlipModel
 from terrain.estimation.models.swerve import default_noise, make_filter, scheduled
 from terrain.estimation.wheel_slip import wheel_slip
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
@@ -22,10 +26,11 @@ from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
-from terrain.simulation.run import simulate_run
+from terrain.simulation.run import simulate, simulate_run
 from terrain.simulation.sensors import Gnss
+from terrain.simulation.tracked import PrescribedSlip
 
-ROBOT = load_robot("agrimaro")
+ROBOT, HUSKY, UGV = (load_robot(name) for name in ("agrimaro", "husky", "orchard_ugv"))
 ODD = ROBOT.with_parts(
     sensors=replace(
         ROBOT.sensors,
@@ -39,28 +44,44 @@ ODD = ROBOT.with_parts(
     steering=replace(ROBOT.steering, zero_1_rad=3.0, zero_2_rad=-2.0, zero_3_rad=0.5),
     camera=replace(ROBOT.camera, time_constant_s=0.08, lever_x_m=0.1, latency_s=0.03),
 )
-HUSKY, SIDES = load_robot("husky"), ("speed_left_mps", "speed_right_mps")
 IDEAL = ROBOT.with_parts(sensors=replace(ROBOT.sensors, encoder_time_constant_s=0.0))
 MIDDLE_S = 8.0
 
 
 @cache
 def log(scenario="straight", duration_s=16.0, gnss=False, lost=(), seed=3):
-    return simulate_run(
-        ROBOT,
-        "grass",
-        scenario,
-        seed,
-        duration_s=duration_s,
-        faults=Faults(camera_lost_s=lost),
-        gnss=Gnss() if gnss else None,
-    )
+    faults = Faults(camera_lost_s=lost)
+    sensors = {"faults": faults, "gnss": Gnss() if gnss else None}
+    return simulate_run(ROBOT, "grass", scenario, seed, duration_s=duration_s, **sensors)
 
 
-def live(run, robot=ROBOT, name="vio15", yaw=None, rate_hz=50.0):
-    channels = {stream: run.streams[stream].channels for stream in CHANNELS if stream in run.streams}
-    estimator = LiveFilter(robot, name, channels, initial_yaw_rad=yaw)
-    return estimator, settled(estimator, (sample.readings for sample in replay(run, rate_hz)))
+@cache
+def skid_log(scenario="survey", seed=31, soil="grass"):
+    return simulate_run(HUSKY, soil, scenario, seed, duration_s=30.0)
+
+
+@cache
+def tracked_log():
+    speeds = 0.5 + 0.2 * np.sin(np.arange(801)[:, None] / [50.0, 70.0])
+    run = simulate(UGV, speeds, PrescribedSlip(0.85, 0.8), 4)
+    return replace(run, streams={name: stream for name, stream in run.streams.items() if name != "pose"})
+
+
+LOGS = {"agrimaro": log, "husky": skid_log, "orchard_ugv": tracked_log}
+
+
+def estimator_of(robot, name="vio15", channels=None, **options):
+    if name in OBSERVERS:
+        default = {"wheels": robot.rate_channels, **OBSERVED}
+        return LiveObserver(make_observer(name, robot, SlipModel()), robot, channels or default)
+    return LiveFilter(robot, name, channels, **options)
+
+
+def live(run, robot=ROBOT, name="vio15", replay_hz=50.0, **options):
+    streams = {"wheels", *OBSERVED} if name in OBSERVERS else set(CHANNELS)
+    channels = {stream: run.streams[stream].channels for stream in streams if stream in run.streams}
+    estimator = estimator_of(robot, name, channels, **options)
+    return estimator, settled(estimator, (sample.readings for sample in replay(run, replay_hz)))
 
 
 def settled(estimator, steps):
@@ -74,44 +95,64 @@ def column(estimates, name):
 
 
 def batch(run, robot=ROBOT, name="vio15", yaw=None):
-    table = measurement_table(run, robot, causal=True, initial_yaw_rad=yaw or 0.0)
-    model, noise = make_filter(name, robot, yaw is not None), default_noise(name, robot, yaw is not None)
-    if yaw is not None:
-        variance = np.tile(noise.measurement_variance, (table.time_s.size, 1))
-        variance[:, [model.rows.index(row) for row in GNSS_ROWS]] = table.gnss_variance
-        noise = Noise(noise.process_variance, variance, noise.initial_variance)
-    desired = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
-    noise, inputs = scheduled(model, noise, table)
-    track = run_filter(model, noise, table.time_s, table.columns(model.rows), desired, inputs)
-    return table.at(track.time_s), track, wheel_slip(track, table.at(track.time_s), robot)
+    """Return times, what is compared of each tick by the name in a live estimate, and counts of a whole log."""
+    if name in OBSERVERS:
+        observer = make_observer(name, robot, SlipModel())
+        time_s, rows, dropped = rows_of(run, robot, observer.rows)
+        track = observe(observer, time_s, rows)
+        compared = ("mean", "std", "slip", "slip_std", "status")
+        return time_s, {what: getattr(track, what) for what in compared}, dropped
+    if name == "skid":
+        found = estimate_run(run, robot, "skid")
+        track, table = found.track, found.table
+        stuck = np.isfinite(np.where(found.motion == Motion.STUCK, 0.0, np.nan))
+        desired = {"speed_x_mps": track.state("speed_mps"), "motion": found.motion, "is_stuck": stuck}
+    else:
+        table = measurement_table(run, robot, causal=True, initial_yaw_rad=yaw or 0.0)
+        model, noise = make_filter(name, robot, yaw is not None), default_noise(name, robot, yaw is not None)
+        if yaw is not None:
+            variance = np.tile(noise.measurement_variance, (table.time_s.size, 1))
+            variance[:, [model.rows.index(row) for row in GNSS_ROWS]] = table.gnss_variance
+            noise = Noise(noise.process_variance, variance, noise.initial_variance)
+        noise, inputs = scheduled(model, noise, table)
+        gates = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)
+        track = run_filter(model, noise, table.time_s, table.columns(model.rows), gates, inputs)
+        table = table.at(track.time_s)
+        slip = wheel_slip(track, table, robot)
+        desired = {name: track.state(name) for name in ("speed_x_mps", "accel_y_mps2")}
+        desired |= {"slip_ratio": slip.slip_ratio, "slip_std": slip.slip_std, "slip_stale": slip.stale}
+    rows = [row for row in table.rows if row not in GNSS_ROWS or yaw is not None]
+    desired |= {"rows": table.columns(rows), "mean": track.mean, "reference_age_s": track.reference_age_s}
+    desired |= {"std": np.column_stack([track.std(state) for state in track.states])}
+    desired |= {"yaw_rate_radps": track.state("yaw_rate_radps")}
+    return track.time_s, desired, {**table.dropped, **track.dropped}
 
 
-def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
-    """Compare everything at every tick; return the live side."""
-    estimator, estimates = live(run, robot, name, yaw)
-    table, track, slip = batch(run, robot, name, yaw)
-    np.testing.assert_array_equal(column(estimates, "time_s"), table.time_s)
-    rows = [row not in GNSS_ROWS or yaw is not None for row in ROWS_OF_DRIVE["swerve"]]
-    np.testing.assert_allclose(
-        column(estimates, "rows")[:, : len(rows)][:, rows], table.z[:, rows], rtol=0, atol=1e-12
+def assert_equal(run, robot=ROBOT, name="vio15", yaw=None, **options):
+    """Compare everything at every tick, to the last bit but of a swerve robot; return the live estimates."""
+    options |= {} if yaw is None else {"initial_yaw_rad": yaw}
+    estimator, estimates = live(run, robot, name, **options)
+    time_s, desired, dropped = batch(run, robot, name, yaw)
+    np.testing.assert_array_equal(column(estimates, "time_s"), time_s)
+    for what, expected in desired.items():
+        if what == "is_stuck":
+            found = np.isfinite(column(estimates, "stuck_since_s"))
+        elif what == "rows":
+            known = {"swerve": ROWS[:-3], "skid_steer": ("wheel_left_mps", "wheel_right_mps", "gyro_z_radps")}
+            names = [*known[robot.drive], *(GNSS_ROWS if robot.drive == "skid_steer" else ())]
+            names += ["rest_gyro_radps"] if robot.drive == "skid_steer" else []
+            names = [row for row in names if row not in GNSS_ROWS or yaw is not None]
+            found = column(estimates, "rows")[:, [ROWS.index(row) for row in names]]
+        else:
+            found = column(estimates, what)
+        close = {"swerve": 1e-9, "skid_steer": 1e-12}.get(robot.drive, 0.0)
+        np.testing.assert_allclose(found, expected, rtol=0, atol=close, err_msg=what)
+    lookahead = ["clock", "time", "stamp", *(["wheels: not finite"] if name == "skid" else [])]
+    counted, expected = (
+        {kind: n for kind, n in counts.items() if not any(word in kind for word in lookahead)}
+        for counts in (estimator.dropped, dropped)
     )
-    std = np.column_stack([track.std(state) for state in track.states])
-    for what, desired in {
-        "mean": track.mean,
-        "std": std,
-        "slip_ratio": slip.slip_ratio,
-        "slip_std": slip.slip_std,
-        "slip_stale": slip.stale,
-        "reference_age_s": track.reference_age_s,
-        "speed_x_mps": track.state("speed_x_mps"),
-        "accel_y_mps2": track.state("accel_y_mps2"),
-    }.items():
-        np.testing.assert_allclose(column(estimates, what), desired, rtol=0, atol=1e-9, err_msg=what)
-    counted = {kind: n for kind, n in estimator.dropped.items() if "clock" not in kind and "time" not in kind}
-    batch_counts = {**table.dropped, **track.dropped}
-    batch_counts.pop("wheels: stamp does not increase", None)
-    batch_counts.pop("clock jump", None)
-    assert counted == batch_counts
+    assert counted == expected
     return estimates
 
 
@@ -129,13 +170,48 @@ def assert_equal(run, robot=ROBOT, name="vio15", yaw=None):
         ("straight", 16.0, ROBOT, "encoder12", 0.1),
     ],
 )
-def test_live_equals_batch(scenario, duration_s, robot, name, yaw):
+def test_a_swerve_robot_live_equals_batch(scenario, duration_s, robot, name, yaw):
     run = log(scenario, duration_s, gnss=yaw is not None)
     estimates = assert_equal(run, robot, name, yaw)
     wheels = with_wheel_speeds(run, robot).streams["wheels"]
     for what, pattern in (("wheel_speed_mps", "speed_{}_mps"), ("current_a", "current_{}_a")):
         raw = np.column_stack([wheels.channel(pattern.format(i)) for i in (1, 2, 3)])
         np.testing.assert_array_equal(column(estimates, what), raw)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "soil", "seed"),
+    [("survey", "grass", 31), ("complex", "tilled_loam", 32), ("straight", "snow", 33)],
+)
+def test_a_skid_steer_robot_live_equals_batch(scenario, soil, seed):
+    assert_equal(skid_log(scenario, seed, soil), HUSKY, "skid")
+
+
+@pytest.mark.parametrize("name", ["tracked", "slip-learning", "gyrodometry"])
+def test_an_observer_live_equals_batch(name):
+    assert_equal(tracked_log(), UGV, name)
+
+
+def test_live_equals_batch_where_the_robot_is_stuck():
+    """The gyro of a robot that stands, on wheels that turn it on the spot."""
+    run = skid_log()
+    wheels, imu = run.streams["wheels"], run.streams["imu"]
+    spins = (wheels.time_s > 8.0) & (wheels.time_s < 16.0)
+    sides = [wheels.channels.index(f"speed_{side}_mps") for side in ("left", "right")]
+    values, angular = np.array(wheels.values), np.array(imu.values)
+    values[np.ix_(spins, sides)] = [-0.2, 0.2]
+    still = (imu.time_s > 7.9) & (imu.time_s < 16.1)
+    angular[still, imu.channels.index("gyro_z_radps")] = np.random.default_rng(2).normal(0, 0.01, still.sum())
+    streams = {
+        "wheels": Stream(wheels.time_s, values, wheels.channels),
+        "imu": Stream(imu.time_s, angular, imu.channels),
+    }
+    estimates = assert_equal(replace(run, streams=streams), HUSKY, "skid")
+    (interval,) = stuck_intervals(column(estimates, "time_s"), column(estimates, "motion"))
+    assert 8.0 <= interval.start_s < 11.0
+    assert interval.end_s == pytest.approx(16.0, abs=0.6)
+    since_s = column(estimates, "stuck_since_s")
+    assert set(since_s[np.isfinite(since_s)].tolist()) == {interval.start_s}
 
 
 def edited(run, name, edit):
@@ -178,7 +254,7 @@ def spikes(time_s, values):
 FAULTS = {
     "NaN": put(np.nan),
     "spikes": spikes,
-    "infinite": put(np.inf, channel=2),
+    "infinite": put(np.inf, channel=1),
     "gap of 0.5 s": gap(0.5),
     "gap of 3 s": gap(3.0),
     "frozen": put(None, n=100),
@@ -190,66 +266,32 @@ FAULTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("stream", "fault"),
-    [
-        (stream, fault)
+SMOOTH = ("NaN", "infinite", "gap of 0.5 s", "gap of 3 s", "frozen")  # the stamps of which are right
+FAULTY = [
+    *(
+        (ROBOT, "vio15", stream, fault)
         for stream in ("wheels", "steering", "imu", "odometry")
         for fault in FAULTS
-        if (stream, fault) != ("wheels", "a stamp ahead")  # a gap that a log may have: live has to take it
-    ],
-)
-def test_faults_cost_live_what_they_cost_the_batch_and_slip_comes_back(stream, fault):
-    estimates = assert_equal(edited(log(), stream, FAULTS[fault]))
-    assert np.isfinite(column(estimates, "mean")).all()
-    late = column(estimates, "time_s") > MIDDLE_S + 5.0
-    assert np.nanmean(column(estimates, "slip_ratio")[late]) == pytest.approx(0.125, abs=0.01)
-
-
-def spinning(time_s, values):
-    values[(time_s > 8.0) & (time_s < 16.0), :2] = [-0.2, 0.2]
-    return time_s, values
-
-
-def standing(time_s, values):
-    still = (time_s > 7.9) & (time_s < 16.1)
-    values[still, 2] = np.random.default_rng(2).normal(0, 0.01, still.sum())
-    return time_s, values
+    ),
+    *((HUSKY, "skid", stream, fault) for stream in ("wheels", "imu") for fault in SMOOTH),
+    *((UGV, "tracked", stream, fault) for stream in ("wheels", "imu", "gnss", "compass") for fault in SMOOTH),
+]
 
 
 @pytest.mark.parametrize(
-    ("scenario", "soil", "seed", "stuck"),
+    ("robot", "name", "stream", "fault"),
     [
-        *(("survey", "grass", 31, False), ("complex", "tilled_loam", 32, False)),
-        *(("straight", "snow", 33, False), ("survey", "grass", 31, True)),
+        case
+        for case in FAULTY  # a gap of the wheels that a log may have: live has to take it; a compass has one channel
+        if case[2:] not in (("wheels", "a stamp ahead"), ("compass", "infinite"))
     ],
 )
-def test_live_equals_batch_of_a_skid_steer_robot_to_the_last_bit(scenario, soil, seed, stuck):
-    """Where it is stuck, its gyro stands still, on wheels that turn it on the spot."""
-    run = simulate_run(HUSKY, soil, scenario, seed, duration_s=30.0)
-    if stuck:
-        run = edited(edited(run, "wheels", spinning), "imu", standing)
-    channels = {name: run.streams[name].channels for name in ("wheels", "imu")}
-    estimates = settled(LiveFilter(HUSKY, "skid", channels), (each.readings for each in replay(run, 50.0)))
-    found = estimate_run(run, HUSKY, "skid")
-    track, rows, since_s = found.track, column(estimates, "rows"), column(estimates, "stuck_since_s")
-    for what, desired in {
-        "time_s": track.time_s,
-        "mean": track.mean,
-        "std": np.column_stack([track.std(state) for state in track.states]),
-        "yaw_rate_radps": track.state("yaw_rate_radps"),
-        "speed_x_mps": track.state("speed_mps"),
-        "motion": found.motion,
-    }.items():
-        np.testing.assert_array_equal(column(estimates, what), desired, err_msg=what)
-    places = [ROWS.index(row) for row in found.model.rows]
-    np.testing.assert_array_equal(rows[:, places], found.table.columns(found.model.rows))
-    np.testing.assert_array_equal(np.isfinite(since_s), found.motion == Motion.STUCK)
-    intervals = stuck_intervals(track.time_s, found.motion)
-    assert set(since_s[np.isfinite(since_s)].tolist()) == {interval.start_s for interval in intervals}
-    if stuck:
-        assert 8.0 <= intervals[0].start_s < 11.0
-        assert intervals[0].end_s == pytest.approx(16.0, abs=0.6)
+def test_faults_cost_live_what_they_cost_the_batch_and_slip_comes_back(robot, name, stream, fault):
+    estimates = assert_equal(edited(LOGS[robot.name](), stream, FAULTS[fault]), robot, name)
+    if name == "vio15":
+        assert np.isfinite(column(estimates, "mean")).all()
+        late = column(estimates, "time_s") > MIDDLE_S + 5.0
+        assert np.nanmean(column(estimates, "slip_ratio")[late]) == pytest.approx(0.125, abs=0.01)
 
 
 def test_a_clock_that_is_set_back_is_believed_when_the_next_stamp_follows():
@@ -284,9 +326,92 @@ def test_the_queue_of_samples_ahead_of_the_wheels_is_bounded():
     assert len(settled(estimator, [{"wheels": wheels}])) == 1
 
 
+KINDS = {
+    "filter": (ROBOT, "vio15", {}),
+    "filter with GNSS": (ROBOT, "vio15", {"initial_yaw_rad": 0.3}),
+    "skid filter": (HUSKY, "skid", {}),
+    "observer": (UGV, "tracked", {}),
+    "filter and observer": (UGV, "slip-learning", {}),
+}
+
+
+def channels_of(kind):
+    robot, name, _ = KINDS[kind]
+    if name in OBSERVERS:
+        return {"wheels": robot.rate_channels, **OBSERVED}
+    return {**CHANNELS, "wheels": robot.rate_channels if name == "skid" else CHANNELS["wheels"]}
+
+
+def made(kind):
+    robot, name, options = KINDS[kind]
+    return estimator_of(robot, name, channels_of(kind), **options)
+
+
+def wheels_of(kind, time_s):
+    return Reading(np.array([time_s]), np.zeros((1, len(channels_of(kind)["wheels"]))))
+
+
+def assert_sound(estimate, kind):
+    numbers = np.concatenate([estimate.mean, estimate.std])
+    assert not np.isinf(numbers).any()
+    if KINDS[kind][1] not in OBSERVERS:
+        assert np.isfinite(numbers).all()
+        assert (estimate.std > 0).all()
+        assert not (np.abs(estimate.slip_ratio) > 1.0).any()
+    assert not np.isinf(estimate.slip_std).any()
+
+
+def assert_goes_on(estimator, kind, time_s):
+    after = settled(estimator, ({"wheels": wheels_of(kind, time_s + 0.02 * k)} for k in range(12)))
+    assert after[-1].time_s > time_s
+
+
 numbers = st.one_of(
-    st.floats(-3.0, 3.0), st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e9, -1e9, 1e300, -1e300, 5e-324])
+    st.floats(-3.0, 3.0),
+    st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 1e9, -1e9, 1e300, -1e300, 5e-324]),
 )
+
+
+@st.composite
+def garbage(draw, kind):
+    """Return readings of a few steps: stamps mostly near their step, values anything."""
+    channels, steps = channels_of(kind), []
+    for k in range(draw(st.integers(1, 12))):
+        readings = {}
+        for name in draw(st.sets(st.sampled_from([*channels, "lidar"]), max_size=5)):
+            n = draw(st.integers(0, 4))
+            width = len(channels.get(name, "ab")) + (draw(st.integers(0, 9)) == 0)
+            offsets = st.one_of(st.floats(-0.02, 0.02), numbers)
+            stamps = 0.02 * k + np.array(draw(st.lists(offsets, min_size=n, max_size=n)))
+            values = np.full((n, width), draw(numbers))
+            values.reshape(-1)[::2] = draw(numbers)
+            values *= draw(st.sampled_from([1.0, 1.0 + 1e-9, -1.0]))
+            readings[name] = Reading(stamps, values)
+        steps.append(readings)
+    return steps
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(deadline=None, max_examples=15)
+@given(st.data())
+def test_arbitrary_readings_neither_raise_nor_make_a_state_infinite(kind, data):
+    estimator, robot = made(kind), KINDS[kind][0]
+    run, channels = LOGS[robot.name](), channels_of(kind)
+    streams = {
+        name: Stream(stream.time_s, stream.values[:, places], channels[name])
+        for name, stream in run.streams.items()
+        if name in channels
+        for places in [[stream.channels.index(c) for c in channels[name] if c in stream.channels]]
+        if len(places) == len(channels[name])
+    }
+    sound = list(replay(replace(run, streams=streams)))[200:260]
+    for sample in sound:
+        estimator.step(sample.readings)
+    for readings in data.draw(garbage(kind)):
+        shifted = {name: Reading(r.time_s + sound[-1].time_s, r.values) for name, r in readings.items()}
+        for estimate in (*estimator.step(shifted), estimator.latest):
+            assert_sound(estimate, kind)
+    assert_goes_on(estimator, kind, 1e3)  # whatever came before
 
 
 WRONG = [
@@ -297,54 +422,18 @@ WRONG = [
 """What is no reading."""
 
 
-@st.composite
-def garbage(draw, widths):
-    """Return readings of a few steps by what is added to a stamp: near their step, values anything; or none."""
-    steps = []
-    for k in range(draw(st.integers(1, 12))):
-        readings = {}
-        for name in draw(st.sets(st.sampled_from([*widths, "lidar"]), max_size=5)):
-            if draw(st.integers(0, 5)) == 0:
-                readings[name] = draw(st.sampled_from(WRONG))
-                continue
-            n = draw(st.integers(0, 4))
-            width = widths.get(name, 2) + (draw(st.integers(0, 9)) == 0)
-            offsets = st.one_of(st.floats(-0.02, 0.02), numbers)
-            stamps = 2.0 + 0.02 * k + np.array(draw(st.lists(offsets, min_size=n, max_size=n)))
-            values = np.full((n, width), draw(numbers))
-            values.reshape(-1)[::2] = draw(numbers)
-            values *= draw(st.sampled_from([1.0, 1.0 + 1e-9, -1.0]))
-            readings[name] = Reading(stamps, values)
-        steps.append(readings)
-    return steps
-
-
-@settings(deadline=None, max_examples=80)
-@given(st.data(), st.sampled_from([("vio15", None), ("vio15", 0.3), ("skid", None)]))
-def test_arbitrary_readings_neither_raise_nor_make_a_state_infinite(data, kind):
-    name, yaw = kind
-    widths = {"wheels": 2, "imu": 9} if name == "skid" else {each: len(c) for each, c in CHANNELS.items()}
-    estimator = LiveFilter(HUSKY if name == "skid" else ROBOT, name, initial_yaw_rad=yaw)
-    estimator.step({"wheels": ("wheels", None)})
-    assert estimator.dropped["wheels: unreadable"] == 1
-    sound = [
-        {"wheels": _wheels(0.02 * k, 2), "imu": Reading(np.array([0.02 * k]), np.zeros((1, 9)))}
-        for k in range(60)
-    ]
-    for readings in sound if name == "skid" else (sample.readings for sample in list(replay(log()))[40:101]):
-        estimator.step(readings)
-    for readings in data.draw(garbage(widths)):
-        for estimate in (*estimator.step(readings), estimator.latest):
-            assert np.isfinite(estimate.mean).all()
-            assert (np.isfinite(estimate.std) & (estimate.std > 0)).all()
-            assert not (np.abs(estimate.slip_ratio) > 1.0).any()
-            assert not np.isinf(estimate.slip_std).any()
-    after = settled(estimator, ({"wheels": _wheels(1e3 + 0.02 * k, widths["wheels"])} for k in range(3)))
-    assert after[-1].time_s > 1e3  # it goes on whatever came before
-
-
-def _wheels(time_s, width):
-    return Reading(np.array([time_s]), np.zeros((1, width)))
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("stream", ["wheels", "imu"])
+def test_what_is_no_reading_is_left_out_and_counted(stream, kind):
+    estimator = made(kind)
+    for k, reading in enumerate(WRONG):
+        estimator.step({"wheels": wheels_of(kind, 0.02 * k)})
+        for estimate in estimator.step({stream: reading}):
+            assert_sound(estimate, kind)
+    assert estimator.dropped[f"{stream}: unreadable"] >= 10
+    for nothing in (None, 0, "wheels"):
+        assert estimator.step(nothing) == []
+    assert_goes_on(estimator, kind, 1.0)
 
 
 def test_columns_go_by_name():
@@ -365,6 +454,9 @@ def test_columns_go_by_name():
     assert np.isnan(estimate.current_a).all()
 
 
+GYRO_LESS = {"wheels": HUSKY.rate_channels, "imu": ("accel_x_mps2",)}
+
+
 @pytest.mark.parametrize(
     ("robot", "name", "options", "message"),
     [
@@ -373,13 +465,13 @@ def test_columns_go_by_name():
         (ROBOT, "vio15", {"initial_yaw_rad": np.nan}, "initial_yaw_rad is nan"),
         (HUSKY, "vio15", {}, "skid_steer"),
         (ROBOT, "skid", {}, "robot agrimaro has the drive 'swerve': this filter is for 'skid_steer'"),
-        (HUSKY, "skid", {"channels": {"wheels": SIDES[:1]}}, "'speed_right_mps' must be among them"),
         (
             HUSKY,
             "skid",
-            {"channels": {"wheels": SIDES, "imu": ("roll_rad",)}},
-            "'gyro_z_radps' must be among",
+            {"channels": {"wheels": ("speed_left_mps",)}},
+            "'speed_right_mps' must be among them",
         ),
+        (HUSKY, "skid", {"channels": GYRO_LESS}, "'gyro_z_radps' must be among them"),
         (
             HUSKY,
             "skid",
@@ -387,11 +479,17 @@ def test_columns_go_by_name():
             "rate of 'imu' is 0.0 Hz, a number above zero is required",
         ),
         (HUSKY, "skid", {"rate_hz": {"wheels": np.nan}}, "rate of 'wheels' is nan Hz"),
+        (
+            UGV,
+            "tracked",
+            {"channels": {"wheels": ("speed_left_mps",)}},
+            "'speed_right_mps' must be among them",
+        ),
     ],
 )
-def test_invalid_options_are_refused(robot, name, options, message):
+def test_what_does_not_fit_is_refused(robot, name, options, message):
     with pytest.raises(ConfigError, match=message):
-        LiveFilter(robot, name, **options)
+        estimator_of(robot, name, **options)
 
 
 STARTS_S = np.arange(3.0, 15.0, 0.235)

@@ -8,14 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrain.estimation.live import REWIND_S, LiveFilter
+from terrain.estimation.live import REWIND_S, LiveFilter, LiveObserver
+from terrain.estimation.models.choice import make_observer
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
 from terrain.simulation.conditions import Faults
-from terrain.simulation.run import simulate_run
+from terrain.simulation.run import simulate, simulate_run
+from terrain.simulation.tracked import PrescribedSlip
 
-ROBOT = load_robot("agrimaro")
+ROBOT, UGV = load_robot("agrimaro"), load_robot("orchard_ugv")
 STREAMS = ("wheels", "steering", "imu", "odometry")
 PERIOD_S = 0.02
 FIRST, N_MIXED, N_AFTER = 100, 25, 15
@@ -40,9 +42,24 @@ def bare(sample):
     return {name: sample.readings[name] for name in STREAMS if name in sample.readings}
 
 
-def drive(steps, now=False):
+OBSERVED = ("wheels", "imu", "gnss", "compass")
+
+
+@cache
+def tracked():
+    """Readings of a tracked robot, step by step, and their channels."""
+    speeds = 0.5 + 0.2 * np.sin(np.arange(201)[:, None] / [20.0, 30.0])
+    run = simulate(UGV, speeds, PrescribedSlip(0.85, 0.8), 4)
+    streams = {name: run.streams[name] for name in OBSERVED}
+    steps = [(sample.time_s, sample.readings) for sample in replay(replace(run, streams=streams))]
+    return steps[: FIRST + N_MIXED + N_AFTER], {name: stream.channels for name, stream in streams.items()}
+
+
+def drive(steps, now=False, observer=None):
     """Return an estimator that was given readings step by step, and the time of each where `now` says so."""
     estimator = LiveFilter(ROBOT)
+    if observer is not None:
+        estimator = LiveObserver(make_observer(observer, UGV), UGV, tracked()[1])
     for time_s, readings in steps:
         estimator.step(readings, time_s if now else None)
     return estimator
@@ -52,14 +69,14 @@ def in_order():
     return [(sample.time_s, bare(sample)) for sample in samples()[: FIRST + N_MIXED + N_AFTER]]
 
 
-def delayed(delays_of):
+def delayed(delays_of, steps=None):
     """Return steps whose readings come later, by stream a number of steps for each of the mixed ones.
 
     What is late of the wheels keeps its order: the next sample comes no earlier.
     """
-    steps = in_order()
-    arrivals = [(time_s, {name: [] for name in STREAMS}) for time_s, _ in steps]
-    last = dict.fromkeys(STREAMS, 0)
+    steps = steps or in_order()
+    arrivals = [(time_s, {name: [] for name in (*STREAMS, *OBSERVED)}) for time_s, _ in steps]
+    last = dict.fromkeys((*STREAMS, *OBSERVED), 0)
     for k, (_, readings) in enumerate(steps):
         for name, reading in readings.items():
             mixed = name in delays_of and 0 <= k - FIRST < N_MIXED
@@ -92,8 +109,9 @@ def assert_same(estimator, expected):
         for one in (estimator, expected)
     )
     assert counts == expected_counts
-    for one, other in zip(estimator._history._memories, expected._history._memories, strict=True):
-        assert one.tobytes() == other.tobytes()
+    if isinstance(estimator, LiveFilter):
+        for one, other in zip(estimator._snapshot(), expected._snapshot(), strict=True):
+            assert one.tobytes() == other.tobytes()
 
 
 @cache
@@ -117,6 +135,14 @@ def test_late_wheels_give_the_numbers_of_wheels_in_time(wheels, delays_of):
     """Ticks without wheels, which were done for want of them, leave nothing behind."""
     estimator = drive(delayed({**delays_of, "wheels": wheels}), now=True)
     assert_same(estimator, undelayed(now=True))
+
+
+@pytest.mark.parametrize("name", ["tracked", "slip-learning", "gyrodometry"])
+@settings(deadline=None, max_examples=8)
+@given(st.dictionaries(st.sampled_from(OBSERVED[1:]), delays, min_size=1))
+def test_an_observer_takes_late_samples_as_those_in_time(name, delays_of):
+    steps, _ = tracked()
+    assert_same(drive(delayed(delays_of, steps), observer=name), drive(steps, observer=name))
 
 
 @pytest.mark.parametrize("name", STREAMS)
