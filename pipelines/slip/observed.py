@@ -26,7 +26,10 @@ from pipelines.slip.tracks import (
     tracks_report,
 )
 from terrain.errors import ConfigError
-from terrain.estimation.estimate import (
+from terrain.estimation.models.choice import BY_MODEL
+from terrain.estimation.models.observer import ObserverStatus
+from terrain.estimation.models.slip_model import read_slip_model
+from terrain.estimation.observe import (
     SETTLED,
     ObserverEstimate,
     ObserverSummary,
@@ -34,9 +37,6 @@ from terrain.estimation.estimate import (
     summarize_observer,
     with_estimates,
 )
-from terrain.estimation.models.choice import BY_MODEL
-from terrain.estimation.models.observer import ObserverStatus
-from terrain.estimation.models.slip_model import read_slip_model
 from terrain.records import Array, RunLog
 from terrain.robots import Robot, packaged_robot
 

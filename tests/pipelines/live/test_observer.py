@@ -15,7 +15,8 @@ from pipelines.live.classifying import Classifier
 from pipelines.live.observer import Observer
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.estimation.estimate import enriched, estimate_run, observe_run, with_estimates
+from terrain.estimation.estimate import enriched, estimate_run
+from terrain.estimation.observe import observe_run, with_estimates
 from terrain.logs.replay import replay
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot

@@ -6,11 +6,6 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError
-from terrain.estimation.estimate import (
-    observe_run,
-    summarize_observer,
-    with_estimates,
-)
 from terrain.estimation.filter import FilterModel, FilterSettings, Noise, differentiate
 from terrain.estimation.models.choice import OBSERVERS, make_observer, observers_of
 from terrain.estimation.models.observer import (
@@ -28,6 +23,7 @@ from terrain.estimation.models.slip_model import (
     read_slip_model,
     write_slip_model,
 )
+from terrain.estimation.observe import observe_run, summarize_observer, with_estimates
 from terrain.kernels import njit
 from terrain.logs.read import read_run
 from terrain.logs.write import write_run
