@@ -179,7 +179,7 @@ class _History:
 
 
 class Live(ABC):
-    """What takes the samples of a robot as they come: a queue a stream, ticks, and the way back for what is late.
+    """What takes the samples of a robot as they come: a queue a stream, ticks, and the rewind for what is late.
 
     Attributes
     ----------

@@ -138,11 +138,13 @@ def test_late_wheels_give_the_numbers_of_wheels_in_time(wheels, delays_of):
 
 
 @pytest.mark.parametrize("name", ["tracked", "slip-learning", "gyrodometry"])
-@settings(deadline=None, max_examples=8)
-@given(st.dictionaries(st.sampled_from(OBSERVED[1:]), delays, min_size=1))
-def test_an_observer_takes_late_samples_as_those_in_time(name, delays_of):
+def test_an_observer_takes_late_samples_as_those_in_time(name):
     steps, _ = tracked()
-    assert_same(drive(delayed(delays_of, steps), observer=name), drive(steps, observer=name))
+    expected = drive(steps, observer=name)
+    for seed in range(4):
+        drawn = np.random.default_rng(seed).integers(0, MOST_STEPS + 1, (3, N_MIXED)).tolist()
+        delays_of = dict(zip(OBSERVED[1 : 4 - seed % 2], drawn, strict=False))
+        assert_same(drive(delayed(delays_of, steps), observer=name), expected)
 
 
 @pytest.mark.parametrize("name", STREAMS)
