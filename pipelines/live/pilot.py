@@ -31,8 +31,9 @@ from terrain.control.slip_table import SlipTable, load_slip_table
 from terrain.control.switching import OutputStatus, TerrainSource
 from terrain.control.traction import TractionStatus
 from terrain.estimation.clocks import Clocks, finite_twist
+from terrain.estimation.feed import places_among
 from terrain.estimation.health import SENSORS, Health
-from terrain.estimation.live import CHANNELS, LiveEstimate, LiveFilter, places_among
+from terrain.estimation.live import CHANNELS, LiveEstimate, LiveFilter
 from terrain.extension import correct_live
 from terrain.records import Array, Command, Reading, Sample
 from terrain.robots import Robot
