@@ -88,9 +88,8 @@ class Protocol(NamedTuple):
     deal: Callable[[Array, Array, int, np.random.Generator], Array]
     repeats: int = 1  #: fold assignments by default; 1 where there is one only
     note: str = ""  #: what a reader of the figures must know of it
-    whole_runs: bool = (
-        True  #: whether a run is on one side of a split, but for the blocks of a class with one unit
-    )
+    #: whether a run is on one side of a split, but for the blocks of a class with one unit
+    whole_runs: bool = True
 
 
 def _leave_one_out(y: Array, group: Array, n_folds: int, rng: np.random.Generator) -> Array:

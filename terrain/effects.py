@@ -149,9 +149,8 @@ class Parameter(NamedTuple):
     homes: tuple[Home, ...] = ()  #: where the description has it; all of them change together
     inverse: Inverse | None = None
     one_sided: bool = False  #: sensitivities towards the positive side only: a backlash is not negative
-    scatter_rank: int = (
-        0  #: from 1, place in the order in which values that scatter from run to run are drawn
-    )
+    #: from 1, place in the order in which values that scatter from run to run are drawn
+    scatter_rank: int = 0
     as_percent: bool = False  #: pages write it as a percentage
     is_error: bool = False  #: of something that is there, so that pages write "off by"
     deprecated: tuple[str, ...] = ()  #: former names, accepted in files and on the command line
@@ -1264,9 +1263,8 @@ SCHEMA = 1  #: Version of the section that is read and written.
 #: Keys of the section that name no parameter; the region is read by :mod:`terrain.robots.region`.
 NOT_EFFECTS = ("schema", "covariance", "region")
 
-ROUNDING = (
-    1e-5  #: A covariance is written with seven digits: correlations may miss symmetry and sign by as much.
-)
+#: A covariance is written with seven digits: correlations may miss symmetry and sign by as much.
+ROUNDING = 1e-5
 
 
 def checked_effects(place: str, values: Mapping[str, float], drive: str) -> dict[str, float]:

@@ -132,9 +132,8 @@ def _without(robot: AnyRobot, names: Collection[str]) -> AnyRobot:
 #: Time outside after which a live drive is: shorter ones, as of a bump, are in the percentiles' tails.
 OUTSIDE_S = 1.0
 
-MAX_STEP_S = (
-    0.1  #: Longest time that a live sample stands for: after a gap nothing is known of what was driven.
-)
+#: Longest time that a live sample stands for: after a gap nothing is known of what was driven.
+MAX_STEP_S = 0.1
 #: Edges of a range: single samples, as of a start or a wheel that spun, are not what was validated.
 PERCENTILES = (1.0, 99.0)
 

@@ -110,7 +110,8 @@ def content_digest(function: Callable[..., Any], options: Mapping[str, Any] | No
             if value.__module__.partition(".")[0] in ("numba", "numpy", "math"):
                 continue
             cells = [cell.cell_contents for cell in value.__closure__ or ()]
-            waiting += [value.__defaults__, *cells, *_globals_read(value.__code__, value.__globals__, digest)]
+            defaults = value.__defaults__, tuple((value.__kwdefaults__ or {}).items())
+            waiting += [*defaults, *cells, *_globals_read(value.__code__, value.__globals__, digest)]
         elif isinstance(value, (tuple, list, frozenset)):
             digest.update(f"{type(value).__name__} {len(value)}".encode())
             waiting += value if not isinstance(value, frozenset) else sorted(value, key=repr)
@@ -173,13 +174,17 @@ def _loaded_names(code: CodeType) -> list[str]:
 
 
 def _has_docstring(code: CodeType) -> bool:
-    return bool(code.co_consts) and isinstance(code.co_consts[0], str)
+    named = not code.co_name.startswith(
+        "<"
+    )  # of lambdas and comprehensions the first constant is no docstring
+    return named and bool(code.co_consts) and isinstance(code.co_consts[0], str)
 
 
 def _type_content(value: type) -> bytes:
     if issubclass(value, Enum):
         return repr([(member.name, member.value) for member in value]).encode()
-    return f"{value.__module__}.{value.__qualname__} {getattr(value, '_fields', '')}".encode()
+    fields, defaults = getattr(value, "_fields", ()), getattr(value, "_field_defaults", {})
+    return f"{value.__module__}.{value.__qualname__} {fields} {defaults}".encode()
 
 
 class _ContentCache(FunctionCache):

@@ -61,9 +61,8 @@ class Proposal(NamedTuple):
     end_s: float
     terrain: str
     confidence: float  #: mean probability of that terrain over the windows
-    supported_ratio: (
-        float  #: share of the windows whose prediction training runs support; 1 where not counted
-    )
+    #: share of the windows whose prediction training runs support; 1 where not counted
+    supported_ratio: float
     unknown_ratio: float  #: share of the windows that are like no terrain that was learned
     n_windows: int  #: in the stretch
 

@@ -191,9 +191,8 @@ class StiffnessFigures(NamedTuple):
     gain: float  #: gain, gain_ci: the first less the second, run by run
     gain_ci: Interval
     least_cost_accuracy: float  #: accuracy of the class of least expected cost
-    soft_hard_ratio: (
-        float  #: windows of which soft was taken for hard or hard for soft, by the most probable class
-    )
+    #: windows of which soft was taken for hard or hard for soft, by the most probable class
+    soft_hard_ratio: float
     clusters: LevelClusters | None  #: None where there are too few runs
 
 

@@ -44,9 +44,8 @@ FINE_S = 0.02  #: Grid on which what is expected is laid out; straight lines bet
 #: skid-steer robot is in none of its wheels.
 CLOCKED = (GYRO, SPEED_X, HEADING)
 
-MIN_EXCITATION = (
-    0.02  #: Standard deviation (rad/s, m/s) of the prediction, below which a channel measures no clock.
-)
+#: Standard deviation (rad/s, m/s) of the prediction, below which a channel measures no clock.
+MIN_EXCITATION = 0.02
 MIN_CORRELATION = 0.7  #: Least correlation at the best shift.
 #: A peak elsewhere is no rival if it leaves so much more of the variance, beside the relative margin.
 RIVAL_FLOOR = 0.02
@@ -201,9 +200,8 @@ MIN_STD_S = 0.002  #: A tenth of the grid's step: runs that agree to less are li
 #: s.
 SIGMAS, GROSS_S = 3.0, 0.1
 
-SHAPE_GAIN = (
-    10.0  #: Twice the log-likelihood by which a delay has to fit better than a low-pass of the encoders.
-)
+#: Twice the log-likelihood by which a delay has to fit better than a low-pass of the encoders.
+SHAPE_GAIN = 10.0
 UNKNOWN = (math.nan, math.nan)
 
 

@@ -380,9 +380,8 @@ class Reading(NamedTuple):
     correlation: Array  #: (runs, channels) under it
     gain: Array  #: (runs,) of twice the log-likelihood
     mends: Array  #: (runs,) whether a channel follows the wheels that did not, and none is worse
-    suits: (
-        Array  #: (runs,) whether the gain is as clear and none is worse; a channel may have followed before
-    )
+    #: (runs,) whether the gain is as clear and none is worse; a channel may have followed before
+    suits: Array
 
 
 def candidate_changes(robot: Robot) -> Changes:
@@ -466,9 +465,8 @@ def _gain_sentence(best: Reading, before: Agreement, shown: Sequence[int]) -> st
 # The logarithms of the gains have a prior: what robots and effects do to them.  A reading of the logs in which
 # a column is in another unit costs a fixed evidence, and is taken where the gains cost more without it.
 
-MIN_FIT = (
-    0.7  #: Correlation about zero from which a gain is used: of a run that hardly responds it says nothing.
-)
+#: Correlation about zero from which a gain is used: of a run that hardly responds it says nothing.
+MIN_FIT = 0.7
 #: Gain of the yaw rate, mean of its logarithm and standard deviations to below and above: skid-steer robots have an
 #: effective track of 1 to 2.5 times the nominal one (Mandow et al., IROS 2007), and the bounds of the catalogue,
 #: which are gains of 0.2 and 2, are within three; a swerve robot turns as its wheels do.
@@ -483,14 +481,12 @@ ACCEL_SPREAD = 0.25  #: Of the accelerometer over the speed: it sees bumps too.
 #: Of the currents: constants of motors and the resistance of a terrain are known to a factor of 10.
 CURRENT_GAIN = (0.7, 1.2)
 
-COST = (
-    16.0  #: Evidence that a unit has to bring, in minus twice the log-likelihood: four standard deviations.
-)
+#: Evidence that a unit has to bring, in minus twice the log-likelihood: four standard deviations.
+COST = 16.0
 LEFT = 9.0  #: Cost of the gains under the right reading, at most: three standard deviations.
 UNIT_TIE = 1.5  #: Readings whose costs differ by less cannot be distinguished: their odds are within 2.
-MIN_USUAL_RATIO = (
-    0.2  #: Ratio of runs without a fault, from which they are what the others are compared with.
-)
+#: Ratio of runs without a fault, from which they are what the others are compared with.
+MIN_USUAL_RATIO = 0.2
 #: A run of another unit than the others agrees with them after its repair: within so many times their scatter, the
 #: second at the least and the first at the most, in the logarithm.  Where its motion would be too small it is the
 #: second, since a run may slip or stall, by any factor.

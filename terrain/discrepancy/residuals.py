@@ -22,9 +22,8 @@ from terrain.robots import BicycleRobot
 from terrain.simulation.planar.motion import Planar, move
 from terrain.simulation.planar.replay import corrected_inputs, replay, sense
 
-CUTOFF_HZ = (
-    2.5  #: Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz.
-)
+#: Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz.
+CUTOFF_HZ = 2.5
 INPUT_CUTOFFS = 2.4  #: Cut-off of the inputs of the simulation, over that of the common low-pass.
 #: Cut-off of the wheel speeds that serve as instruments of the sensitivities, over that of the common low-pass: see
 #: :func:`rows_of`.
@@ -32,14 +31,12 @@ INSTRUMENT_CUTOFF_RATIO = 0.6
 
 SAME_CLOCK = 0.05  #: Ratio by which the runs' clocks may differ: one window serves all of them.
 CLOCKS_PER_CUTOFF = 10.0  #: Rate of the replay's clock over the cut-off of the common low-pass.
-ROWS_PER_CUTOFF = (
-    2.5  #: Rows a second over the cut-off: the low-pass is down by 50 dB at half the rate of the rows.
-)
+#: Rows a second over the cut-off: the low-pass is down by 50 dB at half the rate of the rows.
+ROWS_PER_CUTOFF = 2.5
 TAPS_PER_CUTOFF = 2.4  #: Half length of the low-pass times its cut-off.
 MIN_KNOWN = 0.75  #: Ratio of the low-pass's weight that has to be known for a row, where a channel has holes.
-SETTLE_S = (
-    0.5  #: Start and end of a run left out, beside those of the low-pass: the replay starts in steady motion.
-)
+#: Start and end of a run left out, beside those of the low-pass: the replay starts in steady motion.
+SETTLE_S = 0.5
 #: A shorter run may have its one change of command at its start, which is kept if it is in steady motion.
 SHORT_S = 10.0
 #: Steady motion: for so long no wheel's speed and no steering changes by more than that.

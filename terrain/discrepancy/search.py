@@ -202,9 +202,8 @@ class Rival(NamedTuple):
     """An effect that fits as well as a cause in its place."""
 
     effect: Effect
-    behind: (
-        float  #: by how much it fits worse, as minus twice a log-likelihood, over the inflation of the cause
-    )
+    #: by how much it fits worse, as minus twice a log-likelihood, over the inflation of the cause
+    behind: float
     change: Array  #: (p,) of its parameters, by a fit of its own; a value may be at its bound
     std: Array
 

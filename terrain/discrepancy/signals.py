@@ -46,14 +46,12 @@ class Signals:
     #: (n, wheels) wheel speeds with the nominal radius, of a car-like robot (n, 1) that of the rear axle; NaN where a
     #: logger was silent
     wheel_speed_mps: Array
-    steer_rad: (
-        Array  #: (n, steered wheels) steering angles, zeros taken off; (n, wheels) zeros of a robot without
-    )
+    #: (n, steered wheels) steering angles, zeros taken off; (n, wheels) zeros of a robot without
+    steer_rad: Array
     grade_rad: Array  #: (n,) measured tilt, uphill and left side up positive; 0 where none is measured
     roll_rad: Array
-    measured: (
-        Array  #: (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
-    )
+    #: (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
+    measured: Array
     session: str = ""  #: that the run is part of; empty where that is not known
 
     def __post_init__(self) -> None:

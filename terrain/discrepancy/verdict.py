@@ -55,9 +55,8 @@ class Cause(NamedTuple):
     name: str
     aliases: tuple[str, ...]
     parameters: tuple[Value, ...]  #: values, over what the simulation has of them already
-    held_out_gain: (
-        float  #: ratio of the whitened squared residual that it removes from runs left out of its fit
-    )
+    #: ratio of the whitened squared residual that it removes from runs left out of its fit
+    held_out_gain: float
     gain_ci: tuple[float, float]  #: its 95 % interval by bootstrap over runs
     channels: tuple[str, ...]  #: where it shows, the clearest first
     z: float  #: its evidence, see :class:`terrain.discrepancy.selection.WaldTest`
@@ -106,9 +105,8 @@ class BySession(NamedTuple):
     terrain: str  #: label of the runs
     sessions: tuple[SessionValue, ...]
     p: float  #: probability of such differences where sessions agree; NaN for one session
-    between_std: (
-        float  #: standard deviation between sessions beyond that of their values; NaN for one session
-    )
+    #: standard deviation between sessions beyond that of their values; NaN for one session
+    between_std: float
     agree: bool  #: whether sessions may have one value (``p`` from :data:`AGREE_P`); one session does
 
 

@@ -38,9 +38,8 @@ class BodyMotion(NamedTuple):
     """Motion of the robot as its camera saw it; NaN where it saw nothing."""
 
     time_s: Array  #: (n,) stamps of the stream
-    speed_mps: (
-        Array  #: (n, 2) of the CAMERA point, forward and left in body axes: ``v_B + w x r`` (6.5, corrected)
-    )
+    #: (n, 2) of the CAMERA point, forward and left in body axes: ``v_B + w x r`` (6.5, corrected)
+    speed_mps: Array
     yaw_rate_radps: Array  #: (n,) about the body's z axis
     roll_rad: Array  #: (n,) against the fixed frame; left side up positive
     pitch_rad: Array  #: (n,) the same; nose down positive

@@ -56,9 +56,8 @@ RATE_KNOWN = 0.01
 #: Share of the variance by which a rival must be worse even when the best peak explains nearly everything.
 RIVAL_FLOOR = 0.05
 
-SAME_PEAK_SIGMAS = (
-    4.0  #: Two peaks of the grid that lie closer than this many widths of the low-pass are one.
-)
+#: Two peaks of the grid that lie closer than this many widths of the low-pass are one.
+SAME_PEAK_SIGMAS = 4.0
 #: Between the clocks of wheels and IMU: in more, a robot that begins to turn is seen to turn without wheels, and the
 #: effective track is wrong by as much as its turns are short.
 MAX_APART_S = 0.1

@@ -58,12 +58,10 @@ MIN_EQUAL = 6
 #: Fingerprints of one overlap agree in their offset within this, and a tenth of the time between them.
 OFFSET_TOLERANCE_S = 0.3
 
-MAX_HOLE_S = (
-    15.0  #: An overlap may lose its fingerprints for so long, as at a standstill, and is one overlap still.
-)
-EDGE_S = (
-    1.5  #: An overlap that reaches so close to the end of a run reaches its end: the first peaks come later.
-)
+#: An overlap may lose its fingerprints for so long, as at a standstill, and is one overlap still.
+MAX_HOLE_S = 15.0
+#: An overlap that reaches so close to the end of a run reaches its end: the first peaks come later.
+EDGE_S = 1.5
 N_FILES = 32
 #: 2^64 over the golden ratio: the first bits of a product with it are spread evenly (Knuth, The Art of Computer
 #: Programming 3, section 6.4).

@@ -25,16 +25,14 @@ from scipy.ndimage import gaussian_filter1d, maximum_filter1d, minimum_filter1d
 
 from terrain.records import Array
 
-SIGMA_S = (
-    0.2  #: Width of the low-pass under which signals are compared: lags of 0.1 s and vibration hardly matter.
-)
+#: Width of the low-pass under which signals are compared: lags of 0.1 s and vibration hardly matter.
+SIGMA_S = 0.2
 #: Under it no sign is read from a signal.  Measured, of eleven sessions and recordings: 0.4 to 0.9 along x and y (0.3
 #: of a Marmotte along x, on snow), 0.95 to 1.00 of the gyro.
 MIN_CORRELATION = 0.2
 
-MIN_GYRO_CORRELATION = (
-    0.5  #: The gyro has no slip in it, and agrees with wheels of its own robot by far more.
-)
+#: The gyro has no slip in it, and agrees with wheels of its own robot by far more.
+MIN_GYRO_CORRELATION = 0.5
 MIN_SAMPLES = 200  #: Ten seconds at 20 Hz: fewer show no sign.
 MIN_SIGN_GRAVITY_MPS2 = 5.0  #: Half of gravity: less along z is no upright IMU, nor one upside down.
 #: Yaw rate for each m/s of difference of the sides, in rad/m: the inverse of the track, which is wider than 0.1 m.

@@ -218,9 +218,8 @@ IMPLAUSIBLE_GRAVITY_RATIO = (0.8, 1.2)
 #: that it is doubtful.
 NO_GRAVITY_RATIO = 0.2
 
-UPRIGHT_RATIO = (
-    0.9  #: Least part of the mean specific force along z, a tilt of 26 degrees; measured runs reach 0.97.
-)
+#: Least part of the mean specific force along z, a tilt of 26 degrees; measured runs reach 0.97.
+UPRIGHT_RATIO = 0.9
 TILTED_RATIO = 0.7  #: Less is a tilt of 45 degrees: another axis points up.
 MIN_GRAVITY_S = 1.0  #: Over shorter runs a brake is as large as gravity.
 
@@ -370,9 +369,8 @@ DURATION_S = (0.5, 2 * 24 * 3600.0)
 #: Largest magnitudes, in SI units, that sensors of a vehicle report: gyros to 4000 deg/s, accelerometers to 40 g.
 DOUBTFUL_VALUES: dict[str, float] = {"gyro": 70.0, "accel": 400.0, "current": 1000.0, "speed": 50.0}
 
-MIN_CONSTANT_S = (
-    10.0  #: A current may rest at 0, and a quantised speed at one step, throughout a command of 6 s.
-)
+#: A current may rest at 0, and a quantised speed at one step, throughout a command of 6 s.
+MIN_CONSTANT_S = 10.0
 #: Common part of the streams over the longest: below the first doubtful, below the second implausible; the published
 #: runs reach 0.9.
 MIN_OVERLAP_RATIO = (0.5, 0.1)

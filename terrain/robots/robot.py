@@ -188,9 +188,8 @@ class Robot(ABC):
 
     name: str  #: what run logs call it
     wheel_radius_m: float  #: nominal radius of a wheel
-    track_m: (
-        float  #: distance between the two sides; of a swerve robot, from the third wheel to the others' line
-    )
+    #: distance between the two sides; of a swerve robot, from the third wheel to the others' line
+    track_m: float
     wheelbase_m: float  #: distance between front and rear wheel
     mass_kg: float  #: total mass without payload
     parts: Mapping[str, Part] = field(

@@ -401,9 +401,8 @@ class TractionSamples(NamedTuple):
     slip_std: Array
     traction_ratio: Array  #: traction_ratio, traction_std: thrust over load
     traction_std: Array
-    lag_std: (
-        Array  #: change of the thrust over load within :data:`LAG_S`; unlike noise it does not average out
-    )
+    #: change of the thrust over load within :data:`LAG_S`; unlike noise it does not average out
+    lag_std: Array
 
 
 class RunBins(NamedTuple):

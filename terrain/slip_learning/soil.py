@@ -421,14 +421,12 @@ def cohesion_profile(
 class ModulusSpread(NamedTuple):
     """Pressure in Pa at a depth of one wheel width that carries the measured load at the measured sinkage."""
 
-    rolling_pa: (
-        float  #: median of trials that roll straight ahead, |slip| below 0.3 and angle below 8 degrees
-    )
+    #: median of trials that roll straight ahead, |slip| below 0.3 and angle below 8 degrees
+    rolling_pa: float
     smallest_pa: float  #: smallest_pa, largest_pa: 5 and 95 % over all trials
     largest_pa: float
-    load_error_ratio: (
-        float  #: root mean square of the logarithm of the load by the median modulus over the measured
-    )
+    #: root mean square of the logarithm of the load by the median modulus over the measured
+    load_error_ratio: float
 
 
 def modulus_spread(fit: LawFit, trials: Trials) -> ModulusSpread:
@@ -763,9 +761,8 @@ class WheelResult:
     #: cohesion, modulus: friction by cohesion, and the modulus of the soil as it seems from each trial
     cohesion: tuple[CohesionRow, ...]
     modulus: ModulusSpread
-    surrogate_slip: (
-        Misfit  #: surrogate_slip, surrogate_angle: errors of a polynomial of slip and angle, for reference
-    )
+    #: surrogate_slip, surrogate_angle: errors of a polynomial of slip and angle, for reference
+    surrogate_slip: Misfit
     surrogate_angle: Misfit
     checked: Checked | None  #: on the trials of ``--check``; None without any
     not_identified: tuple[str, ...]  #: a sentence for each thing that these trials cannot say

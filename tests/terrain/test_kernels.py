@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from collections import namedtuple
 from enum import IntEnum
 from pathlib import Path
 
@@ -77,12 +78,18 @@ class Colour(IntEnum):
     RED = 1
 
 
+def settings(gain):
+    """Return a class of settings with a default, under one name."""
+    return namedtuple("Settings", "gain", defaults=[gain], module=__name__)
+
+
 GLOBALS = {
     "number": 1.0,
     "array": np.zeros(3),
     "kind": record({"x": float}),
     "colour": Colour,
     "words": ("a", 1),
+    "named": settings(1.0),
 }
 CHANGED = {
     "number": -1.0,
@@ -90,12 +97,13 @@ CHANGED = {
     "kind": record({"x": int}),
     "colour": IntEnum("Colour", {"RED": 2}, module=__name__),
     "words": ("a", 2),
+    "named": settings(2.0),
 }
 
 
 def reading(names):
     scope = dict(GLOBALS, **names)
-    exec("def read():\n    return number, array, kind, colour, words", scope)
+    exec("def read():\n    return number, array, kind, colour, words, named", scope)
     function = scope["read"]
     function.__module__ = __name__
     return function

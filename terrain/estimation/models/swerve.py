@@ -50,7 +50,7 @@ Source: Danzi, AgriMaRo thesis, 4.3-4.5 and 6.1.  Corrected:
   the filter diverges on a straight run; they are a_x and a_y, as in (6.6);
 - (4.36), (4.44): the yaw rate stands after the accelerations; here states go by name, in the order of (6.1);
 - (4.42), (4.46): place and angle of wheel 1 stand for every wheel; each has its own;
-- 4.5.1 blames the nonlinearity of the 14 states: it is observability, no row measures the speed over ground;
+- 4.5.1 names the nonlinearity of the 14 states: it is observability, no row measures the speed over ground;
 - (6.2): the signs of the Coriolis terms are flipped; those of (4.33), (4.34) are right;
 - (6.5): v - w x r; it is v + w x r, as in (6.6);
 - (4.38), (4.40), (6.8), (6.9)-(6.14): see :func:`thesis_noise`;

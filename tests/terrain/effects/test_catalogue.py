@@ -188,8 +188,8 @@ for extended in (corrected(replace(robot, effects={name: 0.05})), _built(robot, 
 assert quantity(name, 0.05) == "5\N{NO-BREAK SPACE}%"
 assert limit_text(Limit(name, 0.05, "ratio", "z"), False).startswith("A gear wear off by under 5")
 ticking = replace(robot, effects={"ticks_ratio": 0.1})
-undone = Correction(ticking)("wheels", ("motor_1_radps",), np.zeros(1), np.ones((1, 1)))[1]
-assert undone.item() == 1.1 and not corrected(ticking).effects
+samples = Correction(ticking)("wheels", ("motor_1_radps",), np.zeros(1), np.ones((1, 1)))[1]
+assert samples.item() == 1.1 and not corrected(ticking).effects
 value = Value("ticks_ratio", 0.1, "ratio", 0.09, 0.11)
 assert in_robot_terms("ticks", [value], robot) == "wheels that count 10 % too much"
 '''

@@ -11,6 +11,7 @@ from terrain.simulation.planar.model import Ground
 from terrain.simulation.run import simulate
 from terrain.slip_learning.ground_changes import slip_step
 from terrain.slip_learning.measured import (
+    _misfit,
     estimate_delay,
     measured_slip,
     outside_source,
@@ -201,3 +202,11 @@ def test_what_cannot_be_measured_is_refused_in_one_sentence(make_omni_run, robot
         measured_slip(run, robotino, window_s=20.0)
     with pytest.raises(ConfigError, match="lengths above zero"):
         measured_slip(run, robotino, window_s=0.0)
+
+
+def test_round_off_of_a_straight_drive_fits_nothing():
+    rng = np.random.default_rng(0)
+    wheels, outside = rng.normal(size=(50, 3)), rng.normal(size=(50, 3))
+    straight, rounded = wheels * [1.0, 0.0, 0.0], wheels * [1.0, 0.0, 1e-17]
+    assert _misfit(rounded, outside) == _misfit(straight, outside)
+    assert _misfit(wheels, outside) < _misfit(straight, outside)
