@@ -88,7 +88,9 @@ class Soak(Result):
     faults: Mapping[str, int] = described("by kind, how often it was made")
     errors: Mapping[str, int] = described("by code, how often the service named one")
     rss_mb: tuple[float, ...] = described("resident memory once a minute, from the first", "MB")
-    memory_growth: float = described("of the mean of the last third over the first; accepted or not from two minutes on", "1")
+    memory_growth: float = described(
+        "of the mean of the last third over the first; judged from two minutes on", "1"
+    )
     problems: tuple[str, ...] = described("what is not accepted, in sentences")
 
     @property
