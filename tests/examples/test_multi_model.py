@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples" / "papers"))
-sys.path.insert(0, str(Path(__file__).parents[1] / "terrain" / "estimation" / "observers"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "terrain" / "estimation" / "models"))
 
 from multi_model import SECTION_VI, Gains, MultiModel
 from test_sideslip import drive, true_slips

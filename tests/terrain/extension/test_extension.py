@@ -235,7 +235,7 @@ def test_a_skid_steer_robot_without_sections_is_corrected_in_its_samples():
 
 EDGES = {
     "terrain/estimation/estimate.py",
-    "terrain/estimation/models/estimate.py",
+    "terrain/estimation/observe.py",
     "terrain/estimation/tuning.py",
     "terrain/slip_learning/learn.py",
     "pipelines/live/windows.py",
