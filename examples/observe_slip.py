@@ -9,8 +9,8 @@ from terrain.estimation.live import LiveObserver
 from terrain.estimation.models.choice import make_observer
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
+from terrain.simulation.plants.tracks import Slope, Stretch
 from terrain.simulation.run import simulate
-from terrain.simulation.tracked import Slope, Stretch
 from terrain.terramechanics.soil import load_soil
 
 

@@ -3,14 +3,14 @@
 An entry holds all about an effect: bounds, formula, source, robots, channels, the stage where it acts, where a
 description has it, how it is taken off samples, and its words.
 
-Signals of the formulas are those of :mod:`terrain.simulation.planar.model`: ``u`` the speed that the wheels
+Signals of the formulas are those of :mod:`terrain.simulation.plants.planar`: ``u`` the speed that the wheels
 would roll without slip, ``v`` the speed over ground, ``d`` a steering angle, ``w`` the yaw rate, ``F`` the
 traction, ``W = m g`` the nominal weight, ``f = F / W``, ``th`` the grade (uphill positive), ``ph`` the roll
 (left side up positive), ``B`` the track, ``dv`` right minus left wheel speed and
 ``q = |dv| / (|dv| + 2 |u|)`` how tight a turn is.
 
 To add an effect, write its entry into the library, and its formula into the kernels of
-:mod:`terrain.simulation.planar`.  Everything else reads the entry.
+:mod:`terrain.simulation.plants.planar`.  Everything else reads the entry.
 
 The section ``effects`` of a robot's description has those found by ``terrain explain``.  Each parameter is a
 number with unit, source and interval like any other; the covariance has a row a parameter, and may be left

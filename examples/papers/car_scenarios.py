@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.control.paths import ReferencePath, path_from_curvature
-from terrain.simulation.car import CarDrive, Ground, level_ground
+from terrain.simulation.plants.car import CarDrive, Ground, level_ground
 
 GRIP_RATIO = 0.7
 """Of soil and grass; assumed."""

@@ -50,9 +50,8 @@ from terrain.kinematics.wheels import no_slip_twist, wheel_velocities
 from terrain.logs.schema import SIGNAL_SETS
 from terrain.records import Array, RunLog, Windows
 from terrain.robots import Robot, load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
-from terrain.simulation.scenario import STAND_S
+from terrain.simulation.scenario import STAND_S, Faults
 from terrain.slip import MIN_SPEED_MPS
 from terrain.terramechanics.soil import load_soil, soil_names
 from terrain.terramechanics.stiffness import response_of

@@ -21,9 +21,7 @@ from terrain.estimation.models.observer import ObserverStatus, ObserverTrack, ob
 from terrain.estimation.models.tracked import TrackedObserver, TrackedSettings
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
-from terrain.simulation.run import simulate
-from terrain.simulation.scenario import RATE_HZ as COMMANDS_HZ
-from terrain.simulation.tracked import (
+from terrain.simulation.plants.tracks import (
     LEVEL,
     NOISY,
     QUIET,
@@ -35,6 +33,8 @@ from terrain.simulation.tracked import (
     rut_depth,
     tracks_on,
 )
+from terrain.simulation.run import simulate
+from terrain.simulation.scenario import RATE_HZ as COMMANDS_HZ
 from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import compaction_resistance, friction_limit
 

@@ -47,8 +47,8 @@ from terrain.estimation.models.slip_model import (
 from terrain.estimation.models.slip_odometry import OBSERVED_RATIO, SlipOdometry, plain_odometry
 from terrain.records import Array, RunLog
 from terrain.robots import TrackedRobot, as_drive, load_robot
+from terrain.simulation.plants.tracks import PrescribedSlip, Slope
 from terrain.simulation.run import simulate
-from terrain.simulation.tracked import PrescribedSlip, Slope
 from terrain.terramechanics.soil import Soil, load_soil, scattered
 from terrain.terramechanics.traction import bekker_pressure, mobilised_ratio, plate_sinkage
 

@@ -46,7 +46,7 @@ they are reported as the paper does.
 beside the regression (28), which is then one of :math:`V_y = |V_x| \sum_i a_i X_i`.  While a robot turns,
 friction is directed against the turning, and a small sideways force makes it drift at a speed in proportion
 to the yaw rate; on a grade it turns about a point behind its middle.  By the forces of
-:mod:`terrain.simulation.tracked` these two explain 98 % of the variance of V_y in turns on sand,
+:mod:`terrain.simulation.plants.tracks` these two explain 98 % of the variance of V_y in turns on sand,
 where the eight variables of (28) explain 78 %.
 
 Laws whose motions were not driven keep what is assumed of unknown ground, with its wide standard deviation, and

@@ -72,8 +72,8 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
     from terrain.files.atomic import ensure_writable
     from terrain.logs.write import run_folder, write_run
     from terrain.robots import load_robot
-    from terrain.simulation.conditions import Conditions, Faults
     from terrain.simulation.run import BENCH_TERRAIN, COURSE, run_id_of, simulate_run
+    from terrain.simulation.scenario import Conditions, Faults
     from terrain.simulation.sensors import Gnss
     from terrain.terramechanics.soil import load_soil, soil_names
 

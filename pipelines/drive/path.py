@@ -29,7 +29,7 @@ from terrain.errors import ConfigError
 from terrain.estimation.models.observer import ObserverStatus
 from terrain.files.atomic import atomic_write
 from terrain.robots import BicycleRobot, as_drive, load_robot
-from terrain.simulation.car import CarDrive, Ground
+from terrain.simulation.plants.car import CarDrive, Ground
 from terrain.simulation.run import simulate
 from terrain.status import StatusCode
 

@@ -26,7 +26,7 @@ search reaches; at the end the drive is finished.
 
 The preview gives speed and steering ahead of bends, by the grip that the estimated cornering stiffness
 shows.  An axle under the load N carries |F| = f N.  With the cornering stiffness C_0 that the tyre has at small
-slip, the force that saturates at the grip mu is, as in :mod:`terrain.simulation.car`::
+slip, the force that saturates at the grip mu is, as in :mod:`terrain.simulation.plants.car`::
 
     f = mu (1 - exp(-q / mu)),   q = C_0 |b| / N
 
@@ -59,7 +59,7 @@ from terrain.estimation.models.observer import Observer, ObserverOutput, Observe
 from terrain.estimation.models.sideslip import RATE, ROLL, SETTINGS, SPEED, Sideslip, X
 from terrain.records import Array, RunLog
 from terrain.robots import BicycleRobot
-from terrain.simulation.car import CarCommand, CarSample
+from terrain.simulation.plants.car import CarCommand, CarSample
 from terrain.status import StatusCode
 
 
@@ -348,7 +348,7 @@ _NO_GRIP = Grip(math.nan, math.nan)
 
 
 class CarFollower:
-    """Controller of a drive along a path, for :func:`terrain.simulation.car.run_car`.
+    """Controller of a drive along a path, for :func:`terrain.simulation.plants.car.run_car`.
 
     The sideslip is from a source, or from another observer than :func:`sideslip_observer` gives; ``ticks`` are what was
     known and done, in the order of time.

@@ -37,9 +37,8 @@ from terrain.errors import ConfigError
 from terrain.records import Array, Command, RunLog, Sample
 from terrain.robots import Robot
 from terrain.signals import low_pass, true_stretches
-from terrain.simulation.conditions import Faults
 from terrain.simulation.faults import FaultyBus, Nature, fault_catalogue
-from terrain.simulation.scenario import Scenario
+from terrain.simulation.scenario import Faults, Scenario
 
 #: From rest at 1 m/s^2 to 1 m/s, where the fault begins as the start does; a command to stop at once from 1 m/s, where
 #: it begins with the command; and at 1 m/s, where it begins 3 s after the speed was reached.

@@ -14,9 +14,18 @@ import numpy as np
 from terrain.errors import ConfigError
 from terrain.records import Command, Label, RunLog, Sample
 from terrain.robots import Robot
-from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
 from terrain.simulation.run import simulate
-from terrain.simulation.scenario import RATE_HZ, SCENARIOS, Patch, Scenario, make_scenario
+from terrain.simulation.scenario import (
+    RATE_HZ,
+    SCENARIOS,
+    Conditions,
+    Faults,
+    Patch,
+    Scenario,
+    draw_conditions,
+    load_spread,
+    make_scenario,
+)
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"  #: Terrain of scenarios that cross all soils in one drive.

@@ -41,7 +41,7 @@ from terrain.control.pid import LOW_SPEED_MPS, Gains, check_gains
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.contact import DEFLECTION_DAMPING_S
+from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S
 from terrain.simulation.sensors import STEP_S
 
 SAMPLE_TIME_S = 0.02  #: Sample time of the commands, assumed: the thesis specifies none.

@@ -23,7 +23,7 @@ from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Array
 from terrain.signals import MIN_ROWS, Delay, DelayFit, DelayStatus, Pair, common_delay, delay, refine_delay
-from terrain.simulation.planar.replay import replay
+from terrain.simulation.plants.planar import replay
 
 #: Loggers of a run are started together, the wheels' first.  The other sign is that of wheels that are late: they are
 #: averaged, sent a few times a second, held, and queued, which adds up to less than a second.

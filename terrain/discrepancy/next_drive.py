@@ -50,7 +50,7 @@ from terrain.kinematics.commands import wheel_motion
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
 from terrain.signals import low_pass
-from terrain.simulation.planar.motion import move
+from terrain.simulation.plants.planar import move
 from terrain.simulation.scenario import RATE_HZ, SCENARIOS, make_scenario
 
 DEFAULT_SOIL, HARD_SOIL, NEXT_RUNS = "grass", "tiles", 8

@@ -19,8 +19,7 @@ from terrain.errors import DataError
 from terrain.kernels import njit
 from terrain.records import Array
 from terrain.robots import BicycleRobot
-from terrain.simulation.planar.motion import Planar, move
-from terrain.simulation.planar.replay import corrected_inputs, replay, sense
+from terrain.simulation.plants.planar import Planar, corrected_inputs, move, replay, sense
 
 #: Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz.
 CUTOFF_HZ = 2.5

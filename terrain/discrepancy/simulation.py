@@ -10,8 +10,7 @@ from terrain.effects import CHANNELS, INDEX, NUISANCES, Effect, library_of, vect
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.motion import Planar, make_planar
+from terrain.simulation.plants.planar import Ground, Planar, make_planar
 
 
 @dataclass(frozen=True, slots=True, eq=False)

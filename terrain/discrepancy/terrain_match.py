@@ -18,8 +18,7 @@ from terrain.effects import Effect, parameters_of
 from terrain.errors import ConfigError, DataError
 from terrain.records import Array, RunLog
 from terrain.robots import Robot
-from terrain.simulation.planar.model import Ground, planar_ground
-from terrain.simulation.planar.noise import load_model_error, load_scatter
+from terrain.simulation.plants.planar import Ground, load_model_error, load_scatter, planar_ground
 from terrain.terramechanics.soil import extra_soil_names, load_soil, soil_names
 
 RATIOS = (0.0, 0.5, 1.0)

@@ -1,11 +1,10 @@
 """All simulated runs: one by objects (:func:`simulate`), one by names (:func:`simulate_run`), and what is learned from.
 
-A plant goes with the ground that it is given: soils by the terrains of a scenario are driven by the dynamic plant of
-swerve robots (:mod:`terrain.simulation.dynamic.run`), a planar ground by the planar one of any wheeled robot
-(:mod:`terrain.simulation.planar.run`), a soil that shears, or prescribed slip, by tracks
-(:mod:`terrain.simulation.tracked`), and ground along a drive by a car with its controller
-(:mod:`terrain.simulation.car`).  By names, swerve robots are simulated by the dynamic plant, tracked ones on ground
-that shears by their tracks, all others, and whatever has effects, by the planar plant.
+A plant (:mod:`terrain.simulation.plants`) goes with the ground that it is given: soils by the terrains of a scenario
+are driven by the dynamic plant of swerve robots, a planar ground by the planar one of any wheeled robot, a soil that
+shears, or prescribed slip, by tracks, and ground along a drive by a car with its controller.  By names, swerve robots
+are simulated by the dynamic plant, tracked ones on ground that shears by their tracks, all others, and whatever has
+effects, by the planar plant.
 
 **Bench**: a simulated IMU, held still in six positions in turn (Danzi, AgriMaRo thesis, 3.3.3).
 
@@ -34,15 +33,22 @@ from terrain.extension import warn_outside
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import Array, Command, RunLog, Sample, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot, TrackedRobot, load_robot
-from terrain.simulation import car
-from terrain.simulation.conditions import NO_FAULTS, Conditions, Faults, draw_conditions, load_spread
-from terrain.simulation.dynamic.run import run_dynamic
-from terrain.simulation.planar.model import Ground, planar_ground
-from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.run import run_planar
-from terrain.simulation.scenario import RATE_HZ, Patch, Scenario, make_scenario
+from terrain.simulation.plants import car
+from terrain.simulation.plants.dynamic import run_dynamic
+from terrain.simulation.plants.planar import Ground, load_noise, load_scatter, planar_ground, run_planar
+from terrain.simulation.plants.tracks import TrackedGround, run_tracked
+from terrain.simulation.scenario import (
+    NO_FAULTS,
+    RATE_HZ,
+    Conditions,
+    Faults,
+    Patch,
+    Scenario,
+    draw_conditions,
+    load_spread,
+    make_scenario,
+)
 from terrain.simulation.sensors import Gnss, draw_imu_errors, imu_values, is_lost
-from terrain.simulation.tracked import TrackedGround, run_tracked
 from terrain.terramechanics.soil import Soil, load_soil, scattered, soil_names
 
 COURSE = "course"  # A path over all terrains, in place of the name of one
@@ -79,10 +85,10 @@ def simulate(
     faults : faults of the sensors
     effects : parameters of :mod:`terrain.effects` that act on this robot and its sensors, beside those of its
         description or in place of them; the commands and the log do not contain them
-    options : of the plant: :func:`~terrain.simulation.dynamic.run.run_dynamic` (gnss, controller, command_delay_s),
-        :func:`~terrain.simulation.planar.run.run_planar` (scatter, noise, outside, heading, fixes, terrain, step_s),
-        :func:`~terrain.simulation.tracked.run_tracked` (slope, yaw_rad, sensors),
-        :func:`~terrain.simulation.car.run_car` (controller, noise)
+    options : of the plant: :func:`~terrain.simulation.plants.dynamic.run_dynamic` (gnss, controller, command_delay_s),
+        :func:`~terrain.simulation.plants.planar.run_planar` (scatter, noise, outside, heading, fixes, terrain, step_s),
+        :func:`~terrain.simulation.plants.tracks.run_tracked` (slope, yaw_rad, sensors),
+        :func:`~terrain.simulation.plants.car.run_car` (controller, noise)
 
     Returns
     -------

@@ -10,7 +10,7 @@ same bytes.
 A sample of an IMU is ``scale x + bias + noise`` of each quantity ``x`` (:func:`imu_values`).  The plants differ in the
 errors that they draw (:class:`ImuErrors`): the dynamic plant draws biases anew for each power-on and lets those of the
 gyro walk (:func:`draw_imu_errors`), the planar one adds coloured vibration while the robot moves
-(:mod:`terrain.simulation.planar.run`), and those of tracks and of the car white noise (:func:`white_imu`).
+(:mod:`terrain.simulation.plants.planar`), and those of tracks and of the car white noise (:func:`white_imu`).
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from terrain.kinematics.wheels import point_velocity
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS, WHEELS_CHANNELS
 from terrain.records import Array, Reading, Stream
 from terrain.robots import Robot, Sensors
-from terrain.simulation.conditions import Faults
+from terrain.simulation.scenario import Faults
 
 # Step of the rows in a closed loop and of the dynamic plant, whose fastest mode is that of the contact, near 170
 # rad/s: a sixth of a radian a step.

@@ -1,6 +1,6 @@
 r"""What makes an omni robot slip, from runs whose motion was measured from outside: rollers, load, scale, distance.
 
-The steady law of :mod:`terrain.simulation.planar.omni` is fitted to the median motion of each run,
+The steady law of :mod:`terrain.simulation.plants.planar` is fitted to the median motion of each run,
 slip along the direction that the wheels roll and speed across it: the sharing of the load and the scale are
 those of the robot, the friction of the rollers over traction is that of each surface.  Intervals are those of runs
 left out in turn; what the law leaves is judged on every fifth run in turn, held out.  A group of runs that is not
@@ -29,7 +29,7 @@ from terrain.errors import DataError
 from terrain.identify import Fit, Parameter, folds, identify
 from terrain.records import Array
 from terrain.robots import OmniRobot, Robot, as_drive
-from terrain.simulation.planar.omni import steady_twist
+from terrain.simulation.plants.planar import steady_twist
 from terrain.slip_learning.measured import Measured, MeasuredSlip, single_terrain
 
 N_FOLDS = 5

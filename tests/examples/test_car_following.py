@@ -24,7 +24,7 @@ from terrain.control.car_following import (
 )
 from terrain.control.paths import path_from_curvature
 from terrain.robots import load_robot
-from terrain.simulation.car import Ground, level_ground, side_force
+from terrain.simulation.plants.car import Ground, level_ground, side_force
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("adap2e")

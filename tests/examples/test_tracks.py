@@ -11,8 +11,8 @@ from scipy.integrate import quad
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
+from terrain.simulation.plants.tracks import QUIET, Slope
 from terrain.simulation.run import simulate
-from terrain.simulation.tracked import QUIET, Slope
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import bekker_pressure, janosi_force, mobilised_ratio
 

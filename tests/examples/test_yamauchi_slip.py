@@ -25,8 +25,8 @@ from terrain.errors import DataError
 from terrain.estimation.models.slip_model import PARAMETERS
 from terrain.identify import Parameter, identify
 from terrain.robots import load_robot
+from terrain.simulation.plants.tracks import LEVEL, PrescribedSlip, Slope
 from terrain.simulation.run import simulate
-from terrain.simulation.tracked import LEVEL, PrescribedSlip, Slope
 from terrain.terramechanics.soil import load_soil
 
 ROBOT = load_robot("patako")

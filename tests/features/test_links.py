@@ -11,8 +11,8 @@ from terrain.estimation.clocks import REWIND_S, Clocks
 from terrain.estimation.live import estimated_channels, make_live_filter
 from terrain.records import Reading
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Faults
 
 STREAMS = ("wheels", "steering", "imu", "odometry")
 LEAST_RATIO = 0.99

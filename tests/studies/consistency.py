@@ -17,8 +17,8 @@ from terrain.control.drive_metrics import MeanInterval, mean_interval
 from terrain.estimation.consistency import consistency_report, lagged_slip_at
 from terrain.estimation.estimate import Estimate, estimate_run
 from terrain.robots import Robot, load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Faults
 from terrain.terramechanics.soil import soil_names
 
 EXAMPLE = "python tests/studies consistency --runs 20 --seed 1200"

@@ -29,10 +29,10 @@ from terrain.identify import Parameter, half_width, identify
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.records import Array, Label, RunLog, Stream, TargetStatus
 from terrain.robots import description_file, load_robot
-from terrain.simulation.planar.omni import steady_twist
+from terrain.simulation.plants.planar import steady_twist
+from terrain.simulation.plants.tracks import PrescribedSlip
 from terrain.simulation.run import learning_runs, simulate, six_positions_log
 from terrain.simulation.scenario import make_scenario
-from terrain.simulation.tracked import PrescribedSlip
 from terrain.slip_learning.curve import (
     SHAPE_STD_RATIO,
     SYSTEMATIC_SLIP_STD,

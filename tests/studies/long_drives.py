@@ -14,8 +14,8 @@ from terrain.angles import wrapped
 from terrain.errors import ConfigError
 from terrain.estimation.estimate import estimate_run
 from terrain.robots import Robot, load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Faults
 from terrain.terramechanics.soil import soil_names
 
 EXAMPLE = "python tests/studies long-drives --runs 12 --minutes 30 --seed 0"

@@ -3,8 +3,7 @@ import pytest
 
 from pipelines.explain.explain import explain
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, load_noise, load_scatter
 from terrain.simulation.run import simulate
 
 HIDDEN = {"camera_yaw_rad": 0.04}

@@ -18,9 +18,7 @@ from terrain.errors import ConfigError, TerrainError
 from terrain.extension import extended_yaml
 from terrain.logs.write import write_run
 from terrain.robots import description_file, load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_noise
-from terrain.simulation.planar.run import DRIVE_S
+from terrain.simulation.plants.planar import DRIVE_S, Ground, load_noise
 from terrain.simulation.run import simulate, simulate_run
 from terrain.simulation.scenario import RATE_HZ as COMMANDS_HZ
 from terrain.slip_learning.learn import terrain_runs

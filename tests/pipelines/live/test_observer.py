@@ -20,8 +20,8 @@ from terrain.estimation.observe import observe_run, with_estimates
 from terrain.logs.replay import replay
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Conditions
 
 AGRIMARO, HUSKY, TABLE = load_robot("agrimaro"), load_robot("husky"), load_slip_table()
 DATA = Path(os.environ.get("TERRAIN_DATA", "/nowhere"))

@@ -9,8 +9,8 @@ from terrain.errors import ConfigError, DataError
 from terrain.estimation.models.slip_model import read_slip_model
 from terrain.logs.write import write_run
 from terrain.robots import load_robot
+from terrain.simulation.plants.tracks import PrescribedSlip
 from terrain.simulation.run import simulate
-from terrain.simulation.tracked import PrescribedSlip
 
 
 def judged(folder, **also):

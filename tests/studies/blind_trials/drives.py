@@ -9,7 +9,7 @@ import numpy as np
 
 from terrain.records import Array
 from terrain.robots import BicycleRobot, Robot
-from terrain.simulation.conditions import Conditions
+from terrain.simulation.scenario import Conditions
 
 DURATION_S = 60.0  #: Length of a run
 STEP_HZ = 50.0  #: Rate of the commanded twists

@@ -34,10 +34,9 @@ from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.held import CHANNELS as TWIST_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import Scatter, load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, Scatter, load_noise, load_scatter
 from terrain.simulation.run import simulate, simulate_run
+from terrain.simulation.scenario import Conditions
 
 
 class Row(StrEnum):

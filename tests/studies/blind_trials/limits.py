@@ -42,21 +42,23 @@ from terrain.errors import ConfigError
 from terrain.kinematics.wheels import velocity_matrix
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import BicycleRobot, Robot, SwerveRobot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.motion import Planar, make_planar, move
-from terrain.simulation.planar.noise import (
+from terrain.simulation.plants.planar import (
     CAMERA_HZ,
     IMU_HZ,
     WHEELS_HZ,
+    Ground,
     Noise,
+    Planar,
     Scatter,
     activity,
     lag_weights,
     load_noise,
     load_scatter,
+    make_planar,
+    move,
+    sense,
+    with_silent_parts,
 )
-from terrain.simulation.planar.replay import sense
-from terrain.simulation.planar.run import with_silent_parts
 from terrain.simulation.run import simulate
 
 TEST_SIZE = 0.02  #: Size of the test over the whole library, to which limits refer

@@ -76,8 +76,7 @@ from terrain.effects import (
 from terrain.errors import DataError
 from terrain.records import RunLog
 from terrain.robots import BicycleRobot, Robot, load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_scatter
+from terrain.simulation.plants.planar import Ground, load_scatter
 
 CLOCK = "clock_offset"  #: effect that a late logger is
 CLOCK_STATED_S = 0.04  #: largest error of its delay that is stated: two samples of the wheels' logger

@@ -18,7 +18,7 @@ from terrain.calibration.odometry import (
 )
 from terrain.errors import DataError
 from terrain.robots import load_robot
-from terrain.simulation.tracked import PrescribedSlip
+from terrain.simulation.plants.tracks import PrescribedSlip
 
 PATAKO = load_robot("patako")
 GIVEN = PrescribedSlip(slip_ratio=0.08, turning_loss_ratio=0.4, turning_exponent=0.7)

@@ -8,8 +8,7 @@ from terrain.calibration.omni import COM_X, COM_Y, FRICTION, RADIUS, identify_om
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_noise
+from terrain.simulation.plants.planar import Ground, load_noise
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("robotino")

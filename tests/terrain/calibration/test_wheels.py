@@ -10,7 +10,7 @@ from terrain.calibration.wheels import (
     why_none,
 )
 from terrain.records import RunLog
-from terrain.simulation.conditions import Conditions
+from terrain.simulation.scenario import Conditions
 
 HARD = ("tiles", "asphalt")
 

@@ -19,7 +19,7 @@ from terrain.control.traction import TractionStatus
 from terrain.estimation.live import LiveFilter
 from terrain.logs.replay import TWIST
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
+from terrain.simulation.scenario import Faults
 
 ROBOT, TABLE, DELAY_S = load_robot("agrimaro"), load_slip_table(), 0.05
 

@@ -8,7 +8,7 @@ from terrain.control.pid import Gains, PidState, check_gains, pid_step
 from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrices, spectral_radius
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation.contact import DEFLECTION_DAMPING_S
+from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S
 
 ROBOT = load_robot("agrimaro")
 DT_S = 0.02

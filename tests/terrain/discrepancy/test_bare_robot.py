@@ -8,9 +8,7 @@ from terrain.discrepancy.signals import signals_of
 from terrain.effects import CHANNELS, effect_named, vector_of
 from terrain.estimation.estimate import enriched, estimate_run
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.motion import make_planar
-from terrain.simulation.planar.replay import replay
+from terrain.simulation.plants.planar import Ground, make_planar, replay
 from terrain.simulation.run import simulate, simulate_run
 
 TEXT = """name: mule

@@ -20,7 +20,7 @@ from terrain.effects import CURRENT, GYRO, HEADING, effect_named
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground
+from terrain.simulation.plants.planar import Ground
 
 OVER = 4.0
 """Times the smallest amplitude that these drives could show."""

@@ -10,8 +10,7 @@ from terrain.discrepancy.verdict import Verdict
 from terrain.effects import library_of
 from terrain.records import Label
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground, planar_ground
-from terrain.simulation.planar.motion import make_planar
+from terrain.simulation.plants.planar import Ground, make_planar, planar_ground
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import load_soil
 

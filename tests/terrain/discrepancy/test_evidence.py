@@ -22,7 +22,7 @@ from terrain.discrepancy.search import misfit_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, SPEED_X, vector_of
 from terrain.robots import load_robot
-from terrain.simulation.planar.noise import load_scatter
+from terrain.simulation.plants.planar import load_scatter
 
 HUSKY = load_robot("husky")
 SCATTER = load_scatter()

@@ -27,8 +27,7 @@ from terrain.effects import CHANNELS, GYRO
 from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, load_noise, load_scatter
 from terrain.simulation.run import simulate
 
 HUSKY = load_robot("husky")

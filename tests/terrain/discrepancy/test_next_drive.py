@@ -13,11 +13,9 @@ from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.verdict import Limit, NextDrive
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_noise
+from terrain.simulation.plants.planar import Ground, load_noise
 from terrain.simulation.run import simulate
-from terrain.simulation.scenario import make_scenario
+from terrain.simulation.scenario import Conditions, make_scenario
 
 HUSKY, AGRIMARO = (simulation_of(load_robot(name)) for name in ("husky", "agrimaro"))
 

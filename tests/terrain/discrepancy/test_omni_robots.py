@@ -14,8 +14,7 @@ from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs import robotino
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, load_noise, load_scatter
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("robotino")

@@ -22,11 +22,9 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SPEED_X, STEPS, vector_of
 from terrain.errors import DataError
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_noise
-from terrain.simulation.planar.replay import replay
+from terrain.simulation.plants.planar import Ground, load_noise, replay
 from terrain.simulation.run import simulate
+from terrain.simulation.scenario import Conditions
 
 ROBOTS = {"husky": load_robot("husky"), "agrimaro": load_robot("agrimaro")}
 HIDDEN = {

@@ -11,9 +11,9 @@ from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SP
 from terrain.errors import DataError
 from terrain.records import Label, Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.planar.model import Ground
+from terrain.simulation.plants.planar import Ground
 from terrain.simulation.run import simulate
+from terrain.simulation.scenario import Conditions
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 

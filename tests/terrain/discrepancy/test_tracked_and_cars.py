@@ -15,7 +15,7 @@ from terrain.errors import DataError
 from terrain.extension import region_of
 from terrain.records import RunLog
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground
+from terrain.simulation.plants.planar import Ground
 from terrain.simulation.run import simulate
 
 CAR, MARMOTTE, PATAKO = (load_robot(name) for name in ("adap2e", "marmotte", "patako"))

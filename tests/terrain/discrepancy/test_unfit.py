@@ -16,11 +16,9 @@ from terrain.discrepancy.unfit import clocks_of, odd_runs, stalled_runs, unfit_r
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.plants.planar import Ground, load_noise, load_scatter
 from terrain.simulation.run import simulate
-from terrain.simulation.scenario import make_scenario
+from terrain.simulation.scenario import Conditions, make_scenario
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 SAND = Ground(1.2, 0.35, 0.15, 0.3)

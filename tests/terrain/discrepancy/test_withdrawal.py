@@ -22,7 +22,7 @@ from terrain.discrepancy.probes import ProbeResult, probe_residuals
 from terrain.discrepancy.search import cause_fit
 from terrain.effects import BOUNDS, CHANNELS, effect_named
 from terrain.robots import load_robot
-from terrain.simulation.planar.noise import Scatter
+from terrain.simulation.plants.planar import Scatter
 
 STEADY = replace(simulation_of(load_robot("husky")), scatter={})
 ALIKE = Scatter(*[0.0] * len(Scatter._fields))

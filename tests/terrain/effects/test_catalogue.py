@@ -31,10 +31,7 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.robots import TrackedRobot, load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.motion import make_planar
-from terrain.simulation.planar.noise import load_scatter
-from terrain.simulation.planar.replay import replay
+from terrain.simulation.plants.planar import Ground, load_scatter, make_planar, replay
 
 HUSKY = load_robot("husky")
 ROBOTS = {
@@ -170,7 +167,7 @@ from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.verdict import Limit, Value
 from terrain.extension import Correction, corrected
 from terrain.robots import load_robot
-from terrain.simulation.dynamic.run import _built
+from terrain.simulation.plants.dynamic import _built
 
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"
 for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_ONLY, effects.ONE_SIDED,

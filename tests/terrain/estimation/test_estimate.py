@@ -9,8 +9,8 @@ from terrain.errors import ConfigError
 from terrain.estimation.estimate import FILTERS, estimate_run, summarize
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Faults
 from terrain.simulation.sensors import Gnss
 
 ROBOT = load_robot("agrimaro")

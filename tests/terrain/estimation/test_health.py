@@ -14,9 +14,9 @@ from terrain.estimation.health import SENSORS, Health
 from terrain.estimation.live import LiveFilter
 from terrain.logs.replay import replay
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.faults import FaultyBus, fault_catalogue
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Faults
 
 ROBOT = load_robot("agrimaro")
 CATALOGUE = fault_catalogue(ROBOT)

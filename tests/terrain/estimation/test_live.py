@@ -25,10 +25,10 @@ from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
+from terrain.simulation.plants.tracks import PrescribedSlip
 from terrain.simulation.run import simulate, simulate_run
+from terrain.simulation.scenario import Faults
 from terrain.simulation.sensors import Gnss
-from terrain.simulation.tracked import PrescribedSlip
 
 ROBOT, HUSKY, UGV = (load_robot(name) for name in ("agrimaro", "husky", "orchard_ugv"))
 ODD = ROBOT.with_parts(

@@ -56,8 +56,8 @@ from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Faults
 from terrain.simulation.sensors import Gnss
 
 ROBOT = load_robot("agrimaro")

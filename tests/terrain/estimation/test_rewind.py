@@ -13,9 +13,9 @@ from terrain.estimation.models.choice import make_observer
 from terrain.logs.replay import replay
 from terrain.records import Reading, Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
+from terrain.simulation.plants.tracks import PrescribedSlip
 from terrain.simulation.run import simulate, simulate_run
-from terrain.simulation.tracked import PrescribedSlip
+from terrain.simulation.scenario import Faults
 
 ROBOT, UGV = load_robot("agrimaro"), load_robot("orchard_ugv")
 STREAMS = ("wheels", "steering", "imu", "odometry")

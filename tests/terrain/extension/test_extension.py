@@ -25,7 +25,7 @@ from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.logs.replay import replay
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import planar_ground
+from terrain.simulation.plants.planar import planar_ground
 from terrain.simulation.run import simulate
 from terrain.simulation.scenario import make_scenario
 from terrain.terramechanics.soil import load_soil

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
-from terrain.simulation import car
+from terrain.simulation.plants import car
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("adap2e")

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from terrain.errors import ConfigError
-from terrain.simulation.conditions import Conditions, Faults, draw_conditions, load_spread
+from terrain.simulation.scenario import Conditions, Faults, draw_conditions, load_spread
 
 
 @pytest.mark.parametrize(

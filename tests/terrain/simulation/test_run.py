@@ -11,15 +11,12 @@ from terrain.errors import ConfigError
 from terrain.kernels import njit, record
 from terrain.logs.schema import unit_of
 from terrain.robots import load_robot
-from terrain.simulation import car
-from terrain.simulation.conditions import Conditions, Faults
-from terrain.simulation.planar import motion
-from terrain.simulation.planar.model import BODY, TRUTH, Drive, Ground
-from terrain.simulation.planar.noise import load_noise, load_scatter
+from terrain.simulation.plants import car, planar
+from terrain.simulation.plants.planar import PLANAR_BODY, TRUTH, Ground, PlanarDrive, load_noise, load_scatter
+from terrain.simulation.plants.tracks import TrackedSensors
 from terrain.simulation.run import simulate, simulate_run
-from terrain.simulation.scenario import make_scenario
-from terrain.simulation.sensors import BODY as BODY_TRUTH
-from terrain.simulation.tracked import TrackedSensors
+from terrain.simulation.scenario import Conditions, Faults, make_scenario
+from terrain.simulation.sensors import BODY
 from terrain.terramechanics.soil import load_soil
 
 AGRIMARO, HUSKY, ROBOTINO, CAR, PATAKO = map(
@@ -78,7 +75,7 @@ def test_every_channel_has_a_unit_and_every_logger_its_rate_from_0_on(plant):
         assert stream.time_s[0] == 0.0
         np.testing.assert_allclose(np.diff(stream.time_s), 1.0 / stream.rate_hz, rtol=0, atol=2e-9)
         assert np.isfinite(stream.values[:, [not c.startswith("slip") for c in stream.channels]]).all(), name
-    assert log.streams["truth"].channels[: len(BODY_TRUTH.names)] == BODY_TRUTH.names
+    assert log.streams["truth"].channels[: len(BODY.names)] == BODY.names
 
 
 @pytest.mark.parametrize("plant", PLANTS)
@@ -192,7 +189,7 @@ def test_names_that_do_not_go_together_are_refused(given, message):
 
 # -- A new drive: its record, its kernel and its entry; loggers, replay and effects of the sensors are there ----------
 
-RAILS = record({"body": BODY, "gauge_m": float})
+RAILS = record({"body": PLANAR_BODY, "gauge_m": float})
 
 
 @njit
@@ -209,8 +206,8 @@ def _on_rails(params, vector, dt, inputs):
 
 
 def test_a_new_drive_is_a_record_a_kernel_and_an_entry(monkeypatch):
-    trolley = Drive(RAILS, lambda robot, ground: {"gauge_m": robot.track_m}, _on_rails)
-    monkeypatch.setattr(motion, "DRIVES", {**motion.DRIVES, "skid_steer": trolley})
+    trolley = PlanarDrive(RAILS, lambda robot, ground: {"gauge_m": robot.track_m}, _on_rails)
+    monkeypatch.setattr(planar, "DRIVES", {**planar.DRIVES, "skid_steer": trolley})
     uphill = Conditions(grade_ratio=(0.1, 0.0))
     log = simulate(HUSKY, turning(0.5, 0.0), Ground(slip_ratio=0.5), 0, conditions=uphill, **NOISE)
     truth = log.streams["truth"]
@@ -218,8 +215,8 @@ def test_a_new_drive_is_a_record_a_kernel_and_an_entry(monkeypatch):
     assert truth.channel("slip_left_ratio")[-1] == pytest.approx(slip, abs=0.03)
     assert set(log.streams) == {"wheels", "imu", "odometry", "commands", "truth"}
     larger, plain = (
-        motion.move(
-            motion.make_planar(HUSKY, Ground()), vector_of(p), 0.02, np.full((9, 2), 0.5), *[np.zeros(9)] * 3
+        planar.move(
+            planar.make_planar(HUSKY, Ground()), vector_of(p), 0.02, np.full((9, 2), 0.5), *[np.zeros(9)] * 3
         )
         for p in ({"wheel_radius_ratio": 0.1}, {})
     )

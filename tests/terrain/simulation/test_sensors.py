@@ -10,7 +10,7 @@ from scipy.stats import chi2, poisson
 from terrain.constants import GRAVITY_MPS2
 from terrain.kinematics.camera import body_motion, odometry_stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import NO_FAULTS, Faults
+from terrain.simulation.scenario import NO_FAULTS, Faults
 from terrain.simulation.sensors import (
     BODY_ROW,
     IMU_BANDWIDTH_HZ,

@@ -12,8 +12,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError
 from terrain.kernels import filled
 from terrain.robots import load_robot
-from terrain.simulation.run import simulate
-from terrain.simulation.tracked import (
+from terrain.simulation.plants.tracks import (
     QUIET,
     STATE,
     PrescribedSlip,
@@ -27,6 +26,7 @@ from terrain.simulation.tracked import (
     tracks_on,
     twist_on_soil,
 )
+from terrain.simulation.run import simulate
 from terrain.terramechanics.soil import load_soil
 from terrain.terramechanics.traction import compaction_resistance, mobilised_ratio, plate_sinkage
 

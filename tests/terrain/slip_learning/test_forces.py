@@ -7,8 +7,8 @@ from terrain.estimation.estimate import estimate_run
 from terrain.estimation.feed import on_clock
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
 from terrain.simulation.run import Drive, SlipSweep, scenario_of, simulate, simulate_run
+from terrain.simulation.scenario import Conditions
 from terrain.slip_learning.forces import (
     body_balance,
     contact_slip,

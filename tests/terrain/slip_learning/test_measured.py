@@ -7,7 +7,7 @@ from terrain.errors import ConfigError, DataError
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.signals import DelayStatus
-from terrain.simulation.planar.model import Ground
+from terrain.simulation.plants.planar import Ground
 from terrain.simulation.run import simulate
 from terrain.slip_learning.ground_changes import slip_step
 from terrain.slip_learning.measured import (

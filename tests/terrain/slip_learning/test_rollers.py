@@ -5,7 +5,7 @@ import pytest
 
 from terrain.errors import DataError
 from terrain.kinematics.wheels import rolling_matrix
-from terrain.simulation.planar.omni import steady_twist
+from terrain.simulation.plants.planar import steady_twist
 from terrain.slip_learning.measured import measured_slip
 from terrain.slip_learning.rollers import distance_bound, roller_findings, surface_of_windows
 

@@ -29,8 +29,8 @@ from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
+from terrain.simulation.plants.tracks import PrescribedSlip
 from terrain.simulation.run import simulate
-from terrain.simulation.tracked import PrescribedSlip
 
 UGV, CAR, HUSKY = (load_robot(name) for name in ("orchard_ugv", "adap2e", "husky"))
 ROBOTS = {name: UGV if name in observers_of(UGV) else CAR for name in OBSERVERS}

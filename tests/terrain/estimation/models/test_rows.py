@@ -20,8 +20,8 @@ from terrain.estimation.models.observer import (
 )
 from terrain.records import Reading, RunLog, Stream
 from terrain.robots import load_robot
+from terrain.simulation.plants.tracks import QUIET, PrescribedSlip
 from terrain.simulation.run import simulate
-from terrain.simulation.tracked import QUIET, PrescribedSlip
 
 UGV = load_robot("orchard_ugv")
 NAMES = tuple(name for name in ROWS if "rear" not in name and "front" not in name)

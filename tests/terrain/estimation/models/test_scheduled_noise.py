@@ -14,8 +14,8 @@ from terrain.logs.replay import replay
 from terrain.logs.schema import IMU_CHANNELS
 from terrain.records import GATED, REOPENED, Reading
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Faults
 from terrain.simulation.run import simulate_run
+from terrain.simulation.scenario import Faults
 
 ROBOT = load_robot("agrimaro")
 SETTINGS = FilterSettings(GATE_PROBABILITY, REOPEN_AFTER_S)

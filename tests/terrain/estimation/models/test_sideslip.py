@@ -11,7 +11,7 @@ from terrain.estimation.models import sideslip
 from terrain.estimation.models.observer import ObserverStatus, observe
 from terrain.estimation.models.sideslip import FIRST_STD, RATE, ROWS, SETTINGS, Sideslip
 from terrain.robots import load_robot
-from terrain.simulation.car import CAR_ROWS, CarCommand, CarDrive, level_ground
+from terrain.simulation.plants.car import CAR_ROWS, CarCommand, CarDrive, level_ground
 from terrain.simulation.run import simulate
 
 ROBOT = load_robot("adap2e")

@@ -33,8 +33,8 @@ from terrain.estimation.models.slip_odometry import (
     plain_odometry,
 )
 from terrain.robots import load_robot
+from terrain.simulation.plants.tracks import QUIET, PrescribedSlip, Slope
 from terrain.simulation.run import simulate
-from terrain.simulation.tracked import QUIET, PrescribedSlip, Slope
 
 ROBOT = load_robot("patako")
 D = ROBOT.half_track_m

@@ -16,10 +16,9 @@ from terrain.kinematics.camera import body_motion
 from terrain.kinematics.wheels import no_slip_twist
 from terrain.robots import load_robot
 from terrain.signals import low_passed
-from terrain.simulation.conditions import Conditions, Faults
-from terrain.simulation.contact import shear_slip
+from terrain.simulation.plants.dynamic import shear_slip
 from terrain.simulation.run import simulate
-from terrain.simulation.scenario import make_scenario
+from terrain.simulation.scenario import Conditions, Faults, make_scenario
 from terrain.simulation.sensors import Gnss
 from terrain.terramechanics.soil import load_soil
 

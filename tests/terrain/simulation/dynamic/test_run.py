@@ -12,12 +12,16 @@ from terrain.logs.read import read_run
 from terrain.logs.write import write_run
 from terrain.records import Command
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions, Faults
-from terrain.simulation.dynamic.plant import make_plant, start_state, uniform_profile
-from terrain.simulation.dynamic.run import Drive
-from terrain.simulation.dynamic.step import advance, settle
+from terrain.simulation.plants.dynamic import (
+    DrivenPlant,
+    advance,
+    make_plant,
+    settle,
+    start_state,
+    uniform_profile,
+)
 from terrain.simulation.run import simulate
-from terrain.simulation.scenario import Scenario, make_scenario
+from terrain.simulation.scenario import Conditions, Faults, Scenario, make_scenario
 from terrain.simulation.sensors import BODY_ROW, Gnss
 from terrain.terramechanics.soil import Scatter, load_soil, soil_names
 
@@ -117,7 +121,7 @@ def test_terrain_varies_along_the_path_as_soil_and_conditions_state(monkeypatch)
         plants.append(profile)
         rows[:] = np.zeros(1, rows.dtype)
 
-    monkeypatch.setattr("terrain.simulation.dynamic.run.advance", noted)
+    monkeypatch.setattr("terrain.simulation.plants.dynamic.advance", noted)
     rough = Scatter("friction_angle_rad", 0.0, 0.3), Scatter("rolling_resistance_ratio", 0.0, 0.5)
     soils = {
         "tiles": dataclasses.replace(SOILS["tiles"], scatter=()),
@@ -126,7 +130,7 @@ def test_terrain_varies_along_the_path_as_soil_and_conditions_state(monkeypatch)
     time_s = np.arange(20_001) / 50
     drive = Scenario("mine", 50.0, time_s, np.zeros((len(time_s), 3)), ((0.0, "tiles"), (100.0, "rough")))
     simulate(ROBOT, drive, soils, 0, conditions=Conditions(roughness_factor=3.0, field_length_m=1.0))
-    (plant,) = plants
+    plant = plants[-1]
     assert plant.field.shape[2] * 0.1 > 0.2 * 10.0 * time_s[-1]  # as far as it can come
     np.testing.assert_allclose(plant.patches["roughness_m3"], [12e-6, 3 * soils["rough"].roughness_m3])
     assert (plant.field[:, :, :1000] == 1.0).all()
@@ -259,7 +263,7 @@ def test_pieces_between_commands_are_the_drive_in_which_each_step_has_its_own(de
     settle(plant, profile, start)
     one, other = start.copy(), start.copy()
     pieces, whole = np.zeros(n * substeps, BODY_ROW), np.zeros(n * substeps, BODY_ROW)
-    drive = Drive(plant, profile, one, noise, pieces)
+    drive = DrivenPlant(plant, profile, one, noise, pieces)
     for k in range(n):
         assert drive.until(k * substeps + 1)
         drive.command(k * substeps + delay, wheel[k], steer[k])

@@ -7,29 +7,27 @@ from scipy.integrate import quad
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.robots import load_robot
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.contact import DEFLECTION_DAMPING_S
-from terrain.simulation.dynamic.plant import (
+from terrain.simulation.plants.dynamic import (
     CONTACT_LIMIT_PS2,
+    DEFLECTION_DAMPING_S,
     FIELD_STEP_M,
+    LEG_FRICTION_NM,
+    LEG_RATE_RADPS,
     LOAD_MARGIN_RATIO,
+    ROLLING_SPEED_MPS,
+    ROUGHNESS_CUTOFF,
+    ROUGHNESS_WAVENUMBER,
     TerrainProfile,
+    advance,
     check_step,
     contact_ratio,
     make_plant,
+    settle,
     start_state,
     tyre_ratio,
     uniform_profile,
 )
-from terrain.simulation.dynamic.step import (
-    LEG_FRICTION_NM,
-    LEG_RATE_RADPS,
-    ROLLING_SPEED_MPS,
-    ROUGHNESS_CUTOFF,
-    ROUGHNESS_WAVENUMBER,
-    advance,
-    settle,
-)
+from terrain.simulation.scenario import Conditions
 from terrain.simulation.sensors import BODY_ROW, STEP_S, Motion
 from terrain.terramechanics.soil import Soil, load_soil
 from terrain.terramechanics.traction import equilibrium_slip, friction_limit, wheel_ground

@@ -12,9 +12,7 @@ from terrain.constants import GRAVITY_MPS2
 from terrain.effects import library_of, vector_of
 from terrain.extension import apply_homes
 from terrain.robots import load_robot
-from terrain.simulation.planar.bicycle import LEAST_RATIO
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.motion import make_planar, move
+from terrain.simulation.plants.planar import LEAST_RATIO, Ground, make_planar, move
 
 CAR = replace(load_robot("adap2e"), com_ahead_m=0.5, front_cornering_npr=12000.0, rear_cornering_npr=18000.0)
 FREE = Ground(slip_ratio=0.0, rolling_ratio=0.0)

@@ -19,12 +19,17 @@ from terrain.effects import (
 )
 from terrain.kinematics.commands import inverse
 from terrain.robots import load_robot
-from terrain.simulation.contact import DEFLECTION_DAMPING_S, shear_slip
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.motion import make_planar, move
-from terrain.simulation.planar.replay import replay
-from terrain.simulation.planar.skid import ENDO_POWER, STANDSTILL_MPS, direction
-from terrain.simulation.planar.swerve import ROLLING_MPS
+from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S, shear_slip
+from terrain.simulation.plants.planar import (
+    ENDO_POWER,
+    ROLLING_MPS,
+    STANDSTILL_MPS,
+    Ground,
+    direction,
+    make_planar,
+    move,
+    replay,
+)
 
 HUSKY, AGRIMARO = load_robot("husky"), load_robot("agrimaro")
 ROBOTS = {"skid_steer": HUSKY, "swerve": AGRIMARO}

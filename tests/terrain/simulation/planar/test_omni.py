@@ -12,10 +12,16 @@ from terrain.extension import apply_homes
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.kinematics.wheels import rolling_matrix
 from terrain.robots import load_robot
-from terrain.simulation.planar.model import Ground
-from terrain.simulation.planar.motion import make_planar, move
-from terrain.simulation.planar.noise import load_noise
-from terrain.simulation.planar.omni import ROLLING_MPS, SUBSTEPS, currents_of, steady_twist
+from terrain.simulation.plants.planar import (
+    ROLLING_MPS,
+    SUBSTEPS,
+    Ground,
+    currents_of,
+    load_noise,
+    make_planar,
+    move,
+    steady_twist,
+)
 from terrain.simulation.run import simulate
 from terrain.slip_learning.measured import measured_slip
 

@@ -24,13 +24,16 @@ from terrain.effects import (
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.signals import low_passed
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.planar.model import Ground, planar_ground
-from terrain.simulation.planar.motion import make_planar
-from terrain.simulation.planar.noise import load_noise, load_scatter
-from terrain.simulation.planar.replay import replay
+from terrain.simulation.plants.planar import (
+    Ground,
+    load_noise,
+    load_scatter,
+    make_planar,
+    planar_ground,
+    replay,
+)
 from terrain.simulation.run import simulate
-from terrain.simulation.scenario import make_scenario
+from terrain.simulation.scenario import Conditions, make_scenario
 from terrain.terramechanics.soil import load_soil
 
 HUSKY, AGRIMARO, CAR = (load_robot(name) for name in ("husky", "agrimaro", "adap2e"))

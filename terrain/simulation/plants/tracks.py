@@ -78,8 +78,7 @@ from terrain.kinematics.commands import wheel_motion
 from terrain.logs.schema import POSE_CHANNELS
 from terrain.records import Array, Label, Stream
 from terrain.robots import Robot, TrackedRobot, as_drive
-from terrain.simulation.conditions import Conditions
-from terrain.simulation.scenario import RATE_HZ, Scenario
+from terrain.simulation.scenario import RATE_HZ, Conditions, Scenario
 from terrain.simulation.sensors import (
     BODY,
     COMPASS_STD_RAD,

@@ -37,7 +37,7 @@ from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.logs.schema import GNSS_CHANNELS
 from terrain.records import Array, Label, Stream
 from terrain.robots import BicycleRobot, Robot, as_drive
-from terrain.simulation.conditions import Conditions
+from terrain.simulation.scenario import Conditions
 from terrain.simulation.sensors import BODY, over_ground, truth_stream, white_imu
 from terrain.slip import slip_angle
 

@@ -1,1 +1,0 @@
-"""The dynamic simulation of a swerve robot in closed loop."""

@@ -1,1 +1,0 @@
-"""The planar simulation that takes any wheeled robot and replays logs."""

@@ -1,0 +1,1 @@
+"""Plants: what a robot does on its ground, in two fidelities of wheels, on tracks, and as a car."""

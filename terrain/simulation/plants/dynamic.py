@@ -1,0 +1,971 @@
+"""The dynamic plant: a swerve robot with load transfer on three driven, steered wheels, in open loop or controlled.
+
+Effects of the robot (:mod:`terrain.effects`) act where a real robot would have them:
+
+- **wheel_radius, one_sided_radius**: true radii of the wheels, of which the commands know nothing;
+- **steering_delay, steering_backlash, steering_offset_i**: between the encoder, which the steering motor obeys, and the
+  wheel: ``wheel(t) = play(encoder(t - T)) + d0``;
+- **force_slip, shear_slip**: a creep of the contact on top of the ground's own slip.  Its deflection follows ``du/dt
+  = (w r - v) - max(|w r|, |v|) (u / sigma + c f)`` with ``f = 3 F_i / W``, so that it settles where slip is that of
+  the ground plus ``c f``, and no equation has to be solved for a force; of a shear curve ``c f`` is bent as in
+  :func:`shear_slip`, up to the wheel's own limit.  A negative creep leaves a tenth of the
+  ground's slip: no contact is stiffer than ten times it;
+- **side_hill_slip**: the ground goes by sideways: wheels roll without side force where they drift downhill by
+  ``c ph |v|``;
+- **rolling_resistance, slip_resistance, viscous_drag**: more resistance at each axle, by its load, its slip and its
+  share of the speed; what is less than none is none.
+
+How stiff a contact may be for the steps of the integration: beyond that it pushes the robot by itself.  A wheel of
+inertia I and radius r on a contact of stiffness ``K = (dF/ds) / sigma``, with the deflection u, the relaxation length
+sigma and the damping T, :data:`DEFLECTION_DAMPING_S`::
+
+    F = K (u + T x)        x = w r - v        du/dt = x        dx/dt = -k u - k T x
+
+with ``k = K (r^2 / I + 1 / m)`` and m the mass of the body.  :func:`step` steps the rate first, and the deflection
+with the new rate::
+
+    x' = x - dt k (u + T x)        u' = u + dt x'
+
+The characteristic polynomial is ``z^2 - (2 - dt k T - dt^2 k) z + 1 - dt k T``.  By Jury's criterion its roots are
+inside the unit circle where ``4 - 2 dt k T - dt^2 k > 0``, that is ``k < 4 / (dt (dt + 2 T))``.  The decay of the
+deflection with the distance rolled only widens this.  Beyond the limit a wheel's rate changes its sign from step to
+step and grows until the contact slides.  Its force then jumps between the friction limits of the load, which for a
+large mass exceed what the motors can give by orders of magnitude.
+
+Three contacts share the body: the largest eigenvalue of all of them together is at most the largest of the wheels' own
+plus the trace of the body's, ``sum K_i (2 / m + rho_i^2 / I_z)``, with rho_i the distance of a wheel from the centre of
+mass.  A tyre as a spring k_t with a damper c under a corner of mass m_i is stepped alike, and is stable where
+``dt^2 k_t + 2 dt c < 4 m_i``.
+
+States are integrated with semi-implicit steps of :data:`STEP_S`.  What acts, in the order of one step:
+
+- **load**: three contacts carry a rigid body, so their normal forces follow from balance alone:
+  ``sum N = m g cos``, and the moments of gravity and inertia about the two body axes; tyres as springs over
+  a rough ground add their own (:func:`ride_over`).
+- **steering**: a rate-limited, acceleration-limited motor turns the wheel through a backlash of half width
+  ``dead_band``.
+- **speed loop** of each motor driver: PI on its own estimate of the wheel's rate, torque limit with
+  anti-windup, torque lag; the current follows the torque.
+- **contact**: longitudinal and lateral deflections of the contact (Pacejka, Tyre and Vehicle Dynamics, 7.2.1,
+  single contact point) with the larger absolute speed as in the SAE slip,
+  ``du/dt = (w r - v_long) - max(|w r|, |v_long|) u / sigma``, so that ``u / sigma`` settles at the slip
+  ratio and stays finite at rest; ``terrain.terramechanics`` turns deflection and load into thrust, side force
+  and resistance.
+- **leg**: the third wheel's leg swings about a hinge on the line of the other two, within
+  ``leg_backlash_rad``, to where the ground pushes its wheel; that turns the wheel's heading, which
+  its steering encoder below the hinge does not see (thesis, conclusions: backlash of the third leg's opening
+  system). What the swing moves the wheel's centre by, and its friction's own moment, are left out.
+- **body**: ``m (dv/dt + w x v) = sum F - m g grad``, ``I dw/dt = sum (r_i - r_com) x F_i``.
+
+Resistance acts at the axle, against the rolling of the wheel; hence in steady motion the thrust balances it
+and the slip follows from the ground, not from the speed.
+
+Roughness of waviness 2 is white in slope: ``d(road)/dt = -2 pi n_c v road + 2 pi n_0 sqrt(G v) w`` with ``w``
+white of one-sided density 1 (ISO 8608); the contact averages it over its length.
+
+**Runs.** With a controller the loop is closed: it gets what the sensors have written so far, and commands the wheels.
+At instant ``t_k`` of the scenario the step that starts there has run with the command in force, so a sample stamped
+``t_k`` of a sensor without latency is there; the command of the controller is in force from the step that starts a
+delay later, one step at the least.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.signal import lfilter
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.effects import EFFECTS, Stage, checked_effects, in_plant, parameters_of, vector_of
+from terrain.errors import ConfigError, DataError, LogError
+from terrain.extension import apply_homes
+from terrain.kernels import filled, inner, is_finite, njit, numbers, record
+from terrain.kinematics.commands import wheel_motion
+from terrain.kinematics.wheels import point_velocity
+from terrain.logs.schema import unit_of
+from terrain.records import Array, Command, Label, Sample, Stream
+from terrain.robots import Robot, SwerveRobot, as_drive
+from terrain.simulation.scenario import Conditions, Faults, Scenario
+from terrain.simulation.sensors import (
+    BODY_ROW,
+    STEP_S,
+    Gnss,
+    Motion,
+    Sensor,
+    camera_sensor,
+    generators,
+    gnss_sensor,
+    imu_sensor,
+    steering_sensor,
+    wheel_sensor,
+    wheels_truth,
+)
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import GROUND, ground_record, wheel_ground
+
+# Damping of the contact as a lead on its deflection; it vanishes in steady rolling and so moves no slip.
+DEFLECTION_DAMPING_S = 0.005
+
+
+FIELD_STEP_M = 0.1  # grid of the variation of the terrain along the path
+# Cells of terrain up to the farthest point that the fastest wheel can reach; 24 h at 2 m/s take 3.5 million.
+MAX_FIELD_CELLS = 5 * 10**6
+MAX_DELAY_STEPS = 500  # steps of the longest delay of the steering, half a second
+CONTACT_LIMIT_PS2 = 4.0 / (STEP_S * (STEP_S + 2.0 * DEFLECTION_DAMPING_S))  # largest stable ``k`` in 1/s^2
+# Load transfer and rough ground load a wheel with up to so many times its share of the weight.
+LOAD_MARGIN_RATIO = 2.0
+
+_SMALL_SLIP = 1e-4
+
+# A soil under the wheels, its ISO 8608 roughness, and the path length at which it begins, the first at 0.
+PATCH = record({"ground": GROUND, "roughness_m3": float, "start_m": float})
+
+PLANT = record(
+    {
+        "wheels_m": (float, (3, 2)),
+        "com_m": (float, 2),
+        "radius_m": (float, 3),
+        "load_fraction": (float, 3),
+        "load_per_force_ratio": (float, (3, 2)),
+        "grade_ratio": (float, 2),
+        "steer_offset_rad": (float, 3),
+        "linked": bool,
+        "yields": bool,
+        "effects": EFFECTS,
+        **numbers(
+            "mass_kg weight_n com_height_m yaw_inertia_kgm2 wheel_inertia_kgm2 relaxation_length_m contact_length_m "
+            "tyre_stiffness_npm tyre_damping_nspm torque_max_nm speed_max_radps torque_time_constant_s friction_nm "
+            "speed_gain_nmspr speed_integral_nmpr speed_estimate_time_constant_s encoder_time_constant_s hall_steps "
+            "rate_max_radps accel_max_radps2 dead_band_rad leg_backlash_rad undulation_ratio undulation_length_m"
+        ),
+    }
+)
+"""All numbers of one run that do not change while it is driven, by their names in the robot's description and in the
+conditions; whether effects act in the linkages of the steering and where wheels touch the ground, and all effects."""
+
+WHEEL_STATE = record(
+    numbers(
+        "rate_radps angle_rad steer_rad steer_motor_rad steer_motor_radps deflection_x_m "
+        "deflection_y_m torque_nm integral_nm estimate_radps reported_radps hall_count ride_m "
+        "ride_mps ride_mps2 road_m contact_m heading_rad creep_ratio"
+    )
+)
+"""A wheel; its heading is that in the play of its linkage, and its creep is over the slip of the ground."""
+
+STATE = record(
+    numbers(
+        "position_x_m position_y_m yaw_rad speed_x_mps speed_y_mps yaw_rate_radps path_m accel_x_mps2 "
+        "accel_y_mps2 leg_rad"
+    )
+    | {"wheels": (WHEEL_STATE, 3), "n_steps": int, "late_rad": (float, (MAX_DELAY_STEPS, 3))}
+)
+"""Position is that of the body's origin; speeds and accelerations (dv/dt + w x v, of the step before) are
+those of its centre of mass in body axes; the third leg is at 0 in the middle of its play; ``late_rad`` are
+angles of the encoders that have not reached the wheels yet."""
+
+
+class TerrainProfile(NamedTuple):
+    """The terrain of one run along the path."""
+
+    patches: Array  # (patches,) of :data:`PATCH`
+    field: Array  # (2, 3, cells) factors along the path on thrust and on resistance, for each wheel
+
+
+def uniform_profile(
+    robot: Robot, *soils: Soil, roughness_m3: float = 0.0, start_m: tuple[float, ...] = (0.0,)
+) -> TerrainProfile:
+    """Return a terrain of one soil a patch without variation along the path, all patches equally rough."""
+    return TerrainProfile(_patches(robot, soils, [roughness_m3] * len(soils), start_m), np.ones((2, 3, 1)))
+
+
+def draw_profile(
+    robot: Robot,
+    scenario: Scenario,
+    soils: Mapping[str, Soil],
+    conditions: Conditions,
+    rng: np.random.Generator,
+) -> TerrainProfile:
+    """Return the terrain of a scenario, drawn as its soils and the conditions describe.
+
+    Raises
+    ------
+    ConfigError
+        if a terrain has no soil, or the robot gets too far to hold its terrain in memory.
+    """
+    for patch in scenario.patches:
+        if patch.terrain not in soils:
+            raise ConfigError(f"scenario {scenario.name}: terrain {patch.terrain!r} has no soil")
+    used = [soils[patch.terrain] for patch in scenario.patches]
+    start_m = np.array([patch.start_m for patch in scenario.patches])
+    speed_max_radps = robot.equipment.motors.speed_max_radps
+    farthest_m = 2.0 * robot.wheel_radius_m * speed_max_radps * scenario.time_s[-1]
+    n_cells = math.ceil(farthest_m / FIELD_STEP_M) + 1
+    if n_cells > MAX_FIELD_CELLS:
+        raise ConfigError(
+            f"robot {robot.name}: its wheels can come {farthest_m / 2e3:g} km far in this run, "
+            f"{MAX_FIELD_CELLS * FIELD_STEP_M / 2e3:g} km of terrain are simulated at most"
+        )
+    keep = math.exp(-FIELD_STEP_M / conditions.field_length_m)
+    white = rng.standard_normal((2, 3, n_cells))
+    white[:, :, 1:] *= math.sqrt(1.0 - keep**2)
+    unit = lfilter([1.0], [1.0, -keep], white, axis=2)
+    patch_of_cell = np.searchsorted(start_m, np.arange(n_cells) * FIELD_STEP_M, side="right") - 1
+    ratios = np.array([[soil.thrust_field_ratio, soil.resistance_field_ratio] for soil in used])
+    spread = ratios[patch_of_cell].T
+    field = np.exp(spread[:, None, :] * unit - 0.5 * spread[:, None, :] ** 2)
+    roughness = [soil.roughness_m3 * conditions.roughness_factor for soil in used]
+    return TerrainProfile(_patches(robot, used, roughness, start_m), field)
+
+
+def _patches(
+    robot: Robot, soils: Sequence[Soil], roughness_m3: Sequence[float], start_m: Sequence[float] | Array
+) -> Array:
+    body = robot.equipment.body
+    patches = np.zeros(len(soils), PATCH)
+    for patch, soil in zip(patches, soils, strict=True):
+        (patch["ground"],) = ground_record(
+            soil, robot.wheel_radius_m, body.tyre_width_m, body.contact_length_m
+        )
+    patches["roughness_m3"], patches["start_m"] = roughness_m3, start_m
+    return patches
+
+
+def make_plant(robot: Robot, conditions: Conditions) -> Array:
+    """Return the plant of a robot with all sections and its load, (1,) of :data:`PLANT`.
+
+    Raises
+    ------
+    ConfigError
+        if the load takes the centre of mass out of the triangle of the wheels.
+    """
+    body, motors, steering, _, sensors = robot.equipment
+    parts = (steering, body, motors, sensors, conditions)  # a torque is that of the motors
+    described = {n: getattr(part, n) for part in parts for n in PLANT.names or () if hasattr(part, n)}
+    effects = dict.fromkeys(parameters_of(robot.drive), 0.0) | dict(robot.effects)
+    mass_kg = robot.mass_kg * (1.0 + effects["payload_ratio"]) + conditions.payload_kg
+    half = 0.5 * effects["one_sided_radius_ratio"]
+    rolling = (1.0 + effects["wheel_radius_ratio"]) * np.array([1.0 - half, 1.0 - half, 1.0 + half])
+    offset_m = conditions.payload_kg / mass_kg * np.asarray(conditions.payload_m)
+    com_m = np.array([body.com_x_m, body.com_y_m]) + offset_m
+    load_fraction, load_per_moment = _load_shares(robot, conditions, com_m)
+    of_robot = {
+        "wheels_m": robot.wheel_positions_m,
+        "com_m": com_m,
+        "mass_kg": mass_kg,
+        "weight_n": robot.mass_kg * GRAVITY_MPS2,
+        "yaw_inertia_kgm2": body.yaw_inertia_kgm2 * mass_kg / robot.mass_kg,
+        "radius_m": robot.wheel_radius_m * np.array(conditions.radius_factors) * rolling,
+        "load_fraction": load_fraction,
+        "load_per_force_ratio": -body.com_height_m * load_per_moment,
+        "hall_steps": sensors.hall_steps_ratio * motors.reduction_ratio / (2 * math.pi),
+        "linked": any(effects[name] != 0.0 for name in in_plant(Stage.LINKAGE)),
+        "steer_offset_rad": [effects[f"steering_offset_{i}_rad"] for i in (1, 2, 3)],
+        "yields": any(effects[name] != 0.0 for name in in_plant(Stage.CONTACT)),
+        "effects": vector_of(effects).view(EFFECTS),
+    }
+    return filled(PLANT, **(described | of_robot))
+
+
+def _load_shares(robot: Robot, conditions: Conditions, com_m: Array) -> tuple[Array, Array]:
+    """Return the load (3,) of each wheel over the weight, and per moment about the two body axes (3, 2)."""
+    # Rows: vertical force, moment about y (x arm), moment about x (y arm); columns: the three wheels.
+    inverse = np.linalg.inv(np.vstack([np.ones(3), robot.wheel_positions_m.T]))
+    load_fraction = inverse @ np.array([1.0, com_m[0], com_m[1]])
+    if load_fraction.min() <= 0.0:
+        x_m, y_m = conditions.payload_m
+        raise ConfigError(
+            f"robot {robot.name}: a payload of {conditions.payload_kg:g} kg at ({x_m:g}, {y_m:g}) m "
+            f"from the centre of mass tips it over: wheel {int(load_fraction.argmin()) + 1} would carry "
+            "nothing"
+        )
+    return load_fraction, inverse[:, 1:]
+
+
+def start_state(steer_rad: Array) -> Array:
+    """Return the state, (1,) of :data:`STATE`, of a robot at rest at the origin, its steering motors at 0.
+
+    Its wheels hang in their play at ``steer_rad`` (3,).
+    """
+    wheels = np.zeros(3, WHEEL_STATE)
+    wheels["steer_rad"] = wheels["heading_rad"] = steer_rad
+    return filled(STATE, wheels=wheels, late_rad=steer_rad)
+
+
+def contact_ratio(plant: Array, profile: TerrainProfile) -> float:
+    """Return ``k`` of a plant under its weight, on its stiffest ground, over its limit: unstable from 1 on."""
+    robot = plant[0]
+    load_n = robot["mass_kg"] * GRAVITY_MPS2 * robot["load_fraction"]
+    spin = robot["radius_m"] ** 2 / robot["wheel_inertia_kgm2"]
+    arm_m2 = ((robot["wheels_m"] - robot["com_m"]) ** 2).sum(axis=1)
+    body = 2.0 / robot["mass_kg"] + arm_m2 / robot["yaw_inertia_kgm2"]
+    rates_ps2 = []
+    for ground in profile.patches["ground"]:  # the thrust over its slip is steepest at the start of the curve
+        slope_n = np.array([wheel_ground(ground, load, _SMALL_SLIP, 0.0)[0] for load in load_n]) / _SMALL_SLIP
+        stiffness_npm = slope_n / robot["relaxation_length_m"]
+        rates_ps2.append((stiffness_npm * spin).max() + (stiffness_npm * body).sum())
+    return float(max(rates_ps2)) / CONTACT_LIMIT_PS2
+
+
+def tyre_ratio(plant: Array) -> float:
+    """Return how stiff and damped the tyres are over their limit: unstable from 1 on."""
+    robot = plant[0]
+    corner_kg = robot["mass_kg"] * float(robot["load_fraction"].min())
+    damped = STEP_S * robot["tyre_stiffness_npm"] + 2.0 * robot["tyre_damping_nspm"]
+    return float(STEP_S * damped / 4.0 / corner_kg)
+
+
+def check_step(plant: Array, profile: TerrainProfile, name: str) -> None:
+    """Refuse a robot on its terrain whose contacts or tyres are too stiff for the steps of the integration.
+
+    Raises
+    ------
+    ConfigError
+        if the contacts, with :data:`LOAD_MARGIN_RATIO`, or the tyres are beyond their limit, or not finite.
+    """
+    steps = f"robot {name}: its motion cannot be integrated in steps of {STEP_S:g} s: "
+    mass_kg = plant["mass_kg"][0]
+    contact, tyre = LOAD_MARGIN_RATIO * contact_ratio(plant, profile), tyre_ratio(plant)
+    if not contact <= 1.0:
+        raise ConfigError(
+            f"{steps}under {mass_kg:g} kg the contacts are {contact:.3g} times too stiff for the "
+            "inertia of wheels and yaw; reduce mass or load, or raise these inertias"
+        )
+    if not tyre <= 1.0:
+        raise ConfigError(
+            f"{steps}with {mass_kg:g} kg the tyres are {tyre:.3g} times too stiff or too damped; raise "
+            "the mass, or reduce their stiffness and damping"
+        )
+
+
+# Speed over which a resistance takes its full size: it opposes rolling and does not push a robot at rest.
+ROLLING_SPEED_MPS = 0.02
+LEG_RATE_RADPS = (
+    0.5  # how fast the third leg swings through its play; assumed, it crosses one degree in 35 ms
+)
+# Moment about its hinge below which the third leg stays where it is; assumed, 7 N on the wheel: a start at 1 m/s^2
+# gives three times as much, steady rolling less.
+LEG_FRICTION_NM = 5.0
+LEAST_CREEP = -0.9  # least creep over the slip of the ground
+ROUGHNESS_WAVENUMBER = 0.1  # reference wave number of ISO 8608 in cycles/m
+ROUGHNESS_CUTOFF = (
+    0.01  # longest wave of the ground that counts as roughness, in cycles/m (ISO 8608's lower end)
+)
+
+
+def settle(plant: Array, profile: TerrainProfile, state: Array) -> None:
+    """Let a robot that was put on a slope come to rest; ``state`` is changed in place.
+
+    Its wheels are commanded to stand; contacts and motors take up the load, which on the level changes
+    nothing. For four of five seconds the speeds are taken away ten times a second, so that it does not swing;
+    where it rests afterwards is the origin.  Terrain too steep to stand on lets it slide.
+    """
+    stand, rows = np.zeros((1, 3)), np.empty(100, BODY_ROW)
+    for tenth in range(50):
+        advance(plant, profile, state, stand, stand, 100, np.zeros((100, 3)), rows)
+        if tenth < 40:
+            state["speed_x_mps"] = state["speed_y_mps"] = state["yaw_rate_radps"] = 0.0
+    for name in ("position_x_m", "position_y_m", "yaw_rad", "path_m"):
+        state[name] = 0.0
+
+
+@njit
+def advance(
+    plant: Array,
+    profile: TerrainProfile,
+    state: Array,
+    wheel_radps: Array,
+    steer_rad: Array,
+    substeps: int,
+    road_noise: Array,
+    rows: Array,
+) -> None:
+    """Drive through commands that are held for ``substeps`` steps each; ``state`` is changed in place.
+
+    Parameters
+    ----------
+    plant, profile, state : as :func:`~terrain.simulation.plants.dynamic.make_plant`, ``draw_profile`` and
+        ``start_state`` give them; or a state as an earlier call left it
+    wheel_radps, steer_rad : (n, 3) commands
+    substeps : steps of :data:`STEP_S` a command
+    road_noise : (n * substeps, 3) standard normal numbers, the roughness under each wheel
+    rows : (n * substeps,) of :data:`~terrain.simulation.sensors.BODY_ROW`, is written
+    """
+    for k in range(wheel_radps.shape[0] * substeps):
+        held = k // substeps
+        step(plant[0], profile, state[0], wheel_radps[held], steer_rad[held], road_noise[k], rows[k], STEP_S)
+
+
+@inner
+def step(
+    plant: Any,
+    profile: TerrainProfile,
+    state: Any,
+    wheel_radps: Array,
+    steer_rad: Array,
+    noise: Array,
+    row: Any,
+    dt: float,
+) -> None:
+    """Step all wheels, then the body that they carry; the row is that of the start of the step."""
+    cos_yaw, sin_yaw = math.cos(state.yaw_rad), math.sin(state.yaw_rad)
+    grade_x, grade_y = terrain_gradient(plant, state.path_m, cos_yaw, sin_yaw)
+    steepness = math.sqrt(1.0 + grade_x * grade_x + grade_y * grade_y)
+    row.grade_x_ratio, row.grade_y_ratio = grade_x, grade_y
+    force_x, force_y, moment, leg_nm = 0.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        steer_wheel(plant, state.wheels[i], steer_rad[i], dt)
+        fx, fy = _wheel_force(plant, profile, state, i, steepness, wheel_radps[i], noise[i], row, dt)
+        if i == 2:
+            leg_nm = -plant.wheels_m[i, 1] * fx
+        force_x += fx
+        force_y += fy
+        moment += (plant.wheels_m[i, 0] - plant.com_m[0]) * fy - (plant.wheels_m[i, 1] - plant.com_m[1]) * fx
+    state.n_steps += 1
+    accel_x = force_x / plant.mass_kg - GRAVITY_MPS2 * grade_x / steepness
+    accel_y = force_y / plant.mass_kg - GRAVITY_MPS2 * grade_y / steepness
+    spin = moment / plant.yaw_inertia_kgm2
+    _write_body(plant, state, accel_x, accel_y, spin, row)
+    _step_body(plant, state, accel_x, accel_y, spin, cos_yaw, sin_yaw, dt)
+    if plant.leg_backlash_rad > 0.0:
+        state.leg_rad = _swing(plant, state.leg_rad, leg_nm, dt)
+
+
+@inner
+def _wheel_force(
+    plant: Any,
+    profile: TerrainProfile,
+    state: Any,
+    i: int,
+    steepness: float,
+    command_radps: float,
+    noise: float,
+    row: Any,
+    dt: float,
+) -> tuple[float, float]:
+    """Step a steered wheel and its contact; return the force on the body along its axes."""
+    w, out, radius_m = state.wheels[i], row.wheels[i], plant.radius_m[i]
+    grade_x, grade_y = row.grade_x_ratio, row.grade_y_ratio
+    heading = w.steer_rad
+    row.encoder_rad[i] = w.steer_rad
+    if plant.linked:
+        heading = linkage_heading(plant, state, i, dt)
+    if i == 2 and plant.leg_backlash_rad > 0.0:
+        heading += state.leg_rad
+    # speed of the wheel's centre, along the wheel and across it
+    x_m, y_m = plant.wheels_m[i, 0] - plant.com_m[0], plant.wheels_m[i, 1] - plant.com_m[1]
+    v_x, v_y = point_velocity(state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps, x_m, y_m)
+    cos_steer, sin_steer = math.cos(heading), math.sin(heading)
+    along = cos_steer * v_x + sin_steer * v_y
+    across = -sin_steer * v_x + cos_steer * v_y
+    wheel_speed = w.rate_radps * radius_m
+    fastest = max(abs(wheel_speed), abs(along))
+    # the patch that the wheel is on lies ahead of the body's by its place in the direction of motion
+    speed = math.sqrt(state.speed_x_mps * state.speed_x_mps + state.speed_y_mps * state.speed_y_mps) + 1e-9
+    ahead_m = (plant.wheels_m[i, 0] * state.speed_x_mps + plant.wheels_m[i, 1] * state.speed_y_mps) / speed
+    patch = patch_index(profile.patches, state.path_m + (ahead_m if speed > 0.05 else 0.0))
+    ground = profile.patches[patch].ground
+    rolled = math.sqrt(along * along + across * across)
+    ride_n = ride_over(plant, w, i, profile.patches[patch].roughness_m3, rolled, noise, dt)
+    normal_n = plant.mass_kg * (
+        GRAVITY_MPS2 / steepness * plant.load_fraction[i]
+        + plant.load_per_force_ratio[i, 0] * (state.accel_x_mps2 + GRAVITY_MPS2 * grade_x / steepness)
+        + plant.load_per_force_ratio[i, 1] * (state.accel_y_mps2 + GRAVITY_MPS2 * grade_y / steepness)
+    )
+    w.ride_mps2 = ride_n / (plant.mass_kg * plant.load_fraction[i])
+    normal_n = max(normal_n + ride_n, 0.0)
+    rate_x = wheel_speed - along - fastest / plant.relaxation_length_m * w.deflection_x_m
+    rate_y = -across - fastest / plant.relaxation_length_m * w.deflection_y_m
+    if plant.yields:
+        rate_x -= w.creep_ratio * fastest / plant.relaxation_length_m * w.deflection_x_m
+        rate_y -= plant.effects.side_hill_slip_ratio * math.atan(grade_y) * abs(along)
+    slip_x = (w.deflection_x_m + DEFLECTION_DAMPING_S * rate_x) / plant.relaxation_length_m
+    slip_y = (w.deflection_y_m + DEFLECTION_DAMPING_S * rate_y) / plant.relaxation_length_m
+    thrust, side, resistance, sinkage = wheel_ground(ground, normal_n, min(max(slip_x, -1.0), 1.0), slip_y)
+    cell = min(max(int(state.path_m / FIELD_STEP_M), 0), profile.field.shape[2] - 1)  # a NaN is no place
+    thrust *= profile.field[0, i, cell]
+    side *= profile.field[0, i, cell]
+    resistance *= profile.field[1, i, cell]
+    if plant.yields:
+        w.creep_ratio = _creep(plant, ground, normal_n, slip_x, thrust)
+        slip = abs(slip_x) * (1.0 + w.creep_ratio)
+        resistance += (
+            plant.effects.rolling_resistance_ratio + plant.effects.slip_resistance_ratio * slip
+        ) * normal_n
+        resistance = max(resistance + plant.effects.viscous_drag_nspm * abs(along) / 3.0, 0.0)
+    pull = thrust - resistance * math.tanh(along / ROLLING_SPEED_MPS)
+    drive_wheel(plant, w, command_radps, thrust * radius_m, dt)
+    # the contact follows with the wheel's new rate: semi-implicit
+    rate_x = w.rate_radps * radius_m - along - fastest / plant.relaxation_length_m * w.deflection_x_m
+    limit = plant.relaxation_length_m
+    deflection = w.deflection_x_m + dt * rate_x
+    if plant.yields:  # implicit: a contact that creeps fast is stiff
+        deflection /= 1.0 + dt * (w.creep_ratio * fastest / plant.relaxation_length_m)
+    w.deflection_x_m = min(max(deflection, -limit), limit)
+    w.deflection_y_m = min(max(w.deflection_y_m + dt * rate_y, -limit), limit)
+    out.wheel_radps = wheel_speed / radius_m  # of this instant, as the slip is
+    out.steer_rad = heading
+    out.slip_ratio = (wheel_speed - along) / fastest if fastest >= 0.05 else np.nan
+    out.slip_angle_rad = math.atan2(across, abs(along)) if math.hypot(along, across) >= 0.05 else np.nan
+    out.normal_n, out.traction_n, out.side_n, out.torque_nm = normal_n, thrust, side, w.torque_nm
+    out.sinkage_m, out.reported_radps, out.patch_ratio = sinkage, w.reported_radps, patch
+    return cos_steer * pull - sin_steer * side, sin_steer * pull + cos_steer * side
+
+
+@inner
+def _step_body(
+    plant: Any,
+    state: Any,
+    accel_x: float,
+    accel_y: float,
+    spin: float,
+    cos_yaw: float,
+    sin_yaw: float,
+    dt: float,
+) -> None:
+    """Step the body with the acceleration of its centre of mass and of its yaw."""
+    turn, vx, vy = state.yaw_rate_radps, state.speed_x_mps, state.speed_y_mps
+    state.speed_x_mps = vx + dt * (accel_x + turn * vy)
+    state.speed_y_mps = vy + dt * (accel_y - turn * vx)
+    state.yaw_rate_radps = turn + dt * spin
+    origin_x, origin_y = point_velocity(
+        state.speed_x_mps, state.speed_y_mps, state.yaw_rate_radps, -plant.com_m[0], -plant.com_m[1]
+    )
+    state.position_x_m += dt * (cos_yaw * origin_x - sin_yaw * origin_y)
+    state.position_y_m += dt * (sin_yaw * origin_x + cos_yaw * origin_y)
+    state.yaw_rad += dt * state.yaw_rate_radps
+    state.path_m += dt * math.sqrt(origin_x * origin_x + origin_y * origin_y)
+    state.accel_x_mps2, state.accel_y_mps2 = accel_x, accel_y
+
+
+@inner
+def _write_body(plant: Any, state: Any, accel_x: float, accel_y: float, spin: float, row: Any) -> None:
+    """Speeds and accelerations at the origin; the ride of the plane through the three corners."""
+    base_m, track_m = plant.wheels_m[1, 0] - plant.wheels_m[0, 0], -plant.wheels_m[2, 1]
+    one, two, three = state.wheels[0], state.wheels[1], state.wheels[2]
+    turn, com_x, com_y = state.yaw_rate_radps, plant.com_m[0], plant.com_m[1]
+    row.position_x_m, row.position_y_m, row.yaw_rad = state.position_x_m, state.position_y_m, state.yaw_rad
+    row.speed_x_mps, row.speed_y_mps = point_velocity(
+        state.speed_x_mps, state.speed_y_mps, turn, -com_x, -com_y
+    )
+    row.yaw_rate_radps = turn
+    row.accel_x_mps2 = accel_x + spin * com_y + turn * turn * com_x
+    row.accel_y_mps2 = accel_y - spin * com_x + turn * turn * com_y
+    row.ride_z_mps2 = 0.5 * (one.ride_mps2 + two.ride_mps2)
+    row.ride_roll_rad = (0.5 * (one.ride_m + two.ride_m) - three.ride_m) / track_m
+    row.ride_pitch_rad = -(two.ride_m - one.ride_m) / base_m
+    row.ride_roll_radps2 = (0.5 * (one.ride_mps2 + two.ride_mps2) - three.ride_mps2) / track_m
+    row.ride_pitch_radps2 = -(two.ride_mps2 - one.ride_mps2) / base_m
+    row.path_m, row.leg_rad = state.path_m, state.leg_rad
+
+
+@njit
+def shear_slip(force_ratio: float, grip_ratio: float) -> float:
+    """Return the slip of a shear curve whose slip per force is 1 at the start; its end at 95 % of the grip.
+
+    ``f/f_max = 1 - (1 - exp(-x))/x`` is solved for ``x``, and ``s = x f_max / 2``: ``x = 2 f/f_max`` for
+    small forces.
+
+    Examples
+    --------
+    >>> round(shear_slip(0.001, 0.5), 5), round(shear_slip(0.25, 0.5), 3)
+    (0.001, 0.398)
+    """
+    part = min(abs(force_ratio) / grip_ratio, 0.95)
+    if part < 1e-9:
+        return force_ratio
+    # start from the two ends' forms, then Newton
+    x = 2.0 * part + part * part * part / (1.0 - part)
+    for _ in range(6):
+        e = math.exp(-x)
+        value = 1.0 - (1.0 - e) / x - part if x > 1e-4 else 0.5 * x - x * x / 6.0 - part
+        slope = (1.0 - e - x * e) / (x * x) if x > 1e-4 else 0.5 - x / 3.0
+        x = max(x - value / slope, 1e-9)
+    return math.copysign(0.5 * grip_ratio * x, force_ratio)
+
+
+@inner
+def _creep(plant: Any, ground: Any, normal_n: float, slip: float, thrust_n: float) -> float:
+    """Return what a contact creeps by beside the slip of the ground, over that slip."""
+    if abs(slip) < 1e-6 or normal_n <= 0.0:
+        return 0.0
+    force_ratio = 3.0 * thrust_n / plant.weight_n
+    creep = plant.effects.force_slip_ratio * force_ratio
+    if plant.effects.shear_slip_ratio != 0.0:
+        grip_ratio = ground.peak_friction_ratio
+        if not ground.hard:
+            area_m2 = ground.contact_length_m * ground.tyre_width_m
+            grip_ratio = ground.tan_friction + ground.cohesion_pa * area_m2 / normal_n
+        creep += plant.effects.shear_slip_ratio * shear_slip(force_ratio, grip_ratio)
+    return float(max(creep / slip, LEAST_CREEP))
+
+
+@inner
+def _swing(plant: Any, leg_rad: float, moment_nm: float, dt: float) -> float:
+    """Swing the third leg through its play to where its wheel is pushed, if that is hard enough."""
+    if abs(moment_nm) <= LEG_FRICTION_NM:
+        return leg_rad
+    turned_rad = leg_rad + math.copysign(LEG_RATE_RADPS * dt, moment_nm)
+    return float(min(max(turned_rad, -plant.leg_backlash_rad), plant.leg_backlash_rad))
+
+
+@inner
+def terrain_gradient(plant: Any, path_m: float, cos_yaw: float, sin_yaw: float) -> tuple[float, float]:
+    """Return the gradient of the ground in body axes, uphill positive."""
+    undulation = plant.undulation_ratio * math.sin(2 * math.pi * path_m / plant.undulation_length_m)
+    world_x, world_y = plant.grade_ratio[0] + undulation, plant.grade_ratio[1]
+    return cos_yaw * world_x + sin_yaw * world_y, -sin_yaw * world_x + cos_yaw * world_y
+
+
+@inner
+def patch_index(patches: Array, path_m: float) -> int:
+    """Return the number of the patch at a path length."""
+    patch = 0
+    while patch + 1 < patches.size and path_m >= patches[patch + 1].start_m:
+        patch += 1
+    return patch
+
+
+@inner
+def ride_over(
+    plant: Any, w: Any, i: int, roughness_m3: float, speed: float, noise: float, dt: float
+) -> float:
+    """Move the corner on its tyre over the rough ground; return what that adds to the load."""
+    white = noise * math.sqrt(0.5 / dt)
+    w.road_m += dt * (
+        -2 * math.pi * ROUGHNESS_CUTOFF * speed * w.road_m
+        + 2 * math.pi * ROUGHNESS_WAVENUMBER * math.sqrt(roughness_m3 * speed) * white
+    )
+    contact_rate = (w.road_m - w.contact_m) * min(2.0 * speed / plant.contact_length_m, 1.0 / dt)
+    w.contact_m += dt * contact_rate
+    mass_kg = plant.mass_kg * plant.load_fraction[i]
+    force_n = plant.tyre_stiffness_npm * (w.contact_m - w.ride_m) + plant.tyre_damping_nspm * (
+        contact_rate - w.ride_mps
+    )
+    w.ride_mps += dt * force_n / mass_kg
+    w.ride_m += dt * w.ride_mps
+    return float(force_n)
+
+
+@inner
+def steer_wheel(plant: Any, w: Any, command_rad: float, dt: float) -> None:
+    """Steering motor to its command with bounded rate and acceleration; the wheel hangs on it with play."""
+    error = command_rad - w.steer_motor_rad
+    # the rate from which the motor can still stop in time
+    desired = math.copysign(
+        min(math.sqrt(2 * plant.accel_max_radps2 * abs(error)), plant.rate_max_radps), error
+    )
+    if abs(error) < 1e-4:
+        desired = error / dt
+    change = plant.accel_max_radps2 * dt
+    w.steer_motor_radps += min(max(desired - w.steer_motor_radps, -change), change)
+    w.steer_motor_rad += dt * w.steer_motor_radps
+    w.steer_rad = min(
+        max(w.steer_rad, w.steer_motor_rad - plant.dead_band_rad), w.steer_motor_rad + plant.dead_band_rad
+    )
+
+
+@inner
+def linkage_heading(plant: Any, state: Any, i: int, dt: float) -> float:
+    """Return the heading of a wheel behind delay, play and offset of its linkage."""
+    w = state.wheels[i]
+    late = w.steer_rad
+    delay_steps, backlash_rad = (
+        round(plant.effects.steering_delay_s / dt),
+        plant.effects.steering_backlash_rad,
+    )
+    if delay_steps > 0:
+        place = state.n_steps % delay_steps
+        late, state.late_rad[place, i] = state.late_rad[place, i], w.steer_rad
+    w.heading_rad = min(max(w.heading_rad, late - backlash_rad), late + backlash_rad)
+    return float(w.heading_rad + plant.steer_offset_rad[i])
+
+
+@inner
+def drive_wheel(plant: Any, w: Any, command_radps: float, load_nm: float, dt: float) -> None:
+    """Speed loop, motor and wheel; then the rate that the motor driver reports."""
+    command = min(max(command_radps, -plant.speed_max_radps), plant.speed_max_radps)
+    error = command - w.estimate_radps
+    desired = plant.speed_gain_nmspr * error + w.integral_nm
+    torque = min(max(desired, -plant.torque_max_nm), plant.torque_max_nm)
+    if torque == desired or desired * error < 0.0:
+        w.integral_nm += dt * plant.speed_integral_nmpr * error
+    w.torque_nm += (torque - w.torque_nm) * min(dt / max(plant.torque_time_constant_s, dt), 1.0)
+    friction = plant.friction_nm * math.tanh(w.rate_radps / 0.1)
+    w.rate_radps += dt * (w.torque_nm - friction - load_nm) / plant.wheel_inertia_kgm2
+    w.angle_rad += dt * w.rate_radps
+    lag = min(dt / max(plant.speed_estimate_time_constant_s, dt), 1.0)
+    w.estimate_radps += (w.rate_radps - w.estimate_radps) * lag
+    count = math.floor(w.angle_rad * plant.hall_steps)
+    seen = (count - w.hall_count) / plant.hall_steps / dt
+    w.hall_count = count
+    w.reported_radps += (seen - w.reported_radps) * min(dt / max(plant.encoder_time_constant_s, dt), 1.0)
+
+
+MIN_LABEL_S = 0.5  # A shorter stay on one ground gets no label
+# No wheel turns so many times as fast as its motor can: then the steps are too long for the robot, as with a load
+# of 1000 t on 90 kg.
+MAX_WHEEL_SPEEDS = 100.0
+MAX_COMMAND_DELAY_S = 0.5  # longest delay of a command to the wheels; a later one is no control
+
+_PURPOSES = ("terrain", "road", "start", "wheels", "steering", "imu", "camera", "gnss")
+
+COMMAND_CHANNELS = (
+    *("speed_x_mps", "speed_y_mps", "yaw_rate_radps"),
+    *(f"wheel_{i}_radps" for i in (1, 2, 3)),
+    *(f"steer_{i}_rad" for i in (1, 2, 3)),
+)
+"""The admitted twist of the body, and what it asks of the wheels."""
+
+
+def run_dynamic(
+    robot: Robot,
+    scenario: Scenario,
+    soils: Mapping[str, Soil],
+    seed: int | np.random.SeedSequence,
+    *,
+    conditions: Conditions,
+    faults: Faults,
+    effects: Mapping[str, float],
+    gnss: Gnss | None = None,
+    controller: Callable[[Sample], Command] | None = None,
+    command_delay_s: float = 0.0,
+) -> tuple[dict[str, Stream], tuple[Label, ...]]:
+    """Return streams and labels of a scenario, for :func:`terrain.simulation.run.simulate`, which describes the rest.
+
+    Parameters
+    ----------
+    robot : swerve robot with all sections
+    soils : by the terrain names of the scenario
+    gnss : receiver on board, if any
+    controller : called once an instant of the scenario with the samples that arrived since the instant before, as the
+        log has them; before its first command is in force, the wheels are commanded to stand and the steering to stay
+        at 0.  Without one the wheels are commanded to follow the desired twists
+    command_delay_s : from that instant to when the command is in force, in whole steps, one at least
+    """
+    robot = as_drive(SwerveRobot, robot, "robot {name}: drive {drive!r} is not simulated, only 'swerve' is")
+    substeps, delay_steps = _substeps(robot, scenario), _delay_steps(command_delay_s)
+    rngs = generators(seed, _PURPOSES)
+    built = _built(robot, effects)
+    profile = draw_profile(built, scenario, soils, conditions, rngs["terrain"])
+    plant = make_plant(built, conditions)
+    check_step(plant, profile, built.name)
+    n_steps = len(scenario.time_s) * substeps
+    state = start_state(plant["dead_band_rad"][0] * rngs["start"].uniform(-1.0, 1.0, 3))
+    settle(plant, profile, state)
+    road_noise = rngs["road"].standard_normal((n_steps, 3))
+    motion = Motion(np.empty(n_steps, BODY_ROW), 0)
+    sensors, gyro_bias_radps = _sensors(motion, built, faults, gnss, rngs)
+    status: dict[str, Array] = {}
+    if controller is None:
+        wheels = wheel_motion(robot, scenario.twist, 1 / scenario.rate_hz)
+        held = (wheels.wheel_radps, wheels.steer_rad, substeps)
+        advance(plant, profile, state, *held, road_noise, motion.record)
+        decided = np.hstack([wheels.twist, wheels.wheel_radps, wheels.steer_rad])
+    else:
+        drive = DrivenPlant(plant, profile, state, road_noise, motion.record)
+        decided, status = _in_loop(controller, delay_steps, scenario, substeps, drive, motion, sensors)
+    _check_motion(motion.record, robot)
+    motion.grow(n_steps)
+    for sensor in sensors.values():
+        sensor.update()
+    streams = {name: sensor.stream() for name, sensor in sensors.items() if len(sensor.time_s) > 1}
+    streams["commands"] = Stream(scenario.time_s, decided, COMMAND_CHANNELS)
+    if status:
+        streams["control"] = Stream(scenario.time_s, np.column_stack(list(status.values())), tuple(status))
+    streams["truth"] = wheels_truth(motion, gyro_bias_radps, sensors["imu"].time_s)
+    return streams, _labels(motion.record, scenario)
+
+
+def _substeps(robot: Robot, scenario: Scenario) -> int:
+    """Return the steps from twist to twist, once robot and scenario are checked."""
+    substeps = round(1 / (scenario.rate_hz * STEP_S))
+    if abs(substeps * scenario.rate_hz * STEP_S - 1.0) > 1e-9:
+        raise ConfigError(
+            f"scenario {scenario.name}: rate_hz is {scenario.rate_hz:g}, it must divide {1 / STEP_S:g}"
+        )
+    _, _, _, camera, sensors = robot.equipment
+    rates_hz = {"camera: rate_hz": camera.rate_hz} | {
+        f"sensors: {name}": getattr(sensors, name)
+        for name in ("wheels_rate_hz", "steering_rate_hz", "imu_rate_hz")
+    }
+    for name, rate_hz in rates_hz.items():
+        if rate_hz > 1 / STEP_S:
+            raise ConfigError(
+                f"robot {robot.name}: {name} is {rate_hz:g}, at most {1 / STEP_S:g} is simulated"
+            )
+    return substeps
+
+
+def _delay_steps(delay_s: float) -> int:
+    number = isinstance(delay_s, int | float | np.integer | np.floating) and not isinstance(delay_s, bool)
+    if not number or not 0 <= delay_s <= MAX_COMMAND_DELAY_S:
+        raise ConfigError(
+            f"command_delay_s is {delay_s!r}, a time from 0 to {MAX_COMMAND_DELAY_S:g} s is required"
+        )
+    return max(round(delay_s / STEP_S), 1)
+
+
+def _sensors(
+    motion: Motion, robot: Robot, faults: Faults, gnss: Gnss | None, rngs: Mapping[str, np.random.Generator]
+) -> tuple[dict[str, Sensor], Array]:
+    """Return the sensors on board, by stream, and the true bias of the yaw gyro."""
+    imu, gyro_bias_radps = imu_sensor(motion, robot, rngs["imu"])
+    sensors = {
+        "wheels": wheel_sensor(motion, robot, rngs["wheels"]),
+        "steering": steering_sensor(motion, robot, rngs["steering"]),
+        "imu": imu,
+        "odometry": camera_sensor(motion, robot, rngs["camera"], faults),
+    }
+    if gnss is not None:
+        sensors["gnss"] = gnss_sensor(motion, gnss, rngs["gnss"], faults)
+    for name, sensor in sensors.items():
+        sensor.stamp(name, robot.effects)
+    return sensors, gyro_bias_radps
+
+
+def _built(robot: Robot, effects: Mapping[str, float]) -> Robot:
+    """Return the robot with all its effects, of which the commanded one lacks some."""
+    if not robot.effects and not effects:
+        return robot
+    acting = checked_effects("effects", {**robot.effects, **effects}, robot.drive)
+    n = len(acting)
+    extended = replace(robot, effects=acting, effects_cov=np.full((n, n), np.nan))
+    return apply_homes(extended, in_plant(Stage.DESCRIPTION))
+
+
+def _check_motion(rows: Array, robot: Robot) -> None:
+    later = ("wheels", "roll_rad", "pitch_rad")
+    finite = all(np.isfinite(rows[name]).all() for name in BODY_ROW.names or () if name not in later)
+    fastest_radps = float(np.abs(rows["wheels"]["wheel_radps"]).max())
+    limit_radps = MAX_WHEEL_SPEEDS * robot.equipment.motors.speed_max_radps
+    if not finite or not fastest_radps <= limit_radps:
+        raise ConfigError(
+            f"robot {robot.name}: its motion cannot be integrated in steps of {STEP_S:g} s; a mass, an "
+            "inertia, a stiffness, a gain or the load is out of scale with the rest"
+        )
+
+
+def _labels(rows: Array, scenario: Scenario) -> tuple[Label, ...]:
+    """One label a stretch in which all three wheels are on the same ground."""
+    patch = rows["wheels"]["patch_ratio"]
+    one = np.where((patch == patch[:, :1]).all(axis=1), patch[:, 0], -1)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(one)) + 1, [len(one)]])
+    labels: list[Label] = []
+    for begin, end in pairwise(edges):
+        start_s, end_s = float(begin * STEP_S), float(end * STEP_S)
+        if one[begin] >= 0 and end_s - start_s >= MIN_LABEL_S:
+            terrain = scenario.patches[int(one[begin])].terrain
+            labels.append(Label(round(start_s, 3), round(end_s, 3), terrain))
+    return tuple(labels)
+
+
+class DrivenPlant:
+    """A plant that is driven on and on, by commands that come into force one after the other.
+
+    Parameters
+    ----------
+    plant, profile, state, road_noise, rows : as :func:`terrain.simulation.plants.dynamic.advance` takes them, for all
+        steps
+    """
+
+    def __init__(
+        self, plant: Array, profile: TerrainProfile, state: Array, road_noise: Array, rows: Array
+    ) -> None:
+        self._driven, self._state, self._noise, self._rows = (plant, profile, state), state, road_noise, rows
+        self._wheel, self._steer = np.zeros((1, 3)), np.zeros((1, 3))
+        self._due: deque[tuple[int, Array, Array]] = deque()
+        self._n_steps = 0
+
+    def command(self, step: int, wheel_radps: Array, steer_rad: Array) -> None:
+        """Let a command (3,), (3,) come into force with a step, not before those that were given before."""
+        self._due.append((step, wheel_radps, steer_rad))
+
+    def until(self, n_steps: int) -> bool:
+        """Drive until so many steps are done; false where the state is not finite: the rest of it is NaN."""
+        while self._n_steps < n_steps:
+            first = self._n_steps
+            if self._due and self._due[0][0] <= first:
+                _, self._wheel[0], self._steer[0] = self._due.popleft()
+                continue
+            end = min(n_steps, self._due[0][0]) if self._due else n_steps
+            held = (self._wheel, self._steer, end - first, self._noise[first:end], self._rows[first:end])
+            advance(*self._driven, *held)
+            self._n_steps = end
+        finite = is_finite(self._state)
+        if not finite:
+            self._rows[self._n_steps :] = filled(BODY_ROW, np.nan)[0]
+            self._n_steps = len(self._rows)
+        return finite
+
+
+def _in_loop(
+    controller: Callable[[Sample], Command],
+    delay_steps: int,
+    scenario: Scenario,
+    substeps: int,
+    drive: DrivenPlant,
+    motion: Motion,
+    sensors: Mapping[str, Sensor],
+) -> tuple[Array, dict[str, Array]]:
+    """Drive a scenario by a controller, to its last row; return commands (n, 9), and (n,) of their status by name."""
+    decided = np.empty((len(scenario.time_s), 9))
+    status: list[Mapping[str, float]] = []
+    for k, time_s in enumerate(scenario.time_s.tolist()):
+        step = k * substeps
+        if not drive.until(step + 1):
+            break
+        motion.grow(step + 1)
+        for sensor in sensors.values():
+            sensor.update()
+        arrived = ((name, sensor.arrived(time_s)) for name, sensor in sensors.items())
+        readings = {name: reading for name, reading in arrived if reading is not None}
+        one, two, three = motion.record["wheels"]["patch_ratio"][step].tolist()
+        terrain = scenario.patches[int(one)].terrain if one == two == three else ""
+        command = controller(Sample(time_s, scenario.twist[k], readings, terrain))
+        decided[k] = _numbers(command, time_s)
+        status.append(_status(command, status[0] if status else None, time_s))
+        drive.command(step + delay_steps, decided[k, 3:6], decided[k, 6:])
+    drive.until(len(motion.record))
+    names = status[0] if status else ()
+    return decided, {name: np.array([row[name] for row in status]) for name in names}
+
+
+def _numbers(command: Command, time_s: float) -> Array:
+    """Return twist, wheel rates and steering angles of a command in a row (9,)."""
+    row = np.empty(9)
+    for i, name in enumerate(("twist", "wheel_radps", "steer_rad")):
+        given = getattr(command, name)
+        try:
+            values = np.asarray(given, dtype=float)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        if values.shape != (3,) or not np.isfinite(values).all():
+            shown = " ".join(repr(given).split())
+            raise DataError(
+                f"controller: {name} of its command at {time_s:g} s is {shown}, 3 finite numbers are required"
+            )
+        row[3 * i : 3 * i + 3] = values
+    return row
+
+
+def _status(command: Command, first: Mapping[str, float] | None, time_s: float) -> dict[str, float]:
+    """Return the status of a command; ``first`` is that of the first one."""
+    try:
+        status = {name: float(value) for name, value in command.status.items()}
+        if first is None:
+            for name in status:
+                unit_of(name)
+    except (AttributeError, TypeError, ValueError, LogError) as error:
+        raise DataError(f"controller: status of its command at {time_s:g} s: {error}") from None
+    if first is not None and status.keys() != first.keys():
+        raise DataError(
+            f"controller: status of its command at {time_s:g} s has {', '.join(status) or 'nothing'}, "
+            f"that of the first has {', '.join(first) or 'nothing'}: the same names are required"
+        )
+    return status

@@ -1,0 +1,1951 @@
+r"""The planar plant: from wheels, steering and tilt to the motion of a body, in whole signals; its sensors and runs.
+
+One body for all wheeled robots, fed either with what a simulated drive does to the wheels or with what a log
+records of them; whatever is wrong about it is a parameter of :mod:`terrain.effects`, 0 where absent.
+
+- **kinematics** without slip: of a swerve robot the least-squares twist of its wheels' velocities, of a
+  skid-steer robot ``u = (v_r + v_l)/2``, ``w = (v_r - v_l)/B``;
+- **force**: ``F = m (1 + p) (dv/dt + g sin th) + R``, with the resistance ``R`` of rolling, drag, slip and
+  scrub against the motion, and ``f = F / (m g)``;
+- **slip**: ``v = u - |u| s(f)``, ``s = c f`` and a shear curve, stepped exactly for inputs that run straight from
+  sample to sample, so that the answer hardly depends on the step;
+- **currents**: their sum is ``F r`` along the wheels' mean heading and the motors' friction over the torque that an
+  ampere gives at the wheel.
+
+Load transfer and roughness are left out: what they do to a log is noise here.  Sources stand with the effects.
+
+A drive is a :class:`PlanarDrive`: the record of its numbers on a ground, and the kernel of its motion.
+
+**Slip along the heading**, of skid-steer and of car-like robots.  With ``f = (m dv/dt + F) / (m g)`` and ``F`` what
+slope and resistances ask for, ``v = u - |u| c f`` is a low-pass of ``u - |u| c F / (m g)`` with the time constant
+``|u| c / g``, stepped exactly for what runs straight from sample to sample; of car-like robots, which are fast, the
+time constant does, too.
+
+**Skid-steer and tracked robots** turn by their two sides.  Turning slip takes of the difference of the sides by how
+tight the turn is, turn drag of the mean by the yaw rate; in fast arcs the track acts narrower.  With friction against
+lateral motion, ``m (dv_y/dt + w v) = -K v_y``, the robot slips to the outside of a turn: ``T dv_y/dt + v_y = -c v w``,
+``c = T = m/K``; the two are parameters of their own.  The difference of the currents of the sides is that of yaw
+inertia and scrub.
+
+**Car-like robots** are the linear single-track model, at rest and fast alike.  With the lateral speed ``c`` of the
+centre of mass, ``a`` ahead of the rear axle and ``b`` behind the front one, ``L = a + b``, the yaw rate ``w``, the
+speed ``v`` and the steering angle ``d``::
+
+    m (dc/dt + v w) = F_f + F_r - m g sin(ph),      I dw/dt = b F_f - a F_r
+    F_f = -C_f (c + b w - v tan d) / |v|,           F_r = -C_r (c - a w) / |v|
+
+as Rajamani, Vehicle Dynamics and Control, has it, with ``tan d`` in place of ``d``, so that at low speed it is the
+kinematic bicycle, and ``|v|``, so that it drives backward.  Where nothing changes::
+
+    w = (v tan d - |v| K g sin ph) / (L + K v |v|),     K = m (a / C_f - b / C_r) / L
+    v_y = -|v| m b / (L C_r) (v w + g sin ph)           at the rear axle
+
+``x = (c, w)`` follows that, ``dx/dt = A (x - s)``, exactly for an ``s`` that runs straight from sample to sample and
+an ``A`` of the step's mean speed.  Understeer is ``K`` more, by a front axle that yields; ``L + K v |v|`` is kept above
+a tenth of ``L``: there, near the speed at which a car spins, the linear model ends, and a front axle that yields enough
+takes its place.  There are no currents.
+
+**Omni robots**: each wheel pulls along its drive direction, rollers resist across it.  Wheel i at :math:`p_i` carries
+the share :math:`n_i` of the weight W, turns with the circumferential speed :math:`u_i`, and with the twist V of the
+centre of mass its own centre moves by :math:`D_i V` along the direction that it drives and by :math:`E_i V` across it.
+Over the root mean square speed U of the wheels or, where that is larger, of their centres, so that slip does not depend
+on speed, the forces on it are
+
+.. math::
+    F_i = n_i W C \frac{u_i - D_i V}{U}, \qquad G_i = -r\, n_i W \frac{E_i V}{U} .
+
+C is the traction over the load of the ground at the root mean square slip of the wheels, over that slip, and r the
+friction of the rollers over the load; steady motion depends on :math:`\rho = r / C` alone, the force that it takes on
+r and C.  Rolling resistance :math:`R_i` opposes the motion along each wheel.  With the masses M and gravity P of a
+slope
+
+.. math:: M \dot V = \sum_i D_i^T (F_i - R_i) + E_i^T G_i + P + M\,(w v_y, -w v_x, 0) .
+
+A contact follows within :math:`U / (C g)`, some milliseconds: steps are implicit in V, which is stable at rest, too,
+and without inertia, resistance and slope is :func:`steady_twist`: the balance that is linear in V,
+
+.. math:: \sum_i n_i \left(D_i^T D_i + \rho\,E_i^T E_i\right) V = \sum_i n_i D_i^T u_i .
+
+Without roller friction the wheels drive what they roll; with ever more of it the body stands.  A common factor
+:math:`1 - \kappa` on V stands for an effective radius, or a scale of what measures V, that is off: it slips alike in
+all directions, and no log of both distinguishes the two.  What is assumed: three wheels at even angles whose loads
+follow from the centre of mass and do not shift; one C and r for all wheels; friction of the rollers that grows with the
+speed across over U; in steady motion a contact that is linear in its slip, and no other resistance.
+
+**Swerve robots**: all wheels slip as one contact with the ground, by a twist of three parts: the speeds of the centre
+of mass along and across, and the yaw rate times the root mean square distance ``r`` of the wheels from it.  Without
+slip they would be ``u``; slip takes ``l`` of each::
+
+    v = u - l,                  dl/dt = a - N f,          a = du/dt + g sin th + w x v + R v
+    f = (z + d dz/dt) / s,      sigma dz/dt = l - |u| c z
+
+with the traction ``f`` over the weight, ``N = (g, g, m g r^2 / I)``, the tilt ``th`` of each axis, a resistance ``R``
+over the mass, the contact's relaxation length ``sigma``, its damping ``d``, the ground's slip ``s`` per traction, and
+by how much a load and effects change it, ``c``; where nothing changes ``l = |u| c s f``.  The three parts meet in
+``R``, ``s``, ``c`` and ``w x v`` alone, and each is stepped exactly for an ``a`` that runs straight from sample to
+sample.
+
+**Replay** leads from logged wheels, steering and tilt to what the other sensors of the log should show.  Lags, clocks
+and offsets that stand between the inputs and their records are corrected first; from there on a replay is the motion
+and the sensors of a simulated run.  Sensors without noise have bias, scale, mounting, latency and their logger's clock.
+
+**A run** turns twists into the wheel speeds and steering angles that a controller would command with the described
+geometry; the motors follow them with a lag and bounded rates; :func:`move` gives the motion, :func:`sense` the
+measurements of sensors without noise; loggers add noise, bias and quantisation.  A hidden effect is a number in the
+same vector that a replay has.  The hills are those along the path that the wheels would roll without slip.
+
+The measurement models are those of :mod:`terrain.simulation.sensors`.  The loggers differ from those of the dynamic
+plant in three respects, so that a replay of the log can undo them exactly: latency and clock errors are interpolated
+delays on a fixed grid, the wheel encoders report the distance over a period, and the noise of a moving robot is
+coloured and grows with speed.  Coloured noise is ``x_k = a x_(k-1) + sqrt(1 - a^2) std e_k`` with
+``a = exp(-dt / tau)``; every second sample of it is again such a noise.  Its numbers travel with the package, in
+``data/spread/planar.yaml``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from terrain.constants import GRAVITY_MPS2
+from terrain.effects import (
+    CHANNELS,
+    CURRENT,
+    EFFECTS,
+    HEADING,
+    INDEX,
+    SLIDING_RADPS,
+    SPEED_X,
+    TURNING_CURRENT,
+    nuisances_of,
+    vector_of,
+)
+from terrain.errors import ConfigError
+from terrain.files.documents import number, read_yaml
+from terrain.files.names import data_folder
+from terrain.kernels import filled, inner, njit, numbers, record
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.kinematics.commands import WheelMotion, wheel_motion
+from terrain.kinematics.wheels import point_velocity, rolling_matrix, velocity_matrix, wheel_frame_velocities
+from terrain.logs.schema import IMU_CHANNELS, POSE_CHANNELS
+from terrain.records import Array, Label, Stream
+from terrain.robots import BicycleRobot, Part, Robot, SwerveRobot, TrackedRobot
+from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S, shear_slip
+from terrain.simulation.scenario import RATE_HZ, Conditions, Scenario
+from terrain.simulation.sensors import (
+    BODY,
+    GYRO_BIAS,
+    N_ERRORS,
+    RAW_HZ,
+    ImuErrors,
+    add_rate_noise,
+    camera_samples,
+    described_calibration,
+    encoder_angle,
+    generators,
+    imu_values,
+    raw_fixes,
+    truth_stream,
+    wheel_channels,
+)
+from terrain.slip import slip_angle, slip_ratio
+from terrain.terramechanics.soil import Soil
+from terrain.terramechanics.traction import equilibrium_slip, ground_record, wheel_ground
+
+
+@njit
+def softness(soft_ratio: Array, slip: float) -> float:
+    """Return slip over traction of the ground at a slip.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> round(softness(np.array([0.3, 0.4, 0.6]), 0.75), 3)
+    0.5
+    """
+    last = soft_ratio.size - 1
+    at = min(slip, 1.0) * last
+    i = min(int(at), last - 1)
+    return float(soft_ratio[i] + (at - i) * (soft_ratio[i + 1] - soft_ratio[i]))
+
+
+@inner
+def shear_softness(force_ratio: float, grip_ratio: float) -> float:
+    """Return slip over traction of a shear curve that starts with 1."""
+    return shear_slip(force_ratio, grip_ratio) / force_ratio if abs(force_ratio) > 1e-9 else 1.0
+
+
+TRUTH = record(
+    numbers(
+        "speed_x_mps speed_y_mps yaw_rate_radps accel_x_mps2 force_n current_a turning_current_a slip_ratio"
+    )
+)
+"""What the body does, before any sensor: speeds of the body's origin, specific force along x, traction, currents of
+motors as described, and slip; traction and slip are those along x, of an omni robot the slip of the body along what
+its wheels roll, and the sum of its currents' magnitudes."""
+
+N_SLIPS = 101
+_SLIPS = np.linspace(0.0, 1.0, N_SLIPS)
+
+PLANAR_BODY = record(
+    numbers(
+        "track_m radius_m mass_kg rotating_kg yaw_inertia_kgm2 nm_per_a friction_nm lever_x_m lever_y_m latency_s "
+        "imu_latency_s imu_lag_s encoder_lag_s com_x_m com_y_m grip_ratio rolling_ratio scrub_ratio load_ratio "
+        "effective_ratio"
+    )
+    | {"soft_ratio": (float, N_SLIPS), "n_wheels": int, "seen_from_above": bool}
+)
+"""Numbers that every drive has: of the robot, of its sensors' latencies, and of its ground, with the slip over the
+traction at slips evenly spaced from 0 to 1; whether a camera above the field measures its poses."""
+
+# Lag of a swerve robot's IMU behind its latency: bandwidths of 47 and 62.5 Hz (Bosch BNO055 data sheet).
+IMU_LAG_S = 0.003
+# Resistance to turning over the ground's grip; assumed: wheels of a side skid sideways over half the distance.
+SCRUB_SHARE = 0.4
+# Width of a tyre, and length of its contact on firm ground, over the wheel's radius, where a description has no
+# section ``body``; assumed: the described robots have 0.5 to 0.7, and 0.6.
+WIDTH_RATIO, CONTACT_RATIO = 0.6, 0.6
+_MORE = 1.01  # load for which growth with load is taken
+
+
+class Ground(NamedTuple):
+    """A terrain in the planar simulation."""
+
+    # slip a traction of the robot's whole weight would take, were the thrust curve straight
+    slip_ratio: float = 0.3
+    grip_ratio: float = 0.5  # largest traction over weight, of the shear curve
+    rolling_ratio: float = 0.05  # resistance over weight
+    scrub_ratio: float = 0.2  # resistance to turning of a skid-steer robot, over weight
+    # traction over weight at slips evenly spaced from 0 to 1, which takes the place of ``slip_ratio``; without any
+    # the thrust curve is straight
+    thrust_ratio: tuple[float, ...] = ()
+    # by how much the traction at a slip grows with a load, as a share of the load's own share
+    load_ratio: float = 0.0
+    # share of the measured tilt that is a slope to drive up; the rest is a body that rides over bumps
+    effective_ratio: float = 1.0
+    # friction of the rollers of omni wheels over the load, at a speed across of the wheels' own
+    roller_ratio: float = 0.0
+
+
+def planar_ground(robot: Robot, soil: Soil) -> Ground:
+    """Return what a soil is to a robot that carries its weight on all tyres alike.
+
+    The thrust curve is that of one tyre with its share of the weight; ``slip_ratio`` is its chord through the slip at
+    which the robot drives steadily on the level.  How thrust grows with load is taken there, too.  Rollers of omni
+    wheels turn freely where the soil does not say what it does to them.
+
+    Raises
+    ------
+    ConfigError
+        if the robot is stuck on that soil.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> from terrain.terramechanics.soil import load_soil
+    >>> ground = planar_ground(load_robot("agrimaro"), load_soil("grass"))
+    >>> [round(number, 3) for number in ground[:4]], round(ground.load_ratio, 2)
+    ([1.569, 0.347, 0.08, 0.139], 0.76)
+    """
+    width_m, contact_m = WIDTH_RATIO * robot.wheel_radius_m, CONTACT_RATIO * robot.wheel_radius_m
+    if robot.describes("body"):
+        width_m, contact_m = robot.body.tyre_width_m, robot.body.contact_length_m
+    wheel = robot.wheel_radius_m, width_m, contact_m
+    normal_n = robot.mass_kg * GRAVITY_MPS2 / robot.n_tyres
+    slip = equilibrium_slip(soil, normal_n, 0.0, *wheel)
+    if math.isnan(slip):
+        raise ConfigError(f"robot {robot.name}: it gets stuck on terrain {soil.name!r}")
+    ground = ground_record(soil, *wheel)[0]
+    thrust_n = wheel_ground(ground, normal_n, max(slip, 1e-3), 0.0)[0]
+    more_n = wheel_ground(ground, _MORE * normal_n, max(slip, 1e-3), 0.0)[0]
+    thrusts = [wheel_ground(ground, normal_n, float(s), 0.0)[0] / normal_n for s in _SLIPS]
+    return Ground(
+        slip_ratio=max(slip, 1e-3) * normal_n / thrust_n,
+        grip_ratio=max(thrusts),
+        rolling_ratio=wheel_ground(ground, normal_n, slip, 0.0)[2] / normal_n,
+        scrub_ratio=SCRUB_SHARE * max(thrusts),
+        thrust_ratio=tuple(thrusts),
+        load_ratio=(more_n / thrust_n - 1.0) / (_MORE - 1.0),
+        roller_ratio=float(np.nan_to_num(soil.roller_friction_ratio)),
+    )
+
+
+Inputs = tuple[Array, Array, Array, Array, Array]
+"""Wheel speeds and steering (n, wheels), grade and roll (n,), and the disturbance (n, 3) or (0, 3)."""
+
+
+class PlanarDrive(NamedTuple):
+    """What a drive is made of: all that is to be written for a new one."""
+
+    record: np.dtype[Any]  # of its numbers, with the field ``body`` of :data:`PLANAR_BODY`
+    # from a robot and a ground to its other fields by name
+    numbers: Callable[[Robot, Ground], Mapping[str, Any]]
+    # the kernel, from that record (1,), the vector of effects, the step in s and inputs to rows (n,) of :data:`TRUTH`
+    move: Callable[[Array, Array, float, Inputs], Array]
+    drifts: bool = True  # whether the body goes sideways by what the ground adds, and on a side hill
+
+
+def body_numbers(robot: Robot, ground: Ground) -> Array:
+    """Return what a robot and a ground are to every drive, (1,) of :data:`PLANAR_BODY`.
+
+    What a description leaves out does not act: without motors a traction of 1 N counts as 1 A, without a camera the
+    speed is that of the body's origin, without delay.
+    """
+    complete = robot.completed
+    motors, camera, body, sensors = complete.motors, complete.camera, complete.body, complete.sensors
+    n = len(robot.wheels)
+    return filled(
+        PLANAR_BODY,
+        n_wheels=n,
+        track_m=robot.track_m,
+        radius_m=robot.wheel_radius_m,
+        mass_kg=robot.mass_kg,
+        rotating_kg=n * body.wheel_inertia_kgm2 / robot.wheel_radius_m**2,
+        yaw_inertia_kgm2=body.yaw_inertia_kgm2,
+        nm_per_a=motors.torque_constant_nmpa * motors.reduction_ratio * motors.efficiency_ratio,
+        friction_nm=n * motors.friction_nm,
+        lever_x_m=camera.lever_x_m,
+        lever_y_m=camera.lever_y_m,
+        latency_s=camera.latency_s + camera.time_constant_s,
+        imu_latency_s=sensors.imu_latency_s,
+        imu_lag_s=IMU_LAG_S if isinstance(robot, SwerveRobot) else 0.0,
+        encoder_lag_s=sensors.encoder_time_constant_s,
+        com_x_m=body.com_x_m,
+        com_y_m=body.com_y_m,
+        soft_ratio=_slip_per_traction(ground),
+        grip_ratio=ground.grip_ratio,
+        rolling_ratio=ground.rolling_ratio,
+        scrub_ratio=ground.scrub_ratio if robot.skids else 0.0,
+        load_ratio=ground.load_ratio,
+        effective_ratio=ground.effective_ratio,
+        seen_from_above=robot.on_omni_wheels,
+    )
+
+
+def _slip_per_traction(ground: Ground) -> Array:
+    """Return slip over traction at slips (N_SLIPS,) evenly spaced from 0 to 1."""
+    thrust = np.array(ground.thrust_ratio)
+    if thrust.size < 4:
+        return np.full(N_SLIPS, ground.slip_ratio)
+    slip = np.linspace(0.0, 1.0, thrust.size)
+    ratio = np.empty(thrust.size)
+    ratio[1:] = slip[1:] / thrust[1:]
+    ratio[0] = 2.0 * ratio[1] - ratio[2]
+    return ratio if thrust.size == N_SLIPS else np.interp(_SLIPS, slip, ratio)
+
+
+@njit
+def slopes(values: Array, dt: float) -> Array:
+    """Return the rate (n,) of a signal, right to the fourth order where two neighbours are there.
+
+    Examples
+    --------
+    >>> round(float(slopes(np.sin(np.arange(9) * 0.2), 0.2)[4]) - math.cos(0.8), 5)
+    -4e-05
+    """
+    n = values.size
+    out = np.zeros(n)
+    for k in range(2, n - 2):
+        out[k] = (8.0 * (values[k + 1] - values[k - 1]) - (values[k + 2] - values[k - 2])) / (12.0 * dt)
+    for k in (0, 1, n - 2, n - 1):
+        before, after = max(k - 1, 0), min(k + 1, n - 1)
+        if after > before:
+            out[k] = (values[after] - values[before]) / ((after - before) * dt)
+    return out
+
+
+@njit
+def delayed(values: Array, late: float, rate: float) -> Array:
+    """Return a signal (n,) that shows at sample k what was at ``k - late - rate k``; its ends are held.
+
+    Between samples it runs along the cubic through the four nearest: straight lines would smooth it.
+
+    Examples
+    --------
+    >>> delayed(np.array([0.0, 1.0, 2.0, 3.0]), 0.5, 0.0)
+    array([0. , 0.5, 1.5, 2.5])
+    """
+    n = values.size
+    out = np.empty(n)
+    first = last = n
+    if rate == 0.0:  # the same weights everywhere but at the ends
+        whole = math.floor(-late)
+        x = -late - whole
+        first, last = min(max(1 - whole, 0), n), max(min(n - 2 - whole, n), 0)
+        if first < last:
+            a, b = -x * (x - 1.0) * (x - 2.0) / 6.0, (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0
+            c, d = -(x + 1.0) * x * (x - 2.0) / 2.0, (x + 1.0) * x * (x - 1.0) / 6.0
+            i = first + whole
+            m = last - first
+            out[first:last] = a * values[i - 1 : i - 1 + m] + b * values[i : i + m]
+            out[first:last] += c * values[i + 1 : i + 1 + m] + d * values[i + 2 : i + 2 + m]
+        else:
+            first = last = n
+    for k in range(n):
+        if k < first or k >= last:
+            out[k] = _between(values, k - late - rate * k)
+    return out
+
+
+@inner
+def _between(values: Array, at: float) -> float:
+    """Return a signal between its samples; its ends are held."""
+    n = values.size
+    at = min(max(at, 0.0), n - 1.0)
+    i = min(int(at), n - 2)
+    x = at - i
+    if 1 <= i < n - 2:
+        return float(
+            -x * (x - 1.0) * (x - 2.0) / 6.0 * values[i - 1]
+            + (x + 1.0) * (x - 1.0) * (x - 2.0) / 2.0 * values[i]
+            - (x + 1.0) * x * (x - 2.0) / 2.0 * values[i + 1]
+            + (x + 1.0) * x * (x - 1.0) / 6.0 * values[i + 2]
+        )
+    return float(values[i] + x * (values[i + 1] - values[i]))
+
+
+@njit
+def lagged(values: Array, tau_s: float, dt: float) -> Array:
+    """Return a signal (n,) behind a first-order lag, exact for what runs straight from sample to sample.
+
+    It starts at rest at its first value; without a time constant it is returned as it is.
+
+    Examples
+    --------
+    >>> lagged(np.array([0.0, 1.0, 2.0, 3.0]), 1e-3, 1.0).round(3)
+    array([0.   , 0.999, 1.999, 2.999])
+    """
+    if tau_s <= 0.0:
+        return values
+    out = np.empty(values.size)
+    keep = math.exp(-dt / tau_s)
+    out[0] = values[0]
+    for k in range(1, values.size):
+        lead = tau_s * (values[k] - values[k - 1]) / dt
+        out[k] = values[k] - lead + keep * (out[k - 1] - values[k - 1] + lead)
+    return out
+
+
+@inner
+def steered(angle: Array, delay_s: float, backlash_rad: float, dt: float) -> Array:
+    """Return the angle (n,) of a wheel behind the delay of its linkage and a play of half a width, from its middle."""
+    if delay_s != 0.0:
+        angle = delayed(angle, delay_s / dt, 0.0)
+    if backlash_rad > 0.0:
+        follower = angle[0]
+        for k in range(angle.size):
+            follower = min(max(follower, angle[k] - backlash_rad), angle[k] + backlash_rad)
+            angle[k] = follower
+    return angle
+
+
+@inner
+def decayed(half_trace: float, determinant: float, dt: float) -> tuple[float, float]:
+    """Return ``a, b`` of ``exp(A dt) = a 1 + b A`` of a matrix (2, 2) that does not grow.
+
+    Where roots are close to each other, two cosines are series: they take no more time than a square root.
+    """
+    x = (half_trace * half_trace - determinant) * dt * dt
+    if x > 4.0:
+        root = math.sqrt(x)
+        quick = half_trace * dt - root
+        slow = math.exp(determinant * dt * dt / quick)
+        quick = math.exp(quick)
+        both, b = 0.5 * (slow + quick), 0.5 * (slow - quick) / root * dt
+    else:
+        both = b = math.exp(half_trace * dt)
+        if x < -4.0:
+            root = math.sqrt(-x)
+            both *= math.cos(root)
+            b *= math.sin(root) / root * dt
+        else:
+            both *= 1.0 + x / 2.0 * (1.0 + x / 12.0 * (1.0 + x / 30.0 * (1.0 + x / 56.0 * (1.0 + x / 90.0))))
+            b *= dt * (
+                1.0 + x / 6.0 * (1.0 + x / 20.0 * (1.0 + x / 42.0 * (1.0 + x / 72.0 * (1.0 + x / 110.0))))
+            )
+    return both - half_trace * b, b
+
+
+# Speed over which a resistance takes its full size: it opposes motion and does not push a robot at rest.
+RESTING_MPS = 0.05
+# Slip that forces take at the most, of either sign; assumed: a straight thrust curve has no end of its own.
+MAX_SLIP = 0.9
+# Shorter time constants are none; one that falls faster than the second, in s/s, is taken as even.
+SHORTEST_S, FALLS_MOST = 1e-6, -0.9
+# Exponent n of the turning slip; assumed, Endo et al. fitted one to each ground, and ``turning_slip_power`` does on
+# tracks.
+ENDO_POWER = 0.5
+
+SIDES = record({"body": PLANAR_BODY, "tracked": bool})
+
+
+@njit
+def direction(speed_mps: float) -> float:
+    """Return the direction of a motion, -1 to 1, and 0 at rest.
+
+    Examples
+    --------
+    >>> round(direction(0.5), 3), direction(0.0)
+    (0.995, 0.0)
+    """
+    return speed_mps / math.sqrt(speed_mps * speed_mps + RESTING_MPS * RESTING_MPS)
+
+
+@inner
+def _remaining(before_s: float, after_s: float, dt: float) -> float:
+    """Return what a step leaves of an offset where the time constant runs straight: ``v' = -v / tau``."""
+    change = math.log(after_s / before_s)
+    if abs(change) < 1e-3:
+        return math.exp(-2.0 * dt / (before_s + after_s))
+    return math.exp(-dt * change / (after_s - before_s))
+
+
+@inner
+def slip_along(
+    body: Any, p: Any, dt: float, u: Array, scrub_n: Array, grade_rad: Array, disturbance: Array, fast: bool
+) -> tuple[Array, Array, Array]:
+    """Return speed over ground, resistance with the slope, and slip (n,)."""
+    n = u.size
+    weight = body.mass_kg * GRAVITY_MPS2
+    mass = body.mass_kg * (1.0 + p.payload_ratio)
+    carried = weight * (1.0 + body.load_ratio * p.payload_ratio)
+    rolling = (body.rolling_ratio + p.rolling_resistance_ratio) * (1.0 + p.payload_ratio) * weight
+    speed, rest, slips, ground = np.zeros(n), np.zeros(n), np.zeros(n), body.soft_ratio
+    target_before, tau_before, force_ratio, slip = 0.0, 0.0, 0.0, 0.0
+    for k in range(n):
+        v = speed[k - 1] + u[k] - u[k - 1] if k > 0 else u[0]  # without the lag of a step
+        smooth = math.sqrt(v * v + RESTING_MPS * RESTING_MPS)
+        force = mass * GRAVITY_MPS2 * body.effective_ratio * math.sin(grade_rad[k]) + rolling * v / smooth
+        force += p.viscous_drag_nspm * v + p.slip_resistance_ratio * abs(slip) * weight * v / smooth
+        force += scrub_n[k]
+        rest[k] = force
+        compliance = softness(ground, abs(slip)) + p.force_slip_ratio
+        if p.shear_slip_ratio != 0.0:
+            compliance += p.shear_slip_ratio * shear_softness(force_ratio, body.grip_ratio)
+        fastest = abs(u[k])
+        target = u[k] - fastest * min(max(compliance * force / carried, -MAX_SLIP), MAX_SLIP)
+        if disturbance.shape[0] > 0:
+            target -= fastest * disturbance[k, 0]
+        tau = fastest * compliance * mass / carried
+        grows = (tau - tau_before) / dt
+        if fast and min(tau, tau_before) > SHORTEST_S and grows > FALLS_MOST:
+            slope = (target - target_before) / (dt * (1.0 + grows))
+            off = speed[k - 1] - target_before + tau_before * slope
+            speed[k] = target - tau * slope + _remaining(tau_before, tau, dt) * off
+        elif k > 0 and tau > SHORTEST_S:
+            lead = tau * (target - target_before) / dt
+            speed[k] = target - lead + math.exp(-dt / tau) * (speed[k - 1] - target_before + lead)
+        else:
+            speed[k] = target
+        target_before, tau_before = target, tau
+        rate = (speed[k] - speed[k - 1]) / dt if k > 0 else 0.0
+        force_ratio = (mass * rate + force) / carried
+        slip = min(max(compliance * force_ratio, -MAX_SLIP), MAX_SLIP)
+        slips[k] = slip
+    return speed, rest, slips
+
+
+@njit
+def _move_skid(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
+    wheel_speed_mps, _steer_rad, grade_rad, _roll_rad, disturbance = inputs
+    body, p, n = params[0].body, vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
+    out = np.zeros(n, TRUTH)
+    mass = body.mass_kg * (1.0 + p.payload_ratio)
+    scrub = (body.scrub_ratio + p.scrub_ratio) * (body.mass_kg * GRAVITY_MPS2)
+    radius_m = body.radius_m * (1.0 + p.wheel_radius_ratio)
+    u, turn, tight, difference = _differed(params[0], p, dt, wheel_speed_mps)
+    scrub_n = np.empty(n)
+    for k in range(n):
+        scrub_n[k] = scrub * tight[k] * direction(u[k])
+    speed, rest, slip = slip_along(body, p, dt, u, scrub_n, grade_rad, disturbance, False)
+    out["speed_x_mps"][:], out["yaw_rate_radps"][:], out["slip_ratio"][:] = speed, turn, slip
+    accel, wheel, spin = slopes(speed, dt), slopes(u, dt), slopes(turn, dt)
+    for k in range(n):
+        row = out[k]
+        row.force_n = mass * accel[k] + rest[k]
+        torque = (row.force_n + body.rotating_kg * wheel[k]) * radius_m
+        row.current_a = (torque + body.friction_nm * direction(u[k])) / body.nm_per_a
+        moment = body.yaw_inertia_kgm2 * (1.0 + p.payload_ratio) * spin[k]
+        force = 2.0 * moment / body.track_m + scrub * tight[k] * direction(difference[k])
+        row.turning_current_a = force * radius_m / body.nm_per_a
+    if p.turn_side_slip_s != 0.0:
+        out["speed_y_mps"][:] = lagged(-p.turn_side_slip_s * speed * turn, p.side_slip_build_up_s, dt)
+    return out
+
+
+@inner
+def _differed(sides: Any, p: Any, dt: float, wheel_speed_mps: Array) -> tuple[Array, Array, Array, Array]:
+    """Return speed without slip, yaw rate, how tight the turn is and the difference of the sides (n,)."""
+    n = wheel_speed_mps.shape[0]
+    u, turn, tight, difference = np.empty(n), np.empty(n), np.zeros(n), np.empty(n)
+    scale = 1.0 + p.wheel_radius_ratio
+    right, left = 1.0 + 0.5 * p.one_sided_radius_ratio, 1.0 - 0.5 * p.one_sided_radius_ratio
+    for k in range(n):
+        v_l, v_r = wheel_speed_mps[k, 0] * scale * left, wheel_speed_mps[k, 1] * scale * right
+        dv = v_r - v_l
+        u[k] = 0.5 * (v_r + v_l)
+        size = abs(dv) + 2.0 * abs(u[k])
+        tight[k] = abs(dv) / size if size > 1e-6 else 0.0
+        lost = p.turning_slip_ratio * tight[k] * dv
+        if lost != 0.0:
+            share = 1.0 - ENDO_POWER - (p.turning_slip_power_ratio if sides.tracked else 0.0)
+            a, b = abs(v_r) ** share, abs(v_l) ** share
+            u[k] -= 0.5 * lost * (a - b) / (a + b)
+        difference[k] = dv
+        turn[k] = (dv - lost) / (sides.body.track_m * (1.0 + p.effective_track_ratio))
+        if p.track_narrowing_s2pm2 != 0.0:
+            x = p.track_narrowing_s2pm2 * (u[k] * turn[k]) ** 2 / (1.0 + (turn[k] / SLIDING_RADPS) ** 2)
+            turn[k] *= 1.0 + x / (1.0 + abs(x))
+    if p.yaw_delay_s != 0.0:
+        turn = delayed(turn, p.yaw_delay_s / dt, 0.0)
+    if p.turn_drag_s2 != 0.0:
+        for k in range(n):
+            drag = p.turn_drag_s2 * turn[k] * turn[k]
+            u[k] *= 1.0 / (1.0 + drag) if drag > 0.0 else 1.0 - drag  # never turns the motion about
+    return u, turn, tight, difference
+
+
+SKID = PlanarDrive(SIDES, lambda robot, ground: {"tracked": isinstance(robot, TrackedRobot)}, _move_skid)
+
+
+SLOW_MPS = 0.01  # speed below which tyres damp a sideways motion as at it: in less than a millisecond
+LEAST_RATIO = (
+    0.1  # the effective wheelbase over the wheelbase at the least, and what is left of an axle's compliance
+)
+STEEPEST_RAD = 1.3  # steering angle at the most, where its tangent is 3.6
+
+_AXLES = "wheelbase_m com_ahead_m front_cornering_npr rear_cornering_npr yaw_inertia_kgm2"
+AXLES = record({"body": PLANAR_BODY} | numbers(_AXLES))
+
+
+def _bicycle_numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
+    return {name: getattr(robot, name) for name in _AXLES.split()}
+
+
+@njit
+def _move_bicycle(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
+    """Return motion and traction: the last wheel is the rear one, the first angle that of the front wheel."""
+    wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
+    body, p, n = params[0].body, vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
+    out = np.zeros(n, TRUTH)
+    u = wheel_speed_mps[:, -1] * (1.0 + p.wheel_radius_ratio)
+    speed, rest, slip = slip_along(body, p, dt, u, np.zeros(n), grade_rad, disturbance, True)
+    accel = slopes(speed, dt)
+    mass = body.mass_kg * (1.0 + p.payload_ratio)
+    for k in range(n):
+        out[k].force_n = mass * accel[k] + rest[k]
+        out[k].speed_x_mps, out[k].slip_ratio = speed[k], slip[k]
+    angle = steer_rad[:, 0] + p.steering_offset_front_rad
+    _turn(params[0], p, dt, steered(angle, p.steering_delay_s, p.steering_backlash_rad, dt), roll_rad, out)
+    return out
+
+
+@inner
+def _turn(car: Any, p: Any, dt: float, steer: Array, roll_rad: Array, out: Array) -> None:
+    """Fill in yaw rate and lateral speed of the rear axle of a body that drives at its ``speed_x_mps``."""
+    nominal = car.body.mass_kg
+    mass = nominal * (1.0 + p.payload_ratio)
+    inertia = car.yaw_inertia_kgm2 * (1.0 + p.payload_ratio)
+    wheelbase, a = car.wheelbase_m, car.com_ahead_m
+    b = wheelbase - a
+    soft = 1.0 / (1.0 + p.cornering_stiffness_ratio)
+    front = soft / car.front_cornering_npr  # compliance of the axles
+    rear = soft / car.rear_cornering_npr
+    front = max(front + p.understeer_s2pm * wheelbase / (nominal * a), LEAST_RATIO * front)
+    gravity = GRAVITY_MPS2 * car.body.effective_ratio
+    c = w = c_before = w_before = 0.0  # of the body, and the steady ones of the sample before
+    for k in range(out.shape[0]):
+        v = out[k].speed_x_mps
+        fast = abs(v)
+        yields = _front(mass, wheelbase, a, front, rear, v)
+        understeer = mass * (a * yields - b * rear) / wheelbase
+        down = gravity * math.sin(roll_rad[k])
+        angle = min(max(steer[k], -STEEPEST_RAD), STEEPEST_RAD)
+        w_now = (v * math.tan(angle) - fast * understeer * down) / (wheelbase + understeer * v * fast)
+        y_now = -fast * mass * b * rear / wheelbase * (v * w_now + down)
+        c_now = y_now + a * w_now
+        middle = 0.5 * (v + out[k - 1].speed_x_mps) if k > 0 else 0.0
+        if middle == 0.0:  # at the start, and at rest
+            c, w = c_now, w_now
+        else:
+            yields = _front(mass, wheelbase, a, front, rear, middle)
+            by_speed = 1.0 / max(abs(middle), SLOW_MPS)
+            c_f, c_r = by_speed / yields, by_speed / rear
+            moment = b * c_f - a * c_r
+            cc, cw = -(c_f + c_r) / mass, -moment / mass - middle
+            wc, ww = -moment / inertia, -(b * b * c_f + a * a * c_r) / inertia
+            determinant = cc * ww - cw * wc
+            c_rate, w_rate = (c_now - c_before) / dt, (w_now - w_before) / dt
+            c_lag = (ww * c_rate - cw * w_rate) / determinant
+            w_lag = (cc * w_rate - wc * c_rate) / determinant
+            one, by_a = decayed(0.5 * (cc + ww), determinant, dt)
+            c_off, w_off = c - c_before - c_lag, w - w_before - w_lag
+            c = c_now + c_lag + one * c_off + by_a * (cc * c_off + cw * w_off)
+            w = w_now + w_lag + one * w_off + by_a * (wc * c_off + ww * w_off)
+        c_before, w_before = c_now, w_now
+        out[k].speed_y_mps, out[k].yaw_rate_radps = c - a * w, w
+
+
+@inner
+def _front(mass: float, wheelbase: float, a: float, front: float, rear: float, v: float) -> float:
+    """Return the compliance of the front axle at a speed: one with which the body does not spin."""
+    fast = v * abs(v)
+    least = -(1.0 - LEAST_RATIO) * wheelbase / fast if fast != 0.0 else 0.0
+    understeer = mass * (a * front - (wheelbase - a) * rear) / wheelbase
+    if fast * understeer < fast * least:
+        return (least * wheelbase / mass + (wheelbase - a) * rear) / a
+    return front
+
+
+BICYCLE = PlanarDrive(AXLES, _bicycle_numbers, _move_bicycle)
+
+
+# Speed below which slip is no more over the speed itself, and over which a resistance takes its full size; assumed:
+# a fifth of the slowest measured drive.
+ROLLING_MPS = 0.02
+# Slip per traction that an effect leaves of the ground's own at the least, and that of the stiffest.
+STIFFEST, STIFFEST_GROUND = 0.1, 1e-6
+SUBSTEPS = (
+    4  # implicit steps within one of the simulation, so that their lag, half of each, is about a millisecond
+)
+
+ROLLERS = record(
+    {"body": PLANAR_BODY, "wheel_load_ratio": (float, 3), **numbers("wheel_distance_m roller_ratio")}
+    | dict.fromkeys(("along", "across", "to_rolled"), (float, (3, 3)))
+)
+"""``along`` and ``across`` (wheels, 3) give the speed of each wheel's centre along and across its direction for a twist
+of the centre of mass, ``to_rolled`` (3, wheels) the twist of the body without slip."""
+
+
+def _omni_numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
+    body, direction = robot.completed.body, robot.wheel_directions_rad
+    arm_m = robot.wheel_positions_m - np.array([body.com_x_m, body.com_y_m])
+    moments = np.vstack([np.ones(len(arm_m)), arm_m.T])
+    return {
+        "along": rolling_matrix(arm_m, direction),
+        "across": rolling_matrix(arm_m, direction + np.pi / 2),
+        "to_rolled": np.linalg.pinv(rolling_matrix(robot.wheel_positions_m, direction)),
+        "wheel_load_ratio": np.linalg.pinv(moments) @ np.array([1.0, 0.0, 0.0]),
+        "wheel_distance_m": float(np.hypot(*robot.wheel_positions_m[0])),
+        "roller_ratio": ground.roller_ratio,
+    }
+
+
+@njit
+def _move_omni(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
+    """Return motion and net traction along x; the current is the sum of the magnitudes of :func:`currents_of`."""
+    wheel_speed_mps, _steer_rad, grade_rad, roll_rad, disturbance = inputs
+    rollers, p, n = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
+    body, out = rollers.body, np.zeros(n, TRUTH)
+    along, across, load = _placed(rollers, p)
+    com_x, com_y = body.com_x_m + p.load_shift_x_m, body.com_y_m + p.load_shift_y_m
+    friction = rollers.roller_ratio + p.roller_friction_ratio
+    twist, before = np.zeros(3), np.zeros(3)
+    matrix, pushed = np.empty((3, 3)), np.empty(3)
+    mass = body.mass_kg * (1.0 + p.payload_ratio)
+    inertia = mass, mass, body.yaw_inertia_kgm2 * (1.0 + p.payload_ratio)
+    weight, gravity = mass * GRAVITY_MPS2, GRAVITY_MPS2 * body.effective_ratio
+    step, size = dt / SUBSTEPS, 0.0
+    for k in range(n):
+        slope = (-mass * gravity * math.sin(grade_rad[k]), -mass * gravity * math.sin(roll_rad[k]), 0.0)
+        u = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio)
+        last = wheel_speed_mps[max(k - 1, 0)] * (1.0 + p.wheel_radius_ratio)
+        started_x, started_y = before[0], before[1]
+        for part in range(SUBSTEPS):
+            wheels = last + (u - last) * ((part + 1) / SUBSTEPS)
+            speed = _fastest(along, wheels, before)
+            stiff = _stiffness(body, p, size) * weight / speed
+            resists = friction * weight / speed
+            w = before[2]
+            turning = (mass * w * before[1], -mass * w * before[0], 0.0)
+            for a in range(3):
+                pushed[a] = inertia[a] / step * before[a] + turning[a] + slope[a]
+                for b in range(3):
+                    matrix[a, b] = inertia[a] / step if a == b else 0.0
+            for i in range(body.n_wheels):
+                v = _dot(along[i], before)
+                share = load[i]
+                drag = share * body.rolling_ratio * weight / math.sqrt(v * v + ROLLING_MPS * ROLLING_MPS)
+                for a in range(3):
+                    pushed[a] += share * stiff * wheels[i] * along[i, a]
+                    for b in range(3):
+                        matrix[a, b] += (share * stiff + drag) * along[i, a] * along[i, b]
+                        matrix[a, b] += share * resists * across[i, a] * across[i, b]
+            _solve(matrix, pushed, twist)
+            slip = 0.0
+            for i in range(body.n_wheels):
+                slip += (wheels[i] - _dot(along[i], twist)) ** 2
+            size = min(math.sqrt(slip / body.n_wheels) / speed, 1.0)
+            before[:] = twist
+        row = out[k]
+        row.speed_x_mps, row.speed_y_mps = twist[0] + twist[2] * com_y, twist[1] - twist[2] * com_x
+        row.yaw_rate_radps = twist[2]
+        row.force_n = (
+            mass * ((twist[0] - started_x) / dt - twist[2] * 0.5 * (twist[1] + started_y)) - slope[0]
+        )
+    currents_a = currents_of(params, vector, dt, wheel_speed_mps, out)
+    for k in range(n):
+        for i in range(body.n_wheels):
+            out[k].current_a += abs(currents_a[k, i])
+        # what the ground adds to the motion takes no force
+        if disturbance.shape[0] > 0:
+            out[k].speed_x_mps *= 1.0 - disturbance[k, 0]
+            out[k].speed_y_mps *= 1.0 - disturbance[k, 0]
+        u = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio)
+        out[k].slip_ratio = _body_slip(rollers, u, out[k].speed_x_mps, out[k].speed_y_mps)
+    return out
+
+
+@njit
+def currents_of(params: Array, vector: Array, dt: float, wheel_speed_mps: Array, truth: Array) -> Array:
+    """Return the current (n, wheels) of each motor along a motion: traction, its own inertia and friction.
+
+    Parameters
+    ----------
+    params : (1,) of :data:`ROLLERS`
+    vector, dt, wheel_speed_mps : as :func:`~terrain.simulation.plants.planar.move` takes them
+    truth : (n,) of the motion, without disturbance
+    """
+    rollers, p, (n, wheels) = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape
+    body, out = rollers.body, np.empty((n, wheels))
+    weight = body.mass_kg * (1.0 + p.payload_ratio) * GRAVITY_MPS2
+    radius_m, twist = body.radius_m * (1.0 + p.wheel_radius_ratio), np.empty(3)
+    along, _, load = _placed(rollers, p)
+    com_x, com_y = body.com_x_m + p.load_shift_x_m, body.com_y_m + p.load_shift_y_m
+    spun = np.empty((n, wheels))
+    for i in range(wheels):
+        spun[:, i] = slopes(wheel_speed_mps[:, i].copy(), dt)
+    for k in range(n):
+        u, w = wheel_speed_mps[k] * (1.0 + p.wheel_radius_ratio), truth[k].yaw_rate_radps
+        twist[0], twist[1] = truth[k].speed_x_mps - w * com_y, truth[k].speed_y_mps + w * com_x
+        twist[2] = w
+        speed, slip = _fastest(along, u, twist), 0.0
+        for i in range(wheels):
+            slip += (u[i] - _dot(along[i], twist)) ** 2
+        size = min(math.sqrt(slip / wheels) / speed, 1.0)
+        stiff = _stiffness(body, p, size) * weight / speed
+        for i in range(wheels):
+            pull = load[i] * stiff * (u[i] - _dot(along[i], twist))
+            torque = (pull + body.rotating_kg / wheels * spun[k, i]) * radius_m
+            direction = u[i] / math.sqrt(u[i] * u[i] + ROLLING_MPS * ROLLING_MPS)
+            out[k, i] = (torque + body.friction_nm / wheels * direction) / body.nm_per_a
+    return out
+
+
+@inner
+def _placed(rollers: Any, p: Any) -> tuple[Array, Array, Array]:
+    """Return ``along`` and ``across`` (wheels, 3) and the loads (wheels,) with wheels and load as p has them.
+
+    With the distance d of the wheels, the directions along and across them and out to them, and the centre of mass c,
+    ``D_i`` ends in ``d - c x along``, ``E_i`` in ``-c x across``, and wheel i of three carries
+    ``(1 + 2 c . out / d) / 3``; one that would carry less than nothing carries nothing, and the others then do not
+    balance about c.
+    """
+    along, across, load = rollers.along.copy(), rollers.across.copy(), rollers.wheel_load_ratio.copy()
+    shift_x, shift_y = p.load_shift_x_m, p.load_shift_y_m
+    distance = rollers.wheel_distance_m * (1.0 + p.wheel_distance_ratio)
+    if shift_x == 0.0 and shift_y == 0.0 and p.wheel_distance_ratio == 0.0:
+        return along, across, load
+    com_x, com_y, total = rollers.body.com_x_m + shift_x, rollers.body.com_y_m + shift_y, 0.0
+    for i in range(rollers.body.n_wheels):
+        out = com_x * along[i, 1] - com_y * along[i, 0]
+        along[i, 2] = distance - out
+        across[i, 2] = -(com_x * across[i, 1] - com_y * across[i, 0])
+        load[i] = max(1.0 + 2.0 * out / distance, 0.0) / rollers.body.n_wheels
+        total += load[i]
+    return along, across, load / total
+
+
+@inner
+def _stiffness(body: Any, p: Any, slip_ratio: float) -> float:
+    """Return traction over load and slip of the ground, with the effect that makes it softer."""
+    soft = max(softness(body.soft_ratio, slip_ratio), STIFFEST_GROUND)
+    return float(1.0 / max(soft + p.force_slip_ratio, STIFFEST * soft))
+
+
+@inner
+def _fastest(along: Array, wheel_speed_mps: Array, twist: Array) -> float:
+    """Return the speed U that slip is over: of wheels (wheels,) or their centres, never below a minimum."""
+    of_wheels, of_centres, n = 0.0, 0.0, wheel_speed_mps.shape[0]
+    for i in range(n):
+        of_wheels += wheel_speed_mps[i] ** 2
+        of_centres += _dot(along[i], twist) ** 2
+    return math.sqrt(max(of_wheels, of_centres) / n + ROLLING_MPS * ROLLING_MPS)
+
+
+@inner
+def _dot(row: Array, twist: Array) -> float:
+    product: float = row[0] * twist[0] + row[1] * twist[1] + row[2] * twist[2]
+    return product
+
+
+@inner
+def _solve(matrix: Array, pushed: Array, out: Array) -> None:
+    """Solve a symmetric positive system of three in place of ``out``, by Cramer's rule."""
+    a, b, c = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    d, e, f = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    p0, p1, p2 = d * f - e * e, c * e - b * f, b * e - c * d
+    by = 1.0 / (a * p0 + b * p1 + c * p2)
+    q1, q2, r2 = a * f - c * c, b * c - a * e, a * d - b * b
+    x, y, z = pushed[0], pushed[1], pushed[2]
+    out[0] = (p0 * x + p1 * y + p2 * z) * by
+    out[1] = (p1 * x + q1 * y + q2 * z) * by
+    out[2] = (p2 * x + q2 * y + r2 * z) * by
+
+
+@inner
+def _body_slip(rollers: Any, wheel_speed_mps: Array, v_x: float, v_y: float) -> float:
+    """Return the slip of the body along what the wheels roll; 0 where neither moves, and in place."""
+    x, y = 0.0, 0.0
+    for i in range(rollers.body.n_wheels):
+        x += rollers.to_rolled[0, i] * wheel_speed_mps[i]
+        y += rollers.to_rolled[1, i] * wheel_speed_mps[i]
+    rolled = math.sqrt(x * x + y * y)
+    if rolled < ROLLING_MPS:
+        return 0.0
+    along = (v_x * x + v_y * y) / rolled
+    return (rolled - along) / max(rolled, abs(along))
+
+
+def steady_twist(
+    wheel_speed_mps: Array,
+    positions_m: Array,
+    direction_rad: Array,
+    load_ratio: Array,
+    roller_ratio: float,
+    scale_error: float = 0.0,
+) -> Array:
+    """Return the twist (n, 3) of a body whose wheels turn at steady speeds (n, wheels).
+
+    Parameters
+    ----------
+    wheel_speed_mps : (n, wheels) circumferential
+    positions_m, direction_rad : (wheels, 2) and (wheels,) of the wheels
+    load_ratio : (wheels,) shares of the weight, summing to 1
+    roller_ratio : rho, friction of the rollers over the stiffness of traction; 0 is free
+    scale_error : kappa
+
+    Examples
+    --------
+    A wheel that rolls across entirely, and carries most of the weight, brakes the more:
+
+    >>> from terrain.robots import load_robot
+    >>> place = load_robot("robotino").wheel_positions_m, np.radians([150.0, 270.0, 390.0])
+    >>> ahead, left, _ = 0.1 * rolling_matrix(*place).T
+    >>> load = np.array([0.25, 0.5, 0.25])
+    >>> steady_twist(np.array([ahead, left]), *place, load, 0.8)[:, :2].diagonal().round(4)
+    array([0.0429, 0.0652])
+    """
+    along = rolling_matrix(positions_m, direction_rad)
+    across = rolling_matrix(positions_m, np.asarray(direction_rad) + np.pi / 2)
+    balance = (along * load_ratio[:, None]).T @ along
+    balance = balance + roller_ratio * (across * load_ratio[:, None]).T @ across
+    driven = np.asarray(wheel_speed_mps) @ (along * load_ratio[:, None])
+    return np.asarray((1.0 - scale_error) * np.linalg.solve(balance, driven.T).T)
+
+
+OMNI = PlanarDrive(ROLLERS, _omni_numbers, _move_omni, drifts=False)
+
+
+# Relaxation length of a contact that has none, and what a body without yaw inertia weighs at its wheels.
+SHORTEST_M, LIGHTEST_KG = 1e-3, 1e-3
+
+CONTACT = record(
+    {
+        "body": PLANAR_BODY,
+        "to_twist": (float, (3, 6)),
+        "arm_ratio": (float, (3, 2)),
+        **numbers("spread_m relaxation_m"),
+    }
+)
+"""``to_twist`` gives the twist of the wheels' velocities; ``spread_m`` is the distance r, and ``arm_ratio`` the wheels'
+places about the centre of mass over it."""
+
+
+def _swerve_numbers(robot: Robot, ground: Ground) -> dict[str, Any]:
+    body = robot.completed.body
+    arm_m = robot.wheel_positions_m - np.array([body.com_x_m, body.com_y_m])
+    spread_m = float(np.sqrt((arm_m**2).sum(axis=1).mean()))
+    return {
+        "to_twist": np.linalg.pinv(velocity_matrix(robot.wheel_positions_m)),
+        "arm_ratio": arm_m / spread_m,
+        "spread_m": spread_m,
+        "relaxation_m": body.relaxation_length_m,
+    }
+
+
+@njit
+def _move_swerve(params: Array, vector: Array, dt: float, inputs: Inputs) -> Array:
+    wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance = inputs
+    contact, p, n = params[0], vector.view(EFFECTS)[0], wheel_speed_mps.shape[0]
+    body, out = contact.body, np.zeros(n, TRUTH)
+    u, pace, mean_wheel_speed, heading = _no_slip(contact, p, dt, wheel_speed_mps, steer_rad)
+    weight = body.mass_kg * GRAVITY_MPS2
+    load = 1.0 + p.payload_ratio
+    pressed = load / (1.0 + body.load_ratio * p.payload_ratio)
+    mass = body.mass_kg * load
+    spin_kg = max(body.yaw_inertia_kgm2 / contact.spread_m**2, LIGHTEST_KG) * load
+    rolling = (body.rolling_ratio + p.rolling_resistance_ratio) * (1.0 + p.payload_ratio) * weight
+    gravity = GRAVITY_MPS2 * body.effective_ratio
+    ground, sigma, damping = body.soft_ratio, max(contact.relaxation_m, SHORTEST_M), DEFLECTION_DAMPING_S
+    by_sigma, by_dt, by_spread = 1.0 / sigma, 1.0 / dt, 1.0 / contact.spread_m
+    # the contact springs as much whatever it carries
+    resisting = load * weight / mass, load * weight / mass, load * weight / spin_kg
+    yielding = 1.0 / resisting[0], 1.0 / resisting[1], 1.0 / resisting[2]
+    by_mass, by_spin = 1.0 / mass, 1.0 / spin_kg
+    if disturbance.shape[0] > 0:
+        u[0] -= pace * disturbance[:, 0]
+    changing = np.empty((3, n))
+    for i in range(3):
+        rate = slopes(u[i], dt)
+        changing[i] = rate
+        for k in range(1, n - 1):  # straight lines between what comes out run on average where it goes
+            changing[i, k] -= (rate[k - 1] - 2.0 * rate[k] + rate[k + 1]) / 12.0
+    lost, z, f = np.zeros(3), np.zeros(3), np.zeros(3)  # speed lost by slip, slip, traction over weight
+    pushed, pushed_before, lost_before = np.zeros(3), np.zeros(3), np.zeros(3)
+    size, size_before, alpha, beta, kappa = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(n):
+        v_x = u[0, k] - 2.0 * lost[0] + lost_before[0]  # as slip goes on
+        v_y = u[1, k] - 2.0 * lost[1] + lost_before[1]
+        v_w = u[2, k] - 2.0 * lost[2] + lost_before[2]
+        fast = math.sqrt(v_x * v_x + v_y * v_y + v_w * v_w + ROLLING_MPS * ROLLING_MPS)
+        resists = (rolling + p.slip_resistance_ratio * size * weight) / fast + p.viscous_drag_nspm
+        w, resists_by_mass = v_w * by_spread, resists * by_mass
+        pushed[0] = changing[0, k] + gravity * math.sin(grade_rad[k]) - w * v_y + resists_by_mass * v_x
+        pushed[1] = changing[1, k] + gravity * math.sin(roll_rad[k]) + w * v_x + resists_by_mass * v_y
+        pushed[2] = changing[2, k] + resists * by_spin * v_w
+        soft = max(softness(ground, max(1.5 * size - 0.5 * size_before, 0.0)), STIFFEST_GROUND)
+        more = p.force_slip_ratio
+        if p.shear_slip_ratio != 0.0:
+            traction = load * math.sqrt(f[0] * f[0] + f[1] * f[1])
+            more += p.shear_slip_ratio * shear_softness(traction, body.grip_ratio)
+        roll = 0.5 * (pace[k] + pace[k - 1]) if k > 0 else pace[0]
+        by_soft = 1.0 / soft
+        creep_now = max(pressed + load * more * by_soft, STIFFEST)
+        creep, creep_now = roll * creep_now, pace[k] * creep_now
+        size_before, size = size, 0.0
+        for i in range(3):
+            yields = soft * yielding[i]
+            if k == 0:
+                z[i], lost[i] = yields * pushed[i], creep * yields * pushed[i]
+                lost_before[i] = lost[i]
+                f[i] = z[i] * by_soft
+            else:
+                if i != 1:  # the two axes of the ground are alike
+                    kappa = by_soft * resisting[i]
+                    alpha, beta = decayed(-0.5 * (kappa * damping + creep) * by_sigma, kappa * by_sigma, dt)
+                # what lasts, of a push that grows evenly, and what of the rest is left after the step
+                z_grows = yields * (pushed[i] - pushed_before[i]) * by_dt
+                z_lasts = yields * (pushed_before[i] - creep * z_grows) - damping * z_grows
+                lost_before[i] = lost[i]
+                off = lost[i] - (creep * z_lasts + sigma * z_grows)
+                z_off = z[i] - z_lasts
+                z_rate = (off - creep * z_off) * by_sigma
+                z[i] = z_lasts + z_grows * dt + alpha * z_off + beta * z_rate
+                lost[i] = creep * (z_lasts + z_grows * dt) + sigma * z_grows
+                lost[i] += alpha * off - beta * kappa * (z_off + damping * z_rate)
+                f[i] = (z[i] + damping * by_sigma * (lost[i] - creep_now * z[i])) * by_soft
+            pushed_before[i] = pushed[i]
+            size += z[i] * z[i]
+        size = pressed * math.sqrt(size)
+        w = (u[2, k] - lost[2]) * by_spread
+        row = out[k]
+        row.speed_x_mps = u[0, k] - lost[0] + w * body.com_y_m
+        row.speed_y_mps = u[1, k] - lost[1] - w * body.com_x_m
+        row.yaw_rate_radps = w
+        row.force_n = load * weight * f[0]
+        row.slip_ratio = (pressed * soft + load * more) * f[0]
+        row.current_a = load * weight * (heading[0, k] * f[0] + heading[1, k] * f[1] + heading[2, k] * f[2])
+    spun, radius_m = slopes(mean_wheel_speed, dt), body.radius_m
+    for k in range(n):
+        torque = (out[k].current_a + body.rotating_kg * spun[k]) * radius_m * (1.0 + p.wheel_radius_ratio)
+        speed = mean_wheel_speed[k]
+        direction = speed / math.sqrt(speed * speed + ROLLING_MPS * ROLLING_MPS)
+        out[k].current_a = (torque + body.friction_nm * direction) / body.nm_per_a
+    return out
+
+
+@inner
+def _no_slip(
+    contact: Any, p: Any, dt: float, wheel_speed_mps: Array, steer_rad: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return the twist without slip, the wheel speeds' root mean square and mean, and the pull of tractions.
+
+    (3, n), (n,), (n,), and (3, n): what a traction in each direction of the twist pulls along the wheels.
+    """
+    n = wheel_speed_mps.shape[0]
+    scale = 1.0 + p.wheel_radius_ratio
+    right, left = 1.0 + 0.5 * p.one_sided_radius_ratio, 1.0 - 0.5 * p.one_sided_radius_ratio
+    u, heading, angle = np.zeros((3, n)), np.zeros((3, n)), np.empty((3, n))
+    pace, mean_wheel_speed = np.empty(n), np.empty(n)
+    offsets = (p.steering_offset_1_rad, p.steering_offset_2_rad, p.steering_offset_3_rad)
+    scales = (p.wheel_scale_1_ratio, p.wheel_scale_2_ratio, p.wheel_scale_3_ratio)
+    for i in range(3):
+        angle[i] = steered(steer_rad[:, i] + offsets[i], p.steering_delay_s, p.steering_backlash_rad, dt)
+    for k in range(n):
+        square, total = 0.0, 0.0
+        for i in range(3):
+            wheel_speed = wheel_speed_mps[k, i] * scale * (right if i == 2 else left) * (1.0 + scales[i])
+            square += wheel_speed * wheel_speed
+            total += wheel_speed
+            cos, sin = math.cos(angle[i, k]), math.sin(angle[i, k])
+            for j in range(3):
+                gain = contact.to_twist[j, 2 * i] * cos + contact.to_twist[j, 2 * i + 1] * sin
+                u[j, k] += wheel_speed * gain
+            heading[0, k] += cos / 3.0
+            heading[1, k] += sin / 3.0
+            heading[2, k] += (contact.arm_ratio[i, 0] * sin - contact.arm_ratio[i, 1] * cos) / 3.0
+        u[0, k] -= u[2, k] * contact.body.com_y_m
+        u[1, k] += u[2, k] * contact.body.com_x_m
+        u[2, k] *= contact.spread_m
+        pace[k], mean_wheel_speed[k] = math.sqrt(square / 3.0), total / 3.0
+    return u, pace, mean_wheel_speed, heading
+
+
+SWERVE = PlanarDrive(CONTACT, _swerve_numbers, _move_swerve)
+
+
+DRIVES: Mapping[str, PlanarDrive] = {
+    "skid_steer": SKID,
+    "tracked": SKID,
+    "swerve": SWERVE,
+    "omni": OMNI,
+    "bicycle": BICYCLE,
+}
+"""By the name of a robot's drive."""
+
+UNDISTURBED = np.zeros((0, 3))  # not read-only: that were another type of array, and kernels compiled twice
+
+
+class Planar(NamedTuple):
+    """The planar plant of a robot on a ground: its drive, and ``params`` (1,) of the drive's record."""
+
+    robot: Robot
+    drive: PlanarDrive
+    params: Array
+
+    @property
+    def body(self) -> Array:
+        """Numbers that every drive has, (1,) of :data:`~terrain.simulation.plants.planar.PLANAR_BODY`."""
+        return np.asarray(self.params["body"])
+
+
+def make_planar(robot: Robot, ground: Ground) -> Planar:
+    """Return the planar plant of a robot on a ground; what a description leaves out does not act."""
+    drive = DRIVES[robot.drive]
+    params = filled(drive.record, body=body_numbers(robot, ground), **drive.numbers(robot, ground))
+    return Planar(robot, drive, params)
+
+
+def move(
+    planar: Planar,
+    vector: Array,
+    dt: float,
+    wheel_speed_mps: Array,
+    steer_rad: Array,
+    grade_rad: Array,
+    roll_rad: Array,
+    disturbance: Array = UNDISTURBED,
+) -> Array:
+    """Return what the body does, (n,) of :data:`~terrain.simulation.plants.planar.TRUTH`.
+
+    Parameters
+    ----------
+    planar, vector : the plant, and its parameters in the order of ``effects.PARAMETERS``
+    dt : step in s
+    wheel_speed_mps : (n, wheels) wheel rates times the nominal radius
+    steer_rad : (n, wheels) angles as encoders without error show them; not looked at without steering
+    grade_rad, roll_rad : (n,) true tilt
+    disturbance : (n, 3) what the ground adds to speeds (shares of ``|u|``, along and across) and yaw rate (rad/s), or
+        none: (0, 3)
+    """
+    inputs = wheel_speed_mps, steer_rad, grade_rad, roll_rad, disturbance
+    truth = planar.drive.move(planar.params, vector, dt, inputs)
+    _finish(planar.body, vector, dt, inputs, planar.drive.drifts, truth)
+    return truth
+
+
+@njit
+def _finish(params: Array, vector: Array, dt: float, inputs: Inputs, drifts: bool, truth: Array) -> None:
+    """Add what side hill and ground do to the motion, and the specific force along x."""
+    p, effective_ratio = vector.view(EFFECTS)[0], params[0].effective_ratio
+    _, _, grade_rad, roll_rad, disturbance = inputs
+    for k in range(truth.shape[0]):
+        row = truth[k]
+        fast = math.sqrt(row.speed_x_mps * row.speed_x_mps + row.speed_y_mps * row.speed_y_mps)
+        if drifts:
+            row.speed_y_mps -= p.side_hill_slip_ratio * effective_ratio * roll_rad[k] * fast
+        if disturbance.shape[0] > 0:
+            row.speed_y_mps += fast * disturbance[k, 1]
+            row.yaw_rate_radps += disturbance[k, 2]
+    accel = slopes(truth["speed_x_mps"].copy(), dt)
+    for k in range(truth.shape[0]):
+        row = truth[k]
+        row.accel_x_mps2 = accel[k] - row.yaw_rate_radps * row.speed_y_mps
+        row.accel_x_mps2 += GRAVITY_MPS2 * math.sin(grade_rad[k])
+
+
+def replay(
+    planar: Planar,
+    vector: Array,
+    dt: float,
+    wheel_speed_mps: Array,
+    steer_rad: Array,
+    grade_rad: Array,
+    roll_rad: Array,
+) -> Array:
+    """Return the channels (n, len(CHANNELS)) that follow from logged wheels, steering and tilt.
+
+    Parameters
+    ----------
+    planar, vector, dt : as :func:`move` takes them
+    wheel_speed_mps, steer_rad, grade_rad, roll_rad : (n, wheels), (n, wheels), (n,), (n,) as measured: the lag of the
+        encoders, the clock and the offsets of the tilt are corrected here
+    """
+    wheel_speed, grade, roll = corrected_inputs(planar, vector, dt, wheel_speed_mps, grade_rad, roll_rad)
+    return sense(planar, vector, dt, move(planar, vector, dt, wheel_speed, steer_rad, grade, roll))
+
+
+def corrected_inputs(
+    planar: Planar, vector: Array, dt: float, wheel_speed_mps: Array, grade_rad: Array, roll_rad: Array
+) -> tuple[Array, Array, Array]:
+    """Return true wheel speeds, grade and roll from the measured ones; see :func:`replay`."""
+    corrected: tuple[Array, Array, Array] = _corrected(
+        planar.body, vector, dt, wheel_speed_mps, grade_rad, roll_rad
+    )
+    return corrected
+
+
+@njit
+def _corrected(
+    params: Array, vector: Array, dt: float, wheel_speed_mps: Array, grade_rad: Array, roll_rad: Array
+) -> tuple[Array, Array, Array]:
+    body, p = params[0], vector.view(EFFECTS)[0]
+    wheel_speed, grade, roll = wheel_speed_mps, grade_rad - p.pitch_offset_rad, roll_rad - p.roll_offset_rad
+    lag = body.encoder_lag_s + p.encoder_lag_s
+    if lag != 0.0:
+        wheel_speed = wheel_speed_mps.copy()
+        for i in range(wheel_speed.shape[1]):
+            wheel_speed[:, i] += lag * slopes(wheel_speed_mps[:, i].copy(), dt)
+    late = (p.clock_offset_s + body.imu_latency_s + p.imu_latency_s) / dt
+    if late != 0.0 or p.clock_rate_ratio != 0.0:
+        grade = delayed(grade, -late, -p.clock_rate_ratio)
+        roll = delayed(roll, -late, -p.clock_rate_ratio)
+    return wheel_speed, grade, roll
+
+
+def sense(planar: Planar, vector: Array, dt: float, truth: Array) -> Array:
+    """Return the channels (n, len(CHANNELS)) that sensors without noise measure.
+
+    Parameters
+    ----------
+    planar, vector, dt : as :func:`move` takes them
+    truth : (n,) that it returns
+    """
+    return np.asarray(_sense(planar.body, vector, dt, truth))
+
+
+@njit
+def _sense(params: Array, vector: Array, dt: float, truth: Array) -> Array:
+    body, p, n = params[0], vector.view(EFFECTS)[0], truth.shape[0]
+    out = np.empty((n, 7))
+    lever_x, lever_y = body.lever_x_m + p.lever_x_m, body.lever_y_m + p.lever_y_m
+    scale = 1.0 + p.camera_scale_ratio if body.seen_from_above else 1.0
+    cos, sin = scale * math.cos(p.camera_yaw_rad), scale * math.sin(p.camera_yaw_rad)
+    for k in range(n):
+        row = truth[k]
+        w = row.yaw_rate_radps
+        v_x, v_y = point_velocity(row.speed_x_mps, row.speed_y_mps, w, lever_x, lever_y)
+        out[k, 0] = (1.0 + p.gyro_scale_ratio) * w + p.gyro_bias_radps
+        out[k, 1] = cos * v_x - sin * v_y
+        out[k, 2] = sin * v_x + cos * v_y
+        out[k, 3] = row.accel_x_mps2 + p.accel_bias_mps2
+        warm = (1.0 + p.motor_constant_ratio) * (1.0 + p.motor_drift_ratio * k * dt / 60.0)
+        out[k, 4] = row.current_a * warm + body.n_wheels * p.current_offset_a
+        out[k, 5] = row.turning_current_a * warm
+        out[k, 6] = w
+    offset, rate = p.clock_offset_s / dt, p.clock_rate_ratio
+    camera = (body.latency_s + p.camera_latency_s) / dt
+    imu = (body.imu_latency_s + p.imu_latency_s + body.imu_lag_s) / dt
+    for c in (0, 1, 2, 3, 6):
+        late = offset + (imu if c in (0, 3) else camera)
+        if late != 0.0 or rate != 0.0:
+            out[:, c] = delayed(out[:, c].copy(), late, rate)
+    return out
+
+
+WHEELS_HZ, IMU_HZ, CAMERA_HZ = 50.0, 100.0, 50.0  # rates of the loggers
+
+
+class Scatter(NamedTuple):
+    """Standard deviations of what differs from run to run by itself."""
+
+    gyro_bias_radps: float
+    accel_bias_mps2: float
+    pitch_offset_rad: float
+    roll_offset_rad: float
+    wheel_radius_ratio: float
+    one_sided_radius_ratio: float
+    rolling_resistance_ratio: float
+    force_slip_ratio: float
+    effective_track_ratio: float
+
+
+class Noise(NamedTuple):
+    """Noise of a run: standard deviations, and ``*_s`` the time over which it forgets itself.
+
+    All but white noise is that of a robot fast enough; at the speed ``moving_mps`` it has half its size, and at rest
+    none.
+    """
+
+    along_ratio: float
+    along_s: float
+    across_ratio: float
+    across_s: float
+    yaw_radps: float
+    yaw_s: float
+    gyro_radps: float
+    gyro_s: float
+    accel_mps2: float
+    accel_s: float
+    current_skid_a: float
+    current_swerve_a: float
+    current_s: float
+    camera_mps: float
+    camera_s: float
+    encoder_m: float
+    tilt_rad: float
+    heading_rad: float
+    moving_mps: float
+
+    def current_a(self, robot: Robot) -> float:
+        """Return the noise of the sum of a robot's currents; that of an omni robot is in its description."""
+        if robot.on_omni_wheels:
+            return 0.0
+        return self.current_skid_a if robot.skids else self.current_swerve_a
+
+
+def load_scatter() -> Scatter:
+    """Return the scatter that travels with the package."""
+    return Scatter(**_spread_numbers("scatter", Scatter._fields))
+
+
+def load_noise() -> Noise:
+    """Return the noise that travels with the package.
+
+    Examples
+    --------
+    >>> load_noise().along_s
+    0.3
+    """
+    return Noise(**_spread_numbers("noise", Noise._fields))
+
+
+class ModelError(NamedTuple):
+    """How far the planar simulation on a soil of the package is off the dynamic plant, by parameter."""
+
+    common: dict[str, float]  # value that each parameter seems to have where nothing is hidden
+    varied: dict[str, float]  # the same of the mean over runs whose conditions differ
+    scatter: dict[str, float]  # of single runs whose conditions differ
+    probes: dict[tuple[str, str], float]  # what the residual depends on, by channel and input
+
+
+def load_model_error() -> ModelError:
+    """Return the simulation's own error; ``data/spread/planar.yaml`` says how it was measured."""
+    common, varied, scatter = (
+        _spread_numbers(part, tuple(_described()[part]))
+        for part in ("model_error", "varied_error", "varied_scatter")
+    )
+    probes = {
+        (channel, name): float(size)
+        for channel, entry in _described()["probe_error"].items()
+        for name, size in entry["sizes"].items()
+    }
+    return ModelError(common, varied, scatter, probes)
+
+
+@cache
+def _described() -> Any:
+    return read_yaml(data_folder("spread") / "planar.yaml")
+
+
+def _spread_numbers(part: str, names: tuple[str, ...]) -> dict[str, float]:
+    described = _described()[part]
+    return {
+        name: number(f"planar.yaml: {part}: {name}", described[name], name.rpartition("_")[2], 0.0)
+        for name in names
+    }
+
+
+@njit
+def coloured(white: Array, std: Array, tau_s: Array, dt: float) -> Array:
+    """Return noise (c, n) of sizes and memories (c,) from white noise (c, n) of size 1, sampled every ``dt`` s."""
+    out = np.empty_like(white)
+    for i in range(white.shape[0]):
+        keep = math.exp(-dt / tau_s[i])
+        push = math.sqrt(1.0 - keep * keep) * std[i]
+        value = std[i] * white[i, 0]
+        out[i, 0] = value
+        for k in range(1, white.shape[1]):
+            value = keep * value + push * white[i, k]
+            out[i, k] = value
+    return out
+
+
+@njit
+def lag_weights(time_constant_s: float, dt: float) -> tuple[float, float, float]:
+    """Return weights of this sample, the one before and the last output in an exact first-order low-pass.
+
+    Examples
+    --------
+    >>> [round(float(weight), 4) for weight in lag_weights(0.05, 0.02)]
+    [0.1758, 0.1539, 0.6703]
+    """
+    keep = math.exp(-dt / time_constant_s)
+    slope = time_constant_s / dt * (1.0 - keep)
+    return 1.0 - slope, slope - keep, keep
+
+
+def activity(speed_mps: Any, noise: Noise) -> Any:
+    """Return how much of the noise of a moving robot there is at a speed of its wheels, 0 to 1."""
+    return np.abs(speed_mps) / (np.abs(speed_mps) + noise.moving_mps)
+
+
+# Each of the two lags in a row by which a wheel follows its command, and that of the steering; assumed.
+DRIVE_S, STEER_S = 0.06, 0.08
+DRIVE_MPS2 = 4.0  # the most that a wheel speeds up; assumed, 2 g of grip would be needed for more
+STEP_S = 0.01  # from step to step: no sensor is sampled faster
+# Causes that no effect of the library describes: wheel speed x (1 + e sin(wheel angle)), each wheel with its own
+# phase, and spikes of the current at crawling speed.
+OUTSIDE: tuple[str, ...] = ("wheel_eccentricity_ratio", "stick_slip_a")
+# Speed below which stick-slip shows as spikes of the current, their mean rate, and the length of each.
+CRAWL_MPS, SPIKE_HZ, SPIKE_S = 0.25, 5.0, 0.06
+STANDSTILL_MPS = 1e-6  # speed below which an encoder counts nothing: its low-pass ends there
+# Channel of the truth of an omni robot, whose body slips otherwise than any of its wheels.
+BODY_SLIP = "slip_body_ratio"
+
+_PURPOSES = ("scatter", "hills", "ground", "wheels", "steering", "imu", "camera", "outside", "lidar")
+
+
+class _DrivenRun:
+    """A drive before its loggers.
+
+    ``p`` are the effects by name, ``truth`` and ``pose`` the motion at each step of ``dt``, ``wheel_speed_mps`` and
+    ``steer_rad`` as encoders without error show them, ``true_speed_mps`` circumferential speeds with the true radii,
+    ``active`` the factor on the noise of a moving robot, and ``ideal`` the channels of sensors without noise.
+    """
+
+    def __init__(
+        self,
+        planar: Planar,
+        vector: Array,
+        dt: float,
+        noise: Noise | None,
+        rngs: Mapping[str, np.random.Generator],
+    ) -> None:
+        self.robot, self.planar, self.vector, self.p = planar.robot, planar, vector, vector.view(EFFECTS)[0]
+        self.dt, self.noise, self.rngs = dt, noise, rngs
+
+    def follow(self, desired: WheelMotion, conditions: Conditions, eccentric: float) -> None:
+        """Let the robot follow commands over hills."""
+        robot, p, dt, noise, rngs = self.robot, self.p, self.dt, self.noise, self.rngs
+        parts, fastest = round(1.0 / (RATE_HZ * dt)), robot.steering_rate_max_radps
+        speed, steer = follow_commands(desired.wheel_speed_mps, desired.steer_rad, parts, dt, fastest)
+        n, wheels = speed.shape
+        active, disturbance = np.zeros(n), np.zeros((0, 3))
+        if noise is not None:
+            active = activity(np.abs(speed).mean(axis=1), noise)
+            std = np.array([noise.along_ratio, noise.across_ratio, noise.yaw_radps])
+            tau_s = np.array([noise.along_s, noise.across_s, noise.yaw_s])
+            disturbance = coloured(rngs["ground"].standard_normal((3, n)), std, tau_s, dt).T.copy()
+            disturbance[:, 2] *= active
+        turned = speed
+        if eccentric:
+            phase = rngs["outside"].uniform(0.0, 2.0 * math.pi, wheels)
+            angle = np.cumsum(speed, axis=0) * dt / robot.wheel_radius_m
+            turned = speed * (1.0 + eccentric * np.sin(angle + phase))
+        grade = roll = np.zeros(n)
+        truth = move(self.planar, self.vector, dt, turned, steer, grade, roll, disturbance)
+        pose, slope = _path(truth, dt), np.array(conditions.grade_ratio)
+        grade, roll = _tilt_along(pose, slope, _undulations(conditions, rngs["hills"]))
+        if grade.any() or roll.any():
+            truth = move(self.planar, self.vector, dt, turned, steer, grade, roll, disturbance)
+            pose = _path(truth, dt)
+        sides = np.full(wheels, 1.0 - 0.5 * p["one_sided_radius_ratio"])
+        sides[-1] = 1.0 + 0.5 * p["one_sided_radius_ratio"]
+        self.true_speed_mps = turned * (1.0 + p["wheel_radius_ratio"]) * sides * _encoder_scales(robot, p)
+        self.truth, self.pose, self.grade_rad, self.roll_rad = truth, pose, grade, roll
+        self.wheel_speed_mps, self.steer_rad, self.active = speed, steer, active
+        self.ideal = sense(self.planar, self.vector, dt, truth)
+
+    def samples(self, rate_hz: float) -> tuple[Array, Array]:
+        """Return steps and stamps (k,) of a logger."""
+        rows = np.arange(0, len(self.ideal), round(1.0 / (rate_hz * self.dt)))
+        return rows, np.arange(len(rows)) / rate_hz
+
+    def channel(self, name: str) -> Array:
+        """Return one channel (n,) of sensors without noise."""
+        return self.ideal[:, CHANNELS.index(name)]
+
+    def delayed(self, values: Array, latency_s: float) -> Array:
+        """Return a signal (n,) as the logger of IMU and camera stamps it, behind a latency."""
+        late = (self.p["clock_offset_s"] + latency_s) / self.dt
+        rate = self.p["clock_rate_ratio"]
+        return np.asarray(delayed(values, late, rate)) if late != 0.0 or rate != 0.0 else values
+
+
+def run_planar(
+    robot: Robot,
+    drive: Scenario | Array,
+    ground: Ground,
+    seed: int | np.random.SeedSequence,
+    *,
+    conditions: Conditions,
+    effects: Mapping[str, float],
+    scatter: Scatter | None = None,
+    noise: Noise | None = None,
+    outside: Mapping[str, float] | None = None,
+    heading: bool = False,
+    fixes: bool = False,
+    terrain: str = "",
+    step_s: float = STEP_S,
+) -> tuple[dict[str, Stream], tuple[Label, ...]]:
+    """Return streams and labels of a drive, for :func:`terrain.simulation.run.simulate`, which describes the rest.
+
+    Parameters
+    ----------
+    drive : a scenario on one terrain, or twists (n, 3) at 50 Hz, from rest
+    conditions : load, and the lie of the land along the start's heading and to its left; of undulations, the
+        standard deviation of what three waves that cross in drawn directions add to either
+    effects : parameters of :mod:`terrain.effects`, beside or in place of the description's own
+    scatter : of this run's own parameters; by default they do not
+    noise : none by default; then encoders do not quantise
+    outside : amplitudes of :data:`OUTSIDE`
+    heading : add the stream lidar, with the rate of a heading that does not depend on the gyro
+    fixes : add the streams gnss and compass
+    terrain : label of a drive that is no scenario; without one it has none
+    step_s : from step to step
+    """
+    outside = outside or {}
+    twist = drive.twist if isinstance(drive, Scenario) else np.asarray(drive)
+    terrain = drive.patches[0].terrain if isinstance(drive, Scenario) else terrain
+    _check(robot, twist, outside, step_s)
+    logs_currents = robot.describes("motors") and "motors" in robot.sections
+    robot = with_silent_parts(robot)
+    rngs = generators(seed, _PURPOSES)
+    vector = vector_of({**robot.effects, **effects})
+    vector[INDEX["payload_ratio"]] += conditions.payload_kg / robot.mass_kg
+    if scatter is not None:
+        for name in nuisances_of(robot.drive):
+            vector[INDEX[name]] += getattr(scatter, name) * rngs["scatter"].standard_normal()
+    desired = wheel_motion(robot, twist, 1.0 / RATE_HZ)
+    run = _DrivenRun(make_planar(robot, ground), vector, step_s, noise, rngs)
+    run.follow(desired, conditions, outside.get("wheel_eccentricity_ratio", 0.0))
+    rows = [*("speed_x_mps", "speed_y_mps", "yaw_rate_radps"), *wheel_channels("wheel_radps", robot.wheels)]
+    commands = [desired.twist, desired.wheel_radps, desired.steer_rad[:, : len(robot.steer_rows)]]
+    streams = {"wheels": _wheels(run, outside.get("stick_slip_a", 0.0), logs_currents)}
+    if robot.on_omni_wheels:
+        streams["pose"] = _pose(run)
+    else:
+        streams |= {"imu": _imu(run), "odometry": _camera(run)}
+    streams["commands"] = Stream(
+        np.arange(len(twist)) / RATE_HZ, np.hstack(commands), (*rows, *robot.steer_rows)
+    )
+    time_s, body = _body(run)
+    streams["truth"] = _truth(run, time_s, body)
+    if robot.steered:
+        streams["steering"] = _steering(run)
+    if heading:
+        streams["lidar"] = _lidar(run)
+    if fixes:
+        at_s, every = np.arange(0.0, time_s[-1] + 1e-9, 1.0 / RAW_HZ), round(IMU_HZ / RAW_HZ)
+        streams |= raw_fixes(at_s, body[::every], generators(seed, ("fixes",))["fixes"])
+    return streams, (Label(0.0, (len(twist) - 1) / RATE_HZ, terrain),) if terrain else ()
+
+
+def _check(robot: Robot, twist: Array, outside: Mapping[str, float], step_s: float) -> None:
+    if isinstance(robot, SwerveRobot):
+        robot.require(*robot.sections)
+    if twist.ndim != 2 or twist.shape[1] != 3 or len(twist) < 2 or not np.isfinite(twist).all():
+        raise ConfigError(f"twist has shape {twist.shape}, (n, 3) finite numbers with two rows are required")
+    if not robot.sideways and twist[:, 1].any():
+        raise ConfigError(
+            f"twist drives robot {robot.name} sideways, which needs steered wheels or omni wheels"
+        )
+    if robot.on_omni_wheels and outside.get("stick_slip_a"):
+        raise ConfigError(f"outside: stick_slip_a is not simulated of robot {robot.name} on omni wheels")
+    for name, value in outside.items():
+        if name not in OUTSIDE or not math.isfinite(value):
+            raise ConfigError(
+                f"outside: {name} is {value!r}; finite numbers of {', '.join(OUTSIDE)} are required"
+            )
+    parts = STEP_S / step_s if step_s > 0 else 0.0
+    if parts < 0.5 or abs(parts - round(parts)) > 1e-9:
+        raise ConfigError(f"step_s is {step_s:g}, {STEP_S:g} s or a whole part of it is required")
+
+
+def with_silent_parts(robot: Robot) -> Robot:
+    """Return the robot with parts that neither act nor are noisy for the sections that it lacks.
+
+    Examples
+    --------
+    >>> from terrain.robots import load_robot
+    >>> with_silent_parts(load_robot("warthog")).sensors.gyro_std_radps
+    0.0
+    """
+    silent: dict[str, Part] = {}
+    for name, part in robot.completed.parts.items():
+        if name not in robot.parts:
+            unknown = [item.name for item in fields(part) if math.isnan(getattr(part, item.name))]
+            silent[name] = replace(part, **dict.fromkeys(unknown, 0.0))  # type: ignore[arg-type]
+    return robot.with_parts(**silent)
+
+
+@njit
+def follow_commands(
+    desired_mps: Array, desired_rad: Array, parts: int, dt: float, rate_max: float
+) -> tuple[Array, Array]:
+    """Return wheel speeds and steering (m, wheels) that follow desired (n, wheels), ``parts`` steps a row."""
+    n, wheels = desired_mps.shape
+    m = (n - 1) * parts + 1
+    wheel_speed, steer = np.empty((m, wheels)), np.empty((m, wheels))
+    quick, turn = 1.0 - math.exp(-dt / DRIVE_S), 1.0 - math.exp(-dt / STEER_S)
+    fastest, furthest = DRIVE_MPS2 * dt, rate_max * dt
+    for i in range(wheels):
+        first, second, angle = 0.0, 0.0, desired_rad[0, i]
+        for k in range(m):
+            row = k // parts
+            part = (k - row * parts) / parts
+            after = min(row + 1, n - 1)
+            goal = desired_mps[row, i] + part * (desired_mps[after, i] - desired_mps[row, i])
+            first += min(max(quick * (goal - first), -fastest), fastest)
+            second += quick * (first - second)
+            wheel_speed[k, i] = second
+            aim = desired_rad[row, i] + part * (desired_rad[after, i] - desired_rad[row, i])
+            angle += min(max(turn * (aim - angle), -furthest), furthest)
+            steer[k, i] = angle
+    return wheel_speed, steer
+
+
+def _undulations(conditions: Conditions, rng: np.random.Generator) -> Array:
+    """Return (3, 4) of the undulations: amplitude along their two axes' direction, wave numbers, phase."""
+    if not conditions.undulation_ratio:
+        return np.zeros((0, 4))
+    direction = rng.uniform(0.0, math.pi, 3)
+    phase = rng.uniform(0.0, 2.0 * math.pi, 3)
+    size = np.full(3, conditions.undulation_ratio * math.sqrt(4.0 / 3.0))
+    number = 2.0 * math.pi / (conditions.undulation_length_m * np.array([0.7, 1.0, 1.4]))
+    return np.column_stack([size, number, direction, phase])
+
+
+@njit
+def _path(truth: Array, dt: float) -> Array:
+    """Return east, north and heading (n, 3) of the body's origin, from 0."""
+    n = truth.shape[0]
+    pose = np.zeros((n, 3))
+    for k in range(1, n):
+        before, now = truth[k - 1], truth[k]
+        yaw = pose[k - 1, 2] + 0.5 * dt * (before.yaw_rate_radps + now.yaw_rate_radps)
+        middle = 0.5 * (yaw + pose[k - 1, 2])
+        x, y = 0.5 * (before.speed_x_mps + now.speed_x_mps), 0.5 * (before.speed_y_mps + now.speed_y_mps)
+        cos, sin = math.cos(middle), math.sin(middle)
+        pose[k, 0] = pose[k - 1, 0] + dt * (x * cos - y * sin)
+        pose[k, 1] = pose[k - 1, 1] + dt * (x * sin + y * cos)
+        pose[k, 2] = yaw
+    return pose
+
+
+@njit
+def _tilt_along(pose: Array, grade_ratio: Array, waves: Array) -> tuple[Array, Array]:
+    """Return grade (nose up positive) and roll (left side up positive) (n,) of a body along its path."""
+    n = pose.shape[0]
+    grade, roll = np.zeros(n), np.zeros(n)
+    for k in range(n):
+        east, north = grade_ratio[0], grade_ratio[1]
+        for i in range(waves.shape[0]):
+            cos, sin = math.cos(waves[i, 2]), math.sin(waves[i, 2])
+            value = waves[i, 0] * math.cos(waves[i, 1] * (pose[k, 0] * cos + pose[k, 1] * sin) + waves[i, 3])
+            east += value * cos
+            north += value * sin
+        cos, sin = math.cos(pose[k, 2]), math.sin(pose[k, 2])
+        ahead, left = east * cos + north * sin, -east * sin + north * cos
+        grade[k] = math.atan(ahead / math.hypot(1.0, left))
+        roll[k] = math.atan(left)
+    return grade, roll
+
+
+def _wheels(run: _DrivenRun, stick_slip_a: float, logs_currents: bool) -> Stream:
+    """Return the stream of wheel speeds and, where they are logged, motor currents."""
+    robot, noise, p, wheels = run.robot, run.noise, run.p, len(run.robot.wheels)
+    sensors, motors, rng = robot.sensors, robot.motors, run.rngs["wheels"]
+    rows, time_s = run.samples(WHEELS_HZ)
+    n, every = len(rows), round(1.0 / (WHEELS_HZ * run.dt))
+    total, turning = run.channel(CURRENT)[rows], run.channel(TURNING_CURRENT)[rows]
+    if stick_slip_a:
+        total = total + _spikes(run, stick_slip_a)[rows]
+    if robot.on_omni_wheels:
+        currents = _omni_currents(run)[rows]
+    elif robot.skids:
+        currents = np.column_stack([total - turning, total + turning]) / 2.0
+    else:
+        currents = np.repeat(total[:, None] / wheels, wheels, axis=1)
+    lag_s = sensors.encoder_time_constant_s + p["encoder_lag_s"]
+    step_m, jitter, white = 0.0, np.zeros((n + 1, wheels)), np.zeros((n, wheels))
+    if noise is not None:
+        active = run.active[rows]
+        if sensors.hall_steps_ratio > 0.0:
+            turns = sensors.hall_steps_ratio * motors.reduction_ratio
+            step_m = 2.0 * math.pi * robot.wheel_radius_m / turns
+        jitter = rng.standard_normal((n + 1, wheels)) * noise.encoder_m
+        jitter *= np.append(active, active[-1])[:, None]
+        white_mps = sensors.motor_std_radps / motors.reduction_ratio * robot.wheel_radius_m
+        white = white_mps * rng.standard_normal((n, wheels))
+        std_a = np.full(wheels, noise.current_a(robot) / math.sqrt(wheels))
+        tau_s = np.full(wheels, noise.current_s)
+        drawn = coloured(rng.standard_normal((wheels, n)), std_a, tau_s, run.dt * every).T * active[:, None]
+        currents = currents + drawn + sensors.current_std_a * rng.standard_normal((n, wheels))
+    speed = encoder_speed(run.wheel_speed_mps, every, run.dt, step_m, jitter, lag_s)
+    speed[np.abs(speed) <= STANDSTILL_MPS] = 0.0
+    speed = robot.logged_rates(add_rate_noise(speed, white, STANDSTILL_MPS))
+    if not logs_currents:
+        return Stream(time_s, speed, robot.rate_channels)
+    if robot.on_omni_wheels:
+        currents = np.abs(currents)  # as its logs have them
+    channels = (*robot.rate_channels, *wheel_channels("current_a", robot.wheels))
+    return Stream(time_s, np.hstack([speed, currents]), channels)
+
+
+def _omni_currents(run: _DrivenRun) -> Array:
+    """Return the current (n, wheels) of each motor: of the motion before the ground disturbs it."""
+    wheels = np.ascontiguousarray(run.true_speed_mps / (1.0 + run.p["wheel_radius_ratio"]))
+    truth = move(run.planar, run.vector, run.dt, wheels, run.steer_rad, run.grade_rad, run.roll_rad)
+    return np.asarray(currents_of(run.planar.params, run.vector, run.dt, wheels, truth))
+
+
+def _spikes(run: _DrivenRun, size_a: float) -> Array:
+    """Return spikes (n,) of the sum of the currents while the wheels crawl."""
+    speed = run.wheel_speed_mps.mean(axis=1)
+    crawls = (np.abs(speed) < CRAWL_MPS) & (np.abs(speed) > 0.02)
+    starts = run.rngs["outside"].random(len(speed)) < SPIKE_HZ * run.dt
+    length = max(1, round(SPIKE_S / run.dt))
+    lasting = np.convolve(starts & crawls, np.ones(length))[: len(speed)] > 0
+    return np.asarray(size_a * np.sign(speed) * lasting)
+
+
+def _encoder_scales(robot: Robot, p: Any) -> Array:
+    """Return true over measured wheel rates (wheels,): encoders may lose counts."""
+    names = [f"wheel_scale_{wheel}_ratio" for wheel in robot.wheels]
+    return np.array([1.0 + p[name] if name in INDEX else 1.0 for name in names])
+
+
+@njit
+def encoder_speed(
+    wheel_speed_mps: Array, every: int, dt: float, step_m: float, jitter_m: Array, lag_s: float
+) -> Array:
+    """Return the wheel speeds (n, wheels) that encoders count: distance over a period, stamped in its middle.
+
+    Parameters
+    ----------
+    wheel_speed_mps : (m, wheels)
+    every, dt : steps a sample, and their length in s
+    step_m : of the encoder, at the circumference; 0 does not quantise
+    jitter_m : (n + 1, wheels) errors of the distances read
+    lag_s : of the low-pass behind the encoder
+    """
+    m, wheels = wheel_speed_mps.shape
+    n = (m - 1) // every + 1
+    out = np.empty((n, wheels))
+    distance = np.empty(m)
+    period = every * dt
+    for i in range(wheels):
+        distance[0] = 0.0
+        for k in range(1, m):
+            distance[k] = distance[k - 1] + 0.5 * dt * (wheel_speed_mps[k - 1, i] + wheel_speed_mps[k, i])
+        before = 0.0
+        for k in range(n + 1):
+            at = k * every - every // 2
+            inside = min(max(at, 0), m - 1)
+            reading = distance[inside] + (at - inside) * dt * wheel_speed_mps[inside, i] + jitter_m[k, i]
+            if step_m > 0.0:
+                reading = math.floor(reading / step_m) * step_m
+            if k > 0:
+                out[k - 1, i] = (reading - before) / period
+            before = reading
+        if lag_s > 0.0:
+            now, earlier, keep = lag_weights(lag_s, period)
+            last_in = last_out = out[0, i]
+            for k in range(n):
+                value = now * out[k, i] + earlier * last_in + keep * last_out
+                last_in, last_out = out[k, i], value
+                out[k, i] = value
+    return out
+
+
+def _steering(run: _DrivenRun) -> Stream:
+    """Return the stream of steering angles."""
+    sensors, channels = run.robot.sensors, run.robot.steer_channels
+    rows, time_s = run.samples(WHEELS_HZ)
+    steer, noise, step_rad = run.steer_rad[rows, : len(channels)], np.zeros(1), 0.0
+    if run.noise is not None:
+        noise = sensors.steering_std_rad * run.rngs["steering"].standard_normal(steer.shape)
+        if sensors.steering_steps_ratio > 0.0:
+            step_rad = 2.0 * math.pi / sensors.steering_steps_ratio
+    angle = encoder_angle(steer, run.robot.steering_zeros_rad[: len(channels)], noise, step_rad)
+    return Stream(time_s, angle, channels)
+
+
+def _imu(run: _DrivenRun) -> Stream:
+    """Return the stream of the IMU: gyro and accelerometer along x have clock and latency already."""
+    rows, time_s = run.samples(IMU_HZ)
+    latency_s = run.robot.sensors.imu_latency_s + run.p["imu_latency_s"]
+    v_x, v_y, turn = (run.truth[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"))
+    level = np.cos(run.grade_rad)
+
+    def measured(values: Array) -> Array:
+        return run.delayed(values, latency_s)[rows]
+
+    tilt = np.column_stack([measured(angle) for angle in (run.roll_rad, -run.grade_rad)])
+    rate, force = np.empty((len(rows), 3)), np.empty((len(rows), 3))
+    rate[:, :2] = np.gradient(tilt, 1.0 / IMU_HZ, axis=0)
+    rate[:, 2], force[:, 0] = run.channel("yaw_rate_radps")[rows], run.channel("accel_x_mps2")[rows]
+    force[:, 1] = measured(
+        np.gradient(v_y, run.dt) + turn * v_x + GRAVITY_MPS2 * np.sin(run.roll_rad) * level
+    )
+    force[:, 2] = measured(GRAVITY_MPS2 * np.cos(run.roll_rad) * level)
+    yaw = (np.cumsum(rate[:, 2]) - rate[0, 2]) / IMU_HZ
+    values = imu_values(_imu_errors(run, measured(run.active)), slice(None), force, rate, tilt, yaw)
+    return Stream(time_s, values, IMU_CHANNELS)
+
+
+def _imu_errors(run: _DrivenRun, active: Array) -> ImuErrors:
+    """Return the errors of the IMU: those described, and vibration while the robot moves; ``active`` (n,)."""
+    sensors, noise, n, rng = run.robot.sensors, run.noise, len(active), run.rngs["imu"]
+    scale, accel_bias, gyro_bias = described_calibration(sensors)
+    inertial, tilt, yaw = np.zeros((n, 6)), np.zeros((n, 2)), np.zeros(n)
+    if noise is not None:
+        std = np.repeat([noise.gyro_radps, noise.accel_mps2], 3)
+        tau = np.repeat([noise.gyro_s, noise.accel_s], 3)
+        vibration = coloured(rng.standard_normal((6, n)), std, tau, 1.0 / IMU_HZ)
+        white = np.repeat([sensors.gyro_std_radps, sensors.accel_std_mps2], 3)
+        inertial = vibration.T * active[:, None] + white * rng.standard_normal((n, 6))
+        tilt = noise.tilt_rad * rng.standard_normal((n, 2))
+        yaw = sensors.yaw_std_rad * rng.standard_normal(n)
+    yaw_rate = gyro_bias[2] + inertial[:, 2]  # the fused yaw sums the measured rate
+    return ImuErrors(
+        accel_scale_ratio=scale,
+        yaw_scale_ratio=1.0,
+        rate_bias_radps=np.tile(gyro_bias, (n, 1)),
+        rate_noise_radps=inertial[:, :3],
+        accel_bias_mps2=accel_bias,
+        accel_noise_mps2=inertial[:, 3:],
+        tilt_bias_rad=np.array([run.p["roll_offset_rad"], -run.p["pitch_offset_rad"]]),
+        tilt_noise_rad=tilt,
+        yaw_bias_rad=(np.cumsum(yaw_rate) - yaw_rate[0]) / IMU_HZ,
+        yaw_noise_rad=yaw,
+    )
+
+
+def _pose(run: _DrivenRun) -> Stream:
+    """Return the poses that a camera above measures of an omni robot: the world's axes, its own noise."""
+    camera, p = run.robot.camera, run.p
+    rows, time_s = run.samples(CAMERA_HZ)
+    latency_s = run.planar.body["latency_s"][0] + p["camera_latency_s"]
+    x_m, y_m, yaw_rad = (run.delayed(column, latency_s)[rows] for column in run.pose.T)
+    lever_m = complex(camera.lever_x_m + p["lever_x_m"], camera.lever_y_m + p["lever_y_m"])
+    marker = x_m + 1j * y_m + np.exp(1j * yaw_rad) * lever_m
+    marker = marker * (1.0 + p["camera_scale_ratio"])
+    seen = np.column_stack([marker.real, marker.imag, yaw_rad - p["camera_yaw_rad"]])
+    if run.noise is not None:
+        std = np.array([camera.position_std_m, camera.position_std_m, camera.yaw_std_rad])
+        seen = seen + std * run.rngs["camera"].standard_normal(seen.shape)
+    return Stream(time_s, seen, POSE_CHANNELS)
+
+
+def _camera(run: _DrivenRun) -> Stream:
+    """Return the stream of the camera: poses of a swerve robot, else speeds in body axes."""
+    camera, noise, rng = run.robot.camera, run.noise, run.rngs["camera"]
+    rows, time_s = run.samples(CAMERA_HZ)
+    n, first = len(rows), CHANNELS.index(SPEED_X)
+    latency_s = run.planar.body["latency_s"][0] + run.p["camera_latency_s"]
+    seen = run.ideal[rows, first : first + 2].copy()
+    if noise is not None:
+        active = run.delayed(run.active, latency_s)[rows]
+        std, tau = np.full(2, noise.camera_mps), np.full(2, noise.camera_s)
+        seen += coloured(rng.standard_normal((2, n)), std, tau, 1.0 / CAMERA_HZ).T * active[:, None]
+        seen += camera.speed_std_mps * rng.standard_normal((n, 2))
+    if not isinstance(run.robot, SwerveRobot):
+        return Stream(time_s, seen, ("speed_x_mps", "speed_y_mps"))
+    turn = run.channel(HEADING)
+    yaw = ((np.cumsum(turn) - 0.5 * (turn + turn[0])) * run.dt)[rows]
+    rate, position_noise = turn[rows], np.zeros((n, 2))
+    if noise is not None:
+        yaw = yaw + camera.yaw_std_rad * rng.standard_normal(n)
+        rate = rate + camera.yaw_rate_std_radps * rng.standard_normal(n)
+        position_noise = camera.position_std_m * rng.standard_normal((n, 2))
+    origin = np.column_stack(
+        point_velocity(seen[:, 0], seen[:, 1], rate, -camera.lever_x_m, -camera.lever_y_m)
+    )
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    velocity = np.column_stack(
+        [origin[:, 0] * cos - origin[:, 1] * sin, origin[:, 0] * sin + origin[:, 1] * cos]
+    )
+    position = np.cumsum(velocity, axis=0) / CAMERA_HZ + position_noise
+    roll, pitch = (run.delayed(a, latency_s)[rows] for a in (run.roll_rad, -run.grade_rad))
+    motion = np.column_stack([origin, rate, roll, pitch, yaw])
+    lever_m = np.array([camera.lever_x_m, camera.lever_y_m, camera.lever_z_m])
+    values = np.empty((n, len(CAMERA_CHANNELS)))
+    camera_samples(position, motion, np.zeros((n, N_ERRORS)), lever_m, 0.0, values)
+    return Stream(time_s, values, CAMERA_CHANNELS)
+
+
+def _lidar(run: _DrivenRun) -> Stream:
+    """Return the rate of a heading that does not depend on the gyro, from central differences."""
+    rows, time_s = run.samples(CAMERA_HZ)
+    rate = run.channel(HEADING)[rows]
+    if run.noise is not None:
+        heading = run.noise.heading_rad * run.rngs["lidar"].standard_normal(len(rows))
+        rate = rate + np.gradient(heading, 1.0 / CAMERA_HZ)
+    return Stream(time_s, rate[:, None], ("yaw_rate_radps",))
+
+
+def _body(run: _DrivenRun) -> tuple[Array, Array]:
+    """Return stamps and the body (n,) at them, of :data:`~terrain.simulation.sensors.BODY`."""
+    rows, time_s = run.samples(IMU_HZ)
+    at, grade, body = run.truth[rows], run.grade_rad[rows], np.zeros(len(rows), BODY)
+    for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps"):
+        body[name] = at[name]
+    body["position_x_m"], body["position_y_m"], body["yaw_rad"] = run.pose[rows].T
+    body["roll_rad"], body["pitch_rad"] = run.roll_rad[rows], -grade
+    body["accel_x_mps2"] = at["accel_x_mps2"] - GRAVITY_MPS2 * np.sin(grade)
+    turning = at["yaw_rate_radps"] * at["speed_x_mps"]
+    body["accel_y_mps2"] = np.gradient(at["speed_y_mps"], 1.0 / IMU_HZ) + turning
+    return time_s, body
+
+
+def _truth(run: _DrivenRun, time_s: Array, body: Array) -> Stream:
+    """Return the stream of true quantities."""
+    robot, (rows, _) = run.robot, run.samples(IMU_HZ)
+    steer = run.steer_rad[rows]
+    places_m = robot.wheel_positions_m * (1.0 + run.p["wheel_distance_ratio"])
+    twist = np.column_stack([body[name] for name in ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")])
+    along, across = wheel_frame_velocities(twist, places_m, steer + robot.wheel_directions_rad)
+    quantities = {
+        "wheel_radps": run.wheel_speed_mps[rows] * _encoder_scales(robot, run.p) / robot.wheel_radius_m,
+        "steer_rad": steer,
+        "slip_ratio": slip_ratio(run.true_speed_mps[rows], along),
+    }
+    columns: dict[str, Any] = {}
+    for quantity, values in quantities.items():
+        columns |= zip(wheel_channels(quantity, robot.wheels), values.T, strict=True)
+    columns[GYRO_BIAS] = np.full(len(rows), run.p["gyro_bias_radps"] + robot.sensors.gyro_bias_z_radps)
+    if isinstance(robot, BicycleRobot):
+        slips = slip_angle(along, across)
+        columns |= zip(wheel_channels("slip_rad", robot.wheels), slips.T, strict=True)
+    if robot.on_omni_wheels:
+        columns[BODY_SLIP] = run.truth["slip_ratio"][rows]
+    return truth_stream(time_s, body, columns)
