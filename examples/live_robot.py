@@ -8,8 +8,8 @@ import sys
 import time
 
 from pipelines.serve.client import TerrainClient
-from terrain.logs.read import read_run
 from terrain.logs.replay import SENSORS, replay
+from terrain.logs.run_folders import read_run
 
 
 def drive(folder: str, url: str, speed: float = 1.0) -> str:

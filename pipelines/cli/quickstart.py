@@ -167,8 +167,7 @@ def _keep(runs: Sequence[RunLog], data: Path | None, folder: Path, progress: Pro
     """Write run folders into ``folder``; earlier ones of the same data are used as they are, others refused."""
     from pipelines.data.datasets import load_runs
     from terrain.files.atomic import atomic_folder
-    from terrain.logs.digest import data_digest
-    from terrain.logs.write import write_run
+    from terrain.logs.run_folders import data_digest, write_run
 
     kept = {"out": folder, "n_runs": len(runs), "reused": folder.exists()}
     if kept["reused"]:

@@ -11,6 +11,7 @@ from pipelines.data.bag_files import Bag, decoder_of, find_bags, messages_of, op
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
 from terrain.logs.labels import RecordedWindow, window_of_text
+from terrain.logs.mapping import MessageStream, TopicMapping, load_topics
 from terrain.logs.run_topics import (
     RUN_TOPIC,
     STRING,
@@ -26,9 +27,6 @@ from terrain.logs.topics import (
     Faults,
     MappedTopics,
     Topic,
-    TopicMapping,
-    check_stream,
-    load_mapping,
     standard_mapping,
 )
 from terrain.records import RunLog, Stream
@@ -49,7 +47,7 @@ def find_runs(place: Path, mapping: str | Path | None, robot: Robot | None) -> l
         place = place.resolve()
     if not (paths := find_bags(place)):
         return []
-    read_mapping = None if mapping is None else load_mapping(mapping)
+    read_mapping = None if mapping is None else load_topics(mapping)
     return [partial(read_run, path, place, read_mapping, robot) for path in paths]
 
 
@@ -102,7 +100,7 @@ def read_run(
 def read_stream(
     path: Path,
     name: str,
-    described_stream: Mapping[str, object],
+    stream: MessageStream,
     repairs: Counter[str] | None,
     radius_m: float | None = None,
 ) -> Stream:
@@ -112,11 +110,10 @@ def read_stream(
     ----------
     path : of the bag
     name : of the stream
-    described_stream : its keys, as in a mapping of topics
+    stream : as a mapping describes it
     repairs : counts by kind of what is dropped; None refuses
     radius_m : of the robot's wheels; None where unknown
     """
-    stream = check_stream(f"stream {name}", described_stream)
     mapping = TopicMapping(streams={name: stream})
     bag = open_bag(path)
     found = _mapped(bag, mapping, topics_of(bag), radius_m, Faults(repairs))

@@ -72,10 +72,10 @@ def run(settings: Settings, progress: Progress = silent) -> ImportResult | Expor
     """
     from pipelines.data.run_writers import target_place, write
     from terrain.files.atomic import atomic_write
-    from terrain.logs.digest import data_digest
     from terrain.logs.duplicates import shared_stretches
     from terrain.logs.mapping import csv_mapping
     from terrain.logs.plausibility import counted, doubts_of, refuse_implausible_runs
+    from terrain.logs.run_folders import data_digest
     from terrain.robots import load_robot
 
     runs, skipped = load(settings)
@@ -126,7 +126,7 @@ def _recorded_windows(place: Path) -> dict[str, list[RecordedWindow]]:
     from pipelines.data.bag_files import find_bags
     from pipelines.data.bag_runs import recorded_windows
     from terrain.logs.labels import read_windows
-    from terrain.logs.read import read_run_head, run_folders
+    from terrain.logs.run_folders import read_run_head, run_folders
 
     folders = run_folders(place) if place.is_dir() else []
     found = {read_run_head(folder).run_id: read_windows(folder) or [] for folder in folders}

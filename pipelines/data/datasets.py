@@ -38,8 +38,8 @@ ACCEPTED = (
 """What a refusal lists."""
 
 FOUND_BY: dict[str, tuple[str, tuple[str, ...]]] = {
-    "runs": ("terrain.logs.read:find_runs", ("run.json", "*/run.json")),
-    "borealtc": ("terrain.logs.borealtc:find_runs", ("*/imu_*.csv", "*/pro_*.csv")),
+    "runs": ("terrain.logs.run_folders:find_runs", ("run.json", "*/run.json")),
+    "borealtc": ("terrain.logs.mapping:find_borealtc", ("*/imu_*.csv", "*/pro_*.csv")),
     "drive": ("terrain.logs.drive:find_sessions", ("samples.csv.gz", "*/samples.csv.gz")),
     "robotino": (
         "terrain.logs.robotino:find_runs",
@@ -103,7 +103,7 @@ def load_runs(folder: str | Path, *, robot: str | Path | None = None, **reading:
         :data:`DRIVE_ROBOT` by default
     layout : one of :data:`~pipelines.data.settings.Layout`; ``auto`` looks, as by default
     mapping : YAML file that describes how to read CSV files (``terrain.logs.mapping``); of logs of a CAN bus
-        their DBC, by default AgriMaRo's; of bags their topics (``terrain.logs.topics``)
+        their DBC, by default AgriMaRo's; of bags their topics (``terrain.logs.mapping``)
     repair : drop and count what a strict read refuses, and skip runs that cannot be read at all
     align : bring the wheel stream onto the clock of the IMU where the two clocks can be compared
 
@@ -135,7 +135,7 @@ def load(settings: RunsSettings) -> tuple[list[RunLog], list[str]]:
     DataError
         if a run that is to be aligned has no gyro or no wheel speeds.
     """
-    from terrain.logs.spelling import one_spelling
+    from terrain.logs.samples import one_spelling
 
     folder, repair = settings.data, settings.repair
     runs: list[RunLog] = []
@@ -258,9 +258,8 @@ def _mapped(folder: Path, mapping: str | Path, robot: Robot | None) -> Readers:
     """Return the readers of files by a mapping; a stream may lie in a bag."""
     from pipelines.data import bag_runs
     from terrain.logs import mapping as by_mapping
-    from terrain.logs.topics import check_stream
 
-    read = by_mapping.load_mapping(mapping, check_stream)
+    read = by_mapping.load_mapping(mapping)
     radius_m = bag_runs.wheel_radius_m(read.robot, robot)
     return by_mapping.find_runs(folder, read, partial(bag_runs.read_stream, radius_m=radius_m))
 

@@ -84,8 +84,8 @@ MAX_ROWS = 12  #: Rows of streams on the first screen: those that need a look co
 
 def run(settings: Settings, progress: Progress = silent) -> Inspection:
     """Return the quality of the runs under a folder."""
-    from terrain.logs.digest import data_digest
     from terrain.logs.duplicates import shared_stretches
+    from terrain.logs.run_folders import data_digest
     from terrain.robots import load_robot
 
     runs, skipped = load(settings)

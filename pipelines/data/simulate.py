@@ -70,7 +70,7 @@ def run(settings: Settings, progress: Progress = silent) -> SimulatedRuns:
 
     from terrain.effects import read_effects_of
     from terrain.files.atomic import ensure_writable
-    from terrain.logs.write import run_folder, write_run
+    from terrain.logs.run_folders import run_folder, write_run
     from terrain.robots import load_robot
     from terrain.simulation.run import BENCH_TERRAIN, COURSE, run_id_of, simulate_run
     from terrain.simulation.scenario import Conditions, Faults

@@ -141,7 +141,7 @@ def explain(
     from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain
     from terrain.effects import chosen_effects, showing
     from terrain.extension import region_of
-    from terrain.logs.digest import data_digest
+    from terrain.logs.run_folders import data_digest
     from terrain.robots import load_robot
 
     asked, progress, runs = ExplainOptions(**options), progress or silent, list(runs)

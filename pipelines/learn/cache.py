@@ -33,8 +33,8 @@ from terrain import __version__
 from terrain.classify.limits import Motion
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.files.atomic import atomic_file, ensure_writable
-from terrain.logs.digest import data_digest, joint_digest
 from terrain.logs.duplicates import PrintFiles, RunPrint, run_print, sentences, shared_stretches
+from terrain.logs.run_folders import data_digest, joint_digest
 from terrain.records import Array, RunLog, Stream, Windows
 
 FORMAT_VERSION = 5

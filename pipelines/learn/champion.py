@@ -16,7 +16,7 @@ import numpy as np
 
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.metrics import MIN_RUNS, Difference, paired_accuracy, runs_by_terrain
-from terrain.logs.digest import joint_digest
+from terrain.logs.run_folders import joint_digest
 
 if TYPE_CHECKING:
     from pipelines.learn.evaluation import CrossvalResult

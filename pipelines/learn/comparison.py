@@ -110,7 +110,7 @@ def compare_models(
     from pipelines.learn.evaluate import evaluation_of
     from terrain.classify.held_out import HeldOut
     from terrain.classify.metrics import Outcome, compare_with_first
-    from terrain.logs.digest import data_digest
+    from terrain.logs.run_folders import data_digest
 
     trained = {digest for model in models for digest in model.info.run_digests}
     excluded = tuple(each.run_id for each in runs if data_digest([each]) in trained)

@@ -55,7 +55,7 @@ def run(settings: Settings, progress: Progress = silent) -> CrossvalResult | Com
             (name,), computed, digest = settings.recipes, (data.rows, data.motion), data.digest
             found, _ = evaluate_recipe(data.recipe, name, data.samples, settings, progress, computed)
         else:
-            from terrain.logs.digest import data_digest
+            from terrain.logs.run_folders import data_digest
 
             runs, skipped = load(settings)
             asked, digest = settings.with_(skip_short=settings.repair), data_digest(runs)

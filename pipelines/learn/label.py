@@ -181,7 +181,7 @@ def _write_labels(settings: Settings, answers: Path, out: Path) -> AnswersResult
     from pipelines.data.datasets import load_runs
     from terrain.classify.proposals import LabelSource, label_of, with_label
     from terrain.files.atomic import atomic_folder
-    from terrain.logs.write import write_run
+    from terrain.logs.run_folders import write_run
     from terrain.records import Label
 
     if out.exists():

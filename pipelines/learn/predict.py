@@ -205,7 +205,7 @@ def predict(
         if the table is for another robot than a run is of.
     """
     from pipelines.live.windows import needs_filter, windows_of_log
-    from terrain.logs.digest import data_digest
+    from terrain.logs.run_folders import data_digest
 
     for each in runs:
         if table.robot and each.robot != table.robot:

@@ -20,7 +20,7 @@ from pipelines.learn.settings import RecipeSettings
 from pipelines.live.model import ModelInfo, TerrainModel
 from terrain.classify.limits import Motion, conformal_threshold, held_out_scores, learn_novelty, learn_support
 from terrain.errors import DataError
-from terrain.logs.digest import data_digest
+from terrain.logs.run_folders import data_digest
 from terrain.logs.schema import ESTIMATED
 from terrain.records import Array, RunLog
 

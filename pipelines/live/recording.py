@@ -28,11 +28,10 @@ from pipelines.live.chain import CommandStatus, Step
 from pipelines.live.classifying import WindowOutput
 from terrain.control.switching import SWITCHING
 from terrain.logs.labels import RecordedWindow
-from terrain.logs.read import RunHead
 from terrain.logs.replay import TWIST
+from terrain.logs.run_folders import RunHead, run_folder
 from terrain.logs.run_topics import LATEST_S, WINDOW_TOPIC, RunRecorder, check_recordable
 from terrain.logs.samples import BAD_TIME
-from terrain.logs.write import run_folder
 from terrain.records import Array, Reading
 
 FLUSH_S = 1.0

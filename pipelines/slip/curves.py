@@ -17,7 +17,7 @@ from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields
 from terrain.control.learned_table import learned_table, run_row, terrain_row
 from terrain.control.slip_table import DRIVE_STATES
 from terrain.errors import DataError
-from terrain.logs.digest import data_digest
+from terrain.logs.run_folders import data_digest
 from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
 from terrain.slip_learning.curve import N_BOOTSTRAP, PeakStatus

@@ -176,7 +176,7 @@ def run(settings: Settings, progress: Progress) -> TracksResult:
     from pipelines.slip.shown import write_figures
     from terrain.errors import LogError
     from terrain.files.atomic import ensure_writable
-    from terrain.logs.write import run_folder, write_run
+    from terrain.logs.run_folders import run_folder, write_run
     from terrain.robots import load_robot
 
     runs, skipped = load(settings)

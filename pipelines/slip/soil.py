@@ -19,7 +19,7 @@ from pipelines.slip.calibrate import Settings
 from pipelines.slip.shown import write_figures
 from terrain.errors import DataError
 from terrain.files.atomic import atomic_write, ensure_writable
-from terrain.logs.digest import data_digest
+from terrain.logs.run_folders import data_digest
 from terrain.records import RunLog
 from terrain.slip_learning.soil import (
     BAR_RATIO,

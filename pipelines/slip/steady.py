@@ -15,7 +15,7 @@ from pipelines.slip.shown import named
 from pipelines.slip.table import SLIP, TARGET, TARGETS, LearnedSlipTable, fields_of
 from terrain.control.learned_table import MIN_RUNS, Transfer, learn_surfaces
 from terrain.errors import DataError
-from terrain.logs.digest import data_digest
+from terrain.logs.run_folders import data_digest
 from terrain.records import RunLog, TargetStatus
 from terrain.robots import Robot
 from terrain.slip_learning.measured import OperatingPoints, measure_steady

@@ -19,7 +19,7 @@ from terrain.errors import ConfigError, LogError
 from terrain.files.atomic import atomic_write
 from terrain.files.documents import accepted, read_json
 from terrain.files.names import MEBIBYTE, read_regular
-from terrain.logs.read import read_run, read_run_head, run_folders
+from terrain.logs.run_folders import read_run, read_run_head, run_folders
 from terrain.logs.samples import short_name, whole_run_label
 from terrain.logs.schema import TIME_TOLERANCE_S
 from terrain.records import Label, Stream

@@ -11,14 +11,22 @@ finite value that no quantity can have, as of damaged bytes, stays as it is; a r
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from terrain.errors import DataError, LogError
-from terrain.files.names import check_inside, check_name, check_regular, has_control_characters, shown
+from terrain.files.names import (
+    check_inside,
+    check_name,
+    check_regular,
+    has_control_characters,
+    normal_name,
+    shown,
+)
 from terrain.logs.schema import UNIT_OFFSETS, UNIT_SCALES
 from terrain.records import Array, Label, RunLog, Stream
 
@@ -34,6 +42,7 @@ BAD_CELL = "cells that are no number"
 SHORT_ROW = "rows with missing or extra cells"
 DEAD_CHANNEL = "channels with nothing finite"
 IMPLAUSIBLE = "values beyond any quantity"
+RESPELT = "labels in another spelling of their terrain"
 
 
 def to_si(numbers: Array, unit: str, scale: float = 1.0, offset: float = 0.0) -> Array:
@@ -41,6 +50,13 @@ def to_si(numbers: Array, unit: str, scale: float = 1.0, offset: float = 0.0) ->
     with np.errstate(over="ignore", invalid="ignore"):
         si: Array = (numbers * scale + offset) * UNIT_SCALES[unit][1] + UNIT_OFFSETS.get(unit, 0.0)
     return si
+
+
+def refuse_or_count(repairs: Counter[str] | None, kind: str, sentence: str, n: int = 1) -> None:
+    """Raise ``LogError`` where nothing is repaired, else count ``n`` of a kind."""
+    if repairs is None:
+        raise LogError(sentence)
+    repairs[kind] += n
 
 
 def usable_rows(samples: Array, *, unknown_is_a_value: bool = False) -> Array:
@@ -167,40 +183,31 @@ def checked_stream(
     terrain.errors.LogError: a.csv: time goes back at row 4 (0.1 s after 0.2 s)
     """
     values = np.where(np.isfinite(values), values, np.nan)
-    if repairs is None:
-        _refuse_bad_time(name, time_s, row_of)
-    else:
-        kept = np.flatnonzero(np.isfinite(time_s))
-        if np.any(np.diff(time_s[kept]) <= 0.0):
-            kept = kept[longest_rise(time_s[kept])]
-        if kept.size < time_s.size:
-            repairs[BAD_TIME] += time_s.size - kept.size
-            time_s, values = time_s[kept], values[kept]
+    finite = np.flatnonzero(np.isfinite(time_s))
+    fallen = 1 + np.flatnonzero(np.diff(time_s[finite]) <= 0.0)
+    if finite.size < time_s.size or fallen.size:
+        if repairs is None and finite.size < time_s.size:
+            row = int(np.flatnonzero(~np.isfinite(time_s))[0])
+            raise LogError(f"{name}: time at row {row_of(row)} is not finite ({time_s[row]})")
+        if repairs is None:
+            row = int(fallen[0])
+            now, then = float(time_s[row]), float(time_s[row - 1])
+            if now == then:
+                raise LogError(f"{name}: time repeats at row {row_of(row)} ({now:.15g} s twice)")
+            raise LogError(f"{name}: time goes back at row {row_of(row)} ({now:.15g} s after {then:.15g} s)")
+        kept = finite[longest_rise(time_s[finite])]
+        repairs[BAD_TIME] += time_s.size - kept.size
+        time_s, values = time_s[kept], values[kept]
     if time_s.size < 2:
         raise LogError(f"{name}: has {time_s.size} usable rows of data, at least 2 are needed")
     implausible = np.abs(values) > MAX_MAGNITUDE
     if repairs is not None and implausible.any():
         repairs[IMPLAUSIBLE] += int(implausible.sum())
         values = np.where(implausible, np.nan, values)
-    dead = [] if unknown_is_a_value else np.flatnonzero(~np.isfinite(values).any(axis=0)).tolist()
-    if dead and repairs is None:
-        column = f" (column {columns[dead[0]]})" if columns else ""
-        raise LogError(
-            f"{name}: channel {channels[dead[0]]}{column} has nothing finite in its {time_s.size} rows"
-        )
-    if dead and repairs is not None:
-        repairs[DEAD_CHANNEL] += len(dead)
+    for i in [] if unknown_is_a_value else np.flatnonzero(~np.isfinite(values).any(axis=0)).tolist():
+        of = f"channel {channels[i]}{f' (column {columns[i]})' if columns else ''}"
+        refuse_or_count(repairs, DEAD_CHANNEL, f"{name}: {of} has nothing finite in its {time_s.size} rows")
     return Stream(time_s, values, tuple(channels))
-
-
-def _refuse_bad_time(name: str, time_s: Array, row_of: Callable[[int], int]) -> None:
-    for row in np.flatnonzero(~np.isfinite(time_s))[:1].tolist():
-        raise LogError(f"{name}: time at row {row_of(row)} is not finite ({time_s[row]})")
-    for row in (np.flatnonzero(np.diff(time_s) <= 0.0)[:1] + 1).tolist():
-        now, then = float(time_s[row]), float(time_s[row - 1])
-        if now == then:
-            raise LogError(f"{name}: time repeats at row {row_of(row)} ({now:.15g} s twice)")
-        raise LogError(f"{name}: time goes back at row {row_of(row)} ({now:.15g} s after {then:.15g} s)")
 
 
 def refuse_apart(run_id: str, streams: Mapping[str, Stream]) -> None:
@@ -222,3 +229,42 @@ def whole_run_label(streams: Mapping[str, Stream], terrain: str) -> Label:
     period_s = float(np.median(np.diff(last.time_s)))
     start_s = min(float(stream.time_s[0]) for stream in streams.values())
     return Label(start_s, float(last.time_s[-1]) + period_s, terrain)
+
+
+def one_spelling(place: str, runs: Sequence[RunLog], *, repair: bool = False) -> list[RunLog]:
+    """Return the runs of a data set, ``place`` in messages, whose terrains differ by more than upper and lower case.
+
+    An accented letter has two forms in Unicode; names that differ in that alone are the same, in form C.
+    ``LogError`` where a terrain has two spellings; a repairing read takes that of most runs, the first in the alphabet
+    among equals, and counts the labels.
+
+    Examples
+    --------
+    >>> runs = [RunLog(name, "husky", {}, ((0.0, 1.0, name),)) for name in ("Asphalt", "ASPHALT")]
+    >>> one_spelling("logs", runs)
+    Traceback (most recent call last):
+    terrain.errors.LogError: logs: the terrains 'ASPHALT' and 'Asphalt' differ in upper and lower case ...
+    """
+    n_runs = Counter(terrain for run in runs for terrain in run.terrains)
+    alike: defaultdict[str, defaultdict[str, list[str]]] = defaultdict(lambda: defaultdict(list))
+    for terrain in n_runs:
+        alike[normal_name(terrain).casefold()][normal_name(terrain)].append(terrain)
+    better: dict[str, str] = {}
+    for forms in alike.values():
+        spelt = {each[0] if len(each) == 1 else name: each for name, each in forms.items()}
+        names = sorted(spelt, key=lambda name: (-sum(n_runs[each] for each in spelt[name]), name))
+        if len(names) > 1 and not repair:
+            listed = " and ".join(shown(name) for name in sorted(names))
+            raise LogError(
+                f"{place}: the terrains {listed} differ in upper and lower case only; name them alike, or "
+                "merge them with --repair"
+            )
+        better |= {each: names[0] for every in spelt.values() for each in every}
+    found = []
+    for run in runs:
+        if any(better[terrain] != terrain for terrain in run.terrains):
+            labels = tuple(label._replace(terrain=better[label.terrain]) for label in run.labels)
+            n = sum(normal_name(each.terrain) != normal_name(better[each.terrain]) for each in run.labels)
+            run = replace(run, labels=labels, dropped=Counter(run.dropped) + Counter({RESPELT: n}))
+        found.append(run)
+    return found

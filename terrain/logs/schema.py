@@ -9,8 +9,6 @@ from __future__ import annotations
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, LogError
 
-SCHEMA_VERSION = 1
-
 TIME_TOLERANCE_S = 1e-6
 """Stamps are compared to this; it covers the rounding of decimal stamps, far below any sample period."""
 

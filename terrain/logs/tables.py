@@ -21,15 +21,16 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
+from io import BytesIO, TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, TextIO
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.errors import LogError, library, one_line
 from terrain.files.names import MEBIBYTE, check_regular, listed, normal_name, printable, shown
-from terrain.logs.samples import BAD_CELL, SHORT_ROW, short_name
+from terrain.logs.samples import BAD_CELL, SHORT_ROW, refuse_or_count, short_name
 from terrain.records import Array
 
 MISSING = ("", "nan", "NaN", "NAN", "NA")  #: Cells that stand for a missing value
@@ -48,8 +49,7 @@ MAX_VALUES = 200_000_000
 A file of constant columns has thousands of millions in some kilobytes."""
 
 _UNREADABLE = (OSError, EOFError, zlib.error, UnicodeDecodeError, csv.Error)
-_BAD_MAT = (ValueError, TypeError, NotImplementedError, LookupError, MemoryError)
-_COLUMN = re.compile(r"(.+?)(?:\[(\d{1,6})\])?")
+_Rows = Iterable[tuple[int, Sequence[Any]]]
 
 
 class TextLayout(NamedTuple):
@@ -88,37 +88,28 @@ def read_table(
     missing, empty or damaged, lacks a column or has it twice, or holds what is refused; ``ConfigError`` where a package
     is missing.
     """
-    kind = path.suffix.lower()
+    kind, name = path.suffix.lower(), short_name(path)
     if kind == ".mat":
         return _mat_columns(path, columns)
-    if kind == ".xlsx":
-        header, rows = _sheet_rows(path, layout, sheet)
-    else:
-        _refuse_too_large(path)
-        header, rows = header_of(path, layout), _rows(path, layout)
+    content = b"" if kind == ".xlsx" else _content(path)
+    header, rows = _sheet_rows(path, layout, sheet) if kind == ".xlsx" else _text_rows(path, content, layout)
     places = [_place(path, header, column) for column in columns]
-    if kind != ".xlsx" and (fast := _fast(path, len(header), places, layout)) is not None:
+    if content and (fast := _fast(content, len(header), places, layout)) is not None:
         return fast
     table = []
     for row, cells in rows:
         if len(cells) != len(header):
-            if repairs is None:
-                raise LogError(
-                    f"{short_name(path)}: row {row} has {len(cells)} cells, the header has {len(header)}"
-                )
-            repairs[SHORT_ROW] += 1
+            fault = f"{name}: row {row} has {len(cells)} cells, the header has {len(header)}"
+            refuse_or_count(repairs, SHORT_ROW, fault)
             continue
-        numbers = [_number(cells[place], layout.decimal) for place in places]
-        for column, place in ((c, p) for c, p, n in zip(columns, places, numbers, strict=True) if n is None):
-            if repairs is None:
-                fault = (
-                    f"{short_name(path)}: {column} at row {row} is {shown(cells[place])}, which is no number"
-                )
+        numbers = [number_in(cells[place], layout.decimal) for place in places]
+        for column, place, number in zip(columns, places, numbers, strict=True):
+            if number is None:
+                fault = f"{name}: {column} at row {row} is {shown(cells[place])}, which is no number"
                 if kind == ".xlsx" and row == layout.first_row + 1:
                     more = layout.header_rows + 1
                     fault += f": a header of {more} rows is read with 'header_rows: {more}'"
-                raise LogError(fault)
-            repairs[BAD_CELL] += 1
+                refuse_or_count(repairs, BAD_CELL, fault)
         table.append([np.nan if number is None else number for number in numbers])
     return np.array(table, dtype=np.float64).reshape(len(table), len(columns))
 
@@ -128,7 +119,7 @@ def row_number(path: Path, index: int, *, layout: TextLayout = PLAIN) -> int:
     kind = path.suffix.lower()
     if kind in (".mat", ".xlsx"):
         return index + 1 + (layout.first_row if kind == ".xlsx" else 0)
-    return next(islice(_rows(path, layout), index, None))[0]
+    return next(islice(_text_rows(path, _content(path), layout)[1], index, None))[0]
 
 
 def text_rows(path: Path, columns: Sequence[str]) -> list[tuple[int, tuple[str, ...] | None]]:
@@ -136,47 +127,45 @@ def text_rows(path: Path, columns: Sequence[str]) -> list[tuple[int, tuple[str, 
 
     The texts are None of a row that is shorter or longer than the header.
     """
-    _refuse_too_large(path)
-    header = header_of(path, PLAIN)
+    header, rows = _text_rows(path, _content(path), PLAIN)
     places = [_place(path, header, column) for column in columns]
     return [
         (row, tuple(cells[place] for place in places) if len(cells) == len(header) else None)
-        for row, cells in _rows(path, PLAIN)
+        for row, cells in rows
     ]
 
 
-def number_in(cell: str, decimal: str = ".") -> float | None:
-    """Return the number in a cell: NaN where it is missing, None where it is no number.
+def header_of(path: Path, layout: TextLayout) -> list[str]:
+    """Return the names of the columns of a CSV file."""
+    return _text_rows(path, _content(path), layout)[0]
+
+
+def number_in(cell: Any, decimal: str = ".") -> float | None:
+    """Return the number in a cell of a text or a sheet: NaN where it is missing, None where it is no number.
+
+    Dates in a sheet are seconds since 1970.
 
     Examples
     --------
     >>> number_in(" 1.5 "), number_in("NA"), number_in("wet")
     (1.5, nan, None)
     """
-    text = cell.strip()
-    if text in MISSING:
+    if cell is None:
         return float("nan")
-    if decimal != ".":
-        if "." in text:
-            return None
-        text = text.replace(decimal, ".")
-    try:
-        return None if "_" in text else float(text)
-    except ValueError:
-        return None
-
-
-def _number(cell: Any, decimal: str) -> float | None:
-    """Return the number in a cell of a text or of a sheet, in which dates are seconds since 1970."""
-    if isinstance(cell, str):
-        return number_in(cell, decimal)
     if isinstance(cell, datetime):
         import pandas as pd
 
         return float(pd.Timestamp(cell).value) / 1e9
+    if isinstance(cell, str):
+        cell = cell.strip()
+        if cell in MISSING:
+            return float("nan")
+        if "_" in cell or (decimal != "." and "." in cell):
+            return None
+        cell = cell.replace(decimal, ".")
     try:
-        return float("nan") if cell is None else float(cell)
-    except TypeError:  # a time without a date
+        return float(cell)
+    except (TypeError, ValueError):  # a time without a date, or a word
         return None
 
 
@@ -187,37 +176,38 @@ def _place(path: Path, header: Sequence[str], column: str) -> int:
     return header.index(column)
 
 
-def _refuse_too_large(path: Path) -> None:
-    if path.suffix != ".gz":
-        return
+def _content(path: Path) -> bytes:
+    """Return the bytes of a regular file, unpacked."""
     check_regular(path, short_name(path), LogError)
-    n_bytes = 0
     try:
+        if path.suffix != ".gz":
+            return path.read_bytes()
         with gzip.open(path, "rb") as file:
-            while n_bytes <= MAX_UNPACKED_BYTES and (part := file.read(MEBIBYTE)):
-                n_bytes += len(part)
+            content = file.read(MAX_UNPACKED_BYTES + 1)
     except _UNREADABLE as error:
         raise _unreadable(path, error) from error
-    if n_bytes > MAX_UNPACKED_BYTES:
+    if len(content) > MAX_UNPACKED_BYTES:
         most = MAX_UNPACKED_BYTES // MEBIBYTE
         raise LogError(f"{short_name(path)}: unpacks to more than {most} MiB, the most that is read")
+    return content
 
 
-def _open(path: Path) -> TextIO:
-    check_regular(path, short_name(path), LogError)
-    if path.suffix == ".gz":
-        return gzip.open(path, "rt", encoding="utf-8-sig", newline="")
-    return path.open(encoding="utf-8-sig", newline="")
+def _text_rows(path: Path, content: bytes, layout: TextLayout) -> tuple[list[str], _Rows]:
+    """Return the names of the columns, and the rows of data that are not blank with their numbers.
 
+    The names are with or without an empty last one, as the first row of data has it.
+    """
 
-def header_of(path: Path, layout: TextLayout) -> list[str]:
-    """Return the names of the columns, with or without an empty last one as the first row of data has it."""
-    try:
-        with _open(path) as file:
-            reader = csv.reader(file, delimiter=layout.delimiter)
-            rows = list(islice(reader, layout.skip_rows, layout.first_row + 1))
-    except _UNREADABLE as error:
-        raise _unreadable(path, error) from error
+    def lines() -> Iterator[tuple[int, list[str]]]:
+        text = TextIOWrapper(BytesIO(content), encoding="utf-8-sig", newline="")
+        reader = csv.reader(text, delimiter=layout.delimiter)
+        try:
+            for cells in reader:
+                yield reader.line_num, cells
+        except _UNREADABLE as error:
+            raise _unreadable(path, error) from error
+
+    rows = [cells for _, cells in islice(lines(), layout.skip_rows, layout.first_row + 1)]
     names = [normal_name(name.strip()) for name in (rows[0] if rows else [])]
     if not any(names):
         if layout.skip_rows:
@@ -228,10 +218,10 @@ def header_of(path: Path, layout: TextLayout) -> list[str]:
         names.append("")
     if len(first) == len(names) - 1 and not names[-1]:
         names.pop()
-    return names
+    return names, (line for line in islice(lines(), layout.first_row, None) if line[1])
 
 
-def _fast(path: Path, width: int, places: Sequence[int], layout: TextLayout) -> Array | None:
+def _fast(content: bytes, width: int, places: Sequence[int], layout: TextLayout) -> Array | None:
     """Return the columns at some places that pyarrow reads; None where it stumbles."""
     from pyarrow import ArrowException
     from pyarrow import csv as arrow_csv
@@ -240,7 +230,7 @@ def _fast(path: Path, width: int, places: Sequence[int], layout: TextLayout) -> 
     chosen = [names[place] for place in places]
     try:
         table = arrow_csv.read_csv(
-            path,
+            BytesIO(content),
             read_options=arrow_csv.ReadOptions(column_names=names, skip_rows=layout.first_row),
             parse_options=arrow_csv.ParseOptions(delimiter=layout.delimiter),
             convert_options=arrow_csv.ConvertOptions(
@@ -256,20 +246,7 @@ def _fast(path: Path, width: int, places: Sequence[int], layout: TextLayout) -> 
     return np.column_stack([table.column(name).to_numpy() for name in chosen])
 
 
-def _rows(path: Path, layout: TextLayout) -> Iterator[tuple[int, Sequence[Any]]]:
-    try:
-        with _open(path) as file:
-            reader = csv.reader(file, delimiter=layout.delimiter)
-            for cells in islice(reader, layout.first_row, None):
-                if cells:
-                    yield reader.line_num, cells
-    except _UNREADABLE as error:
-        raise _unreadable(path, error) from error
-
-
 def _unreadable(path: Path, error: Exception) -> LogError:
-    if isinstance(error, FileNotFoundError):
-        return LogError(f"{short_name(path)}: is missing")
     if isinstance(error, gzip.BadGzipFile | EOFError | zlib.error):
         return LogError(f"{short_name(path)}: is no whole gzip file ({error})")
     if isinstance(error, OSError):
@@ -277,9 +254,7 @@ def _unreadable(path: Path, error: Exception) -> LogError:
     return LogError(f"{short_name(path)}: is no CSV text ({error})")
 
 
-def _sheet_rows(
-    path: Path, layout: TextLayout, sheet: str
-) -> tuple[list[str], Iterable[tuple[int, Sequence[Any]]]]:
+def _sheet_rows(path: Path, layout: TextLayout, sheet: str) -> tuple[list[str], _Rows]:
     """Return the names of the columns of a sheet, and its rows with their numbers."""
     import pandas as pd
 
@@ -307,61 +282,57 @@ def _sheet_rows(
 
 def _mat_columns(path: Path, columns: Sequence[str]) -> Array:
     """Return variables of a ``.mat``, each a vector of the same length."""
-    variables = _mat_variables(path, {column.partition(".")[0].partition("[")[0] for column in columns})
-    vectors = [_mat_column(path, variables, column) for column in columns]
-    for column, each in zip(columns, vectors, strict=True):
-        if each.size != vectors[0].size:
-            raise LogError(
-                f"{short_name(path)}: variable {shown(column)} has {each.size} values, "
-                f"{shown(columns[0])} has {vectors[0].size}"
-            )
-    return np.column_stack(vectors)
-
-
-def _mat_variables(path: Path, names: set[str]) -> Mapping[str, Any]:
-    """Return the variables of some names, structs as mappings; of others only that they are there."""
     from scipy.io import loadmat, whosmat
     from scipy.io.matlab import MatReadError
 
+    name = short_name(path)
+    asked = {column.partition(".")[0].partition("[")[0] for column in columns}
+    variables: Mapping[str, Any]
     try:
         with path.open("rb") as file:
             head = file.read(64)
         if head.startswith((b"\x89HDF", b"MATLAB 7.3")):
-            return _hdf5_variables(path, names)
-        shapes = {name: shape for name, shape, _ in whosmat(str(path))}
-        for name in names & set(shapes):
-            if np.prod(shapes[name], dtype=float) > MAX_VALUES:
-                raise LogError(
-                    f"{short_name(path)}: variable {shown(name)} has more than {MAX_VALUES} values"
-                )
-        read = loadmat(str(path), variable_names=[*names], simplify_cells=True)
-        return dict.fromkeys(shapes) | {name: read[name] for name in names if name in read}
+            h5py = library("h5py", f"{name}: needs the package h5py", "logs")
+
+            def content(item: Any) -> Any:
+                if isinstance(item, h5py.Group):
+                    return {field: content(item[field]) for field in item}
+                if item.size > MAX_VALUES:
+                    raise LogError(f"{name}: a variable has more than {MAX_VALUES} values")
+                return np.asarray(item).T  # MATLAB writes columns first
+
+            with h5py.File(path, "r") as packed:
+                variables = {
+                    each: content(packed[each]) if each in asked else None
+                    for each in packed
+                    if each[0] != "#"
+                }
+        else:
+            shapes = {each: shape for each, shape, _ in whosmat(str(path))}
+            for each in asked & set(shapes):
+                if np.prod(shapes[each], dtype=float) > MAX_VALUES:
+                    raise LogError(f"{name}: variable {shown(each)} has more than {MAX_VALUES} values")
+            variables = dict.fromkeys(shapes) | loadmat(
+                str(path), variable_names=[*asked], simplify_cells=True
+            )
     except OSError as error:
         raise _unreadable(path, error) from error
-    except (MatReadError, *_BAD_MAT) as error:
+    except (MatReadError, ValueError, TypeError, NotImplementedError, LookupError, MemoryError) as error:
         raise LogError(
-            f"{short_name(path)}: is no .mat of version 5 to 7.3, or is damaged ({one_line(error)})"
+            f"{name}: is no .mat of version 5 to 7.3, or is damaged ({one_line(error)})"
         ) from error
+    vectors: list[Array] = []
+    for column in columns:
+        vectors.append(_mat_column(f"{name}: variable", variables, column))
+        if vectors[-1].size != vectors[0].size:
+            sizes = f"{vectors[-1].size} values, {shown(columns[0])} has {vectors[0].size}"
+            raise LogError(f"{name}: variable {shown(column)} has {sizes}")
+    return np.column_stack(vectors)
 
 
-def _hdf5_variables(path: Path, names: set[str]) -> Mapping[str, Any]:
-    h5py = library("h5py", f"{short_name(path)}: needs the package h5py", "logs")
-
-    def content(item: Any) -> Any:
-        if isinstance(item, h5py.Group):
-            return {name: content(item[name]) for name in item}
-        if item.size > MAX_VALUES:
-            raise LogError(f"{short_name(path)}: a variable has more than {MAX_VALUES} values")
-        return np.asarray(item).T  # MATLAB writes columns first
-
-    with h5py.File(path, "r") as file:
-        return {name: content(file[name]) if name in names else None for name in file if name[0] != "#"}
-
-
-def _mat_column(path: Path, variables: Mapping[str, Any], column: str) -> Array:
-    match = _COLUMN.fullmatch(column)
+def _mat_column(place: str, variables: Mapping[str, Any], column: str) -> Array:
+    match = re.fullmatch(r"(.+?)(?:\[(\d{1,6})\])?", column)
     name, index = (match[1], match[2]) if match is not None else (column, None)
-    place = f"{short_name(path)}: variable"
     value: Any = variables
     for part in name.split("."):
         if not isinstance(value, Mapping) or part not in value:
@@ -396,41 +367,38 @@ def read_parquet(path: Path, columns: Sequence[str]) -> list[Array]:
         if the file is damaged or too large, or a column is missing, is there twice or holds no numbers.
     """
     import pyarrow
+    from pyarrow import parquet
 
     place = short_name(path)
     try:
         with path.open("rb") as file:
-            return _parquet_columns(path, file, columns)
+            size = file.seek(0, 2)
+            file.seek(max(size - 8, 0))  # the last 8 bytes are the length of the description and a mark
+            footer_bytes = int.from_bytes(file.read(4), "little")
+            file.seek(0)
+            if MAX_FOOTER_BYTES < footer_bytes <= size:  # a longer one than the file is damage
+                fault = f"describes itself in {footer_bytes} bytes, {MAX_FOOTER_BYTES} are read"
+                raise LogError(f"{place}: {fault}")
+            with parquet.ParquetFile(file) as content:
+                metadata, schema = content.metadata, content.schema_arrow
+                if metadata.num_columns > MAX_COLUMNS:
+                    fault = f"has {metadata.num_columns} columns, at most {MAX_COLUMNS} are read"
+                    raise LogError(f"{place}: {fault}")
+                groups = (metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
+                n_rows = max(metadata.num_rows, *groups, 0)
+                if n_rows * len(columns) > MAX_VALUES:
+                    fault = (
+                        f"has {n_rows} rows of {len(columns)} columns, at most {MAX_VALUES} values are read"
+                    )
+                    raise LogError(f"{place}: {fault}")
+                for name in columns:
+                    kind = schema.field(_place(path, schema.names, name)).type
+                    if not (pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind)):
+                        fault = f"column {shown(name)} holds {str(kind)[:80]}, numbers are required"
+                        raise LogError(f"{place}: {fault}")
+                table = content.read(columns=list(columns), use_threads=False)
     except MemoryError as error:
         raise LogError(f"{place}: takes more memory than there is") from error
     except (pyarrow.ArrowException, OSError, ValueError) as error:
         raise LogError(f"{place}: is no whole Parquet file ({printable(one_line(error, 200))})") from error
-
-
-def _parquet_columns(path: Path, file: BinaryIO, columns: Sequence[str]) -> list[Array]:
-    import pyarrow
-    from pyarrow import parquet
-
-    place = short_name(path)
-    size = file.seek(0, 2)
-    file.seek(max(size - 8, 0))  # the last 8 bytes are the length of the description and a mark
-    footer_bytes = int.from_bytes(file.read(4), "little")
-    file.seek(0)
-    if MAX_FOOTER_BYTES < footer_bytes <= size:  # a longer one than the file is damage
-        raise LogError(f"{place}: describes itself in {footer_bytes} bytes, {MAX_FOOTER_BYTES} are read")
-    with parquet.ParquetFile(file) as content:
-        metadata, schema = content.metadata, content.schema_arrow
-        if metadata.num_columns > MAX_COLUMNS:
-            raise LogError(f"{place}: has {metadata.num_columns} columns, at most {MAX_COLUMNS} are read")
-        groups = (metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
-        n_rows = max(metadata.num_rows, *groups, 0)
-        if n_rows * len(columns) > MAX_VALUES:
-            raise LogError(
-                f"{place}: has {n_rows} rows of {len(columns)} columns, at most {MAX_VALUES} values are read"
-            )
-        for name in columns:
-            kind = schema.field(_place(path, schema.names, name)).type
-            if not (pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind)):
-                raise LogError(f"{place}: column {shown(name)} holds {str(kind)[:80]}, numbers are required")
-        table = content.read(columns=list(columns), use_threads=False)
     return [table.column(name).cast("float64", safe=False).to_numpy() for name in columns]

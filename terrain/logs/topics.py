@@ -1,9 +1,8 @@
-"""Messages of topics as streams: what a small YAML mapping describes (``docs/bags.md``), or the types of the topics.
+"""Messages of topics as streams, as a mapping describes them (``docs/bags.md``), or the types of the topics.
 
-A number becomes ``(scale * number + offset)`` in the unit given, and then SI.  A channel may name a topic of
-its own.  Samples of several topics are joined by ``join``: ``equal`` takes the instants that all topics have,
-by their stamps; ``previous`` the instants of the stream's topic, with the last value of the others by then.
-Messages are an object of ROS or Protobuf, or JSON, whatever decoded them.
+A channel may name a topic of its own.  Samples of several topics are joined by ``join``: ``equal`` takes the instants
+that all topics have, by their stamps; ``previous`` the instants of the stream's topic, with the last value of the
+others by then.  Messages are an object of ROS or Protobuf, or JSON, whatever decoded them.
 
 What is wrong with a log is refused at once, or counted where it is repaired (:class:`Faults`).
 """
@@ -14,20 +13,17 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
-from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import Field, FiniteFloat
 
 from terrain.errors import ConfigError, LogError
-from terrain.files.documents import accepted, read_yaml
-from terrain.files.names import check_name, data_folder, listed, plain_name, shown
+from terrain.files.names import listed, shown
 from terrain.logs.labels import label_intervals
-from terrain.logs.mapping import Strict, Unit, Word, unit_required
-from terrain.logs.samples import checked_stream, longest_rise, to_si
-from terrain.logs.schema import UNIT_SCALES, check_unit, unit_of
+from terrain.logs.mapping import MessageStream, TopicMapping
+from terrain.logs.samples import checked_stream, longest_rise, refuse_or_count
+from terrain.logs.schema import UNIT_SCALES, unit_of
 from terrain.logs.tables import MAX_VALUES
 from terrain.records import Array, Label, Stream
 
@@ -65,10 +61,6 @@ DISTRO = "ROS2_HUMBLE"
 MAX_LABELS = 1_000_000  #: Messages with terrains; ten a second are 28 hours
 LATEST_NS = 2**62  #: Latest stamp that a message may have
 
-_JOINT_UNITS: Mapping[str, str] = {"velocity": "rad/s", "position": "rad", "effort": "Nm"}
-_PATH = re.compile(r"[A-Za-z]\w*(\[\d+\])?(\.[A-Za-z]\w*(\[\d+\])?)*")
-
-Kind = Literal["fields", "gnss", "imu", "joints", "odometry", "pose", "twist"]
 Number = Callable[[Any], float]
 Converted = tuple[tuple[str, ...], Array]  #: Channels, and their values (n, c)
 
@@ -108,68 +100,7 @@ class Faults:
     def found(self, place: str, kind: str, text: str, n: int = 1) -> None:
         """Raise :class:`LogError`, or count."""
         self.first = self.first or f"{place}: {text}; read it with --repair to leave that out"
-        if self.repairs is None:
-            raise LogError(self.first)
-        self.repairs[kind] += n
-
-
-class WheelRadius(Strict):
-    """Radius by which rates of wheels become speeds."""
-
-    value: Annotated[FiniteFloat, Field(gt=0.0)]
-    unit: Literal["m", "mm"]
-    source: Word
-
-
-class Channel(Strict):
-    """Where a channel is: ``(scale * number + offset)`` is in ``unit``; ``source`` is that of those."""
-
-    field: Word
-    joint: str = ""
-    topic: str = ""
-    unit: Unit = ""
-    scale: FiniteFloat = 1.0
-    offset: FiniteFloat = 0.0
-    source: str = ""
-
-    @property
-    def number_unit(self) -> str:
-        """Unit as stated, else that of ROS for a joint."""
-        return self.unit or (_JOINT_UNITS.get(self.field, "") if self.joint else "")
-
-    def turns(self, desired: str) -> bool:
-        """Return whether it is a speed whose joint turns: its rate is multiplied by the wheel's radius."""
-        turning = self.number_unit in ("rad/s", "deg/s", "rpm")
-        return desired == "mps" and bool(self.joint) and self.field == "velocity" and turning
-
-
-class StreamMapping(Strict):
-    """Where a stream is."""
-
-    topic: Word
-    kind: Kind = "fields"
-    channels: Annotated[dict[str, Channel], Field(default_factory=dict)]
-    time: Literal["header", "log", ""] = ""
-    join: Literal["equal", "previous"] = "equal"
-    wheel_radius: WheelRadius | None = None
-
-    @property
-    def by_topic(self) -> dict[str, dict[str, Channel]]:
-        """Channels by their topic, those of the stream's own first."""
-        topics: dict[str, dict[str, Channel]] = {self.topic: {}}
-        for name, channel in self.channels.items():
-            topics.setdefault(channel.topic or self.topic, {})[name] = channel
-        return {topic: channels for topic, channels in topics.items() if channels}
-
-
-class TopicMapping(Strict):
-    """How topics become streams."""
-
-    streams: Annotated[dict[Word, StreamMapping], Field(min_length=1)]
-    robot: str = ""
-    time: Literal["header", "log"] = "header"
-    terrain: str = ""
-    labels: str = ""
+        refuse_or_count(self.repairs, kind, self.first, n)
 
 
 def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -> Number:
@@ -188,8 +119,25 @@ def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -
     if joint:
         if not {path, "name"} <= set(_fields(message)) or not _is_array(_field(message, path)):
             raise ConfigError(f"{place} is no array of joints")
-        return lambda message: _number_of_joint(message, path, joint)
+
+        def of_joint(message: Any) -> float:
+            names, values = list(_field(message, "name")), _field(message, path)
+            at = names.index(joint) if joint in names else len(values)
+            return float(values[at]) if at < len(values) else np.nan
+
+        return of_joint
     steps: list[str | int] = []
+
+    def along(message: Any) -> float:
+        for step in steps:
+            if isinstance(step, str):
+                message = _field(message, step)
+            else:
+                message = message[step] if step < len(message) else None
+            if message is None:
+                return np.nan
+        return float(message)
+
     value, owner = message, kind
     for name, index in re.findall(r"(\w+)(?:\[(\d+)\])?", path):
         fields = _fields(value)
@@ -203,42 +151,14 @@ def number_at(topic: str, kind: str, message: Any, path: str, joint: str = "") -
         steps += [name, int(index)] if index else [name]
         if index:
             if int(index) >= len(value):  # another message may have more elements
-                return lambda message: _number_along(message, steps)
+                return along
             value = value[int(index)]
     if value is not None and not isinstance(value, int | float | np.number | np.bool_):
         inner = f" (it has {listed(fields)})" if (fields := _fields(value)) else ""
         raise ConfigError(f"{place} is of type {type(value).__name__}, a number is required{inner}")
     if isinstance(message, dict) or not all(isinstance(step, str) for step in steps):
-        return lambda message: _number_along(message, steps)
+        return along
     return attrgetter(path)
-
-
-def stamp_at(topic: str, kind: str, message: Any) -> tuple[Number, Number] | None:
-    """Return what takes whole seconds and nanoseconds of a measurement from each message; None: it has none."""
-    for pair in STAMPS:
-        try:
-            seconds, rest = (number_at(topic, kind, message, path) for path in pair)
-        except ConfigError:
-            continue
-        return seconds, rest
-    return None
-
-
-def _number_along(message: Any, steps: list[str | int]) -> float:
-    for step in steps:
-        if isinstance(step, str):
-            message = _field(message, step)
-        else:
-            message = message[step] if step < len(message) else None
-        if message is None:
-            return np.nan
-    return float(message)
-
-
-def _number_of_joint(message: Any, path: str, joint: str) -> float:
-    names, values = list(_field(message, "name")), _field(message, path)
-    place = names.index(joint) if joint in names else len(values)
-    return float(values[place]) if place < len(values) else np.nan
 
 
 def _fields(message: Any) -> list[str]:
@@ -264,66 +184,6 @@ def short_type(name: str) -> str:
     return f"{parts[0]}/{parts[-1]}" if len(parts) == 3 else name
 
 
-def load_mapping(path: str | Path) -> TopicMapping:
-    """Return the mapping that a YAML file, or a packaged one of that name, describes.
-
-    Raises
-    ------
-    ConfigError
-        if the file cannot be read, a key is unknown or missing, or a unit is unknown or does not suit its
-        channel.
-
-    Examples
-    --------
-    >>> load_mapping("husky_topics").streams["wheels"].topic
-    '/joint_states'
-    """
-    path = Path(path)
-    packaged = data_folder("bags") / f"{path}.yaml"
-    if not path.exists() and plain_name(str(path)) and packaged.is_file():
-        path = packaged
-    mapping = accepted(TopicMapping, read_yaml(path), path.name, ConfigError)
-    for key in ("robot", "terrain"):
-        if getattr(mapping, key):
-            check_name(f"{path.name}: {key}", getattr(mapping, key), ConfigError)
-    if mapping.terrain and mapping.labels:
-        raise ConfigError(f"{path.name}: has both 'terrain' and 'labels', one of them is accepted")
-    for name, stream in mapping.streams.items():
-        check_name(f"{path.name}: stream", name, ConfigError)
-        check_stream(f"{path.name}: stream {name}", stream)
-    return mapping
-
-
-def check_stream(place: str, described: StreamMapping | Mapping[str, object]) -> StreamMapping:
-    """Return a stream of messages, as a mapping of topics or of files describes it at a place; ``ConfigError``."""
-    stream = described
-    if not isinstance(stream, StreamMapping):
-        stream = accepted(StreamMapping, dict(stream), place, ConfigError)
-    has_channels = stream.kind in ("fields", "joints")
-    if has_channels != bool(stream.channels):
-        own = f"is of kind {stream.kind!r}, which has channels of its own"
-        raise ConfigError(f"{place}: {'has no channels' if has_channels else own}")
-    if stream.wheel_radius is not None and stream.kind != "joints":
-        raise ConfigError(f"{place}: 'wheel_radius' is for kind 'joints'")
-    for name, channel in stream.channels.items():
-        desired, at = unit_required(f"{place}:", name), f"{place}: channel {name}"
-        if stream.kind == "joints":
-            if channel.field not in _JOINT_UNITS:
-                raise ConfigError(f"{at}: field {channel.field!r} is none of {', '.join(_JOINT_UNITS)}")
-            if not channel.joint:
-                raise ConfigError(f"{at}: key 'joint' is missing")
-            if channel.topic:
-                raise ConfigError(f"{at}: 'topic' is for streams without a kind")
-        elif channel.joint:
-            raise ConfigError(f"{at}: 'joint' is for kind 'joints'")
-        elif not _PATH.fullmatch(channel.field):
-            path = "no path, as 'twist.linear.x' or 'data[2]' is one"
-            raise ConfigError(f"{at}: field {channel.field!r} is {path}")
-        if (channel.joint or desired != "code") and not channel.turns(desired):
-            check_unit(at, channel.number_unit, desired)
-    return stream
-
-
 def standard_mapping(place: str, topics: list[Topic]) -> TopicMapping:
     """Return the mapping of a bag, which messages call ``place``, by the types of its topics.
 
@@ -346,7 +206,7 @@ def standard_mapping(place: str, topics: list[Topic]) -> TopicMapping:
                 "choose one with --mapping"
             )
         if fitting:
-            streams[stream] = StreamMapping.model_validate({"topic": fitting[0], "kind": kind})
+            streams[stream] = MessageStream.model_validate({"topic": fitting[0], "kind": kind})
     if not streams:
         raise ConfigError(f"{place}: needs a mapping (--mapping): it has {_described(topics)}")
     return TopicMapping(streams=streams)
@@ -354,6 +214,14 @@ def standard_mapping(place: str, topics: list[Topic]) -> TopicMapping:
 
 def _described(topics: Sequence[Topic]) -> str:
     return listed([f"{topic.name} ({topic.kind})" for topic in sorted(topics)]) if topics else "no topic"
+
+
+class _Source(NamedTuple):
+    """Where the numbers of a stream are: path and joint of each, by topic, and what makes channels of them."""
+
+    stream: MessageStream
+    paths: Mapping[str, Sequence[tuple[str, str]]]
+    channels: Callable[[Array], Converted]
 
 
 class MappedTopics:
@@ -374,12 +242,36 @@ class MappedTopics:
         wheel_radius_m: float | None,
         faults: Faults,
     ) -> None:
-        self._place, self._mapping, self._topics, self._kinds = place, mapping, topics, kinds
-        self._wheel_radius_m, self._faults = wheel_radius_m, faults
-        self._check()
+        self._place, self._mapping, self._faults = place, mapping, faults
+        self._sources: dict[str, _Source] = {}
         self._of_topic: dict[str, _TopicNumbers] = {}
-        paths = [each for stream in mapping.streams.values() for each in self._paths(stream).items()]
-        for name, numbers in [*paths, *([(mapping.labels, [])] if mapping.labels else [])]:
+        there = _described([*topics.values()])
+        for name, stream in mapping.streams.items():
+            at = f"{place}: stream {name}"
+            for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
+                if topic and topic not in topics:
+                    raise LogError(f"{at}: there is no topic {shown(topic)} (there are {there})")
+            kind = topics[stream.topic].kind
+            if stream.kind != "fields" and short_type(kind) not in TYPES[stream.kind]:
+                required = f"kind {stream.kind!r} is {' or '.join(TYPES[stream.kind])} (there are {there})"
+                raise LogError(f"{at}: topic {stream.topic} is of type {kind}, {required}")
+            radius, radius_m = stream.wheel_radius, wheel_radius_m
+            if radius is not None:
+                radius_m = radius.value * UNIT_SCALES[radius.unit][1]
+            if stream.channels:
+                self._sources[name] = _fields_source(at, stream, radius_m)
+            else:
+                of_kind = kinds[short_type(kind)]
+                paths = {stream.topic: [(path, "") for path in of_kind.paths]}
+                self._sources[name] = _Source(stream, paths, of_kind.channels)
+        labels = mapping.labels
+        if labels and labels not in topics:
+            raise LogError(f"{place}: labels: there is no topic {shown(labels)} (there are {there})")
+        if labels and short_type(topics[labels].kind) != LABELS_TYPE:
+            of_type = f"topic {labels} is of type {topics[labels].kind}"
+            raise LogError(f"{place}: labels: {of_type}, {LABELS_TYPE} is required")
+        asked = [each for source in self._sources.values() for each in source.paths.items()]
+        for name, numbers in [*asked, *([(labels, [])] if labels else [])]:
             if name not in self._of_topic:
                 self._of_topic[name] = _TopicNumbers(place, topics[name], decoder(topics[name]), faults)
             for path in numbers:
@@ -401,7 +293,7 @@ class MappedTopics:
         where a topic has no message, topics of a stream have no stamp in common, stamps go back or repeat, a
         channel has nothing finite, or there are fewer than two samples.
         """
-        raw = {name: self._raw(name, stream) for name, stream in self._mapping.streams.items()}
+        raw = {name: self._raw(name, source) for name, source in self._sources.items()}
         repairs = self._faults.repairs
         if start_ns is None:
             stamps = [stamp_ns for stamp_ns, *_ in raw.values()]
@@ -421,97 +313,68 @@ class MappedTopics:
         texts = self._of_topic[self._mapping.labels].texts
         return label_intervals(sorted(texts, key=lambda each: each[0]), start_ns, streams)
 
-    def _check(self) -> None:
-        """Refuse topics that are not there or of another type, and speeds without a radius."""
-        topics, there = self._topics, _described([*self._topics.values()])
-        for name, stream in self._mapping.streams.items():
-            at = f"{self._place}: stream {name}"
-            for topic in (stream.topic, *(channel.topic for channel in stream.channels.values())):
-                if topic and topic not in topics:
-                    raise LogError(f"{at}: there is no topic {shown(topic)} (there are {there})")
-            kind = topics[stream.topic].kind
-            if stream.kind != "fields" and short_type(kind) not in TYPES[stream.kind]:
-                raise LogError(
-                    f"{at}: topic {stream.topic} is of type {kind}, "
-                    f"kind {stream.kind!r} is {' or '.join(TYPES[stream.kind])} (there are {there})"
-                )
-            for channel, entry in stream.channels.items():
-                if (
-                    entry.turns(unit_of(channel))
-                    and stream.wheel_radius is None
-                    and self._wheel_radius_m is None
-                ):
-                    raise ConfigError(
-                        f"{at}: channel {channel} is the speed of a joint that turns: "
-                        "'wheel_radius' is missing, and the robot has no description"
-                    )
-        labels = self._mapping.labels
-        if labels and labels not in topics:
-            raise LogError(f"{self._place}: labels: there is no topic {shown(labels)} (there are {there})")
-        if labels and short_type(topics[labels].kind) != LABELS_TYPE:
-            kind = topics[labels].kind
-            raise LogError(
-                f"{self._place}: labels: topic {labels} is of type {kind}, {LABELS_TYPE} is required"
-            )
-
-    def _paths(self, stream: StreamMapping) -> dict[str, list[tuple[str, str]]]:
-        """Return path and joint of each number of a stream, by topic."""
-        if not stream.channels:
-            return {stream.topic: [(path, "") for path in self._kind(stream).paths]}
-        return {
-            topic: [(channel.field, channel.joint) for channel in channels.values()]
-            for topic, channels in stream.by_topic.items()
-        }
-
-    def _kind(self, stream: StreamMapping) -> MessageKind:
-        return self._kinds[short_type(self._topics[stream.topic].kind)]
-
-    def _raw(self, name: str, stream: StreamMapping) -> tuple[Array, tuple[str, ...], Array]:
+    def _raw(self, name: str, source: _Source) -> tuple[Array, tuple[str, ...], Array]:
         """Return the stamps (n,) in ns, the channels and the values (n, c) of a stream."""
+        stream = source.stream
         by_header = (stream.time or self._mapping.time) == "header"
-        parts = []
-        for topic, paths in self._paths(stream).items():
-            stamps, values = self._of_topic[topic].numbers(paths, by_header=by_header)
-            if not stamps.size:
+        stamps, values = list[Array](), list[Array]()
+        for topic, paths in source.paths.items():
+            stamp_ns, numbers = self._of_topic[topic].numbers(paths, by_header=by_header)
+            if not stamp_ns.size:
                 what = " with any of the joints" if stream.kind == "joints" else ""
                 raise LogError(f"{self._place}: topic {shown(topic)} has no message{what}")
-            parts.append((stamps, values))
-        stamp_ns, values = parts[0] if len(parts) == 1 else self._joined(name, stream, parts)
-        if stream.channels:
-            return stamp_ns, tuple(stream.channels), _in_si(stream, values, self._wheel_radius_m)
-        channels, values = self._kind(stream).channels(values)
+            order = np.argsort(stamp_ns, kind="stable") if len(source.paths) > 1 else slice(None)
+            stamps.append(stamp_ns[order])
+            values.append(numbers[order])
+        common = stamps[0]
+        if len(stamps) > 1 and stream.join == "previous":
+            for i, each in enumerate(stamps[1:], start=1):
+                row = np.searchsorted(each, common, side="right") - 1
+                values[i] = np.where((row >= 0)[:, None], values[i][np.maximum(row, 0)], np.nan)
+        elif len(stamps) > 1:
+            for each in stamps[1:]:
+                common = np.intersect1d(common, each)
+            n_lost = sum(each.size for each in stamps) - common.size * len(stamps)
+            if n_lost:
+                topics = " and ".join(shown(topic) for topic in source.paths)
+                text = f"{name}: {n_lost} messages of {topics} lack one of equal stamp (join: previous)"
+                self._faults.found(self._place, UNMATCHED, text, n_lost)
+            if not common.size:
+                fault = "no two stamps of its topics agree (join: previous)"
+                raise LogError(f"{self._place}: stream {name}: {fault}")
+            rows = [np.searchsorted(each, common) for each in stamps]
+            values = [value[row] for value, row in zip(values, rows, strict=True)]
+        channels, joined = source.channels(np.concatenate(values, axis=1))
         if not channels:
             raise LogError(f"{self._place}: topic {shown(stream.topic)} states that it measures nothing")
-        return stamp_ns, channels, values
+        return common, channels, joined
 
-    def _joined(
-        self, name: str, stream: StreamMapping, parts: list[tuple[Array, Array]]
-    ) -> tuple[Array, Array]:
-        """Return the samples of several topics at stamps that all of them have, or at those of the first."""
-        orders = [np.argsort(stamps, kind="stable") for stamps, _ in parts]
-        stamps = [each[order] for (each, _), order in zip(parts, orders, strict=True)]
-        values = [each[order] for (_, each), order in zip(parts, orders, strict=True)]
-        if stream.join == "previous":
-            rows = [np.searchsorted(each, stamps[0], side="right") - 1 for each in stamps[1:]]
-            others = [
-                np.where((row >= 0)[:, None], value[np.maximum(row, 0)], np.nan)
-                for row, value in zip(rows, values[1:], strict=True)
-            ]
-            return stamps[0], np.concatenate([values[0], *others], axis=1)
-        common = stamps[0]
-        for each in stamps[1:]:
-            common = np.intersect1d(common, each)
-        n_lost = sum(each.size for each in stamps) - common.size * len(stamps)
-        if n_lost:
-            topics = " and ".join(shown(topic) for topic in stream.by_topic)
-            text = f"{name}: {n_lost} messages of {topics} lack one of equal stamp (join: previous)"
-            self._faults.found(self._place, UNMATCHED, text, n_lost)
-        if not common.size:
-            raise LogError(
-                f"{self._place}: stream {name}: no two stamps of its topics agree (join: previous)"
-            )
-        rows = [value[np.searchsorted(each, common)] for each, value in zip(stamps, values, strict=True)]
-        return common, np.concatenate(rows, axis=1)
+
+def _fields_source(at: str, stream: MessageStream, wheel_radius_m: float | None) -> _Source:
+    """Return where the channels of a stream of fields or joints are."""
+    by_topic: dict[str, list[str]] = {stream.topic: []}
+    for name, channel in stream.channels.items():
+        by_topic.setdefault(channel.topic or stream.topic, []).append(name)
+        if channel.turns(unit_of(name)) and wheel_radius_m is None:
+            missing = "'wheel_radius' is missing, and the robot has no description"
+            raise ConfigError(f"{at}: channel {name} is the speed of a joint that turns: {missing}")
+    places = [name for names in by_topic.values() for name in names]
+
+    def in_si(values: Array) -> Converted:
+        columns = []
+        for name, channel in stream.channels.items():
+            desired = unit_of(name)
+            unit = "1" if desired == "code" else channel.number_unit
+            si = channel.si(values[:, places.index(name)], unit)
+            columns.append(si * (wheel_radius_m or np.nan) if channel.turns(desired) else si)
+        return tuple(stream.channels), np.column_stack(columns)
+
+    paths = {
+        topic: [(stream.channels[name].field, stream.channels[name].joint) for name in names]
+        for topic, names in by_topic.items()
+        if names
+    }
+    return _Source(stream, paths, in_si)
 
 
 class _TopicNumbers:
@@ -527,7 +390,7 @@ class _TopicNumbers:
         self.rows, self.texts = list[list[float]](), list[tuple[int, str]]()
         self._place, self._decode, self._faults = place, decode, faults
         self._numbers: list[Number] | None = None
-        self._stamp: tuple[Number, Number] | None = None
+        self._stamp: list[Number] = []
 
     def take(self, log_ns: int, content: bytes) -> None:
         try:
@@ -542,10 +405,14 @@ class _TopicNumbers:
         if self._numbers is None:
             about = (self.topic.name, short_type(self.topic.kind), message)
             self._numbers = [number_at(*about, *path) for path in self.paths]
-            self._stamp = stamp_at(*about)
+            for pair in STAMPS:  # the first of which the message has
+                try:
+                    self._stamp = self._stamp or [number_at(*about, path) for path in pair]
+                except ConfigError:
+                    continue
         try:
             row = [float(number(message)) for number in self._numbers]
-            seconds, rest = (0, log_ns) if self._stamp is None else (get(message) for get in self._stamp)
+            seconds, rest = (get(message) for get in self._stamp) if self._stamp else (0, log_ns)
             stamp_ns = int(seconds) * 10**9 + int(rest)
             if abs(stamp_ns) > LATEST_NS:
                 raise ValueError("a stamp is beyond what clocks show")
@@ -568,24 +435,10 @@ class _TopicNumbers:
     def numbers(self, paths: Sequence[tuple[str, str]], *, by_header: bool) -> tuple[Array, Array]:
         """Return stamps (n,) in ns, and numbers (n, k) of some paths, in the order of log times."""
         order = np.argsort(np.array(self.log_ns, dtype=np.int64), kind="stable")
-        stamp_ns = np.array(self.stamp_ns if by_header else self.log_ns, dtype=np.int64)
+        stamp_ns = np.array(self.stamp_ns if by_header else self.log_ns, dtype=np.int64)[order]
         values = np.array(self.rows, dtype=np.float64).reshape(len(order), len(self.paths))
         values = values[order][:, [self.paths[path] for path in paths]]
-        kept: Array = np.ones(len(order), dtype=bool)
         if any(joint for _, joint in paths):  # a robot may send its joints in several messages
-            kept = np.asarray(np.isfinite(values).any(axis=1))
-        return stamp_ns[order][kept], values[kept]
-
-
-def _in_si(stream: StreamMapping, values: Array, wheel_radius_m: float | None) -> Array:
-    """Return the channels (n, c) of numbers (n, c) that are in the order of their topics."""
-    if stream.wheel_radius is not None:
-        wheel_radius_m = stream.wheel_radius.value * UNIT_SCALES[stream.wheel_radius.unit][1]
-    names = [name for channels in stream.by_topic.values() for name in channels]
-    columns = []
-    for name, channel in stream.channels.items():
-        desired = unit_of(name)
-        unit = "1" if desired == "code" else channel.number_unit
-        si = to_si(values[:, names.index(name)], unit, channel.scale, channel.offset)
-        columns.append(si * (wheel_radius_m or np.nan) if channel.turns(desired) else si)
-    return np.column_stack(columns)
+            known = np.isfinite(values).any(axis=1)
+            stamp_ns, values = stamp_ns[known], values[known]
+        return stamp_ns, values

@@ -13,7 +13,7 @@ from pipelines.learn.model_file import write_model
 from pipelines.learn.training_data import fitted_model
 from pipelines.serve.serve import Settings
 from pipelines.serve.service import Service
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.records import RunLog, Stream
 
 IMU = tuple(

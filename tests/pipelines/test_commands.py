@@ -14,7 +14,7 @@ from pipelines.slip.estimate import Filter, Tuning
 from terrain.control.controllers import CONTROLLERS
 from terrain.estimation.estimate import FILTERS, TUNINGS
 from terrain.estimation.models.choice import OBSERVERS
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.robots import description_file, load_robot
 from terrain.simulation.run import simulate_run
 

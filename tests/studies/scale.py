@@ -23,8 +23,7 @@ from pipelines.report.results import Progress, Result, described, silent
 from pipelines.report.settings import ByCommas, setting
 from pipelines.report.settings import Settings as BaseSettings
 from pipelines.report.tree import Column, Pairs, Report, Table
-from terrain.logs.read import read_run
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import read_run, write_run
 from terrain.records import Label, RunLog, Stream
 
 EXAMPLE = "python tests/studies scale --runs 10000 --workers 1,2"

@@ -238,7 +238,7 @@ def test_workers_that_are_not_accepted_are_one_sentence(workers):
 
 @pytest.mark.slow
 def test_label_strategies_are_compared_on_held_out_runs(tmp_path):
-    from terrain.logs.write import write_run
+    from terrain.logs.run_folders import write_run
 
     for number in range(24):
         write_run(scale.generated_run(1, number), tmp_path / "runs")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from terrain.files.names import data_folder
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.records import RunLog, Stream
 
 DEEP = "[" * 100_000

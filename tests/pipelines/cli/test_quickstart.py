@@ -11,9 +11,7 @@ from pipelines.learn.model_file import read_model
 from pipelines.report.results import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.errors import ConfigError, DataError
-from terrain.logs.digest import data_digest
-from terrain.logs.read import read_run
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import data_digest, read_run, write_run
 
 
 @pytest.fixture

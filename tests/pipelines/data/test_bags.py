@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, IndexType
 
 from pipelines.data.datasets import load_runs
 from terrain.kinematics.camera import body_motion
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.robots import Camera, load_robot
 
 from .foreign_bags import (

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pipelines.data.datasets import load_runs
-from terrain.logs.digest import data_digest
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import data_digest, write_run
 
 from .foreign_bags import refused
 

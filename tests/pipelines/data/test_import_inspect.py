@@ -8,8 +8,7 @@ from pipelines.data.datasets import load_runs
 from pipelines.report.results import as_json
 from pipelines.report.terminal import terminal_text
 from terrain.errors import TerrainError
-from terrain.logs.digest import data_digest
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import data_digest, write_run
 from terrain.records import RunLog, Stream
 
 

@@ -7,7 +7,8 @@ import cantools
 
 from pipelines.data.run_writers import messages_of_run
 from terrain.files.names import data_folder
-from terrain.logs.topics import TYPES, load_mapping, short_type
+from terrain.logs.mapping import load_topics
+from terrain.logs.topics import TYPES, short_type
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 ROW = re.compile(
@@ -42,7 +43,7 @@ def test_the_mapping_of_the_page_is_accepted_and_begins_with_the_packaged_one(tm
     page = (DOCS / "bags.md").read_text(encoding="utf-8")
     (yaml,) = re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)
     (tmp_path / "mapping.yaml").write_text(yaml)
-    shown, packaged = load_mapping(tmp_path / "mapping.yaml"), load_mapping("husky_topics")
+    shown, packaged = load_topics(tmp_path / "mapping.yaml"), load_topics("husky_topics")
     assert {name: shown.streams[name] for name in packaged.streams} == packaged.streams
     assert set(re.findall(r"^\| `(\w+)` \|", page, flags=re.MULTILINE)) == set(TYPES)
 

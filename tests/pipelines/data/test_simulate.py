@@ -6,7 +6,7 @@ from pipelines.data.simulate import run as simulate_with
 from pipelines.report.results import silent
 from terrain.errors import LogError
 from terrain.files.names import data_folder
-from terrain.logs.read import find_runs, read_run
+from terrain.logs.run_folders import find_runs, read_run
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
 from terrain.terramechanics.soil import soil_names

@@ -16,7 +16,7 @@ from pipelines.slip.estimate import estimate_runs
 from terrain.discrepancy.verdict import INTERVAL_T
 from terrain.errors import ConfigError, TerrainError
 from terrain.extension import extended_yaml
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.robots import description_file, load_robot
 from terrain.simulation.plants.planar import DRIVE_S, Ground, load_noise
 from terrain.simulation.run import simulate, simulate_run

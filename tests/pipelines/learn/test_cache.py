@@ -18,8 +18,7 @@ from pipelines.learn.cache import cached_data
 from pipelines.learn.crossval import EvaluationSettings, Settings
 from pipelines.learn.recipes import recipe_of
 from terrain.errors import ConfigError, DataError, LogError
-from terrain.logs.digest import joint_digest
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import joint_digest, write_run
 from terrain.records import Label, Stream
 
 OPTIONS = {"repeats": 1, "steady": False, "n_jobs": 1, "extras": False}

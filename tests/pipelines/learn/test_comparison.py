@@ -11,7 +11,7 @@ from pipelines.report.results import as_json
 from terrain.classify.limits import SupportLevel
 from terrain.classify.metrics import Verdict
 from terrain.errors import DataError
-from terrain.logs.digest import data_digest
+from terrain.logs.run_folders import data_digest
 
 
 @pytest.fixture(scope="module")

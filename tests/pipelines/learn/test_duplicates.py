@@ -12,7 +12,7 @@ from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
 from pipelines.learn.crossval import crossval
 from terrain.errors import DataError
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.records import Label, Stream
 
 

@@ -12,8 +12,7 @@ from pipelines.learn.label import SOURCES_FILE, Settings
 from pipelines.learn.label import run as label
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.logs.labels import WINDOWS_FILE, RecordedWindow, windows_text
-from terrain.logs.read import read_run
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import read_run, write_run
 
 WINDOWS = [
     RecordedWindow(

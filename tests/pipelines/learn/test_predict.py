@@ -12,7 +12,7 @@ from pipelines.learn.training_data import fitted_model
 from pipelines.report.results import as_json
 from terrain.control.slip_table import DRIVE_STATES, SlipTable, load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.records import RunLog, Stream
 
 TABLE = load_slip_table()

@@ -22,7 +22,7 @@ from pipelines.learn.tracking import METRICS, log_training
 from pipelines.learn.training_data import data_of_runs
 from terrain.errors import ModelError, TerrainError
 from terrain.files.atomic import file_lock
-from terrain.logs.digest import data_digest
+from terrain.logs.run_folders import data_digest
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from pipelines.learn.train import Settings, run
 from pipelines.report.results import as_json
 from terrain.classify.held_out import channel_drops
 from terrain.errors import ModelError, TerrainError
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 
 
 def test_training_is_evaluated_on_held_out_runs_and_names_the_model(tracked):

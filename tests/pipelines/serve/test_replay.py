@@ -18,7 +18,7 @@ from pipelines.serve.serve import Settings
 from pipelines.serve.serve import run as serve
 from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

@@ -8,7 +8,7 @@ from studies.intervals import HIDDEN, NOMINAL, drive_hidden
 from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
 from terrain.estimation.feed import measurement_table
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.robots import description_file, load_robot
 from terrain.simulation.run import six_positions_log
 

@@ -12,9 +12,8 @@ from pipelines.slip.estimate import Settings, estimate_runs, run
 from terrain.errors import ConfigError, DataError, LogError
 from terrain.estimation.estimate import estimate_run
 from terrain.estimation.tuning import TuningStatus
-from terrain.logs.read import read_run
+from terrain.logs.run_folders import read_run, write_run
 from terrain.logs.schema import signal_set_of
-from terrain.logs.write import write_run
 from terrain.records import Label, RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

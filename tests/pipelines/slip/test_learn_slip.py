@@ -12,7 +12,7 @@ from pipelines.slip.shown import write_figures
 from terrain.control.learned_table import FALLBACK
 from terrain.control.slip_table import DRIVE_STATES, load_slip_table
 from terrain.errors import ConfigError, DataError, TerrainError
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import Drive, learning_runs

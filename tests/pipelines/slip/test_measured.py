@@ -14,7 +14,7 @@ from terrain.control.slip_table import load_slip_table
 from terrain.errors import ConfigError, DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds
 from terrain.kinematics.wheels import rolling_matrix
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.records import Label, RunLog, Stream, TargetStatus
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

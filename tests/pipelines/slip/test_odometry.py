@@ -7,7 +7,7 @@ from pipelines.report.results import silent
 from pipelines.slip.calibrate import Settings, run
 from terrain.errors import ConfigError, DataError
 from terrain.estimation.models.slip_model import read_slip_model
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.robots import load_robot
 from terrain.simulation.plants.tracks import PrescribedSlip
 from terrain.simulation.run import simulate

@@ -15,9 +15,9 @@ from pipelines.data.convert import Settings as ConvertSettings
 from pipelines.data.convert import run as convert
 from pipelines.data.datasets import load_runs
 from terrain.errors import ConfigError, LogError
-from terrain.logs.digest import data_digest
 from terrain.logs.mapping import load_mapping, local_metres
-from terrain.logs.spelling import RESPELT
+from terrain.logs.run_folders import data_digest
+from terrain.logs.samples import RESPELT
 
 T, TIME = 0.1 * np.arange(6), {"column": "t", "unit": "s"}
 SPEED = {"speed_left_mps": {"column": "v", "unit": "m/s"}}
@@ -307,7 +307,7 @@ NO_TABLE = {"messages": {"topic": "/a"}, "time": None, "channels": {}}
               "position": {"latitude": "a", "longitude": "b"}}, "'position' gives the channel position_x_m too"),
         (AT, {"messages": {"topic": "/a"}}, "'messages' leave out time, channels and position"),
         (AT, NO_TABLE, "has no channels"),
-        (AT, NO_TABLE | {"messages": {"topic": "/a", "topics": "/a"}}, "key 'topics' is unknown"),
+        (AT, NO_TABLE | {"messages": {"topic": "/a", "topics": "/a"}}, "messages.topics' is unknown"),
         (None, "{robot: r, run_id: a, streams: {imu: {file: ., "
                "time: {column: t, unit: s}, channels: {a_m: {column: a, unit: m}}}}}", "names no file"),
         (None, "a: [", "is no YAML"),

@@ -9,7 +9,7 @@ from pipelines.data.datasets import load_runs, verdict
 from pipelines.data.inspect import Settings as InspectSettings
 from pipelines.data.inspect import run as inspect_runs
 from terrain.logs.plausibility import Level, Scale, doubt_sentences, doubts_of, judge, worst
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run

@@ -15,8 +15,7 @@ from terrain.control.slip_table import load_slip_table
 from terrain.errors import LogError, TerrainError
 from terrain.files.names import data_folder
 from terrain.logs import tables
-from terrain.logs.read import read_run
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import read_run, write_run
 from terrain.robots import load_robot, packaged_robot
 
 N_FUZZED = 300

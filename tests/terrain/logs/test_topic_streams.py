@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from terrain.errors import ConfigError, LogError
 from terrain.kinematics.standard_messages import KINDS
-from terrain.logs.topics import Faults, MappedTopics, Topic, load_mapping
+from terrain.logs.mapping import load_topics
+from terrain.logs.topics import Faults, MappedTopics, Topic
 
 START_NS = 1_700_000_000_123_456_789
 TYPES = {
@@ -57,7 +58,7 @@ def taken(tmp_path):
         (tmp_path / "mapping.yaml").write_text(lines)
         types = {name: TYPES.get(name, "geometry_msgs/msg/Twist") for name, *_ in rows}
         topics = {name: Topic(name, kind, "json", "", "") for name, kind in types.items()}
-        mapping = load_mapping(tmp_path / "mapping.yaml")
+        mapping = load_topics(tmp_path / "mapping.yaml")
         about = (KINDS, lambda _: lambda message: message, wheel_radius_m, Faults(repairs))
         found = MappedTopics("a.mcap", mapping, topics, *about)
         for row in rows:

@@ -25,8 +25,7 @@ from terrain.estimation.models.slip_model import (
 )
 from terrain.estimation.observe import observe_run, summarize_observer, with_estimates
 from terrain.kernels import njit
-from terrain.logs.read import read_run
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import read_run, write_run
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot
 from terrain.simulation.plants.tracks import PrescribedSlip

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from terrain.errors import ConfigError, DataError
-from terrain.logs.read import read_run
-from terrain.logs.write import write_run
+from terrain.logs.run_folders import read_run, write_run
 from terrain.records import Command
 from terrain.robots import load_robot
 from terrain.simulation.plants.dynamic import (
