@@ -45,9 +45,11 @@ from __future__ import annotations
 
 import cmath
 import math
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Any
 
@@ -56,6 +58,7 @@ import numpy as np
 from terrain.angles import wrapped
 from terrain.constants import GRAVITY_MPS2
 from terrain.errors import ConfigError, DataError
+from terrain.estimation.clocks import REWIND_S
 from terrain.kernels import filled, inner, njit, numbers, record
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import QUATERNION_TOLERANCE
@@ -578,7 +581,7 @@ def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
     if not settings.is_steered:
         row.side_mps[0], row.side_mps[1] = wheels[0], wheels[1]
         return
-    moving, lively, finite, beyond = is_moving(feed), False, True, False
+    moving, lively, beyond = is_moving(feed), False, False
     _mask_frozen(wheels, np.int64(FIRST_WHEEL), moving, feed)
     for i in range(3):
         lively |= feed.channels[FIRST_WHEEL + i].repeated <= LIVELY
@@ -587,10 +590,8 @@ def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
         rate = wheels[i] / settings.reduction_ratio
         known = math.isfinite(rate)
         too_fast = known and abs(rate) > settings.fastest_radps
-        finite &= known
         beyond |= too_fast
         row.wheel_radps[i] = np.nan if too_fast or not known or frozen else rate
-    feed.wheels_not_finite += not finite
     feed.wheels_beyond += beyond
 
 
@@ -875,7 +876,9 @@ def check_channels(stream: str, names: Iterable[str], known: Sequence[str]) -> N
 
 
 class SampleQueue:
-    """Samples of a stream that are not due, by stamp; of two that are not in order one goes.
+    """Samples of a stream that are not due, by stamp: late ones go where they belong.
+
+    Of two of which one is further ahead than any is late, the one goes that the other shows to be wrong.
 
     ``columns`` say where each channel of the schema stands in the readings, -1 where it does not.
     """
@@ -895,18 +898,21 @@ class SampleQueue:
         finite[:, self._is_lacking] = True
         waiting, complete = self.waiting, np.all(finite, axis=1).tolist()
         for stamp_s, whole, sample in zip(time_s.tolist(), complete, samples, strict=True):
-            before_s = waiting[-1][0] if waiting else last_s
-            if not (math.isfinite(stamp_s) and stamp_s > before_s):
+            place = bisect_left(waiting, stamp_s, key=itemgetter(0))
+            if not last_s < stamp_s < math.inf or (place < len(waiting) and waiting[place][0] == stamp_s):
                 self.counts["stamp does not increase"] += 1
                 self.n_behind = self.n_behind + 1 if stamp_s <= last_s - CLOCK_SET_S else 0
-                earlier_s = waiting[-2][0] if len(waiting) > 1 else last_s
-                if not waiting or stamp_s == before_s or not stamp_s > earlier_s or stamp_s == math.inf:
+                continue
+            if waiting and waiting[-1][0] - stamp_s > REWIND_S:  # one of the two has a wrong stamp
+                self.counts["stamp does not increase"] += 1
+                if len(waiting) > 1 and waiting[-2][0] - stamp_s > REWIND_S:
                     continue
-                waiting.pop()  # the one before was the one ahead
+                waiting.pop()
             if len(waiting) == QUEUE:
                 self.counts["waited too long"] += QUEUE // 2
                 del waiting[: QUEUE // 2]
-            waiting.append((stamp_s, whole, sample))
+                place = max(place - QUEUE // 2, 0)
+            waiting.insert(place, (stamp_s, whole, sample))
             self.n_behind = 0
 
     def take(self, time_s: float) -> Due:

@@ -213,6 +213,7 @@ class Live(ABC):
         self._settled_s = -math.inf
         self._newest_s: dict[str, float] = {}
         self._counted: Counter[str] = Counter()
+        self._leapt: Tick | None = None  # not believed yet: its stamp is far ahead
         self.too_late = -math.inf, math.nan
 
     @abstractmethod
@@ -270,7 +271,11 @@ class Live(ABC):
                 continue
             stamps, time_s, values = taken
             if name != "wheels":
-                late = self._late(name, stamps, last_s) if stamps and min(stamps) <= last_s else math.inf
+                late = (
+                    self._late(name, stamps, last_s)
+                    if stamps and min(stamps) <= last_s + TICK_S
+                    else math.inf
+                )
                 late_s = min(late_s, late)
                 if late == math.inf:
                     self._queues[name].push(time_s, values, self._last_taken_s(name))
@@ -346,7 +351,9 @@ class Live(ABC):
     def _late(self, name: str, stamps: list[float], last_s: float) -> float:
         """Return the instant to go back to for late samples, infinite where there is none that is new."""
         known = self._history.stamps(name)
-        late_s = min((at_s for at_s in stamps if at_s <= last_s and at_s not in known), default=math.inf)
+        late_s = min(
+            (at_s for at_s in stamps if at_s <= last_s + TICK_S and at_s not in known), default=math.inf
+        )
         if late_s == math.inf:
             return math.inf
         if not self._history.reaches(late_s):
@@ -373,8 +380,10 @@ class Live(ABC):
 
     def _tick(self, tick: Tick, settled: list[Any]) -> Any:
         """Do a tick; what was not settled before a clock was set back has settled."""
-        follows = self._follows(tick.time_s)
+        follows, leapt = self._follows(tick.time_s), self._leapt
+        self._leapt = None
         if follows == 0:
+            self._leapt = tick if math.isfinite(tick.time_s) else None
             return None
         if follows < 0:
             settled += self._unsettled
@@ -384,13 +393,25 @@ class Live(ABC):
             self._forget()
             for queue in self._queues.values():
                 queue.waiting.clear()
-        due = {name: queue.take(tick.time_s) for name, queue in self._queues.items()}
+        elif (
+            leapt is not None
+            and self._history.last_s < leapt.time_s < tick.time_s
+            and leapt.wheels is not None
+        ):
+            self._pass(leapt.time_s, leapt.wheels, self._due(leapt.time_s))
+        due = self._due(tick.time_s)
         wheels = self._no_wheels if tick.wheels is None else tick.wheels
         estimate = self._estimate(tick.time_s, wheels, due)
         if follows < 0:
             self._history.clear()
         self._history.add_tick(tick)
         return estimate
+
+    def _due(self, time_s: float) -> dict[str, Due]:
+        return {name: queue.take(time_s) for name, queue in self._queues.items()}
+
+    def _pass(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Any:  # noqa: B027
+        """Take what was measured up to a stamp that leapt, and was no tick: the next one has shown it to be right."""
 
 
 class LiveFilter(Live):
@@ -563,15 +584,21 @@ class LiveFilter(Live):
         for one, snapshot in zip(self._memories, memory, strict=True):
             one[:] = snapshot
 
-    def _estimate(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> LiveEstimate:
-        filter_, robot = self.filter, self._robot
+    def _pass(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Array:
         for stream, name in enumerate(STREAMS):
             for came_s, complete, sample in due.get(name, ()):
                 rows.take_live(stream, sample, complete, came_s, self._settings, self._feed)
         rates = wheels[self._rate_columns]
+        if wheels is not self._no_wheels:
+            self._feed["wheels_not_finite"] += not math.isfinite(sum(rates.tolist()))
         if self._skids:
             rates[~np.isfinite(rates)] = np.nan
         rows.tick_live(time_s, rates, self._settings, self._feed, self._row)
+        return rates
+
+    def _estimate(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> LiveEstimate:
+        filter_, robot = self.filter, self._robot
+        rates = self._pass(time_s, wheels, due)
         z = self._numbers[:, self._row_places][0]
         variance, walk, inputs = filter_.noise.measurement_variance, None, None
         if self._schedule is not None:
