@@ -22,11 +22,11 @@ from pipelines.report.numbers import enumerated, format_value, sentence
 from pipelines.report.results import Result, as_json, described
 from pipelines.report.tree import Column, Pairs, Part, Report, Section, Table, Text
 from pipelines.report.versions import versions
-from terrain.discrepancy.compared import ComparedRun, channels_of, example_stretch, telling_runs
+from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain import Powertrain
+from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.robot_terms import limit_text, quantity, quantity_interval, values_with_intervals
-from terrain.discrepancy.slopes import CHANNEL_WORDS
 from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import PARAMETER, effect_named
 from terrain.robots import Robot
@@ -111,7 +111,7 @@ def report(result: ExplainResult) -> Report:
     picture = None
     if shown := result.gain.judged or runs.compared:  # held-out runs where there are any
         stretch = example_stretch(shown, runs.noise)
-        there = channels_of([stretch])
+        there = measured_channels([stretch])
         stated = [each.channel for each in result.statements if each.channel in there and each.differs]
         picture = figures.run_figure(stretch, runs.noise, (stated or there)[:PICTURED])
     written = Report(
@@ -269,7 +269,7 @@ def _details(result: ExplainResult) -> Iterator[Section]:
     whole: Sequence[ComparedRun] = [*runs.compared, *result.gain.judged]
     if result.n_pictures is not None:
         whole = telling_runs(whole, runs.noise, result.n_pictures)
-    drawn = [figures.run_figure(run, runs.noise, channels_of([run])) for run in whole]
+    drawn = [figures.run_figure(run, runs.noise, measured_channels([run])) for run in whole]
     yield Section("Whole runs", drawn)
     limits = []
     for limit in diagnosis.detection_limits:

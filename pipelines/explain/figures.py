@@ -8,10 +8,11 @@ import numpy as np
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Points
 from terrain.discrepancy.compared import (
+    CHANNEL_WORDS,
+    INPUT_LABELS,
     MIN_SPREAD,
     ComparedRun,
     binned_means,
-    channels_of,
     noise_spectrum,
     run_means,
     spectrum,
@@ -20,8 +21,8 @@ from terrain.discrepancy.compared import (
 )
 from terrain.discrepancy.constancy import PartValues
 from terrain.discrepancy.noise import Noise
+from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.robot_terms import quantity
-from terrain.discrepancy.slopes import CHANNEL_WORDS, INPUT_LABELS
 from terrain.effects import CHANNELS
 from terrain.records import Array
 
@@ -60,7 +61,7 @@ def run_figure(run: ComparedRun, noise: Noise, channels: Sequence[str]) -> Figur
 def dependence_figures(runs: Sequence[ComparedRun], noise: Noise) -> tuple[Figure, list[Figure]]:
     """Return the mean residual of each channel over the input on which it depends most, and figures of every one."""
     strongest, every = [], []
-    for name in channels_of(runs):
+    for name in measured_channels(runs):
         c, axis = CHANNELS.index(name), AXIS.format(*CHANNEL_WORDS[name])
         residuals, most = [*_residuals(runs, c)], strongest_input(runs, name)
         panels = {}
@@ -113,7 +114,7 @@ def spectra_figure(runs: Sequence[ComparedRun], noise: Noise, cutoff_hz: float) 
     """Return the spectrum of each channel's residual before and after, and that of the noise, in decibels."""
     rate_hz = 1.0 / float(np.median(np.diff(runs[0].time_s)))
     panels = []
-    for name in channels_of(runs):
+    for name in measured_channels(runs):
         c, unit, curves = CHANNELS.index(name), CHANNEL_WORDS[name][1], []
         for kind, colour, left in _residuals(runs, c):
             curves.append((kind, *spectrum(left, rate_hz), colour))

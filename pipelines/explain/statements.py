@@ -9,10 +9,10 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any, NamedTuple
 
 from pipelines.report.numbers import enumerated
-from terrain.discrepancy.compared import ComparedRun, channels_of, rms_of
+from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, Slope, off_by, rms_of, slopes_of
 from terrain.discrepancy.held_out import Gain, Reference
+from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.robot_terms import UNITS, in_robot_terms, quantity, values_with_intervals
-from terrain.discrepancy.slopes import CHANNEL_WORDS, Slope, off_by, slopes_of
 from terrain.discrepancy.terrain_match import TerrainMatch
 from terrain.discrepancy.verdict import Diagnosis, RuledOut, Varying
 from terrain.effects import PARAMETER, TRACKED, effect_named
@@ -79,7 +79,7 @@ def statements_of(
     slopes, extended = slopes_of(used), bool(used) and used[0].after is not None
     acts = {cause.name: cause.channels for cause in diagnosis.causes} if acting is None else acting
     statements = []
-    for channel in channels_of(used):
+    for channel in measured_channels(used):
         slope, where = slopes[channel], "on the runs compared"
         before, after = rms_of(used, channel, False), rms_of(used, channel, True) if extended else math.nan
         if gain is not None and channel in gain.channels:
@@ -159,7 +159,7 @@ def notes_of(
     """Return what a reader has to know of terrains and sessions that differ, in sentences.
 
     Terrains are ``apart`` where measured over simulated differs, as of
-    :func:`terrain.discrepancy.slopes.terrains_apart`.
+    :func:`terrain.discrepancy.compared.terrains_apart`.
     """
     notes = [
         f"On {match.terrain} runs fit best if {100.0 * match.effective_ratio:.0f} % of the measured tilt "

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,11 +12,13 @@ from scipy.signal import welch
 from scipy.stats import t as student
 
 from terrain.discrepancy.noise import Noise
-from terrain.discrepancy.residuals import INPUTS, LowPass, measured_channels, rows_of
+from terrain.discrepancy.residuals import INPUTS, LowPass, rows_of
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.effects import CHANNELS
+from terrain.discrepancy.verdict import Diagnosis
+from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.records import Array
+from terrain.signals import true_stretches
 
 STRETCH_S = 20.0  #: Length of the stretch that is drawn large.
 STRETCH_STEP_S = 1.0  #: Distance of the stretches among which it is chosen.
@@ -65,22 +67,17 @@ def compare_runs(
     """Return runs beside the simulation, and beside the extended one if any; too short ones are left out."""
     compared = []
     for run in signals:
-        planar = simulation.planar_on(run.terrain)
+        planar, after = simulation.planar_on(run.terrain), None
         rows = rows_of(run, planar, simulation.vector, (), low_pass)
-        if len(rows.time_s):
-            after = (
-                None if extended is None else rows_of(run, planar, extended.vector, (), low_pass).predicted
-            )
-            inputs = {name: rows.inputs[:, i] for i, name in enumerate(INPUTS) if name != "wheel_phase_rad"}
-            inputs["time_s"] = rows.time_s
-            about = rows.run_id, rows.terrain, held_out, rows.time_s, rows.pace_mps
-            compared.append(ComparedRun(*about, rows.measured, rows.predicted, after, inputs))
+        if not len(rows.time_s):
+            continue
+        if extended is not None:
+            after = rows_of(run, planar, extended.vector, (), low_pass).predicted
+        inputs = dict(zip(INPUTS, rows.inputs.T, strict=False), time_s=rows.time_s)
+        del inputs["wheel_phase_rad"]
+        about = rows.run_id, rows.terrain, held_out, rows.time_s, rows.pace_mps
+        compared.append(ComparedRun(*about, rows.measured, rows.predicted, after, inputs))
     return tuple(compared)
-
-
-def channels_of(runs: Sequence[ComparedRun]) -> list[str]:
-    """Return the channels that any run has."""
-    return list(measured_channels(runs))
 
 
 def rms_of(runs: Sequence[ComparedRun], channel: str, extended: bool) -> float:
@@ -91,72 +88,60 @@ def rms_of(runs: Sequence[ComparedRun], channel: str, extended: bool) -> float:
     return float(np.sqrt(np.mean(known**2))) if known.size else math.nan
 
 
-def residual_size(run: ComparedRun, noise: Noise) -> float:
-    """Return the mean squared residual of a run over that of noise, before; NaN where nothing is known."""
-    with np.errstate(invalid="ignore", divide="ignore"):
-        squared = ((run.measured - run.before) / noise.size(run.pace_mps)) ** 2
-    known = squared[np.isfinite(squared)]
-    return float(known.mean()) if known.size else math.nan
+def residual_sizes(runs: Sequence[ComparedRun], noise: Noise) -> Array:
+    """Return the mean squared residual of runs (runs,) over that of noise, before; NaN where nothing is known."""
+    sizes = []
+    for run in runs:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            squared = ((run.measured - run.before) / noise.size(run.pace_mps)) ** 2
+        known = squared[np.isfinite(squared)]
+        sizes.append(float(known.mean()) if known.size else math.nan)
+    return np.array(sizes)
 
 
-def example_stretch(runs: Sequence[ComparedRun], noise: Noise, span_s: float = STRETCH_S) -> ComparedRun:
+def example_stretch(runs: Sequence[ComparedRun], noise: Noise) -> ComparedRun:
     """Return a stretch of a run whose residuals over the noise are larger than most, not the largest."""
 
-    def size(run: ComparedRun) -> float:
-        return residual_size(run, noise)
+    def at_quantile(some: Sequence[ComparedRun]) -> ComparedRun:
+        sizes = residual_sizes(some, noise)
+        n_known = int(np.isfinite(sizes).sum())  # NaN comes last in the order
+        place = round(EXAMPLE_QUANTILE * (n_known - 1)) if n_known else 0
+        return some[np.argsort(sizes, kind="stable")[place] if n_known else 0]
 
-    run = _at_quantile(runs, size)
-    starts = np.arange(run.time_s[0], max(run.time_s[-1] - span_s, run.time_s[0]) + 1e-9, STRETCH_STEP_S)
-    return _at_quantile([run.part(start, start + span_s) for start in starts], size)
-
-
-def _at_quantile(runs: Sequence[ComparedRun], size: Callable[[ComparedRun], float]) -> ComparedRun:
-    sizes = np.array([size(run) for run in runs])
-    order = [i for i in np.argsort(sizes, kind="stable") if np.isfinite(sizes[i])]
-    return runs[order[round(EXAMPLE_QUANTILE * (len(order) - 1))]] if order else runs[0]
-
-
-def strongest_input(runs: Sequence[ComparedRun], channel: str) -> str:
-    """Return the input over whose bins the mean residual of a channel, before, is largest beyond its error.
-
-    Raises
-    ------
-    ValueError
-        if there is no run.
-    """
-    c = CHANNELS.index(channel)
-    residuals = [run.residual(False)[:, c] for run in runs]
-
-    def size(name: str) -> float:
-        found = binned_means([run.inputs[name] for run in runs], residuals)
-        error = np.nan_to_num(found.half_interval) / 1.96
-        return float(np.mean(found.mean**2 - error**2)) if found.mean.size else -math.inf
-
-    return max(
-        (name for name in runs[0].inputs if spread_of(runs, name) > MIN_SPREAD), key=size, default="time_s"
-    )
-
-
-def spread_of(runs: Sequence[ComparedRun], name: str) -> float:
-    """Return the range of an input over all runs, outliers left out; 0 where it is not known."""
-    values = np.concatenate([run.inputs[name] for run in runs])
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return 0.0
-    low, high = input_range(known)
-    return high - low
+    run = at_quantile(runs)
+    last_s = max(run.time_s[-1] - STRETCH_S, run.time_s[0])
+    starts_s = np.arange(run.time_s[0], last_s + 1e-9, STRETCH_STEP_S)
+    return at_quantile([run.part(start_s, start_s + STRETCH_S) for start_s in starts_s])
 
 
 def telling_runs(runs: Sequence[ComparedRun], noise: Noise, n: int) -> list[ComparedRun]:
     """Return so many runs, from the largest residual over the noise to the smallest."""
-    if n <= 0:
-        return []
-    sizes = np.nan_to_num([residual_size(run, noise) for run in runs], nan=-1.0)
-    order = np.argsort(-sizes, kind="stable")
     if n >= len(runs):
         return list(runs)
+    order = np.argsort(-np.nan_to_num(residual_sizes(runs, noise), nan=-1.0), kind="stable")
     places = np.unique(np.linspace(0, len(runs) - 1, n).round().astype(int))
-    return [runs[order[place]] for place in places]
+    return [runs[i] for i in order[places]]
+
+
+def strongest_input(runs: Sequence[ComparedRun], channel: str) -> str:
+    """Return the input over whose bins the mean residual of a channel, before, is largest beyond its error."""
+    strongest, most, c = "time_s", -math.inf, CHANNELS.index(channel)
+    for name in runs[0].inputs:
+        if spread_of(runs, name) > MIN_SPREAD:
+            means = binned_means(
+                [run.inputs[name] for run in runs], [run.residual(False)[:, c] for run in runs]
+            )
+            error = np.nan_to_num(means.half_interval) / 1.96
+            size = float(np.mean(means.mean**2 - error**2)) if means.mean.size else -math.inf
+            if size > most:
+                strongest, most = name, size
+    return strongest
+
+
+def spread_of(runs: Sequence[ComparedRun], name: str) -> float:
+    """Return the range of an input over all runs, outliers left out; 0 where it is not known."""
+    low, high = input_range([run.inputs[name] for run in runs])
+    return high - low
 
 
 def without_levels(noise: Noise, runs: Sequence[ComparedRun]) -> Noise:
@@ -197,17 +182,16 @@ def spectrum(residuals: Sequence[Array], rate_hz: float) -> tuple[Array, Array]:
     The segment length is halved until half of the known rows lie in stretches of that length; where no
     stretch has :data:`MIN_SEGMENT_ROWS`, the density is NaN.
     """
-    parts = [part for values in residuals for part in _without_holes(values)]
-    n_known = sum(map(len, parts))
-    n_rows = SEGMENT_ROWS
-    while n_rows > MIN_SEGMENT_ROWS and 2 * sum(len(part) for part in parts if len(part) >= n_rows) < n_known:
+    parts = [values[a:b] for values in residuals for a, b in true_stretches(np.isfinite(values))]
+    lengths, n_rows = np.array([len(part) for part in parts]), SEGMENT_ROWS
+    while n_rows > MIN_SEGMENT_ROWS and 2 * lengths[lengths >= n_rows].sum() < lengths.sum():
         n_rows //= 2
-    long = [part for part in parts if len(part) >= n_rows]
-    total = np.zeros(n_rows // 2 + 1) if long else np.full(n_rows // 2 + 1, np.nan)
-    for part in long:
-        total += len(part) * welch(part, rate_hz, nperseg=n_rows, detrend=False)[1]
+    total = np.full(n_rows // 2 + 1, 0.0 if (lengths >= n_rows).any() else np.nan)
+    for part in parts:
+        if len(part) >= n_rows:
+            total += len(part) * welch(part, rate_hz, nperseg=n_rows, detrend=False)[1]
     frequency = np.fft.rfftfreq(n_rows, 1.0 / rate_hz)
-    return frequency[1:], total[1:] / max(sum(map(len, long)), 1)
+    return frequency[1:], total[1:] / max(int(lengths[lengths >= n_rows].sum()), 1)
 
 
 def noise_spectrum(weights: Array, frequency_hz: Array, rate_hz: float) -> Array:
@@ -217,17 +201,11 @@ def noise_spectrum(weights: Array, frequency_hz: Array, rate_hz: float) -> Array
     return density
 
 
-def _without_holes(values: Array) -> Iterator[Array]:
-    """Yield the stretches of a signal without a hole."""
-    known = np.isfinite(values)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], known, [False]]).astype(int)))
-    for start, end in zip(edges[::2], edges[1::2], strict=True):
-        yield values[start:end]
-
-
-def input_range(known: Array) -> tuple[float, float]:
-    """Return the range of values without outliers."""
-    low, high = np.quantile(known, [TAIL_RATIO, 1.0 - TAIL_RATIO])
+def input_range(inputs: Sequence[Array]) -> tuple[float, float]:
+    """Return the range of values without outliers; 0 and 0 where none is known."""
+    values = np.concatenate(inputs)
+    known = values[np.isfinite(values)]
+    low, high = np.quantile(known, [TAIL_RATIO, 1.0 - TAIL_RATIO]) if known.size else (0.0, 0.0)
     return float(low), float(high)
 
 
@@ -241,13 +219,8 @@ def binned_means(inputs: Sequence[Array], residuals: Sequence[Array]) -> BinnedM
     >>> centres.round(1), means.round(0)
     (array([0.5, 1.5, 2.5, 3.5, 4.5, 5.5]), array([ 2.,  4.,  6.,  8., 10., 12.]))
     """
-    known = np.concatenate([x[np.isfinite(x)] for x in inputs])
-    nothing = np.empty(0)
-    if not known.size:
-        return BinnedMeans(nothing, nothing, nothing)
-    edges = np.linspace(*input_range(known), N_BINS + 1)
-    found = []
-    for low, high in itertools.pairwise(edges):
+    edges, rows = np.linspace(*input_range(inputs), N_BINS + 1), []
+    for low, high in pairwise(edges):
         each = []
         for given, left in zip(inputs, residuals, strict=True):
             inside = (given >= low) & (given < high) & np.isfinite(left)
@@ -256,8 +229,8 @@ def binned_means(inputs: Sequence[Array], residuals: Sequence[Array]) -> BinnedM
         n = len(each)
         if n:
             half = student.ppf(0.975, n - 1) * np.std(each, ddof=1) / math.sqrt(n) if n > 2 else math.nan
-            found.append(((low + high) / 2, float(np.mean(each)), half))
-    return BinnedMeans(*np.array(found).T) if found else BinnedMeans(nothing, nothing, nothing)
+            rows.append(((low + high) / 2, float(np.mean(each)), half))
+    return BinnedMeans(*np.array(rows).reshape(-1, 3).T)
 
 
 def run_means(residuals: Sequence[Array], sizes: Sequence[Array], weights: Array) -> tuple[Array, Array]:
@@ -266,16 +239,183 @@ def run_means(residuals: Sequence[Array], sizes: Sequence[Array], weights: Array
     ``sizes`` (m,) are those of the noise, ``weights`` those of the filter that whitens it.
     """
     covariance = np.fft.irfft(1.0 / np.abs(np.fft.rfft(weights, COVARIANCE_ROWS)) ** 2)
-    means, halves = [], []
-    for left, size in zip(residuals, sizes, strict=True):
+    means, halves = np.full((2, len(residuals)), np.nan)
+    for i, (left, size) in enumerate(zip(residuals, sizes, strict=True)):
         known = np.isfinite(left)
-        n = int(known.sum())
-        if not n:
-            means.append(math.nan)
-            halves.append(math.nan)
+        if n := int(known.sum()):
+            lags = np.arange(1, min(n, COVARIANCE_ROWS // 2))
+            spread = (covariance[0] + 2.0 * float(((1.0 - lags / n) * covariance[lags]).sum())) / n
+            means[i] = left[known].mean()
+            halves[i] = 1.96 * math.sqrt(float((size[known] ** 2).mean()) * max(spread, 0.0))
+    return means, halves
+
+
+# -- By which factor, or level, measured and simulated are apart in a channel: a slope through zero, robust ----
+
+#: A factor or a level is stated where it is off by so many standard deviations over runs.
+CLEAR_STDS = 3.0
+#: Distance of a run from the others, in their standard deviations, beyond which it is far out.
+OUTLIER_STDS = 3.0
+LEAST_OFF = 0.03  #: Least ratio by which a factor is off: below it a sentence has nothing to state.
+#: Least part of the absolute residual that a factor or a level has to remove, to describe it.
+EXPLAINS = 0.15
+LEVEL_RATIO = 0.3  #: Least ratio of the residual's root mean square that a level has to be.
+#: Terrains differ if their factors are so many standard deviations apart, the two furthest of several, and by that
+#: ratio.
+APART_STDS, APART_RATIO = 4.0, 0.05
+
+
+class Slope(NamedTuple):
+    """Measured over simulated, by a slope through zero, or by a level."""
+
+    ratio: float = math.nan  #: NaN where it is not clear from 1, or does not describe the residual
+    std: float = math.nan  #: over runs
+    level: float = math.nan
+    """Measured minus simulated, in the channel's unit; NaN where a factor is stated or none clear."""
+
+
+def slope_through_zero(simulated: Array, measured: Array) -> float:
+    """Return the slope ``b`` that minimises ``sum |measured - b simulated|``; NaN where nothing is simulated.
+
+    It is the median of ``measured / simulated``, each weighted by ``|simulated|``, of rows (n,) without NaN.
+
+    Examples
+    --------
+    >>> x = np.array([1.0, -2.0, 3.0, 4.0])
+    >>> slope_through_zero(x, 0.4 * x + np.array([0.0, 0.0, 9.0, 0.0]))
+    0.4
+    """
+    weight = np.abs(simulated)
+    seen = weight > 0.0
+    if not seen.any():
+        return math.nan
+    ratio, weight = measured[seen] / simulated[seen], weight[seen]
+    order = np.argsort(ratio, kind="stable")
+    total = np.cumsum(weight[order])
+    return float(ratio[order][np.searchsorted(total, total[-1] / 2.0)])
+
+
+def slopes_of(runs: Sequence[ComparedRun]) -> dict[str, Slope]:
+    """Return the slope of measured on simulated by channel, over all rows of some runs, before."""
+    slopes = {}
+    for c, channel in enumerate(CHANNELS):
+        pairs = []
+        for run in runs:
+            seen = np.isfinite(run.before[:, c]) & np.isfinite(run.measured[:, c])
+            if seen.any():
+                pairs.append((run.before[seen, c], run.measured[seen, c]))
+        if not pairs:
             continue
-        lags = np.arange(1, min(n, COVARIANCE_ROWS // 2))
-        spread = (covariance[0] + 2.0 * float(((1.0 - lags / n) * covariance[lags]).sum())) / n
-        means.append(float(left[known].mean()))
-        halves.append(1.96 * math.sqrt(float((size[known] ** 2).mean()) * max(spread, 0.0)))
-    return np.array(means), np.array(halves)
+        x, y = np.concatenate([x for x, _ in pairs]), np.concatenate([y for _, y in pairs])
+        ratio, off = slope_through_zero(x, y), y - x
+        most = (1.0 - EXPLAINS) * np.abs(off).sum()  # that a factor or a level leaves
+        ratios, levels = np.array(
+            [(slope_through_zero(*pair), np.median(pair[1] - pair[0])) for pair in pairs]
+        ).T
+        std = _std_of_mean(ratios - ratio, np.array([np.abs(x).sum() for x, _ in pairs]))
+        level, rms = float(np.median(off)), float(np.sqrt(np.mean(off**2)))
+        level_std = _std_of_mean(levels - level, np.array([float(x.size) for x, _ in pairs]))
+        if abs(ratio - 1.0) > max(CLEAR_STDS * std, LEAST_OFF) and np.abs(y - ratio * x).sum() < most:
+            slopes[channel] = Slope(ratio, std)
+        elif abs(level) > max(CLEAR_STDS * level_std, LEVEL_RATIO * rms) and np.abs(off - level).sum() < most:
+            slopes[channel] = Slope(level=level)
+        else:
+            slopes[channel] = Slope()
+    return slopes
+
+
+def _std_of_mean(off: Array, weight: Array) -> float:
+    """Return the standard deviation of a weighted mean by how far runs (n,) are from it.
+
+    A run that is far out, as a stalled one, hardly moves a median, and counts as one at the edge.
+    """
+    known = np.isfinite(off) & (weight > 0.0)
+    if known.sum() < 2:
+        return math.inf
+    edge = OUTLIER_STDS * 1.48 * float(np.median(np.abs(off[known])))
+    off = np.clip(off, -edge, edge)
+    return float(np.sqrt(((weight * off)[known] ** 2).sum()) / weight[known].sum())
+
+
+def terrains_apart(diagnosis: Diagnosis, used: Sequence[ComparedRun]) -> Mapping[str, Slope]:
+    """Return measured over simulated by terrain where terrains clearly differ; empty where they do not.
+
+    They are compared in the channel of the effect that varies, or of a cause whose caveat is the run; with
+    runs of one label, or runs that are alike, nothing is compared.
+    """
+    channels = [effect.channel for effect in diagnosis.varying]
+    channels += [cause.channels[0] for cause in diagnosis.causes if "run" in cause.caveat and cause.channels]
+    labels = sorted({run.terrain for run in used if run.terrain})
+    if not channels or len(labels) < 2:
+        return {}
+    of_label = {label: slopes_of([run for run in used if run.terrain == label]) for label in labels}
+    for channel in dict.fromkeys(channels):
+        slopes = {label: slopes.get(channel, Slope()) for label, slopes in of_label.items()}
+        known = {label: slope for label, slope in slopes.items() if math.isfinite(slope.std)}
+        if len(known) > 1:
+            low, *_, high = sorted(known.values(), key=lambda slope: slope.ratio)
+            least = max(APART_STDS * math.hypot(low.std, high.std), APART_RATIO * abs(low.ratio))
+            if high.ratio - low.ratio > least:
+                return known
+    return {}
+
+
+# -- What sentences call channels, and what a simulation does that is off in one ---------------------------
+
+#: A factor from the first is stated as "2.5 times", below it in percent; over the second it is not stated.
+TIMES, MOST_TIMES = 1.5, 20.0
+
+#: What a channel is called, and its unit.
+CHANNEL_WORDS = {
+    GYRO: ("yaw rate (gyro)", "rad/s"),
+    SPEED_X: ("speed ahead", "m/s"),
+    SPEED_Y: ("speed to the left", "m/s"),
+    ACCEL: ("accelerometer ahead", "m/s²"),
+    CURRENT: ("sum of the currents", "A"),
+    TURNING_CURRENT: ("right minus left current", "A"),
+    HEADING: ("heading rate (no gyro)", "rad/s"),
+}
+#: Inputs of the simulation as axes call them.
+INPUT_LABELS = {
+    "speed_mps": "speed [m/s]",
+    "turn_mps": "turn [m/s]",
+    "steer_rad": "steering [rad]",
+    "grade_rad": "grade [rad]",
+    "roll_rad": "roll [rad]",
+    "force_ratio": "force [weight]",
+    "sideways_mps": "speed to the left [m/s]",
+    "time_s": "time [s]",
+}
+#: What a simulation does with too much of it and too little, and with too low a level.
+OFF_WORDS = {
+    **dict.fromkeys(CHANNEL_WORDS, ("simulated, it is", "large", "small", "small")),
+    **dict.fromkeys((GYRO, HEADING), ("the simulation turns", "fast", "slowly", "slow")),
+    SPEED_X: ("the simulation drives", "fast", "slowly", "slow"),
+}
+
+
+def off_by(channel: str, ratio: float, level: float = math.nan) -> str:
+    """Return by which factor (measured over simulated) or level (measured minus simulated) a channel is off.
+
+    Examples
+    --------
+    >>> off_by("yaw_rate_radps", 0.4), off_by("speed_x_mps", 1.05)
+    ('the simulation turns 2.5 times too fast', 'the simulation drives 4.8 % too slowly')
+    >>> off_by("current_a", math.nan, 1.98)
+    'simulated, it is 2 A too small throughout'
+    """
+    verb, more, less, low = OFF_WORDS[channel]
+    if not math.isfinite(ratio):
+        size = f"{abs(level):.2g} {CHANNEL_WORDS[channel][1]}"
+        if channel in (GYRO, HEADING, SPEED_Y):  # a level to one side is no lack of turning
+            return f"measured is {size} more to the {'left' if level > 0 else 'right'} throughout"
+        is_off = verb if more == "large" else "the simulation is"
+        return f"{is_off} {size} too {low if level > 0 else more} throughout"
+    if ratio < 0.0:
+        return f"{verb} of the wrong sign" if more == "large" else f"{verb} backward"
+    times = max(ratio, 1.0 / max(ratio, 1e-9))
+    if times < TIMES:
+        size = f"{100.0 * abs(1.0 / ratio - 1.0):.2g} %"
+    else:
+        size = f"{times:.2g} times" if times <= MOST_TIMES else f"more than {MOST_TIMES:g} times"
+    return f"{verb} {size} too {more if ratio < 1.0 else less}"

@@ -19,7 +19,7 @@ import numpy as np
 from terrain.discrepancy.clocks import Latencies, Shift, latencies_of, shifts_of
 from terrain.discrepancy.constancy import CAVEAT_RATIO, Constancy, constancy_of, values_by_session
 from terrain.discrepancy.evidence import Evidence, fit_change, move_point, partial_information
-from terrain.discrepancy.faults import Fault, faults_of, repaired
+from terrain.discrepancy.health import Excluded, Fault, clocks_of, faults_of, repaired, unfit_runs
 from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
 from terrain.discrepancy.residuals import low_pass_of, measured_channels, rows_of
@@ -28,14 +28,12 @@ from terrain.discrepancy.search import CauseFit, Problem, names_of, pooled, refi
 from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT, fits_without_each, gain_interval
 from terrain.discrepancy.signals import Signals, signals_of
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.unfit import clocks_of, unfit_runs
 from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effects, with_conditions
 from terrain.discrepancy.verdict import (
     INTERVAL_T,
     Cause,
     Covariance,
     Diagnosis,
-    Excluded,
     Limit,
     Residual,
     RuledOut,
@@ -469,7 +467,7 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
         rows_of(run, simulation.planar_on(run.terrain), simulation.vector, (), low_pass) for run in signals
     ]
     latencies = latencies_of(signals, simulation)
-    faults = faults_of(signals, plain, simulation, low_pass, latencies=latencies)
+    faults = faults_of(signals, plain, simulation, low_pass, latencies)
     runs = repaired(signals, faults)
     if faults:
         latencies = latencies_of(runs, simulation)
@@ -493,7 +491,7 @@ def prepare(signals: Sequence[Signals], simulation: Simulation, library: Sequenc
 def _aligned(problem: Problem, latencies: Latencies) -> tuple[dict[str, float], Evidence, Shift]:
     """Return lags to start from, the information of the runs with them built in, and their clocks there."""
     known = names_of(problem.library)
-    seeds = {name: value for name, value in latencies.starting_values().items() if name in known}
+    seeds = {name: value for name, value in latencies.starting_values.items() if name in known}
     aligned = problem.at(move_point(problem.simulation.vector, tuple(seeds), np.array(list(seeds.values()))))
     return seeds, aligned, shifts_of(aligned)
 

@@ -11,7 +11,7 @@ import numpy as np
 from terrain.discrepancy.compared import ComparedRun, compare_runs, without_levels
 from terrain.discrepancy.constancy import PartValues, part_values
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.faults import repaired
+from terrain.discrepancy.health import repaired
 from terrain.discrepancy.held_out import (
     HOLD_OUT_FROM,
     Comparison,
@@ -93,7 +93,8 @@ def diagnose_runs(
     used, held_out = split_runs(runs, hold_out, seed)
     simulation, terrains = simulation_for(used, robot, library)
     diagnosis = diagnose(used, simulation, library)
-    extended = extend(simulation, diagnosis) if diagnosis.causes else None
+    # ambiguous sets are left out: which of their effects acts is not known
+    extended = simulation.with_effects(diagnosis.values) if diagnosis.causes else None
     excluded = {run.run_id for run in diagnosis.excluded_runs}
     fit = tuple(run for run in used if run.run_id not in excluded)
     signals = repaired([signals_of(run, robot) for run in fit], diagnosis.faults)
@@ -175,27 +176,6 @@ def held_out_gain(diagnosed: DiagnosedRuns, robot: Robot, seed: int) -> HeldOutG
 
 
 # -- The simulation, and the description of the robot, with what it lacked built in ------------------------
-
-
-def extend(simulation: Simulation, diagnosis: Diagnosis) -> Simulation:
-    """Return the simulation with the named causes added to what is built in already.
-
-    Ambiguous sets are left out: which of their effects acts is not known.
-
-    Raises
-    ------
-    ConfigError
-        if nothing was named, or the diagnosis is of another robot.
-    """
-    if diagnosis.robot != simulation.robot.name:
-        raise ConfigError(
-            f"the diagnosis is of the robot {diagnosis.robot!r}, the simulation of {simulation.robot.name!r}"
-        )
-    if not diagnosis.causes:
-        raise ConfigError(
-            f"the diagnosis is {diagnosis.verdict.value!r} and names no cause: there is nothing to build in"
-        )
-    return simulation.with_effects(diagnosis.values)
 
 
 def extended_effects(

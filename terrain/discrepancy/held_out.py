@@ -11,17 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from terrain.bootstrap import bootstrap_counts, percentile_interval
-from terrain.discrepancy.compared import ComparedRun, channels_of
+from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.discrepancy.evidence import N_BLOCKS, Evidence, evidence_at
-from terrain.discrepancy.faults import Fault
+from terrain.discrepancy.health import Excluded, Fault, unfit_runs
 from terrain.discrepancy.residuals import LowPass, low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.selection import MIN_CLUSTERS
 from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.unfit import unfit_runs
-from terrain.discrepancy.verdict import Excluded
 from terrain.effects import CHANNELS
 from terrain.errors import DataError, TerrainError
 from terrain.estimation.estimate import Estimate, estimate_run, summarize
@@ -350,7 +348,7 @@ def black_box_reference(
     columns, test = (np.concatenate([_columns(run) for run in runs]) for runs in (used, held_out))
     run_of_row = np.repeat(np.arange(len(held_out)), [len(run.time_s) for run in held_out])
     channels, total = {}, np.zeros(3)
-    for name in channels_of(used):
+    for name in measured_channels(used):
         c = CHANNELS.index(name)
         before = np.concatenate([run.residual(False)[:, c] for run in held_out])
         known = np.isfinite(before)

@@ -20,11 +20,8 @@ from terrain.records import Array
 FLOOR = 0.2
 
 ORDER = 6  #: Of the autoregression: about a second at the rate of the rows.
-ORDERS = (
-    ORDER,
-    3,
-    1,
-)  #: Orders that are tried: a channel with many holes has few stretches that fill a long one.
+#: Orders that are tried: a channel with many holes has few stretches that fill a long one.
+ORDERS = (ORDER, 3, 1)
 #: The order of noise without memory, with which a fit starts: a memory that is fitted to a residual full of levels
 #: would weigh levels down to nothing, and they would never be fitted.
 WHITE = (0,)
@@ -78,16 +75,25 @@ def noise_of(
     noise = Noise(growth, filters, np.full(n_channels, np.nan))
     powers = [_powers(speed) for speed in speeds_mps]
     n_rows = sum(int(np.isfinite(r).sum()) for r in residuals)
+    window = np.lib.stride_tricks.sliding_window_view
     for c in range(n_channels):
         square = np.concatenate([r[:, c] for r in residuals]) ** 2
         seen = np.isfinite(square)
         if seen.sum() < 10 * ORDER or not square[seen].any():
             continue
-        noise.growth[c] = _growth(square[seen], np.concatenate(powers)[seen])
-        scaled = [
-            r[:, c] / np.sqrt(power @ noise.growth[c]) for r, power in zip(residuals, powers, strict=True)
-        ]
-        tables = {order: _lag_table(scaled, order) for order in orders}
+        # squares by powers of the speed, none negative, twice weighted by what was fitted
+        known, mean = np.concatenate(powers)[seen], float(square[seen].mean())
+        growth[c] = mean, 0.0, 0.0
+        for _ in range(3):
+            weight = 1.0 / np.maximum(known @ growth[c], 0.02 * mean)
+            growth[c] = nnls(known * weight[:, None], square[seen] * weight)[0]
+            growth[c, 0] = max(growth[c, 0], FLOOR * mean)
+        scaled = [r[:, c] / np.sqrt(power @ growth[c]) for r, power in zip(residuals, powers, strict=True)]
+        tables = {}  # by order, rows x_k, x_(k-1), ... x_(k-order) of all runs, as far as they are known
+        for order in orders:
+            rows = [window(x, order + 1)[:, ::-1] for x in scaled if len(x) > order]
+            table = np.concatenate(rows or [np.empty((0, order + 1))])
+            tables[order] = table[np.isfinite(table).all(axis=1)]
         order = next(n for n in orders if len(tables[n]) >= WHOLE_RATIO * len(tables[orders[-1]]))
         table = tables[order]
         if len(table) < 10 * ORDER:
@@ -96,7 +102,7 @@ def noise_of(
         weights = _autoregression(table, row_s)
         scale = np.sqrt(np.mean((table[:, 0] - table[:, 1:] @ weights) ** 2) * grow)
         if scale > 0:
-            noise.filters[c] = np.concatenate([[1.0], -weights, np.zeros(ORDER - order)]) / scale
+            filters[c] = np.concatenate([[1.0], -weights, np.zeros(ORDER - order)]) / scale
             noise.std[c] = np.sqrt(np.mean(square[seen]) * grow)
     return noise
 
@@ -121,25 +127,6 @@ def _autoregression(table: Array, row_s: float) -> Array:
         if power <= most * (1.0 - drawn_in.sum()) ** 2 and drawn_in.sum() < 1.0:
             return np.asarray(drawn_in)
     return np.zeros(order)
-
-
-def _growth(square: Array, powers: Array) -> Array:
-    """Fit squares (m,) by their powers of speed (m, 3), none negative, twice weighted by what was fitted."""
-    mean = float(square.mean())
-    fitted = np.array([mean, 0.0, 0.0])
-    for _ in range(3):
-        weight = 1.0 / np.maximum(powers @ fitted, 0.02 * mean)
-        fitted = nnls(powers * weight[:, None], square * weight)[0]
-        fitted[0] = max(fitted[0], FLOOR * mean)
-    return fitted
-
-
-def _lag_table(signals: Sequence[Array], order: int) -> Array:
-    """Return rows ``x_k, x_(k-1), ... x_(k-order)`` of all signals, as far as they are known."""
-    window = np.lib.stride_tricks.sliding_window_view
-    rows = [window(x, order + 1)[:, ::-1] for x in signals if len(x) > order]
-    table = np.concatenate(rows or [np.empty((0, order + 1))])
-    return np.asarray(table[np.isfinite(table).all(axis=1)])
 
 
 @njit

@@ -23,12 +23,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import Enum
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.bootstrap import LEVEL, bootstrap_counts, percentile_interval
-from terrain.discrepancy.faults import Fault
+from terrain.discrepancy.health import Fault
 from terrain.discrepancy.robot_terms import listed
 from terrain.identify import Fit, Parameter, deal, folds, identify
 from terrain.kernels import njit, record
@@ -196,75 +197,15 @@ class Traces(NamedTuple):
     new: Array  #: (n, wheels) 1 where a sample of a wheel is new, else 0
 
 
-def powertrain_of(
-    runs: Sequence[RunLog], robot: Robot, faults: Sequence[Fault] = (), seed: int = 0
-) -> Powertrain | None:
-    """Return what is between commanded and measured wheel speeds; None where no run logs both.
-
-    Parameters
-    ----------
-    runs : with a stream ``commands`` that has a channel ``wheel_<wheel>_radps`` for each wheel
-    robot : names of its wheels, wheel radius and reduction
-    faults : of their logs; runs whose wheel speeds have one are left out
-    seed : of the folds and of the bootstrap
-    """
-    commanded = [run for run in runs if _is_commanded(run, robot)]
-    if not commanded:
-        return None
-    faulty = {run_id for fault in faults if fault.change.of_wheels for run_id in fault.run_ids}
-    traces, hold_s = traces_of([run for run in commanded if run.run_id not in faulty], robot)
-    n_runs = len(traces.start_radps)
-    if n_runs < MIN_RUNS:
-        left_out = f" ({len(faulty)} have a fault of their wheel speeds)" if faulty else ""
-        return Powertrain(
-            reason=f"runs: {n_runs} have commanded and measured wheel speeds; at least {MIN_RUNS} are "
-            f"required{left_out}"
-        )
-    two_sides = traces.measured.shape[1] == 2
-    candidates = [name for name in NAMES if two_sides or name not in OF_TWO_SIDES]
-    fold = deal(np.arange(n_runs), FOLDS, np.random.default_rng(seed))
-    draws = bootstrap_counts(n_runs, DRAWS, seed)
-    gains, values, error = _select_parts(traces, candidates, fold, draws)
-    values, fit = _fit(traces, list(gains), values)
-    parts = []
-    for name in candidates:
-        if name not in gains:
-            seen = PartStatus.NOT_NEEDED if _is_excited(traces, values, name) else PartStatus.NOT_EXCITED
-            parts.append(Part(name, seen))
-            continue
-        assert fit is not None
-        room_s = GRID_ROOM_S if name in ("delay_s", "time_constant_s") else 0.0
-        if name == "delay_s" and not {"time_constant_s", "slew_radps2"} & gains.keys():
-            room_s += hold_s  # the next sample shows all of a step
-        low, high = fit.interval[:, list(gains).index(name)]
-        low, high = (
-            max(float(low) - room_s, KINDS[name].low, 0.0),
-            min(float(high), KINDS[name].high) + room_s,
-        )
-        parts.append(Part(name, PartStatus.FOUND, float(values[NAMES.index(name)]), low, high, gains[name]))
-    raw = squared_errors(traces, ABSENT)
-    reduction = (0.0, 0.0, 0.0)
-    if raw.sum() > 0:
-        drawn = 1.0 - (draws @ error) / np.maximum(draws @ raw, 1e-12)
-        reduction = (1.0 - float(error.sum() / raw.sum()), *percentile_interval(drawn))
-    before, after = (math.sqrt(float(each.sum()) / int(traces.new.sum())) for each in (raw, error))
-    return Powertrain(tuple(parts), before, after, reduction, hold_s, n_runs)
-
-
-def _is_commanded(run: RunLog, robot: Robot) -> bool:
-    """Return whether a run logs the commanded and the measured speed of each wheel."""
-    if not {"commands", "wheels"} <= run.streams.keys():
-        return False
-    ordered = {f"wheel_{wheel}_radps" for wheel in robot.logged_wheels}
-    commanded = ordered <= set(run.streams["commands"].channels)
-    return commanded and set(robot.rate_channels) <= set(run.streams["wheels"].channels)
-
-
 def traces_of(runs: Sequence[RunLog], robot: Robot) -> tuple[Traces, float]:
-    """Return runs that log commanded and measured wheel speeds on one grid, and the period of new samples (s)."""
+    """Return runs that log commanded and measured wheel speeds on one grid, and the period of new samples (s).
+
+    Samples are new that differ from the one before; what stays the same for twice the period of these is new as well:
+    a wheel that turns steadily.
+    """
     per_radps = robot.logged_rates(np.full(len(robot.wheels), robot.wheel_radius_m))
-    n_wheels = len(robot.rate_channels)
-    traced: list[tuple[Any, ...]] = []
+    none = np.empty((0, len(robot.rate_channels)))
+    areas, starts, places, measured, news, holds = [none], [none], [np.empty(0)], [none], [none], []
     for run in runs:
         commands, wheels = run.streams["commands"], run.streams["wheels"]
         rates = np.column_stack([wheels.channel(name) for name in robot.rate_channels]) / per_radps
@@ -274,46 +215,34 @@ def traces_of(runs: Sequence[RunLog], robot: Robot) -> tuple[Traces, float]:
         time_s, rates = wheels.time_s[inside], rates[inside]
         if len(time_s) < 3 or not np.isfinite(orders).all():
             continue
-        new, hold_s = _new_samples(time_s, rates)
+        new = np.diff(rates, axis=0, prepend=rates[:1]) != 0.0
+        between = np.concatenate([np.diff(np.flatnonzero(column)) for column in new.T])
+        every = int(np.median(between)) if between.size else 1
+        for column in new.T:
+            last = 0
+            for k in range(1, len(time_s)):
+                if column[k] or k - last >= 2 * every:
+                    column[k], last = True, k
         some = new.any(axis=1)
-        if some.any():
-            grid_s = np.arange(time_s[0], time_s[-1] + 2.0 * STEP_S, STEP_S)
-            area = np.column_stack([_integral(grid_s, commands.time_s, held) for held in orders.T])
-            traced.append(
-                (area, rates[0], (time_s[some] - grid_s[0]) / STEP_S, rates[some], new[some], hold_s)
-            )
-    if not traced:
-        none = np.empty((0, n_wheels))
-        return Traces(none, np.zeros(1, int), none, np.empty(0, int), np.empty(0), none, none), math.nan
-    areas, start, place, measured, news = ([each[i] for each in traced] for i in range(5))
-    first = np.cumsum([0, *map(len, areas)])
-    of_run = np.repeat(np.arange(len(traced)), [len(each) for each in place])
-    columns = np.concatenate(place), np.vstack(measured), np.vstack(news).astype(float)
-    hold_s = float(np.median([each[5] for each in traced]))
-    return Traces(np.vstack(areas), first, np.vstack(start), of_run, *columns), hold_s
-
-
-def _integral(time_s: Array, stamps_s: Array, held: Array) -> Array:
-    """Return the integral (m,) of a command that is held from stamp to stamp, and after the last."""
-    sums = np.concatenate([[0.0], np.cumsum(held[:-1] * np.diff(stamps_s))])
-    after = np.maximum(time_s - stamps_s[-1], 0.0) * held[-1]
-    return np.asarray(np.interp(time_s, stamps_s, sums) + after)
-
-
-def _new_samples(time_s: Array, rates: Array) -> tuple[Array, float]:
-    """Return which samples (n, wheels) are new, and the period at which they come.
-
-    What stays the same for twice that period is new as well: a wheel that turns steadily.
-    """
-    new = np.vstack([np.zeros(rates.shape[1], dtype=bool), np.diff(rates, axis=0) != 0.0])
-    between = [np.diff(np.flatnonzero(column)) for column in new.T]
-    every = int(np.median(np.concatenate(between))) if any(len(each) for each in between) else 1
-    for column in new.T:
-        last = 0
-        for k in range(1, len(time_s)):
-            if column[k] or k - last >= 2 * every:
-                column[k], last = True, k
-    return new, every * float(np.median(np.diff(time_s)))
+        if not some.any():
+            continue
+        grid_s = np.arange(time_s[0], time_s[-1] + 2.0 * STEP_S, STEP_S)
+        # integral of a command that is held from stamp to stamp, and after the last
+        sums = np.cumsum(orders[:-1] * np.diff(commands.time_s)[:, None], axis=0)
+        area = np.maximum(grid_s - commands.time_s[-1], 0.0)[:, None] * orders[-1]
+        for j, column in enumerate(sums.T):
+            area[:, j] += np.interp(grid_s, commands.time_s, np.concatenate([[0.0], column]))
+        areas.append(area)
+        starts.append(rates[:1])
+        places.append((time_s[some] - grid_s[0]) / STEP_S)
+        measured.append(rates[some])
+        news.append(new[some].astype(float))
+        holds.append(every * float(np.median(np.diff(time_s))))
+    first = np.cumsum([len(area) for area in areas])
+    of_run = np.repeat(np.arange(len(holds)), [len(place) for place in places[1:]])
+    samples = np.concatenate(places), np.vstack(measured), np.vstack(news)
+    hold_s = float(np.median(holds)) if holds else math.nan
+    return Traces(np.vstack(areas), first, np.vstack(starts), of_run, *samples), hold_s
 
 
 @njit
@@ -386,136 +315,167 @@ def predict(traces: Traces, values: Array) -> Array:
     return out
 
 
-def left_over(traces: Traces, values: Array) -> Array:
-    """Return measured minus predicted wheel speeds (n, wheels), 0 where a sample is not new."""
-    return np.asarray((traces.measured - predict(traces, values)) * traces.new)
+def powertrain_of(
+    runs: Sequence[RunLog], robot: Robot, faults: Sequence[Fault] = (), seed: int = 0
+) -> Powertrain | None:
+    """Return what is between commanded and measured wheel speeds; None where no run logs both.
 
+    Parts are added one at a time, each the one that leaves least; those that a later one made needless are dropped
+    again.  A part's gain is what it removes, beside the others, of the squared error of runs left out.
 
-def squared_errors(traces: Traces, values: Array) -> Array:
-    """Return the sum of the squared errors of each run (runs,)."""
-    return np.bincount(traces.run, (left_over(traces, values) ** 2).sum(axis=1))
-
-
-def _fit(
-    traces: Traces, names: Sequence[str], start: Array, used: Array | None = None
-) -> tuple[Array, Fit | None]:
-    """Return the values of all parts, those named fitted to some runs, to all by default; and the fit."""
-    if not names:
-        return start, None
-    at = [NAMES.index(name) for name in names]
-    weight = np.ones((len(traces.run), 1))
-    if used is not None:
-        weight[:, 0] = np.isin(traces.run, used)
-
-    def inserted(values: Array) -> Array:
-        whole = start.copy()
-        whole[at] = values
-        return whole
-
-    def derivative(values: Array) -> Array:
-        columns = []
-        for i, name in zip(at, names, strict=True):
-            ahead, back = inserted(values), inserted(values)
-            ahead[i] += KINDS[name].step
-            back[i] = max(back[i] - KINDS[name].step, KINDS[name].low)
-            change = (predict(traces, ahead) - predict(traces, back)) / (ahead[i] - back[i])
-            columns.append(-np.ravel(change * traces.new * weight))
-        return np.column_stack(columns)
-
-    fit = identify(
-        lambda values: left_over(traces, inserted(values)) * weight,
-        [
-            Parameter(name, start[i], KINDS[name].low, KINDS[name].high, step=KINDS[name].usual)
-            for i, name in zip(at, names, strict=True)
-        ],
-        clusters=traces.run if used is None else None,
-        derivative=derivative,
-        ftol=TOLERANCE,
-    )
-    return inserted(fit.value), fit
-
-
-def _left_out(traces: Traces, names: Sequence[str], start: Array, fold: Array) -> Array:
-    """Return the squared error of each run (runs,), of a fit that it is left out of."""
-    error = np.empty(len(fold))
-    for train, test in folds(fold):
-        error[test] = squared_errors(traces, _fit(traces, names, start, train)[0])[test]
-    return error
-
-
-def _is_less(after: Array, before: Array, draws: Array) -> bool:
-    """Return whether squared errors (runs,) are less over bootstrap samples of the runs (n_draws, runs).
-
-    The level leaves to all parts together what an interval leaves to one.
+    Parameters
+    ----------
+    runs : with a stream ``commands`` that has a channel ``wheel_<wheel>_radps`` for each wheel
+    robot : names of its wheels, wheel radius and reduction
+    faults : of their logs; runs whose wheel speeds have one are left out
+    seed : of the folds and of the bootstrap
     """
-    return percentile_interval(draws @ (before - after), 1.0 - (1.0 - LEVEL) / len(NAMES))[0] > 0.0
+    ordered, commanded = {f"wheel_{wheel}_radps" for wheel in robot.logged_wheels}, []
+    for run in runs:
+        if {"commands", "wheels"} <= run.streams.keys():
+            both = ordered <= set(run.streams["commands"].channels)
+            if both and set(robot.rate_channels) <= set(run.streams["wheels"].channels):
+                commanded.append(run)
+    if not commanded:
+        return None
+    faulty = {run_id for fault in faults if fault.change.of_wheels for run_id in fault.run_ids}
+    traces, hold_s = traces_of([run for run in commanded if run.run_id not in faulty], robot)
+    n_runs, n_wheels = traces.start_radps.shape
+    if n_runs < MIN_RUNS:
+        left_out = f" ({len(faulty)} have a fault of their wheel speeds)" if faulty else ""
+        return Powertrain(
+            reason=f"runs: {n_runs} have commanded and measured wheel speeds; at least {MIN_RUNS} are "
+            f"required{left_out}"
+        )
+    names = np.array(NAMES)
+    fold = deal(np.arange(n_runs), FOLDS, np.random.default_rng(seed))
+    draws = bootstrap_counts(n_runs, DRAWS, seed)
 
+    def left_over(values: Array) -> Array:
+        """Return measured minus predicted wheel speeds (n, wheels), 0 where a sample is not new."""
+        return np.asarray((traces.measured - predict(traces, values)) * traces.new)
 
-def _select_parts(
-    traces: Traces, candidates: Sequence[str], fold: Array, draws: Array
-) -> tuple[dict[str, float], Array, Array]:
-    """Return the parts that reduce the error of runs left out, each with what it removes beside the others.
+    def squared_errors(values: Array) -> Array:
+        """Return the sum of the squared errors of each run (runs,)."""
+        return np.bincount(traces.run, (left_over(values) ** 2).sum(axis=1))
 
-    Further returned are all values, and the squared error of each run (runs,) left out.  Parts are added one at a
-    time; those that a later one made needless are dropped again.
-    """
+    def fit_parts(some: Sequence[str], start: Array, used: Array | None = None) -> tuple[Array, Fit | None]:
+        """Return the values of all parts, those named fitted to some runs, to all by default; and the fit."""
+        if not some:
+            return start, None
+        at = [NAMES.index(name) for name in some]
+        weight = np.ones((len(traces.run), 1)) if used is None else np.isin(traces.run, used)[:, None] * 1.0
+
+        def inserted(values: Array) -> Array:
+            whole = start.copy()
+            whole[at] = values
+            return whole
+
+        def derivative(values: Array) -> Array:
+            columns = []
+            for i, name in zip(at, some, strict=True):
+                ahead, back = inserted(values), inserted(values)
+                ahead[i] += KINDS[name].step
+                back[i] = max(back[i] - KINDS[name].step, KINDS[name].low)
+                change = (predict(traces, ahead) - predict(traces, back)) / (ahead[i] - back[i])
+                columns.append(-np.ravel(change * traces.new * weight))
+            return np.column_stack(columns)
+
+        parameters = []
+        for i, name in zip(at, some, strict=True):
+            kind = KINDS[name]
+            parameters.append(Parameter(name, start[i], kind.low, kind.high, step=kind.usual))
+        fit = identify(
+            lambda values: left_over(inserted(values)) * weight,
+            parameters,
+            clusters=traces.run if used is None else None,
+            derivative=derivative,
+            ftol=TOLERANCE,
+        )
+        return inserted(fit.value), fit
+
+    def held_out_errors(some: Sequence[str], start: Array) -> Array:
+        """Return the squared error of each run (runs,), of a fit that it is left out of."""
+        error = np.empty(n_runs)
+        for train, test in folds(fold):
+            error[test] = squared_errors(fit_parts(some, start, train)[0])[test]
+        return error
+
+    def is_less(after: Array, before: Array) -> bool:
+        """Return whether squared errors (runs,) are less over bootstrap samples of the runs.
+
+        The level leaves to all parts together what an interval leaves to one.
+        """
+        return percentile_interval(draws @ (before - after), 1.0 - (1.0 - LEVEL) / len(NAMES))[0] > 0.0
+
+    candidates = [name for name in NAMES if n_wheels == 2 or name not in OF_TWO_SIDES]
     present: list[str] = []
-    values, error = ABSENT, squared_errors(traces, ABSENT)
-    added = True
+    values, raw = ABSENT, squared_errors(ABSENT)
+    error, top, added = raw, float(np.abs(traces.measured).max()), True
     while added:
-        least = (1.0 - MIN_GAIN_RATIO) * float(squared_errors(traces, values).sum())
-        fits = {}
-        for name in candidates:
-            if name not in present:
-                fitted = _fit(traces, [*present, name], _started(traces, values, name))[0]
-                fits[name] = float(squared_errors(traces, fitted).sum()), fitted
-        added = False
-        for name in sorted(fits, key=lambda name: fits[name][0]):
-            size, fitted = fits[name]
-            if size < least:
-                left = _left_out(traces, [*present, name], fitted, fold)
-                if _is_less(left, error, draws):
-                    present, values, error = sorted([*present, name], key=NAMES.index), fitted, left
-                    added = True
-                    break
+        added, fits = False, []
+        least = (1.0 - MIN_GAIN_RATIO) * float(squared_errors(values).sum())
+        for name in (name for name in candidates if name not in present):
+            # from the best of the values that a fit may start from
+            kind, i = KINDS[name], NAMES.index(name)
+            starts = kind.starts or tuple(ratio * top for ratio in LIMIT_STARTS)
+            shorter = np.where(
+                names == "time_constant_s", 0.5 * values, values
+            )  # a slew limit takes over much of it
+            points = np.repeat([values, shorter], len(starts), axis=0)
+            points[:, i] = np.clip(np.tile(starts, 2), kind.low, kind.high)
+            sizes = [float(squared_errors(point).sum()) for point in points]
+            fitted = fit_parts([*present, name], points[int(np.argmin(sizes))])[0]
+            fits.append((float(squared_errors(fitted).sum()), name, fitted))
+        for size, name, fitted in sorted(fits, key=itemgetter(0)):
+            left = held_out_errors([*present, name], fitted) if size < least else error
+            if size < least and is_less(left, error):
+                present, values, error = sorted([*present, name], key=NAMES.index), fitted, left
+                added = True
+                break
     while True:
-        error = _left_out(traces, present, values, fold)
-        gains, needless = {}, {}
+        error, gains, needless = held_out_errors(present, values), {}, {}
         for name in present:
             rest = [other for other in present if other != name]
-            without = np.where(np.array(NAMES) == name, ABSENT, values)
-            without = _fit(traces, rest, without)[0]
-            left = _left_out(traces, rest, without, fold)
+            without = fit_parts(rest, np.where(names == name, ABSENT, values))[0]
+            left = held_out_errors(rest, without)
             gains[name] = float(1.0 - error.sum() / left.sum())
-            if not _is_less(error, left, draws):
+            if not is_less(error, left):
                 needless[name] = rest, without
         if not needless:
-            return gains, values, error
+            break
         present, values = needless[min(needless, key=lambda name: gains[name])]
+    values, fit = fit_parts(present, values)
 
-
-def _started(traces: Traces, values: Array, name: str) -> Array:
-    """Return the values with a part added, at the best of those that its fit may start from."""
-    kind, top = KINDS[name], float(np.abs(traces.measured).max())
-    starts = kind.starts or tuple(ratio * top for ratio in LIMIT_STARTS)
-    shorter = values.copy()
-    shorter[NAMES.index("time_constant_s")] *= 0.5  # a slew limit takes over much of it
-    points = np.repeat([values, shorter], len(starts), axis=0)
-    points[:, NAMES.index(name)] = np.clip(np.tile(starts, 2), kind.low, kind.high)
-    return np.asarray(min(points, key=lambda point: float(squared_errors(traces, point).sum())))
-
-
-def _is_excited(traces: Traces, values: Array, name: str) -> bool:
-    """Return whether a part of a usual size would change the wheel speeds noticeably.
-
-    The runs then start at the speeds that their first commands lead to: noise of the first samples is no motion.
-    """
-    there = np.where(np.array(NAMES) == name, KINDS[name].usual, values)
-    at_once = np.where(np.isin(NAMES, ("delay_s", "time_constant_s", "slew_radps2")), ABSENT, values)
-    none = np.zeros(traces.measured.shape[1])
-    settled = [follow(traces.area_rad[k : k + 2], none, at_once, STEP_S)[1] for k in traces.first[:-1]]
-    traces = traces._replace(start_radps=np.array(settled))
-    change = (predict(traces, there) - predict(traces, values)) * traces.new
-    scatter = np.bincount(traces.run, 2.0 * (change * left_over(traces, values)).sum(axis=1))
-    least = MIN_GAIN_RATIO * float(squared_errors(traces, values).sum())
-    return float((change**2).sum()) > max(EXCITED_SIGMAS * float(np.linalg.norm(scatter)), least, 1e-9)
+    # Whether a part of a usual size would change the wheel speeds noticeably: runs then start at the speeds that
+    # their first commands lead to, since noise of the first samples is no motion.
+    at_once = np.where(np.isin(names, ("delay_s", "time_constant_s", "slew_radps2")), ABSENT, values)
+    first = [traces.area_rad[k : k + 2] for k in traces.first[:-1]]
+    settled = [follow(area, np.zeros(n_wheels), at_once, STEP_S)[1] for area in first]
+    steady = traces._replace(start_radps=np.array(settled))
+    now = predict(steady, values)
+    misses = (traces.measured - now) * traces.new
+    least = max(MIN_GAIN_RATIO * float((misses**2).sum()), 1e-9)
+    parts = []
+    for i, name in enumerate(NAMES):
+        kind = KINDS[name]
+        if name in present:
+            assert fit is not None
+            room_s = GRID_ROOM_S if name in ("delay_s", "time_constant_s") else 0.0
+            if name == "delay_s" and not {"time_constant_s", "slew_radps2"} & {*present}:
+                room_s += hold_s  # the next sample shows all of a step
+            low, high = fit.interval[:, present.index(name)].tolist()
+            ends = max(low - room_s, kind.low, 0.0), min(high, kind.high) + room_s
+            parts.append(Part(name, PartStatus.FOUND, float(values[i]), *ends, gains[name]))
+        elif name in candidates:
+            change = (predict(steady, np.where(names == name, kind.usual, values)) - now) * traces.new
+            scatter = np.linalg.norm(np.bincount(traces.run, 2.0 * (change * misses).sum(axis=1)))
+            seen = float((change**2).sum()) > max(EXCITED_SIGMAS * float(scatter), least)
+            parts.append(Part(name, PartStatus.NOT_NEEDED if seen else PartStatus.NOT_EXCITED))
+    reduction = (0.0, 0.0, 0.0)
+    if raw.sum() > 0:
+        drawn = 1.0 - (draws @ error) / np.maximum(draws @ raw, 1e-12)
+        reduction = (1.0 - float(error.sum() / raw.sum()), *percentile_interval(drawn))
+    n_new = int(traces.new.sum())
+    before, after = math.sqrt(float(raw.sum()) / n_new), math.sqrt(float(error.sum()) / n_new)
+    return Powertrain(tuple(parts), before, after, reduction, hold_s, n_runs)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -74,6 +75,11 @@ class Rows(NamedTuple):
         return self.measured - self.predicted
 
     @property
+    def period_s(self) -> float:
+        """From row to row; 0 where there is none."""
+        return float(np.median(np.diff(self.time_s))) if self.time_s.size > 1 else 0.0
+
+    @property
     def pace_mps(self) -> Array:
         """Speed (m,) of the wheels, straight ahead or against each other; of omni wheels in any direction."""
         speed = np.hypot(self.inputs[:, 0], self.inputs[:, INPUTS.index("sideways_mps")])
@@ -98,7 +104,7 @@ def low_pass_of(signals: Sequence[Signals]) -> LowPass:
     DataError
         if the runs' clocks differ by more than a twentieth.
     """
-    slow, fast = (pick(signals, key=lambda run: 1 / run.dt_s) for pick in (min, max))
+    slow, fast = max(signals, key=attrgetter("dt_s")), min(signals, key=attrgetter("dt_s"))
     rate_hz = 1 / slow.dt_s
     if 1 / fast.dt_s > (1 + SAME_CLOCK) * rate_hz:
         raise DataError(
@@ -150,11 +156,22 @@ def rows_of(
         instruments = _decimated(wheel_speed, _window(low_pass.instrument_cutoff_hz, 1.0 / dt), 1)
     true_wheel_speed, true_grade, true_roll = corrected_inputs(planar, vector, dt, instruments, grade, roll)
     truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll)
-    points, sensed, spans = _evaluation_points(vector, parameters)
-    inputs = steer, grade, roll, truth, holes, *window
-    now = _predictions(planar, points[:1], sensed[:1], dt, wheel_speed, *inputs)[0, kept]
-    both = _predictions(planar, points[1:], sensed[1:], dt, instruments, *inputs)[:, kept]
-    change = (both[::2] - both[1::2]) / spans[:, None, None]
+
+    def shown(point: Array, speeds: Array, only_sensed: bool) -> Array:
+        """Return the low-pass filtered prediction (rows, channels); the motion stays where only sensors change."""
+        seen = sense(planar, point, dt, truth) if only_sensed else replay(planar, point, dt, speeds, *inputs)
+        return np.asarray(decimate(seen, holes, *window))[kept]
+
+    inputs = steer, grade, roll
+    now = shown(vector, wheel_speed, False)
+    change = np.empty((len(parameters), *now.shape))
+    for j, name in enumerate(parameters):
+        i, (ahead, back) = INDEX[name], np.tile(vector, (2, 1))
+        ahead[i] += STEPS[name]
+        if name not in ONE_SIDED or vector[i] >= STEPS[name]:
+            back[i] -= STEPS[name]
+        here, there = (shown(point, instruments, name in SENSED_ONLY) for point in (ahead, back))
+        change[j] = (here - there) / (ahead[i] - back[i])
     speed, turn, sideways = _rolled(planar, instruments, steer)
     force = truth["force_n"] / (GRAVITY_MPS2 * planar.robot.mass_kg)
     driven = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, force, sideways])
@@ -182,53 +199,6 @@ def _decimated(values: Array, taps: Array, every: int) -> Array:
     half = taps.size // 2
     padded = np.pad(values, ((half, half), (0, 0)), mode="edge")
     return np.asarray(decimate(padded, np.zeros((0, 0), dtype=np.bool_), taps, every))
-
-
-def _evaluation_points(vector: Array, parameters: Sequence[str]) -> tuple[Array, Array, Array]:
-    """Return the points at which the simulation is evaluated: here, and ahead and back in each parameter.
-
-    Further returned are the points at which only sensors change, and the distances from ahead to back.
-    """
-    points = np.tile(vector, (1 + 2 * len(parameters), 1))
-    sensed = np.zeros(len(points), dtype=np.bool_)
-    for j, name in enumerate(parameters):
-        i, step = INDEX[name], STEPS[name]
-        points[1 + 2 * j, i] += step
-        if name not in ONE_SIDED or vector[i] >= step:
-            points[2 + 2 * j, i] -= step
-        sensed[1 + 2 * j : 3 + 2 * j] = name in SENSED_ONLY
-    at = [INDEX[name] for name in parameters]
-    rows = np.arange(len(at))
-    return points, sensed, points[1 + 2 * rows, at] - points[2 + 2 * rows, at]
-
-
-def _predictions(
-    planar: Planar,
-    points: Array,
-    sensed: Array,
-    dt: float,
-    wheel_speed_mps: Array,
-    steer_rad: Array,
-    grade_rad: Array,
-    roll_rad: Array,
-    truth: Array,
-    known: Array,
-    taps: Array,
-    every: int,
-) -> Array:
-    """Return the low-pass filtered prediction of the simulation at each point (points, rows, channels).
-
-    ``truth`` is the motion of the body at all points where only sensors change.
-    """
-    m = max((wheel_speed_mps.shape[0] - taps.size) // every + 1, 0)
-    out = np.empty((points.shape[0], m, 7))
-    for i in range(points.shape[0]):
-        if sensed[i]:
-            shown = sense(planar, points[i], dt, truth)
-        else:
-            shown = replay(planar, points[i], dt, wheel_speed_mps, steer_rad, grade_rad, roll_rad)
-        out[i] = decimate(shown, known, taps, every)
-    return out
 
 
 def prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array, Array, Array, Array]:
@@ -288,7 +258,6 @@ def decimate(values: Array, known: Array, taps: Array, every: int) -> Array:
 
 def measured_channels(rows: Sequence[Any]) -> tuple[str, ...]:
     """Return the channels that any run, with what it measured, has, in the order of ``CHANNELS``."""
-    seen = np.zeros(len(CHANNELS), dtype=bool)
-    for run in rows:
-        seen |= np.isfinite(run.measured).any(axis=0)
-    return tuple(name for name, there in zip(CHANNELS, seen, strict=True) if there)
+    return tuple(
+        name for c, name in enumerate(CHANNELS) if any(np.isfinite(run.measured[:, c]).any() for run in rows)
+    )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from terrain.errors import DataError
 from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
 from terrain.logs.schema import POSE_CHANNELS
-from terrain.records import Array, RunLog, Stream, read_only
+from terrain.records import Array, RunLog, read_only
 from terrain.robots import Robot
 from terrain.slip_learning.measured import travelled
 
@@ -26,10 +26,8 @@ MIN_LENGTH_S = 4.0  #: Of a shorter run nothing is left once filters have settle
 #: and by so many times the usual deviation.
 JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
 
-BACKWARD_MPS, MIN_BACKWARD = (
-    0.02,
-    5,
-)  #: A wheel turns backward if it is faster than that on at least so many samples.
+#: A wheel turns backward if it is faster than that on at least so many samples.
+BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
 #: Least norm of the mean of the wheels' unit vectors at which the sum of currents measures traction: wheels within 18
 #: degrees of each other.
 PARALLEL = 0.95
@@ -70,21 +68,37 @@ class Signals:
 def signals_of(run: RunLog, robot: Robot) -> Signals:
     """Return the signals of a run, resampled to one clock.
 
+    Currents of omni wheels, which drive in three directions, are magnitudes.  Others get the sign of the wheel speed
+    where the motor driver logs magnitudes only: if a wheel turns backward and its current is never negative.  Braking
+    cannot be seen in such a log.
+
     Raises
     ------
     DataError
         if the run is of another robot or lacks inputs of the simulation, if none of its channels is
         simulated, or if it is too short.
     """
+    name = f"run {run.run_id}"
     if run.robot != robot.name:
-        raise DataError(
-            f"run {run.run_id} is of the robot {run.robot!r}, the simulation is of {robot.name!r}"
-        )
+        raise DataError(f"{name} is of the robot {run.robot!r}, the simulation is of {robot.name!r}")
     inputs = ("wheels", "steering") if robot.steered else ("wheels",)
-    for name in inputs:
-        if name not in run.streams:
-            raise DataError(f"run {run.run_id}: it has no stream {name!r}, which drives the simulation")
-    wheels, speeds = run.streams["wheels"], _wheel_speeds(run, robot)
+    for stream in inputs:
+        if stream not in run.streams:
+            raise DataError(f"{name}: it has no stream {stream!r}, which drives the simulation")
+    wheels, imu = run.streams["wheels"], run.streams.get("imu")
+    # a robot whose motors are not described logs speeds
+    for pattern in ("motor_{}_radps", "speed_{}_mps"):
+        names = [pattern.format(wheel) for wheel in robot.logged_wheels]
+        if set(names) <= set(wheels.channels):
+            break
+    else:
+        raise DataError(
+            f"{name}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "
+            f"{', '.join(robot.logged_wheels)} is required"
+        )
+    is_motor = names[0].startswith("motor")
+    scale = robot.wheel_radius_m / robot.motors.reduction_ratio if is_motor else 1.0
+    speeds = np.column_stack([wheels.channel(channel) for channel in names]) * scale
     # poses of an omni robot's body (of a camera above, motion capture) count where nothing else measures its speed
     pose, lidar = run.streams.get("pose"), run.streams.get("lidar")
     others = "odometry" in run.streams or (lidar is not None and "speed_x_mps" in lidar.channels)
@@ -92,16 +106,14 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
         robot.on_omni_wheels and pose is not None and set(POSE_CHANNELS) <= set(pose.channels) and not others
     )
 
-    used = [*inputs, *(name for name in ("imu", "odometry", "lidar") if name in run.streams)]
-    spans = [run.streams[name].time_s[[0, -1]] for name in [*used, "pose"][: len(used) + by_pose]]
-    start_s, end_s = (
-        float(pick(each)) for pick, each in zip((max, min), zip(*spans, strict=True), strict=True)
-    )
+    used = [*inputs, *(each for each in ("imu", "odometry", "lidar") if each in run.streams)]
+    spans_s = np.array([run.streams[each].time_s[[0, -1]] for each in [*used, "pose"][: len(used) + by_pose]])
+    start_s, end_s = float(spans_s[:, 0].max()), float(spans_s[:, 1].min())
     rate_hz = min(MAX_RATE_HZ, wheels.rate_hz)
     n = math.floor((end_s - start_s) * rate_hz + 1e-6) + 1 if end_s > start_s else 0
     if n < MIN_LENGTH_S * rate_hz:
         raise DataError(
-            f"run {run.run_id}: its streams have {max(end_s - start_s, 0.0):.1f} s in common, "
+            f"{name}: its streams have {max(end_s - start_s, 0.0):.1f} s in common, "
             f"at least {MIN_LENGTH_S:g} s are required"
         )
     time_s = start_s + np.arange(n) / rate_hz
@@ -111,17 +123,28 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
 
     steer = np.zeros((n, len(robot.steer_channels) or len(robot.wheels)))
     if robot.steered:
-        steer = resampled(run.streams["steering"].time_s, _steering(run, robot))
-    imu, tilt = run.streams.get("imu"), np.zeros((n, 2))
-    has_tilt = imu is not None and {"roll_rad", "pitch_rad"} <= set(imu.channels)
+        steering, angles = run.streams["steering"], []
+        for channel, zero in zip(robot.steer_channels, robot.steering_zeros_rad, strict=False):
+            raw = unwrapped(steering.channel(channel))
+            turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
+            angles.append(raw - zero - turn)
+        steer = resampled(steering.time_s, np.column_stack(angles))
+    tilt, has_tilt = np.zeros((n, 2)), imu is not None and {"roll_rad", "pitch_rad"} <= set(imu.channels)
     if imu is not None and has_tilt:
         tilt = resampled(imu.time_s, np.column_stack([-imu.channel("pitch_rad"), imu.channel("roll_rad")]))
     measured = np.full((n, len(CHANNELS)), np.nan)
     for channel, stamps_s, values in _measurements(run, robot, has_tilt, by_pose):
         measured[:, CHANNELS.index(channel)] = _resample(time_s, stamps_s, values)
-    currents = [f"current_{wheel}_a" for wheel in robot.wheels]
-    if set(currents) <= set(wheels.channels):
-        each = resampled(wheels.time_s, _currents(wheels, currents, speeds, robot))
+    names = [f"current_{wheel}_a" for wheel in robot.wheels]
+    if set(names) <= set(wheels.channels):
+        currents = np.column_stack([wheels.channel(channel) for channel in names])
+        if robot.on_omni_wheels:
+            currents = np.abs(currents)
+        else:
+            for current, speed in zip(currents.T, speeds.T, strict=False):
+                if (speed < -BACKWARD_MPS).sum() >= MIN_BACKWARD and not np.nanmin(current) < 0:
+                    current *= np.sign(speed)
+        each = resampled(wheels.time_s, currents)
         measured[:, CHANNELS.index(CURRENT)] = np.sum(list(each.T), axis=0)
         parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
         measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
@@ -129,22 +152,12 @@ def signals_of(run: RunLog, robot: Robot) -> Signals:
             measured[:, CHANNELS.index(TURNING_CURRENT)] = each[:, 1] - each[:, 0]
     if not np.isfinite(measured).any():
         raise DataError(
-            f"run {run.run_id}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
+            f"{name}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
             "over ground or an accelerometer with its tilt is required"
         )
     terrain = run.terrains[0] if len(run.terrains) == 1 else ""
     on_clock = resampled(wheels.time_s, speeds), steer, tilt[:, 0], tilt[:, 1], measured
     return Signals(run.run_id, terrain, 1 / rate_hz, float(time_s[0]), *on_clock, run.session)
-
-
-def _steering(run: RunLog, robot: Robot) -> Array:
-    """Return the steering angles (n, steered wheels) as logged, zeros and whole turns subtracted."""
-    angles = []
-    for name, zero in zip(robot.steer_channels, robot.steering_zeros_rad, strict=False):
-        raw = unwrapped(run.streams["steering"].channel(name))
-        turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
-        angles.append(raw - zero - turn)
-    return np.column_stack(angles)
 
 
 def _measurements(
@@ -164,7 +177,12 @@ def _measurements(
             yield channel, seen.time_s[:-1] + 0.5 * step_s, rate
     camera = run.streams.get("odometry")
     if camera is not None and set(CAMERA_CHANNELS) <= set(camera.channels):
-        speed = _without_jumps(camera, body_motion(camera, robot.camera).speed_mps)
+        speed = body_motion(camera, robot.camera).speed_mps
+        width = 2 * round(JUMP_S * camera.rate_hz) + 1
+        off = np.abs(speed - median_filter(speed, (width, 1), mode="nearest"))
+        usual = 1.48 * np.nanmedian(off, axis=0) if len(off) else np.zeros(2)
+        relocalised = (off > np.maximum(JUMP_MPS, JUMP_SIGMAS * usual)).any(axis=1)
+        speed = np.where(relocalised[:, None], np.nan, speed)
         yield SPEED_X, camera.time_s, speed[:, 0]
         yield SPEED_Y, camera.time_s, speed[:, 1]
     else:
@@ -173,47 +191,6 @@ def _measurements(
     for stream, name, channel in [*direct, ("lidar", "yaw_rate_radps", HEADING)]:
         if stream in run.streams and name in run.streams[stream].channels:
             yield channel, run.streams[stream].time_s, run.streams[stream].channel(name)
-
-
-def _wheel_speeds(run: RunLog, robot: Robot) -> Array:
-    """Wheel speeds (n, wheels that are logged), from wheel speeds or from the motors' rates."""
-    wheels = run.streams["wheels"]
-    for pattern in ("motor_{}_radps", "speed_{}_mps"):
-        names = [pattern.format(wheel) for wheel in robot.logged_wheels]
-        if set(names) <= set(wheels.channels):
-            is_motor = pattern.startswith("motor")  # a robot whose motors are not described logs speeds
-            scale = robot.wheel_radius_m / robot.motors.reduction_ratio if is_motor else 1.0
-            return np.column_stack([wheels.channel(name) for name in names]) * scale
-    raise DataError(
-        f"run {run.run_id}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "
-        f"{', '.join(robot.logged_wheels)} is required"
-    )
-
-
-def _currents(wheels: Stream, names: Sequence[str], speeds: Array, robot: Robot) -> Array:
-    """Return the motor currents (n, wheels): of omni wheels, which drive in three directions, their magnitudes.
-
-    They get the sign of the wheel speed where the motor driver logs magnitudes only: if a wheel turns backward and its
-    current is never negative.  Braking cannot be seen in such a log.
-    """
-    columns = []
-    for i, name in enumerate(names):
-        current = wheels.channel(name)
-        if robot.on_omni_wheels:
-            current = np.abs(current)
-        elif (speeds[:, i] < -BACKWARD_MPS).sum() >= MIN_BACKWARD and not np.nanmin(current) < 0:
-            current = current * np.sign(speeds[:, i])
-        columns.append(current)
-    return np.column_stack(columns)
-
-
-def _without_jumps(seen: Stream, speed_mps: Array) -> Array:
-    """Return speeds (n, 2) with NaN where the camera relocalised."""
-    width = 2 * round(JUMP_S * seen.rate_hz) + 1
-    off = np.abs(speed_mps - median_filter(speed_mps, (width, 1), mode="nearest"))
-    usual = 1.48 * np.nanmedian(off, axis=0) if len(off) else np.zeros(2)
-    jumps = (off > np.maximum(JUMP_MPS, JUMP_SIGMAS * usual)).any(axis=1)
-    return np.where(jumps[:, None], np.nan, speed_mps)
 
 
 def _resample(time_s: Array, stamps_s: Array, values: Array) -> Array:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
-from types import MappingProxyType
+from dataclasses import dataclass, field, replace
 
-from terrain.effects import CHANNELS, INDEX, NUISANCES, Effect, library_of, vector_of
-from terrain.errors import ConfigError
+from terrain.effects import Effect, library_of, vector_of
 from terrain.records import Array
 from terrain.robots import Robot
 from terrain.simulation.plants.planar import Ground, Planar, make_planar
@@ -15,19 +13,12 @@ from terrain.simulation.plants.planar import Ground, Planar, make_planar
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """What :func:`terrain.discrepancy.diagnose.diagnose` compares measured runs with.
-
-    Raises
-    ------
-    ConfigError
-        for a parameter that is unknown, or a scatter of a parameter that is no nuisance.
-    """
+    """What :func:`terrain.discrepancy.diagnose.diagnose` compares measured runs with."""
 
     robot: Robot
     ground: Ground = field(default_factory=Ground)  #: default terrain
-    effects: Mapping[str, float] = field(
-        default_factory=dict
-    )  #: that are built in already; those not named are 0
+    #: that are built in already; those not named are 0
+    effects: Mapping[str, float] = field(default_factory=dict)
     #: standard deviation from run to run of parameters in NUISANCES; those not named are 0
     scatter: Mapping[str, float] = field(default_factory=dict)
     grounds: Mapping[str, Ground] = field(default_factory=dict)  #: terrains by the label of a run
@@ -40,26 +31,6 @@ class Simulation:
     varied_scatter: Mapping[str, float] = field(default_factory=dict)
     #: how much the residual of a channel depends on an input by the simulation's own error
     probe_error: Mapping[tuple[str, str], float] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        vector_of(self.effects)
-        for name, std in self.scatter.items():
-            if name not in NUISANCES or not std >= 0:
-                raise ConfigError(
-                    f"scatter: {name} is {std!r}; a standard deviation of a nuisance is required"
-                )
-        for kind in ("model_error", "varied_error", "varied_scatter"):
-            for name, size in getattr(self, kind).items():
-                if name not in INDEX or not size >= 0:
-                    raise ConfigError(f"{kind}: {name} is {size!r}; a size from 0 of a parameter is required")
-        for (channel, name), size in self.probe_error.items():
-            if channel not in CHANNELS or not size >= 0:
-                raise ConfigError(
-                    f"probe_error: {name} in {channel} is {size!r}; a size from 0 in a channel is required"
-                )
-        for each in fields(self):
-            if isinstance(value := getattr(self, each.name), Mapping):
-                object.__setattr__(self, each.name, MappingProxyType(dict(value)))
 
     @property
     def library(self) -> tuple[Effect, ...]:

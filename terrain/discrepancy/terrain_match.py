@@ -12,7 +12,7 @@ import numpy as np
 from terrain.discrepancy.evidence import evidence_at
 from terrain.discrepancy.residuals import low_pass_of
 from terrain.discrepancy.search import names_of
-from terrain.discrepancy.signals import Signals, signals_of
+from terrain.discrepancy.signals import signals_of
 from terrain.discrepancy.simulation import Simulation
 from terrain.effects import Effect, parameters_of
 from terrain.errors import ConfigError, DataError
@@ -51,40 +51,50 @@ def simulation_for(
 ) -> tuple[Simulation, tuple[TerrainMatch, ...]]:
     """Return the simulation of runs, and the terrain that each of their labels is simulated on.
 
-    A label that is the name of a soil of the package is simulated on that soil, all others on the default
-    terrain.
+    A label that is the name of a soil of the package is simulated on that soil, all others on the default terrain.  On
+    soils the simulation has an error of its own, and a part of the measured tilt acts as a slope: a tilt that is none,
+    of a body that rides over bumps, takes no traction; simulated as a slope it biases mass, resistance and slip.  The
+    runs fit best with the part that acts, all parameters of the library freed.
     """
     labels = sorted({run.terrains[0] if len(run.terrains) == 1 else "" for run in runs})
-    known = {*soil_names(), *extra_soil_names()}
-    grounds = {
-        label: planar_ground(robot, load_soil(label))
-        for label in labels
-        if label in known and drivable(robot, label)
-    }
+    known, grounds = {*soil_names(), *extra_soil_names()}, {}
+    for label in labels:
+        if label in known and drivable(robot, label):
+            grounds[label] = planar_ground(robot, load_soil(label))
     simulation = Simulation(robot, Ground(), robot.effects, load_scatter()._asdict(), grounds)
     if grounds:
-        signals = [signals_of(run, robot) for run in runs]
-        simulation = with_effective_tilt(with_model_error(simulation), signals, library)
-    ratios = {label: ground.effective_ratio for label, ground in simulation.grounds.items()}
-    return simulation, tuple(
-        TerrainMatch(label, label if label in ratios else None, ratios.get(label)) for label in labels
-    )
-
-
-def with_model_error(simulation: Simulation) -> Simulation:
-    """Return the simulation with its own error on the soils of the package."""
-    parameters, error = set(parameters_of(simulation.robot.drive)), load_model_error()
-    common, varied, scatter = (
-        {name: size for name, size in sizes.items() if name in parameters}
-        for sizes in (error.common, error.varied, error.scatter)
-    )
-    return replace(
-        simulation,
-        model_error=common,
-        varied_error=varied,
-        varied_scatter=scatter,
-        probe_error=error.probes,
-    )
+        parameters, error = parameters_of(robot.drive), load_model_error()
+        common, varied, scatter = (
+            {name: size for name, size in sizes.items() if name in parameters}
+            for sizes in (error.common, error.varied, error.scatter)
+        )
+        simulation = replace(
+            simulation,
+            model_error=common,
+            varied_error=varied,
+            varied_scatter=scatter,
+            probe_error=error.probes,
+        )
+    signals = [signals_of(run, robot) for run in runs] if grounds else []
+    for label, ground in list(grounds.items()):
+        own = [run for run in signals if run.terrain == label]
+        if not own:
+            continue
+        losses = np.zeros(len(RATIOS))
+        for k, ratio in enumerate(RATIOS):
+            tried = replace(simulation, grounds={label: ground._replace(effective_ratio=ratio)})
+            info = evidence_at(own, tried, simulation.vector, names_of(library), low_pass_of(own))
+            # minus twice the log-likelihood of what the whole library leaves, up to a constant
+            scale = -np.log(np.abs(info.noise.filters[:, 0]))
+            for run in info.rows:
+                size = np.log(info.noise.size(run.pace_mps)) + scale
+                losses[k] += 2.0 * float(size[np.isfinite(run.residual) & np.isfinite(size)].sum())
+        ratio, least = best_ratio(losses)
+        effective = ratio if losses[-1] - least > TILT_LOSS else 1.0
+        grounds[label] = ground._replace(effective_ratio=effective)
+    ratios = {label: ground.effective_ratio for label, ground in grounds.items()}
+    matches = (TerrainMatch(label, label if label in ratios else None, ratios.get(label)) for label in labels)
+    return replace(simulation, grounds=grounds), tuple(matches)
 
 
 def drivable(robot: Robot, soil: str) -> bool:
@@ -129,34 +139,6 @@ def check_robots(runs: Sequence[RunLog], robot: Robot) -> None:
         raise DataError(
             f"{n} of {len(runs)} runs are of the robot {name!r}; the simulation is of {robot.name!r}"
         )
-
-
-def with_effective_tilt(
-    simulation: Simulation, signals: Sequence[Signals], library: Sequence[Effect]
-) -> Simulation:
-    """Return the simulation with the part of the measured tilt that acts as a slope on each labelled terrain.
-
-    A tilt that is no slope, of a body that rides over bumps, takes no traction; simulated as a slope it biases
-    mass, resistance and slip.  The runs fit best with the part that acts, all parameters of the library freed.
-    """
-    grounds, names = dict(simulation.grounds), names_of(library)
-    for terrain, ground in simulation.grounds.items():
-        runs = [run for run in signals if run.terrain == terrain]
-        losses = np.zeros(len(RATIOS))
-        for k, ratio in enumerate(RATIOS if runs else ()):
-            tried = replace(simulation, grounds={terrain: ground._replace(effective_ratio=ratio)})
-            info = evidence_at(runs, tried, simulation.vector, names, low_pass_of(runs))
-            # minus twice the log-likelihood of what the whole library leaves, up to a constant
-            scale = -np.log(np.abs(info.noise.filters[:, 0]))
-            for run in info.rows:
-                size = np.log(info.noise.size(run.pace_mps)) + scale
-                losses[k] += 2.0 * float(size[np.isfinite(run.residual) & np.isfinite(size)].sum())
-        if runs:
-            ratio, least = best_ratio(losses)
-            grounds[terrain] = ground._replace(
-                effective_ratio=ratio if losses[-1] - least > TILT_LOSS else 1.0
-            )
-    return replace(simulation, grounds=grounds)
 
 
 def best_ratio(losses: Array) -> tuple[float, float]:

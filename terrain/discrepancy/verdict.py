@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, NamedTuple
 
-from terrain.discrepancy.faults import Fault
+from terrain.discrepancy.health import Clock, Excluded, Fault
 from terrain.records import Array
 
 AGREE_P = 0.01
@@ -151,21 +151,6 @@ class NextDrive(NamedTuple):
     scenario: str
     grade_deg: float
     reason: str
-
-
-class Excluded(NamedTuple):
-    """A run that is excluded as unfit, and why."""
-
-    run_id: str
-    reason: str
-
-
-class Clock(NamedTuple):
-    """Delay of the IMU's and the camera's logger behind the wheels' in a run, and its standard deviation."""
-
-    run_id: str
-    offset_s: float
-    std_s: float
 
 
 class Covariance(NamedTuple):

@@ -23,7 +23,6 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from enum import StrEnum
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -86,7 +85,24 @@ def stream_quality(stream: Stream) -> StreamQuality:
     intervals_s = np.diff(stream.time_s)
     gap = intervals_s > GAP_PERIODS * np.median(intervals_s)
     longest = int(np.argmax(intervals_s))
-    constant = {name: constant_stretches(stream.channel(name)) for name in stream.channels}
+    kinds = {name: (name.partition("_")[0], name.rpartition("_")[2]) for name in stream.channels}
+    stuck, longest_constant_s = [], {}
+    for name, kind in kinds.items():
+        values, quantity = stream.channel(name), kind[0]
+        first, last = constant_stretches(values)
+        longest_constant_s[name] = float(np.max(stream.time_s[last] - stream.time_s[first], initial=0.0))
+        if not first.size or quantity not in (*IMU_QUANTITIES, "speed", "current"):
+            continue
+        if quantity in IMU_QUANTITIES:
+            is_stuck = np.max(last - first) + 1 >= STUCK_IMU_SAMPLES
+        elif quantity == "current" and np.unique(values[first]).size > 1:
+            is_stuck = False
+        else:
+            siblings = [other for other in kinds if other != name and kinds[other] == kind]
+            changes = [np.r_[0, np.cumsum(np.diff(stream.channel(other)) != 0.0)] for other in siblings]
+            is_stuck = any(np.max(n[last] - n[first]) >= STUCK_SIBLING_CHANGES for n in changes)
+        if is_stuck:
+            stuck.append(name)
     return StreamQuality(
         n=len(stream),
         rate_hz=stream.rate_hz,
@@ -95,12 +111,9 @@ def stream_quality(stream: Stream) -> StreamQuality:
         longest_gap_s=float(intervals_s[longest]) if gap.any() else 0.0,
         longest_gap_at_s=float(stream.time_s[longest]) if gap.any() else float("nan"),
         jitter_s=float(np.std(intervals_s[~gap])),
-        stuck=tuple(name for name, (first, last) in constant.items() if _is_stuck(stream, name, first, last)),
+        stuck=tuple(stuck),
         n_nonfinite={name: int(np.sum(~np.isfinite(stream.channel(name)))) for name in stream.channels},
-        longest_constant_s={
-            name: float(np.max(stream.time_s[last] - stream.time_s[first], initial=0.0))
-            for name, (first, last) in constant.items()
-        },
+        longest_constant_s=longest_constant_s,
     )
 
 
@@ -117,28 +130,6 @@ def constant_stretches(values: Array) -> tuple[Array, Array]:
     last = np.r_[first[1:] - 1, values.size - 1]
     finite = np.isfinite(values[first])
     return first[finite], last[finite]
-
-
-def _is_stuck(stream: Stream, name: str, first: Array, last: Array) -> bool:
-    quantity = name.partition("_")[0]
-    if not first.size:
-        return False
-    if quantity in IMU_QUANTITIES:
-        return bool(np.max(last - first) + 1 >= STUCK_IMU_SAMPLES)
-    if quantity not in ("speed", "current"):
-        return False
-    if quantity == "current" and np.unique(stream.channel(name)[first]).size > 1:
-        return False
-    for sibling in stream.channels:
-        if sibling != name and _kind(sibling) == _kind(name):
-            n_changes = np.r_[0, np.cumsum(np.diff(stream.channel(sibling)) != 0.0)]
-            if np.max(n_changes[last] - n_changes[first]) >= STUCK_SIBLING_CHANGES:
-                return True
-    return False
-
-
-def _kind(channel: str) -> tuple[str, str]:
-    return channel.partition("_")[0], channel.rpartition("_")[2]
 
 
 class Level(StrEnum):
@@ -163,6 +154,10 @@ class Check(NamedTuple):
     place: str  #: stream or channel that it is about
     measured: float  #: the figure that was judged; NaN where there is none
     sentence: str  #: what was measured, and what is expected
+
+
+def _unknown(check: str, place: str, why: str, measured: float = math.nan) -> Check:
+    return Check(check, UNKNOWN, place, measured, why)
 
 
 class Scale(NamedTuple):
@@ -226,41 +221,34 @@ MIN_GRAVITY_S = 1.0  #: Over shorter runs a brake is as large as gravity.
 
 def _gravity(run: RunLog) -> Check:
     stream, names = run.streams.get("imu"), [f"accel_{axis}_mps2" for axis in AXES]
-    judged = partial(_first, "gravity", "imu")
     if stream is None or not set(names) <= set(stream.channels):
-        return judged(math.nan, (True, UNKNOWN, "gravity: the run has no accelerometer of three axes"))
+        return _unknown("gravity", "imu", "gravity: the run has no accelerometer of three axes")
     values = np.column_stack([stream.channel(name) for name in names])
     finite = np.isfinite(values).all(axis=1)
     if finite.sum() < MIN_SAMPLES or np.ptp(stream.time_s[finite]) < MIN_GRAVITY_S:
-        few = f"gravity: fewer than {MIN_GRAVITY_S:g} s of the accelerometer"
-        return judged(math.nan, (True, UNKNOWN, few))
+        return _unknown("gravity", "imu", f"gravity: fewer than {MIN_GRAVITY_S:g} s of the accelerometer")
     mean = values[finite].mean(axis=0)
     size = float(np.linalg.norm(mean))
-    ratio, near = size / GRAVITY_MPS2, 1.0 - IMPLAUSIBLE_GRAVITY_RATIO[0]
+    ratio, (low, high) = size / GRAVITY_MPS2, IMPLAUSIBLE_GRAVITY_RATIO
     upright = float(mean[2] / size) if size else math.nan
     force = f"gravity: the mean specific force is {size:.3g} m/s^2"
     measured, along = f"{force}, {GRAVITY_MPS2:.3g} is expected", ", ".join(f"{part:.3g}" for part in mean)
     axes = f"gravity: it is ({along}) m/s^2 along x, y and z, mostly along +z is expected"
-    return judged(
-        size,
-        (abs(size - 1.0) <= near, IMPLAUSIBLE, f"{measured}: an accelerometer in g read as m/s^2?"),
-        (abs(ratio / GRAVITY_MPS2 - 1.0) <= near, IMPLAUSIBLE, f"{measured}: one in m/s^2 read as g?"),
+    cases: list[Case] = [
+        (abs(size - 1.0) <= 1.0 - low, IMPLAUSIBLE, f"{measured}: an accelerometer in g read as m/s^2?"),
+        (abs(ratio / GRAVITY_MPS2 - 1.0) <= 1.0 - low, IMPLAUSIBLE, f"{measured}: one in m/s^2 read as g?"),
         (ratio < NO_GRAVITY_RATIO, DOUBTFUL, f"{measured}: gravity removed?"),
-        (
-            not _within(ratio, IMPLAUSIBLE_GRAVITY_RATIO),
-            IMPLAUSIBLE,
-            f"{measured}: another unit, or a scale?",
-        ),
+        (not low <= ratio <= high, IMPLAUSIBLE, f"{measured}: another unit, or a scale?"),
         (upright < -TILTED_RATIO, IMPLAUSIBLE, f"{axes}: z points down?"),
         (upright < TILTED_RATIO, IMPLAUSIBLE, f"{axes}: another axis points up?"),
         (upright < UPRIGHT_RATIO, DOUBTFUL, f"{axes}: a tilted sensor, or a steep slope?"),
-        (not _within(ratio, GRAVITY_RATIO), DOUBTFUL, f"{measured}: a wrong scale, or an offset?"),
-        (True, OK, f"{force}, along z"),
-    )
-
-
-def _within(value: float, bounds: tuple[float, float]) -> bool:
-    return bounds[0] <= value <= bounds[1]
+        (
+            not GRAVITY_RATIO[0] <= ratio <= GRAVITY_RATIO[1],
+            DOUBTFUL,
+            f"{measured}: a wrong scale, or an offset?",
+        ),
+    ]
+    return _first("gravity", "imu", size, *cases, (True, OK, f"{force}, along z"))
 
 
 # -- Yaw rate: the gyro beside the turn of a left and a right wheel -------------------------------------------
@@ -283,45 +271,40 @@ MAX_IMPLAUSIBLE_TURN_RATIO = 8.0
 
 def _turns(run: RunLog, scale: Scale) -> Check:
     """Return how the gyro's yaw rate agrees with the turn of a left and a right wheel."""
-    judged, described = partial(_first, "yaw rate", "gyro_z_radps"), math.isfinite(scale.track_m)
+    about, described = ("yaw rate", "gyro_z_radps"), math.isfinite(scale.track_m)
     try:
-        found = yaw_rate_pair(run, scale.track_m if described else 1.0)
+        pair = yaw_rate_pair(run, scale.track_m if described else 1.0)
     except DataError:
-        return judged(
-            math.nan, (True, UNKNOWN, "yaw rate: no gyro about z, or no left and right wheel speed")
-        )
-    if found is None:
-        return judged(math.nan, (True, UNKNOWN, "yaw rate: too few samples of gyro and wheels together"))
+        return _unknown(*about, "yaw rate: no gyro about z, or no left and right wheel speed")
+    if pair is None:
+        return _unknown(*about, "yaw rate: too few samples of gyro and wheels together")
     fits = []  # likeness at a shift, slope of the gyro over the wheels, and the larger of both rates
     for shift_s in np.linspace(-MAX_SHIFT_S, MAX_SHIFT_S, N_SHIFTS):
-        both = np.column_stack([found[0].at(found[0].time_s + shift_s), found[0].measured])
+        both = np.column_stack([pair[0].at(pair[0].time_s + shift_s), pair[0].measured])
         there = both[np.isfinite(both[:, 0])]
         power = (there**2).sum(axis=0)
         if len(there) >= max(MIN_YAW_RATES, 0.5 * len(both)) and power.min() > 0.0:
             like, slope = (float(each[0]) for each in agreement(there[:, :1], there[:, 1:]))
             fits.append((like, slope, math.sqrt(power.max() / len(there))))
     if not fits:
-        return judged(math.nan, (True, UNKNOWN, "yaw rate: gyro and wheels hardly overlap"))
+        return _unknown(*about, "yaw rate: gyro and wheels hardly overlap")
     likeness, ratio, rate_radps = max(fits, key=lambda fit: abs(fit[0]))
     other = max(-math.copysign(1.0, likeness) * fit[0] for fit in fits)
+    like = f"(likeness {likeness:.2f} of 1)"
     if rate_radps < MIN_TURN_RADPS or abs(likeness) < MIN_LIKENESS or other > MAX_OTHER_LIKENESS:
-        none = f"yaw rate: gyro and wheels show no turns in common (likeness {likeness:.2f} of 1)"
-        return judged(likeness, (True, UNKNOWN, none))
-    measured = (
-        f"yaw rate: the gyro shows {ratio:.3g} times the yaw rate of the wheels (likeness {likeness:.2f} of 1)"
-        if described
-        else f"yaw rate: the gyro shows {ratio:.3g} rad/s for each m/s between the sides"
-    )
+        return _unknown(*about, f"yaw rate: gyro and wheels show no turns in common {like}", likeness)
+    measured = f"yaw rate: the gyro shows {ratio:.3g} rad/s for each m/s between the sides"
+    if described:
+        measured = f"yaw rate: the gyro shows {ratio:.3g} times the yaw rate of the wheels {like}"
     low, high = TURN_RATIO
     odd = f"{measured}, {low:g} to {high:g} is expected"
-    return judged(
-        ratio,
+    cases: list[Case] = [
         (likeness < 0.0, IMPLAUSIBLE, f"{odd}: turned sign of the gyro, or sides swapped"),
         (ratio > MAX_IMPLAUSIBLE_TURN_RATIO, IMPLAUSIBLE, f"{odd}: a gyro in deg/s read as rad/s?"),
         (ratio < low, DOUBTFUL, f"{odd}: wheels that dig in, or in rad/s or km/h read as m/s?"),
         (ratio > high, DOUBTFUL, f"{odd}: another track?"),
-        (True, OK, measured),
-    )
+    ]
+    return _first(*about, ratio, *cases, (True, OK, measured))
 
 
 # -- Wheel speed: what a robot reaches ------------------------------------------------------------------------
@@ -336,13 +319,12 @@ SPEED_QUANTILE = 0.99
 
 
 def _speeds(run: RunLog, scale: Scale) -> Check:
-    judged, stream = partial(_first, "wheel speed", "wheels"), run.streams.get("wheels")
-    speeds = np.empty(0)
+    about, stream, speeds = ("wheel speed", "wheels"), run.streams.get("wheels"), np.empty(0)
     if stream is not None:
         speeds = stream.values[:, [name.startswith("speed_") for name in stream.channels]]
         speeds = np.abs(speeds[np.isfinite(speeds)])
     if not speeds.size:
-        return judged(math.nan, (True, UNKNOWN, "wheel speed: the run has none"))
+        return _unknown(*about, "wheel speed: the run has none")
     fast = float(np.quantile(speeds, SPEED_QUANTILE))
     low, high = MAX_SPEED_MPS
     expected = f"up to {low:g} m/s is expected"
@@ -351,13 +333,9 @@ def _speeds(run: RunLog, scale: Scale) -> Check:
         expected = f"the robot's top speed is {scale.speed_max_mps:.3g} m/s"
     measured = f"wheel speed: {fast:.3g} m/s ({SPEED_QUANTILE:.0%} of the samples are slower)"
     odd = f"{measured}, {expected}: rad/s or km/h read as m/s?"
-    return judged(
-        fast,
-        (fast > max(low, high), IMPLAUSIBLE, odd),
-        (fast > low, DOUBTFUL, odd),
-        (fast == 0.0, UNKNOWN, "wheel speed: the wheels never turn"),
-        (True, OK, measured),
-    )
+    odd_cases: list[Case] = [(fast > max(low, high), IMPLAUSIBLE, odd), (fast > low, DOUBTFUL, odd)]
+    still = (fast == 0.0, UNKNOWN, "wheel speed: the wheels never turn")
+    return _first(*about, fast, *odd_cases, still, (True, OK, measured))
 
 
 # -- Sampling, names, values, constants, overlap --------------------------------------------------------------
@@ -378,25 +356,20 @@ MIN_OVERLAP_RATIO = (0.5, 0.1)
 
 def _sampling(name: str, stream: Stream) -> Check:
     rate_hz, duration_s = stream.rate_hz, stream.duration_s
+    (slowest, fastest), (shortest, longest) = RATE_HZ, DURATION_S
     place, n = f"sampling of stream {name!r}", len(stream)
-    slow_fast = ("ms read as s?", "s read as ms?")
-    rate = f"{place}: {rate_hz:.3g} Hz, {RATE_HZ[0]:g} Hz to {RATE_HZ[1] / 1e3:g} kHz is expected"
-    length = (
-        f"{place}: {duration_s:.3g} s long, {DURATION_S[0]:g} s to {DURATION_S[1] / 3600:g} h is expected"
-    )
-    slow = DOUBTFUL if name in NO_FEATURES else IMPLAUSIBLE
-    long = n >= MIN_SAMPLES and _within(rate_hz, RATE_HZ) and not _within(duration_s, DURATION_S)
-    return _first(
-        "sampling",
-        name,
-        duration_s if long else rate_hz,
+    rate = f"{place}: {rate_hz:.3g} Hz, {slowest:g} Hz to {fastest / 1e3:g} kHz is expected"
+    length = f"{place}: {duration_s:.3g} s long, {shortest:g} s to {longest / 3600:g} h is expected"
+    cases: list[Case] = [
         (n < MIN_SAMPLES, UNKNOWN, f"{place}: {n} samples show no rate"),
-        (rate_hz < RATE_HZ[0], slow, f"{rate}: {slow_fast[0]}"),
-        (rate_hz > RATE_HZ[1], IMPLAUSIBLE, f"{rate}: {slow_fast[1]}"),
-        (duration_s < DURATION_S[0], DOUBTFUL, f"{length}: {slow_fast[1]}"),
-        (duration_s > DURATION_S[1], DOUBTFUL, f"{length}: {slow_fast[0]}"),
+        (rate_hz < slowest, DOUBTFUL if name in NO_FEATURES else IMPLAUSIBLE, f"{rate}: ms read as s?"),
+        (rate_hz > fastest, IMPLAUSIBLE, f"{rate}: s read as ms?"),
+        (duration_s < shortest, DOUBTFUL, f"{length}: s read as ms?"),
+        (duration_s > longest, DOUBTFUL, f"{length}: ms read as s?"),
         (True, OK, f"{place}: {rate_hz:.3g} Hz over {duration_s:.3g} s"),
-    )
+    ]
+    rated = n < MIN_SAMPLES or not slowest <= rate_hz <= fastest or shortest <= duration_s <= longest
+    return _first("sampling", name, rate_hz if rated else duration_s, *cases)
 
 
 #: Unit of each quantity that features are made of by name.
@@ -422,44 +395,40 @@ def check_names(name: str, stream: Stream) -> list[Check]:
     >>> check.sentence
     "channel 'gyor_z_radps' of stream 'imu': no feature is made of 'gyor'; is it 'gyro_z_radps'?"
     """
-    sound = f"stream {name!r}: all quantities are known"
     if name in NO_FEATURES or name in ("estimator", "slip"):
-        checks, sound = [], f"stream {name!r}: no feature is made of its channels by name"
-    else:
-        checks = [_named(name, channel) for channel in stream.channels]
+        sound = f"stream {name!r}: no feature is made of its channels by name"
+        return [Check("channel names", OK, name, math.nan, sound)]
+    known, checks = (*FEATURE_UNITS, *OTHER_QUANTITIES.split()), []
+    for channel in stream.channels:
+        quantity, _, rest = channel.partition("_")
+        place = f"channel {channel!r} of stream {name!r}"
+        near = (
+            "" if quantity in known else next(iter(difflib.get_close_matches(quantity, known, 1, NEAR)), "")
+        )
+        other = f"{place}: no feature is made of {quantity!r}"
+        meant = f"{other}; is it {f'{near}_{rest}'!r}?"
+        unit, expected, fault = "", FEATURE_UNITS.get(quantity, ""), ""
+        features = signal_set_of(name, channel) is not None and bool(expected)
+        if features:
+            try:
+                unit = unit_of(channel)
+            except LogError as error:
+                fault = str(error)
+        of_imu, axis = quantity in IMU_QUANTITIES, rest.rpartition("_")[0]
+        wrong = f"{place}: {quantity} is in {unit!r}, {expected!r} is expected (a name ends in its unit)"
+        no_axis = f"{place}: {axis!r} is no axis, one of {', '.join(AXES)} is expected"
+        cases: list[Case] = [
+            (near in FEATURE_UNITS, IMPLAUSIBLE, meant),
+            (bool(near), DOUBTFUL, meant),
+            (quantity not in known, DOUBTFUL, f"{other} (features are made of {', '.join(FEATURE_UNITS)})"),
+            (bool(fault), DOUBTFUL, fault),
+            (features and unit != expected, IMPLAUSIBLE if of_imu else DOUBTFUL, wrong),
+            (features and of_imu and axis not in AXES, DOUBTFUL, no_axis),
+        ]
+        checks.append(_first("channel names", channel, math.nan, *cases, (True, OK, "")))
     odd = [check for check in checks if check.level is not OK]
-    return odd or [Check("channel names", OK, name, math.nan, sound)]
-
-
-def _named(stream: str, channel: str) -> Check:
-    quantity, _, rest = channel.partition("_")
-    place, known = f"channel {channel!r} of stream {stream!r}", (*FEATURE_UNITS, *OTHER_QUANTITIES.split())
-    near = "" if quantity in known else next(iter(difflib.get_close_matches(quantity, known, 1, NEAR)), "")
-    other = f"{place}: no feature is made of {quantity!r}"
-    unit, expected, fault = "", FEATURE_UNITS.get(quantity, ""), ""
-    features = signal_set_of(stream, channel) is not None and bool(expected)
-    if features:
-        try:
-            unit = unit_of(channel)
-        except LogError as error:
-            fault = str(error)
-    of_imu, axis = quantity in IMU_QUANTITIES, rest.rpartition("_")[0]
-    wrong = f"{place}: {quantity} is in {unit!r}, {expected!r} is expected (a name ends in its unit)"
-    return _first(
-        "channel names",
-        channel,
-        math.nan,
-        (near in FEATURE_UNITS, IMPLAUSIBLE, f"{other}; is it {f'{near}_{rest}'!r}?"),
-        (bool(near), DOUBTFUL, f"{other}; is it {f'{near}_{rest}'!r}?"),
-        (quantity not in known, DOUBTFUL, f"{other} (features are made of {', '.join(FEATURE_UNITS)})"),
-        (bool(fault), DOUBTFUL, fault),
-        (features and unit != expected, IMPLAUSIBLE if of_imu else DOUBTFUL, wrong),
-        (
-            features and of_imu and axis not in AXES,
-            *(DOUBTFUL, f"{place}: {axis!r} is no axis, one of {', '.join(AXES)} is expected"),
-        ),
-        (True, OK, ""),
-    )
+    sound = Check("channel names", OK, name, math.nan, f"stream {name!r}: all quantities are known")
+    return odd or [sound]
 
 
 def _values(run: RunLog) -> list[Check]:
@@ -507,24 +476,19 @@ def _constants(run: RunLog) -> list[Check]:
 def _overlap(run: RunLog) -> Check:
     streams = {name: stream for name, stream in run.streams.items() if name not in NO_FEATURES}
     longest_s = max((stream.duration_s for stream in streams.values()), default=0.0)
-    ratio = math.nan
-    if len(streams) > 1 and longest_s > 0.0:
-        start_s = max(stream.time_s[0] for stream in streams.values())
-        ratio = max(float(min(stream.time_s[-1] for stream in streams.values()) - start_s), 0.0) / longest_s
+    if len(streams) < 2:
+        return _unknown("overlap", "all", "overlap: there is one stream of sensors")
+    if not longest_s > 0.0:
+        return _unknown("overlap", "all", "overlap: the streams have no duration")
+    start_s = max(stream.time_s[0] for stream in streams.values())
+    end_s = min(stream.time_s[-1] for stream in streams.values())
+    ratio = max(float(end_s - start_s), 0.0) / longest_s
     measured = f"overlap: {100 * ratio:.0f} % of the longest stream lie in all ({', '.join(streams)})"
     doubtful, implausible = MIN_OVERLAP_RATIO
     expected = f"{measured}, {100 * doubtful:.0f} % is expected"
     odd = f"{expected}: other units of time, or loggers that were started apart?"
-    return _first(
-        "overlap",
-        "all",
-        ratio,
-        (len(streams) < 2, UNKNOWN, "overlap: there is one stream of sensors"),
-        (math.isnan(ratio), UNKNOWN, "overlap: the streams have no duration"),
-        (ratio < implausible, IMPLAUSIBLE, odd),
-        (ratio < doubtful, DOUBTFUL, odd),
-        (True, OK, measured),
-    )
+    odd_cases: list[Case] = [(ratio < implausible, IMPLAUSIBLE, odd), (ratio < doubtful, DOUBTFUL, odd)]
+    return _first("overlap", "all", ratio, *odd_cases, (True, OK, measured))
 
 
 # -- Sentences on many runs -----------------------------------------------------------------------------------

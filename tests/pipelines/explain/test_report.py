@@ -9,9 +9,9 @@ from pipelines.explain.figures import dependence_figures, parts_figure, run_figu
 from pipelines.report.numbers import NOT_KNOWN
 from pipelines.report.terminal import terminal_text
 from terrain.discrepancy import verdict
-from terrain.discrepancy.compared import channels_of
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
 from terrain.discrepancy.held_out import Change, ChannelGain, ChannelReference, Comparison, Gain, Reference
+from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.verdict import Clock, Excluded
 from terrain.robots import load_robot
 
@@ -165,7 +165,7 @@ def test_figures_show_the_residual_before_and_after_with_the_noise_about_the_mea
     errors = [np.nanstd(np.asarray(each.y) - np.asarray(measured.y)) for each in (before, after)]
     assert errors[1] < np.nanmean(half) < errors[0]
     strongest, every = dependence_figures(runs, noise)
-    place = channels_of(runs).index(name)
+    place = measured_channels(runs).index(name)
     for panel in (strongest.panels[place], every[place].panels[0]):
         first, second = panel.marks
         assert np.nanstd(second.y) < 0.5 * np.nanstd(first.y)

@@ -7,10 +7,16 @@ import numpy as np
 import pytest
 
 from pipelines.explain.statements import notes_of, split_ruled_out, statements_of
-from terrain.discrepancy.compared import ComparedRun
+from terrain.discrepancy.compared import (
+    ComparedRun,
+    Slope,
+    off_by,
+    slope_through_zero,
+    slopes_of,
+    terrains_apart,
+)
 from terrain.discrepancy.held_out import ChannelGain, Gain
 from terrain.discrepancy.robot_terms import in_robot_terms
-from terrain.discrepancy.slopes import Slope, off_by, slope_through_zero, slopes_of, terrains_apart
 from terrain.discrepancy.terrain_match import TerrainMatch
 from terrain.discrepancy.verdict import (
     Cause,

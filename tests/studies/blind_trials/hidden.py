@@ -16,7 +16,7 @@ import numpy as np
 
 from studies.blind_trials.drives import STEP_HZ, Drives
 from studies.blind_trials.limits import Limits, Sensing, confusable_class
-from terrain.discrepancy.faults import Column, FaultKind
+from terrain.discrepancy.health import Column, FaultKind
 from terrain.effects import (
     BOTH,
     BOUNDS,
@@ -442,7 +442,7 @@ class WrittenFault(NamedTuple):
     drives: tuple[str, ...]
     stream: str
     write: Callable[[Stream, Robot], Stream]
-    kind: FaultKind  #: of the statement, as :class:`terrain.discrepancy.faults.Change` has it
+    kind: FaultKind  #: of the statement, as :class:`terrain.discrepancy.health.Change` has it
     column: Column
     word: str = ""  #: in the sentence
 

@@ -10,8 +10,8 @@ import pytest
 from pipelines.explain.statements import reference_text
 from pipelines.report.results import as_json
 from terrain.discrepancy.compared import ComparedRun, compare_runs
-from terrain.discrepancy.diagnosed_runs import acting_causes, extend, extended_effects
-from terrain.discrepancy.faults import Change, Column, Fault, FaultKind
+from terrain.discrepancy.diagnosed_runs import acting_causes, extended_effects
+from terrain.discrepancy.health import Change, Column, Fault, FaultKind
 from terrain.discrepancy.held_out import (
     DRIVEN,
     black_box_reference,
@@ -135,15 +135,11 @@ def diagnosis(robot="husky", cov=None, **values):
 def test_causes_are_added_to_what_is_built_in_already_of_the_same_robot():
     built_in = {"payload_ratio": 0.1, "scrub_ratio": 0.02}
     simulation = Simulation(HUSKY, effects=built_in, scatter={"gyro_bias_radps": 0.1})
-    extended = extend(simulation, diagnosis(payload_ratio=0.05, gyro_scale_ratio=0.02))
+    extended = simulation.with_effects({"payload_ratio": 0.05, "gyro_scale_ratio": 0.02})
     assert extended.effects == pytest.approx(
         {"payload_ratio": 0.15, "scrub_ratio": 0.02, "gyro_scale_ratio": 0.02}
     )
     assert (extended.robot, extended.scatter) == (simulation.robot, simulation.scatter)
-    with pytest.raises(ConfigError, match="names no cause"):
-        extend(simulation, diagnosis())
-    with pytest.raises(ConfigError, match="'agrimaro'"):
-        extend(simulation, diagnosis("agrimaro", payload_ratio=0.05))
 
 
 def test_the_covariance_of_what_is_found_again_replaces_the_known_one():

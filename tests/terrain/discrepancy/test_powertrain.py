@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from terrain.discrepancy.faults import Change, Column, Fault, FaultKind
+from terrain.discrepancy.health import Change, Column, Fault, FaultKind
 from terrain.discrepancy.powertrain import ABSENT, NAMES, STEP_S, PartStatus, follow, powertrain_of
 from terrain.logs.drive import DriveRobot, find_runs
 from terrain.records import RunLog, Stream

@@ -5,7 +5,7 @@ import pytest
 from studies.blind_trials.drives import CAR_MPS2, STEP_HZ, car_drives
 from studies.blind_trials.limits import limits_of
 
-from terrain.discrepancy.faults import candidate_changes
+from terrain.discrepancy.health import candidate_changes
 from terrain.discrepancy.powertrain import traces_of
 from terrain.discrepancy.robot_terms import in_robot_terms, value_in_robot_terms
 from terrain.discrepancy.signals import signals_of

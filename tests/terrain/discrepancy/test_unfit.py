@@ -9,10 +9,16 @@ from studies.blind_trials.trial import simulation_of
 
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.clocks import latencies_of, shifts_of
-from terrain.discrepancy.faults import responses_of
+from terrain.discrepancy.health import (
+    agreement_of,
+    clocks_of,
+    odd_runs,
+    on_own_clocks,
+    stalled_runs,
+    unfit_runs,
+)
 from terrain.discrepancy.residuals import low_pass_of, rows_of
 from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.unfit import clocks_of, odd_runs, stalled_runs, unfit_runs
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot
@@ -100,16 +106,15 @@ def test_an_effect_common_to_all_runs_makes_none_unfit(excluded, robot, effects)
 def test_a_clock_offset_of_one_run_is_found_to_a_hundredth_of_a_second(sound, evidence):
     offset_s = [0.84 if i == ODD else 0.02 for i in range(6)]
     signals, info = evidence([late(run, by_s) for run, by_s in zip(sound, offset_s, strict=True)])
-    unfit, clocks, shift = unfit_runs(signals, info), clocks_of(info), shifts_of(info)
+    shift = shifts_of(info)
+    unfit, clocks = unfit_runs(signals, info), clocks_of(info, shift)
     assert unfit == (
         (f"run_{ODD}", "its IMU and camera are 0.84 s behind its wheels, 0.02 s behind in the other runs"),
     )
     assert [clock.run_id for clock in clocks] == [run.run_id for run in sound]
     assert_allclose([clock.offset_s for clock in clocks], offset_s, atol=0.01)
     assert all(0 < clock.std_s < 0.01 for clock in clocks)
-    # clocks that are known are taken
-    assert unfit_runs(signals, info, shift) == unfit
-    assert clocks_of(info, shift) == clocks
+    assert unfit_runs(signals, info, shift) == unfit  # clocks that are known are taken
 
 
 def test_clocks_out_of_the_search_exclude_a_run_and_are_refused_for_most_runs(sound, excluded):
@@ -212,18 +217,22 @@ def responses(runs):
     signals = [signals_of(run, HUSKY) for run in runs]
     planar, low_pass = simulation.planar_on(""), low_pass_of(signals)
     rows = [rows_of(run, planar, simulation.vector, (), low_pass) for run in signals]
-    return responses_of(rows, latencies_of(signals, simulation))
+    return on_own_clocks(rows, latencies_of(signals, simulation))
 
 
 def stalls(compared):
-    return stalled_runs(compared, [False] * len(compared), WAIT_S)
+    return stalled_runs(compared, agreement_of(compared), [False] * len(compared), WAIT_S)
+
+
+def odd(compared):
+    return odd_runs(compared, agreement_of(compared), range(len(compared)))
 
 
 @pytest.mark.parametrize("scatter", [0.1, 0.35])
 @pytest.mark.parametrize("n", [6, 40])
 def test_runs_that_scatter_have_no_outlier_and_none_stalls(n, scatter):
     compared = responses(runs_of(n, scatter))
-    assert odd_runs(compared, range(n)) == {}
+    assert odd(compared) == {}
     assert stalls(compared) == {}
 
 
@@ -237,20 +246,20 @@ def test_four_stalled_runs_of_forty_are_named_also_those_that_stall_later():
 
 
 @pytest.mark.parametrize(
-    ("odd", "named"),
+    ("others", "named"),
     [
         ({7: -0.3}, True),
         (dict.fromkeys(range(0, 40, 5), 0.1), True),
         (dict.fromkeys(range(0, 40, 2), 0.1), False),  # two groups are no outliers
     ],
 )
-def test_runs_of_another_robot_are_named_beside_those_of_their_terrain(odd, named):
-    compared = responses(runs_of(40, 0.08, odd))
-    reasons = odd_runs(compared, range(40))
-    assert set(reasons) == (set(odd) if named else set())
+def test_runs_of_another_robot_are_named_beside_those_of_their_terrain(others, named):
+    compared = responses(runs_of(40, 0.08, others))
+    reasons = odd(compared)
+    assert set(reasons) == (set(others) if named else set())
     assert all("its yaw rate is" in reason for reason in reasons.values())
-    labelled = [run._replace(terrain="ice") if i in odd else run for i, run in enumerate(compared)]
-    assert odd_runs(labelled, range(40)) == {}
+    labelled = [run._replace(terrain="ice") if i in others else run for i, run in enumerate(compared)]
+    assert odd(labelled) == {}
 
 
 def test_the_snow_runs_that_are_stuck_are_named_by_a_gap_of_their_response(measured):
