@@ -592,8 +592,8 @@ def _unit_faults(runs: Sequence[Rows], robot: Robot) -> tuple[Fault, ...]:
         return Fault(measured[0]._replace(factor=math.nan), fault.run_ids, sentence, left_out)
 
     # those that would show it if they had one of the units that others seem to have
-    told = np.nan_to_num(adds[suggested]).any(axis=0)
-    usual = [i for i in informed if not own[i] and (np.isfinite(logs[i]) & told).any()]
+    moved = np.nan_to_num(adds[suggested]).any(axis=0)
+    usual = [i for i in informed if not own[i] and (np.isfinite(logs[i]) & moved).any()]
     if len(usual) < MIN_USUAL_RATIO * len(informed):
         middle = _medians(logs[[i for i in informed if i not in usual]])
         best, rivals = likeliest(middle, options, robot)
@@ -1030,6 +1030,6 @@ def odd_runs(runs: Sequence[Rows], follows: Agreement, among: Sequence[int]) -> 
             far = np.flatnonzero(np.abs(off) > np.maximum(sigmas * np.hypot(scatter, error), LEAST_OFF))
             for k in far if len(far) <= MAX_ODD_RATIO * len(places) else ():
                 text = f"its {name} is {math.exp(off[k]):.2f} times what they make of the same wheels"
-                said = f"it is unlike the other runs: {text}, and they scatter by {scatter:.0%}"
-                reasons.setdefault(places[k], said)
+                reason = f"it is unlike the other runs: {text}, and they scatter by {scatter:.0%}"
+                reasons.setdefault(places[k], reason)
     return reasons

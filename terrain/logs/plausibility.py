@@ -290,12 +290,12 @@ def _turns(run: RunLog, scale: Scale) -> Check:
         return _unknown(*about, "yaw rate: gyro and wheels hardly overlap")
     likeness, ratio, rate_radps = max(fits, key=lambda fit: abs(fit[0]))
     other = max(-math.copysign(1.0, likeness) * fit[0] for fit in fits)
-    like = f"(likeness {likeness:.2f} of 1)"
+    alike = f"(likeness {likeness:.2f} of 1)"
     if rate_radps < MIN_TURN_RADPS or abs(likeness) < MIN_LIKENESS or other > MAX_OTHER_LIKENESS:
-        return _unknown(*about, f"yaw rate: gyro and wheels show no turns in common {like}", likeness)
+        return _unknown(*about, f"yaw rate: gyro and wheels show no turns in common {alike}", likeness)
     measured = f"yaw rate: the gyro shows {ratio:.3g} rad/s for each m/s between the sides"
     if described:
-        measured = f"yaw rate: the gyro shows {ratio:.3g} times the yaw rate of the wheels {like}"
+        measured = f"yaw rate: the gyro shows {ratio:.3g} times the yaw rate of the wheels {alike}"
     low, high = TURN_RATIO
     odd = f"{measured}, {low:g} to {high:g} is expected"
     cases: list[Case] = [
@@ -427,8 +427,8 @@ def check_names(name: str, stream: Stream) -> list[Check]:
         ]
         checks.append(_first("channel names", channel, math.nan, *cases, (True, OK, "")))
     odd = [check for check in checks if check.level is not OK]
-    sound = Check("channel names", OK, name, math.nan, f"stream {name!r}: all quantities are known")
-    return odd or [sound]
+    sound = f"stream {name!r}: all quantities are known"
+    return odd or [Check("channel names", OK, name, math.nan, sound)]
 
 
 def _values(run: RunLog) -> list[Check]:
