@@ -12,8 +12,8 @@ signal goes through a low-pass too, and its own lag and the filter's together ar
 5. rows that follow from others: vibration, changes of the wheels' speeds, rest; of a robot that skids the
    gyro's mean since the last tick.
 
-A whole log (:func:`measurement_table`) and the live chain (:mod:`terrain.estimation.live`) take the same compiled
-steps, one for each sample and one for each tick.  What looks ahead in a log is the cleaning, which leaves out and
+A whole log (:func:`measurement_table`) and the live chain (:class:`~terrain.estimation.live.LiveFilter`) take one
+compiled loop (:func:`run_feed`), live over one tick.  What looks ahead in a log is the cleaning, which leaves out and
 counts samples that cannot be true, the median periods and, unless ``causal``, latencies, the yaw at the start and the
 origin of positions.
 
@@ -50,8 +50,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
-from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -65,7 +64,7 @@ from terrain.kinematics.camera import QUATERNION_TOLERANCE
 from terrain.kinematics.wheels import no_slip_twist, point_velocity
 from terrain.logs.samples import longest_rise
 from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS, STEERING_CHANNELS
-from terrain.records import Array, RunLog, Stream, read_only
+from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 from terrain.signals import low_pass_step
 
@@ -78,23 +77,6 @@ MAX_AGE_PERIODS = 1.5
 GAP_PERIODS = 5.5
 #: A value that has jumped and stays is accepted after this long: it is left to the filter's gate.
 BELIEVED_S = 0.1
-#: What becomes of a value that jumped: it is accepted after a while; it is left out until it jumps back, as a speed
-#: over ground cannot have jumped; its jump is taken off, as a heading counts from anywhere.
-PASSING, LATCHED, SUBTRACTED = range(3)
-#: Largest change of a row between two samples: noise, and a second what a robot can do: half a g of speed, two thirds
-#: of a turn, twice the fastest steering; an accelerometer on rough terrain sees several g; roll and pitch turn by 3
-#: rad/s at the most, and a jump tilts gravity. Then what becomes of a value that jumped.
-JUMPS: dict[str, tuple[float, float, int]] = {
-    "accel_mps2": (20.0, 1000.0, PASSING),
-    "gyro_z_radps": (0.5, 20.0, PASSING),
-    "imu_yaw_rad": (0.1, 4.0, PASSING),
-    "steer_rad": (0.1, 5.0, PASSING),
-    "camera_speed_mps": (0.1, 5.0, LATCHED),
-    "camera_yaw_rate_radps": (0.2, 20.0, PASSING),
-    "camera_yaw_rad": (0.1, 4.0, SUBTRACTED),
-    "tilt_rad": (0.05, 3.0, LATCHED),
-}
-NO_JUMP = (math.inf, math.inf, PASSING)  #: Of a row whose changes are not judged.
 #: The camera tells 0, 1/3, 2/3 or 1; at 1/3 (low) and below it has lost its features.
 MIN_CONFIDENCE_RATIO = 0.34
 MAX_RATE_FACTOR = 2.0  #: Wheel rates above this multiple of the motor's maximum are discarded.
@@ -152,9 +134,6 @@ STREAMS = {
     "gnss": GNSS_CHANNELS,
 }
 STEERING, IMU, ODOMETRY, GNSS = range(len(STREAMS))  #: Number of each stream.
-
-N_CHANNELS = max(map(len, STREAMS.values()))
-
 #: Channels that never repeat themselves all at once, of streams that are left out where they do.
 NOISY = {"imu": slice(0, 6), "odometry": slice(3, 13)}
 #: Noise of a log that repeats exactly for so long is none: 50 samples of the camera, 25 of the IMU.
@@ -164,33 +143,50 @@ HEADING_SPEED_MPS = 0.2  #: Slower, a course is noise.
 #: A heading that is known no better is not known: at 1 m/s it would be 5 cm/s of sideways speed.
 MAX_HEADING_STD_RAD = 0.05
 
+#: What becomes of a value that jumped: it is accepted after a while; it is left out until it jumps back, as a speed
+#: over ground cannot have jumped; its jump is taken off, as a heading counts from anywhere.
+PASSING, LATCHED, SUBTRACTED = range(3)
+
+
+class Signal(NamedTuple):
+    """What is measured by a stream, behind a low-pass and held; how far it may jump, and what becomes of it then."""
+
+    stream: str
+    #: largest change between two samples: noise, and a second what a robot can do
+    jump: float = math.inf
+    jump_per_s: float = math.inf
+    policy: int = PASSING
+
+
 CAMERA_ROWS = ("camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps", "camera_yaw_rad")
 GNSS_ROWS = ("gnss_position_x_m", "gnss_position_y_m", "gnss_speed_x_mps", "gnss_speed_y_mps")
+_WHEEL_ROWS = tuple(f"wheel_{i}_radps" for i in (1, 2, 3))
+#: All signals, stream by stream, each a row but for roll and pitch, of which jumps are seen only. Half a g of speed,
+#: two thirds of a turn, twice the fastest steering; an accelerometer on rough terrain sees several g; roll and pitch
+#: turn by 3 rad/s at the most, and a jump tilts gravity.
+SIGNALS: dict[str, Signal] = {
+    **dict.fromkeys(("accel_x_mps2", "accel_y_mps2"), Signal("imu", 20.0, 1000.0)),
+    "gyro_z_radps": Signal("imu", 0.5, 20.0),
+    "imu_yaw_rad": Signal("imu", 0.1, 4.0),
+    **dict.fromkeys((f"steer_{i}_rad" for i in (1, 2, 3)), Signal("steering", 0.1, 5.0)),
+    **dict.fromkeys(CAMERA_ROWS[:2], Signal("odometry", 0.1, 5.0, LATCHED)),
+    "camera_yaw_rate_radps": Signal("odometry", 0.2, 20.0),
+    "camera_yaw_rad": Signal("odometry", 0.1, 4.0, SUBTRACTED),
+    **dict.fromkeys(GNSS_ROWS, Signal("gnss")),
+    **dict.fromkeys(("roll_rad", "pitch_rad"), Signal("imu", 0.05, 3.0, LATCHED)),
+}
+DERIVED_ROWS = (
+    "vibration_mps2",
+    *(f"wheel_{i}_growth_per_s" for i in (1, 2, 3)),
+    *(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)),
+    *("camera_age_s", "rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
+)
 SIDE_ROWS = ("wheel_left_mps", "wheel_right_mps")
 REST_ROW = "rest_gyro_radps"
-_ROWS = {
-    "wheel_radps": tuple(f"wheel_{i}_radps" for i in (1, 2, 3)),
-    "accel_mps2": ("accel_x_mps2", "accel_y_mps2"),
-    "gyro_z_radps": ("gyro_z_radps",),
-    "imu_yaw_rad": ("imu_yaw_rad",),
-    "steer_rad": tuple(f"steer_{i}_rad" for i in (1, 2, 3)),
-    "camera_speed_mps": CAMERA_ROWS[:2],
-    "camera_yaw_rate_radps": CAMERA_ROWS[2:3],
-    "camera_yaw_rad": CAMERA_ROWS[3:],
-    "gnss_position_m": GNSS_ROWS[:2],
-    "gnss_speed_mps": GNSS_ROWS[2:],
-    "vibration_mps2": ("vibration_mps2",),
-    "growth_per_s": tuple(f"wheel_{i}_growth_per_s" for i in (1, 2, 3)),
-    "change_m2ps3": tuple(f"wheel_{i}_change_m2ps3" for i in (1, 2, 3)),
-    "camera_age_s": ("camera_age_s",),
-    "rest_twist": ("rest_speed_x_mps", "rest_speed_y_mps", "rest_yaw_rate_radps"),
-    "side_mps": SIDE_ROWS,
-    "rest_gyro_radps": (REST_ROW,),
-}
-#: Names of all numbers of a :data:`ROW`, in its order.
-ROWS = tuple(name for names in _ROWS.values() for name in names)
-
-DERIVED_ROWS = ROWS[ROWS.index("vibration_mps2") : ROWS.index(SIDE_ROWS[0])]
+#: Names of all numbers of a row, in its order, behind which stand the variances of :data:`GNSS_ROWS`; NaN where
+#: nothing is measured.
+ROWS = (*_WHEEL_ROWS, *list(SIGNALS)[:-2], *DERIVED_ROWS, *SIDE_ROWS, REST_ROW)
+N_NUMBERS = len(ROWS) + len(GNSS_ROWS)
 _SIDES = (*SIDE_ROWS, "gyro_z_radps", *GNSS_ROWS, REST_ROW)
 ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {"swerve": ROWS[:-3], "skid_steer": _SIDES, "tracked": _SIDES}
 """Rows that a drive measures, of a swerve robot in the order of (6.3).
@@ -198,23 +194,26 @@ ROWS_OF_DRIVE: dict[str, tuple[str, ...]] = {"swerve": ROWS[:-3], "skid_steer": 
 Positions and GNSS speeds are in the world frame, east and north from where the antenna first was; yaw counts
 from east once the heading at the start is given; all else is in body axes."""
 
-
-def _sized(kind: Any, n: int) -> Any:
-    return kind if n == 1 else (kind, n)
-
-
-#: What is measured at a tick, NaN where nothing is: the numbers of :data:`ROWS`, and the variances of
-#: :data:`GNSS_ROWS`.
-ROW = record(
-    {name: _sized(float, len(names)) for name, names in _ROWS.items()} | {"gnss_variance": (float, 4)}
+#: Where signals stand among all of them, the signals among the rows, and the derived rows and the others among these.
+ACCEL, GYRO, IMU_YAW, STEER, SEEN, SEEN_TURN, SEEN_YAW, POSITION, TILT = map(
+    list(SIGNALS).index,
+    (
+        *("accel_x_mps2", "gyro_z_radps", "imu_yaw_rad", "steer_1_rad", "camera_speed_x_mps"),
+        *("camera_yaw_rate_radps", "camera_yaw_rad", "gnss_position_x_m", "roll_rad"),
+    ),
 )
-#: What is behind a low-pass and held, by the stream that measures it; of the tilt jumps are seen only.
-_SIGNALS = {
-    "steer_rad": "steering",
-    **dict.fromkeys(("accel_mps2", "gyro_z_radps", "imu_yaw_rad", "tilt_rad"), "imu"),
-    **dict.fromkeys(("camera_speed_mps", "camera_yaw_rate_radps", "camera_yaw_rad"), "odometry"),
-    **dict.fromkeys(("gnss_position_m", "gnss_speed_mps"), "gnss"),
-}
+FIRST_SIGNAL, VIBRATION, GROWTH, CHANGE, SEEN_AGE, REST_TWIST, SIDE, REST_GYRO = map(
+    ROWS.index,
+    (
+        *("accel_x_mps2", "vibration_mps2", "wheel_1_growth_per_s", "wheel_1_change_m2ps3", "camera_age_s"),
+        *("rest_speed_x_mps", "wheel_left_mps", REST_ROW),
+    ),
+)
+_GYRO, _YAW, _SEEN, _SEEN_YAW = (FIRST_SIGNAL + k for k in (GYRO, IMU_YAW, SEEN, SEEN_YAW))
+_POSITION, _VARIANCE = FIRST_SIGNAL + POSITION, len(ROWS)
+#: First and last signal of each stream.
+_SPANS = np.array([[STEER, SEEN], [ACCEL, STEER], [SEEN, POSITION], [POSITION, TILT]])
+
 #: What is constant of a signal: low-pass, longest step, oldest value, the largest change between two samples (a
 #: constant, and a part per second), whether a sample is given at one tick only, and what becomes of a jump.
 LIMIT = record(numbers("time_constant_s gap_s age_s jump jump_per_s") | {"once": bool, "policy": int})
@@ -228,41 +227,43 @@ LINE = record(
 )
 #: Of a channel that may freeze: last value, number of repetitions, longest run, and whether this one began in motion.
 CHANNEL = record(numbers("last repeated longest") | {"began_in_motion": bool})
+#: Of an unwrapped angle the last one, and the turns so far.
+_TURN = record(numbers("last_rad turned_rad"))
 
-_TURN = record(numbers("last_rad turned_rad"))  # of an unwrapped angle the last one, and the turns so far
-_AVERAGE = record({"sum": float, "n": int, "mean": float})
-_SIZES = {name: len(_ROWS.get(name, "xy")) for name in _SIGNALS}
-
-#: What is constant of a robot's feed.
+#: What is constant of a robot's feed: its signals, ages on arrival, its description; whether a sample counts from its
+#: arrival, and is taken without a look at those after it; the smoothing of the thesis, 0 for none.
 SETTINGS = record(
-    {name: _sized(LIMIT, n) for name, n in _SIZES.items()}
-    | {"latency_s": (float, len(STREAMS)), "is_steered": bool}
-    | numbers("reduction_ratio fastest_radps wheel_radius_m initial_yaw_rad gyro_bias_radps")
+    {"limits": (LIMIT, len(SIGNALS)), "latency_s": (float, len(STREAMS))}
+    | {"is_steered": bool, "is_causal": bool, "is_live": bool}
+    | numbers("reduction_ratio fastest_radps wheel_radius_m initial_yaw_rad gyro_bias_radps ema_alpha")
     | dict.fromkeys(("steering_zeros_rad", "accel_bias_mps2", "accel_scale_ratio"), (float, 3))
 )
 
 COUNTS = ("not_finite", "frozen", "low_confidence", "no_rotation", "jump")
+#: What a clock that is set back makes worthless.
+_OF_TIME = [
+    *("lines", "before", "received_s", "wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3"),
+    *numbers("vibration_square vibration_s tick_s rest_since_s camera_s gyro_angle_rad gyro_time_s"),
+]
 FEED = record(
-    {name: _sized(LINE, n) for name, n in _SIZES.items()}
-    | {"steer_turns": (_TURN, 3), "imu_turns": _TURN, "camera_turns": _TURN, "camera_yaw_0_rad": float}
-    | {"channels": (CHANNEL, REPEATED.size)}
-    | {"before": (float, (2, N_CHANNELS)), "last_s": (float, len(STREAMS))}
+    {"lines": (LINE, len(SIGNALS)), "turns": (_TURN, 5), "channels": (CHANNEL, REPEATED.size)}
+    | {"before": (float, (2, len(CAMERA_CHANNELS))), "camera_yaw_0_rad": float}
     | {"gnss_origin_m": (float, 2), "gnss_variance": float}
     | numbers("vibration_square vibration_s tick_s rest_since_s camera_s")
     | dict.fromkeys(("wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3"), (float, 3))
-    | dict.fromkeys(("rate_received_s", "steer_received_s"), (float, 3))
+    | {"received_s": (float, (2, 3)), "smooth": (float, len(CAMERA_ROWS))}
     | {"start_s": float, "has_moved": bool, "camera_has_started": bool, "camera_offset_rad": float}
-    | {"imu_yaw_start": _AVERAGE, "camera_yaw_start": _AVERAGE}
+    | {"yaw_sum_rad": (float, 2), "n_yaw": (int, 2)}
     | numbers("gyro_angle_rad gyro_time_s standing_s gyro_low_radps gyro_high_radps gyro_sum_radps")
     | {"n_gyro": int, "wheels_not_finite": int, "wheels_beyond": int}
     | dict.fromkeys(COUNTS, (int, len(STREAMS)))
 )
 """All that is remembered of the samples: a copy is a snapshot.
 
-The signals; turns of angles; channels that may freeze; the last complete sample of IMU and camera, and of each
-stream the last stamp taken; positions' origin and variance; what the derived rows need; what each wheel was
-measured by last; the yaw at the start; the gyro since the last tick, and at rest; and counts of what was left
-out."""
+The signals; turns of the steering, the IMU and the camera; channels that may freeze; the last complete sample of IMU
+and camera; positions' origin and variance; what the derived rows need; when rate and angle of each wheel were measured
+last; the thesis' smoothing; the yaw of IMU and camera at the start; the gyro since the last tick, and at rest; and
+counts of what was left out."""
 
 _kernel, _inner = njit(error_model="numpy"), inner(error_model="numpy")
 
@@ -273,6 +274,7 @@ def feed_settings(
     initial_yaw_rad: float,
     gnss_latency_s: float,
     time_constant_s: float | None = None,
+    **options: Any,
 ) -> Array:
     """Return what is constant of a robot's feed, with neutral values for what it does not have.
 
@@ -282,12 +284,12 @@ def feed_settings(
     initial_yaw_rad : heading of the start
     gnss_latency_s : age of a position when it arrives
     time_constant_s : of the low-pass on all but the wheels; by default what each sensor lacks to the encoders'
+    options : other fields of :data:`SETTINGS`
     """
     for name, value in (("time_constant_s", time_constant_s), ("gnss_latency_s", gnss_latency_s)):
         if value is not None and not 0 <= value < np.inf:
             raise ConfigError(f"{name} is {value:g}, a time from zero up is required")
     motors, sensors, camera = robot.completed.motors, robot.completed.sensors, robot.completed.camera
-    zeros = robot.steering_zeros_rad.tolist()
     settings = filled(
         SETTINGS,
         latency_s=[0.0, sensors.imu_latency_s, camera.latency_s, gnss_latency_s],
@@ -296,47 +298,36 @@ def feed_settings(
         fastest_radps=MAX_RATE_FACTOR * motors.speed_max_radps,
         wheel_radius_m=robot.wheel_radius_m,
         initial_yaw_rad=initial_yaw_rad,
-        steering_zeros_rad=(zeros + [0.0] * 3)[:3],
+        steering_zeros_rad=(*robot.steering_zeros_rad, 0.0, 0.0, 0.0)[:3],
         gyro_bias_radps=sensors.gyro_bias_z_radps,
         accel_bias_mps2=[getattr(sensors, f"accel_bias_{axis}_mps2") for axis in "xyz"],
         accel_scale_ratio=[getattr(sensors, f"accel_scale_{axis}_ratio") for axis in "xyz"],
+        **options,
     )
-    lag_s = dict.fromkeys(STREAMS, robot.encoder_lag_s if time_constant_s is None else time_constant_s)
-    if robot.describes("camera") and time_constant_s is None:
-        lag_s["odometry"] = max(robot.encoder_lag_s - camera.time_constant_s, 0.0)
-    for name, stream in _SIGNALS.items():
-        judged = robot.steered or name in ("gyro_z_radps", "tilt_rad")
-        jump = JUMPS.get(name, NO_JUMP) if judged else NO_JUMP
-        limits = lag_s[stream], period_s.get(stream, math.nan), period_s["wheels"]
-        settings[name] = signal_limits(*((0.0, 0.02, 0.0) if name == "tilt_rad" else limits), jump)
+    lag_s = robot.encoder_lag_s if time_constant_s is None else time_constant_s
+    for k, (name, signal) in enumerate(SIGNALS.items()):
+        limits = lag_s, period_s.get(signal.stream, math.nan), period_s["wheels"]
+        if k >= TILT:
+            limits = 0.0, 0.02, 0.0
+        elif signal.stream == "odometry" and robot.describes("camera") and time_constant_s is None:
+            limits = max(lag_s - camera.time_constant_s, 0.0), *limits[1:]
+        judged = robot.steered or k >= TILT or name == "gyro_z_radps"
+        settings["limits"][0, k] = _limit(*limits, signal if judged else Signal(signal.stream))
     return settings
 
 
-def signal_limits(
-    time_constant_s: float, period_s: float, tick_s: float, jump: tuple[float, float, int] = NO_JUMP
-) -> Array:
-    """Return the :data:`LIMIT` (1,) of a signal by its low-pass (0 for none), its sensor's period and the clock's."""
-    return filled(
-        LIMIT,
-        time_constant_s=time_constant_s,
-        gap_s=GAP_PERIODS * period_s,
-        age_s=MAX_AGE_PERIODS * np.fmax(period_s, tick_s),
-        once=period_s > MAX_AGE_PERIODS * tick_s + TICK_S,
-        jump=jump[0],
-        jump_per_s=jump[1],
-        policy=jump[2],
-    )
+def _limit(time_constant_s: float, period_s: float, tick_s: float, signal: Signal) -> tuple[Any, ...]:
+    """Return the :data:`LIMIT` of a signal by its low-pass (0 for none), its sensor's period and the clock's."""
+    once = period_s > MAX_AGE_PERIODS * tick_s + TICK_S
+    age_s = MAX_AGE_PERIODS * np.fmax(period_s, tick_s)
+    return time_constant_s, GAP_PERIODS * period_s, age_s, signal.jump, signal.jump_per_s, once, signal.policy
 
 
 def new_feed() -> Array:
     """Return the memory before the first sample."""
-    feed = filled(
-        FEED, np.nan, last_s=-np.inf, rate_received_s=-np.inf, steer_received_s=-np.inf, camera_offset_rad=0.0
-    )
-    feed["gyro_angle_rad"] = feed["gyro_time_s"] = 0.0
+    nothing = dict.fromkeys(("camera_offset_rad", "yaw_sum_rad", "gyro_angle_rad", "gyro_time_s"), 0.0)
+    feed = filled(FEED, np.nan, received_s=-np.inf, **nothing)
     feed["channels"]["repeated"] = feed["channels"]["longest"] = 0.0
-    for name in ("imu_yaw_start", "camera_yaw_start"):
-        feed[name] = 0
     return feed
 
 
@@ -455,132 +446,116 @@ def _unwrap(angle_rad: float, turn: Any) -> float:
 
 
 @_inner
-def _take_steering(sample: Array, came_s: float, settings: Any, feed: Any) -> bool:
-    """Steering angles without their zeros; the first one lies within half a turn."""
-    jumped = False
-    for i in range(3):
-        angle = _unwrap(wrapped(sample[i] - settings.steering_zeros_rad[i]), feed.steer_turns[i])
-        jumped |= _take(angle, came_s, came_s, feed.steer_rad[i], settings.steer_rad[i])
-    return bool(jumped)
-
-
-@_inner
-def _take_imu(sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any) -> bool:
-    """Calibrated yaw rate, acceleration of the body without gravity, yaw, and mean square of the vibration.
-
-    A sample is ``scale * truth + bias``.  The specific force at rest is g times the world's vertical in body
-    axes, ``g (-sin pitch, sin roll cos pitch, cos roll cos pitch)``: with the nose up (pitch negative) it
-    points forward too, with the left side up (roll positive) to the left.
-    """
-    roll, pitch = sample[6], sample[7]
-    for i in range(2):
-        line, limit, angle = feed.tilt_rad[i], settings.tilt_rad[i], sample[6 + i]
-        if not math.isnan(angle) and _sum_of_jumps(angle, instant_s, line, limit) != 0.0:
-            roll = pitch = np.nan
-    level_x, level_y = -GRAVITY_MPS2 * math.sin(pitch), GRAVITY_MPS2 * math.sin(roll) * math.cos(pitch)
-    bias, scale, jumped = settings.accel_bias_mps2, settings.accel_scale_ratio, False
-    for i, level in ((0, level_x), (1, level_y)):
-        accel = (sample[3 + i] - bias[i]) / scale[i] - level
-        jumped |= _take(accel, instant_s, came_s, feed.accel_mps2[i], settings.accel_mps2[i])
-    gyro, limit = feed.gyro_z_radps, settings.gyro_z_radps
-    before_s, before_radps = gyro.instant_s, gyro.low_passed
-    if _take(sample[2] - settings.gyro_bias_radps, instant_s, came_s, gyro, limit):
-        jumped = True
-    else:  # the angle since the last tick
-        step_s = gyro.instant_s - before_s
-        if 0.0 < step_s <= limit.gap_s:
-            feed.gyro_angle_rad += 0.5 * (before_radps + gyro.low_passed) * step_s
-            feed.gyro_time_s += step_s
-    yaw = _unwrap(sample[8], feed.imu_turns)
-    jumped |= _take(yaw, instant_s, came_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
-    accel = (sample[5] - bias[2]) / scale[2] - GRAVITY_MPS2 * math.cos(roll) * math.cos(pitch)
-    if not math.isnan(accel):
-        step_s, square = instant_s - feed.vibration_s, accel * accel
-        feed.vibration_s = instant_s
-        if not step_s > 0.0 or math.isnan(feed.vibration_square):
-            feed.vibration_square = square
-        else:
-            feed.vibration_square += (square - feed.vibration_square) * -math.expm1(-step_s / VIBRATION_S)
-    return bool(jumped)
-
-
-@_inner
-def _take_odometry(
-    sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any, moving: bool
-) -> bool:
-    """Speed of the camera point, yaw rate and yaw: ``kinematics.camera.body_motion`` of one sample."""
-    # the camera's axes renamed to the body's: (-z, -x, y), of vectors and of the quaternion's vector alike
-    x, y, z, w = -sample[5], -sample[3], sample[4], sample[6]
-    v_x, v_y, v_z = -sample[9], -sample[7], sample[8]
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    if not abs(norm - 1.0) <= QUATERNION_TOLERANCE:
-        feed.no_rotation[ODOMETRY] += not math.isnan(norm)
+def _repeats_whole(stream: int, sample: Array, feed: Any) -> bool:
+    """Say whether a complete sample of the IMU or the camera repeats the noise of the one before, and count it."""
+    first, last = (0, 6) if stream == IMU else (3, 13)
+    before, same, n_known = feed.before[stream - IMU], True, 0
+    for c in range(first, last):
+        if not math.isnan(sample[c]):
+            n_known += 1
+            same &= sample[c] == before[c]
+        before[c] = sample[c]
+    if not same or n_known == 0:
         return False
-    x, y, z, w = x / norm, y / norm, z / norm, w / norm
-    r_00, r_11 = x * x - y * y - z * z + w * w, -x * x + y * y - z * z + w * w
-    r_01, r_10 = 2.0 * (x * y - z * w), 2.0 * (x * y + z * w)
-    r_20, r_21 = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w)
-    yaw = _unwrap(math.atan2(r_10, r_00), feed.camera_turns)
-    if math.isnan(feed.camera_yaw_0_rad):
-        feed.camera_yaw_0_rad = yaw
-    along, left = r_00 * v_x + r_10 * v_y + r_20 * v_z, r_01 * v_x + r_11 * v_y + r_21 * v_z
-    speed = _mask_frozen(np.array([along, left]), np.int64(FIRST_SPEED), moving, feed)
-    line, turned_by = feed.camera_yaw_rad, feed.camera_yaw_rad.jumped_by
-    jumped = _take(yaw - feed.camera_yaw_0_rad, instant_s, came_s, line, settings.camera_yaw_rad)
-    turned = line.jumped_by != turned_by  # that turns the speeds: they have not jumped themselves
-    for i in range(2):
-        if turned:
-            feed.camera_speed_mps[i].raw = speed[i]
-        jumped |= _take(speed[i], instant_s, came_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
-    rate, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
-    jumped |= _take(sample[11], instant_s, came_s, rate, limit)
-    return bool(jumped)
-
-
-@_inner
-def _take_gnss(sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any) -> None:
-    """Position from the origin, by default the first one, and speed; the position's variance is kept."""
-    std = sample[4]
-    if not std > 0.0:
-        std = FIX_STD_M if sample[5] >= 0.5 else FLOAT_STD_M
-    known = not (math.isnan(sample[0]) or math.isnan(sample[1]))
-    if known and math.isnan(feed.gnss_origin_m[0]):
-        feed.gnss_origin_m[0], feed.gnss_origin_m[1] = sample[0], sample[1]
-    if known:
-        feed.gnss_variance = std * std
-    for i in range(2):
-        place = sample[i] - feed.gnss_origin_m[i] if known else np.nan
-        _take(place, instant_s, came_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
-        _take(sample[2 + i], instant_s, came_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
+    feed.frozen[stream] += 1
+    for c in range(9 if stream == IMU else 14):
+        feed.channels[c if stream == IMU else FIRST_CAMERA + c].repeated += 1.0
+    return True
 
 
 @_inner
 def _take_sample(
-    stream: int, sample: Array, instant_s: float, came_s: float, settings: Any, feed: Any
+    stream: int, sample: Array, is_whole: bool, stamp_s: float, settings: Any, feed: Any
 ) -> None:
-    """Take a sample (channels,) of any stream but the wheels, that was measured and arrived at two instants."""
-    moving, jumped = is_moving(feed), False
-    if stream == STEERING:
-        jumped = _take_steering(sample, came_s, settings, feed)
+    """Take a sample (channels,) of any stream but the wheels, as signals without calibration, gravity and axes.
+
+    An accelerometer reads ``scale * truth + bias``.  The specific force at rest is g times the world's vertical in
+    body axes, ``g (-sin pitch, sin roll cos pitch, cos roll cos pitch)``: with the nose up (pitch negative) it
+    points forward too, with the left side up (roll positive) to the left.
+    """
+    instant_s = stamp_s - settings.latency_s[stream]
+    came_s, moving, signals = stamp_s if settings.is_causal else instant_s, is_moving(feed), np.empty(TILT)
+    if settings.is_live:
+        feed.not_finite[stream] += not is_whole
+        if is_whole and stream in (IMU, ODOMETRY) and _repeats_whole(stream, sample, feed):
+            return
+    if stream == ODOMETRY and sample[13] < MIN_CONFIDENCE_RATIO:
+        feed.low_confidence[stream] += 1
+        return
+    if stream == STEERING:  # the first angle lies within half a turn
+        for i in range(3):
+            angle = wrapped(sample[i] - settings.steering_zeros_rad[i])
+            signals[STEER + i] = _unwrap(angle, feed.turns[i])
     elif stream == IMU:
         sample = _mask_frozen(sample, np.int64(FIRST_IMU), moving, feed)
-        jumped = _take_imu(sample, instant_s, came_s, settings, feed)
-    elif stream == ODOMETRY:
+        roll, pitch = sample[6], sample[7]
+        for i in range(2):
+            line, limit, angle = feed.lines[TILT + i], settings.limits[TILT + i], sample[6 + i]
+            if not math.isnan(angle) and _sum_of_jumps(angle, instant_s, line, limit) != 0.0:
+                roll = pitch = np.nan
+        bias, scale = settings.accel_bias_mps2, settings.accel_scale_ratio
+        level_x, level_y = -GRAVITY_MPS2 * math.sin(pitch), GRAVITY_MPS2 * math.sin(roll) * math.cos(pitch)
+        signals[ACCEL] = (sample[3] - bias[0]) / scale[0] - level_x
+        signals[ACCEL + 1] = (sample[4] - bias[1]) / scale[1] - level_y
+        signals[GYRO], signals[IMU_YAW] = (
+            sample[2] - settings.gyro_bias_radps,
+            _unwrap(sample[8], feed.turns[3]),
+        )
+        accel = (sample[5] - bias[2]) / scale[2] - GRAVITY_MPS2 * math.cos(roll) * math.cos(pitch)
+        if not math.isnan(accel):
+            step_s, square = instant_s - feed.vibration_s, accel * accel
+            feed.vibration_s = instant_s
+            if not step_s > 0.0 or math.isnan(feed.vibration_square):
+                feed.vibration_square = square
+            else:
+                feed.vibration_square += (square - feed.vibration_square) * -math.expm1(-step_s / VIBRATION_S)
+    elif stream == ODOMETRY:  # `kinematics.camera.body_motion` of one sample, of the camera's point
         sample = _mask_frozen(sample, np.int64(FIRST_CAMERA), moving, feed)
-        jumped = _take_odometry(sample, instant_s, came_s, settings, feed, moving)
-    else:
-        _take_gnss(sample, instant_s, came_s, settings, feed)
+        # the camera's axes renamed to the body's: (-z, -x, y), of vectors and of the quaternion's vector alike
+        x, y, z, w = -sample[5], -sample[3], sample[4], sample[6]
+        v_x, v_y, v_z = -sample[9], -sample[7], sample[8]
+        norm = math.sqrt(x * x + y * y + z * z + w * w)
+        if not abs(norm - 1.0) <= QUATERNION_TOLERANCE:
+            feed.no_rotation[ODOMETRY] += not math.isnan(norm)
+            return
+        x, y, z, w = x / norm, y / norm, z / norm, w / norm
+        r_00, r_11 = x * x - y * y - z * z + w * w, -x * x + y * y - z * z + w * w
+        r_01, r_10 = 2.0 * (x * y - z * w), 2.0 * (x * y + z * w)
+        r_20, r_21 = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w)
+        yaw = _unwrap(math.atan2(r_10, r_00), feed.turns[4])
+        if math.isnan(feed.camera_yaw_0_rad):
+            feed.camera_yaw_0_rad = yaw
+        along, left = r_00 * v_x + r_10 * v_y + r_20 * v_z, r_01 * v_x + r_11 * v_y + r_21 * v_z
+        signals[SEEN:SEEN_TURN] = _mask_frozen(np.array([along, left]), np.int64(FIRST_SPEED), moving, feed)
+        signals[SEEN_TURN], signals[SEEN_YAW] = sample[11], yaw - feed.camera_yaw_0_rad
+    else:  # positions from the origin, by default the first one
+        known = not (math.isnan(sample[0]) or math.isnan(sample[1]))
+        if known and math.isnan(feed.gnss_origin_m[0]):
+            feed.gnss_origin_m[0], feed.gnss_origin_m[1] = sample[0], sample[1]
+        if known:
+            std = FIX_STD_M if sample[5] >= 0.5 else FLOAT_STD_M
+            feed.gnss_variance = (sample[4] if sample[4] > 0.0 else std) ** 2
+        for i in range(2):
+            signals[POSITION + i] = sample[i] - feed.gnss_origin_m[i] if known else np.nan
+            signals[POSITION + 2 + i] = sample[2 + i]
+    jumped = False
+    for k in range(_SPANS[stream, 1] - 1, _SPANS[stream, 0] - 1, -1):  # of the camera its yaw first
+        line, limit = feed.lines[k], settings.limits[k]
+        before_s, before, jumped_by = line.instant_s, line.low_passed, line.jumped_by
+        jumped |= _take(signals[k], instant_s, came_s, line, limit)
+        if k == GYRO and 0.0 < line.instant_s - before_s <= limit.gap_s:  # the angle since the last tick
+            feed.gyro_angle_rad += 0.5 * (before + line.low_passed) * (line.instant_s - before_s)
+            feed.gyro_time_s += line.instant_s - before_s
+        if (
+            k == SEEN_YAW and line.jumped_by != jumped_by
+        ):  # that turns the speeds: they have not jumped themselves
+            feed.lines[SEEN].raw, feed.lines[SEEN + 1].raw = signals[SEEN], signals[SEEN + 1]
     feed.jump[stream] += jumped
 
 
 @_inner
 def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
-    """Write the rates (3,) of the wheels, or the speeds (2,) of the sides."""
-    for i in range(3):
-        row.wheel_radps[i] = np.nan
-    if not settings.is_steered:
-        row.side_mps[0], row.side_mps[1] = wheels[0], wheels[1]
-        return
+    """Write the rates (3,) of the wheels; what is not finite, frozen, or faster than a motor turns is left out."""
     moving, lively, beyond = is_moving(feed), False, False
     _mask_frozen(wheels, np.int64(FIRST_WHEEL), moving, feed)
     for i in range(3):
@@ -591,7 +566,7 @@ def _take_wheels(wheels: Array, settings: Any, feed: Any, row: Any) -> None:
         known = math.isfinite(rate)
         too_fast = known and abs(rate) > settings.fastest_radps
         beyond |= too_fast
-        row.wheel_radps[i] = np.nan if too_fast or not known or frozen else rate
+        row[i] = np.nan if too_fast or not known or frozen else rate
     feed.wheels_beyond += beyond
 
 
@@ -600,43 +575,41 @@ def _derive(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     """Write the rows that follow from others."""
     step_s = time_s - feed.tick_s
     feed.tick_s = time_s
-    row.vibration_mps2 = math.sqrt(feed.vibration_square)
+    row[VIBRATION] = math.sqrt(feed.vibration_square)
     still = True
     keep = math.exp(-step_s / CHANGE_S) if step_s > 0.0 else 0.0
-    if not math.isnan(row.camera_speed_mps[0]):
+    if not math.isnan(row[_SEEN]):
         feed.camera_s = time_s
-    row.camera_age_s = time_s - feed.camera_s
+    row[SEEN_AGE] = time_s - feed.camera_s
     for i in range(3):
-        speed = row.wheel_radps[i] * settings.wheel_radius_m
+        speed = row[i] * settings.wheel_radius_m
         once, twice = feed.wheel_once_mps[i], feed.wheel_twice_mps[i]
         still &= abs(twice) <= REST_WHEEL_MPS and abs(speed) <= MOVING_MPS
         rise = once - twice
         change = twice * math.copysign(max(abs(rise) - WAVERING_MPS, 0.0), rise) / CHANGE_S
-        row.growth_per_s[i] = change / (twice * twice + CRAWL_MPS * CRAWL_MPS)
+        row[GROWTH + i] = change / (twice * twice + CRAWL_MPS * CRAWL_MPS)
         change = (abs(speed) + CRAWL_MPS) * max(abs(speed - once) - RIPPLE_MPS, 0.0) / CHANGE_S
         held = feed.wheel_change_m2ps3[i] * math.exp(-step_s / HELD_S) if step_s > 0.0 else np.nan
         feed.wheel_change_m2ps3[i] = change if math.isnan(held) or change > held else held
-        unseen = not row.camera_age_s <= UNSEEN_AFTER_S
-        row.change_m2ps3[i] = feed.wheel_change_m2ps3[i] if unseen else change
+        unseen = not row[SEEN_AGE] <= UNSEEN_AFTER_S
+        row[CHANGE + i] = feed.wheel_change_m2ps3[i] if unseen else change
         if math.isnan(once) or not step_s > 0.0:
             feed.wheel_once_mps[i] = feed.wheel_twice_mps[i] = speed
         elif not math.isnan(speed):
             feed.wheel_twice_mps[i] = once + (twice - once) * keep
             feed.wheel_once_mps[i] = speed + (once - speed) * keep
-    still &= abs(row.gyro_z_radps) <= REST_TURN_RADPS
+    still &= abs(row[_GYRO]) <= REST_TURN_RADPS
     for i in range(2):
-        still &= abs(row.accel_mps2[i]) <= REST_ACCEL_MPS2
-        still &= not abs(row.camera_speed_mps[i]) > REST_SEEN_MPS
+        still &= abs(row[FIRST_SIGNAL + ACCEL + i]) <= REST_ACCEL_MPS2
+        still &= not abs(row[_SEEN + i]) > REST_SEEN_MPS
     if not still:
         feed.rest_since_s = np.nan
     elif math.isnan(feed.rest_since_s):
         feed.rest_since_s = time_s
-    rests = time_s - feed.rest_since_s >= REST_AFTER_S
-    for i in range(3):
-        row.rest_twist[i] = 0.0 if rests else np.nan
-    if rests:
+    if time_s - feed.rest_since_s >= REST_AFTER_S:
+        row[REST_TWIST : REST_TWIST + 3] = 0.0
         for i in range(2):  # at rest a camera that measures none is right again
-            line = feed.camera_speed_mps[i]
+            line = feed.lines[SEEN + i]
             if abs(line.raw) <= REST_SEEN_MPS:
                 line.jumped_by, line.jumped_s = 0.0, np.nan
 
@@ -667,65 +640,23 @@ def rest_at(time_s: float, left_mps: float, right_mps: float, gyro_radps: float,
 
 
 @_inner
-def _take_tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
-    """Write the row of a tick but for its yaw, which :func:`refer_yaw` counts from the start.
-
-    ``wheels`` are the rates (3,) of the motors, or the speeds (2,) of the sides.
-    """
-    row.side_mps[0] = row.side_mps[1] = row.rest_gyro_radps = np.nan
-    _take_wheels(wheels, settings, feed, row)
-    for i in range(3):
-        row.steer_rad[i] = _at_tick(time_s, feed.steer_rad[i], settings.steer_rad[i])
-        if not math.isnan(row.wheel_radps[i]):
-            feed.rate_received_s[i] = time_s
-        if not math.isnan(row.steer_rad[i]):
-            feed.steer_received_s[i] = time_s
-    for i in range(2):
-        row.accel_mps2[i] = _at_tick(time_s, feed.accel_mps2[i], settings.accel_mps2[i])
-        row.camera_speed_mps[i] = _at_tick(time_s, feed.camera_speed_mps[i], settings.camera_speed_mps[i])
-        row.gnss_position_m[i] = _at_tick(time_s, feed.gnss_position_m[i], settings.gnss_position_m[i])
-        row.gnss_speed_mps[i] = _at_tick(time_s, feed.gnss_speed_mps[i], settings.gnss_speed_mps[i])
-        row.gnss_variance[i] = np.nan if math.isnan(row.gnss_position_m[i]) else feed.gnss_variance
-        row.gnss_variance[2 + i] = np.nan if math.isnan(row.gnss_speed_mps[i]) else GNSS_SPEED_STD_MPS**2
-    row.gyro_z_radps = _at_tick(time_s, feed.gyro_z_radps, settings.gyro_z_radps)
-    row.imu_yaw_rad = _at_tick(time_s, feed.imu_yaw_rad, settings.imu_yaw_rad)
-    line, limit = feed.camera_yaw_rate_radps, settings.camera_yaw_rate_radps
-    row.camera_yaw_rate_radps = _at_tick(time_s, line, limit)
-    row.camera_yaw_rad = _at_tick(time_s, feed.camera_yaw_rad, settings.camera_yaw_rad)
-    if not settings.is_steered and not math.isnan(row.gyro_z_radps) and feed.gyro_time_s > 0.0:
-        row.gyro_z_radps = feed.gyro_angle_rad / feed.gyro_time_s
-    feed.gyro_angle_rad = feed.gyro_time_s = 0.0
-    _derive(time_s, settings, feed, row)
-    if not settings.is_steered:
-        row.rest_gyro_radps = rest_at(time_s, row.side_mps[0], row.side_mps[1], row.gyro_z_radps, feed)
-
-
-@_inner
-def _average_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
-    """Take a tick into the averages of the yaw rows at the start."""
+def _refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
+    """Count the yaw rows from their averages at the start, and keep the camera's on the turn that the IMU is on."""
     if math.isnan(feed.start_s):
         feed.start_s = time_s
     if time_s > feed.start_s + STANDING_S:
         feed.has_moved = True
     for i in range(3):
-        if abs(row.wheel_radps[i] * settings.wheel_radius_m) > STANDING_SPEED_MPS:
+        if abs(row[i] * settings.wheel_radius_m) > STANDING_SPEED_MPS:
             feed.has_moved = True
-    for yaw_rad, average in (
-        (row.imu_yaw_rad, feed.imu_yaw_start),
-        (row.camera_yaw_rad, feed.camera_yaw_start),
-    ):
-        if not math.isnan(yaw_rad) and (not feed.has_moved or average.n == 0):
-            average.sum += yaw_rad
-            average.n += 1
-            average.mean = average.sum / average.n
-
-
-@_inner
-def _refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
-    """Count the yaw rows of a tick from the averages."""
     initial = settings.initial_yaw_rad
-    row.imu_yaw_rad = imu = row.imu_yaw_rad - feed.imu_yaw_start.mean + initial
-    row.camera_yaw_rad = seen = row.camera_yaw_rad - feed.camera_yaw_start.mean + initial
+    for i, place in enumerate((_YAW, _SEEN_YAW)):
+        if not math.isnan(row[place]):
+            if not feed.has_moved or feed.n_yaw[i] == 0:
+                feed.yaw_sum_rad[i] += row[place]
+                feed.n_yaw[i] += 1
+            row[place] = row[place] - feed.yaw_sum_rad[i] / feed.n_yaw[i] + initial
+    imu, seen = row[_YAW], row[_SEEN_YAW]
     if math.isnan(seen):
         return
     if not feed.camera_has_started:
@@ -735,99 +666,75 @@ def _refer_yaw(time_s: float, settings: Any, feed: Any, row: Any) -> None:
     seen += feed.camera_offset_rad
     if not math.isnan(imu):
         seen += 2 * np.pi * np.rint((imu - seen) / (2 * np.pi))
-    row.camera_yaw_rad = seen
+    row[_SEEN_YAW] = seen
 
 
-@_kernel
-def take_live(stream: int, sample: Array, complete: bool, came_s: float, settings: Any, feed: Any) -> None:
-    """Take a sample as it came, without a look ahead: unless it repeats the one before, or is not confident."""
-    settings, feed = settings[0], feed[0]
-    feed.last_s[stream] = came_s
-    feed.not_finite[stream] += not complete
-    first, last = (0, 6) if stream == IMU else (3, 13)
-    if complete and stream in (IMU, ODOMETRY):
-        before, same, n_known = feed.before[stream - IMU], True, 0
-        for c in range(first, last):
-            if not math.isnan(sample[c]):
-                n_known += 1
-                same &= sample[c] == before[c]
-            before[c] = sample[c]
-        if same and n_known > 0:
-            feed.frozen[stream] += 1
-            for c in range(9 if stream == IMU else 14):
-                feed.channels[c if stream == IMU else FIRST_CAMERA + c].repeated += 1.0
-            return
-    if stream == ODOMETRY and sample[13] < MIN_CONFIDENCE_RATIO:
-        feed.low_confidence[stream] += 1
-        return
-    _take_sample(stream, sample, came_s - settings.latency_s[stream], came_s, settings, feed)
-
-
-@_kernel
-def tick_live(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
-    """Write the row of a tick, yaw counted from the averages so far."""
-    settings, feed, row = settings[0], feed[0], row[0]
-    _take_tick(time_s, wheels, settings, feed, row)
+@_inner
+def _tick(time_s: float, wheels: Array, settings: Any, feed: Any, row: Any) -> None:
+    """Write the row of a tick; ``wheels`` are the rates (3,) of the motors, or the speeds (2,) of the sides."""
+    row[:] = np.nan
     if settings.is_steered:
-        _average_yaw(time_s, settings, feed, row)
-        _refer_yaw(time_s, settings, feed, row)
+        _take_wheels(wheels, settings, feed, row)
+    else:
+        row[SIDE], row[SIDE + 1] = wheels[0], wheels[1]
+    for k in range(TILT):
+        row[FIRST_SIGNAL + k] = _at_tick(time_s, feed.lines[k], settings.limits[k])
+    for i in range(3):
+        if not math.isnan(row[i]):
+            feed.received_s[0, i] = time_s
+        if not math.isnan(row[FIRST_SIGNAL + STEER + i]):
+            feed.received_s[1, i] = time_s
+    for i in range(2):
+        if not math.isnan(row[_POSITION + i]):
+            row[_VARIANCE + i] = feed.gnss_variance
+        if not math.isnan(row[_POSITION + 2 + i]):
+            row[_VARIANCE + 2 + i] = GNSS_SPEED_STD_MPS**2
+    if not settings.is_steered and not math.isnan(row[_GYRO]) and feed.gyro_time_s > 0.0:
+        row[_GYRO] = feed.gyro_angle_rad / feed.gyro_time_s
+    feed.gyro_angle_rad = feed.gyro_time_s = 0.0
+    _derive(time_s, settings, feed, row)
+    if not settings.is_steered:
+        row[REST_GYRO] = rest_at(time_s, row[SIDE], row[SIDE + 1], row[_GYRO], feed)
+        return
+    if settings.ema_alpha > 0.0:  # (7.8)
+        for i in range(feed.smooth.size):
+            value = row[_SEEN + i]
+            if not math.isnan(value) and not math.isnan(feed.smooth[i]):
+                value = settings.ema_alpha * feed.smooth[i] + (1.0 - settings.ema_alpha) * value
+            if not math.isnan(value):
+                feed.smooth[i] = row[_SEEN + i] = value
+    _refer_yaw(time_s, settings, feed, row)
 
 
 @_kernel
-def _run(
+def run_feed(
     clock: Array,
     wheels: Array,
-    came_s: tuple[Array, ...],
-    instant_s: tuple[Array, ...],
+    stamps: tuple[Array, ...],
     samples: tuple[Array, ...],
+    are_whole: tuple[Array, ...],
     settings: Any,
     feed: Any,
     rows: Any,
 ) -> None:
-    """Write the rows (n,) of all ticks of a log but for their yaw; samples by stream, as :data:`STREAMS`."""
+    """Write the rows (n, :data:`N_NUMBERS`) of ticks, from the wheels and the samples by stream, as :data:`STREAMS`.
+
+    Of a sample, ``are_whole`` says whether all channels that there are were finite.
+    """
     settings, feed = settings[0], feed[0]
-    due = np.zeros(len(came_s), np.int64)
+    due = np.zeros(len(stamps), np.int64)
     for n in range(clock.size + 1):
         time_s = clock[n] + TICK_S if n < clock.size else np.inf  # what comes after the last tick is counted
-        for stream in range(len(came_s)):
+        for stream in range(len(stamps)):
+            age_s = 0.0 if settings.is_causal else settings.latency_s[stream]
             k = due[stream]
-            while k < came_s[stream].size and came_s[stream][k] <= time_s:
-                instant = instant_s[stream][k]
-                _take_sample(stream, samples[stream][k], instant, came_s[stream][k], settings, feed)
+            while k < stamps[stream].size and stamps[stream][k] - age_s <= time_s:
+                stamp_s = stamps[stream][k]
+                _take_sample(stream, samples[stream][k], are_whole[stream][k], stamp_s, settings, feed)
                 k += 1
             due[stream] = k
         if n < clock.size:
-            _take_tick(clock[n], wheels[n], settings, feed, rows[n])
-
-
-@_kernel
-def _refer_all(clock: Array, causal: bool, settings: Any, feed: Any, rows: Any) -> None:
-    """Count the yaw rows from the start: from the averages of all ticks, or ``causal`` of those so far."""
-    settings, feed = settings[0], feed[0]
-    if not causal:
-        for n in range(clock.size):
-            _average_yaw(clock[n], settings, feed, rows[n])
-    for n in range(clock.size):
-        if causal:
-            _average_yaw(clock[n], settings, feed, rows[n])
-        _refer_yaw(clock[n], settings, feed, rows[n])
-
-
-def forget_times(feed: Any) -> None:
-    """Begin anew after a clock was set back: what is remembered of its other time is of no use."""
-    fresh = new_feed()
-    names = set(_SIGNALS) | {"before", "last_s", "rate_received_s", "steer_received_s"}
-    names |= {"vibration_square", "vibration_s", "tick_s", "rest_since_s", "camera_s"}
-    names |= {"wheel_once_mps", "wheel_twice_mps", "wheel_change_m2ps3", "gyro_angle_rad", "gyro_time_s"}
-    for name in names:
-        feed[name] = fresh[name]
-    feed["channels"]["repeated"] = 0.0
-
-
-def measurements(rows: Any) -> Array:
-    """Return rows (n,) as numbers (n, m) in the order of :data:`ROWS`; a view."""
-    values: Array = rows.view(np.float64).reshape(len(rows), -1)[:, : len(ROWS)]
-    return values
+            _tick(clock[n], wheels[n], settings, feed, rows[n])
 
 
 def on_clock(
@@ -837,13 +744,12 @@ def on_clock(
 
     Instants of samples and ticks increase; a missing sample is NaN; a time constant of 0 is no low-pass.
     """
-    limits = signal_limits(time_constant_s, median_step_s(time_s), median_step_s(clock))
-    return {
-        row: _on_clock(
-            clock, time_s, np.where(np.isfinite(signal), signal, np.nan), filled(LINE, np.nan), limits
-        )
-        for row, signal in signals.items()
-    }
+    limit, found = filled(LIMIT), {}
+    limit[0] = _limit(time_constant_s, median_step_s(time_s), median_step_s(clock), Signal(""))
+    for row, signal in signals.items():
+        known = np.where(np.isfinite(signal), signal, np.nan)
+        found[row] = _on_clock(clock, time_s, known, filled(LINE, np.nan), limit)
+    return found
 
 
 @_kernel
@@ -857,76 +763,6 @@ def _on_clock(clock: Array, time_s: Array, signal: Array, line: Array, limit: Ar
     return out
 
 
-#: Samples of a stream that wait for the wheels; five seconds of a camera.
-QUEUE = 1024
-CLOCK_SET_S = 1.0  #: Samples that are so far behind, many in a row, are of a clock that was set back.
-Due = list[tuple[float, bool, Array]]
-"""Of samples their stamp, whether all of their numbers are finite, and those, NaN where they are not."""
-
-
-def places_among(names: Sequence[str], among: Sequence[str]) -> Array:
-    """Return the place of each name among others, -1 where it is not there."""
-    return np.array([list(among).index(name) if name in among else -1 for name in names])
-
-
-def check_channels(stream: str, names: Iterable[str], known: Sequence[str]) -> None:
-    """Raise ``ConfigError`` where a stream that is read sample by sample lacks a channel."""
-    for lacking in (name for name in names if name not in known):
-        raise ConfigError(f"channels of {stream!r} are {list(known)}: {lacking!r} must be among them")
-
-
-class SampleQueue:
-    """Samples of a stream that are not due, by stamp: late ones go where they belong.
-
-    Of two of which one is further ahead than any is late, the one goes that the other shows to be wrong.
-
-    ``columns`` say where each channel of the schema stands in the readings, -1 where it does not.
-    """
-
-    def __init__(self, columns: Array) -> None:
-        self._columns, self._is_lacking = columns, columns < 0
-        self.waiting: Due = []
-        self.counts: Counter[str] = Counter()
-        self.n_behind = 0  # samples in a row that are stamped long before the last that was taken
-
-    def push(self, time_s: Array, values: Array, last_s: float) -> None:
-        """Queue samples; ``last_s`` is the stamp of the last that was taken out."""
-        samples = np.ascontiguousarray(values[:, self._columns])  # one layout: one compiled form
-        samples[:, self._is_lacking] = np.nan
-        finite = np.isfinite(samples)
-        samples[~finite] = np.nan
-        finite[:, self._is_lacking] = True
-        waiting, complete = self.waiting, np.all(finite, axis=1).tolist()
-        for stamp_s, whole, sample in zip(time_s.tolist(), complete, samples, strict=True):
-            place = bisect_left(waiting, stamp_s, key=itemgetter(0))
-            if not last_s < stamp_s < math.inf or (place < len(waiting) and waiting[place][0] == stamp_s):
-                self.counts["stamp does not increase"] += 1
-                self.n_behind = self.n_behind + 1 if stamp_s <= last_s - CLOCK_SET_S else 0
-                continue
-            if waiting and waiting[-1][0] - stamp_s > REWIND_S:  # one of the two has a wrong stamp
-                self.counts["stamp does not increase"] += 1
-                if len(waiting) > 1 and waiting[-2][0] - stamp_s > REWIND_S:
-                    continue
-                waiting.pop()
-            if len(waiting) == QUEUE:
-                self.counts["waited too long"] += QUEUE // 2
-                del waiting[: QUEUE // 2]
-                place = max(place - QUEUE // 2, 0)
-            waiting.insert(place, (stamp_s, whole, sample))
-            self.n_behind = 0
-
-    def take(self, time_s: float) -> Due:
-        """Take out what came by a tick; what is stamped far ahead of it goes."""
-        waiting = self.waiting
-        n = next((k for k, (stamp_s, _, _) in enumerate(waiting) if stamp_s > time_s + TICK_S), len(waiting))
-        due = waiting[:n]
-        del waiting[:n]
-        while waiting and waiting[-1][0] > time_s + OFF_CLOCK_S:
-            self.counts["off the clock"] += 1
-            waiting.pop()
-        return due
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasurementTable:
     """What a filter measures at each tick of its clock; NaN where a sensor gave nothing."""
@@ -938,36 +774,20 @@ class MeasurementTable:
     #: samples left out, as counts by stream and kind (``"imu: frozen"``)
     dropped: Mapping[str, int] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        for name, n_columns in (("time_s", None), ("z", len(self.rows)), ("gnss_variance", len(GNSS_ROWS))):
-            array = read_only(getattr(self, name))
-            object.__setattr__(self, name, array)
-            shape = (self.time_s.size,) if n_columns is None else (self.time_s.size, n_columns)
-            if array.shape != shape:
-                raise ValueError(f"{name} has shape {array.shape}, {shape} is needed")
-        object.__setattr__(self, "rows", tuple(self.rows))
-        object.__setattr__(self, "dropped", MappingProxyType(dict(self.dropped)))
-
     def at(self, time_s: Array) -> MeasurementTable:
         """Return the table of some of its own instants, as a filter's track has them that left rows out."""
-        if np.array_equal(time_s, self.time_s):
-            return self
         n = np.searchsorted(self.time_s, time_s)
         return MeasurementTable(self.time_s[n], self.rows, self.z[n], self.gnss_variance[n], self.dropped)
 
     def columns(self, names: Iterable[str]) -> Array:
-        """Return the measurements (n, len(names)) in the order of a model's rows.
-
-        Raises
-        ------
-        DataError
-            if the table has no such row.
-        """
-        names = list(names)
-        for lacking in (name for name in names if name not in self.rows):
-            known = ", ".join(self.rows)
-            raise DataError(f"there is no measurement {lacking!r}; this robot gives {known}")
-        return self.z[:, [self.rows.index(name) for name in names]]
+        """Return the measurements (n, len(names)) in the order of a model's rows; ``DataError`` where one lacks."""
+        places = []
+        for name in names:
+            if name not in self.rows:
+                known = ", ".join(self.rows)
+                raise DataError(f"there is no measurement {name!r}; this robot gives {known}")
+            places.append(self.rows.index(name))
+        return self.z[:, places]
 
 
 def measurement_table(
@@ -1021,122 +841,98 @@ def measurement_table(
         time_constant_s = 0.0
     if robot.steered:
         robot.require("motors", "steering", "sensors", *(["camera"] if "odometry" in run.streams else []))
-    dropped: Counter[str] = Counter()
-    wheels, streams = _clean_streams(run, robot, dropped)
-    clock, period_s = np.array(wheels.time_s), {"wheels": median_step_s(wheels.time_s)}
-    period_s |= {name: median_step_s(stream.time_s) for name, stream in streams.items()}
-    settings = feed_settings(robot, period_s, initial_yaw_rad, gnss_latency_s, time_constant_s)
-    memory = new_feed()
-    if "gnss" in streams and not causal:
-        memory["gnss_origin_m"] = _gnss_origin(streams["gnss"])
-    came_s, instant_s, values = [], [], []
-    for (name, channels), age_s in zip(STREAMS.items(), settings["latency_s"][0].tolist(), strict=True):
-        nothing = Stream(np.empty(0), np.empty((0, len(channels))), channels)
-        stream = streams.get(name, nothing)
-        instant_s.append(np.array(stream.time_s) - age_s)
-        came_s.append(np.array(stream.time_s) if causal else instant_s[-1])
-        values.append(np.array(stream.values))
-    rows = np.zeros(clock.size, ROW)
-    samples = tuple(came_s), tuple(instant_s), tuple(values)
-    _run(clock, np.array(wheels.values), *samples, settings, memory, rows)
-    counts = {"wheels: beyond the motors": int(memory["wheels_beyond"][0])}
-    for number, name in enumerate(STREAMS):
-        counts[f"{name}: jump"] = int(memory["jump"][0, number])
-        counts[f"{name}: no rotation"] = int(memory["no_rotation"][0, number])
-    dropped += Counter(counts)  # a Counter, so that zeros fall out
-    z = measurements(rows)
-    if ema_alpha is not None:
-        for row in CAMERA_ROWS:
-            z[:, ROWS.index(row)] = _ema(z[:, ROWS.index(row)], ema_alpha)
-    if robot.steered:
-        _refer_all(clock, causal, settings, memory, rows)
-    names = ROWS_OF_DRIVE[robot.drive]
-    return MeasurementTable(
-        clock, names, z[:, [ROWS.index(name) for name in names]], rows["gnss_variance"], dropped
-    )
-
-
-def _clean_streams(run: RunLog, robot: Robot, dropped: Counter[str]) -> tuple[Stream, dict[str, Stream]]:
-    """Return the wheels, and the streams that the robot's other rows are measured by, cleaned."""
-    place = f"run {run.run_id}: "
-    if "wheels" not in run.streams:
-        raise DataError(f"{place}there is no stream 'wheels', which gives the clock")
-    for lacking in (name for name in robot.rate_channels if name not in run.streams["wheels"].channels):
-        raise DataError(
-            f"{place}the stream 'wheels' has no channel {lacking!r}, which the robot {robot.name} should have"
-        )
-    wheels = clean_stream(run, "wheels", list(robot.rate_channels), dropped)
-    if wheels is None:
-        raise DataError(f"{place}the stream 'wheels', which gives the clock, is empty")
-    has = {"steering": robot.describes("steering"), "odometry": robot.describes("camera")}
-    streams = {}
+    streams, dropped = clean_streams(run, robot)
+    clock, wheels = (np.array(part) for part in (streams["wheels"].time_s, streams["wheels"].values))
+    stamps, samples = [], []
     for name, channels in STREAMS.items():
-        names = [f"angle_{wheel}_rad" for wheel in robot.wheels] if name == "steering" else channels
-        stream = clean_stream(run, name, names, dropped, channels[NOISY[name]] if name in NOISY else ())
-        if stream is not None and has.get(name, True):
-            streams[name] = stream
-    return wheels, streams
+        stream = streams.get(name)
+        stamps.append(np.empty(0) if stream is None else np.array(stream.time_s))
+        samples.append(np.empty((0, len(channels))) if stream is None else np.array(stream.values))
+    are_whole = tuple(np.ones(times.size, np.bool_) for times in stamps)
+    period_s = {name: median_step_s(stream.time_s) for name, stream in streams.items()}
+    options = {"is_causal": causal, "ema_alpha": ema_alpha or 0.0}
+    settings = feed_settings(robot, period_s, initial_yaw_rad, gnss_latency_s, time_constant_s, **options)
+    feed, rows = new_feed(), np.empty((clock.size, N_NUMBERS))
+    if not causal:  # the origin, and over the whole log once before, the averages of the yaw at the start
+        if len(samples[GNSS]):
+            known = np.isfinite(samples[GNSS][:, :2]).all(axis=1)
+            fixed = known & (samples[GNSS][:, 5] >= 0.5)
+            if known.any():
+                feed["gnss_origin_m"] = samples[GNSS][(fixed if fixed.any() else known).argmax(), :2]
+        ahead = feed.copy()
+        run_feed(clock, wheels, tuple(stamps), tuple(samples), are_whole, settings, ahead, rows)
+        feed["yaw_sum_rad"], feed["n_yaw"], feed["has_moved"] = ahead["yaw_sum_rad"], ahead["n_yaw"], True
+    run_feed(clock, wheels, tuple(stamps), tuple(samples), are_whole, settings, feed, rows)
+    dropped["wheels: beyond the motors"] = int(feed["wheels_beyond"][0])
+    dropped += counts_of(feed, streams)
+    names = ROWS_OF_DRIVE[robot.drive]
+    z = rows[:, [ROWS.index(name) for name in names]]
+    return MeasurementTable(clock, names, z, rows[:, len(ROWS) :].copy(), dict(+dropped))
 
 
-def _gnss_origin(gnss: Stream) -> Array:
-    """Return the first position with a fix, or the first where there is none; NaN without any."""
-    position = gnss.values[:, :2]
-    known = np.isfinite(position).all(axis=1)
-    fixed = known & (gnss.channel("fix_ratio") >= 0.5)
-    first = fixed if fixed.any() else known
-    return np.asarray(position[first.argmax()]) if first.any() else np.full(2, np.nan)
+def counts_of(feed: Array, streams: Iterable[str]) -> Counter[str]:
+    """Return what a feed has left out of some streams, by stream and kind."""
+    counts: Counter[str] = Counter()
+    for stream, name in enumerate(STREAMS):
+        if name in streams:
+            for kind in COUNTS:
+                counts[f"{name}: {kind.replace('_', ' ')}"] = int(feed[kind][0, stream])
+    return counts
 
 
-def clean_stream(
-    run: RunLog, name: str, channels: Sequence[str], dropped: Counter[str], frozen: Sequence[str] = ()
-) -> Stream | None:
-    """Return the channels named of a stream without what cannot be true, or None where nothing is left.
+def clean_streams(run: RunLog, robot: Robot) -> tuple[dict[str, Stream], Counter[str]]:
+    """Return wheels, and the streams that the robot's other rows are measured by, without what cannot be true.
 
     Stamps increase strictly (one far ahead costs itself only), numbers are finite or NaN, channels that the log
-    lacks are NaN.  A camera or IMU all of whose noisy channels (``frozen``) repeat is left out from the first
-    repetition on.
+    lacks are NaN.  A camera or IMU all of whose noisy channels repeat is left out from the first repetition on.
+    What is left out is counted; a stream of which nothing is left is none.
     """
-    stream = run.streams.get(name)
-    if stream is None:
-        return None
-    clock_s = run.streams["wheels"].time_s if "wheels" in run.streams else stream.time_s
-    known_s = clock_s[np.isfinite(clock_s)]
-    there = [k for k, channel in enumerate(channels) if channel in stream.channels]
-    values = np.full((len(stream), len(channels)), np.nan)
-    for k in there:
-        values[:, k] = stream.channel(channels[k])
-    increasing = np.flatnonzero(np.isfinite(stream.time_s))
-    if not (np.diff(stream.time_s[increasing]) > 0).all():
-        increasing = increasing[longest_rise(stream.time_s[increasing])]
-    dropped[f"{name}: stamp does not increase"] += len(stream) - len(increasing)
-    time_s, values = stream.time_s[increasing], values[increasing]
-    if known_s.size:
-        off = (time_s < known_s.min() - OFF_CLOCK_S) | (time_s > known_s.max() + OFF_CLOCK_S)
-        dropped[f"{name}: off the clock"] += int(off.sum())
-    finite = np.isfinite(values[:, there]).all(axis=1)
-    dropped[f"{name}: not finite"] += int((~finite).sum())
-    values[~np.isfinite(values)] = np.nan
-    kept = np.ones(len(time_s), dtype=bool)
-    noisy = [k for k in there if channels[k] in frozen]
-    if noisy and finite.any():
-        kept[finite] = ~_frozen(time_s[finite], values[finite][:, noisy])
-        dropped[f"{name}: frozen"] += int((~kept).sum())
-    if "confidence_ratio" in stream.channels and "confidence_ratio" in channels:
-        confidence = values[:, list(channels).index("confidence_ratio")]
-        low_confidence = kept & (confidence < MIN_CONFIDENCE_RATIO)
-        dropped[f"{name}: low confidence"] += int(low_confidence.sum())
-        kept &= ~low_confidence
-    return Stream(time_s[kept], values[kept], tuple(channels)) if kept.any() else None
-
-
-def _frozen(time_s: Array, values: Array) -> Array:
-    """Return which rows (n,) repeat the one before, in stretches of at least :data:`FROZEN_S`."""
-    same = np.zeros(len(time_s), dtype=bool)
-    same[1:] = (values[1:] == values[:-1]).all(axis=1)
-    first = np.flatnonzero(~same)
-    last = np.append(first[1:], len(time_s)) - 1
-    lasting = np.repeat(time_s[last] - time_s[first] >= FROZEN_S - TICK_S, last - first + 1)
-    return np.asarray(same & lasting)
+    place, streams, dropped = f"run {run.run_id}: ", {}, Counter[str]()
+    if "wheels" not in run.streams:
+        raise DataError(f"{place}there is no stream 'wheels', which gives the clock")
+    read: dict[str, Sequence[str]] = {"wheels": robot.rate_channels, **STREAMS}
+    read["steering"] = [f"angle_{wheel}_rad" for wheel in robot.wheels]
+    lacks = {"steering": not robot.describes("steering"), "odometry": not robot.describes("camera")}
+    clock_s = run.streams["wheels"].time_s[np.isfinite(run.streams["wheels"].time_s)]
+    for name, channels in read.items():
+        stream = run.streams.get(name)
+        if stream is None:
+            continue
+        values, there = np.full((len(stream), len(channels)), np.nan), []
+        for k, channel in enumerate(channels):
+            if channel in stream.channels:
+                values[:, k] = stream.channel(channel)
+                there.append(k)
+            elif name == "wheels":
+                raise DataError(
+                    f"{place}the stream 'wheels' has no channel {channel!r}, which the robot {robot.name} should have"
+                )
+        kept = np.flatnonzero(np.isfinite(stream.time_s))
+        if not (np.diff(stream.time_s[kept]) > 0).all():
+            kept = kept[longest_rise(stream.time_s[kept])]
+        dropped[f"{name}: stamp does not increase"] += len(stream) - len(kept)
+        time_s, values = stream.time_s[kept], values[kept]
+        if clock_s.size:
+            off = (time_s < clock_s.min() - OFF_CLOCK_S) | (time_s > clock_s.max() + OFF_CLOCK_S)
+            dropped[f"{name}: off the clock"] += int(off.sum())
+        finite = np.isfinite(values[:, there]).all(axis=1)
+        dropped[f"{name}: not finite"] += int((~finite).sum())
+        values[~np.isfinite(values)] = np.nan
+        noisy = sorted(set(there) & set(range(len(channels))[NOISY[name]])) if name in NOISY else []
+        if noisy and finite.any():  # what repeats the one before, in stretches that last
+            known_s, noise = time_s[finite], values[np.ix_(finite, noisy)]
+            same = np.append(False, (noise[1:] == noise[:-1]).all(axis=1))
+            first = np.flatnonzero(~same)
+            last = np.append(first[1:], len(same)) - 1
+            lasting = known_s[last] - known_s[first] >= FROZEN_S - TICK_S
+            frozen = np.flatnonzero(finite)[same & np.repeat(lasting, last - first + 1)]
+            dropped[f"{name}: frozen"] += len(frozen)
+            time_s, values = np.delete(time_s, frozen), np.delete(values, frozen, axis=0)
+        if time_s.size and not lacks.get(name, False):
+            streams[name] = Stream(time_s, values, tuple(channels))
+    if "wheels" not in streams:
+        raise DataError(f"{place}the stream 'wheels', which gives the clock, is empty")
+    return streams, dropped
 
 
 def median_step_s(time_s: Array) -> float:
@@ -1144,14 +940,84 @@ def median_step_s(time_s: Array) -> float:
     return float(np.median(np.diff(time_s))) if time_s.size > 1 else math.nan
 
 
-def _ema(value: Array, alpha: float) -> Array:
-    """Smooth the finite values (n,) one after the other, whatever the time between them (7.8)."""
-    from scipy.signal import lfilter  # half a second of import, which only the thesis' smoothing needs
+#: Samples of a stream that wait for the wheels; five seconds of a camera.
+QUEUE = 1024
+CLOCK_SET_S = 1.0  #: Samples that are so far behind, many in a row, are of a clock that was set back.
+Due = list[tuple[float, bool, Array]]
+"""Of samples their stamp, whether all of their numbers are finite, and those, NaN where they are not."""
 
-    out, known = np.array(value), np.isfinite(value)
-    if known.any():
-        out[known] = lfilter([1.0 - alpha], [1.0, -alpha], value[known], zi=[alpha * value[known][0]])[0]
-    return out
+
+def places_among(names: Sequence[str], among: Sequence[str]) -> Array:
+    """Return the place of each name among others, -1 where it is not there."""
+    return np.array([list(among).index(name) if name in among else -1 for name in names])
+
+
+def check_channels(stream: str, names: Iterable[str], known: Sequence[str]) -> None:
+    """Raise ``ConfigError`` where a stream that is read sample by sample lacks a channel."""
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"channels of {stream!r} are {list(known)}: {name!r} must be among them")
+
+
+class SampleQueue:
+    """Samples of a stream that wait for the wheels, in order of their stamps: late ones go where they belong.
+
+    Of two of which one is further ahead than any is late, one has a wrong stamp, and goes.
+
+    Attributes
+    ----------
+    waiting : samples that are not due
+    taken_s : stamp of the last one that was taken out
+    n_behind : samples in a row that are stamped long before that one
+    counts : of samples left out, by kind
+    """
+
+    def __init__(self, columns: Array) -> None:
+        """``columns`` say where each channel stands in the readings, -1 where it does not."""
+        self._columns, self._is_lacking = columns, columns < 0
+        self.waiting: Due = []
+        self.taken_s, self.n_behind = -math.inf, 0
+        self.counts: Counter[str] = Counter()
+
+    def push(self, time_s: Array, values: Array) -> None:
+        """Queue samples."""
+        samples = np.ascontiguousarray(values[:, self._columns])  # one layout: one compiled form
+        samples[:, self._is_lacking] = np.nan
+        finite = np.isfinite(samples)
+        samples[~finite] = np.nan
+        finite[:, self._is_lacking] = True
+        waiting, are_whole = self.waiting, np.all(finite, axis=1).tolist()
+        for stamp_s, is_whole, sample in zip(time_s.tolist(), are_whole, samples, strict=True):
+            place = bisect_left(waiting, stamp_s, key=itemgetter(0))
+            is_known = place < len(waiting) and waiting[place][0] == stamp_s
+            if is_known or not self.taken_s < stamp_s < math.inf:
+                self.counts["stamp does not increase"] += 1
+                self.n_behind = self.n_behind + 1 if stamp_s <= self.taken_s - CLOCK_SET_S else 0
+                continue
+            if waiting and waiting[-1][0] - stamp_s > REWIND_S:
+                self.counts["stamp does not increase"] += 1
+                if len(waiting) > 1 and waiting[-2][0] - stamp_s > REWIND_S:
+                    continue
+                waiting.pop()
+            if len(waiting) == QUEUE:
+                self.counts["waited too long"] += QUEUE // 2
+                del waiting[: QUEUE // 2]
+                place = max(place - QUEUE // 2, 0)
+            waiting.insert(place, (stamp_s, is_whole, sample))
+            self.n_behind = 0
+
+    def take(self, time_s: float) -> Due:
+        """Take out what came by a tick; what is stamped far ahead of it goes."""
+        waiting = self.waiting
+        n = next((k for k, (stamp_s, _, _) in enumerate(waiting) if stamp_s > time_s + TICK_S), len(waiting))
+        due = waiting[:n]
+        del waiting[:n]
+        if due:
+            self.taken_s = due[-1][0]
+        while waiting and waiting[-1][0] > time_s + OFF_CLOCK_S:
+            self.counts["off the clock"] += 1
+            waiting.pop()
+        return due
 
 
 def gnss_heading(table: MeasurementTable, robot: Robot) -> float:
@@ -1173,7 +1039,7 @@ def gnss_heading(table: MeasurementTable, robot: Robot) -> float:
     speed = twist[:, 0] + 1j * twist[:, 1]
     if robot.describes("camera"):
         camera = robot.camera
-        x, y, turn = table.columns(["camera_speed_x_mps", "camera_speed_y_mps", "camera_yaw_rate_radps"]).T
+        x, y, turn, _ = table.columns(CAMERA_ROWS).T
         origin_x, origin_y = point_velocity(x, y, turn, -camera.lever_x_m, -camera.lever_y_m)
         by_camera = origin_x + 1j * origin_y
         speed = np.where(np.isfinite(by_camera), by_camera, speed)
@@ -1185,3 +1051,9 @@ def gnss_heading(table: MeasurementTable, robot: Robot) -> float:
     if weight == 0.0 or GNSS_SPEED_STD_MPS / math.sqrt(weight) > MAX_HEADING_STD_RAD:
         return math.nan
     return cmath.phase(complex(np.sum(received[good] * np.conj(speed[good]))))
+
+
+def forget_times(feed: Array) -> None:
+    """Begin anew after a clock was set back: what is remembered of its other time is of no use."""
+    feed[_OF_TIME] = new_feed()[_OF_TIME]
+    feed["channels"]["repeated"] = 0.0

@@ -24,9 +24,24 @@ from typing import Any
 
 import numpy as np
 
-from terrain.estimation.feed import FIRST_CAMERA, FIRST_SPEED, FIRST_WHEEL, is_moving, repeats
+from terrain.estimation.feed import (
+    ACCEL,
+    FIRST_CAMERA,
+    FIRST_SIGNAL,
+    FIRST_SPEED,
+    FIRST_WHEEL,
+    GYRO,
+    IMU_YAW,
+    SEEN,
+    SEEN_TURN,
+    SEEN_YAW,
+    TILT,
+    is_moving,
+    places_among,
+    repeats,
+)
 from terrain.estimation.filter import FilterModel
-from terrain.kernels import filled, inner, njit, record
+from terrain.kernels import filled, njit, record
 from terrain.records import ABSENT, GATED, REOPENED, Array
 from terrain.robots import Robot
 
@@ -46,13 +61,24 @@ class Health(IntEnum):
 
 SOUND = Health.REOPENED
 
-#: Sensors that are judged; ``tilt`` is the IMU's pitch and roll.
-SENSORS = (
-    *(f"wheel_{i}" for i in (1, 2, 3)),
-    *(f"steer_{i}" for i in (1, 2, 3)),
-    *("gyro", "accel", "tilt", "imu_yaw"),
-    *("camera_speed", "camera_yaw_rate", "camera_yaw"),
-)
+#: Sensors beside wheels and steering, ``tilt`` is the IMU's pitch and roll: the signal that tells when each was taken
+#: last, the first and last one whose jumps count, and which channels of those that may freeze are its own.
+_OTHERS: dict[str, tuple[int, int, int, tuple[int, ...]]] = {
+    "gyro": (GYRO, GYRO, GYRO, (2,)),
+    "accel": (ACCEL, ACCEL, ACCEL, (3, 4)),
+    "tilt": (ACCEL, TILT, TILT + 1, (6, 7)),
+    "imu_yaw": (IMU_YAW, IMU_YAW, IMU_YAW, (8,)),
+    "camera_speed": (
+        SEEN,
+        SEEN,
+        SEEN + 1,
+        (FIRST_CAMERA + 7, FIRST_CAMERA + 9, FIRST_SPEED, FIRST_SPEED + 1),
+    ),
+    "camera_yaw_rate": (SEEN_TURN, SEEN_TURN, SEEN_TURN, (FIRST_CAMERA + 11,)),
+    "camera_yaw": (SEEN_YAW, SEEN_YAW, SEEN_YAW, tuple(range(FIRST_CAMERA + 3, FIRST_CAMERA + 7))),
+}
+#: Sensors that are judged.
+SENSORS = (*(f"wheel_{i}" for i in (1, 2, 3)), *(f"steer_{i}" for i in (1, 2, 3)), *_OTHERS)
 #: Those that slip control is built on: the camera's yaw turns its speed into the body's axes.
 SLIP_SENSORS = tuple(name for name in SENSORS if name not in ("imu_yaw", "camera_yaw_rate"))
 
@@ -64,40 +90,27 @@ BIAS_RADPS = 0.05  #: A gyro's bias beyond this, five times what is usual, is a 
 COMPARED_S, DISAGREES_MPS = 0.4, 0.25
 N_COLUMNS = 16  #: So many channels of the wheels are compared with those of the sample before.
 
+_FIRST = SENSORS.index("gyro")
+_GYRO, _ACCEL, _SEEN = (SENSORS.index(name) for name in ("gyro", "accel", "camera_speed"))
+_SIGNALS = np.array([signals for *signals, _ in _OTHERS.values()])
+_CHANNELS = np.array([(sensor, c) for sensor, (*_, own) in enumerate(_OTHERS.values(), _FIRST) for c in own])
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps")
 _BIASES = ("accel_bias_x_mps2", "accel_bias_y_mps2", "gyro_bias_radps")
-_WHEEL, _STEER, _GYRO, _ACCEL, _TILT, _YAW, _SEEN, _SEEN_TURN, _SEEN_YAW = (
-    0,
-    3,
-    *range(6, 13),
-)  # among SENSORS
+_FRESH, _LATE, _REOPENED, _GATED, _DISAGREES, _STEPPED, _FROZEN, _LOST = (each.value for each in Health)
 
 #: What is constant: places of motion and biases among the states and of the sensors in the filter, -1 where there is
 #: none; periods of the sensors, and of the ticks.
 MONITOR = record(
-    {
-        **dict.fromkeys(("motion_places", "bias_places"), (int, 3)),
-        "places": (int, len(SENSORS)),
-        "period_s": (float, len(SENSORS)),
-        "tick_s": float,
-    }
+    dict.fromkeys(("motion_places", "bias_places"), (int, 3))
+    | {"places": (int, len(SENSORS)), "period_s": (float, len(SENSORS)), "tick_s": float}
 )
 #: What is remembered: health at the last tick, how long each sensor has been gated; difference of camera and
 #: accelerometer along and across, the camera's last speeds and their instant; the sample of the wheels, and how often
 #: it repeated itself.
 MEMORY = record(
-    {
-        "health": (np.int8, len(SENSORS)),
-        "gated_s": (float, len(SENSORS)),
-        "apart_mps": (float, 2),
-        "seen_mps": (float, 2),
-        "seen_s": float,
-        "wheels": (float, N_COLUMNS),
-        "n_repeated": int,
-    }
+    {"health": (np.int8, len(SENSORS)), "gated_s": (float, len(SENSORS)), "seen_s": float, "n_repeated": int}
+    | {"apart_mps": (float, 2), "seen_mps": (float, 2), "wheels": (float, N_COLUMNS)}
 )
-
-_inner = inner(error_model="numpy")
 
 
 class HealthMonitor:
@@ -113,15 +126,11 @@ class HealthMonitor:
         sensors, camera = robot.sensors, robot.completed.camera
         rates_hz = [sensors.wheels_rate_hz] * 3 + [sensors.steering_rate_hz] * 3
         rates_hz += [sensors.imu_rate_hz] * 4 + [camera.rate_hz] * 3
-
-        def places(names: tuple[str, ...], among: tuple[str, ...]) -> list[int]:
-            return [among.index(name) if name in among else -1 for name in names]
-
         self._settings = filled(
             MONITOR,
-            motion_places=places(_MOTION, model.states),
-            bias_places=places(_BIASES, model.states),
-            places=places(SENSORS, model.sensor_names),
+            motion_places=places_among(_MOTION, model.states),
+            bias_places=places_among(_BIASES, model.states),
+            places=places_among(SENSORS, model.sensor_names),
             period_s=1.0 / np.array(rates_hz),
             tick_s=1.0 / sensors.wheels_rate_hz,
         )
@@ -130,152 +139,91 @@ class HealthMonitor:
         self._wheels = np.zeros(N_COLUMNS)
 
     def judge(
-        self, time_s: float, wheels: Array, rates: Array, row: Array, feed: Array, state: Array
+        self, time_s: float, wheels: Array, rates: Array, rows: Array, feed: Array, state: Array
     ) -> None:
         """Judge the sensors at a tick, by the sample (c,) of the wheels and the rates (3,) of the motors in it.
 
-        ``row`` and ``feed`` are of :mod:`terrain.estimation.feed`, ``state`` is that of the filter after the tick.
+        ``rows`` and ``feed`` are of :mod:`terrain.estimation.feed`, ``state`` is that of the filter after the tick.
         """
         n = min(wheels.size, N_COLUMNS)
         self._wheels[:n] = wheels[:n]
-        _judge(time_s, self._wheels, rates, row, feed, state, self._settings, self.memory)
+        _judge(time_s, self._wheels, rates, rows, feed, state, self._settings, self.memory)
 
     @property
     def names(self) -> dict[str, str]:
         """Health of each sensor by name, in small letters."""
-        health = (Health(status).name.lower() for status in self.health.tolist())
-        return dict(zip(SENSORS, health, strict=True))
+        return {name: Health(health).name.lower() for name, health in zip(SENSORS, self.health, strict=True)}
 
 
-@_inner
-def _compare(time_s: float, row: Any, bias_mps2: Array, motion: Array, memory: Any) -> bool:
-    """Say whether camera and accelerometer disagree; ``motion`` is the speed (2,) and the yaw rate."""
-    step_s, apart = time_s - memory.seen_s, memory.apart_mps
-    seen_x, seen_y = row.camera_speed_mps[0], row.camera_speed_mps[1]
-    accel_x, accel_y = row.accel_mps2[0], row.accel_mps2[1]
-    known = step_s > 0.0 and step_s < COMPARED_S and not math.isnan(seen_x + seen_y + accel_x + accel_y)
-    if known:
+@njit(error_model="numpy")
+def _judge(
+    time_s: float, wheels: Array, rates: Array, rows: Array, feed: Any, state: Any, settings: Any, memory: Any
+) -> None:
+    """Write the health of the sensors at a tick."""
+    row, feed, state, settings, memory = rows[0], feed[0], state[0], settings[0], memory[0]
+    same, health = True, memory.health
+    for c in range(N_COLUMNS):
+        same &= wheels[c] == memory.wheels[c]
+        memory.wheels[c] = wheels[c]
+    memory.n_repeated = memory.n_repeated + 1 if same else 0
+    bias, motion = np.zeros(3), np.empty(3)
+    for i in range(3):
+        if settings.bias_places[i] >= 0:
+            bias[i] = state.x[settings.bias_places[i]]
+        motion[i] = state.x[settings.motion_places[i]]
+
+    # camera against accelerometer
+    apart, step_s = memory.apart_mps, time_s - memory.seen_s
+    seen_x, seen_y = row[FIRST_SIGNAL + SEEN], row[FIRST_SIGNAL + SEEN + 1]
+    along, across = row[FIRST_SIGNAL + ACCEL], row[FIRST_SIGNAL + ACCEL + 1]
+    if step_s > 0.0 and step_s < COMPARED_S and not math.isnan(seen_x + seen_y + along + across):
         keep = math.exp(-step_s / COMPARED_S)
-        along = accel_x - bias_mps2[0] + motion[2] * motion[1]
-        across = accel_y - bias_mps2[1] - motion[2] * motion[0]
+        along, across = along - bias[0] + motion[2] * motion[1], across - bias[1] - motion[2] * motion[0]
         apart[0] = apart[0] * keep + seen_x - memory.seen_mps[0] - along * step_s
         apart[1] = apart[1] * keep + seen_y - memory.seen_mps[1] - across * step_s
     if not math.isnan(seen_x + seen_y):
         if math.isnan(apart[0]):
             apart[0], apart[1] = 0.0, 0.0
         memory.seen_mps[0], memory.seen_mps[1], memory.seen_s = seen_x, seen_y, time_s
-    return bool(abs(apart[0]) > DISAGREES_MPS or abs(apart[1]) > DISAGREES_MPS)
 
-
-@_inner
-def _or_infinite(since_s: float) -> float:
-    return np.inf if math.isnan(since_s) else since_s
-
-
-@_inner
-def _received(line: Any, sensor: int, received_s: Array, jumped_s: Array) -> None:
-    """Write when a signal of a sensor was taken last, and since when it has jumped and not jumped back."""
-    received_s[sensor] = line.came_s
-    jumped_s[sensor] = min(_or_infinite(line.jumping_s), _or_infinite(line.jumped_s))
-
-
-@_inner
-def _when_received(feed: Any, received_s: Array, jumped_s: Array) -> None:
-    """Write when each sensor (13,) was taken last, and since when its value has jumped, infinite where it has not."""
-    jumped_s[:] = np.inf
-    for i in range(3):
-        received_s[_WHEEL + i], received_s[_STEER + i] = feed.rate_received_s[i], feed.steer_received_s[i]
-    _received(feed.gyro_z_radps, _GYRO, received_s, jumped_s)
-    _received(feed.accel_mps2[0], _ACCEL, received_s, jumped_s)
-    _received(feed.imu_yaw_rad, _YAW, received_s, jumped_s)
-    _received(feed.camera_speed_mps[0], _SEEN, received_s, jumped_s)
-    _received(feed.camera_yaw_rate_radps, _SEEN_TURN, received_s, jumped_s)
-    _received(feed.camera_yaw_rad, _SEEN_YAW, received_s, jumped_s)
-    received_s[_TILT] = feed.accel_mps2[0].came_s
-    jumped_s[_TILT] = min(_or_infinite(feed.tilt_rad[0].jumped_s), _or_infinite(feed.tilt_rad[1].jumped_s))
-    jumped_s[_SEEN] = min(jumped_s[_SEEN], _or_infinite(feed.camera_speed_mps[1].jumped_s))
-
-
-@_inner
-def _status(i: int, age_s: float, jumping_s: float, use: int, settings: Any, memory: Any) -> int:
-    """Return the health of a sensor by what came of it, and by what the filter made of it.
-
-    What was gated or worse has to be used first: only then is it sound again.
-    """
-    status = Health.FRESH.value
-    if jumping_s > JUMPING_S:
-        status = Health.STEPPED.value
-    elif not age_s <= (WHEELS_LOST_S if i < _STEER else LOST_AFTER_S):
-        status = Health.LOST.value
-    elif age_s > LATE_PERIODS * settings.period_s[i]:
-        status = Health.LATE.value
-    if use == GATED:
-        memory.gated_s[i] += settings.tick_s
-        if memory.gated_s[i] > GATED_AFTER_S or memory.health[i] >= Health.GATED.value:
-            return max(status, Health.GATED.value)
-    elif use != ABSENT:
-        memory.gated_s[i] = 0.0
-    return max(status, Health.REOPENED.value) if use == REOPENED else status
-
-
-@_inner
-def _mark_frozen(feed: Any, health: Array) -> None:
-    """Mark the sensors of frozen channels, of wheels aside."""
-    for c in range(9):  # rates, forces, roll, pitch, yaw
-        sensor = (-1, -1, _GYRO, _ACCEL, _ACCEL, -1, _TILT, _TILT, _YAW)[c]
-        if sensor >= 0 and repeats(feed, c):
-            health[sensor] = Health.FROZEN.value
-    for c in range(3, 12):  # quaternion, velocity, turning about the vertical
-        sensor = _SEEN_YAW if c < 7 else (_SEEN if c < 10 else _SEEN_TURN)
-        if c not in (8, 10) and repeats(feed, FIRST_CAMERA + c):
-            health[sensor] = Health.FROZEN.value
-    for c in range(2):
-        if repeats(feed, FIRST_SPEED + c):
-            health[_SEEN] = Health.FROZEN.value
-
-
-@_inner
-def _mark_stuck(rates: Array, speed_mps: float, row: Any, feed: Any, memory: Any) -> None:
-    """Mark the wheels that are frozen: their rate repeats itself, or all that the wheels measure does.
-
-    A sample of zeros may be that of a robot at rest: it is frozen where the robot has a speed.
-    """
-    for i in range(3):
-        left_out = math.isnan(row.wheel_radps[i]) and math.isfinite(rates[i])
-        stuck = left_out and repeats(feed, FIRST_WHEEL + i)
-        stuck |= memory.n_repeated >= N_STUCK and (rates[i] != 0.0 or speed_mps > AT_REST_MPS)
-        if stuck:
-            memory.health[_WHEEL + i] = Health.FROZEN.value
-
-
-@njit(error_model="numpy")
-def _judge(
-    time_s: float, wheels: Array, rates: Array, row: Any, feed: Any, state: Any, settings: Any, memory: Any
-) -> None:
-    """Write the health of the sensors at a tick."""
-    row, feed, state, settings, memory = row[0], feed[0], state[0], settings[0], memory[0]
-    same, health = True, memory.health
-    for c in range(N_COLUMNS):
-        same &= wheels[c] == memory.wheels[c]
-        memory.wheels[c] = wheels[c]
-    memory.n_repeated = memory.n_repeated + 1 if same else 0
-    bias, motion = np.empty(3), np.empty(3)
-    for i in range(3):
-        place = settings.bias_places[i]
-        bias[i] = state.x[place] if place >= 0 else 0.0
-        motion[i] = state.x[settings.motion_places[i]]
-    disagrees = _compare(time_s, row, bias, motion, memory)
-    received_s, jumped_s = np.empty(health.size), np.empty(health.size)
-    _when_received(feed, received_s, jumped_s)
+    # what came of each sensor, and what the filter made of it
     for i in range(health.size):
+        received_s, jumped_s = feed.received_s[i // 3 % 2, i % 3], np.inf
+        if i >= _FIRST:
+            received_s = feed.lines[_SIGNALS[i - _FIRST, 0]].came_s
+            for k in range(_SIGNALS[i - _FIRST, 1], _SIGNALS[i - _FIRST, 2] + 1):
+                for since_s in (feed.lines[k].jumping_s, feed.lines[k].jumped_s):
+                    if since_s < jumped_s:  # False for NaN
+                        jumped_s = since_s
         use = state.use[settings.places[i]] if settings.places[i] >= 0 else ABSENT
-        age_s, jumping_s = time_s - received_s[i], time_s - jumped_s[i]
-        health[i] = _status(i, age_s, jumping_s, use, settings, memory)
-    if disagrees:
-        health[_ACCEL] = max(health[_ACCEL], Health.DISAGREES.value)
-        health[_SEEN] = max(health[_SEEN], Health.DISAGREES.value)
+        age_s, status = time_s - received_s, _FRESH
+        if time_s - jumped_s > JUMPING_S:
+            status = _STEPPED
+        elif not age_s <= (WHEELS_LOST_S if i < 3 else LOST_AFTER_S):
+            status = _LOST
+        elif age_s > LATE_PERIODS * settings.period_s[i]:
+            status = _LATE
+        if use == GATED:
+            memory.gated_s[i] += settings.tick_s
+            if memory.gated_s[i] > GATED_AFTER_S or health[i] >= _GATED:
+                status = max(status, _GATED)  # it has to be used before it is sound again
+        elif use != ABSENT:
+            memory.gated_s[i] = 0.0
+            if use == REOPENED:
+                status = max(status, _REOPENED)
+        health[i] = status
+    if abs(apart[0]) > DISAGREES_MPS or abs(apart[1]) > DISAGREES_MPS:
+        health[_ACCEL], health[_SEEN] = max(health[_ACCEL], _DISAGREES), max(health[_SEEN], _DISAGREES)
     if abs(bias[2]) > BIAS_RADPS:
-        health[_GYRO] = max(health[_GYRO], Health.DISAGREES.value)
+        health[_GYRO] = max(health[_GYRO], _DISAGREES)
     if is_moving(feed):
-        _mark_frozen(feed, health)
-    _mark_stuck(rates, math.hypot(motion[0], motion[1]), row, feed, memory)
+        for n in range(_CHANNELS.shape[0]):
+            if repeats(feed, _CHANNELS[n, 1]):
+                health[_CHANNELS[n, 0]] = _FROZEN
+
+    # a wheel whose rate repeats itself, or all that the wheels measure: zeros may be those of a robot at rest
+    for i in range(3):
+        stuck = math.isnan(row[i]) and math.isfinite(rates[i]) and repeats(feed, FIRST_WHEEL + i)
+        moves = rates[i] != 0.0 or math.hypot(motion[0], motion[1]) > AT_REST_MPS
+        if stuck or (memory.n_repeated >= N_STUCK and moves):
+            health[i] = _FROZEN

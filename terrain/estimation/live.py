@@ -23,29 +23,34 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from terrain.errors import ConfigError
-from terrain.estimation import feed as rows
-from terrain.estimation.clocks import REWIND_S, numbers
+from terrain.estimation.clocks import NEVER, REWIND_S, readable
 from terrain.estimation.feed import (
     GNSS_LATENCY_S,
     GNSS_PERIOD_S,
     GNSS_ROWS,
+    N_NUMBERS,
     OFF_CLOCK_S,
     ROWS,
+    SIDE,
     STREAMS,
     TICK_S,
-    Due,
     SampleQueue,
     check_channels,
+    counts_of,
+    feed_settings,
+    forget_times,
+    new_feed,
     places_among,
+    run_feed,
 )
-from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings, Noise
+from terrain.estimation.filter import GATE_PROBABILITY, REOPEN_AFTER_S, Filter, FilterSettings
 from terrain.estimation.health import HealthMonitor
 from terrain.estimation.models.choice import OBSERVERS, make_observer
 from terrain.estimation.models.observer import Observer, ObserverFeed, ObserverStatus
@@ -75,8 +80,10 @@ LATE_PERIODS = 1.5  #: So many periods without wheels make a tick without them.
 
 _JUST_BEFORE_S = 1e-6
 _MOTION = ("speed_x_mps", "speed_y_mps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
-
-Samples = tuple[list[float], Array, Array]  #: Stamps, twice, and values of a stream.
+#: A block of samples of each stream where none came.
+_NOTHING = {
+    name: (np.empty(0), np.empty(0, np.bool_), np.empty((0, len(names)))) for name, names in STREAMS.items()
+}
 
 
 class LiveEstimate(NamedTuple):
@@ -112,72 +119,6 @@ class Tick(NamedTuple):
     wheels: Array | None
 
 
-class _History:
-    """The last ticks with a snapshot of all that was remembered after each, and the last samples of each stream.
-
-    The first tick is none: what was remembered before any.
-    """
-
-    def __init__(self, snapshot: Callable[[], Any], restore: Callable[[Any], None]) -> None:
-        self._snapshot, self._restore = snapshot, restore
-        self._ticks: deque[tuple[Tick, Any]] = deque(maxlen=N_TICKS)
-        self._samples: deque[tuple[float, dict[str, Samples]]] = deque(maxlen=N_STEPS)
-        self.add_tick(Tick(-math.inf, None))
-
-    def add_samples(self, came: dict[str, Samples], now_s: float) -> None:
-        """Remember what came of each stream at a step, and drop what is old."""
-        samples = self._samples
-        samples.append((max([stamps[-1] for stamps, _, _ in came.values()]), came))
-        while samples and not samples[0][0] > now_s - 2.0 * REWIND_S:
-            samples.popleft()
-
-    def add_tick(self, tick: Tick) -> None:
-        """Remember a tick that was just done."""
-        self._ticks.append((tick, self._snapshot()))
-
-    def stamps(self, stream: str) -> set[float]:
-        """Return the stamps of a stream that came."""
-        return {stamp_s for _, came in self._samples if stream in came for stamp_s in came[stream][0]}
-
-    @property
-    def last_s(self) -> float:
-        """Stamp of the last tick; minus infinity before the first."""
-        return self._ticks[-1][0].time_s if self._ticks else -math.inf
-
-    @property
-    def last_measured_s(self) -> float:
-        """Stamp of the last tick at which the wheels gave a sample."""
-        return next((tick.time_s for tick, _ in reversed(self._ticks) if tick.wheels is not None), -math.inf)
-
-    def reaches(self, time_s: float) -> bool:
-        """Say whether it is possible to go back before an instant."""
-        return bool(self._ticks) and time_s - TICK_S > max(self._ticks[0][0].time_s, self.last_s - REWIND_S)
-
-    def go_back(self, time_s: float) -> list[Tick]:
-        """Go back to what was remembered at the last tick before an instant; return the ticks after it."""
-        later: list[Tick] = []
-        while self.last_s >= time_s - TICK_S:
-            later.append(self._ticks.pop()[0])
-        self._restore(self._ticks[-1][1])
-        return later[::-1]
-
-    def since(self, stream: str, time_s: float) -> tuple[Array, Array] | None:
-        """Return the samples of a stream that are stamped after an instant, in order, each stamp once."""
-        steps = [came[stream] for _, came in self._samples if stream in came]
-        blocks = [(at_s, values) for stamps, at_s, values in steps if max(stamps) > time_s]
-        if not blocks:
-            return None
-        stamps, values = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
-        later = np.flatnonzero(stamps > time_s)
-        _, first = np.unique(stamps[later], return_index=True)
-        return stamps[later][first], values[later][first]
-
-    def clear(self) -> None:
-        """Drop all: the clock was set back."""
-        self._ticks.clear()
-        self._samples.clear()
-
-
 class Live(ABC):
     """What takes the samples of a robot as they come: a queue a stream, ticks, and the rewind for what is late.
 
@@ -191,9 +132,8 @@ class Live(ABC):
     filter: Filter | None
     name: str  #: of the filter or observer
     states: tuple[str, ...]  #: name of each state, in the order of ``mean`` and ``std``
-    health: Mapping[str, str] = MappingProxyType(
-        {}
-    )  #: of each sensor at the last tick; empty where none is judged
+    #: of each sensor at the last tick; empty where none is judged
+    health: Mapping[str, str] = MappingProxyType({})
     latest: Any
     _ticks_without_wheels = False  #: whether time goes on where the wheels give nothing
 
@@ -204,17 +144,18 @@ class Live(ABC):
         period_s: float,
         correction: Correction | None,
     ) -> None:
-        self._channels, self._queues, self._correction = channels, dict(queues), correction
-        self._n_columns = {name: len(channels[name]) for name in ("wheels", *queues)}
-        self._no_wheels, self._period_s = np.full(len(channels["wheels"]), np.nan), period_s
-        self._history = _History(self._snapshot, self._restore)
-        self.latest = None
-        self._unsettled: deque[Any] = deque()
-        self._settled_s = -math.inf
-        self._newest_s: dict[str, float] = {}
+        self._channels = {name: channels[name] for name in (*queues, "wheels")}
+        self._queues, self._correction, self._period_s = dict(queues), correction, period_s
+        self._no_wheels = np.full(len(channels["wheels"]), np.nan)
         self._counted: Counter[str] = Counter()
+        #: ticks, each with what was remembered after it; the first is none. What came of each stream at a step
+        self._ticks: deque[tuple[Tick, Any]] = deque(maxlen=N_TICKS)
+        self._came: deque[tuple[float, dict[str, tuple[list[float], Reading]]]] = deque(maxlen=N_STEPS)
         self._leapt: Tick | None = None  # not believed yet: its stamp is far ahead
-        self.too_late = -math.inf, math.nan
+        self._unsettled: deque[Any] = deque()
+        self._settled_s, self._newest_s = -math.inf, dict[str, float]()
+        self.latest, self.too_late = None, NEVER
+        self._add(Tick(-math.inf, None))
 
     @abstractmethod
     def _follows(self, time_s: float) -> int:
@@ -225,12 +166,11 @@ class Live(ABC):
         """Begin anew after a clock was set back."""
 
     @abstractmethod
-    def _last_taken_s(self, name: str) -> float:
-        """Return the stamp of the last sample of a stream that was taken out of its queue."""
+    def _estimate(self, tick: Tick, leapt: Tick | None) -> Any:
+        """Do a tick: take the samples that are due, and return what is known then.
 
-    @abstractmethod
-    def _estimate(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Any:
-        """Do a tick: take the samples that are due, and return what is known then."""
+        The tick before it may be one that ``leapt``: it was not believed, and is right, as the next one shows.
+        """
 
     @abstractmethod
     def _snapshot(self) -> Any:
@@ -248,6 +188,15 @@ class Live(ABC):
             counts |= {f"{name}: {kind}": n for kind, n in queue.counts.items()}
         return counts
 
+    @property
+    def _last_s(self) -> float:
+        """Stamp of the last tick; minus infinity before the first."""
+        return self._ticks[-1][0].time_s if self._ticks else -math.inf
+
+    def _add(self, tick: Tick) -> None:
+        taken_s = [queue.taken_s for queue in self._queues.values()]
+        self._ticks.append((tick, (self._snapshot(), taken_s)))
+
     def step(self, readings: Mapping[str, Reading], now_s: float | None = None) -> list[Any]:
         """Take in what arrived, and return the estimates at samples of the wheels that have settled.
 
@@ -260,56 +209,67 @@ class Live(ABC):
         now_s : the time by the clock of the stamps: a tick where the wheels have given nothing for one and a
             half of their periods
         """
-        if not isinstance(readings, Mapping):
-            readings = {}
-        history, last_s, late_s = self._history, self._history.last_s, math.inf
-        came: dict[str, Samples] = {}
-        ticks = []
-        for name in (*self._queues, "wheels"):
-            taken = self._taken(name, readings, came)
-            if taken is None:
+        came: dict[str, tuple[list[float], Reading]] = {}
+        last_s, late_s, ticks = self._last_s, math.inf, list[Tick]()
+        for name in self._channels if isinstance(readings, Mapping) else ():
+            reading = self._read(name, readings[name]) if readings.get(name) is not None else None
+            if reading is None:
                 continue
-            stamps, time_s, values = taken
-            if name != "wheels":
-                late = (
-                    self._late(name, stamps, last_s)
-                    if stamps and min(stamps) <= last_s + TICK_S
-                    else math.inf
-                )
-                late_s = min(late_s, late)
-                if late == math.inf:
-                    self._queues[name].push(time_s, values, self._last_taken_s(name))
-                continue
-            ticks = [Tick(*tick) for tick in zip(stamps, values, strict=True)]
-            if ticks and stamps[0] <= last_s and history.last_measured_s < stamps[0]:
-                late_s = min(late_s, self._late("wheels", stamps, last_s))
+            stamps = reading.time_s.tolist()
+            came[name] = stamps, reading
+            if stamps[-1] <= last_s + OFF_CLOCK_S or last_s == -math.inf:  # else its clock jumped
+                self._newest_s[name] = max(stamps[-1], self._newest_s.get(name, -math.inf))
+            is_late = min(stamps) <= last_s + TICK_S
+            if name == "wheels":
+                ticks = [Tick(*tick) for tick in zip(stamps, reading.values, strict=True)]
+                known = (tick.time_s for tick, _ in reversed(self._ticks) if tick.wheels is not None)
+                is_late = stamps[0] <= last_s and next(known, -math.inf) < stamps[0]
+            before_s = self._late(name, stamps) if is_late else math.inf
+            late_s = min(late_s, before_s)
+            if name != "wheels" and before_s == math.inf:
+                self._queues[name].push(*reading)
         if came:
-            history.add_samples(came, last_s)
-            for name, (stamps, _, _) in came.items():
-                if stamps[-1] <= last_s + OFF_CLOCK_S or last_s == -math.inf:  # else its clock jumped
-                    self._newest_s[name] = max(stamps[-1], self._newest_s.get(name, -math.inf))
+            self._came.append((max(stamps[-1] for stamps, _ in came.values()), came))
+            while self._came and not self._came[0][0] > last_s - 2.0 * REWIND_S:
+                self._came.popleft()
         if late_s < math.inf:
             ticks = self._go_back(late_s, ticks)
-        if self._ticks_without_wheels and now_s is not None and history.last_s > -math.inf:
-            reached_s = ticks[-1].time_s if ticks else history.last_s
+        if self._ticks_without_wheels and now_s is not None and self._last_s > -math.inf:
+            reached_s = ticks[-1].time_s if ticks else self._last_s
             if LATE_PERIODS * self._period_s < now_s - reached_s < SETTINGS.max_gap_s:
                 ticks.append(Tick(now_s, None))
                 self._counted["ticks without wheels"] += 1
         settled: list[Any] = []
         for tick in ticks:
-            estimate = self._tick(tick, settled)
-            if estimate is not None:
-                self.latest = estimate
-                if tick.wheels is not None and tick.time_s > self._settled_s:
-                    self._unsettled.append(estimate)
+            follows, leapt = self._follows(tick.time_s), self._leapt
+            self._leapt = tick if follows == 0 and tick.time_s > self._last_s else None
+            if follows == 0:
+                continue
+            if follows < 0:  # what was not settled before has settled
+                settled += self._unsettled
+                self._unsettled.clear()
+                self._newest_s.clear()
+                self._settled_s, leapt = -math.inf, None
+                self._forget()
+                for queue in self._queues.values():
+                    queue.waiting.clear()
+            if leapt is not None and not self._last_s < leapt.time_s < tick.time_s:
+                leapt = None
+            self.latest = self._estimate(tick, leapt)
+            if follows < 0:
+                self._ticks.clear()
+                self._came.clear()
+            self._add(tick)
+            if tick.wheels is not None and tick.time_s > self._settled_s:
+                self._unsettled.append(self.latest)
         return settled + self.settle()
 
     def settle(self, *, all_of_them: bool = False) -> list[Any]:
         """Return the estimates that have settled since the last call, or all that are there, at a log's end."""
         if not self._unsettled:
             return []
-        last_s, first_s, reached_s = self._history.last_s, self._unsettled[0].time_s, math.inf
-        for name in self._n_columns:
+        last_s, first_s, reached_s = self._last_s, self._unsettled[0].time_s, math.inf
+        for name in self._channels:
             newest_s = self._newest_s.setdefault(name, first_s - _JUST_BEFORE_S)
             if newest_s > last_s - REWIND_S:  # one that stopped, or does not begin, is waited for no longer
                 reached_s = min(reached_s, newest_s)
@@ -320,43 +280,35 @@ class Live(ABC):
             self._settled_s = settled[-1].time_s
         return settled
 
-    def _taken(self, name: str, readings: Mapping[str, Reading], came: dict[str, Samples]) -> Samples | None:
-        """Return what came of a stream, noted where it has stamps to go back to; None where nothing did.
+    def _read(self, name: str, given: Any) -> Reading | None:
+        """Return what came of a stream, without stamps that are no numbers; None of nothing.
 
-        Values that do not fit are unknown, stamps that do not are nothing.
+        Samples of the wheels whose values do not fit are unknown.
         """
-        reading = readings.get(name)
-        if reading is None or name not in self._n_columns:
-            return None
-        try:
-            time_s, values = numbers(reading[0]), numbers(reading[1])
-        except (TypeError, ValueError, LookupError):
-            time_s = values = None
-        if time_s is None or values is None:
+        reading, n_columns = readable(given), len(self._channels[name])
+        if reading is None or reading.values.shape[1] != n_columns:
             self._counted[f"{name}: unreadable"] += 1
-            return None
-        if time_s.ndim != 1 or values.shape != (time_s.size, self._n_columns[name]):
-            self._counted[f"{name}: unreadable"] += max(time_s.size, 1)
-            if name != "wheels" or time_s.ndim != 1:
+            if reading is None or name != "wheels":
                 return None
-            values = np.full((time_s.size, self._n_columns[name]), np.nan)
+            reading = Reading(reading.time_s, np.full((reading.time_s.size, n_columns), np.nan))
         elif self._correction is not None:
-            time_s, values = self._correction(name, self._channels[name], time_s, values)
-        stamps: list[float] = time_s.tolist()
-        taken = stamps, time_s, values
-        if stamps and math.isfinite(sum(stamps)):
-            came[name] = taken
-        return taken
+            reading = Reading(*self._correction(name, self._channels[name], *reading))
+        finite = np.isfinite(reading.time_s)
+        if not finite.all():
+            self._counted[f"{name}: stamp does not increase"] += int((~finite).sum())
+            reading = Reading(reading.time_s[finite], reading.values[finite])
+        return reading if reading.time_s.size else None
 
-    def _late(self, name: str, stamps: list[float], last_s: float) -> float:
-        """Return the instant to go back to for late samples, infinite where there is none that is new."""
-        known = self._history.stamps(name)
+    def _late(self, name: str, stamps: list[float]) -> float:
+        """Return the instant to go back to for late samples, infinite where there is none that is new, or in reach."""
+        last_s = self._last_s
+        known = {stamp_s for _, came in self._came if name in came for stamp_s in came[name][0]}
         late_s = min(
             (at_s for at_s in stamps if at_s <= last_s + TICK_S and at_s not in known), default=math.inf
         )
         if late_s == math.inf:
             return math.inf
-        if not self._history.reaches(late_s):
+        if not late_s - TICK_S > max(self._ticks[0][0].time_s, last_s - REWIND_S):
             self.too_late = last_s, last_s - late_s
             return math.inf
         self._counted["came late"] += 1
@@ -364,54 +316,30 @@ class Live(ABC):
 
     def _go_back(self, late_s: float, ticks: list[Tick]) -> list[Tick]:
         """Put the memory back before an instant; return the ticks to be done again, with new ones."""
-        done = self._history.go_back(late_s)
-        for name, queue in self._queues.items():
+        done = [] if self._leapt is None else [self._leapt]
+        self._leapt = None
+        while self._last_s >= late_s - TICK_S:
+            done.append(self._ticks.pop()[0])
+        memory, taken_s = self._ticks[-1][1]
+        self._restore(memory)
+        for (name, queue), before_s in zip(self._queues.items(), taken_s, strict=True):
+            queue.taken_s = before_s
             queue.waiting.clear()
-            later = self._history.since(name, self._last_taken_s(name))
-            if later is not None:
-                queue.push(*later, self._last_taken_s(name))
-        first_s = done[0].time_s if done else math.inf
+            later = [
+                came[name][1] for _, came in self._came if name in came and max(came[name][0]) > before_s
+            ]
+            if later:
+                time_s, values = (np.concatenate(parts) for parts in zip(*later, strict=True))
+                _, first = np.unique(time_s, return_index=True)
+                first = first[time_s[first] > before_s]
+                queue.push(time_s[first], values[first])
+        first_s = min((tick.time_s for tick in done), default=math.inf)
         while self._unsettled and self._unsettled[-1].time_s >= first_s:
             self._unsettled.pop()
         measured = {tick.time_s: tick for tick in (*ticks, *done) if tick.wheels is not None}
         reached_s = max(measured, default=-math.inf) + LATE_PERIODS * self._period_s  # none was due before
         spare = [tick for tick in done if tick.wheels is None and tick.time_s > reached_s]
         return sorted([*measured.values(), *spare], key=lambda tick: tick.time_s)
-
-    def _tick(self, tick: Tick, settled: list[Any]) -> Any:
-        """Do a tick; what was not settled before a clock was set back has settled."""
-        follows, leapt = self._follows(tick.time_s), self._leapt
-        self._leapt = None
-        if follows == 0:
-            self._leapt = tick if math.isfinite(tick.time_s) else None
-            return None
-        if follows < 0:
-            settled += self._unsettled
-            self._unsettled.clear()
-            self._newest_s.clear()
-            self._settled_s = -math.inf
-            self._forget()
-            for queue in self._queues.values():
-                queue.waiting.clear()
-        elif (
-            leapt is not None
-            and self._history.last_s < leapt.time_s < tick.time_s
-            and leapt.wheels is not None
-        ):
-            self._pass(leapt.time_s, leapt.wheels, self._due(leapt.time_s))
-        due = self._due(tick.time_s)
-        wheels = self._no_wheels if tick.wheels is None else tick.wheels
-        estimate = self._estimate(tick.time_s, wheels, due)
-        if follows < 0:
-            self._history.clear()
-        self._history.add_tick(tick)
-        return estimate
-
-    def _due(self, time_s: float) -> dict[str, Due]:
-        return {name: queue.take(time_s) for name, queue in self._queues.items()}
-
-    def _pass(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Any:  # noqa: B027
-        """Take what was measured up to a stamp that leapt, and was no tick: the next one has shown it to be right."""
 
 
 class LiveFilter(Live):
@@ -423,8 +351,6 @@ class LiveFilter(Live):
         skids; corrected
     filter_name : one of :data:`~terrain.estimation.estimate.FILTERS` that is the robot's
     channels : names of the columns of the streams that are read, in their order; those of the schema
-    settings : when a measurement or a stamp is not believed
-    noise : in place of the physical
     initial_yaw_rad : heading of the start in the world; without it the GNSS is not used
     gnss_latency_s : age of a position when it arrives
     rate_hz : of ``wheels`` and ``imu``, where they are not those of the robot's description
@@ -434,8 +360,6 @@ class LiveFilter(Live):
     ------
     ConfigError
         if filter, robot and channels do not fit, the robot is not corrected, or a number is out of its range.
-    DataError
-        if the noise does not fit the filter.
 
     Examples
     --------
@@ -460,9 +384,7 @@ class LiveFilter(Live):
         robot: Robot,
         filter_name: str = "vio15",
         channels: Mapping[str, tuple[str, ...]] | None = None,
-        settings: FilterSettings = SETTINGS,
         *,
-        noise: Noise | None = None,
         initial_yaw_rad: float | None = None,
         gnss_latency_s: float = GNSS_LATENCY_S,
         rate_hz: Mapping[str, float] | None = None,
@@ -475,72 +397,60 @@ class LiveFilter(Live):
         for stream, rate in (rate_hz or {}).items():
             if not 0.0 < rate < math.inf:
                 raise ConfigError(f"rate of {stream!r} is {rate} Hz, a number above zero is required")
-        skids = filter_name == "skid"
+        self._robot, self._skids = robot, filter_name == "skid"
         if channels is None:
-            channels = {**CHANNELS, "wheels": robot.rate_channels} if skids else CHANNELS
-        has_gnss = not skids and initial_yaw_rad is not None and "gnss" in channels
-        if skids:
-            self.model, usual = make_skid_filter(robot), skid_noise(robot)
+            channels = {**CHANNELS, "wheels": robot.rate_channels} if self._skids else CHANNELS
+        has_gnss = not self._skids and initial_yaw_rad is not None and "gnss" in channels
+        if self._skids:
+            self.model, noise = make_skid_filter(robot), skid_noise(robot)
         else:
             self.model = make_filter(filter_name, robot, with_gnss=has_gnss)
             robot.require("motors", "steering", "sensors")
-            usual = default_noise(filter_name, robot, has_gnss)
-        states, model_rows = self.model.states, self.model.rows
-        is_scheduled = noise is None and bool(self.model.inputs)
-        self._schedule = Schedule(self.model, ROWS) if is_scheduled else None
-        self._robot, self._skids = robot, skids
-        self.filter = Filter(self.model, usual if noise is None else noise, settings)
-        sensors = robot.completed.sensors
+            noise = default_noise(filter_name, robot, has_gnss)
+        self.name, self.states, self.filter = (
+            self.model.name,
+            self.model.states,
+            Filter(self.model, noise, SETTINGS),
+        )
+        sensors, camera = robot.completed.sensors, robot.completed.camera
         rates = {"wheels": sensors.wheels_rate_hz, "imu": sensors.imu_rate_hz, "gnss": 1.0 / GNSS_PERIOD_S}
-        rates["steering"] = sensors.steering_rate_hz
-        if robot.describes("camera"):
-            rates["odometry"] = robot.camera.rate_hz
-        period_s = {stream: 1.0 / rate for stream, rate in (rates | dict(rate_hz or {})).items()}
-        self._settings = rows.feed_settings(robot, period_s, yaw_rad, gnss_latency_s)
-        self._feed, self._row = rows.new_feed(), np.zeros(1, rows.ROW)
-        self._numbers = rows.measurements(self._row)
-        self._monitor = None if skids else HealthMonitor(robot, self.model)
-        self._slip = SlipOfInstant(robot, states)
+        rates |= {"steering": sensors.steering_rate_hz, "odometry": camera.rate_hz, **(rate_hz or {})}
+        period_s = {stream: 1.0 / rate for stream, rate in rates.items() if rate > 0.0}
+        arriving = {"is_causal": True, "is_live": True}
+        self._settings = feed_settings(robot, period_s, yaw_rad, gnss_latency_s, **arriving)
+        self._feed, self._rows = new_feed(), np.full((1, N_NUMBERS), np.nan)
+        self._schedule = Schedule(self.model, ROWS) if self.model.inputs else None
+        self._monitor = None if self._skids else HealthMonitor(robot, self.model)
+        self._slip, self._region = SlipOfInstant(robot, self.states), RegionMonitor(robot)
         self._motion = motion_memory()
         memories = [self.filter.state, self._feed, self._motion]
         memories += [] if self._monitor is None else [self._monitor.memory]
         self._memories = [memory.view(np.uint8) for memory in memories]  # bytes are copied at once
-        super().__init__(channels, self._queues_of(channels, has_gnss), period_s["wheels"], correction)
-        self._region = RegionMonitor(robot)
-        self._row_places = [ROWS.index(row) for row in model_rows]
-        self._gnss_places = [k for k, row in enumerate(model_rows) if row in GNSS_ROWS]
-        motion = ("speed_mps", "", "yaw_rate_radps", "", "") if skids else _MOTION
-        self._motion_places = places_among(motion, states).tolist()
-        self.name, self.states = self.model.name, states
-
-    def _queues_of(self, channels: Mapping[str, tuple[str, ...]], has_gnss: bool) -> dict[str, SampleQueue]:
-        """Find the columns of the wheels, and return a queue for each stream that is read."""
-        needed = {"wheels": self._robot.rate_channels}
+        self._row_places = [ROWS.index(row) for row in self.model.rows]
+        self._gnss_places = [k for k, row in enumerate(self.model.rows) if row in GNSS_ROWS]
+        motion = ("speed_mps", "", "yaw_rate_radps", "", "") if self._skids else _MOTION
+        self._motion_places = places_among(motion, self.states).tolist()
+        check_channels("wheels", robot.rate_channels, channels.get("wheels", ()))
         if self._skids and channels.get("imu"):
-            needed["imu"] = ("gyro_z_radps",)
-        for stream, names in needed.items():
-            check_channels(stream, names, channels.get(stream, ()))
-        has = {"gnss": has_gnss, "odometry": self._robot.describes("camera")}
-        used = ("imu",) if self._skids else tuple(STREAMS)
-        wheels = list(channels["wheels"])
-        self._rate_columns = [wheels.index(channel) for channel in self._robot.rate_channels]
-        self._current_columns = places_among([f"current_{wheel}_a" for wheel in self._robot.wheels], wheels)
-        return {
+            check_channels("imu", ("gyro_z_radps",), channels["imu"])
+        has = {"gnss": has_gnss, "odometry": robot.describes("camera")}
+        queues = {
             name: SampleQueue(places_among(STREAMS[name], channels[name]))
-            for name in used
+            for name in (("imu",) if self._skids else STREAMS)
             if channels.get(name) and has.get(name, True)
         }
+        self._rate_columns = places_among(robot.rate_channels, channels["wheels"])
+        self._current_columns = places_among(
+            [f"current_{wheel}_a" for wheel in robot.wheels], channels["wheels"]
+        )
+        super().__init__(channels, queues, period_s["wheels"], correction)
 
     @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind, and by what the filter did not believe."""
-        counts = super().dropped | self.filter.dropped
+        counts = super().dropped | self.filter.dropped | counts_of(self._feed, self._queues)
         counts["wheels: not finite"] = int(self._feed["wheels_not_finite"][0])
         counts["wheels: beyond the motors"] = int(self._feed["wheels_beyond"][0])
-        for stream, name in enumerate(STREAMS):
-            if name in self._queues:
-                for kind in rows.COUNTS:
-                    counts[f"{name}: {kind.replace('_', ' ')}"] = int(self._feed[kind][0, stream])
         return {kind: n for kind, n in counts.items() if n}
 
     @property
@@ -565,17 +475,12 @@ class LiveFilter(Live):
 
     def _follows(self, time_s: float) -> int:
         follows = self.filter.follows(time_s)
-        if follows == 0:
-            self.filter.step(
-                time_s, np.full(len(self.model.rows), np.nan)
-            )  # to count it, and remember a jump
+        if follows == 0:  # to count it, and remember a jump
+            self.filter.step(time_s, np.full(len(self.model.rows), np.nan))
         return follows
 
     def _forget(self) -> None:
-        rows.forget_times(self._feed)
-
-    def _last_taken_s(self, name: str) -> float:
-        return float(self._feed["last_s"][0, list(STREAMS).index(name)])
+        forget_times(self._feed)
 
     def _snapshot(self) -> list[Array]:
         return [memory.copy() for memory in self._memories]
@@ -584,46 +489,50 @@ class LiveFilter(Live):
         for one, snapshot in zip(self._memories, memory, strict=True):
             one[:] = snapshot
 
-    def _pass(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Array:
-        for stream, name in enumerate(STREAMS):
-            for came_s, complete, sample in due.get(name, ()):
-                rows.take_live(stream, sample, complete, came_s, self._settings, self._feed)
-        rates = wheels[self._rate_columns]
-        if wheels is not self._no_wheels:
-            self._feed["wheels_not_finite"] += not math.isfinite(sum(rates.tolist()))
-        if self._skids:
-            rates[~np.isfinite(rates)] = np.nan
-        rows.tick_live(time_s, rates, self._settings, self._feed, self._row)
+    def _measure(self, tick: Tick) -> Array:
+        """Write the row of a tick; return the rates of the motors, or the speeds of the sides, NaN where unknown."""
+        blocks = []
+        for name, nothing in _NOTHING.items():
+            due = self._queues[name].take(tick.time_s) if name in self._queues else []
+            blocks.append(tuple(map(np.array, zip(*due, strict=True))) if due else nothing)
+        stamps, are_whole, samples = zip(*blocks, strict=True)
+        rates = (self._no_wheels if tick.wheels is None else tick.wheels)[self._rate_columns]
+        unknown = ~np.isfinite(rates)
+        rates[unknown] = np.nan
+        self._feed["wheels_not_finite"] += tick.wheels is not None and unknown.any()
+        clock = np.array([tick.time_s])
+        run_feed(clock, rates[None], stamps, samples, are_whole, self._settings, self._feed, self._rows)
         return rates
 
-    def _estimate(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> LiveEstimate:
-        filter_, robot = self.filter, self._robot
-        rates = self._pass(time_s, wheels, due)
-        z = self._numbers[:, self._row_places][0]
+    def _estimate(self, tick: Tick, leapt: Tick | None) -> LiveEstimate:
+        filter_, robot, row, time_s = self.filter, self._robot, self._rows[0], tick.time_s
+        if leapt is not None:
+            self._measure(leapt)
+        rates, wheels = self._measure(tick), self._no_wheels if tick.wheels is None else tick.wheels
         variance, walk, inputs = filter_.noise.measurement_variance, None, None
         if self._schedule is not None:
-            (variance,), (walk,), (inputs,) = self._schedule(self._numbers, variance)
+            (variance,), (walk,), (inputs,) = self._schedule(self._rows[:, : len(ROWS)], variance)
         if self._gnss_places:
             variance = np.array(variance)
-            variance[self._gnss_places] = self._row["gnss_variance"][0]
-        filter_.step(time_s, z, variance, walk, inputs)
+            variance[self._gnss_places] = row[len(ROWS) :]
+        filter_.step(time_s, row[self._row_places], variance, walk, inputs)
         if self._monitor is not None:
-            self._monitor.judge(time_s, wheels, rates, self._row, self._feed, filter_.state)
+            self._monitor.judge(time_s, wheels, rates, self._rows, self._feed, filter_.state)
         mean, std = filter_.mean.copy(), np.sqrt(filter_.cov.diagonal())
         motion, age_s = Motion.UNKNOWN, filter_.reference_age_s
         slip_ratio = slip_std = motor_radps = np.full(len(robot.wheels), np.nan)
         wheel_speed_mps = rates
         if self._skids:  # nothing sees the ground go by: slip is not known
             mean = within_bounds(mean, robot.track_m)
-            left_mps, right_mps = self._row["side_mps"][0].tolist()
-            has_gyro = not math.isnan(self._row["gyro_z_radps"][0])
+            left_mps, right_mps = row[SIDE : SIDE + 2].tolist()
+            has_gyro = not math.isnan(row[ROWS.index("gyro_z_radps")])
             yaw_rate, bias = (self.states.index(name) for name in ("yaw_rate_radps", "gyro_bias_radps"))
             known = float(mean[yaw_rate]), float(std[bias]), robot.track_m
             motion = motion_at(time_s, left_mps, right_mps, has_gyro, *known, self._motion)
         else:
-            motor_radps = rates.copy()
+            motor_radps = rates
             wheel_speed_mps = robot.wheel_speeds_mps(rates / robot.motors.reduction_ratio)
-            slip_ratio, slip_std = self._slip.at(time_s, filter_, self._row, self._feed)
+            slip_ratio, slip_std = self._slip.at(time_s, filter_, self._rows, self._feed)
         v_x, v_y, turn, a_x, a_y = self._motion_of(mean)
         if self._region.compares:
             self._region.step(time_s, float(wheel_speed_mps.mean()), turn)
@@ -635,7 +544,7 @@ class LiveFilter(Live):
             slip_std,
             age_s > STALE_AFTER_S,
             age_s,
-            self._numbers[0].copy(),
+            row[: len(ROWS)].copy(),
             v_x,
             v_y,
             turn,
@@ -677,7 +586,7 @@ class LiveObserver(Live):
         channels: Mapping[str, tuple[str, ...]],
         correction: Correction | None = None,
     ) -> None:
-        self.observer, self._feed, self._last_s = (
+        self.observer, self._feed, self._before_s = (
             observer,
             ObserverFeed(robot, observer.rows, channels),
             math.nan,
@@ -688,31 +597,30 @@ class LiveObserver(Live):
     @property
     def dropped(self) -> dict[str, int]:
         """What was not taken so far, as counts by stream and kind."""
-        return super().dropped | self._feed.dropped
+        return dict(Counter(super().dropped) + self._feed.dropped)
 
     def _follows(self, time_s: float) -> int:
         return self._feed.follows(time_s)
 
     def _forget(self) -> None:
         self._feed.begin()
-        self._last_s = math.nan
-
-    def _last_taken_s(self, name: str) -> float:
-        return self._feed.taken_s[name]
+        self._before_s = math.nan
 
     def _snapshot(self) -> tuple[float, Any, Any]:
-        return self._last_s, self._feed.snapshot(), self.observer.snapshot()
+        return self._before_s, self._feed.snapshot(), self.observer.snapshot()
 
     def _restore(self, memory: tuple[float, Any, Any]) -> None:
-        self._last_s, of_feed, of_observer = memory
+        self._before_s, of_feed, of_observer = memory
         self._feed.restore(of_feed)
         self.observer.restore(of_observer)
 
-    def _estimate(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> LiveObserverEstimate:
-        dt_s = 0.0 if math.isnan(self._last_s) else time_s - self._last_s
-        self._last_s = time_s
-        output = self.observer.step(self._feed.tick(time_s, wheels, due), dt_s)
-        return LiveObserverEstimate(time_s, *output[:4], ObserverStatus(output.status))
+    def _estimate(self, tick: Tick, leapt: Tick | None) -> LiveObserverEstimate:
+        due = {name: queue.take(tick.time_s) for name, queue in self._queues.items()}
+        dt_s = 0.0 if math.isnan(self._before_s) else tick.time_s - self._before_s
+        self._before_s = tick.time_s
+        wheels = self._no_wheels if tick.wheels is None else tick.wheels
+        output = self.observer.step(self._feed.tick(tick.time_s, wheels, due), dt_s)
+        return LiveObserverEstimate(tick.time_s, *output[:4], ObserverStatus(output.status))
 
 
 Estimate = LiveEstimate | LiveObserverEstimate

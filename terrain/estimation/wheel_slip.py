@@ -113,14 +113,14 @@ class SlipOfInstant:
         self._places = _places(robot, states) if robot.steered else np.empty(0, np.int64)
         self._variance = wheel_speed_scatter_mps(robot) ** 2
 
-    def at(self, time_s: float, session: Filter, row: Array, feed: Array) -> tuple[Array, Array]:
-        """Return slip and standard deviation (wheels,) at a tick, of a row of a feed and its memory."""
+    def at(self, time_s: float, session: Filter, rows: Array, feed: Array) -> tuple[Array, Array]:
+        """Return slip and standard deviation (wheels,) at a tick, of the row (1, n) of a feed and its memory."""
         slip, age_s = np.full((1, 2, len(self._robot.wheels)), np.nan), session.reference_age_s
         if not math.isinf(age_s) and (age_s <= STALE_AFTER_S or self._has_slip_speed):
-            speeds = self._robot.wheel_speeds_mps(row["wheel_radps"])
+            speeds = self._robot.wheel_speeds_mps(rows[:, : len(self._robot.wheels)])
             mean, cov = session.mean[None], np.ascontiguousarray(session.cov)[None]
             _slips(mean, cov, self._positions_m, self._places, speeds, self._variance, slip)
-            received_s = np.minimum(feed["rate_received_s"][0], feed["steer_received_s"][0])
+            received_s = feed["received_s"][0].min(axis=0)
             slip[0, :, time_s - received_s > UNMEASURED_AFTER_S] = np.nan
         return slip[0, 0], slip[0, 1]
 

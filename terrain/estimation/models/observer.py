@@ -217,7 +217,6 @@ class ObserverFeed:
     Attributes
     ----------
     queues : of the streams beside the wheels that are read
-    taken_s : stamp of the last sample of each stream that was taken out of its queue
     dropped : what was left out, as counts by stream and kind: wheels not later than the sample before, late or
         inaccurate fixes, and clocks that were set back
     """
@@ -236,7 +235,9 @@ class ObserverFeed:
 
     def begin(self) -> None:
         """Begin anew: nothing was measured before."""
-        self.taken_s = dict.fromkeys((*self.queues, "wheels"), -math.inf)
+        self._last_s = -math.inf
+        for queue in self.queues.values():
+            queue.taken_s = -math.inf
         self._held: dict[tuple[str, int], tuple[float, float]] = {}
         self._heading, self._n_behind = (-math.inf, math.nan), 0
 
@@ -250,8 +251,8 @@ class ObserverFeed:
 
     def follows(self, time_s: float) -> int:
         """Return what a stamp of the wheels is: 1 taken, -1 of a clock that was set back, 0 not taken, and counted."""
-        before_s = self.taken_s["wheels"]
-        if math.isfinite(time_s) and time_s > before_s:
+        before_s = self._last_s
+        if before_s < time_s < math.inf:
             self._n_behind = 0
             return 1
         self._n_behind = self._n_behind + 1 if time_s <= before_s - CLOCK_SET_S else 0
@@ -263,13 +264,11 @@ class ObserverFeed:
 
     def tick(self, time_s: float, wheels: Array, due: Mapping[str, Due]) -> Array:
         """Return the row (m,) at a sample of the wheels, of the samples of other streams that came since the last."""
-        self.taken_s["wheels"] = time_s
+        self._last_s = time_s
         for name, samples in due.items():
-            if samples:
-                self.taken_s[name] = samples[-1][0]
-            elif self.queues[name].n_behind >= CLOCK_SET_SAMPLES:  # its own clock was set back
+            if not samples and self.queues[name].n_behind >= CLOCK_SET_SAMPLES:  # its own clock was set back
                 self.dropped["time: clock set"] += 1
-                self.taken_s[name], self.queues[name].n_behind = -math.inf, 0
+                self.queues[name].taken_s, self.queues[name].n_behind = -math.inf, 0
         row = dict.fromkeys(ROWS, math.nan)
         row |= {name: float(wheels[column]) for column, name in self._speeds}
         row["steer_front_rad"] = self._means("steering", time_s, due, last=True)[0]
@@ -352,7 +351,7 @@ def rows_of(run: RunLog, robot: Robot, rows: tuple[str, ...]) -> tuple[Array, Ar
             new = slice(*edges[name][k : k + 2])
             if new.start < new.stop:
                 stream = run.streams[name]
-                queue.push(stream.time_s[new], stream.values[new], feed.taken_s[name])
+                queue.push(stream.time_s[new], stream.values[new])
         follows = feed.follows(time_s)
         if follows < 0:
             feed.begin()

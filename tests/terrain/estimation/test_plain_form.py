@@ -1,7 +1,5 @@
 """The compiled chain, sample by sample, gives the numbers of its plain form: whole signals, one by one."""
 
-import re
-from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 
@@ -26,11 +24,11 @@ from terrain.estimation.feed import (
     GNSS_ROWS,
     GNSS_SPEED_STD_MPS,
     HELD_S,
-    JUMPS,
     LATCHED,
     LATE_S,
     MAX_AGE_PERIODS,
     MAX_RATE_FACTOR,
+    MIN_CONFIDENCE_RATIO,
     MOVING_MPS,
     PASSING,
     REPEATED,
@@ -42,18 +40,17 @@ from terrain.estimation.feed import (
     RIPPLE_MPS,
     ROWS_OF_DRIVE,
     SAME,
+    SIGNALS,
     STANDING_S,
     STANDING_SPEED_MPS,
     TICK_S,
     UNSEEN_AFTER_S,
     VIBRATION_S,
     WAVERING_MPS,
-    clean_stream,
+    clean_streams,
     measurement_table,
 )
-from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
 from terrain.kinematics.camera import body_motion
-from terrain.logs.schema import GNSS_CHANNELS, IMU_CHANNELS
 from terrain.records import Stream
 from terrain.robots import load_robot
 from terrain.simulation.run import simulate_run
@@ -188,11 +185,6 @@ def plain_derived(clock, table, once, twice, imu_s, accel_z, robot):
     return rows, square
 
 
-def signal_of(row):
-    """Return the name of a row's signal, of all axes and wheels."""
-    return re.sub("_[xy123]_", "_", row)
-
-
 def plain_low_pass(time_s, value, tau_s, gap_s):
     out = np.array(value)
     for k in range(1, value.size):
@@ -281,8 +273,8 @@ def plain_yaw(table, clock, wheel_speed_mps, initial_yaw_rad, causal):
 
 def plain_table(run, robot, causal, initial_yaw_rad):
     """Return rows (n, 29), variances (n, 4) and counts of jumps of a swerve robot's run."""
-    dropped, lag_s = Counter(), robot.sensors.encoder_time_constant_s
-    wheels = clean_stream(run, "wheels", [f"motor_{i}_radps" for i in (1, 2, 3)], dropped)
+    streams, lag_s = clean_streams(run, robot)[0], robot.sensors.encoder_time_constant_s
+    wheels = streams["wheels"]
     clock, rates = wheels.time_s, wheels.values / robot.motors.reduction_ratio
     rates = np.where(np.abs(rates) > MAX_RATE_FACTOR * robot.motors.speed_max_radps, np.nan, rates)
     rows = ROWS_OF_DRIVE["swerve"]
@@ -292,15 +284,18 @@ def plain_table(run, robot, causal, initial_yaw_rad):
     imu_s, accel_z = np.zeros(0), np.zeros(0)
     camera_lag_s = max(lag_s - robot.camera.time_constant_s, 0.0)
     gnss_variance = dict.fromkeys(GNSS_ROWS, np.full(clock.size, np.nan))
-    for name, channels, frozen, latency_s, tau_s in (
-        ("imu", IMU_CHANNELS, IMU_CHANNELS[:6], robot.sensors.imu_latency_s, lag_s),
-        ("steering", [f"angle_{i}_rad" for i in (1, 2, 3)], (), 0.0, lag_s),
-        ("odometry", CAMERA_CHANNELS, CAMERA_CHANNELS[3:13], robot.camera.latency_s, camera_lag_s),
-        ("gnss", GNSS_CHANNELS, (), GNSS_LATENCY_S, lag_s),
+    for name, latency_s, tau_s in (
+        ("imu", robot.sensors.imu_latency_s, lag_s),
+        ("steering", 0.0, lag_s),
+        ("odometry", robot.camera.latency_s, camera_lag_s),
+        ("gnss", GNSS_LATENCY_S, lag_s),
     ):
-        stream = clean_stream(run, name, channels, dropped, frozen=frozen)
-        if stream is None:
+        if name not in streams:
             continue
+        stream = streams[name]
+        if name == "odometry":
+            sees = ~(stream.channel("confidence_ratio") < MIN_CONFIDENCE_RATIO)
+            stream = Stream(stream.time_s[sees], stream.values[sees], stream.channels)
         time_s = stream.time_s - latency_s
         came_s = stream.time_s if causal else time_s
         if name == "gnss":
@@ -319,13 +314,10 @@ def plain_table(run, robot, causal, initial_yaw_rad):
                 frozen = plain_frozen(signals[row], REPEATED[FIRST_SPEED], moving(came_s))
                 signals[row] = np.where(frozen, np.nan, signals[row])
             yaw = signals["camera_yaw_rad"]
-            sums = plain_sums(time_s, yaw, *JUMPS["camera_yaw_rad"])
+            sums = plain_sums(time_s, yaw, *SIGNALS["camera_yaw_rad"][1:])
             signals["camera_yaw_rad"] = np.where(np.isnan(yaw), np.nan, yaw - sums)
-        none = (np.inf, np.inf)
         found = {
-            row: plain_jumps(
-                time_s, v, *(none if row == "camera_yaw_rad" else JUMPS.get(signal_of(row), none))
-            )
+            row: plain_jumps(time_s, v, *((np.inf, np.inf) if row == "camera_yaw_rad" else SIGNALS[row][1:]))
             for row, v in signals.items()
         }
         jumps[name] = int(np.any(list(found.values()), axis=0).sum())

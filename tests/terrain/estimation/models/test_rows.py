@@ -36,7 +36,7 @@ def feed_of(run):
 
 
 def push(feed, name, time_s, values):
-    feed.queues[name].push(np.array(time_s), values, feed.taken_s[name])
+    feed.queues[name].push(np.array(time_s), values)
 
 
 def tick(feed, time_s):
