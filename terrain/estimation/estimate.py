@@ -76,6 +76,7 @@ class Estimate:
     blind: SlipTrack
     figures: SlipFigures  #: of ``slip``, or of ``blind`` where there is no other
     truth: Array | None  #: (n, d) true states, or None
+    observable: bool  #: whether the slip was observed at any time
 
     @property
     def innovations(self) -> dict[str, tuple[Array, Array]]:
@@ -93,11 +94,6 @@ class Estimate:
         measured = self.table.columns(WHEELS_AND_GYRO)
         return motion_track(self.track.time_s, measured, turn, bias_std, self.robot.track_m)
 
-    @property
-    def observable(self) -> bool:
-        """Whether the slip was observed at any time."""
-        return bool(np.isfinite(self.slip.slip_ratio).any())
-
 
 def estimate_run(
     run: RunLog,
@@ -113,8 +109,12 @@ def estimate_run(
 
     Parameters
     ----------
-    run, robot : log of the robot, as measured, and its description
-    name, tuning, noise, initial_yaw_rad : as :func:`filter_run` takes them
+    run, robot : log of the robot, as measured, and its description; or both corrected
+    name : one of :data:`FILTERS`
+    tuning : one of :data:`TUNINGS`; the filter's own (:data:`OWN_TUNING`) by default
+    noise : any, in place of that of the tuning
+    initial_yaw_rad : heading at the start in the frame of the GNSS, east 0; found from the drive by default,
+        and where the drive does not determine it the GNSS is left out and counted
     tuned : noise of other runs, which may have other sensors; only its process variance is taken
 
     Returns
@@ -128,80 +128,56 @@ def estimate_run(
     DataError
         if the log has no wheels.
     """
-    log, robot = correct(run, robot)
-    if tuned is not None:
-        usual = model_and_noise(log, robot, name, tuning)[1]
-        noise = replace(usual, process_variance=tuned.process_variance)
-    estimate = filter_run(log, robot, name, tuning=tuning, noise=noise, initial_yaw_rad=initial_yaw_rad)
-    left_out = "gnss" in run.streams and "gnss" not in estimate.run.streams
-    return replace(estimate, run=_without_gnss(run) if left_out else run)
-
-
-def filter_run(
-    run: RunLog,
-    robot: Robot,
-    name: str,
-    *,
-    tuning: str | None = None,
-    noise: Noise | None = None,
-    initial_yaw_rad: float | None = None,
-) -> Estimate:
-    """Filter one run that is corrected; errors as :func:`estimate_run`, and where it is not.
-
-    Parameters
-    ----------
-    run, robot : as :func:`terrain.extension.correct` returns them
-    name : one of :data:`FILTERS`
-    tuning : one of :data:`TUNINGS`; the filter's own (:data:`OWN_TUNING`) by default
-    noise : that of a tuning on chosen runs, or any other, in place of the physical
-    initial_yaw_rad : heading at the start in the frame of the GNSS, east 0; found from the drive by default,
-        and where the drive does not determine it the GNSS is left out and counted
-    """
+    log, driven = correct(run, robot)
     tuning = tuning_of(name, tuning)
-    model, usual = model_and_noise(run, robot, name, tuning)
+    model, usual = model_and_noise(log, driven, name, tuning)
+    if tuned is not None:
+        noise = replace(usual, process_variance=tuned.process_variance)
+    has_gnss, yaw_rad = GNSS_ROWS[0] in model.rows, initial_yaw_rad or 0.0
     ema_alpha = THESIS_EMA_ALPHA if tuning == "thesis" and name == "vio12" else None
-    yaw_rad = initial_yaw_rad or 0.0
-    table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
-    gnss_places = [model.rows.index(row) for row in GNSS_ROWS if row in model.rows]
-    if initial_yaw_rad is None and name != "skid" and gnss_places:
-        yaw_rad = gnss_heading(table, robot)
+    table = measurement_table(log, driven, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
+    if has_gnss and initial_yaw_rad is None:
+        yaw_rad = gnss_heading(table, driven)
         if math.isnan(yaw_rad):
-            without = filter_run(_without_gnss(run), robot, name, tuning=tuning, initial_yaw_rad=0.0)
-            unused = {"gnss: heading not observable in this run": len(run.streams["gnss"])}
-            return replace(without, table=replace(without.table, dropped={**without.table.dropped, **unused}))
-        table = measurement_table(run, robot, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
-    is_physical, noise, inputs = noise is None and tuning == "physical", noise or usual, None
-    if gnss_places:  # each position has the variance of its own fix
-        variance = np.tile(noise.measurement_variance, (len(table.time_s), 1))
-        variance[:, gnss_places] = table.gnss_variance
+            streams = dict(run.streams)
+            unused = {"gnss: heading not observable in this run": len(streams.pop("gnss"))}
+            without = replace(run, streams=streams)
+            found = estimate_run(without, robot, name, tuning=tuning, initial_yaw_rad=0.0, tuned=tuned)
+            return replace(found, table=replace(found.table, dropped={**found.table.dropped, **unused}))
+        table = measurement_table(log, driven, ema_alpha=ema_alpha, initial_yaw_rad=yaw_rad)
+    is_scheduled, noise, inputs = noise is None and tuning == "physical", noise or usual, None
+    if has_gnss:  # each position has the variance of its own fix
+        variance, first = (
+            np.tile(noise.measurement_variance, (len(table.time_s), 1)),
+            model.rows.index(GNSS_ROWS[0]),
+        )
+        variance[:, first : first + len(GNSS_ROWS)] = table.gnss_variance
         noise = Noise(noise.process_variance, variance, noise.initial_variance)
-    if is_physical:
+    if is_scheduled:
         noise, inputs = swerve.scheduled(model, noise, table)
     settings = FilterSettings(1.0 if tuning == "thesis" else GATE_PROBABILITY, REOPEN_AFTER_S)
     track = run_filter(model, noise, table.time_s, table.columns(model.rows), settings, inputs)
     if name == "skid":
-        track = replace(track, mean=within_bounds(track.mean, robot.track_m))
+        track = replace(track, mean=within_bounds(track.mean, driven.track_m))
         speed_mps = track.state("speed_mps")
     else:
         speed_mps = np.hypot(track.state("speed_x_mps"), track.state("speed_y_mps"))
     noise = noise.at(np.searchsorted(table.time_s, track.time_s))
     table = table.at(track.time_s)
-    slip, blind = wheel_slip(track, table, robot), blind_slip(track, table, robot)
-    rolling = np.where(table.columns(robot.wheel_rows) < 0.0, -1.0, 1.0)
-    shown = slip if np.isfinite(slip.slip_ratio).any() else blind
-    figures = slip_figures(shown, speed_mps, track.time_s, rolling)
-    truth = true_states(run, track, robot, robot.encoder_lag_s, yaw_rad)
-    return Estimate(run, robot, name, model, noise, table, track, slip, blind, figures, truth)
+    slip, blind = wheel_slip(track, table, driven), blind_slip(track, table, driven)
+    rolling = np.where(table.columns(driven.wheel_rows) < 0.0, -1.0, 1.0)
+    observable = bool(np.isfinite(slip.slip_ratio).any())
+    figures = slip_figures(slip if observable else blind, speed_mps, track.time_s, rolling)
+    truth = true_states(log, track, driven, driven.encoder_lag_s, yaw_rad)
+    return Estimate(run, driven, name, model, noise, table, track, slip, blind, figures, truth, observable)
 
 
 def model_and_noise(
     run: RunLog, robot: Robot, name: str, tuning: str | None = None
 ) -> tuple[FilterModel, Noise]:
-    """Return the filter for a corrected run, and the noise that it starts from; errors as :func:`filter_run`."""
+    """Return the filter for a corrected run, and the noise that it starts from; errors as :func:`estimate_run`."""
     check_corrected(robot)
-    suitable = FILTERS_OF_DRIVE[robot.drive]
-    if robot.filters:
-        suitable = tuple(each for each in suitable if each in robot.filters)
+    suitable = [each for each in FILTERS_OF_DRIVE[robot.drive] if not robot.filters or each in robot.filters]
     if name in FILTERS and name not in suitable:
         from terrain.estimation.models.choice import observers_of  # has kernels that filters do not need
 
@@ -209,12 +185,10 @@ def model_and_noise(
         raise ConfigError(
             f"filter {name!r} is not for robot {robot.name}, whose drive is {robot.drive}: use {fits}"
         )
-    tuning = tuning_of(name, tuning)
     if name == "skid":
         return make_skid_filter(robot), skid_noise(robot)
-    if tuning == "thesis":
-        noise = swerve.thesis_noise(name, robot, THESIS_SAMPLE_TIME_S)
-        return swerve.make_filter(name, robot), noise
+    if tuning_of(name, tuning) == "thesis":
+        return swerve.make_filter(name, robot), swerve.thesis_noise(name, robot, THESIS_SAMPLE_TIME_S)
     gnss = "gnss" in run.streams and len(run.streams["gnss"]) > 0
     return swerve.make_filter(name, robot, with_gnss=gnss), swerve.default_noise(name, robot, gnss)
 
@@ -227,10 +201,6 @@ def tuning_of(name: str, tuning: str | None) -> str:
     return tuning
 
 
-def _without_gnss(run: RunLog) -> RunLog:
-    return replace(run, streams={name: stream for name, stream in run.streams.items() if name != "gnss"})
-
-
 def enriched(estimate: Estimate) -> RunLog:
     """Return the run with its estimate.
 
@@ -240,25 +210,37 @@ def enriched(estimate: Estimate) -> RunLog:
     ``stuck_ratio`` (1 where the robot is stuck, NaN where that is unknown) and ``nis_<sensor>_ratio``; a column
     without any finite value is left out.
     """
-    run, track, slip = with_wheel_speeds(estimate.run, estimate.robot), estimate.track, estimate.slip
-    channels = tuple(state for state in ESTIMATOR_CHANNELS if state in track.states)
-    estimator = Stream(track.time_s, np.column_stack([track.state(state) for state in channels]), channels)
-    columns = {state: track.state(state) for state in track.states}
-    columns |= {f"std_{state}": track.std(state) for state in track.states}
-    columns |= {f"std_slip_{wheel}_ratio": slip.slip_std[:, i] for i, wheel in enumerate(slip.wheels)}
+    track, slip = estimate.track, estimate.slip
+    columns = dict(zip(track.states, track.mean.T, strict=True))
+    for state in track.states:
+        columns[f"std_{state}"] = track.std(state)
+    for wheel, std in zip(slip.wheels, slip.slip_std.T, strict=True):
+        columns[f"std_slip_{wheel}_ratio"] = std
     columns["stale_ratio"] = slip.stale.astype(float)
     if (motion := estimate.motion) is not None:
         columns["stuck_ratio"] = np.where(motion == Motion.UNKNOWN, np.nan, motion == Motion.STUCK)
-    columns |= {f"nis_{sensor}_ratio": track.nis[:, k] for k, sensor in enumerate(track.sensors)}
-    streams = {**run.streams, "estimator": estimator, "slip": slip.as_stream()}
-    streams["state"] = known_columns(track.time_s, columns)
-    return replace(run, streams=streams, filter=estimate.name)
+    for sensor, nis in zip(track.sensors, track.nis.T, strict=True):
+        columns[f"nis_{sensor}_ratio"] = nis
+    return with_tracks(estimate.run, estimate.robot, estimate.name, track.time_s, columns, slip.as_stream())
 
 
-def known_columns(time_s: Array, columns: Mapping[str, Array]) -> Stream:
-    """Return the columns (n,) that have a finite value as one stream."""
+def with_tracks(
+    run: RunLog, robot: Robot, name: str, time_s: Array, columns: Mapping[str, Array], slip: Stream | None
+) -> RunLog:
+    """Return a run with wheel speeds and what a filter or observer found: ``slip``, ``estimator`` and ``state``.
+
+    ``columns`` (n,) by name; those without any finite value are left out of ``state``.
+    """
+    run = with_wheel_speeds(run, robot)
     known = {name: column for name, column in columns.items() if np.isfinite(column).any()}
-    return Stream(time_s, np.column_stack(list(known.values())), tuple(known))
+    moves = {name: columns[name] for name in ESTIMATOR_CHANNELS if name in columns}
+    streams = dict(run.streams)
+    if moves:
+        streams["estimator"] = Stream(time_s, np.column_stack(list(moves.values())), tuple(moves))
+    if slip is not None:
+        streams["slip"] = slip
+    streams["state"] = Stream(time_s, np.column_stack(list(known.values())), tuple(known))
+    return replace(run, streams=streams, filter=name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,40 +278,37 @@ def summarize(estimate: Estimate) -> EstimateSummary:
     track, slip, figures, motion = estimate.track, estimate.slip, estimate.figures, estimate.motion
     truth, used = estimate.truth, track.use == USED
     steps_s = np.diff(track.time_s, append=track.time_s[-1:])
-    true_slip = true_slip_at(estimate.run, estimate.robot, track.time_s)
-    n_refused = sum(n for kind, n in track.dropped.items() if not kind.endswith(" gated"))
-    judged = [i for i, state in enumerate(track.states) if state.startswith(JUDGED_STATES)]
-    speeds = [i for i, state in enumerate(track.states) if state in ("speed_x_mps", "speed_y_mps")]
     mean_nees = speed_rmse_mps = math.nan
     if truth is not None:
-        names = [track.states[i] for i in judged]
-        mean_nees = known_mean(nees(track, truth[:, judged], names)) / len(judged)
-        error = (track.mean - truth)[:, speeds]
-        speed_rmse_mps = math.sqrt(known_mean(error**2) * len(speeds))
-    report = consistency_report(track, truth)._asdict()
+        judged = [state.startswith(JUDGED_STATES) for state in track.states]
+        names = [state for state in track.states if state.startswith(JUDGED_STATES)]
+        mean_nees = known_mean(nees(track, truth[:, judged], names)) / len(names)
+        speeds = np.isin(track.states, ("speed_x_mps", "speed_y_mps"))
+        speed_rmse_mps = math.sqrt(known_mean((track.mean - truth)[:, speeds] ** 2) * speeds.sum())
+    dof = np.where(used, track.nis_dof, 0).sum(axis=0)
+    squares = np.nansum(np.where(used, track.nis, 0.0), axis=0)
+    report = consistency_report(track, truth)
+    dropped = {**estimate.table.dropped, **track.dropped}
     return EstimateSummary(
         run_id=estimate.run.run_id,
         filter=estimate.name,
         slip_mean=figures.steady_mean,
         slip_std=known_mean(slip.slip_std[figures.steady]),
-        slip_true_mean=known_mean(true_slip[figures.steady]),
+        slip_true_mean=known_mean(true_slip_at(estimate.run, estimate.robot, track.time_s)[figures.steady]),
         slip_observable=estimate.observable,
         slip_peak=figures.peak,
         steady_s=float(steps_s[figures.steady].sum()),
         stale_s=float(steps_s[slip.stale].sum()),
-        nis={
-            sensor: float(np.nansum(track.nis[used[:, k], k]) / dof)
-            for k, sensor in enumerate(track.sensors)
-            if (dof := int(track.nis_dof[used[:, k], k].sum()))
-        },
+        nis={name: float(squares[k] / dof[k]) for k, name in enumerate(track.sensors) if dof[k]},
         nees=mean_nees,
         consistency={
-            kind: {entry.name: entry.verdict for entry in entries} for kind, entries in report.items()
+            "sensors": {entry.name: entry.verdict for entry in report.sensors},
+            "states": {entry.name: entry.verdict for entry in report.states},
         },
         speed_rmse_mps=speed_rmse_mps,
-        n_dropped=sum(estimate.table.dropped.values()) + n_refused,
+        n_dropped=sum(n for kind, n in dropped.items() if not kind.endswith(" gated")),
         n_gated=int((track.use == GATED).sum()),
-        dropped={**estimate.table.dropped, **track.dropped},
+        dropped=dropped,
         finite=bool(np.isfinite(track.mean).all() and np.isfinite(track.cov).all()),
         motion=None if motion is None else motion_seconds(track.time_s, motion),
         stuck=None if motion is None else stuck_intervals(track.time_s, motion),

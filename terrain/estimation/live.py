@@ -253,6 +253,7 @@ class Live(ABC):
                 self._forget()
                 for queue in self._queues.values():
                     queue.waiting.clear()
+                    queue.taken_s = -math.inf
             if leapt is not None and not self._last_s < leapt.time_s < tick.time_s:
                 leapt = None
             self.latest = self._estimate(tick, leapt)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from terrain.angles import wrapped
-from terrain.estimation.estimate import known_columns, known_mean
+from terrain.estimation.estimate import known_mean, with_tracks
 from terrain.estimation.models.choice import make_observer
 from terrain.estimation.models.observer import Observer, ObserverStatus, ObserverTrack, observe, rows_of
 from terrain.estimation.models.slip_model import PARAMETERS, SlipModel
 from terrain.extension import correct
 from terrain.kinematics.logged_wheels import with_wheel_speeds
-from terrain.logs.schema import ESTIMATOR_CHANNELS
 from terrain.records import Array, RunLog, Stream
 from terrain.robots import Robot
 
@@ -85,22 +84,15 @@ def with_estimates(found: ObserverEstimate) -> RunLog:
     state, ``std_<state>``, ``std_<slip>`` and ``observer_code``, the number of an
     :class:`~terrain.estimation.models.observer.ObserverStatus`.
     """
-    run = with_wheel_speeds(found.run, found.robot)
-    track, streams = found.track, dict(run.streams)
-    states = {name: k for k, name in enumerate(track.states)}
-    channels = tuple(name for name in ESTIMATOR_CHANNELS if name in states)
-    if channels:
-        values = track.mean[:, [states[name] for name in channels]]
-        streams["estimator"] = Stream(track.time_s, values, channels)
-    if track.slips:
-        streams["slip"] = Stream(track.time_s, track.slip, track.slips)
-    named = [f"{name}_ratio" if name in WITHOUT_UNIT else name for name in track.states]
-    columns = dict(zip(named, track.mean.T, strict=True))
-    columns |= {f"std_{name}": std for name, std in zip(named, track.std.T, strict=True)}
-    columns |= {f"std_{name}": std for name, std in zip(track.slips, track.slip_std.T, strict=True)}
+    track, columns = found.track, {}
+    for prefix, values in (("", track.mean), ("std_", track.std)):
+        for state, column in zip(track.states, values.T, strict=True):
+            columns[f"{prefix}{state}{'_ratio' * (state in WITHOUT_UNIT)}"] = column
+    for name, std in zip(track.slips, track.slip_std.T, strict=True):
+        columns[f"std_{name}"] = std
     columns["observer_code"] = track.status.astype(float)
-    streams["state"] = known_columns(track.time_s, columns)
-    return replace(run, streams=streams, filter=found.observer.name)
+    slip = Stream(track.time_s, track.slip, track.slips) if track.slips else None
+    return with_tracks(found.run, found.robot, found.observer.name, track.time_s, columns, slip)
 
 
 SETTLED = (ObserverStatus.OK, ObserverStatus.UNEXCITED)
@@ -143,15 +135,19 @@ class ObserverSummary:
 
 def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
     """Return the figures of an estimate."""
-    track = found.track
-    started = track.status != ObserverStatus.STARTING
-    settled = np.isin(track.status, SETTLED)
+    track, slips = found.track, {}
+    started, settled = track.status != ObserverStatus.STARTING, np.isin(track.status, SETTLED)
     steps_s = np.diff(track.time_s, append=track.time_s[-1:])
-    slips = {
-        name: _slip(track.slip[settled, k], track.slip_std[settled, k], found.true(name), settled)
-        for k, name in enumerate(track.slips)
-    }
-    error_m = _position_error(found)[started]
+    for k, name in enumerate(track.slips):
+        slip, std, true = track.slip[settled, k], track.slip_std[settled, k], found.true(name)
+        true = np.full(len(slip), np.nan) if true is None else true[settled]
+        error = slip - true
+        with np.errstate(divide="ignore", invalid="ignore"):
+            nees = known_mean(np.where(std > 0.0, (error / std) ** 2, np.nan))
+        figures = known_mean(slip), _root_mean_square(std), known_mean(true), _root_mean_square(error), nees
+        slips[name] = ObservedSlip(*figures)
+    own, place = found.path()  # odometry begins at the true pose
+    error_m = (np.full(len(own), np.nan) if place is None else np.abs(own - place))[started]
     return ObserverSummary(
         run_id=found.run.run_id,
         filter=found.observer.name,
@@ -167,26 +163,6 @@ def summarize_observer(found: ObserverEstimate) -> ObserverSummary:
         finite=bool(np.isfinite(track.mean[started][:, :2]).all())
         and not any(np.isinf(part).any() for part in track[3:7]),
     )
-
-
-def _slip(slip: Array, std: Array, true: Array | None, settled: Array) -> ObservedSlip:
-    true = np.full(len(slip), np.nan) if true is None else true[settled]
-    error = slip - true
-    with np.errstate(divide="ignore", invalid="ignore"):
-        squares = np.where(std > 0.0, (error / std) ** 2, np.nan)
-    return ObservedSlip(
-        known_mean(slip),
-        _root_mean_square(std),
-        known_mean(true),
-        _root_mean_square(error),
-        known_mean(squares),
-    )
-
-
-def _position_error(found: ObserverEstimate) -> Array:
-    """Return the distance (n,) from the true position; odometry begins at the true pose."""
-    own, true = found.path()
-    return np.full(len(own), np.nan) if true is None else np.abs(own - true)
 
 
 def _root_mean_square(values: Array) -> float:

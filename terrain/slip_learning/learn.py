@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.errors import DataError
-from terrain.estimation.estimate import filter_run
+from terrain.estimation.estimate import estimate_run
 from terrain.estimation.wheel_slip import wheel_speed_scatter_mps
 from terrain.extension import correct
 from terrain.records import RunLog, TargetStatus
@@ -87,7 +87,7 @@ def terrain_runs(run: RunLog, robot: Robot) -> list[TerrainRun]:
             f"run {run.run_id} is of robot {run.robot!r}: a table is learned for one, {robot.name!r}"
         )
     run, robot = correct(run, robot)
-    found = filter_run(run, robot, FILTER)
+    found = estimate_run(run, robot, FILTER)
     forces = wheel_forces(run, robot, found.track, found.table, found.slip)
     speed_std_mps = wheel_speed_scatter_mps(robot)
     measured = []
