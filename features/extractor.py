@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 from numbers import Real
 from typing import Any, NamedTuple
 
@@ -90,35 +91,6 @@ def derived_channels(values: Array, channels: Sequence[str]) -> tuple[Array, tup
     return np.concatenate(derived, axis=1), tuple(names)
 
 
-def _correlation_features(values: Array, channels: Sequence[str], stream: str) -> tuple[list[Feature], Array]:
-    """Return the correlation of each pair of IMU channels, and of each pair of currents."""
-    correlated = [
-        (rows, signal_set)
-        for quantities, signal_set in ((("gyro", "accel"), "imu"), (("current",), "currents"))
-        if len(rows := [i for quantity in quantities for i in rows_of(channels, quantity)]) > 1
-    ]
-    parts = [
-        np.empty((values.shape[0], 0)),
-        *(channel_correlations(values[:, rows]) for rows, _ in correlated),
-    ]
-    features = [
-        feature
-        for rows, of in correlated
-        for feature in _pair_names(stream, tuple(channels[i] for i in rows), of)
-    ]
-    return features, np.concatenate(parts, axis=1)
-
-
-@lru_cache(maxsize=256)
-def _pair_names(stream: str, channels: tuple[str, ...], signal_set: str) -> tuple[Feature, ...]:
-    short = [channel.rpartition("_")[0] for channel in channels]
-    return tuple(
-        Feature(f"{stream}.{a}~{b}.correlation", "1", frozenset({signal_set}))
-        for j, a in enumerate(short)
-        for b in short[j + 1 :]
-    )
-
-
 def speed_features(
     values: Mapping[str, Array], channels: Mapping[str, Sequence[str]]
 ) -> tuple[list[Feature], Array]:
@@ -164,20 +136,17 @@ def speed_features(
     if sides and yaw_stream:
         turning_mps = wheels[:, sides[1]] - wheels[:, sides[0]]
         gyro = values[yaw_stream][:, channels[yaw_stream].index("gyro_z_radps")]
-        n_parts = min(N_PARTS, turning_mps.shape[1], gyro.shape[1])
-        difference, yaw_rate = _part_means(turning_mps, n_parts), _part_means(gyro, n_parts)
+        n_parts, means = min(N_PARTS, turning_mps.shape[1], gyro.shape[1]), []
+        for signal in (turning_mps, gyro):
+            edges = np.linspace(0, signal.shape[1], n_parts + 1).round().astype(int)
+            means.append(np.add.reduceat(signal, edges[:-1], axis=1) / np.diff(edges))
+        difference, yaw_rate = means
         power = np.sum(difference**2, axis=1)
         gain = np.full(n, np.nan)
         turning = np.sqrt(power / difference.shape[1]) >= MIN_WHEEL_DIFFERENCE_MPS
         np.divide(np.sum(yaw_rate * difference, axis=1), power, out=gain, where=turning)
         add(gain, "turning.yaw_per_wheel_difference", "rad/m", "imu", "wheels")
     return features, np.stack(columns, axis=1) if columns else np.empty((n, 0))
-
-
-def _part_means(signal: Array, n_parts: int) -> Array:
-    edges = np.linspace(0, signal.shape[1], n_parts + 1).round().astype(int)
-    sums: Array = np.add.reduceat(signal, edges[:-1], axis=1)
-    return sums / np.diff(edges)
 
 
 def left_out_of(stream: str, channel: str) -> frozenset[str]:
@@ -221,16 +190,30 @@ class FeatureMatrix(NamedTuple):
 
     def named(self, windows: Windows) -> tuple[list[Feature], Array]:
         """Return the features beside their values."""
-        values, features, parts = self.selected(windows), list[Feature](), list[Array]()
+        selected, features, parts = self.selected(windows), list[Feature](), [np.empty((len(windows), 0))]
         for stream, names in self.layout.channels.items():
-            for found, part in (
-                self._channel_features(stream, values[stream], names),
-                _correlation_features(values[stream], names, stream),
-            ):
-                features += found
-                parts.append(part)
-        found, part = speed_features(values, self.layout.channels) if values else ([], np.empty((0, 0)))
-        return features + found, np.concatenate([*parts, part], axis=1)
+            values, rate_hz = selected[stream], self.layout.rate_hz[stream]
+            if stream == "slip":
+                all_names, columns, table = names, SLIP_STATISTICS, slip_statistics(values)
+            else:
+                derived, derived_names = derived_channels(values, names)
+                all_names, all_values = (*names, *derived_names), np.concatenate([values, derived], axis=1)
+                columns, table = STATISTICS, channel_statistics(all_values, rate_hz)
+                if values.shape[2] >= MIN_SAMPLES:
+                    columns = (*columns, *spectrum_names(values.shape[2]))
+                    table = np.concatenate([table, channel_spectra(all_values, rate_hz)], axis=2)
+            of_channels, kept = _described(stream, all_names, columns, frozenset(self.level_sets))
+            features += of_channels
+            parts.append(table[:, kept])
+            for quantities, signal_set in ((("gyro", "accel"), "imu"), (("current",), "currents")):
+                rows = [i for quantity in quantities for i in rows_of(names, quantity)]
+                parts.append(channel_correlations(values[:, rows]))
+                features += _pairs(stream, tuple(names[i] for i in rows), signal_set)
+        if selected:
+            of_speed = speed_features(selected, self.layout.channels)
+            features += of_speed[0]
+            parts.append(of_speed[1])
+        return features, np.concatenate(parts, axis=1)
 
     def selected(self, X: Windows) -> dict[str, Array]:
         """Return the samples of the channels that are used, by stream (n, channels, samples).
@@ -241,53 +224,37 @@ class FeatureMatrix(NamedTuple):
             raise DataError(
                 f"windows last {X.length_s:g} s; the features were learned on {self.length_s:g} s"
             )
-        missing = [
-            f"{stream}.{name}"
-            for stream, names in self.layout.channels.items()
-            for name in names
-            if name not in X.channels.get(stream, ())
-        ]
+        own = self.layout.channels.items()
+        missing = [f"{s}.{name}" for s, names in own for name in names if name not in X.channels.get(s, ())]
         if missing:
+            listed = (
+                "; ".join(f"{stream} with {', '.join(names)}" for stream, names in channels.items())
+                for channels in (X.channels, self.layout.channels)
+            )
+            has, needed = (each or "no channel" for each in listed)
             raise DataError(
-                f"the windows lack {', '.join(missing)}: they have {_listed(X.channels)}; the features were "
-                f"learned on {_listed(self.layout.channels)}"
+                f"the windows lack {', '.join(missing)}: they have {has}; the features were learned on {needed}"
             )
         values = {}
         for stream, names in self.layout.channels.items():
-            rate_hz = X.rate_hz[stream]
+            rate_hz, n = X.rate_hz[stream], self.n_samples[stream]
+            array, held = X.values[stream], X.values[stream].shape[2]
             if abs(rate_hz / self.layout.rate_hz[stream] - 1) > MAX_RATE_DEVIATION:
                 raise DataError(
                     f"stream {stream!r} runs at {rate_hz:.4g} Hz; the features were learned at "
                     f"{self.layout.rate_hz[stream]:.4g} Hz"
                 )
-            order = [X.channels[stream].index(name) for name in names]
-            array = (
-                X.values[stream]
-                if order == list(range(len(X.channels[stream])))
-                else X.values[stream][:, order]
-            )
-            values[stream] = _of_length(array, self.n_samples[stream], stream)
+            if abs(held - n) > MAX_RATE_DEVIATION * n + 1:
+                raise DataError(
+                    f"a window holds {held} samples of stream {stream!r}; the features were learned on {n}"
+                )
+            if names != tuple(X.channels[stream]):
+                array = array[:, [X.channels[stream].index(name) for name in names]]
+            # The number of samples follows the rate that was measured of a set of runs, from which the next set's
+            # differs by a little: where it gives a few less, the last ones are mirrored.
+            mirrored = held - 1 - np.abs(held - 1 - np.arange(n))
+            values[stream] = array if held == n else np.take(array, mirrored, axis=2)
         return values
-
-    def _channel_features(
-        self, stream: str, values: Array, names: tuple[str, ...]
-    ) -> tuple[Sequence[Feature], Array]:
-        if stream == "slip":
-            features = [
-                Feature(f"slip.{name.rpartition('_')[0]}.{statistic}", "1", frozenset({"slip"}))
-                for name in names
-                for statistic in SLIP_STATISTICS
-            ]
-            return features, slip_statistics(values).reshape(len(values), len(features))
-        derived, derived_names = derived_channels(values, names)
-        values, rate_hz = np.concatenate([values, derived], axis=1), self.layout.rate_hz[stream]
-        columns, table = list(STATISTICS), channel_statistics(values, rate_hz)
-        if values.shape[2] >= MIN_SAMPLES:
-            columns += spectrum_names(values.shape[2])
-            table = np.concatenate([table, channel_spectra(values, rate_hz)], axis=2)
-        described = stream, (*names, *derived_names), tuple(columns), frozenset(self.level_sets)
-        features_of, kept = _described(*described)
-        return features_of, table[:, kept]
 
     def samples(self, windows: Windows) -> Array:
         """Return the samples (n_windows, n_columns) of all channels, stream by stream, centred where they must be."""
@@ -300,26 +267,10 @@ class FeatureMatrix(NamedTuple):
         return np.concatenate(parts, axis=1)
 
 
-def _listed(channels: Mapping[str, tuple[str, ...]]) -> str:
-    return (
-        "; ".join(f"{stream} with {', '.join(names)}" for stream, names in channels.items()) or "no channel"
-    )
-
-
-def _of_length(values: Array, n: int, stream: str) -> Array:
-    """Return the first n samples of windows; where their own set of runs gave a few less, the last are mirrored.
-
-    The number of samples follows the rate that was measured of a set of runs, which the next set's differs from
-    by a little.
-    """
-    held = values.shape[2]
-    if held == n:
-        return values
-    if abs(held - n) > MAX_RATE_DEVIATION * n + 1:
-        raise DataError(
-            f"a window holds {held} samples of stream {stream!r}; the features were learned on {n}"
-        )
-    return np.asarray(np.take(values, held - 1 - np.abs(held - 1 - np.arange(n)), axis=2))
+@lru_cache(maxsize=256)
+def _pairs(stream: str, channels: tuple[str, ...], signal_set: str) -> tuple[Feature, ...]:
+    pairs = combinations([channel.rpartition("_")[0] for channel in channels], 2)
+    return tuple(Feature(f"{stream}.{a}~{b}.correlation", "1", frozenset({signal_set})) for a, b in pairs)
 
 
 @lru_cache(maxsize=256)
@@ -538,7 +489,7 @@ class FunctionExtractor(FeatureExtractor):
     def fit(self, X: Windows, y: Any = None) -> FunctionExtractor:
         """Learn channels and rates, and the names of what the functions give."""
         super().fit(X, y)
-        self.own_names_ = tuple(self._numbers(X, 0)) if len(X) else ()
+        self.own_names_ = tuple(self._numbers(X, 0)[1]) if len(X) else ()
         return self
 
     def transform(self, X: Windows | Mapping[str, Array]) -> Array:
@@ -549,11 +500,11 @@ class FunctionExtractor(FeatureExtractor):
         windows = self._windows(X)
         own = np.empty((len(windows), len(self.own_names_)))
         for row in range(len(windows)):
-            numbers = self._numbers(windows, row)
+            place, numbers = self._numbers(windows, row)
             if tuple(numbers) != self.own_names_:
                 raise ConfigError(
-                    f"own features of {_place(windows, row)} are {', '.join(numbers)}; those of the first "
-                    f"window are {', '.join(self.own_names_)}"
+                    f"own features of {place} are {', '.join(numbers)}; those of the first window are "
+                    f"{', '.join(self.own_names_)}"
                 )
             own[row] = list(numbers.values())
         return np.concatenate([super().transform(windows), own], axis=1)
@@ -562,30 +513,25 @@ class FunctionExtractor(FeatureExtractor):
         """Return the name of each column, of the package's own features with the unit."""
         return np.array([*super().get_feature_names_out(), *self.own_names_], dtype=object)
 
-    def _numbers(self, windows: Windows, row: int) -> dict[str, float]:
-        """Return what all functions give for a window, by name."""
+    def _numbers(self, windows: Windows, row: int) -> tuple[str, dict[str, float]]:
+        """Return a window's place in words, and what all functions give for it, by name."""
         values = {name: values[row] for name, values in windows.values.items()}
         window = Window(values, windows.channels, windows.rate_hz, windows.length_s)
-        found: dict[str, float] = {}
+        place = f"the window of run {windows.run_id[row]} at {windows.start_s[row]:.2f} s"
+        numbers: dict[str, float] = {}
         for function in self.functions:
             name = str(getattr(function, "__name__", type(function).__name__))
             try:
                 given = function(window)
             except Exception as error:
                 raise ConfigError(
-                    f"feature {name!r} fails on {_place(windows, row)}: {type(error).__name__}: {error}"
+                    f"feature {name!r} fails on {place}: {type(error).__name__}: {error}"
                 ) from error
-            if isinstance(given, Mapping):
-                named = {f"{name}.{key}": value for key, value in given.items()}
-            else:
-                named = {name: given}
-            for key, value in named.items():
-                if not isinstance(value, Real | np.generic) or key in found:
-                    what = "a second time" if key in found else f"{value!r} for {_place(windows, row)}"
+            several = isinstance(given, Mapping)
+            for key, value in given.items() if isinstance(given, Mapping) else [(name, given)]:
+                key = f"{name}.{key}" if several else key
+                if not isinstance(value, Real | np.generic) or key in numbers:
+                    what = "a second time" if key in numbers else f"{value!r} for {place}"
                     raise ConfigError(f"feature {key!r} is given {what}; one number a window is needed")
-                found[key] = float(value) if np.isfinite(value) else np.nan
-        return found
-
-
-def _place(windows: Windows, row: int) -> str:
-    return f"the window of run {windows.run_id[row]} at {windows.start_s[row]:.2f} s"
+                numbers[key] = float(value) if np.isfinite(value) else np.nan
+        return place, numbers

@@ -139,26 +139,25 @@ def slow_and_fast(samples: Samples) -> tuple[Array, SlowFast]:
     return slow_fast_split(fastest_wheel(windows), run_id, samples.terrain, windows.start_s, windows.length_s)
 
 
-def _sides(samples: Samples) -> Array:
-    """Return ``slow`` or ``fast`` (n,); ``DataError`` where too few classes have enough slow and fast runs."""
-    side, split = slow_and_fast(samples)
-    if split.status is Applicability.NOT_APPLICABLE:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in split.left_out.items())
-        raise DataError(
-            f"slow and fast runs are compared on {MIN_CLASSES} terrains with at least {MIN_RUNS_A_SIDE} runs "
-            f"and {MIN_TIME_A_SIDE_S:g} s of each; there are {len(split.classes)} ({reasons})"
-        )
-    return side
-
-
 def _from_to(trained: str, tested: str) -> Protocol:
-    held_out = f"{tested} runs held out, {trained} ones trained on"
-    note = f"{held_out}, on either side of the median speed of each terrain"
+    """Return the protocol of slow and fast runs; ``DataError`` where too few classes have enough of both."""
+
+    def sides(samples: Samples) -> Array:
+        side, split = slow_and_fast(samples)
+        if split.status is Applicability.NOT_APPLICABLE:
+            reasons = "; ".join(f"{name}: {reason}" for name, reason in split.left_out.items())
+            raise DataError(
+                f"slow and fast runs are compared on {MIN_CLASSES} terrains with at least {MIN_RUNS_A_SIDE} runs "
+                f"and {MIN_TIME_A_SIDE_S:g} s of each; there are {len(split.classes)} ({reasons})"
+            )
+        return side
 
     def deal(_: Array, side: Array, *__: Any) -> Array:
         return np.where(side == tested, 0, -1)
 
-    return Protocol(held_out, _sides, deal, note=note, whole_runs=False)
+    held_out = f"{tested} runs held out, {trained} ones trained on"
+    note = f"{held_out}, on either side of the median speed of each terrain"
+    return Protocol(held_out, sides, deal, note=note, whole_runs=False)
 
 
 def _groups(samples: Samples) -> Array:

@@ -32,7 +32,9 @@ MOMENTS: tuple[tuple[str, str], ...] = (
     ("peak_ratio", "1"),
 )
 
-SLIP_STATISTICS: tuple[str, ...] = ("mean", "std", "min", "max", "mean_abs", "median")
+SLIP_STATISTICS: tuple[tuple[str, str], ...] = tuple(
+    (name, "1") for name in ("mean", "std", "min", "max", "mean_abs", "median")
+)
 
 MIN_DEFINED_FRACTION = 0.5  #: With a smaller fraction of the window defined, its slip statistics are NaN.
 MAX_BANDS, MIN_BINS_PER_BAND = 20, 2
@@ -52,20 +54,14 @@ def _statistics(values: Array, in_order: Array, rate_hz: float, out: Array) -> N
     for i in range(n_windows):
         for c in range(n_channels):
             x = values[i, c]
-            mean = 0.0
-            square = 0.0
-            absolute = 0.0
+            mean = square = absolute = 0.0
             for k in range(n):
                 mean += x[k]
                 square += x[k] * x[k]
                 absolute += abs(x[k])
             mean /= n
-            m2 = 0.0
-            m3 = 0.0
-            m4 = 0.0
-            peak = 0.0
+            m2 = m3 = m4 = peak = steps = 0.0
             crossings = 0
-            steps = 0.0
             for k in range(n):
                 d = x[k] - mean
                 m2 += d * d
@@ -226,9 +222,7 @@ def _describe(power: Array, log_power: Array, edges: Array, resolution_hz: float
             if total <= _POWER_FLOOR:
                 row[bands + 1 :] = 0.0
                 continue
-            centroid = 0.0
-            log_mean = 0.0
-            log_weighted = 0.0
+            centroid = log_mean = log_weighted = 0.0
             peak = 0
             for k in range(n_lines):
                 centroid += p[k] / total * (k + 1)
@@ -236,10 +230,7 @@ def _describe(power: Array, log_power: Array, edges: Array, resolution_hz: float
                 log_weighted += p[k] / total * log_p[k]
                 if p[k] > p[peak]:
                     peak = k
-            m2 = 0.0
-            m3 = 0.0
-            m4 = 0.0
-            sum_so_far = 0.0
+            m2 = m3 = m4 = sum_so_far = 0.0
             rolloff = n_lines
             for k in range(n_lines):
                 d = k + 1 - centroid
@@ -277,12 +268,6 @@ def slip_statistics(slip_ratio: Array) -> Array:
     known = (~np.isnan(slip_ratio)).mean(axis=2) >= MIN_DEFINED_FRACTION
     if known.any():
         x = slip_ratio[known]
-        of_samples = (
-            np.nanmean,
-            np.nanstd,
-            np.nanmin,
-            np.nanmax,
-            lambda x, axis: np.nanmean(np.abs(x), axis),
-        )
-        out[known] = np.stack([of(x, axis=1) for of in (*of_samples, np.nanmedian)], axis=1)
+        plain = [of(x, axis=1) for of in (np.nanmean, np.nanstd, np.nanmin, np.nanmax)]
+        out[known] = np.stack([*plain, np.nanmean(np.abs(x), axis=1), np.nanmedian(x, axis=1)], axis=1)
     return out

@@ -48,9 +48,6 @@ class _Buffer:
     last_s: float = math.nan
     suspect: tuple[float, Sequence[float] | Array] | None = None
 
-    def first_at(self, time_s: float) -> int:
-        return bisect_left(self.time_s, time_s - TIME_TOLERANCE_S)
-
 
 class WindowStream:
     """Cut windows from samples as they arrive.
@@ -137,71 +134,86 @@ class WindowStream:
             raise ValueError(
                 f"stream {stream!r} has {buffer.n_channels} channels; the sample has {len(values)} values"
             )
-        if buffer.suspect is None and 0.0 < time_s - buffer.last_s <= PATIENCE_S:  # False for NaN
-            self._append(stream, buffer, time_s, values)
-            return self._advance() if time_s >= self._due_s[stream] else []
-        return self._push_doubtful(stream, buffer, float(time_s), values)
-
-    def _append(self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array) -> None:
-        if len(buffer.time_s) == buffer.capacity:
-            self._make_room(stream)
-        buffer.values.append(np.array(values, dtype=float))
-        buffer.time_s.append(time_s)
-        buffer.last_s = time_s
-
-    def _push_doubtful(
-        self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array
-    ) -> list[Windows]:
-        """Accept, hold back or drop a first sample, one that jumps ahead, and the one after it."""
         suspect = buffer.suspect
-        if not math.isfinite(time_s):
-            self.dropped_samples[stream, "time not finite"] += 1
-            return []
-        if time_s <= buffer.last_s or (suspect and time_s == suspect[0]):
-            self.dropped_samples[stream, "time goes back or repeats"] += 1
-            return []
-        if suspect and not 0.0 < time_s - suspect[0] <= PATIENCE_S:
-            self.dropped_samples[stream, "time jumps ahead"] += 1
-            suspect = buffer.suspect = None
-        if suspect is None and not time_s - buffer.last_s <= PATIENCE_S:
-            buffer.suspect = time_s, np.array(values, dtype=float)
-            return []
-        buffer.suspect = None
-        if suspect is not None:
-            self._append(stream, buffer, *suspect)
+        if suspect is not None or not 0.0 < time_s - buffer.last_s <= PATIENCE_S:  # of NaN too
+            # a first sample, one that jumps ahead, and the one after it: accept, hold back or drop
+            time_s = float(time_s)
+            if not math.isfinite(time_s):
+                self.dropped_samples[stream, "time not finite"] += 1
+                return []
+            if time_s <= buffer.last_s or (suspect and time_s == suspect[0]):
+                self.dropped_samples[stream, "time goes back or repeats"] += 1
+                return []
+            if suspect and not 0.0 < time_s - suspect[0] <= PATIENCE_S:
+                self.dropped_samples[stream, "time jumps ahead"] += 1
+                suspect = None
+            is_confirmed = suspect is not None or time_s - buffer.last_s <= PATIENCE_S
+            buffer.suspect = None if is_confirmed else (time_s, np.array(values, dtype=float))
+            if not is_confirmed:
+                return []
+            if suspect is not None:
+                self._append(stream, buffer, *suspect)
         self._append(stream, buffer, time_s, values)
-        if math.isnan(buffer.first_s) and suspect is not None:
+        if suspect is not None and math.isnan(buffer.first_s):
             buffer.first_s = suspect[0]
             begun_s = [each.first_s for each in self._buffers.values()]
-            if not any(math.isnan(each_s) for each_s in begun_s):
+            if not any(map(math.isnan, begun_s)):
                 self._start_s = max(begun_s)
                 self._set_due()
         return self._advance() if time_s >= self._due_s[stream] else []
 
-    def _set_due(self) -> None:
-        end_s = self._start_of(self._next) + self.rule.length_s - 2 * TIME_TOLERANCE_S
-        for name, period_s in self._period_s.items():
-            self._due_s[name] = end_s - period_s
+    def _append(self, stream: str, buffer: _Buffer, time_s: float, values: Sequence[float] | Array) -> None:
+        if len(buffer.time_s) == buffer.capacity:
+            # remove what no window needs any more, and the oldest samples where that is not enough
+            needed_from_s = self._start_s + self.rule.step_s * self._next
+            if math.isnan(self._start_s):
+                needed_from_s = max(b.last_s for b in self._buffers.values() if b.time_s) - PATIENCE_S
+            n = bisect_left(buffer.time_s, needed_from_s - TIME_TOLERANCE_S)
+            enough = buffer.capacity // BUFFER_MARGIN
+            if n < enough:
+                self.dropped_samples[stream, "faster than its rate"] += enough - n
+                n = enough
+            del buffer.time_s[:n], buffer.values[:n]
+        buffer.values.append(np.array(values, dtype=float))
+        buffer.time_s.append(time_s)
+        buffer.last_s = time_s
 
-    def _start_of(self, number: int) -> float:
-        return self._start_s + self.rule.step_s * number
+    def _set_due(self) -> None:
+        """Set the time before which no sample can finish the next window."""
+        start_s = self._start_s + self.rule.step_s * self._next
+        for name, period_s in self._period_s.items():
+            self._due_s[name] = start_s + self.rule.length_s - 2 * TIME_TOLERANCE_S - period_s
 
     def _advance(self) -> list[Windows]:
         """Decide all windows that can be decided now."""
         if math.isnan(self._start_s):
             return []
-        found: list[Windows] = []
+        windows, rule, channels = list[Windows](), self.rule, self.layout.channels
         front_s = max(buffer.last_s for buffer in self._buffers.values())
         reached_s = min(buffer.last_s + self._period_s[name] for name, buffer in self._buffers.items())
         # The numbers of windows that fit, by the formula of `regular_starts`, and that wait no longer.
-        n_fit = self._n_windows(reached_s)
-        n_overdue = self._n_windows(front_s - PATIENCE_S)
+        n_fit, n_overdue = (
+            int(math.floor((end_s - self._start_s - rule.length_s + TIME_TOLERANCE_S) / rule.step_s) + 1)
+            for end_s in (reached_s, front_s - PATIENCE_S)
+        )
         while self._next < max(n_fit, n_overdue):
-            start_s = self._start_of(self._next)
-            first = {name: buffer.first_at(start_s) for name, buffer in self._buffers.items()}
-            if all(first[name] + n <= len(self._buffers[name].time_s) for name, n in self._n_samples.items()):
-                found += self._cut(start_s, first)
+            start_s, streams = self._start_s + rule.step_s * self._next, {}
+            for name, buffer in self._buffers.items():
+                first = bisect_left(buffer.time_s, start_s - TIME_TOLERANCE_S)
+                rows = slice(first, first + self._n_samples[name])
+                if rows.stop <= len(buffer.time_s):
+                    samples = np.array(buffer.time_s[rows]), np.array(buffer.values[rows])
+                    streams[name] = Stream(*samples, channels[name])
+            if len(streams) == len(channels):
+                at = np.array([start_s])
+                values, (reason,) = cut_at(streams, at, rule, self.layout)
                 self._next += 1
+                if reason:
+                    self.dropped[str(reason)] += 1
+                else:
+                    run_id, unknown = (np.array([name], dtype=object) for name in ("live", ""))
+                    of_layout = channels, self.layout.rate_hz, rule.length_s
+                    windows.append(Windows(values, *of_layout, at, run_id, unknown))
             elif self._next < n_overdue:
                 # A window that lacks samples is followed by windows that lack them too.
                 self.dropped["gap"] += n_overdue - self._next
@@ -209,40 +221,7 @@ class WindowStream:
             else:
                 break
         self._set_due()
-        return found
-
-    def _n_windows(self, end_s: float) -> int:
-        rule = self.rule
-        return int(math.floor((end_s - self._start_s - rule.length_s + TIME_TOLERANCE_S) / rule.step_s) + 1)
-
-    def _cut(self, start_s: float, first: Mapping[str, int]) -> list[Windows]:
-        streams = {}
-        for name, buffer in self._buffers.items():
-            rows = slice(first[name], first[name] + self._n_samples[name])
-            samples = np.array(buffer.time_s[rows]), np.array(buffer.values[rows])
-            streams[name] = Stream(*samples, self.layout.channels[name])
-        at = np.array([start_s])
-        values, reason = cut_at(streams, at, self.rule, self.layout)
-        if reason[0]:
-            self.dropped[str(reason[0])] += 1
-            return []
-        run_id, unknown = (np.array([name], dtype=object) for name in ("live", ""))
-        of_layout = self.layout.channels, self.layout.rate_hz, self.rule.length_s
-        return [Windows(values, *of_layout, at, run_id, unknown)]
-
-    def _make_room(self, stream: str) -> None:
-        """Remove what no window needs any more, and the oldest samples where that is not enough."""
-        buffer = self._buffers[stream]
-        if math.isnan(self._start_s):
-            needed_from_s = max(b.last_s for b in self._buffers.values() if b.time_s) - PATIENCE_S
-        else:
-            needed_from_s = self._start_of(self._next)
-        n = buffer.first_at(needed_from_s)
-        enough = buffer.capacity // BUFFER_MARGIN
-        if n < enough:
-            self.dropped_samples[stream, "faster than its rate"] += enough - n
-            n = enough
-        del buffer.time_s[:n], buffer.values[:n]
+        return windows
 
 
 class WindowFeed:
@@ -284,17 +263,27 @@ class WindowFeed:
     ) -> None:
         self.unreadable: Counter[str] = Counter()
         self._stream = WindowStream(rule, layout)
-        self._measured: dict[str, tuple[int, Callable[[Array], Array]]] = {}
+        self._measured: dict[str, tuple[int, Callable[[Array], Array] | None, list[int]]] = {}
         self._estimated: dict[str, list[int]] = {}
         added = estimated or {}
         for stream, needed in layout.channels.items():
+            measured = list(channels.get(stream, ()))
+            with_speeds, known = None, measured if stream in channels else list(added.get(stream, ()))
+            if stream == "wheels" and stream in channels and robot is not None:
+                found = wheel_speeds_from(measured, robot)
+                known, with_speeds = (known, None) if found is None else (list(found[0]), found[1])
+            for channel in needed:
+                if channel not in known:
+                    there = ", ".join(known or [*channels, *added]) or "no streams"
+                    raise DataError(
+                        f"the model requires {channel!r} of the stream {stream!r}, which is neither measured nor "
+                        f"estimated here (there are {there})"
+                    )
+            places = [known.index(channel) for channel in needed]
             if stream in channels:
-                measured = list(channels[stream])
-                self._measured[stream] = len(measured), _columns(stream, needed, measured, robot)
-            elif stream in added:
-                self._estimated[stream] = _places(stream, needed, added[stream])
+                self._measured[stream] = len(measured), with_speeds, places
             else:
-                raise _lacks(needed[0], stream, [*channels, *added])
+                self._estimated[stream] = places
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -312,43 +301,17 @@ class WindowFeed:
         """Take what was measured and estimated since the last call; return the windows it completes."""
         windows: list[Windows] = []
         push = self._stream.push
-        for stream, (n_columns, columns) in self._measured.items():
+        for stream, (n_columns, with_speeds, places) in self._measured.items():
             if stream not in readings:
                 continue
             reading = readable(readings[stream])
             if reading is None or not reading.time_s.size or reading.values.shape[1] != n_columns:
                 self.unreadable[stream] += 1
                 continue
-            for time_s, values in zip(reading.time_s.tolist(), columns(reading.values), strict=True):
-                windows += push(stream, time_s, values)
+            values = reading.values if with_speeds is None else with_speeds(reading.values)
+            for time_s, row in zip(reading.time_s.tolist(), values[:, places], strict=True):
+                windows += push(stream, time_s, row)
         for estimate in estimates:
             for stream, places in self._estimated.items():
                 windows += push(stream, estimate.time_s, estimated_values(stream, estimate)[places])
         return windows
-
-
-def _columns(
-    stream: str, needed: Sequence[str], measured: list[str], robot: Robot | None
-) -> Callable[[Array], Array]:
-    """Return what takes the channels of a window out of the columns that are measured."""
-    found = wheel_speeds_from(measured, robot) if stream == "wheels" and robot is not None else None
-    if found is None:
-        places = _places(stream, needed, measured)
-        return lambda values: values[:, places]
-    channels, with_speeds = found
-    places = _places(stream, needed, channels)
-    return lambda values: with_speeds(values)[:, places]
-
-
-def _places(stream: str, needed: Sequence[str], known: Sequence[str]) -> list[int]:
-    for channel in needed:
-        if channel not in known:
-            raise _lacks(channel, stream, known)
-    return [known.index(channel) for channel in needed]
-
-
-def _lacks(channel: str, stream: str, known: Sequence[str]) -> DataError:
-    return DataError(
-        f"the model requires {channel!r} of the stream {stream!r}, which is neither measured nor estimated "
-        f"here (there are {', '.join(known) or 'no streams'})"
-    )

@@ -156,20 +156,23 @@ def layout_of(
         raise DataError("there is no run to cut windows from")
     desired_sets = frozenset({*signal_sets, *(("wheels",) if speeds else ())})
 
-    def used(name: str, stream: Stream) -> tuple[str, ...]:
-        return tuple(stream.channels[i] for i in rows_of_sets(name, tuple(stream.channels), desired_sets))
-
-    names = dict.fromkeys(name for run in runs for name, stream in run.streams.items() if used(name, stream))
     channels: dict[str, tuple[str, ...]] = {}
     rate_hz: dict[str, float] = {}
-    for name in names:
+    used = [
+        {
+            name: tuple(stream.channels[i] for i in rows)
+            for name, stream in run.streams.items()
+            if (rows := rows_of_sets(name, tuple(stream.channels), desired_sets))
+        }
+        for run in runs
+    ]
+    for name in dict.fromkeys(name for each in used for name in each):
         for run in runs:
             if name not in run.streams:
                 raise DataError(f"run {run.run_id} has no stream {name!r}, which other runs have")
-        channels[name] = used(name, runs[0].streams[name])
-        for run in runs:
-            differing = sorted(set(used(name, run.streams[name])) ^ set(channels[name]))
-            if differing:
+        channels[name] = used[0].get(name, ())
+        for run, own in zip(runs, used, strict=True):
+            if differing := sorted(set(own.get(name, ())) ^ set(channels[name])):
                 raise DataError(
                     f"run {run.run_id}, stream {name!r}: channel {differing[0]!r} is not in all runs"
                 )
@@ -244,12 +247,8 @@ def cut_at(
         off_rate = (
             np.abs(last_s - first_s - (n - 1) * period_s) > SPAN_TOLERANCE * (n - 1) * period_s + period_s
         )
-        faults = {
-            "gap": has_gap,
-            "wrong rate": off_rate,
-            "not finite": bad_before[first + n] > bad_before[first],
-        }
-        for why, faulty in faults.items():
+        not_finite = bad_before[first + n] > bad_before[first]
+        for why, faulty in (("gap", has_gap), ("wrong rate", off_rate), ("not finite", not_finite)):
             reason[(reason == "") & faulty] = why
         reason[~complete] = "incomplete"
         # Contiguous, so that numpy adds one window's samples in the same order as those of many.

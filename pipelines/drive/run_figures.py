@@ -9,12 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from pipelines.report.figure import Band, Figure, Line, Mark, Panel, Span, Strip, spans
-from terrain.control.drive_metrics import PEAK_ABOVE_MPS, low_passed_slip
+from terrain.control.drive_metrics import PEAK_ABOVE_MPS, SMOOTH_S
 from terrain.control.pid import DriveState
 from terrain.control.slip_table import SlipTable
 from terrain.control.traction import TractionStatus
 from terrain.kinematics.logged_wheels import true_slip
 from terrain.records import Array, RunLog
+from terrain.signals import low_pass
 
 MAX_POINTS = 2500
 
@@ -51,7 +52,7 @@ def drive_curves(run: RunLog, table: SlipTable) -> DriveCurves:
     speed = np.hypot(truth.channel("speed_x_mps"), truth.channel("speed_y_mps"))
     wheels = [name.split("_")[1] for name in truth.channels if name.startswith("wheel_")]
     true = np.clip(true_slip(truth, wheels), -1.0, 1.0)
-    slips = low_passed_slip(true, float(np.median(np.diff(truth.time_s))))
+    slips = low_pass(np.nan_to_num(true), float(np.median(np.diff(truth.time_s))), SMOOTH_S)
     slips[speed < PEAK_ABOVE_MPS] = np.nan
     seen, ticks = (
         slice(None, None, max(1, math.ceil(len(each) / MAX_POINTS)))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from features.extractor import FeatureExtractor
-from features.motion import NO_MOTION, fastest_wheel, window_motion
+from features.motion import NO_MOTION, window_motion
 from features.protocols import PROTOCOLS, Samples, folds_of, slow_and_fast
 from features.recipes import WindowPipeline, feature_matrix
 from features.sequences import following
@@ -33,7 +33,6 @@ from terrain.classify.held_out import (
     fit_fold,
     itself,
     left_out_folds,
-    run_speeds,
     score_fold,
 )
 from terrain.classify.limits import Motion
@@ -226,14 +225,13 @@ def _extras(
         slow_fast = slow_fast._replace(slow_to_fast=both[0], fast_to_slow=both[1])
     drawn, runs_per_class = drawn_folds(terrain, samples.group.astype(str), first, seed)
     curve = accuracies(features, drawn, "learning curve") if drawn else []
-    speeds = run_speeds(fastest_wheel(windows), run_id)
     tracks = [track for result in held_out.results for track in result.found or ()]
     spliced = sequence_figures([track for track in tracks if track.spliced], seed)
     found = {
         "speed_only_accuracy": speed_only,
         "slow_fast": slow_fast,
         "learning_curve": learning_curve(runs_per_class, curve, full),
-        "stiffness": stiffness_figures(held_out, run_id, known_levels(), features, speeds, seed),
+        "stiffness": stiffness_figures(held_out, run_id, known_levels(), seed),
         "courses": spliced,
         "recorded_courses": sequence_figures([track for track in tracks if not track.spliced], seed),
         "breakaways": breakaways(held_out, windows),

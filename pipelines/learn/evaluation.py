@@ -324,12 +324,6 @@ def _checks(result: CrossvalResult) -> list[Part]:
             ("  by the class of least expected cost", levels.least_cost, ".3f"),
             ("  gain, 95 % over runs", levels.gain_ci, ".4f"),
         ]
-    if levels is not None and levels.clusters is not None:
-        rows += [
-            ("clusters of runs without labels", levels.clusters.n_clusters),
-            ("  adjusted Rand index with the levels", levels.clusters.adjusted_rand, ".2f"),
-            ("  95 % over runs", levels.clusters.interval, ".2f"),
-        ]
     runs, right = curve.runs_per_class, curve.accuracy
     spread = [(a, std or 0.0) for a, std in zip(right, curve.accuracy_spread, strict=True)]
     low, high = [a - std for a, std in spread], [a + std for a, std in spread]

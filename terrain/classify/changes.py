@@ -135,37 +135,28 @@ class Breakaway(NamedTuple):
 
 def breakaways(held_out: HeldOut, windows: Windows) -> tuple[Breakaway, ...]:
     """Return the stretches that break away by their mean held-out probabilities, the surest first."""
-    run_id, probability = windows.run_id.astype(str), held_out.probability.mean(axis=0)
-    found = []
-    for run in np.unique(run_id).tolist():
-        for label in np.unique(held_out.truth[run_id == run]).tolist():
-            rows = np.flatnonzero((run_id == run) & (held_out.truth == label))
-            rows = rows[np.argsort(windows.start_s[rows], kind="stable")]
-            of_run = probability[rows], windows.start_s[rows], windows.length_s
-            found += stretches(run, label, held_out.classes, *of_run)
+    run_id, mean, found = windows.run_id.astype(str), held_out.probability.mean(axis=0), []
+    for run, label in sorted(set(zip(run_id.tolist(), held_out.truth.tolist(), strict=True))):
+        of_run = np.flatnonzero((run_id == run) & (held_out.truth == label))
+        of_run = of_run[np.argsort(windows.start_s[of_run], kind="stable")]
+        probability, start_s = mean[of_run], windows.start_s[of_run]
+        stated = probability[:, np.searchsorted(held_out.classes, label)]
+        best = probability.argmax(axis=1)
+        other = (held_out.classes[best] != label) & (probability.max(axis=1) >= OTHER_LEAST)
+        state = np.where(other, best, -1)
+        apart = np.diff(start_s) > 2.0 * windows.length_s  # windows on both sides of a pause are no stretch
+        for rows in np.split(np.arange(len(state)), np.flatnonzero((np.diff(state) != 0) | apart) + 1):
+            if len(rows) == len(state) or state[rows[0]] < 0:
+                continue
+            begin_s, end_s = float(start_s[rows[0]]), float(start_s[rows[-1]] + windows.length_s)
+            label_ratio, rest_ratio = float(stated[rows].mean()), float(np.delete(stated, rows).mean())
+            if end_s - begin_s >= LEAST_S - 1e-6 and label_ratio <= LABEL_MOST and rest_ratio >= REST_LEAST:
+                terrain, ratio = state[rows[0]], float(probability[rows, state[rows[0]]].mean())
+                looks_like = str(held_out.classes[terrain])
+                found.append(
+                    Breakaway(run, begin_s, end_s, label, looks_like, ratio, label_ratio, rest_ratio)
+                )
     return tuple(sorted(found, key=lambda each: -each.probability * (each.end_s - each.start_s)))
-
-
-def stretches(
-    run_id: str, label: str, classes: Array, probability: Array, start_s: Array, length_s: float
-) -> list[Breakaway]:
-    """Return the stretches of one run under one label that break away, of its windows (n,) in order of time."""
-    column = int(np.searchsorted(classes, label))
-    best = probability.argmax(axis=1)
-    other = (best != column) & (probability.max(axis=1, initial=0.0) >= OTHER_LEAST)
-    state = np.where(other, best, -1)
-    apart = np.diff(start_s) > 2.0 * length_s  # windows on both sides of a pause are no stretch
-    found = []
-    for rows in np.split(np.arange(len(state)), np.flatnonzero((np.diff(state) != 0) | apart) + 1):
-        if not len(rows) or len(rows) == len(state) or state[rows[0]] < 0:
-            continue
-        begin_s, end_s = float(start_s[rows[0]]), float(start_s[rows[-1]] + length_s)
-        looks_like, label_ratio = state[rows[0]], float(probability[rows, column].mean())
-        rest_ratio = float(np.delete(probability[:, column], rows).mean())
-        if end_s - begin_s >= LEAST_S - 1e-6 and label_ratio <= LABEL_MOST and rest_ratio >= REST_LEAST:
-            means = float(probability[rows, looks_like].mean()), label_ratio, rest_ratio
-            found.append(Breakaway(run_id, begin_s, end_s, label, str(classes[looks_like]), *means))
-    return found
 
 
 class DetectorSettings(NamedTuple):
@@ -198,89 +189,71 @@ class Block(NamedTuple):
     wheel_speed_mps: Array
 
 
-class ChangeDetector:
-    """Finds changes of the ground block by block; ``blocks`` are of one regime and, as far as is known, one ground.
-
-    Examples
-    --------
-    >>> detector = ChangeDetector(DetectorSettings(np.eye(1) * 0.01, 30.0, 0, 0.0))
-    >>> time_s = np.arange(0.0, 10.0, 0.05)
-    >>> current_a, speed_mps = np.where(time_s < 5.0, 1.0, 2.0)[:, None], np.full((200, 1), 0.5)
-    >>> found = [detector.take(block) for block in blocks_of(time_s, current_a, speed_mps)]
-    >>> [(float(each.change_s), float(each.alarm_s)) for each in found if each is not None]
-    [(4.75, 5.5)]
-    """
-
-    def __init__(self, settings: DetectorSettings) -> None:
-        self.threshold = settings.threshold
-        self.blocks: list[Block] = []
-        self._precision = np.linalg.inv(settings.covariance)
-        self._regime: Array | None = None
-        self._settled_s = -np.inf
-
-    def take(self, block: Block) -> GroundChange | None:
-        """Take one block, after those before; return a change where it makes one known."""
-        begin_s, speed_mps = block.end_s - BLOCK_S, block.wheel_speed_mps
-        if not self._continues(speed_mps):
-            self.blocks, self._settled_s = [], begin_s + SETTLING_S
-        if begin_s < self._settled_s - 1e-9:
-            self._regime = speed_mps
-            return None
-        if not np.isfinite(block.responses).all():
-            return None
-        self.blocks.append(block)
-        self._regime = np.mean([each.wheel_speed_mps for each in self.blocks], axis=0)
-        statistic, at = self.ratio()
-        if statistic <= self.threshold:
-            return None
-        before, self.blocks = self.blocks[:at], self.blocks[at:]
-        means = (np.mean([each.responses for each in part], axis=0) for part in (before, self.blocks))
-        return GroundChange(block.end_s, before[-1].end_s, statistic, *means)
-
-    def _continues(self, wheel_speed_mps: Array) -> bool:
-        """Return whether a block's wheel speeds are of the regime so far."""
-        if self._regime is None or not np.isfinite(wheel_speed_mps).all():
-            return False
-        norm = float(np.linalg.norm(self._regime))
-        if norm == 0.0 or np.linalg.norm(wheel_speed_mps) < MIN_SPEED_RATIO * norm:
-            return False
-        return bool(np.linalg.norm(wheel_speed_mps - self._regime) <= MAX_REGIME_CHANGE * norm)
-
-    def ratio(self) -> tuple[float, int]:
-        """Return G of the blocks so far, and the number of blocks before the most likely change."""
-        n = len(self.blocks)
-        if n < 2 * MIN_BLOCKS:
-            return 0.0, 0
-        sums = np.cumsum(np.array([each.responses for each in self.blocks]), axis=0)
-        at = np.arange(max(MIN_BLOCKS, n - MAX_BLOCKS), n - MIN_BLOCKS + 1)
-        apart = (sums[-1] - sums[at - 1]) / (n - at)[:, None] - sums[at - 1] / at[:, None]
-        ratio = at * (n - at) / n * np.einsum("ji,ik,jk->j", apart, self._precision, apart)
-        best = int(np.argmax(ratio))
-        return float(ratio[best]), int(at[best])
-
-
 def blocks_of(time_s: Array, responses: Array, wheel_speed_mps: Array) -> Iterator[Block]:
     """Yield the blocks of samples (n,), (n, r), (n, w), each once it is over, on a grid from the first sample."""
     number = np.floor((time_s - time_s[:1]) / BLOCK_S + 1e-9).astype(int)
     for rows in np.split(np.arange(len(time_s)), np.flatnonzero(np.diff(number) != 0) + 1)[:-1]:
-        end_s = time_s[0] + (number[rows[0]] + 1) * BLOCK_S
-        yield Block(end_s, _known_mean(responses[rows]), _known_mean(wheel_speed_mps[rows]))
+        means = []
+        for values in (responses[rows], wheel_speed_mps[rows]):
+            known = np.isfinite(values)
+            n, total = known.sum(axis=0), np.where(known, values, 0.0).sum(axis=0)
+            means.append(np.divide(total, n, out=np.full(n.shape, np.nan), where=n > 0))
+        yield Block(time_s[0] + (number[rows[0]] + 1) * BLOCK_S, *means)
 
 
-def _known_mean(values: Array) -> Array:
-    known = np.isfinite(values)
-    n = known.sum(axis=0)
-    total = np.where(known, values, 0.0).sum(axis=0)
-    return np.asarray(np.divide(total, n, out=np.full(n.shape, np.nan), where=n > 0))
+def _ratios(
+    blocks: Iterable[Block], covariance: Array, threshold: float
+) -> Iterator[tuple[float, int, list[Block]]]:
+    """Yield, block by block, G, the number of blocks before the most likely change, and the blocks that it is of.
+
+    These are of one regime and, as far as is known, one ground.
+    """
+    precision, so_far, settled_s = np.linalg.inv(covariance), list[Block](), -np.inf
+    regime: Array | None = None
+    for block in blocks:
+        begin_s, speed, ratio, at = block.end_s - BLOCK_S, block.wheel_speed_mps, 0.0, 0
+        norm = 0.0 if regime is None else float(np.linalg.norm(regime))
+        continues = norm > 0.0 and np.linalg.norm(speed) >= MIN_SPEED_RATIO * norm
+        if not (continues and np.linalg.norm(speed - regime) <= MAX_REGIME_CHANGE * norm):
+            so_far, settled_s = [], begin_s + SETTLING_S
+        if begin_s < settled_s - 1e-9:
+            regime = speed
+        elif np.isfinite(block.responses).all():
+            so_far.append(block)
+            regime, n = np.mean([each.wheel_speed_mps for each in so_far], axis=0), len(so_far)
+            if n >= 2 * MIN_BLOCKS:
+                sums = np.cumsum(np.array([each.responses for each in so_far]), axis=0)
+                places = np.arange(max(MIN_BLOCKS, n - MAX_BLOCKS), n - MIN_BLOCKS + 1)
+                before = sums[places - 1]
+                apart = (sums[-1] - before) / (n - places)[:, None] - before / places[:, None]
+                g = places * (n - places) / n * np.einsum("ji,ik,jk->j", apart, precision, apart)
+                ratio, at = float(g.max()), int(places[g.argmax()])
+        yield ratio, at, so_far
+        if ratio > threshold:
+            so_far = so_far[at:]
 
 
 def changes_of(
     time_s: Array, responses: Array, wheel_speed_mps: Array, settings: DetectorSettings
 ) -> list[GroundChange]:
-    """Return the changes of a log of samples (n,), (n, r), (n, w), as they are found while it drives."""
-    detector = ChangeDetector(settings)
-    found = (detector.take(block) for block in blocks_of(time_s, responses, wheel_speed_mps))
-    return [each for each in found if each is not None]
+    """Return the changes of a log of samples (n,), (n, r), (n, w), as they are found while it drives.
+
+    Examples
+    --------
+    >>> time_s = np.arange(0.0, 10.0, 0.05)
+    >>> current_a, speed_mps = np.where(time_s < 5.0, 1.0, 2.0)[:, None], np.full((200, 1), 0.5)
+    >>> found = changes_of(time_s, current_a, speed_mps, DetectorSettings(np.eye(1) * 0.01, 30.0, 0, 0.0))
+    >>> [(float(each.change_s), float(each.alarm_s)) for each in found]
+    [(4.75, 5.5)]
+    """
+    blocks, found = blocks_of(time_s, responses, wheel_speed_mps), []
+    for ratio, at, so_far in _ratios(blocks, settings.covariance, settings.threshold):
+        if ratio > settings.threshold:
+            means = (
+                np.mean([each.responses for each in part], axis=0) for part in (so_far[:at], so_far[at:])
+            )
+            found.append(GroundChange(so_far[-1].end_s, so_far[at - 1].end_s, ratio, *means))
+    return found
 
 
 def calibrate(
@@ -291,12 +264,10 @@ def calibrate(
     ``logs`` are as :func:`changes_of` takes them; ``DataError`` where none is long enough.
     """
     runs = []
-    for time_s, responses, wheel_speed_mps in logs:
-        detector = ChangeDetector(DetectorSettings(np.eye(responses.shape[1]), np.inf, 0, 0.0))
-        for block in blocks_of(time_s, responses, wheel_speed_mps):
-            detector.take(block)
-        if len(detector.blocks) >= 2 * MIN_BLOCKS:  # of one regime, settled, with all responses
-            runs.append(detector.blocks)
+    for log in logs:
+        found = list(_ratios(blocks_of(*log), np.eye(log[1].shape[1]), np.inf))
+        if found and len(found[-1][2]) >= 2 * MIN_BLOCKS:  # of one regime, settled, with all responses
+            runs.append(found[-1][2])
     if not runs:
         raise DataError(
             f"no run is driven steadily for {2 * MIN_BLOCKS * BLOCK_S + SETTLING_S:g} s, as a threshold takes"
@@ -305,11 +276,6 @@ def calibrate(
     apart = np.concatenate([part - part.mean(axis=0) for part in values])
     covariance = apart.T @ apart / max(len(apart) - len(values), 1)
     covariance += np.eye(len(covariance)) * 1e-9 * max(float(np.trace(covariance)), 1e-12)
-    largest = np.zeros(len(runs))
-    for i, blocks in enumerate(runs):
-        detector = ChangeDetector(DetectorSettings(covariance, np.inf, 0, 0.0))
-        for block in blocks:
-            detector.take(block)
-            largest[i] = max(largest[i], detector.ratio()[0])
+    largest = np.array([max(ratio for ratio, *_ in _ratios(each, covariance, np.inf)) for each in runs])
     threshold = float(np.quantile(largest, 1.0 - false_alarm_ratio))
     return DetectorSettings(covariance, threshold, len(runs), float(np.mean(largest > threshold)))

@@ -94,27 +94,12 @@ def speed_edges(speed_mps: Array) -> tuple[float, ...]:
     for edge in np.linspace(low, high, n_ranges + 1)[1:-1]:
         nearest = round(edge / EDGE_STEP_MPS)
         places = EDGE_STEP_MPS * np.arange(max(nearest - reach, 1), nearest + reach + 1)
-        beside = [int(np.sum(np.abs(speed_mps - place) < EDGE_STEP_MPS / 2)) for place in places]
-        best = min(
-            zip(beside, np.abs(places - edge), places, strict=True)
-        )  # of the fewest windows the nearest
-        inner.add(float(np.round(best[2], 6)))
+        beside = (np.abs(speed_mps - places[:, None]) < EDGE_STEP_MPS / 2).sum(axis=1)
+        best = np.lexsort((np.abs(places - edge), beside))[0]  # of the fewest windows the nearest
+        inner.add(float(np.round(places[best], 6)))
     ends = np.floor(low / EDGE_STEP_MPS), max(np.ceil(high / EDGE_STEP_MPS), 1.0)
     first, last = (float(np.round(EDGE_STEP_MPS * end, 6)) for end in ends)
     return (first, *sorted(edge for edge in inner if first < edge < last), last)
-
-
-def regime_name(edges_mps: tuple[float, ...], number: int) -> str:
-    """Return a regime in words.
-
-    Examples
-    --------
-    >>> [regime_name((0.1, 0.3, 0.6), number) for number in (0, 4)]
-    ['straight at 0.1 to 0.3 m/s', 'curve at 0.3 to 0.6 m/s']
-    """
-    within, manoeuvre = divmod(number, len(Manoeuvre))
-    low, high = edges_mps[within : within + 2]
-    return f"{Manoeuvre(manoeuvre).name.lower()} at {low:g} to {high:g} m/s"
 
 
 def held_out_support(held_out: HeldOut, run_id: Array, motion: Motion) -> tuple[Array, Array]:
@@ -127,12 +112,13 @@ def held_out_support(held_out: HeldOut, run_id: Array, motion: Motion) -> tuple[
     """
     shape, terrain = held_out.probability.shape[:2], held_out.truth
     true_runs, probability = np.zeros(shape, dtype=int), np.full(shape, np.nan)
-    classes = [str(name) for name in held_out.classes]
     true = np.searchsorted(held_out.classes, terrain)
     for (repeat, _, train, test), stated, *_ in held_out.results:
         driven, there = motion.of(train), motion.of(test)
-        table = learn_support(driven.speed_mps, driven.yaw_rate_radps, terrain[train], run_id[train], classes)
-        near = table.near_runs(there.speed_mps, there.yaw_rate_radps)
+        trained = driven.speed_mps, driven.yaw_rate_radps, terrain[train], run_id[train]
+        near = learn_support(*trained, held_out.classes.tolist()).near_runs(
+            there.speed_mps, there.yaw_rate_radps
+        )
         true_runs[repeat, test] = near[np.arange(len(test)), true[test]]
         probability[repeat, test] = supported_probability(stated, near)
     return true_runs, probability
@@ -150,51 +136,6 @@ class PartFigures(NamedTuple):
     accuracy_ci: Interval | None
     errors_ratio: float | None
     errors_ratio_ci: Interval | None
-
-
-def support_accuracy(
-    correct: Array,
-    true_runs: Array,
-    probability: Array,
-    run_id: Array,
-    terrain: Array,
-    rng: np.random.Generator,
-) -> dict[str, Any]:
-    """Return the accuracy of held-out windows (repeats, n) of runs and true terrains (n,) by their support, by name.
-
-    ``accuracy_by_support`` is by :class:`~terrain.classify.limits.SupportLevel` of the true terrain: needs labels;
-    ``unsupported`` and ``supported`` by the mark of the prediction, without a label; ``supported_auc`` is the area from
-    the supported probability to correctness, None where all are right.
-    """
-    weights, place = drawn_runs(run_id, terrain, N_BOOTSTRAP, rng)
-    level, wrong, supported = support_levels(true_runs), ~correct, probability >= SUPPORTED
-
-    def total(windows: Array) -> Array:
-        return np.asarray(weights @ np.bincount(place, windows.sum(axis=0), weights.shape[1]))
-
-    n, errors = total(np.ones(wrong.shape)), total(wrong)
-
-    def part(inside: Array) -> PartFigures:
-        n_inside, wrong_inside = total(inside), total(inside & wrong)
-        ratio, interval = ratio_over_runs(n_inside, n)
-        accuracy = ratio_over_runs(n_inside - wrong_inside, n_inside)
-        return PartFigures(
-            ratio or 0.0, interval or (0.0, 0.0), *accuracy, *ratio_over_runs(wrong_inside, errors)
-        )
-
-    repeats = zip(probability, correct.astype(float), strict=True)
-    areas = np.array(
-        [confidence_auc(stated, right, np.ones((1, right.size)))[0] for stated, right in repeats]
-    )
-    known = np.isfinite(areas)
-    return {
-        "accuracy_by_support": tuple(
-            {"support": each.value, **part(level == each.value)._asdict()} for each in SupportLevel
-        ),
-        "unsupported": part(~supported),
-        "supported": part(supported),
-        "supported_auc": float(areas[known].mean()) if known.any() else None,
-    }
 
 
 def errors_left(law: Array, n_runs: Array) -> Array:
@@ -307,7 +248,9 @@ def coverage_of(
     -------
     support : a :class:`SupportRow` of each terrain in each regime, those without a window among them
     next_drives : :class:`NextDrive`, best first; empty where the data cannot show what more runs gain
-    and what :func:`support_accuracy` gives
+    accuracy_by_support : by :class:`~terrain.classify.limits.SupportLevel` of the true terrain: needs labels
+    unsupported, supported : by the mark of the prediction, without a label
+    supported_auc : area from the supported probability to correctness, None where all are right
     """
     classes, tested = [str(name) for name in held_out.classes], np.flatnonzero(held_out.tested)
     table = learn_support(motion.speed_mps, motion.yaw_rate_radps, held_out.truth, run_id, classes)
@@ -317,17 +260,16 @@ def coverage_of(
     near = table.near_runs(motion.speed_mps, motion.yaw_rate_radps)
     edges_mps = speed_edges(motion.speed_mps)
     within = np.searchsorted(np.array(edges_mps[1:-1]), motion.speed_mps, side="right")
-    regime = (within * len(Manoeuvre) + manoeuvres(motion)).astype(
-        int
-    )  # manoeuvre by manoeuvre in each range
-    rows, cells = [], []
+    # manoeuvre by manoeuvre in each range
+    regime, rows, cells = (within * len(Manoeuvre) + manoeuvres(motion)).astype(int), [], []
     for column, name in enumerate(classes):
         for number in np.unique(regime):
             of_class, of_regime = terrain == name, regime == number
             inside = of_class & of_regime
-            n = int(inside.sum())
+            n, (place, manoeuvre) = int(inside.sum()), divmod(int(number), len(Manoeuvre))
             right = float(correct[:, inside].mean()) if n else None
-            named = regime_name(edges_mps, int(number))
+            low, high = edges_mps[place : place + 2]
+            named = f"{Manoeuvre(manoeuvre).name.lower()} at {low:g} to {high:g} m/s"
             rows.append(SupportRow(name, named, n, len(np.unique(run_id[inside])), right))
             expected = float(inside.mean() + of_class.mean() * of_regime.mean()) / 2
             at = inside if n else of_regime  # the motions of other terrains show where coverage lacks
@@ -337,14 +279,38 @@ def coverage_of(
             cells.append((expected, n, errors, held_out_runs, all_runs))
     law = fit_growth(true_runs.ravel(), correct.ravel())
     gain = np.zeros(len(cells)) if law is None else expected_gain(law, *np.array(cells, dtype=float).T)
-    lasts_s = max(RUN_WINDOWS * window_s, MIN_RUN_S)
-    drives = []
+    lasts_s, drives = max(RUN_WINDOWS * window_s, MIN_RUN_S), []
     for i in np.argsort(-gain, kind="stable")[:MAX_DRIVES]:
         if gain[i] >= MIN_GAIN:
             name, driven, n, _, right = rows[i]
             asked = name, driven, ADDED_RUNS, lasts_s, float(gain[i])
             drives.append(NextDrive(*asked, cells[i][-1], n, right))
-    by_support = support_accuracy(
-        correct, true_runs, probability, run_id, terrain, np.random.default_rng(seed)
-    )
-    return {"support": tuple(rows), "next_drives": tuple(drives), **by_support}
+
+    weights, place_of = drawn_runs(run_id, terrain, N_BOOTSTRAP, np.random.default_rng(seed))
+
+    def total(windows: Array) -> Array:
+        return np.asarray(weights @ np.bincount(place_of, windows.sum(axis=0), weights.shape[1]))
+
+    def part(inside: Array) -> PartFigures:
+        n_all, n_inside, n_wrong, n_wrong_inside = map(
+            total, (np.ones(correct.shape), inside, ~correct, inside & ~correct)
+        )
+        ratio, interval = ratio_over_runs(n_inside, n_all)
+        accuracy = ratio_over_runs(n_inside - n_wrong_inside, n_inside)
+        of_errors = ratio_over_runs(n_wrong_inside, n_wrong)
+        return PartFigures(ratio or 0.0, interval or (0.0, 0.0), *accuracy, *of_errors)
+
+    level, supported = support_levels(true_runs), probability >= SUPPORTED
+    once, repeats = np.ones((1, len(terrain))), zip(probability, correct.astype(float), strict=True)
+    areas = np.array([confidence_auc(stated, right, once)[0] for stated, right in repeats])
+    known = np.isfinite(areas)
+    return {
+        "support": tuple(rows),
+        "next_drives": tuple(drives),
+        "accuracy_by_support": tuple(
+            {"support": each.value, **part(level == each.value)._asdict()} for each in SupportLevel
+        ),
+        "unsupported": part(~supported),
+        "supported": part(supported),
+        "supported_auc": float(areas[known].mean()) if known.any() else None,
+    }

@@ -204,6 +204,9 @@ def learn_novelty(
 
 def _fitted(X: Array, y: Array) -> Novelty:
     """Return the score without references and threshold."""
+    from sklearn.covariance import ledoit_wolf
+    from sklearn.svm import SVC
+
     from terrain.classify.grouped import f_score
 
     valid = np.isfinite(X)
@@ -225,40 +228,31 @@ def _fitted(X: Array, y: Array) -> Novelty:
     z = scaled @ components.T
     classes, class_of = np.unique(y, return_inverse=True)
     means = np.stack([z[class_of == c].mean(axis=0) for c in range(len(classes))])
-    within, background = _whitening(z - means[class_of]), _whitening(z - z.mean(axis=0))
-    step = -(-len(z) // MAX_PROTOTYPES)
-    return Novelty(
-        X.shape[1], columns.astype(np.int64), fill, mean, scale, components, within, background,
-        means @ within.T, background @ z.mean(axis=0), np.ascontiguousarray(z[::step, :N_NEAR]),
-        *_pair_machine(scaled, y), np.zeros((0, N_TERMS)), np.inf,
-    )  # fmt: skip
-
-
-def _pair_machine(scaled: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-    """Return support vectors, their weights in each pair of classes, offsets, and squared lengths."""
-    from sklearn.svm import SVC
-
+    whitening = []  # W with W'W the inverse of the shrunk covariance (Ledoit and Wolf 2004)
+    for residuals in (z - means[class_of], z - z.mean(axis=0)):
+        covariance = ledoit_wolf(residuals, assume_centered=True)[0]
+        covariance += 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
+        whitening.append(np.linalg.inv(np.linalg.cholesky(covariance)))
+    within, background = whitening
     svc = SVC(C=PENALTY, gamma=GAMMA / scaled.shape[1], cache_size=500).fit(scaled, y)
-    sign = -1.0 if len(svc.classes_) == 2 else 1.0  # scikit-learn turns the two-class decision around
-    bounds = np.concatenate(([0], np.cumsum(svc.n_support_)))
-    pairs = list(combinations(range(len(svc.classes_)), 2))
+    sign = -1.0 if len(classes) == 2 else 1.0  # scikit-learn turns the two-class decision around
+    bounds, pairs = (
+        np.concatenate(([0], np.cumsum(svc.n_support_))),
+        list(combinations(range(len(classes)), 2)),
+    )
     weights = np.zeros((len(svc.support_vectors_), len(pairs)))
     for pair, (a, b) in enumerate(pairs):
         of_a, of_b = slice(bounds[a], bounds[a + 1]), slice(bounds[b], bounds[b + 1])
         weights[of_a, pair] = sign * svc.dual_coef_[b - 1, of_a]
         weights[of_b, pair] = sign * svc.dual_coef_[a, of_b]
     vectors = svc.support_vectors_.astype(np.float32)  # half the memory that a window has to go through
-    return vectors, weights, sign * svc.intercept_, np.square(vectors, dtype=float).sum(axis=1)
-
-
-def _whitening(residuals: Array) -> Array:
-    """Return W (q, q) with ``W'W`` the inverse of the shrunk covariance (Ledoit and Wolf 2004) of rows."""
-    from sklearn.covariance import ledoit_wolf
-
-    covariance = ledoit_wolf(residuals, assume_centered=True)[0]
-    covariance += 1e-9 * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
-    found: Array = np.linalg.inv(np.linalg.cholesky(covariance))
-    return found
+    step = -(-len(z) // MAX_PROTOTYPES)
+    return Novelty(
+        X.shape[1], columns.astype(np.int64), fill, mean, scale, components, within, background,
+        means @ within.T, background @ z.mean(axis=0), np.ascontiguousarray(z[::step, :N_NEAR]),
+        vectors, weights, sign * svc.intercept_, np.square(vectors, dtype=float).sum(axis=1),
+        np.zeros((0, N_TERMS)), np.inf,
+    )  # fmt: skip
 
 
 class Motion(NamedTuple):

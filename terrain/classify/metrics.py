@@ -9,7 +9,7 @@ leaves this common part out of the interval of their difference.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from functools import partial
 from types import MappingProxyType
@@ -235,22 +235,6 @@ def calibration_error(confidence: Array, correct: Array, weights: Array, n_bins:
     return found
 
 
-def reliability_bins(
-    confidence: Array, correct: Array, weights: Array, n_bins: int
-) -> tuple[ReliabilityBin, ...]:
-    """Return bins of equal count over all repeats (repeats, n) together; intervals are of the weights (d, n)."""
-    n = confidence.shape[1]
-    confidence, correct = confidence.ravel(), correct.ravel().astype(float)
-    order = np.argsort(confidence, kind="stable")
-    found = []
-    for rows in np.array_split(order, min(n_bins, len(order))):
-        drawn = np.vstack([np.ones(len(rows)), weights[:, rows % n]])
-        accuracy, interval = ratio_over_runs(drawn @ correct[rows], drawn.sum(axis=1))
-        of_bin = float(confidence[rows].mean()), accuracy or 0.0, len(rows), interval or NO_INTERVAL
-        found.append(ReliabilityBin(*of_bin))
-    return tuple(found)
-
-
 def confidence_figures(
     confidence: Array, correct: Array, run_id: Array, terrain: Array, rng: np.random.Generator
 ) -> dict[str, Any]:
@@ -271,20 +255,26 @@ def confidence_figures(
         known = np.isfinite(draws[1:]).any()
         return float(draws[0]), percentile_interval(draws[1:]) if known else NO_INTERVAL
 
-    auc, auc_ci = figure(confidence_auc)
-    ece, ece_ci = figure(partial(calibration_error, n_bins=CALIBRATION_BINS))
-    at_coverage = []
+    at_coverage, n = [], confidence.shape[1]
     for coverage in COVERAGES:
         of_most = figure(partial(accuracy_at_coverage, coverage=coverage))
         least = float(np.mean(np.quantile(confidence, 1.0 - coverage, axis=1)))
         at_coverage.append(CoverageFigures(coverage, *of_most, least))
+    stated, right, bins = confidence.ravel(), correct.ravel().astype(float), []
+    for rows in np.array_split(np.argsort(stated, kind="stable"), min(CALIBRATION_BINS, len(stated))):
+        drawn = weights[:, rows % n]
+        accuracy, interval = ratio_over_runs(drawn @ right[rows], drawn.sum(axis=1))
+        of_bin = float(stated[rows].mean()), accuracy or 0.0, len(rows), interval or NO_INTERVAL
+        bins.append(ReliabilityBin(*of_bin))
+    auc, auc_ci = figure(confidence_auc)
+    ece, ece_ci = figure(partial(calibration_error, n_bins=CALIBRATION_BINS))
     return {
         "ece": round(ece, 12),
         "ece_ci": ece_ci,
         "confidence_auc": auc,
         "confidence_auc_ci": auc_ci,
         "accuracy_at_coverage": tuple(at_coverage),
-        "reliability": reliability_bins(confidence, correct, weights[1:], CALIBRATION_BINS),
+        "reliability": tuple(bins),
     }
 
 
@@ -302,14 +292,13 @@ def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: in
     predicted = classes[probability.argmax(axis=2)]
     correct = predicted == terrain
     group_of = np.unique(group.astype(str)[rows], return_inverse=True)[1]
-    segments = group_of * (fold_number.max() + 1) + fold_number
-    votes = [
-        vote(p, segment, start_s, windows.length_s) for p, segment in zip(probability, segments, strict=True)
-    ]
+    segments, votes = group_of * (fold_number.max() + 1) + fold_number, []
+    for p, segment in zip(probability, segments, strict=True):
+        votes.append(vote(p, segment, start_s, windows.length_s))
     voted = classes[np.stack([each for each, _ in votes])] == terrain
     repeats = [class_figures(terrain, each, classes) for each in predicted]
     pooled = class_figures(np.tile(terrain, len(predicted)), predicted.ravel(), classes)
-    accuracies = np.array([repeat["accuracy"] for repeat in repeats])
+    means = {name: [each[name] for each in repeats] for name in ("accuracy", "balanced_accuracy", "macro_f1")}
     per_run, of_terrain = [], dict[str, list[float]]()
     for run in np.unique(run_id):
         mine = run_id == run
@@ -319,24 +308,21 @@ def held_out_figures(held_out: HeldOut, windows: Windows, group: Array, seed: in
         voted_right = float(np.mean(voted[:, mine]))
         per_run.append(RunFigures(str(run), name, int(mine.sum()), accuracy, voted_right, mistaken_for))
         of_terrain.setdefault(name, []).append(accuracy)
-    right = np.where(held_out.tested, held_out.correct, np.nan)
-    of_confidence = probability.max(axis=2), correct, run_id, terrain, np.random.default_rng(seed)
-    folds = []
+    right, folds = np.where(held_out.tested, held_out.correct, np.nan), []
     for fold, _, chosen, *_ in held_out.results:
-        accuracy = float(np.nanmean(right[fold.repeat, fold.test]))
         sizes = len(fold.train), len(fold.test)
+        accuracy = float(np.nanmean(right[fold.repeat, fold.test]))
         folds.append(FoldFigures(fold.repeat, fold.number, *sizes, accuracy, chosen))
+    of_confidence = probability.max(axis=2), correct, run_id, terrain, np.random.default_rng(seed)
     return {
         "classes": tuple(str(name) for name in classes),
         "n_windows": len(terrain),
         "n_runs": len(np.unique(windows.run_id[rows])),
         "repeats": len(repeats),
-        "accuracy": float(accuracies.mean()),
-        "accuracy_spread": float(accuracies.std(ddof=1)) if len(repeats) > 1 else None,
-        "accuracy_per_repeat": tuple(accuracies.tolist()),
+        **{name: float(np.mean(each)) for name, each in means.items()},
+        "accuracy_spread": float(np.std(means["accuracy"], ddof=1)) if len(repeats) > 1 else None,
+        "accuracy_per_repeat": tuple(means["accuracy"]),
         "accuracy_ci": run_bootstrap(correct.mean(axis=0), run_id, terrain, np.random.default_rng(seed)),
-        "balanced_accuracy": float(np.mean([repeat["balanced_accuracy"] for repeat in repeats])),
-        "macro_f1": float(np.mean([repeat["macro_f1"] for repeat in repeats])),
         "macro_run_accuracy": float(np.mean([np.mean(each) for each in of_terrain.values()])),
         "per_class": pooled["per_class"],
         "confusion": pooled["confusion"],
@@ -504,43 +490,29 @@ def compare_outcomes(a: Outcome, b: Outcome, rng: np.random.Generator) -> Compar
         other = sorted(set(pairs[0]) ^ set(pairs[1]))[0]
         raise DataError(f"run {other[0]} ({other[1]}) was judged by one of the two only")
     number, terrain = {cell: i for i, cell in enumerate(cells)}, np.array([name for _, name in cells])
-    names = np.unique(terrain)
     weights = np.vstack([np.ones(len(cells)), stratified_counts(terrain, N_PAIRED_DRAWS, rng)])
-    places = [np.array([number[pair] for pair in each]) for each in pairs]
-    sizes = [np.bincount(place) for place in places]
-    rates = [
-        np.bincount(place, weights=each.correct.mean(axis=0)) / size
-        for each, place, size in zip((a, b), places, sizes, strict=True)
-    ]
-
-    def accuracy(kept: Array) -> Difference:
-        of_a, of_b = (
-            weights @ (kept * r * n) / (weights @ (kept * n)) for r, n in zip(rates, sizes, strict=True)
-        )
-        return _difference(of_a, of_b, int(kept.sum()))
-
-    def macro(rate: Array) -> Array:
-        of_class = [weights[:, terrain == name] for name in names]
-        means = [w @ rate[terrain == name] / w.sum(axis=1) for w, name in zip(of_class, names, strict=True)]
-        return np.asarray(np.mean(means, axis=0))
-
-    def area(each: Outcome, place: Array) -> Array:
+    parts = {"": np.ones(len(cells))} | {str(name): (terrain == name) * 1.0 for name in np.unique(terrain)}
+    figures, rates = list[dict[str, Array]](), []
+    for each, of_windows in zip((a, b), pairs, strict=True):
+        place = np.array([number[pair] for pair in of_windows])
+        size = np.bincount(place)
+        rate = np.bincount(place, weights=each.correct.mean(axis=0)) / size
+        found = {
+            name: weights @ (kept * rate * size) / (weights @ (kept * size)) for name, kept in parts.items()
+        }
+        of_class = [(weights[:, kept > 0], rate[kept > 0]) for name, kept in parts.items() if name]
+        found["\nmacro"] = np.mean([drawn @ one / drawn.sum(axis=1) for drawn, one in of_class], axis=0)
         repeats = zip(each.confidence, each.correct.astype(float), strict=True)
-        return np.asarray(
-            np.mean([confidence_auc(c, right, weights[:, place]) for c, right in repeats], axis=0)
-        )
-
-    areas = [area(each, place) for each, place in zip((a, b), places, strict=True)]
-    return Comparison(
-        accuracy(np.ones(len(cells))),
-        _difference(macro(rates[0]), macro(rates[1]), len(cells)),
-        _difference(areas[0], areas[1], len(cells)),
-        {str(name): accuracy((terrain == name).astype(float)) for name in names},
-        tuple(
-            RunDifference(run, name, float(of_a), float(of_b))
-            for (run, name), of_a, of_b in zip(cells, *rates, strict=True)
-        ),
-    )
+        areas = [confidence_auc(c, right, weights[:, place]) for c, right in repeats]
+        figures.append(found | {"\narea": np.mean(areas, axis=0)})
+        rates.append(rate.tolist())
+    differences = {
+        name: _difference(one, figures[1][name], int(parts[name if name in parts else ""].sum()))
+        for name, one in figures[0].items()
+    }
+    by_run = (RunDifference(*cell, *pair) for cell, *pair in zip(cells, *rates, strict=True))
+    accuracy, macro, area = (differences.pop(name) for name in ("", "\nmacro", "\narea"))
+    return Comparison(accuracy, macro, area, differences, tuple(by_run))
 
 
 def paired_accuracy(
@@ -588,21 +560,25 @@ def unknown_figures(
     for number, name in enumerate(terrains):  # how often each run is drawn, terrain by terrain
         runs = np.unique(run_of[terrain == name])
         weights[:, runs] = bootstrap_counts(len(runs), N_BOOTSTRAP, seed + number)
-    windows = [_compare(parts, run_of) for parts in of_terrain.values()]
-    spans = [_compare([_span_means(s, run_of, start_s) for s in p], run_of) for p in of_terrain.values()]
-
-    def within(scores: Iterable[tuple[Array, float]]) -> float:
-        return float(np.concatenate([each <= threshold for each, threshold in scores]).mean())
-
-    rows = {
-        name: LeftOutTerrain(
-            float(window[0].sum() / window[1].sum()),
-            float(span[0].sum() / span[1].sum()),
-            within((part.unknown_scores, part.threshold) for part in parts),
-            within((part.known_scores, part.threshold) for part in parts),
+    windows, spans, rows = [], [], {}
+    for name, parts in of_terrain.items():
+        means = []
+        for part in parts:  # of the windows that begin in the same 10 s of a run, at the first of their rows
+            both = []
+            for at, scores in ((part.known, part.known_scores), (part.unknown, part.unknown_scores)):
+                span = np.stack([run_of[at], np.floor(start_s[at] / MEAN_SPAN_S)])
+                _, first, which = np.unique(span, axis=1, return_index=True, return_inverse=True)
+                both.append((at[first], np.bincount(which.ravel(), scores) / np.bincount(which.ravel())))
+            (known, known_scores), (unknown, unknown_scores) = both
+            means.append(Scored(known, unknown, known_scores, unknown_scores, part.threshold))
+        windows.append(_compare(parts, run_of))
+        spans.append(_compare(means, run_of))
+        areas = (float(won.sum() / pairs.sum()) for won, pairs in (windows[-1], spans[-1]))
+        kept = (
+            [each <= part.threshold for part, each in zip(parts, scores, strict=True)]
+            for scores in ([part.unknown_scores for part in parts], [part.known_scores for part in parts])
         )
-        for (name, parts), window, span in zip(of_terrain.items(), windows, spans, strict=True)
-    }
+        rows[name] = LeftOutTerrain(*areas, *(float(np.concatenate(each).mean()) for each in kept))
     auroc, auroc_10s, accepted, known_kept = np.mean([*rows.values()], axis=0).tolist()
     return {
         "auroc_unknown": auroc,
@@ -616,17 +592,6 @@ def unknown_figures(
     }
 
 
-def _span_means(scored: Scored, run_of: Array, start_s: Array) -> Scored:
-    """Return mean scores of the windows that begin in the same 10 s of a run, at the first of their rows."""
-    means = []
-    for rows, scores in ((scored.known, scored.known_scores), (scored.unknown, scored.unknown_scores)):
-        span = np.stack([run_of[rows], np.floor(start_s[rows] / MEAN_SPAN_S)])
-        _, first, which = np.unique(span, axis=1, return_index=True, return_inverse=True)
-        means.append((rows[first], np.bincount(which.ravel(), scores) / np.bincount(which.ravel())))
-    (known, known_scores), (unknown, unknown_scores) = means
-    return Scored(known, unknown, known_scores, unknown_scores, scored.threshold)
-
-
 def _compare(parts: Sequence[Scored], run_of: Array) -> tuple[Array, Array]:
     """Return, by run of known and unknown windows, how many pairs the unknown one wins, and how many pairs are.
 
@@ -635,14 +600,15 @@ def _compare(parts: Sequence[Scored], run_of: Array) -> tuple[Array, Array]:
     n_runs = int(run_of.max()) + 1
     won, pairs = np.zeros((2, n_runs, n_runs))
     for part in parts:
-        known_scores = np.nan_to_num(part.known_scores, nan=np.inf, posinf=np.inf)
-        unknown_scores = np.nan_to_num(part.unknown_scores, nan=np.inf, posinf=np.inf)
+        known_scores, unknown_scores = (
+            np.nan_to_num(each, nan=np.inf, posinf=np.inf)
+            for each in (part.known_scores, part.unknown_scores)
+        )
         known_run, unknown_run = run_of[part.known], run_of[part.unknown]
         for run in np.unique(known_run):
             ordered = np.sort(known_scores[known_run == run])
-            below = np.searchsorted(ordered, unknown_scores, "left")
-            up_to = np.searchsorted(ordered, unknown_scores, "right")
-            won[run] += np.bincount(unknown_run, (below + up_to) / 2.0, n_runs)
+            ranks = sum(np.searchsorted(ordered, unknown_scores, side) for side in ("left", "right"))
+            won[run] += np.bincount(unknown_run, ranks / 2.0, n_runs)
             pairs[run] += np.bincount(unknown_run, minlength=n_runs) * len(ordered)
     return won, pairs
 
@@ -707,15 +673,8 @@ class SequenceFigures(NamedTuple):
 
 #: Of a stretch on one terrain; flips are changes of the reported terrain less the true one.
 COUNTS = (
-    "whole",
-    "filtered",
-    "single",
-    "all",
-    "filtered_all",
-    "single_all",
-    "unknown",
-    "flips",
-    "single_flips",
+    *("whole", "filtered", "single", "all", "filtered_all"),
+    *("single_all", "unknown", "flips", "single_flips"),
 )
 
 
@@ -795,14 +754,27 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
         value, interval = ratio_over_runs((drawn[above] - less) * per, drawn[below])
         return math.nan if value is None else value, interval or NO_INTERVAL
 
-    a_minute = 60.0 / STRIDE_S
+    changes, found = delay_s[~np.isnan(delay_s)], np.flatnonzero(np.isfinite(delay_s))
+    order = found[np.argsort(delay_s[found], kind="stable")]
+    ordered_s, upto = delay_s[order], draws[1:, order].cumsum(axis=1)
+
+    def quantile(level: float) -> tuple[float, Interval]:
+        if not len(order):
+            return math.nan, NO_INTERVAL
+        at = (upto < level * upto[:, -1:]).sum(axis=1)
+        drawn_s = np.where(upto[:, -1] > 0, ordered_s[np.minimum(at, len(ordered_s) - 1)], np.nan)
+        return float(np.quantile(ordered_s, level, method="inverted_cdf")), percentile_interval(drawn_s)
+
+    of_all = float(np.quantile(changes, 0.9, method="inverted_cdf")) if len(found) else math.inf
+    known = of_all if math.isfinite(of_all) else None
+    n_missed, a_minute = len(changes) - len(found), 60.0 / STRIDE_S
     return SequenceFigures(
         *ratio("filtered", "whole"),
         *ratio("single", "whole"),
         *ratio("filtered", "whole", "single"),
         *ratio("filtered_all", "all"),
         *ratio("single_all", "all"),
-        _delays(delay_s, draws),
+        DelayFigures(*quantile(0.5), *quantile(0.9), len(changes), n_missed, known),
         *ratio("flips", "all", per=a_minute),
         *ratio("single_flips", "all", per=a_minute),
         unknown_ratio=ratio("unknown", "all")[0],
@@ -810,24 +782,6 @@ def sequence_figures(tracks: Sequence[Track], seed: int) -> SequenceFigures | No
         n_grounds=len(run),
         duration_s=float(drawn["all"][0] * STRIDE_S),
     )
-
-
-def _delays(delay_s: Array, draws: Array) -> DelayFigures:
-    changes, found = delay_s[~np.isnan(delay_s)], np.flatnonzero(np.isfinite(delay_s))
-    n_missed = len(changes) - len(found)
-    if not len(found):
-        return DelayFigures(math.nan, NO_INTERVAL, math.nan, NO_INTERVAL, len(changes), n_missed, None)
-    order = found[np.argsort(delay_s[found], kind="stable")]
-    ordered_s, weights = delay_s[order], draws[1:, order].cumsum(axis=1)
-
-    def quantile(ratio: float) -> tuple[float, Interval]:
-        at = (weights < ratio * weights[:, -1:]).sum(axis=1)
-        drawn = np.where(weights[:, -1] > 0, ordered_s[np.minimum(at, len(ordered_s) - 1)], np.nan)
-        return float(np.quantile(ordered_s, ratio, method="inverted_cdf")), percentile_interval(drawn)
-
-    of_all = float(np.quantile(changes, 0.9, method="inverted_cdf"))
-    known = of_all if np.isfinite(of_all) else None
-    return DelayFigures(*quantile(0.5), *quantile(0.9), len(changes), n_missed, known)
 
 
 MIN_CURVE_POINTS = 4  #: The law of the learning curve has three parameters.
@@ -880,7 +834,7 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> tuple[int | None, str
     largest = runs_per_class.max()
     sizes = np.arange(1, int(10 * largest) + 1)
     gain = scale * sizes**-power * (1 - 2.0**-power)
-    slack = _percent(float(np.interp(largest, sizes, gain)), 1)
+    slack = f"{100 * float(np.interp(largest, sizes, gain)):.1f}\N{NO-BREAK SPACE}%"
     found = sizes[gain < ENOUGH_GAIN]
     if not len(found):
         return None, f"not enough yet: doubling the {largest:.1f} runs per class would still gain {slack}"
@@ -888,10 +842,6 @@ def enough_runs(runs_per_class: Array, accuracy: Array) -> tuple[int | None, str
     return enough, (
         f"{'enough' if enough <= largest else 'not enough yet'}: "
         f"{enough} {'run' if enough == 1 else 'runs'} per class would be enough "
-        f"(doubling them gains under {_percent(ENOUGH_GAIN, 0)}); "
+        f"(doubling them gains under {100 * ENOUGH_GAIN:.0f}\N{NO-BREAK SPACE}%); "
         f"the data have {largest:.1f} on average, doubling which would gain {slack}"
     )
-
-
-def _percent(ratio: float, decimals: int) -> str:
-    return f"{100 * ratio:.{decimals}f}\N{NO-BREAK SPACE}%"

@@ -105,14 +105,6 @@ class SampleColumns(NamedTuple):
         return max(1, round(HOP_S * self.rate_hz))
 
 
-class Branch(NamedTuple):
-    """How one stream is standardised: ``floor`` (c,), and mean and deviation (c, f) in training; f = 1 of samples."""
-
-    floor: Array
-    mean: Array
-    std: Array
-
-
 def streams_of(columns: Sequence[SampleColumns], samples: Array) -> list[Array]:
     """Return each stream's samples (n, channels, samples); ``DataError`` where there are not as many columns."""
     width = sum(each.width for each in columns)
@@ -283,7 +275,8 @@ class Training:
     ) -> None:
         self.columns, self.class_index = columns, class_index
         self.streams = streams_of(columns, samples)
-        self.branches = []
+        #: of each stream its floor (c,), and mean and deviation (c, f) in training; f = 1 of samples
+        self.branches: list[tuple[Array, Array, Array]] = []
         for each, values in zip(columns, self.streams, strict=True):
             floor = np.zeros(len(each.channels), np.float32)
             if each.frame:
@@ -292,7 +285,7 @@ class Training:
             found = _seen(each, values, floor)
             mean, std = found.mean(axis=(0, 3)), found.std(axis=(0, 3))
             std = np.where(std > 1e-6 * np.maximum(1.0, np.abs(mean)), std, 1.0)
-            self.branches.append(Branch(floor, mean, std))
+            self.branches.append((floor, mean, std))
         self.means = [values.mean(axis=(0, 2)) for values in self.streams]
         _, run, count = np.unique(groups, return_inverse=True, return_counts=True)
         weight = 1.0 / np.sqrt(count[run])
@@ -301,9 +294,9 @@ class Training:
     def rows(self, streams: Sequence[Array]) -> list[Array]:
         """Return what the branches see, standardised and clipped, as rows of a convolution (n, c f, t)."""
         rows = []
-        for columns, branch, values in zip(self.columns, self.branches, streams, strict=True):
-            scaled = _seen(columns, values, branch.floor) - branch.mean[:, :, None]
-            scaled /= branch.std[:, :, None]
+        for columns, (floor, mean, std), values in zip(self.columns, self.branches, streams, strict=True):
+            scaled = _seen(columns, values, floor) - mean[:, :, None]
+            scaled /= std[:, :, None]
             clipped = np.clip(scaled, -CLIP_STD, CLIP_STD, out=scaled)
             rows.append(clipped.reshape(len(scaled), -1, scaled.shape[3]))
         return rows
@@ -375,8 +368,8 @@ class Training:
         nn = torch.nn
         of_samples = [not each.frame for each in self.columns]
         branches, pooled_width = nn.ModuleList(), 0
-        for slow, branch in zip(of_samples, self.branches, strict=True):
-            rows, hidden = branch.mean.size, HIDDEN_SAMPLES if slow else HIDDEN_SPECTRUM
+        for slow, (_, mean, _) in zip(of_samples, self.branches, strict=True):
+            rows, hidden = mean.size, HIDDEN_SAMPLES if slow else HIDDEN_SPECTRUM
             layers = (
                 nn.Identity() if slow else nn.Dropout1d(INPUT_DROPOUT),
                 nn.Conv1d(rows, hidden, 3, padding=1),
@@ -411,18 +404,6 @@ class Training:
         return Network()
 
 
-def _folded(conv: Any, norm: Any) -> tuple[Array, Array]:
-    """Return weight and bias of a convolution with the normalisation after it: both are linear."""
-    weight, bias, gain, shift, mean, variance = (
-        p.detach().numpy().astype(np.float64)
-        for p in (conv.weight, conv.bias, norm.weight, norm.bias, norm.running_mean, norm.running_var)
-    )
-    scale = gain / np.sqrt(variance + norm.eps)
-    return (weight * scale[:, None, None]).astype(np.float32), (scale * (bias - mean) + shift).astype(
-        np.float32
-    )
-
-
 def require_onnx() -> Any:
     """Return onnx; a :class:`~terrain.errors.ConfigError` where it is not installed."""
     try:
@@ -433,78 +414,6 @@ def require_onnx() -> Any:
     return onnx
 
 
-class _Graph:
-    """Nodes and constants of a graph; each step takes names and arrays, and returns the name of its output."""
-
-    def __init__(self) -> None:
-        self.onnx = require_onnx()
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-
-    def constant(self, array: Any, name: str = "") -> str:
-        values = np.asarray(array)
-        values = values.astype(np.float32) if values.dtype.kind == "f" else values
-        name = name or f"c{len(self.constants)}"
-        self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
-        return name
-
-    def step(self, kind: str, *inputs: Any, output: str = "", **attributes: Any) -> str:
-        names = [each if isinstance(each, str) else self.constant(np.array(each)) for each in inputs]
-        output = output or f"n{len(self.nodes)}"
-        self.nodes.append(self.onnx.helper.make_node(kind, names, [output], **attributes))
-        return output
-
-    def mean(self, values: str, axis: int) -> str:
-        return self.step("ReduceMean", values, axes=[axis], keepdims=1)
-
-    def branch(self, columns: SampleColumns, branch: Branch, fill: Array, nets: Sequence[Any]) -> list[str]:
-        """Return what a branch passes on, each (windows, K, p); its channels are centred on request, and filled.
-
-        ``nets`` are the layers of the K members in this branch, ``fill`` (c, samples) for missing samples.
-        """
-        stream, c, frame, half = columns.stream, len(columns.channels), columns.frame, columns.frame // 2
-        n_times = columns.n_samples
-
-        def named(array: Array, kind: str) -> str:
-            return self.constant(array, f"{stream}.{kind}")
-
-        centred = named(np.zeros((c, 1), bool), "centred")  # at first no channel is
-        values = self.step("Sub", stream, self.step("Where", centred, self.mean(stream, 2), 0.0))
-        values = self.step("Where", self.step("IsNaN", values), named(fill, "fill"), values)
-        if frame:
-            values = self.step("Sub", values, self.mean(values, 2))
-            single = self.step("Reshape", values, [-1, 1, n_times])
-            waves = self.step("Conv", single, fourier_kernel(frame).T[:, None], strides=[columns.hop])
-            squares = self.step("Mul", waves, waves)
-            cosine = self.step("Slice", squares, [0], [half], [1])
-            sine = self.step("Slice", squares, [half], [2 * half], [1])
-            n_times = (n_times - frame) // columns.hop + 1
-            power = self.step("Reshape", self.step("Add", cosine, sine), [-1, c, half, n_times])
-            values = self.step("Log", self.step("Add", power, named(branch.floor[:, None, None], "floor")))
-        else:
-            values = self.step("Reshape", values, [-1, c, 1, n_times])
-        scaled = self.step("Sub", values, named(branch.mean[:, :, None], "mean"))
-        scaled = self.step("Div", scaled, named(branch.std[:, :, None], "std"))
-        clipped = self.step("Clip", scaled, -CLIP_STD, CLIP_STD)
-        found = rows = self.step("Reshape", clipped, [0, branch.mean.size, n_times])
-        for number, (place, groups) in enumerate(((1, 1), (5, len(nets))), start=1):
-            weights, biases = zip(*(_folded(net[place], net[place + 1]) for net in nets), strict=True)
-            kernel = named(np.concatenate(weights), f"weight_{number}")
-            offset = named(np.concatenate(biases), f"bias_{number}")
-            found = self.step("Relu", self.step("Conv", found, kernel, offset, pads=[1, 1], group=groups))
-        largest = self.step("ReduceMax", found, axes=[2], keepdims=1)
-        each = [-1, len(nets), len(biases[0])]
-        pooled = [self.step("Reshape", part, each) for part in (self.mean(found, 2), largest)]
-        if not frame:
-            mean = self.mean(rows, 2)
-            offset = self.step("Sub", rows, mean)
-            spread = self.step("Sqrt", self.mean(self.step("Mul", offset, offset), 2))
-            for part in (mean, spread):
-                alike = self.step("Reshape", part, [-1, 1, c])
-                pooled.append(self.step("Mul", alike, np.ones((1, len(nets), 1))))
-        return pooled
-
-
 def network_onnx(
     training: Training, nets: Sequence[Any], fill: Array, temperature: float, classes: Sequence[str]
 ) -> bytes:
@@ -513,37 +422,104 @@ def network_onnx(
     ``fill`` (n_columns,) is what a missing sample is taken for, ``temperature`` what log probabilities are divided
     by, ``classes`` (k,) are in the order of the output.
     """
-    graph, columns = _Graph(), training.columns
-    helper, float_ = graph.onnx.helper, graph.onnx.TensorProto.FLOAT
+    onnx = require_onnx()
+    nodes: list[Any] = []
+    constants: list[Any] = []
+
+    def constant(array: Any, name: str = "") -> str:
+        values = np.asarray(array)
+        values = values.astype(np.float32) if values.dtype.kind == "f" else values
+        name = name or f"c{len(constants)}"
+        constants.append(onnx.numpy_helper.from_array(np.ascontiguousarray(values), name))
+        return name
+
+    def step(kind: str, *inputs: Any, output: str = "", **attributes: Any) -> str:
+        names = [each if isinstance(each, str) else constant(each) for each in inputs]
+        output = output or f"n{len(nodes)}"
+        nodes.append(onnx.helper.make_node(kind, names, [output], **attributes))
+        return output
+
+    def mean_of(values: str) -> str:
+        return step("ReduceMean", values, axes=[2], keepdims=1)
+
+    helper, float_ = onnx.helper, onnx.TensorProto.FLOAT
     inputs, pooled, streams = [], [], {}
-    for number, (each, missing) in enumerate(zip(columns, streams_of(columns, fill[None]), strict=True)):
-        shape = ["windows", len(each.channels), each.n_samples]
-        inputs.append(helper.make_tensor_value_info(each.stream, float_, shape))
-        layers = [net.branches[number] for net in nets]
-        pooled += graph.branch(each, training.branches[number], missing[0], layers)
-        described = {"channels": each.channels, "rate_hz": each.rate_hz, "n_samples": each.n_samples}
-        streams[each.stream] = described
-    column = graph.step("Unsqueeze", graph.step("Concat", *pooled, axis=2), [3])
-    weights, biases = (
+    of_streams = zip(
+        training.columns, training.branches, streams_of(training.columns, fill[None]), strict=True
+    )
+    for number, (columns, (floor, mean, std), missing) in enumerate(of_streams):
+        stream, c, frame, n_times = columns.stream, len(columns.channels), columns.frame, columns.n_samples
+        inputs.append(helper.make_tensor_value_info(stream, float_, ["windows", c, n_times]))
+        streams[stream] = {"channels": columns.channels, "rate_hz": columns.rate_hz, "n_samples": n_times}
+        centred = constant(np.zeros((c, 1), bool), f"{stream}.centred")  # at first no channel is
+        values = step("Sub", stream, step("Where", centred, mean_of(stream), 0.0))
+        values = step("Where", step("IsNaN", values), constant(missing[0], f"{stream}.fill"), values)
+        if frame:
+            values = step("Sub", values, mean_of(values))
+            single = step("Reshape", values, [-1, 1, n_times])
+            waves = step("Conv", single, fourier_kernel(frame).T[:, None], strides=[columns.hop])
+            squares, half = step("Mul", waves, waves), frame // 2
+            parts = (step("Slice", squares, [at], [at + half], [1]) for at in (0, half))
+            n_times = (n_times - frame) // columns.hop + 1
+            power = step("Reshape", step("Add", *parts), [-1, c, half, n_times])
+            values = step("Log", step("Add", power, constant(floor[:, None, None], f"{stream}.floor")))
+        else:
+            values = step("Reshape", values, [-1, c, 1, n_times])
+        scaled = step("Sub", values, constant(mean[:, :, None], f"{stream}.mean"))
+        scaled = step("Div", scaled, constant(std[:, :, None], f"{stream}.std"))
+        clipped = step("Clip", scaled, -CLIP_STD, CLIP_STD)
+        found = rows = step("Reshape", clipped, [0, mean.size, n_times])
+        for layer, (place, groups) in enumerate(((1, 1), (5, len(nets))), start=1):
+            weights, biases = [], []
+            for net in nets:  # a convolution with the normalisation after it: both are linear
+                conv, norm = net.branches[number][place], net.branches[number][place + 1]
+                parameters = (
+                    conv.weight,
+                    conv.bias,
+                    norm.weight,
+                    norm.bias,
+                    norm.running_mean,
+                    norm.running_var,
+                )
+                weight, bias, gain, shift, centre, variance = (
+                    each.detach().numpy().astype(np.float64) for each in parameters
+                )
+                scale = gain / np.sqrt(variance + norm.eps)
+                weights.append(weight * scale[:, None, None])
+                biases.append(scale * (bias - centre) + shift)
+            kernel = constant(np.concatenate(weights), f"{stream}.weight_{layer}")
+            offset = constant(np.concatenate(biases), f"{stream}.bias_{layer}")
+            found = step("Relu", step("Conv", found, kernel, offset, pads=[1, 1], group=groups))
+        largest = step("ReduceMax", found, axes=[2], keepdims=1)
+        pooled += [
+            step("Reshape", part, [-1, len(nets), len(biases[0])]) for part in (mean_of(found), largest)
+        ]
+        if not frame:
+            level = mean_of(rows)
+            apart = step("Sub", rows, level)
+            for part in (level, step("Sqrt", mean_of(step("Mul", apart, apart)))):
+                alike = step("Reshape", part, [-1, 1, c])
+                pooled.append(step("Mul", alike, np.ones((1, len(nets), 1))))
+    column = step("Unsqueeze", step("Concat", *pooled, axis=2), [3])
+    joining, added = (
         np.stack([getattr(net.head[1], name).detach().numpy() for net in nets]) for name in ("weight", "bias")
     )
-    product = graph.step("MatMul", graph.constant(weights, "head_weight"), column)
-    logits = graph.step("Add", graph.step("Squeeze", product, [3]), graph.constant(biases, "head_bias"))
-    mean = graph.step("ReduceMean", graph.step("LogSoftmax", logits, axis=2), axes=[1], keepdims=0)
-    tempered = graph.step("Div", mean, graph.constant(np.array(temperature), "temperature"))
-    outputs = []
+    product = step("MatMul", constant(joining, "head_weight"), column)
+    logits = step("Add", step("Squeeze", product, [3]), constant(added, "head_bias"))
+    joined = step("ReduceMean", step("LogSoftmax", logits, axis=2), axes=[1], keepdims=0)
+    tempered, outputs = step("Div", joined, constant(np.array(temperature), "temperature")), []
     for kind, name in (("Softmax", OUTPUT), ("LogSoftmax", LOG_OUTPUT)):
-        graph.step(kind, tempered, output=name, axis=1)
+        step(kind, tempered, output=name, axis=1)
         outputs.append(helper.make_tensor_value_info(name, float_, ["windows", len(classes)]))
     model = helper.make_model(
-        helper.make_graph(graph.nodes, "terrain", inputs, outputs, graph.constants),
+        helper.make_graph(nodes, "terrain", inputs, outputs, constants),
         opset_imports=[helper.make_opsetid("", OPSET)],
         ir_version=IR_VERSION,
         producer_name="terrain-slip",
     )
     metadata = {"classes": json.dumps([str(name) for name in classes]), "streams": json.dumps(streams)}
     helper.set_model_props(model, metadata)
-    graph.onnx.checker.check_model(model)
+    onnx.checker.check_model(model)
     return bytes(model.SerializeToString())
 
 
@@ -691,13 +667,34 @@ class GroupedNetwork(GroupedClassifier):
         columns = tuple(self.columns)
         if not columns or sum(each.width for each in columns) != X.shape[1]:
             raise DataError(f"the columns of the samples do not describe rows of {X.shape[1]} columns")
-        fill = fill_of(columns, X)
+        fills = []  # the mean of each channel, 0 where it was never measured
+        for each, values in zip(columns, streams_of(columns, X), strict=True):
+            known = np.isfinite(values)
+            total = np.where(known, values, 0.0).sum(axis=(0, 2))
+            fills.append(np.repeat(total / np.maximum(known.sum(axis=(0, 2)), 1), each.n_samples))
+        fill = np.concatenate(fills)
         training = Training(columns, np.where(np.isnan(X), fill, X).astype(np.float32), class_index, groups)
         splits = list(inner_splits(y, groups, self.n_inner_folds, self.seed, self.gap))
         if not splits:
             raise DataError(TOO_FEW)
         with reproducible():
-            used = self._choose(training, splits)
+            self.trials_: tuple[Trial, ...] = ()
+            used, losses = Augmentation(), dict[Augmentation, float]()
+
+            def loss(used: Augmentation) -> float:
+                if used not in losses:
+                    members = self._members(training, splits, used, self.trial_epochs)
+                    losses[used] = float(np.mean([each for _, each, _ in members]))
+                return losses[used]
+
+            if self.trial_epochs:  # none, one, or all that lower the loss alone: what does so most
+                vibrates, mirrored = any(each.frame for each in columns), mirrors_of(columns) is not None
+                can = {"shift": True, "gain": vibrates, "mirror": mirrored, "dropout": len(columns) > 1}
+                limit, possible = loss(used), [name for name, each in can.items() if each]
+                better = [name for name in possible if loss(Augmentation(**{name: True})) < limit]
+                loss(Augmentation(**dict.fromkeys(better, True)))
+                self.trials_ = tuple(Trial(*each) for each in losses.items())
+                used = min(losses, key=lambda each: losses[each])
             inner = self._members(training, splits, used, self.epochs)
             epochs = float(np.mean([epoch + 1 for *_, epoch in inner]))
             seeds = self.seed + len(splits) + np.arange(self.n_members)
@@ -718,33 +715,6 @@ class GroupedNetwork(GroupedClassifier):
     ) -> list[tuple[Array, float, int]]:
         return [training.member(split, used, epochs, self.seed + i) for i, split in enumerate(splits)]
 
-    def _choose(self, training: Training, splits: Sequence[tuple[Array, Array]]) -> Augmentation:
-        """Return the augmentation with the lowest held-out loss: none, one, or all that lowered it alone."""
-        plain, losses = Augmentation(), dict[Augmentation, float]()
-        self.trials_: tuple[Trial, ...] = ()
-        if not self.trial_epochs:
-            return plain
-
-        def loss(used: Augmentation) -> float:
-            if used not in losses:
-                members = self._members(training, splits, used, self.trial_epochs)
-                losses[used] = float(np.mean([each for _, each, _ in members]))
-            return losses[used]
-
-        possible = {
-            "shift": True,
-            "gain": any(each.frame for each in training.columns),
-            "mirror": mirrors_of(training.columns) is not None,
-            "dropout": len(training.columns) > 1,
-        }
-        limit = loss(plain)
-        better = [
-            name for name, can in possible.items() if can and loss(plain._replace(**{name: True})) < limit
-        ]
-        loss(plain._replace(**dict.fromkeys(better, True)))
-        self.trials_ = tuple(Trial(*each) for each in losses.items())
-        return min(losses, key=lambda used: losses[used])
-
     def predict_proba(self, X: Array) -> Array:
         """Return calibrated probabilities (n, k) in the order of ``classes_``."""
         return np.asarray(np.exp(log_probabilities(self.onnx_, self.columns, self._rows(X))))
@@ -762,13 +732,3 @@ def fit_temperature(log_probability: Array, class_index: Array) -> float:
 
     found = minimize_scalar(loss, bounds=LOG_TEMPERATURE_BOUNDS, method="bounded")
     return float(np.exp(found.x))
-
-
-def fill_of(columns: Sequence[SampleColumns], X: Array) -> Array:
-    """Return the mean of each channel (n_columns,), 0 where it was never measured."""
-    parts = []
-    for each, values in zip(columns, streams_of(columns, X), strict=True):
-        known = np.isfinite(values)
-        total = np.where(known, values, 0.0).sum(axis=(0, 2))
-        parts.append(np.repeat(total / np.maximum(known.sum(axis=(0, 2)), 1), each.n_samples))
-    return np.concatenate(parts)

@@ -86,24 +86,6 @@ def regimes(wheel_speed_mps: Array, fastest_mps: float) -> Array:
     return np.concatenate([unit[:, order], speed], axis=2)
 
 
-def _units(regime: Array, run: Array) -> Array:
-    """Return the number (n,) of the unit of each row: its run by number, and its regime where a run has several."""
-    cell = np.floor(regime / CELL + 0.5).astype(np.int64)
-    for number in range(run.max() + 1):
-        rows = run == number
-        if regime[rows].std(axis=0).max() < SAME_REGIME:
-            cell[rows] = 0
-    return np.unique(np.column_stack([run, cell]), axis=0, return_inverse=True)[1].ravel()
-
-
-def _unit_means(values: Array, unit: Array) -> Array:
-    """Return the mean (units, ...) of rows (n, ...) of each unit."""
-    count = np.bincount(unit)
-    sums = np.zeros((len(count), *values.shape[1:]))
-    np.add.at(sums, unit, values)
-    return sums / count.reshape(-1, *[1] * (values.ndim - 1))
-
-
 class Process(NamedTuple):
     """A fitted process of a response: its mean, points (m,) and their weights, and its covariance.
 
@@ -216,12 +198,23 @@ def fit_ground(
     """
     n_wheels = regime.shape[1]
     run = np.unique(groups.astype(str), return_inverse=True)[1]
-    unit = _units(regime[:, 0], run)
-    n_units = unit.max() + 1
+    cell = np.floor(regime[:, 0] / CELL + 0.5).astype(np.int64)
+    for number in range(run.max() + 1):  # a unit is a run, and its regime where a run has several
+        rows = run == number
+        if regime[rows, 0].std(axis=0).max() < SAME_REGIME:
+            cell[rows] = 0
+    unit = np.unique(np.column_stack([run, cell]), axis=0, return_inverse=True)[1].ravel()
+    count, n_units = np.bincount(unit), unit.max() + 1
     kept = np.zeros(n_units, dtype=bool)
     n_kept = min(n_units, max(MAX_POINTS // n_wheels, 1))
     kept[np.unique(np.linspace(0, n_units - 1, n_kept).round().astype(int))] = True
-    mean_regime, mean_response = _unit_means(regime, unit), _unit_means(responses, unit)
+    mean_regime, mean_response = (
+        np.zeros((n_units, *regime.shape[1:])),
+        np.zeros((n_units, responses.shape[1])),
+    )
+    np.add.at(mean_regime, unit, regime)
+    np.add.at(mean_response, unit, responses)
+    mean_regime, mean_response = mean_regime / count[:, None, None], mean_response / count[:, None]
     block = np.zeros(n_units, dtype=np.int64)
     block[unit] = run
     processes, left = [], np.zeros_like(mean_response)

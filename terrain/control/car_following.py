@@ -133,12 +133,6 @@ def law_17(
     return math.atan(math.tan(rear) + base_m / math.cos(rear) * bend) - front
 
 
-def _curvature_at(path: ReferencePath, distance_m: float) -> float:
-    at = min(max(distance_m / GRID_M, 0.0), len(path.curvature_pm) - 1.001)
-    before, after = path.curvature_pm[int(at) : int(at) + 2].tolist()
-    return float(before + (at - int(at)) * (after - before))
-
-
 def steer(
     robot: BicycleRobot,
     settings: SteeringSettings,
@@ -179,7 +173,9 @@ def steer(
     horizon_s = settings.horizon_time_constants * tau_s
     if horizon_s > 0.0:
         reach = abs(speed_mps) * (settings.delay_s + horizon_s)
-        target = math.atan(along * _curvature_at(path, place.distance_m + reach))
+        at = min(max((place.distance_m + reach) / GRID_M, 0.0), len(path.curvature_pm) - 1.001)
+        before, after = path.curvature_pm[int(at) : int(at) + 2].tolist()
+        target = math.atan(along * (before + (at - int(at)) * (after - before)))
         keep = math.exp(-horizon_s / tau_s)
         ahead = (target - keep * state.model_rad) / (1.0 - keep)
     ahead = min(max(ahead, -most), most)
@@ -207,14 +203,6 @@ class SlipSource(StrEnum):
     KINEMATIC = "kinematic"
     MULTI = "multi"
     GRIP = "multi-grip"  #: The multi-model observer, and the preview by its cornering stiffness.
-
-
-def sideslip_observer(robot: BicycleRobot, source: SlipSource) -> Observer:
-    """Return the observer of a source; of ``none``, one whose slip stays 0."""
-    if source is SlipSource.NONE:
-        return Sideslip(robot, "sideslip-kinematic", SETTINGS["sideslip-kinematic"]._replace(by_fixes=False))
-    name = SlipSource.MULTI if source is SlipSource.GRIP else source
-    return Sideslip(robot, f"sideslip-{name}")
 
 
 #: Of the grip, what the side force ahead may take; and the braking before a bend, below the drive's acceleration.
@@ -282,13 +270,6 @@ def grip_step(
     return Grip(mu, variance)
 
 
-def _roll_at(path: ReferencePath, row: int, roll_rad: float) -> float:
-    """Return the roll of a row of a path; where it is not known, what is measured now."""
-    assert path.roll_rad is not None
-    known = float(path.roll_rad[row])
-    return roll_rad if math.isnan(known) else known
-
-
 def preview_speed(grip: Grip, path: ReferencePath, distance_m: float, roll_rad: float) -> float:
     """Return the fastest speed at a distance along a path; infinite where nothing limits it.
 
@@ -305,27 +286,12 @@ def preview_speed(grip: Grip, path: ReferencePath, distance_m: float, roll_rad: 
         ahead = (i - first) * GRID_M
         if 2.0 * BRAKING_MPS2 * ahead > least:
             break
-        curvature, roll = float(path.curvature_pm[i]), _roll_at(path, i, roll_rad)
+        curvature, roll = float(path.curvature_pm[i]), path.roll_at(i, roll_rad)
         pull = GRAVITY_MPS2 * math.sin(roll) * (1.0 if curvature > 0.0 else -1.0)
         room = USED_PART * known * GRAVITY_MPS2 * math.cos(roll) - max(pull, 0.0)
         square = max(room, 0.25) / max(abs(curvature), 1e-6)
         least = min(least, square + 2.0 * BRAKING_MPS2 * ahead)
     return math.sqrt(least)
-
-
-def expected_slips(
-    robot: BicycleRobot,
-    path: ReferencePath,
-    distance_m: float,
-    roll_rad: float,
-    speed_mps: float,
-    stiffness_npr: Array,
-) -> Array:
-    """Return the slip angles (2,) of steady cornering at a distance, by an estimated stiffness."""
-    row = path.row_at(distance_m)
-    curvature, roll = float(path.curvature_pm[row]), _roll_at(path, row, roll_rad)
-    force = speed_mps * speed_mps * curvature + GRAVITY_MPS2 * math.sin(roll)
-    return np.clip(-_axle_masses(robot) * force / stiffness_npr, -0.2, 0.2)
 
 
 def _axle_masses(robot: BicycleRobot) -> Array:
@@ -350,8 +316,8 @@ _NO_GRIP = Grip(math.nan, math.nan)
 class CarFollower:
     """Controller of a drive along a path, for :func:`terrain.simulation.plants.car.run_car`.
 
-    The sideslip is from a source, or from another observer than :func:`sideslip_observer` gives; ``ticks`` are what was
-    known and done, in the order of time.
+    The sideslip is from the observer of a source, of ``none`` one whose slip stays 0, or from another observer; ``ticks``
+    are what was known and done, in the order of time.
     """
 
     def __init__(
@@ -363,7 +329,14 @@ class CarFollower:
         observer: Observer | None = None,
     ) -> None:
         self._robot, self._path, self._source = robot, path, SlipSource(source)
-        self._observer = sideslip_observer(robot, self._source) if observer is None else observer
+        if observer is None:
+            kind = {SlipSource.NONE: "kinematic", SlipSource.GRIP: "multi"}.get(
+                self._source, self._source.value
+            )
+            name = f"sideslip-{kind}"
+            without = SETTINGS[name]._replace(by_fixes=False) if self._source is SlipSource.NONE else None
+            observer = Sideslip(robot, name, without)
+        self._observer = observer
         self._steered, self._speed_mps, self._roll_rad, self._without_fix_s = SteerState(), 0.0, 0.0, 0.0
         self._steering, self._grip = check_steering(steering), Grip()
         self._reach_s = steering.delay_s + REACH_TIME_CONSTANTS * robot.steering_time_constant_s
@@ -391,9 +364,23 @@ class CarFollower:
             self._before_m = place.distance_m
         slips = np.zeros(2) if self._source is SlipSource.NONE else known.slip
         desired, grip = sample.speed_desired_mps, _NO_GRIP
-        if self._source is SlipSource.GRIP:
-            slips, desired = self._preview(known, sample, place.distance_m, dt_s, desired)
-            grip = self._grip
+        if (
+            self._source is SlipSource.GRIP
+        ):  # what is expected of the path ahead, and the speed that the grip allows
+            robot, path, roll = self._robot, self._path, self._roll_rad
+            expected = []
+            force = float(measured[SPEED] * measured[RATE]) + GRAVITY_MPS2 * math.sin(roll)
+            grip = self._grip = grip_step(robot, self._grip, force, known.slip, known.slip_std, dt_s)
+            desired = min(desired, preview_speed(grip, path, place.distance_m, roll))
+            for s in (
+                place.distance_m,
+                place.distance_m + abs(speed) * self._reach_s,
+            ):  # of steady cornering there
+                row = path.row_at(s)
+                force = speed * speed * float(path.curvature_pm[row])
+                force += GRAVITY_MPS2 * math.sin(path.roll_at(row, roll))
+                expected.append(np.clip(-_axle_masses(robot) * force / known.mean[5:7], -0.2, 0.2))
+            slips = known.slip + expected[1] - expected[0]
         steer_rad, self._steered, status = steer(
             self._robot, self._steering, self._steered, self._path, place, slips, speed, dt_s
         )
@@ -401,20 +388,6 @@ class CarFollower:
         finished = place.status is PathStatus.END
         self.ticks.append(FollowedTick(sample.time_s, place, known, status, grip))
         return CarCommand(steer_rad, 0.0 if stops or finished else desired, finished)
-
-    def _preview(
-        self, known: ObserverOutput, sample: CarSample, distance_m: float, dt_s: float, desired_mps: float
-    ) -> tuple[Array, float]:
-        """Return slips with what is expected of the path ahead, and the speed that the grip allows."""
-        speed, roll = self._speed_mps, self._roll_rad
-        force = float(sample.measured[SPEED] * sample.measured[RATE]) + GRAVITY_MPS2 * math.sin(roll)
-        self._grip = grip_step(self._robot, self._grip, force, known.slip, known.slip_std, dt_s)
-        fastest = preview_speed(self._grip, self._path, distance_m, roll)
-        here, ahead = (
-            expected_slips(self._robot, self._path, s, roll, speed, known.mean[5:7])
-            for s in (distance_m, distance_m + abs(speed) * self._reach_s)
-        )
-        return known.slip + ahead - here, min(desired_mps, fastest)
 
 
 #: Lateral specific force and slip angles from which a cornering stiffness can be compared with its secant.

@@ -71,12 +71,14 @@ METRICS = {
     "command_mps2": ("change of the wheels' commands, rms", "m/s²"),
     "yaw_drift_rad": ("change of heading over the drive", "rad"),
 }
+#: Of a start.
+OF_STARTS = "slip_peak", f"distance_{START_TIME_S:g}s_m", f"energy_{START_DISTANCE_M:g}m_j"
 #: The same with those of some scenarios.
 LABELS = METRICS | {
     "stop_m": ("stopping distance", "m"),
     "steepest_deg": ("steepest grade climbed", "°"),
-    f"distance_{START_TIME_S:g}s_m": (f"distance within {START_TIME_S:g} s of a start", "m"),
-    f"energy_{START_DISTANCE_M:g}m_j": (f"energy of the first {START_DISTANCE_M:g} m", "J"),
+    OF_STARTS[1]: (f"distance within {START_TIME_S:g} s of a start", "m"),
+    OF_STARTS[2]: (f"energy of the first {START_DISTANCE_M:g} m", "J"),
 }
 #: Metrics of a controller that uses the terrain.
 BELIEF = ("believed_ratio", "n_accepted", "n_below_threshold", "n_refused")
@@ -108,8 +110,8 @@ def drive_history(
     Factors are the true radius of each wheel over the nominal one (``Conditions``); without them, wheels of different
     radii appear to gain energy from the ground.
     """
-    truth, wheels = run.streams["truth"], robot.wheels
-    step_s = float(np.median(np.diff(truth.time_s)))
+    truth, wheels, commands = run.streams["truth"], robot.wheels, run.streams.get("commands")
+    time_s, step_s = truth.time_s, float(np.median(np.diff(truth.time_s)))
     twist = np.column_stack([truth.channel(name) for name in TWIST])
     rate, steer, torque, traction, side, sinkage = (
         np.column_stack([truth.channel(name.format(wheel)) for wheel in wheels])
@@ -122,12 +124,20 @@ def drive_history(
     wheel_speed = rate * robot.wheel_radius_m * np.asarray(radius_factors)
     along_w = (traction * (wheel_speed - ground)).sum(axis=1)
     velocity = twist[:, :2]
-    progress = _progress(truth.time_s, velocity, run.streams.get("commands"))
+    progress = np.linalg.norm(velocity, axis=1)
+    if commands is not None:
+        # along the last desired direction: sliding down a slope backwards is negative; over ground before one
+        desired = np.column_stack([commands.channel("speed_x_mps"), commands.channel("speed_y_mps")])
+        size = np.linalg.norm(desired, axis=1)
+        last = np.maximum.accumulate(np.where(size > 0.0, np.arange(size.size), -1))
+        at = last[np.clip(np.searchsorted(commands.time_s, time_s, side="right") - 1, 0, size.size - 1)]
+        direction = desired[at] / np.maximum(size[at], 1e-9)[:, None]
+        progress = np.where(at < 0, progress, np.einsum("ij,ij->i", velocity, direction))
     true = true_slip(truth, wheels)
-    slip = low_passed_slip(true, step_s)
+    slip = low_pass(np.nan_to_num(true), step_s, SMOOTH_S)
     slip[np.isnan(true)] = np.nan
     return DriveHistory(
-        truth.time_s,
+        time_s,
         np.hypot(velocity[:, 0], velocity[:, 1]),
         velocity,
         progress,
@@ -141,28 +151,6 @@ def drive_history(
         sinkage.max(axis=1),
         truth.channel("yaw_rad"),
     )
-
-
-def _progress(time_s: Array, velocity: Array, commands: Stream | None) -> Array:
-    """Return the speed (n,) along the last desired direction: sliding down a slope backwards is negative.
-
-    Before any translation is desired, as in a turn on the spot, or without commands, it is the speed over
-    ground.
-    """
-    if commands is None:
-        return np.asarray(np.linalg.norm(velocity, axis=1))
-    desired = np.column_stack([commands.channel("speed_x_mps"), commands.channel("speed_y_mps")])
-    size = np.linalg.norm(desired, axis=1)
-    last = np.maximum.accumulate(np.where(size > 0.0, np.arange(size.size), -1))
-    at = last[np.clip(np.searchsorted(commands.time_s, time_s, side="right") - 1, 0, size.size - 1)]
-    direction = desired[at] / np.maximum(size[at], 1e-9)[:, None]
-    along = np.where(at < 0, np.linalg.norm(velocity, axis=1), np.einsum("ij,ij->i", velocity, direction))
-    return np.asarray(along)
-
-
-def low_passed_slip(slip_ratio: Array, step_s: float) -> Array:
-    """Return slip (n, wheels) behind the low-pass of its estimate; NaN counts as 0."""
-    return low_pass(np.nan_to_num(slip_ratio), step_s, SMOOTH_S)
 
 
 def slip_peak(history: DriveHistory, within: Array | None = None) -> float:
@@ -282,63 +270,45 @@ def evaluate_drive(
         "scrub_j": float(history.scrub_j[-1]),
         "scrub_along_j": float(history.scrub_along_j[-1]),
         "immobilised": float(immobilised(history, control)),
-        "adapt_s": math.nan,
-        "adapted_ratio": math.nan,
+        **dict.fromkeys(("adapt_s", "adapted_ratio"), math.nan),
         "slip_error_ratio": float(np.nanmean(error)) if np.isfinite(error).any() else math.nan,
         "sinkage_m": float(history.sinkage_m.mean()),
         "command_mps2": command_change(run.streams["commands"]) * robot.wheel_radius_m,
         "yaw_drift_rad": float(abs(history.yaw_rad[-1] - history.yaw_rad[0])),
     } | dict.fromkeys(BELIEF, math.nan)
     if adapting_to is not None:
-        row |= _belief(control)
-        if changes := _target_changes(run, adapting_to):
+        known = control.channel("terrain_code")[control.channel("desired_mps") >= DRIVING_MPS] >= 0.0
+        counted = (OutputStatus.ACCEPTED, OutputStatus.BELOW_THRESHOLD, OutputStatus.REFUSED)
+        counts = (float((control.channel("output_code") == status).sum()) for status in counted)
+        row |= zip(BELIEF, (float(known.mean()) if known.size else math.nan, *counts), strict=True)
+        changes, before = [], math.nan  # when the terrain changes the target, and to which
+        begins = [(0.0, run.labels[0].terrain), *terrain_changes(run.labels)] if run.labels else []
+        for time_s, terrain in begins:
+            target = adapting_to.lookup(terrain)["traction"].slip_ratio
+            if abs(target - before) > TARGET_CHANGE:
+                changes.append((time_s, target))
+            before = target
+        if changes:
             times = np.array(adaptation_times(control, changes))
             row["adapted_ratio"] = float(np.isfinite(times).mean())
             row["adapt_s"] = float(np.nanmean(times)) if np.isfinite(times).any() else math.nan
-    if scenario.name == STARTS:
-        row |= _evaluate_starts(history, start_times(scenario))
+    if scenario.name == STARTS:  # of the first, before which no balance is known, and means of those after it
+        of_starts = []
+        for start_s in start_times(scenario):
+            within = (history.time_s >= start_s) & (history.time_s < start_s + START_WINDOW_S)
+            values = (
+                slip_peak(history, within),
+                distance_within(history, start_s, START_TIME_S),
+                energy_over(history, START_DISTANCE_M, start_s),
+            )
+            of_starts.append(dict(zip(OF_STARTS, values, strict=True)))
+        row |= {f"first_{key}": value for key, value in of_starts[0].items()}
+        row |= {key: float(np.mean([each[key] for each in of_starts[1:]])) for key in OF_STARTS}
     if scenario.name == BRAKE:
         stop_s = brake_time(scenario)
         row["stop_m"] = stopping_distance(history, stop_s)
         row["lock_s"] = lock_s(history, stop_s, standstill_time(history, stop_s))
     return row
-
-
-def _belief(control: Stream) -> dict[str, float]:
-    """Return :data:`BELIEF`: ratio of driving time with a known terrain, and outputs by their status."""
-    driving = control.channel("desired_mps") >= DRIVING_MPS
-    known = control.channel("terrain_code")[driving] >= 0.0
-    output = control.channel("output_code")
-    counted = (OutputStatus.ACCEPTED, OutputStatus.BELOW_THRESHOLD, OutputStatus.REFUSED)
-    counts = (float((output == status).sum()) for status in counted)
-    return dict(zip(BELIEF, (float(known.mean()) if known.size else math.nan, *counts), strict=True))
-
-
-def _target_changes(run: RunLog, table: SlipTable) -> list[tuple[float, float]]:
-    """Return when the terrain changes the target, and to which."""
-    found, before = [], math.nan
-    for time_s, terrain in [(0.0, run.labels[0].terrain), *terrain_changes(run.labels)] if run.labels else []:
-        target = table.lookup(terrain)["traction"].slip_ratio
-        if abs(target - before) > TARGET_CHANGE:
-            found.append((time_s, target))
-        before = target
-    return found
-
-
-def _evaluate_starts(history: DriveHistory, starts: Sequence[float]) -> dict[str, float]:
-    """Return metrics of the first start, before which no balance is known, and means of those after it."""
-    first, *later = (
-        {
-            "slip_peak": slip_peak(
-                history, (history.time_s >= start_s) & (history.time_s < start_s + START_WINDOW_S)
-            ),
-            f"distance_{START_TIME_S:g}s_m": distance_within(history, start_s, START_TIME_S),
-            f"energy_{START_DISTANCE_M:g}m_j": energy_over(history, START_DISTANCE_M, start_s),
-        }
-        for start_s in starts
-    )
-    means = {key: float(np.mean([row[key] for row in later])) for key in first}
-    return {f"first_{key}": value for key, value in first.items()} | means
 
 
 class EnergyCurve(NamedTuple):
@@ -382,6 +352,9 @@ class MeanInterval(NamedTuple):
     n: int
 
 
+UNKNOWN = MeanInterval(None, None, 0)
+
+
 class Difference(NamedTuple):
     """Mean difference and its 95 % interval, which is NaN where one pair gives none."""
 
@@ -406,10 +379,12 @@ def mean_interval(values: Sequence[float]) -> MeanInterval:
     """
     known = np.array([value for value in values if math.isfinite(value)])
     if not known.size:
-        return MeanInterval(None, None, 0)
-    mean, half = float(known.mean()), _half_interval(known)
-    ci = None if math.isnan(half) else (mean - half, mean + half)
-    return MeanInterval(mean, ci, int(known.size))
+        return UNKNOWN
+    mean, n, ci = float(known.mean()), int(known.size), None
+    if n > 1:
+        half = float(student.ppf(0.975, n - 1) * known.std(ddof=1) / math.sqrt(n))
+        ci = mean - half, mean + half
+    return MeanInterval(mean, ci, n)
 
 
 def paired_difference(
@@ -423,20 +398,12 @@ def paired_difference(
     pairs = pairs[np.isfinite(pairs).all(axis=1)]
     if not len(pairs):
         return None
-    each = pairs[:, 0] - pairs[:, 1]
     scale = float(pairs[:, 1].mean()) if relative else 1.0
     if scale <= 0.0:
         return None
-    mean, half = float(each.mean()) / scale, _half_interval(each) / scale
-    return Difference(mean, mean - half, mean + half)
-
-
-def _half_interval(values: Array) -> float:
-    """Return half the 95 % interval of a mean; NaN of a single value."""
-    n = len(values)
-    if n < 2:
-        return math.nan
-    return float(student.ppf(0.975, n - 1) * values.std(ddof=1) / math.sqrt(n))
+    mean, ci, _ = mean_interval((pairs[:, 0] - pairs[:, 1]) / scale)
+    assert mean is not None
+    return Difference(mean, *(ci or (math.nan, math.nan)))
 
 
 #: Range of the search for the steepest grade, and its bisections: to a tenth of a degree.
@@ -466,7 +433,6 @@ WHERE_ANY = ("immobilised", "lock_s")
 #: Metrics of controllers whose target follows the terrain; another's may be close to the target by chance.
 ADAPTATION = ("adapt_s", "adapted_ratio")
 Metrics = Mapping[str, float]  #: Metrics of one drive by name; NaN where one is undefined.
-UNKNOWN = MeanInterval(None, None, 0)
 
 
 class Drive(NamedTuple):
@@ -511,7 +477,7 @@ def matching_ramp(
     references += [name for name in drives if name.startswith(("known:", "target:"))]
     if not references:
         return None
-    key = f"distance_{START_TIME_S:g}s_m" if scenario == STARTS else "distance_m"
+    key = OF_STARTS[1] if scenario == STARTS else "distance_m"
 
     def distance_m(found: Sequence[Drive]) -> float:
         return float(np.mean([one.metrics[key] for one in found]))

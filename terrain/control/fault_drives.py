@@ -162,11 +162,11 @@ def fault_drive(run: RunLog, history: DriveHistory, robot: Robot, scenario: Scen
     wheels = np.column_stack([commands.channel(f"wheel_{i}_radps") for i in robot.wheels])
     desired = np.hypot(scenario.twist[:, 0], scenario.twist[:, 1])
     return FaultDrive(
-        time_s=time_s,
-        ok=control.channel("status_code") == TractionStatus.OK,
-        slip_ratio=control.channel("slip_ratio"),
-        true_slip_ratio=true_slip,
-        body_slip_ratio=body_slip,
+        time_s,
+        control.channel("status_code") == TractionStatus.OK,
+        control.channel("slip_ratio"),
+        true_slip,
+        body_slip,
         moving=(speed > STANDING_MPS) | (desired > 0.0),
         commanded_mps=np.abs(wheels).mean(axis=1) * robot.wheel_radius_m,
         desired_mps=desired,
@@ -191,40 +191,41 @@ def fault_figures(
     """
     time_s = drive.time_s
     step_s = float(np.median(np.diff(time_s)))
-    since = time_s >= start_s - _SLACK_S
-    acts = since & (time_s < end_s - _SLACK_S)
+    since, until = time_s >= start_s - _SLACK_S, time_s < end_s - _SLACK_S
+    acts = since & until
     ok, not_ok = (acts & drive.moving & each for each in (drive.ok, ~drive.ok))
     clean_not_ok = acts & clean.moving & ~clean.ok
-    too_fast = drive.commanded_mps > drive.desired_mps + OVERSPEED_MPS
-
-    def lasts_s(n_steps: float) -> float:  # to a microsecond
-        return round(float(n_steps) * step_s, 6)
-
-    def slip_error(one: FaultDrive) -> float:
-        return _largest((one.slip_ratio - one.true_slip_ratio)[since & one.ok])
-
+    too_fast = since & (drive.commanded_mps > drive.desired_mps + OVERSPEED_MPS)
+    ok_longest, overspeed = (np.ptp(true_stretches(each), axis=1).max(initial=0) for each in (ok, too_fast))
+    held_back = max(not_ok.sum() - clean_not_ok.sum(), 0)
+    ok_total_s, ok_longest_s, not_ok_s, overspeed_s = (
+        round(float(n) * step_s, 6) for n in (ok.sum(), ok_longest, held_back, overspeed)
+    )
+    slip_error, clean_slip_error = (
+        _largest((one.slip_ratio - one.true_slip_ratio)[since & one.ok]) for one in (drive, clean)
+    )
     recovery_s = math.nan
-    if (after := drive.moving & (time_s >= end_s - _SLACK_S)).any():
+    if (after := drive.moving & ~until).any():
         left_s, lost = time_s[after], np.flatnonzero(~drive.ok[after])
         resumes = int(lost[-1]) + 1 if lost.size else 0
         recovery_s = math.inf if resumes == left_s.size else round(float(left_s[resumes] - end_s), 6)
         recovery_s = recovery_s if lost.size else 0.0
-    is_stop = math.isfinite(plain.stop_m)
     stop_m = drive.stop_m if math.isfinite(drive.stop_m) else math.inf
+    stop_m = stop_m if math.isfinite(plain.stop_m) else math.nan
     return FaultFigures(
-        ok_total_s=lasts_s(ok.sum()),
-        ok_longest_s=lasts_s(np.ptp(true_stretches(ok), axis=1).max(initial=0)),
-        not_ok_s=lasts_s(max(not_ok.sum() - clean_not_ok.sum(), 0)),
-        slip_error_ratio=slip_error(drive),
-        clean_slip_error_ratio=slip_error(clean),
-        slip_peak_ratio=_largest(drive.body_slip_ratio[since]),
-        plain_slip_peak_ratio=_largest(plain.body_slip_ratio[since]),
-        stop_m=stop_m if is_stop else math.nan,
-        stop_ratio=stop_m / plain.stop_m if is_stop else math.nan,
-        recovery_s=recovery_s,
-        overspeed_s=lasts_s(np.ptp(true_stretches(since & too_fast), axis=1).max(initial=0)),
-        n_exceptions=n_exceptions,
-        n_not_finite=n_not_finite,
+        ok_total_s,
+        ok_longest_s,
+        not_ok_s,
+        slip_error,
+        clean_slip_error,
+        _largest(drive.body_slip_ratio[since]),
+        _largest(plain.body_slip_ratio[since]),
+        stop_m,
+        stop_m / plain.stop_m,
+        recovery_s,
+        overspeed_s,
+        n_exceptions,
+        n_not_finite,
     )
 
 
@@ -270,12 +271,11 @@ class BarCount(NamedTuple):
 
 def count_bars(judged: Sequence[Mapping[str, bool | None]], limits: Limits = LIMITS) -> dict[str, BarCount]:
     """Return each bar by name, over the drives that were judged."""
-    counted = {}
-    for name, text in BARS.items():
-        met = [bars[name] for bars in judged]
-        counts = met.count(True), met.count(False), met.count(None)
-        counted[name] = BarCount(text.format(**limits._asdict()), *counts)
-    return counted
+    met = {name: [bars[name] for bars in judged] for name in BARS}
+    return {
+        name: BarCount(text.format(**limits._asdict()), *map(met[name].count, (True, False, None)))
+        for name, text in BARS.items()
+    }
 
 
 FRESH = "fresh"  #: Status of a sensor that nothing is wrong with, in a pilot's ``health``.
@@ -343,46 +343,46 @@ class References(NamedTuple):
 
 def drive_references(loop: FaultLoop, place: Place) -> References:
     """Return the clean and the plain drive of a place."""
-    made, start_s = make_fault_situation(place.situation, loop.robot, place.terrain, place.seed)
-    pilots = (GuardedPilot(loop.new_pilot(name)) for name in ("traction", "plain"))
-    clean, plain = (_drive(loop, made, pilot.step) for pilot in pilots)
-    return References(clean, plain, start_s)
+    found = [_drive(loop, place, name) for name in ("traction", "plain")]
+    return References(found[0][0], found[1][0], found[0][2])
 
 
 def drive_case(loop: FaultLoop, case: FaultCase) -> tuple[FaultDrive, GuardedPilot]:
     """Return the drive with a fault, and its pilot with its record."""
-    made, start_s = make_fault_situation(case.situation, loop.robot, case.terrain, case.seed)
-    pilot, fault = GuardedPilot(loop.new_pilot("traction")), fault_catalogue(loop.robot)[case.fault]
-    bus = FaultyBus(pilot.step, fault, start_s, start_s + case.duration_s, case.seed)
-    return _drive(loop, made, bus.__call__), pilot
+    return _drive(loop, Place(*case[2:]), "traction", case)[:2]
 
 
-def _drive(loop: FaultLoop, made: Situation, step: Callable[[Sample], Command]) -> FaultDrive:
+def _drive(
+    loop: FaultLoop, place: Place, controller: str, case: FaultCase | None = None
+) -> tuple[FaultDrive, GuardedPilot, float]:
+    """Return a drive, with a fault or without, its pilot, and the time at which a fault begins."""
+    robot, new_pilot, delay_s = loop
+    made, start_s = make_fault_situation(place.situation, robot, place.terrain, place.seed)
+    pilot = GuardedPilot(new_pilot(controller))
+    step: Callable[[Sample], Command] = pilot.step
+    if case is not None:
+        fault, end_s = fault_catalogue(robot)[case.fault], start_s + case.duration_s
+        step = FaultyBus(pilot.step, fault, start_s, end_s, case.seed).__call__
     with np.errstate(all="ignore"):  # values of a fault are squared
-        log = simulate_situation(loop.robot, made, step, loop.delay_s)
-    history = drive_history(log, loop.robot, made.conditions.radius_factors)
-    return fault_drive(log, history, loop.robot, made.scenario)
+        log = simulate_situation(robot, made, step, delay_s)
+    history = drive_history(log, robot, made.conditions.radius_factors)
+    return fault_drive(log, history, robot, made.scenario), pilot, start_s
 
 
 def evaluate_case(loop: FaultLoop, case: FaultCase, references: References) -> FaultRow:
     """Return the row of a drive with a fault, compared with the references of the same place."""
-    fault = fault_catalogue(loop.robot)[case.fault]
+    fault, (clean, plain, start_s) = fault_catalogue(loop.robot)[case.fault], references
     drive, pilot = drive_case(loop, case)
-    clean, plain, start_s = references
     end_s, time_s = start_s + case.duration_s, drive.time_s
     counts = pilot.n_exceptions, pilot.n_not_finite
     figures = fault_figures(drive, clean, plain, start_s, end_s, *counts)
     acts = ((time_s >= start_s) & (time_s < end_s)).tolist()
-    return FaultRow(
-        case,
-        fault.kind,
-        fault.streams,
-        fault.nature.value,
-        figures,
-        judge(figures, fault.nature),
+    named, bars = (
         named_sensors(pilot.health, acts, float(time_s[1] - time_s[0])),
-        pilot.exception,
+        judge(figures, fault.nature),
     )
+    kind = fault.kind, fault.streams, fault.nature.value
+    return FaultRow(case, *kind, figures, bars, named, pilot.exception)
 
 
 def drawn_cases(rows: Sequence[FaultRow], draw: Sequence[str] = ()) -> list[FaultCase]:
@@ -442,15 +442,15 @@ class GuardedPilot:
 
         An exception in the first step is raised.
         """
+        command: Command | None = None
         try:
-            command: Command | None = self._pilot.step(sample)
+            command = self._pilot.step(sample)
         except Exception as error:
             if self._last is None:
                 raise
             self.n_exceptions += 1
             self.exception = self.exception or f"{type(error).__name__}: {error}"
-            command = None
-        if command is not None and not is_finite(command) and self._last is not None:
+        if command is not None and self._last is not None and not is_finite(command):
             self.n_not_finite += 1
             command = None
         if command is None:
@@ -459,9 +459,8 @@ class GuardedPilot:
             command = self._last._replace(status={**self._last.status, **changed})
         else:
             self._last = command
-        estimate = self._pilot.estimate
+        estimate, health = self._pilot.estimate, getattr(self._pilot, "health", None)
         self.speed_mps.append(math.nan if estimate is None else estimate.speed_x_mps)
-        health = getattr(self._pilot, "health", None)
         self.health.append(None if health is None else dict(health))
         return command
 
@@ -488,7 +487,7 @@ def named_sensors(
     {'imu': 'lost'}
     """
     named = [each for each, acting in zip(health, acts, strict=True) if acting]
-    if not named or all(each is None for each in named):
+    if all(each is None for each in named):
         return None
     counts = Counter((sensor, status) for each in named if each for sensor, status in each.items())
     found: dict[str, str] = {}

@@ -9,7 +9,7 @@ or no robot would start.  What such a target of one session costs in another ses
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from statistics import median_low
 from typing import Any, NamedTuple
 
@@ -32,7 +32,6 @@ from terrain.slip_learning.learn import LearnedTerrain, TerrainRun, learn_terrai
 from terrain.slip_learning.measured import (
     Measured,
     OperatingPoints,
-    SurfaceSlip,
     operating_points,
     surface_slip,
 )
@@ -43,6 +42,7 @@ DIGITS = 4  #: Of slips and ratios of forces in the table: a hundredth of their 
 MIN_RUNS = 3  #: From fewer, how a median differs from run to run is not known.
 N_DRAWS = 1000
 
+FOR_OTHERS = "used for a terrain without an entry"
 NO_PEAK = (
     "steady motion alone is used: the slip where thrust balances resistance, which shows no peak of thrust"
 )
@@ -71,7 +71,7 @@ def learned_table(learned: Sequence[LearnedTerrain], robot: Robot, name: str) ->
     terrains' numbers, and the packaged table's own without any.  The least of them would not do: on soft
     terrain the slip for tiles would not overcome the resistance.
     """
-    targets: dict[str, Mapping[str, SlipTarget]] = {}
+    targets: dict[str, dict[str, SlipTarget]] = {}
     curves, reasons, estimated = {}, {}, []
     for entry in learned:
         terrain = entry.terrain
@@ -79,36 +79,20 @@ def learned_table(learned: Sequence[LearnedTerrain], robot: Robot, name: str) ->
             targets[terrain] = _assumed(terrain, entry.status)
             reasons[terrain] = entry.reason
             continue
-        curves[terrain] = curve_entry(curve, entry.targets, robot)
-        targets[terrain] = {
-            state: SlipTarget(
-                terrain,
-                state,
-                round(slip, DIGITS),
-                round(std, DIGITS),
-                curve.n_runs,
-                TargetStatus.ESTIMATED,
-                source,
-            )
-            for state in DRIVE_STATES
-            for slip, std, source in [entry.targets.of(state)]
-        }
-        estimated.append(targets[terrain])
+        curves[terrain], numbers = curve_entry(curve, entry.targets, robot), {}
+        for state in DRIVE_STATES:
+            slip, std, source = entry.targets.of(state)
+            rounded = round(slip, DIGITS), round(std, DIGITS), curve.n_runs
+            numbers[state] = SlipTarget(terrain, state, *rounded, TargetStatus.ESTIMATED, source)
+        targets[terrain] = numbers
+        estimated.append(numbers)
     if FALLBACK not in targets:
-        own = load_slip_table()
-        slips = {state: target.slip_ratio for state, target in own.targets[own.fallback].items()}
-        source = f"table {own.name}, its fallback"
-        if estimated:
-            source = "lower median of the terrains estimated here"
-            slips = {
-                state: SIGN[state] * median_low(abs(entry[state].slip_ratio) for entry in estimated)
-                for state in DRIVE_STATES
-            }
-        targets[FALLBACK] = {
-            state: SlipTarget(FALLBACK, state, slip, math.nan, 0, TargetStatus.UNESTIMATED, source)
-            for state, slip in slips.items()
-        }
-    reasons.setdefault(FALLBACK, "used for a terrain without an entry")
+        targets[FALLBACK] = _assumed(FALLBACK)
+        source = "lower median of the terrains estimated here"
+        for state, target in targets[FALLBACK].items() if estimated else ():
+            slip = SIGN[state] * median_low(abs(entry[state].slip_ratio) for entry in estimated)
+            targets[FALLBACK][state] = target._replace(slip_ratio=slip, source=source)
+    reasons.setdefault(FALLBACK, FOR_OTHERS)
     return SlipTable(name, FALLBACK, targets, robot.name, curves, reasons)
 
 
@@ -246,44 +230,6 @@ def transfers(measured: Measured, rng: np.random.Generator) -> list[Transfer]:
     return shown
 
 
-def measured_table(surfaces: Sequence[SurfaceSlip], robot: Robot, name: str) -> SlipTable:
-    """Return the table of a robot: steady slip of surfaces where it was measured, assumed numbers elsewhere."""
-    targets = {surface.terrain: _measured_targets(surface) for surface in surfaces}
-    reasons = {surface.terrain: reason_of(surface) for surface in surfaces}
-    reasons.setdefault(FALLBACK, "used for a terrain without an entry")
-    targets.setdefault(FALLBACK, _assumed(FALLBACK))
-    return SlipTable(name, FALLBACK, targets, robot.name, {}, reasons)
-
-
-def reason_of(surface: SurfaceSlip) -> str:
-    """Return why a surface has no more targets than it has."""
-    if surface.n_runs < MIN_RUNS:
-        return FEW_RUNS
-    return BRAKES if surface.slip_ratio < 0.0 else NO_PEAK
-
-
-def _measured_targets(surface: SurfaceSlip) -> dict[str, SlipTarget]:
-    assumed = _assumed(surface.terrain)
-    if reason_of(surface) is not NO_PEAK:
-        return assumed
-    low, high = surface.interval
-    steady = SlipTarget(
-        surface.terrain,
-        "steady",
-        round(surface.slip_ratio, DIGITS),
-        round((high - low) / (2 * _Z95), DIGITS),
-        surface.n_runs,
-        TargetStatus.ESTIMATED,
-        f"median over {surface.n_runs} runs, measured from outside; 95 % {low:.3f} to {high:.3f}",
-    )
-    traction = assumed["traction"]
-    least = min(steady.slip_ratio + MIN_ABOVE_BALANCE_SLIP, 1.0)
-    if traction.slip_ratio < least:
-        source = "assumed: just above the steady slip that was measured"
-        traction = traction._replace(slip_ratio=round(least, DIGITS), source=source)
-    return {**assumed, "steady": steady, "traction": traction}
-
-
 def learn_surfaces(
     measured: Measured, robot: Robot, name: str, seed: int
 ) -> tuple[SlipTable, dict[str, dict[str, Any]], dict[str, OperatingPoints], tuple[Transfer, ...]]:
@@ -299,25 +245,34 @@ def learn_surfaces(
     """
     rng, by_terrain = np.random.default_rng(seed), measured.by_terrain()
     slips = {terrain: surface_slip(terrain, own.slips, rng) for terrain, own in by_terrain.items()}
-    table = measured_table(list(slips.values()), robot, name)
+    targets, reasons = dict[str, dict[str, SlipTarget]](), dict[str, str]()
+    for terrain, slip in slips.items():  # steady slip where it was measured, assumed numbers elsewhere
+        targets[terrain] = assumed = _assumed(terrain)
+        reasons[terrain] = NO_PEAK if slip.slip_ratio >= 0.0 else BRAKES
+        if slip.n_runs < MIN_RUNS:
+            reasons[terrain] = FEW_RUNS
+        if reasons[terrain] is not NO_PEAK:
+            continue
+        low, high = slip.interval
+        ratio, std = round(slip.slip_ratio, DIGITS), round((high - low) / (2 * _Z95), DIGITS)
+        source = f"median over {slip.n_runs} runs, measured from outside; 95 % {low:.3f} to {high:.3f}"
+        estimated = slip.n_runs, TargetStatus.ESTIMATED, source
+        assumed["steady"] = SlipTarget(terrain, "steady", ratio, std, *estimated)
+        least = min(ratio + MIN_ABOVE_BALANCE_SLIP, 1.0)
+        if assumed["traction"].slip_ratio < least:
+            source = "assumed: just above the steady slip that was measured"
+            assumed["traction"] = assumed["traction"]._replace(slip_ratio=round(least, DIGITS), source=source)
+    targets.setdefault(FALLBACK, _assumed(FALLBACK))
+    reasons.setdefault(FALLBACK, FOR_OTHERS)
+    table = SlipTable(name, FALLBACK, targets, robot.name, {}, reasons)
     points = {terrain: operating_points(own.runs, own.slips, robot) for terrain, own in by_terrain.items()}
-    surfaces = {
-        terrain: {
-            "slip": slip,
-            "current_a": _quartiles(points[terrain].current_a),
-            "thrust_ratio": _quartiles(points[terrain].thrust_ratio),
-            "targets": table.target_rows(terrain),
-            "reason": reason_of(slip),
-        }
-        for terrain, slip in slips.items()
-    }
+    surfaces: dict[str, dict[str, Any]] = {}
+    for terrain, slip in slips.items():
+        row = surfaces[terrain] = {"slip": slip}
+        for key in ("current_a", "thrust_ratio"):  # median, and the quartiles below and above it
+            values = getattr(points[terrain], key)
+            known = values[np.isfinite(values)]
+            low, middle, high = np.quantile(known, [0.25, 0.5, 0.75]) if known.size else np.full(3, math.nan)
+            row[key] = float(middle), float(low), float(high)
+        row |= {"targets": table.target_rows(terrain), "reason": reasons[terrain]}
     return table, surfaces, points, tuple(transfers(measured, rng))
-
-
-def _quartiles(values: Array) -> tuple[float, float, float]:
-    """Return the median, and the quartiles below and above it."""
-    known = values[np.isfinite(values)]
-    if not known.size:
-        return math.nan, math.nan, math.nan
-    low, middle, high = np.quantile(known, [0.25, 0.5, 0.75])
-    return float(middle), float(low), float(high)

@@ -40,7 +40,7 @@ from scipy.linalg import expm
 
 from terrain.angles import wrapped
 from terrain.control.pid import LONGEST_STEP_S, Gains, PidState, PidStatus, checked, pid_step
-from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, closed_loop, spectral_radius
+from terrain.control.stability import DELAY_S, SAMPLE_TIME_S, closed_loop
 from terrain.errors import ConfigError
 from terrain.records import Array
 from terrain.robots import Robot
@@ -121,11 +121,9 @@ def check_tracking(
     speeds_mps = np.geomspace(MOVING_MPS, fastest_mps, N_SPEEDS).tolist()
     for loop, (k, k_i, _, fastest_ps) in _loops(settings).items():
         gains = k, k_i, fastest_ps
-        bad = [
-            speed
-            for speed in speeds_mps
-            if spectral_radius(_loop_matrix(robot, gains, delay_s, dt_s, speed)) >= 1.0 + 1e-9
-        ]
+        loops = [_loop_matrix(robot, gains, delay_s, dt_s, speed) for speed in speeds_mps]
+        radii = [np.abs(np.linalg.eigvals(each)).max() for each in loops]
+        bad = [speed for speed, radius in zip(speeds_mps, radii, strict=True) if radius >= 1.0 + 1e-9]
         if bad:
             raise ConfigError(
                 f"path tracking: {loop}_pm {k:g} and {loop}_integral_pm2 {k_i:g} with a delay of "
@@ -259,8 +257,13 @@ def track_step(
     if state.reference is None or size < _STAND_MPS:
         state = TrackState(reference=pose)
     elif state.blind_s == 0.0:
-        jumped = _after_jump(state.reference, state.last, pose, ground_twist, dt_s)
-        state = state._replace(reference=jumped)
+        # a pose that jumps away from the motion: the reference jumps with it
+        last, path = state.last, state.reference
+        due = last + dt_s * _rotated(last[2] + 0.5 * dt_s * ground_twist[2], ground_twist)
+        jump = float(wrapped(pose[2] - due[2]))
+        if abs(jump) > _JUMP_RAD or math.hypot(pose[0] - due[0], pose[1] - due[1]) > _JUMP_M:
+            x, y, _ = pose + _rotated(jump, path - due)
+            state = state._replace(reference=np.array([x, y, path[2] + jump]))
     state = state._replace(last=pose, blind_s=0.0)
     if size < _STAND_MPS:
         return twist, state, uncorrected(TrackStatus.STANDING)
@@ -304,16 +307,6 @@ def track_step(
     report = TrackReport(float(error[2]) / settings.arm_m, cross_m, angle, status)
     state = TrackState(reference, once, desired, tuple(integrals), pose)
     return twist + size * correction / metres, state, report
-
-
-def _after_jump(reference: Array, last: Array, pose: Array, ground: Array, dt_s: float) -> Array:
-    """Return the reference, which jumps with a pose that jumps away from the motion."""
-    due = last + dt_s * _rotated(last[2] + 0.5 * dt_s * ground[2], ground)
-    jump = float(wrapped(pose[2] - due[2]))
-    if not (abs(jump) > _JUMP_RAD or math.hypot(pose[0] - due[0], pose[1] - due[1]) > _JUMP_M):
-        return reference
-    x, y, _ = pose + _rotated(jump, reference - due)
-    return np.array([x, y, reference[2] + jump])
 
 
 def _rotated(angle_rad: float, vector: Array) -> Array:

@@ -93,6 +93,12 @@ class ReferencePath:
         """Return the path with side slopes (n,) over distance (n,), as a drive along it measured them."""
         return replace(self, roll_rad=np.interp(self.distance_m, distance_m, roll_rad))
 
+    def roll_at(self, row: int, roll_rad: float) -> float:
+        """Return the side slope at a row; where it is not known, the one given."""
+        assert self.roll_rad is not None
+        known = float(self.roll_rad[row])
+        return roll_rad if math.isnan(known) else known
+
     def row_at(self, distance_m: float) -> int:
         """Return the number of the last row before a distance."""
         return min(max(int(distance_m / GRID_M), 0), len(self.x_m) - 1)
@@ -120,9 +126,13 @@ class ReferencePath:
             return Place(s, math.nan, math.nan, curvature, PathStatus.NO_POSE)
         near = slice(first, (last if is_first else min(first + int(_WINDOW_M / GRID_M), last)) + 1)
         squares = (self.x_m[near] - x_m) ** 2 + (self.y_m[near] - y_m) ** 2
-        nearest = (
-            self._first_as_near(x_m, y_m, math.sqrt(squares.min())) if is_first else int(squares.argmin())
-        )
+        nearest = int(squares.argmin())
+        if (
+            is_first
+        ):  # the first row, closest among its neighbours, that is hardly further than the closest of all
+            away = np.hypot(self.x_m - x_m, self.y_m - y_m)
+            closest = (away[:-1] <= away[1:]) & (away[:-1] <= math.sqrt(squares.min()) + _AS_NEAR_M)
+            nearest = int(closest.argmax()) if closest.any() else last
         least, nearest = float(squares[nearest]), nearest + first
         heading, curvature = float(self.heading_rad[nearest]), float(self.curvature_pm[nearest])
         off_x, off_y = x_m - float(self.x_m[nearest]), y_m - float(self.y_m[nearest])
@@ -139,12 +149,6 @@ class ReferencePath:
         if nearest == last and along >= 0.0:
             status = PathStatus.END
         return Place(s, lateral, float(wrapped(yaw_rad - heading)), curvature, status)
-
-    def _first_as_near(self, x_m: float, y_m: float, least_m: float) -> int:
-        """Return the first row, closest among its neighbours, that is hardly further than the closest of all."""
-        away = np.hypot(self.x_m - x_m, self.y_m - y_m)
-        closest = (away[:-1] <= away[1:]) & (away[:-1] <= least_m + _AS_NEAR_M)
-        return int(closest.argmax()) if closest.any() else len(away) - 1
 
 
 def path_from_curvature(distance_m: Array, curvature_pm: Array) -> ReferencePath:

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +68,7 @@ from terrain.estimation.live import LiveEstimate
 from terrain.kinematics.commands import FAR_RAD, wheel_command_step
 from terrain.kinematics.wheels import in_wheel_frame, point_velocity
 from terrain.logs.schema import IMU_CHANNELS, WHEELS_CHANNELS
-from terrain.records import Array, Command, Reading, SlipTarget
+from terrain.records import Array, Command, Reading
 from terrain.robots import Robot, SwerveRobot, as_drive
 from terrain.slip import MIN_SPEED_MPS
 
@@ -179,92 +179,6 @@ def estimate_age(estimate: LiveEstimate, time_s: float) -> float:
     return estimate.reference_age_s + max(time_s - estimate.time_s, 0.0)
 
 
-class WheelController:
-    """Turns desired wheel speeds into commanded ones, step by step.
-
-    Parameters
-    ----------
-    name : ``plain``, ``ramp``, ``thesis`` or ``traction``
-    robot : swerve robot
-    ramp_mps2 : largest rise of the speed of the fastest wheel, of ``ramp``
-    traction : settings of ``traction``, checked for every controller; ``thesis`` uses no older speed over ground
-    gains : of ``thesis``
-
-    Raises
-    ------
-    ConfigError
-        if a setting is not accepted.
-    """
-
-    def __init__(
-        self, name: str, robot: Robot, ramp_mps2: float, traction: TractionSettings, gains: Gains
-    ) -> None:
-        self._name, self._radius_m = name, robot.wheel_radius_m
-        self._traction = check_settings(traction, robot)
-        self._gains = check_gains(gains) if name == "thesis" else gains
-        self._ramp_mps2 = ramp_mps2 if name == "ramp" else math.inf
-        self._state = TractionState()
-        self._pids = [WheelPid()] * len(robot.wheels)
-        self._wheel_radps, self._driven_mps = np.zeros(3), 0.0
-
-    def reset_terrain(self) -> None:
-        """Drop what was learned of the terrain, as another one is classified: balance, and floor of the target."""
-        self._state = self._state.on_other_terrain()
-
-    def step(
-        self,
-        wheel_radps: Array,
-        seen: WheelMotion,
-        target: TractionTarget,
-        slip_targets: Mapping[str, SlipTarget],
-        dt_s: float,
-    ) -> tuple[Array, WheelReport]:
-        """Return the commanded rates (wheels,) and what was decided.
-
-        Parameters
-        ----------
-        wheel_radps : (wheels,) desired
-        seen : as estimated
-        target, slip_targets : slips of the current terrain, of the traction controller and by drive state
-        dt_s : since the step before; NaN where the clock is not valid
-        """
-        if self._name == "traction":
-            command, self._state, report = traction_step(
-                self._traction, self._state, target, self._radius_m, wheel_radps, seen, dt_s
-            )
-            return command, report
-        if self._name == "thesis":
-            return self._thesis(wheel_radps, seen, slip_targets, dt_s)
-        desired_mps = max(map(abs, wheel_radps.tolist())) * self._radius_m
-        before_mps = self._driven_mps if float(wheel_radps @ self._wheel_radps) >= 0.0 else 0.0
-        rise_mps = self._ramp_mps2 * step_or_period(dt_s)
-        self._wheel_radps, self._driven_mps = wheel_radps, min(desired_mps, before_mps + rise_mps)
-        command = wheel_radps * (self._driven_mps / desired_mps) if desired_mps > 0.0 else wheel_radps
-        unknown = math.nan, math.nan, math.nan
-        return command, WheelReport(self._driven_mps, *unknown, DriveState.STEADY, TractionStatus.OK)
-
-    def _thesis(
-        self, wheel_radps: Array, seen: WheelMotion, slip_targets: Mapping[str, SlipTarget], dt_s: float
-    ) -> tuple[Array, WheelReport]:
-        stale = seen.stale_s > self._traction.stale_max_s
-        targets = [slip_targets[state].slip_ratio for state in DRIVE_STATES]
-        columns = (wheel_radps, seen.wheel_radps, _UNKNOWN if stale else seen.speed_mps, seen.accel_mps2)
-        gains, radius_m, rows = self._gains, self._radius_m, (column.tolist() for column in columns)
-        steps = [
-            wheel_step(gains, radius_m, state, command, rate, speed, accel, seen.chassis_mps, targets, dt_s)
-            for state, command, rate, speed, accel in zip(self._pids, *rows, strict=True)
-        ]
-        wheels, self._pids = [step for step, _ in steps], [state for _, state in steps]
-        desired = np.array([one.desired_ratio for one in wheels])
-        status = TractionStatus.OK if np.isfinite(desired).all() else TractionStatus.NO_SLIP
-        if not 0.0 < dt_s <= LONGEST_STEP_S:
-            status = TractionStatus.BAD_TIME
-        command = wheel_radps + np.array([one.correction_radps for one in wheels])
-        driven_mps = float(np.abs(command).max()) * self._radius_m
-        aimed, largest = (largest_forward(wheel_radps, slips) for slips in (desired, seen.slip_ratio))
-        return command, WheelReport(driven_mps, aimed, math.nan, largest, wheels[0].drive_state, status)
-
-
 #: Thrust over load at the peak, up to which terrain counts as slick: with more, a robot stops from 1 m/s in less than
 #: two tenths of a second, which is the response time of a slip controller.
 SLICK_RATIO = 0.5
@@ -329,12 +243,6 @@ SLOW_S, APPROACH = 0.2, 0.02
 SPEED_MPS, SPEED_RATIO, STEER_RAD = 0.05, 0.06, 0.06
 
 
-def _low_passed(before: Array, value: Array, step_ratio: float) -> Array:
-    """Return values behind a low-pass; an unknown one leaves nothing there."""
-    passed = before - (value - before) * math.expm1(-step_ratio)
-    return np.where(np.isnan(passed), value, passed)
-
-
 _TOLERANCE, _RATIO = np.repeat([SPEED_MPS, STEER_RAD], 3), np.repeat([SPEED_RATIO, 0.0], 3)
 _STILL_S = np.repeat([STILL_S, math.inf], 3)  # a steering angle may repeat itself
 
@@ -367,8 +275,11 @@ class Actuation:
         middle = np.where(np.isnan(last_three).any(axis=0), value, np.sort(last_three, axis=0)[1])
         self._repeated_s = np.where(value == self._last, self._repeated_s + step_s, 0.0)
         self._last, self._before = value, self._last
-        smooth = self._smooth = _low_passed(self._smooth, middle, step_s / SMOOTH_S)
-        slow = self._slow = _low_passed(self._slow, middle, step_s / SLOW_S)
+        self._smooth, self._slow = smooth, slow = [
+            np.where(np.isnan(passed), middle, passed)  # an unknown value leaves nothing there
+            for before, time_s in ((self._smooth, SMOOTH_S), (self._slow, SLOW_S))
+            for passed in [before - (middle - before) * math.expm1(-step_s / time_s)]
+        ]
         self._commands.append((now_s, self._command))
         commands = np.array([command for _, command in self._commands])
         since_s = now_s - np.where(self._repeated_s >= _STILL_S, STILL_S, WINDOW_S)
@@ -423,9 +334,8 @@ class RobotControl:
         self._radius_m, self._positions_m = robot.wheel_radius_m, np.array(robot.wheel_positions_m)
         motors, steering = robot.equipment.motors, robot.equipment.steering
         self._limits = robot.wheel_radius_m, motors.speed_max_radps, steering.rate_max_radps
-        self._controller = WheelController(
-            settings.controller, robot, settings.ramp_mps2, settings.traction, settings.gains
-        )
+        self._traction = check_settings(settings.traction, robot)
+        self._gains = check_gains(settings.gains) if settings.controller == "thesis" else settings.gains
         if states:
             self._steer_states = np.array([states.index(f"steer_{i}_rad") for i in robot.wheels])
             self._pose_states = [states.index(state) for state in ("position_x_m", "position_y_m", "yaw_rad")]
@@ -437,6 +347,8 @@ class RobotControl:
         self.health = [0] * len(SENSORS)
         self.steer_rad = np.zeros(3)
         self.target_ratio, self._tilt_rad, self._tracking = math.nan, (0.0, 0.0), TrackState()
+        self._state, self._pids = TractionState(), [WheelPid()] * len(robot.wheels)
+        self._wheel_radps, self._driven_mps = np.zeros(3), 0.0
 
     def use(self, table: SlipTable) -> None:
         """Aim for the targets of a table from now on."""
@@ -445,8 +357,8 @@ class RobotControl:
         self.terrains = {terrain: index for index, terrain in enumerate(table.targets)}
 
     def reset_terrain(self) -> None:
-        """Drop what was learned of the terrain, as another one is believed."""
-        self._controller.reset_terrain()
+        """Drop what was learned of the terrain, balance and floor of the target, as another one is believed."""
+        self._state = self._state._replace(balance_ratio=math.nan, floor_ratio=0.0)
 
     def measured(
         self, time_s: float, dt_s: float, readings: dict[str, Reading], seen: LiveEstimate | None
@@ -511,9 +423,9 @@ class RobotControl:
         if self._estimates:
             observed = observe_wheels(self._robot, self._steer_states, seen, time_s)
         sound = health <= SOUND
-        slip_targets = self._table.lookup(belief.terrain)
-        command_radps, done = self._controller.step(
-            wheel_radps, observed if sound else UNOBSERVED, target, slip_targets, dt_s
+        seen_wheels = observed if sound else UNOBSERVED
+        command_radps, done = self._command(
+            wheel_radps, desired_mps, seen_wheels, target, belief.terrain, dt_s
         )
         status, slip_ratio = done.status, done.slip_ratio
         if not sound:
@@ -542,6 +454,47 @@ class RobotControl:
         }
         scale = done.driven_mps / desired_mps if desired_mps > 0.0 else 0.0
         return Command(command_radps, self.steer_rad, admitted * scale, figures), belief
+
+    def _command(
+        self,
+        wheel_radps: Array,
+        desired_mps: float,
+        seen: WheelMotion,
+        target: TractionTarget,
+        terrain: str,
+        dt_s: float,
+    ) -> tuple[Array, WheelReport]:
+        """Return the commanded rates (wheels,) for desired ones, and what was decided."""
+        settings, radius_m = self._settings, self._radius_m
+        if settings.controller == "traction":
+            command, self._state, report = traction_step(
+                self._traction, self._state, target, radius_m, wheel_radps, seen, dt_s
+            )
+            return command, report
+        if settings.controller in OPEN_LOOP:
+            before_mps = self._driven_mps if float(wheel_radps @ self._wheel_radps) >= 0.0 else 0.0
+            ramp_mps2 = settings.ramp_mps2 if settings.controller == "ramp" else math.inf
+            driven_mps = min(desired_mps, before_mps + ramp_mps2 * step_or_period(dt_s))
+            self._wheel_radps, self._driven_mps = wheel_radps, driven_mps
+            command = wheel_radps * (driven_mps / desired_mps) if desired_mps > 0.0 else wheel_radps
+            unknown = math.nan, math.nan, math.nan
+            return command, WheelReport(driven_mps, *unknown, DriveState.STEADY, TractionStatus.OK)
+        by_state, stale = self._table.lookup(terrain), seen.stale_s > self._traction.stale_max_s
+        targets = [by_state[state].slip_ratio for state in DRIVE_STATES]
+        columns = (wheel_radps, seen.wheel_radps, _UNKNOWN if stale else seen.speed_mps, seen.accel_mps2)
+        rows, chassis_mps, wheels = (column.tolist() for column in columns), seen.chassis_mps, []
+        for i, (rate, measured, speed, accel) in enumerate(zip(*rows, strict=True)):
+            given = rate, measured, speed, accel, chassis_mps, targets, dt_s
+            wheel, self._pids[i] = wheel_step(self._gains, radius_m, self._pids[i], *given)
+            wheels.append(wheel)
+        desired = np.array([one.desired_ratio for one in wheels])
+        status = TractionStatus.OK if np.isfinite(desired).all() else TractionStatus.NO_SLIP
+        if not 0.0 < dt_s <= LONGEST_STEP_S:
+            status = TractionStatus.BAD_TIME
+        command = wheel_radps + np.array([one.correction_radps for one in wheels])
+        aimed, largest = (largest_forward(wheel_radps, slips) for slips in (desired, seen.slip_ratio))
+        driven_mps = float(np.abs(command).max()) * radius_m
+        return command, WheelReport(driven_mps, aimed, math.nan, largest, wheels[0].drive_state, status)
 
     def _judge(self, seen: LiveEstimate | None) -> tuple[int, int]:
         """Update the health of the sensors; return the place of the least sound, or -1, and its health."""

@@ -95,8 +95,44 @@ def make_situation(
     drawn, driven, simulated = np.random.SeedSequence(key).spawn(3)
     rng = np.random.default_rng(drawn)
     soils = {name: scattered(soil, rng) for name, soil in soils.items()}
-    conditions = _chosen(draw_conditions(load_spread(), rng), options, level=not over_all)
-    scenario = _scenario(name, robot, list(soils), driven, options)
+    chosen: dict[str, Any] = {} if over_all else {"grade_ratio": (0.0, 0.0), "undulation_ratio": 0.0}
+    if options.leg_backlash_rad:
+        chosen["leg_backlash_rad"] = options.leg_backlash_rad
+    if options.grade_deg:
+        chosen["grade_ratio"] = (math.tan(math.radians(options.grade_deg)), 0.0)
+    if options.radius_factors is not None:
+        chosen["radius_factors"] = options.radius_factors
+    conditions = replace(draw_conditions(load_spread(), rng), **chosen)
+    number, names = int(driven.generate_state(1)[0]), list(soils)
+    duration_s, speed_mps, accel_mps2 = options.duration_s, options.speed_mps, options.accel_mps2
+    changes = {"accel_mps2": accel_mps2} if accel_mps2 != 1.0 else {}
+    if name == STARTS:
+        if duration_s is not None:
+            raise ConfigError(f"scenario 'starts' is as long as its {N_STARTS} starts: leave duration_s out")
+        # stand, start, hold the speed, stop, several times: as ``terrain simulate`` has it, but longer
+        enough_s = 60.0 + 4.0 * speed_mps / accel_mps2 if accel_mps2 > 0 else None
+        checked = make_scenario(STARTS, robot, names[0], enough_s, speed_mps, accel_mps2=accel_mps2)
+        ramp_s = speed_mps / accel_mps2
+        lengths_s = (ramp_s, STARTS_HOLD_S, ramp_s, STARTS_REST_S) * N_STARTS
+        knots_s = np.cumsum([0.0, 1.0, *lengths_s])
+        speeds = [0.0, 0.0, *(speed_mps, speed_mps, 0.0, 0.0) * N_STARTS]
+        time_s = np.arange(round(knots_s[-1] * RATE_HZ) + 1) / RATE_HZ
+        twist = np.zeros((time_s.size, 3))
+        twist[:, 0] = np.interp(time_s, knots_s, speeds)
+        scenario = replace(checked, time_s=time_s, twist=twist)
+    elif name == MIXED:
+        length_s = MIXED_S if duration_s is None else duration_s
+        whole = make_scenario("complex", robot, names[0], length_s, speed_mps, number, **changes)
+        # patches of 5 to 9 m in drawn order, no two alike in a row
+        patches, start_m, of_patches = list[Patch](), 0.0, np.random.default_rng(driven)
+        while start_m < float(whole.distance_m[-1]):
+            others = [each for each in names if not patches or each != patches[-1].terrain]
+            patches.append(Patch(start_m, others[int(of_patches.integers(len(others)))]))
+            start_m += float(of_patches.uniform(5.0, 9.0))
+        scenario = replace(whole, name=MIXED, patches=tuple(patches))
+    else:
+        made = "climb" if name == SLOPE else name
+        scenario = make_scenario(made, robot, names, duration_s, speed_mps, number, **changes)
     faults = Faults(camera_lost_s=(CAMERA_LOST_S,)) if name == MIXED else Faults()
     return Situation(scenario, soils, conditions, faults, simulated)
 
@@ -119,61 +155,6 @@ def simulate_situation(
         controller=controller,
         command_delay_s=delay_s,
     )
-
-
-def _chosen(conditions: Conditions, options: SituationOptions, level: bool) -> Conditions:
-    """Return the drawn conditions with those that are chosen."""
-    chosen: dict[str, Any] = {"grade_ratio": (0.0, 0.0), "undulation_ratio": 0.0} if level else {}
-    if options.leg_backlash_rad:
-        chosen["leg_backlash_rad"] = options.leg_backlash_rad
-    if options.grade_deg:
-        chosen["grade_ratio"] = (math.tan(math.radians(options.grade_deg)), 0.0)
-    if options.radius_factors is not None:
-        chosen["radius_factors"] = options.radius_factors
-    return replace(conditions, **chosen)
-
-
-def _scenario(
-    name: str, robot: Robot, soils: list[str], drawn: np.random.SeedSequence, options: SituationOptions
-) -> Scenario:
-    seed = int(drawn.generate_state(1)[0])
-    duration_s, speed_mps = options.duration_s, options.speed_mps
-    changes = {"accel_mps2": options.accel_mps2} if options.accel_mps2 != 1.0 else {}
-    if name == STARTS:
-        if duration_s is not None:
-            raise ConfigError(f"scenario 'starts' is as long as its {N_STARTS} starts: leave duration_s out")
-        return _starts(robot, soils[0], speed_mps, options.accel_mps2)
-    if name == MIXED:
-        length_s = MIXED_S if duration_s is None else duration_s
-        whole = make_scenario("complex", robot, soils[0], length_s, speed_mps, seed, **changes)
-        return replace(whole, name=MIXED, patches=_patches(soils, whole, np.random.default_rng(drawn)))
-    made = "climb" if name == SLOPE else name
-    return make_scenario(made, robot, soils, duration_s, speed_mps, seed, **changes)
-
-
-def _starts(robot: Robot, terrain: str, speed_mps: float, accel_mps2: float) -> Scenario:
-    """Stand, start, hold the speed, stop, several times: as ``terrain simulate`` has it, but longer."""
-    enough_s = 60.0 + 4.0 * speed_mps / accel_mps2 if accel_mps2 > 0 else None
-    checked = make_scenario(STARTS, robot, terrain, enough_s, speed_mps, accel_mps2=accel_mps2)
-    ramp_s = speed_mps / accel_mps2
-    lengths_s = (ramp_s, STARTS_HOLD_S, ramp_s, STARTS_REST_S) * N_STARTS
-    knots_s = np.cumsum([0.0, 1.0, *lengths_s])
-    speeds = [0.0, 0.0, *(speed_mps, speed_mps, 0.0, 0.0) * N_STARTS]
-    time_s = np.arange(round(knots_s[-1] * RATE_HZ) + 1) / RATE_HZ
-    twist = np.zeros((time_s.size, 3))
-    twist[:, 0] = np.interp(time_s, knots_s, speeds)
-    return replace(checked, time_s=time_s, twist=twist)
-
-
-def _patches(names: list[str], scenario: Scenario, rng: np.random.Generator) -> tuple[Patch, ...]:
-    """Return patches of 5 to 9 m in drawn order, no two alike in a row."""
-    patches: list[Patch] = []
-    start_m, end_m = 0.0, float(scenario.distance_m[-1])
-    while start_m < end_m:
-        others = [name for name in names if not patches or name != patches[-1].terrain]
-        patches.append(Patch(start_m, others[int(rng.integers(len(others)))]))
-        start_m += float(rng.uniform(5.0, 9.0))
-    return tuple(patches)
 
 
 def start_times(scenario: Scenario) -> list[float]:

@@ -213,11 +213,6 @@ def closed_loop(keep: Array, drive: Array, controller: Array, output: Array, n_d
     return loop
 
 
-def spectral_radius(matrix: Array) -> float:
-    """Return the largest magnitude of an eigenvalue."""
-    return float(np.abs(np.linalg.eigvals(matrix)).max())
-
-
 def _samples_of(delay_s: float, dt_s: float) -> int:
     """Return a delay in samples, rounded up; ``ConfigError`` where it or the sample time is not accepted."""
     if not 0 < dt_s <= LONGEST_DELAY_S:

@@ -172,10 +172,6 @@ class TractionState(NamedTuple):
         0.0,
     )  #: of each wheel at w = 1 m/s, of the last command to move
 
-    def on_other_terrain(self) -> TractionState:
-        """Return the state without what was learned of the terrain: for a change of the classified terrain."""
-        return self._replace(balance_ratio=math.nan, floor_ratio=0.0)
-
 
 _SLOW_S = 0.5  # window of the speed gain: shorter is noise, longer comes late
 _HELD_S = 0.4  # a robot that was limited for so long has had time to gain speed
@@ -227,12 +223,35 @@ def traction_step(
         command = np.array([rate * driven for rate in state.rate_radpm])
         report = WheelReport(*figures, DriveState.STEADY, TractionStatus.BAD_TIME)
         return command, state._replace(driven_mps=driven), report
-    q, accel, largest_slip, mean_slip, status = _observe(settings, state, radius_m, wheels)
+
+    # q and acceleration: of all wheels the one counts that shows the least speed; largest and mean slip; status
+    status = TractionStatus.OK
+    q, accel, largest_slip, mean_slip, uncertain = math.inf, 0.0, -math.inf, 0.0, 0.0
+    for rate, *motion in zip(state.rate_radpm, *(row.tolist() for row in wheels[:4]), strict=True):
+        if not all(map(math.isfinite, motion)):
+            status = TractionStatus.NO_SLIP
+            continue
+        speed, wheel_accel, slip, std = motion
+        sign = 1.0 if rate >= 0.0 else -1.0
+        ratio = abs(rate) * radius_m  # of the fastest wheel's speed
+        largest_slip = max(largest_slip, sign * slip)
+        mean_slip += sign * slip / len(state.rate_radpm)
+        fastest = abs(speed) / max(1.0 - max(sign * slip, 0.0), 0.05)
+        judged = max(fastest, _JUDGED * settings.launch_mps, state.braked_from_mps)
+        uncertain = max(uncertain, std * fastest / judged)
+        if ratio >= _SLOWEST_WHEEL_RATIO and sign * speed / ratio < q:
+            q, accel = sign * speed / ratio, sign * wheel_accel / ratio
+    if status is TractionStatus.OK and not wheels.stale_s <= settings.stale_max_s:
+        status = TractionStatus.STALE
+    if status is TractionStatus.OK and not uncertain <= settings.std_max_ratio:
+        status = TractionStatus.UNCERTAIN
+    q = 0.0 if math.isinf(q) else q
     margin = max(settings.balance_margin_ratio, target.margin_ratio)
     aimed = target.traction_ratio  # s*: no more than the balance and its margin, no less than the floor
-    if math.isfinite(state.balance_ratio):
-        aimed = min(aimed, max(state.balance_ratio, 0.0) + margin)
-    aimed = max(aimed, state.floor_ratio)
+    balance, floor = state.balance_ratio, state.floor_ratio
+    if math.isfinite(balance):
+        aimed = min(aimed, max(balance, 0.0) + margin)
+    aimed = max(aimed, floor)
 
     # d, by what is commanded
     driven, held_s, braking_s, drive_state = desired, 0.0, 0.0, DriveState.STEADY
@@ -256,99 +275,28 @@ def traction_step(
         if not overdue and not ahead <= max(desired, _BRAKE_END_MPS):
             charge = settings.charge_mps_per_mps2 * math.exp(-time_s / settings.charge_time_s)
             driven, braking_s = max(desired, min(was, ahead - charge * target.braking_mps2)), time_s
-    state = state._replace(
-        driven_mps=driven,
-        desired_mps=desired,
-        held_s=held_s,
-        braking_s=braking_s,
-        braked_from_mps=0.0 if braking_s == 0.0 else max(state.braked_from_mps, was),
-    )
+
+    # the slip of steady motion, and the floor of s*, which rises where the robot gains no speed
+    slow, reference, constant_s = state.slow_mps, state.reference_mps, state.constant_s
     if status is TractionStatus.OK:
-        state = _learn_balance(settings, state, q, mean_slip, aimed, margin, dt_s)
-    command, torques = _share_torque(settings, state, wheels.torque_nm, mean_slip, status, dt_s)
-    slip = math.nan if status is TractionStatus.NO_SLIP else largest_slip
-    report = WheelReport(driven, aimed, state.balance_ratio, slip, drive_state, status)
-    return command, state._replace(droop_nm=torques), report
+        slow += (q - slow) * min(dt_s / _SLOW_S, 1.0)
+        gained = (q - slow) / _SLOW_S
+        if held_s > _HELD_S and gained < settings.gain_least_mps2:
+            floor = min(aimed + settings.floor_rate_ratio * dt_s, _FLOOR_MAX)
+        if abs(driven - reference) > _CONSTANT_MPS:
+            reference, constant_s = driven, 0.0
+        constant_s += dt_s
+        if constant_s > _CONSTANT_S and abs(gained) < _STEADY_MPS2 and q > _STEADY_MPS:
+            before = balance if math.isfinite(balance) else mean_slip
+            balance = before + (mean_slip - before) * min(dt_s / _BALANCE_S, 1.0)
+            steady = min(max(balance, 0.0) + margin, _FLOOR_MAX)
+            floor = steady if driven >= desired else max(floor, steady)
 
-
-def _observe(
-    settings: TractionSettings, state: TractionState, radius_m: float, wheels: WheelMotion
-) -> tuple[float, float, float, float, TractionStatus]:
-    """Return speed and acceleration over ground seen from the fastest wheel, largest and mean slip, and their status.
-
-    Of all wheels the one counts that shows the least speed.
-    """
-    status = TractionStatus.OK
-    q, gain, largest, mean, uncertain = math.inf, 0.0, -math.inf, 0.0, 0.0
-    rows = (row.tolist() for row in wheels[:4])
-    for rate, *motion in zip(state.rate_radpm, *rows, strict=True):
-        if not all(map(math.isfinite, motion)):
-            status = TractionStatus.NO_SLIP
-            continue
-        speed, accel, slip, std = motion
-        sign = 1.0 if rate >= 0.0 else -1.0
-        ratio = abs(rate) * radius_m  # of the fastest wheel's speed
-        largest = max(largest, sign * slip)
-        mean += sign * slip / len(state.rate_radpm)
-        fastest = abs(speed) / max(1.0 - max(sign * slip, 0.0), 0.05)
-        judged = max(fastest, _JUDGED * settings.launch_mps, state.braked_from_mps)
-        uncertain = max(uncertain, std * fastest / judged)
-        if ratio >= _SLOWEST_WHEEL_RATIO and sign * speed / ratio < q:
-            q, gain = sign * speed / ratio, sign * accel / ratio
-    if status is TractionStatus.OK and not wheels.stale_s <= settings.stale_max_s:
-        status = TractionStatus.STALE
-    if status is TractionStatus.OK and not uncertain <= settings.std_max_ratio:
-        status = TractionStatus.UNCERTAIN
-    return (0.0 if math.isinf(q) else q), gain, largest, mean, status
-
-
-def _learn_balance(
-    settings: TractionSettings,
-    state: TractionState,
-    ground_mps: float,
-    mean_slip: float,
-    aimed_ratio: float,
-    margin_ratio: float,
-    dt_s: float,
-) -> TractionState:
-    """Update the slip of steady motion, and raise the floor of s* where the robot gains no speed."""
-    driven = state.driven_mps
-    slow = state.slow_mps + (ground_mps - state.slow_mps) * min(dt_s / _SLOW_S, 1.0)
-    gained = (ground_mps - slow) / _SLOW_S
-    balance, floor = state.balance_ratio, state.floor_ratio
-    if state.held_s > _HELD_S and gained < settings.gain_least_mps2:
-        floor = min(aimed_ratio + settings.floor_rate_ratio * dt_s, _FLOOR_MAX)
-    reference, constant_s = state.reference_mps, state.constant_s
-    if abs(driven - reference) > _CONSTANT_MPS:
-        reference, constant_s = driven, 0.0
-    constant_s += dt_s
-    if constant_s > _CONSTANT_S and abs(gained) < _STEADY_MPS2 and ground_mps > _STEADY_MPS:
-        before = balance if math.isfinite(balance) else mean_slip
-        balance = before + (mean_slip - before) * min(dt_s / _BALANCE_S, 1.0)
-        steady = min(max(balance, 0.0) + margin_ratio, _FLOOR_MAX)
-        floor = steady if driven >= state.desired_mps else max(floor, steady)
-    return state._replace(
-        slow_mps=slow,
-        reference_mps=reference,
-        constant_s=constant_s,
-        balance_ratio=balance,
-        floor_ratio=floor,
-    )
-
-
-def _share_torque(
-    settings: TractionSettings,
-    state: TractionState,
-    torque_nm: Array,
-    mean_slip: float,
-    status: TractionStatus,
-    dt_s: float,
-) -> tuple[Array, tuple[float, ...]]:
-    """Return the wheels' commands, one speed for all less the droop by torque above the mean, and the torques."""
+    # one speed for all wheels, less the droop by torque above the mean, behind its low-pass
     signs = [1.0 if rate >= 0.0 else -1.0 for rate in state.rate_radpm]
-    torques = torque_nm.tolist()
+    torques = wheels.torque_nm.tolist()
     # a torque that is not known must not count as 0 beside the others
-    measured = state.driven_mps > _STEADY_MPS and all(map(math.isfinite, torques))
+    measured = driven > _STEADY_MPS and all(map(math.isfinite, torques))
     keep = math.exp(-dt_s / settings.droop_time_s)
     filtered = tuple(
         keep * before + (1.0 - keep) * (sign * torque if measured else 0.0)
@@ -358,10 +306,14 @@ def _share_torque(
     for torque in filtered:
         mean += torque / len(filtered)
     grip = min(max(2.0 - abs(mean_slip) / _GRIP, 0.0), 1.0)
-    command = [rate * state.driven_mps for rate in state.rate_radpm]
+    commands = [rate * driven for rate in state.rate_radpm]
     if status is TractionStatus.OK:
         for i, sign in enumerate(signs):
-            limit = grip * settings.droop_max_ratio * abs(command[i])
+            limit = grip * settings.droop_max_ratio * abs(commands[i])
             droop = settings.droop_radps_per_nm * (filtered[i] - mean)
-            command[i] -= sign * min(max(droop, -limit), limit)
-    return np.array(command), filtered
+            commands[i] -= sign * min(max(droop, -limit), limit)
+    braked_from = 0.0 if braking_s == 0.0 else max(state.braked_from_mps, was)
+    learned = driven, desired, reference, constant_s, slow, balance, floor, held_s, braking_s, braked_from
+    slip = math.nan if status is TractionStatus.NO_SLIP else largest_slip
+    report = WheelReport(driven, aimed, balance, slip, drive_state, status)
+    return np.array(commands), TractionState(*learned, filtered, state.rate_radpm), report

@@ -9,13 +9,15 @@ from terrain.classify.changes import (
     BLOCK_S,
     SHIFT_LEAST,
     blocks_of,
+    breakaways,
     calibrate,
     change_points,
     changes_of,
     partition,
-    stretches,
 )
+from terrain.classify.held_out import HeldOut
 from terrain.errors import DataError
+from terrain.records import Windows
 
 
 def cost(z, ends, penalty):
@@ -57,8 +59,9 @@ START_S = 2.0 * np.arange(30)
 
 def of_run(probability, start_s=START_S):
     """Return the stretches of a run of class 0."""
-    classes = np.arange(probability.shape[1]).astype(str)
-    return stretches("a", "0", classes, probability, start_s, 2.0)
+    classes, n = np.arange(probability.shape[1]).astype(str), len(start_s)
+    windows = Windows({}, {}, {}, 2.0, start_s, np.full(n, "a"), np.full(n, "0"))
+    return breakaways(HeldOut.of_model(classes, probability, np.full(n, "0")), windows)
 
 
 def draw_run(seed, accuracy=0.85):
@@ -89,8 +92,7 @@ def test_windows_beside_a_pause_are_no_stretch_and_nothing_is_found_in_nothing()
     probability = np.repeat([[0.9, 0.1], [0.1, 0.9], [0.9, 0.1]], [13, 4, 13], axis=0)
     assert len(of_run(probability)) == 1
     paused = START_S + 60.0 * (np.arange(30) >= 15)
-    assert of_run(probability, paused) == []
-    assert of_run(np.empty((0, 2)), np.empty(0)) == []
+    assert of_run(probability, paused) == of_run(np.empty((0, 2)), np.empty(0)) == ()
 
 
 def log_of(rng, change_s=None, step=0.2, length_s=15.0, speed=0.1):

@@ -5,7 +5,7 @@ import pytest
 
 from terrain.constants import GRAVITY_MPS2
 from terrain.control.pid import Gains, PidState, check_gains, pid_step
-from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrices, spectral_radius
+from terrain.control.stability import DELAY_S, SLOPES, check_stable, loop_matrices
 from terrain.errors import ConfigError
 from terrain.robots import load_robot
 from terrain.simulation.plants.dynamic import DEFLECTION_DAMPING_S
@@ -15,6 +15,10 @@ DT_S = 0.02
 RADIUS_M = ROBOT.wheel_radius_m
 LOAD_N = ROBOT.mass_kg / 3 * GRAVITY_MPS2
 MOST_RADPS = 1e300
+
+
+def spectral_radius(matrix):
+    return np.abs(np.linalg.eigvals(matrix)).max()
 
 
 def critical_gain(delay_s, *where):
