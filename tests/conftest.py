@@ -60,7 +60,7 @@ def _simulate_plant():
 
 def _explain_planar():
     from terrain.discrepancy.diagnose import diagnose
-    from terrain.discrepancy.simulation import Simulation
+    from terrain.discrepancy.runs import Simulation
     from terrain.effects import effect_named
     from terrain.robots import load_robot
     from terrain.simulation.run import simulate_run

@@ -134,11 +134,16 @@ def explain(
     from pipelines.explain.statements import notes_of, statements_of
     from pipelines.report.results import silent
     from terrain.discrepancy.compared import terrains_apart
-    from terrain.discrepancy.diagnosed_runs import diagnose_runs, extended_effects, held_out_gain
+    from terrain.discrepancy.diagnosed_runs import (
+        check_robots,
+        diagnose_runs,
+        extended_effects,
+        held_out_gain,
+        runs_of_terrain,
+    )
     from terrain.discrepancy.next_drive import next_command
     from terrain.discrepancy.powertrain import powertrain_of
     from terrain.discrepancy.robot_terms import in_robot_terms
-    from terrain.discrepancy.terrain_match import check_robots, runs_of_terrain
     from terrain.effects import chosen_effects, showing
     from terrain.extension import region_of
     from terrain.logs.run_folders import data_digest

@@ -25,8 +25,8 @@ from pipelines.report.versions import versions
 from terrain.discrepancy.compared import CHANNEL_WORDS, ComparedRun, example_stretch, telling_runs
 from terrain.discrepancy.diagnosed_runs import DiagnosedRuns, HeldOutGain
 from terrain.discrepancy.powertrain import Powertrain
-from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.robot_terms import limit_text, quantity, quantity_interval, values_with_intervals
+from terrain.discrepancy.runs import measured_channels
 from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import PARAMETER, effect_named
 from terrain.robots import Robot

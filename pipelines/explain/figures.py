@@ -21,8 +21,8 @@ from terrain.discrepancy.compared import (
 )
 from terrain.discrepancy.constancy import PartValues
 from terrain.discrepancy.noise import Noise
-from terrain.discrepancy.residuals import measured_channels
 from terrain.discrepancy.robot_terms import quantity
+from terrain.discrepancy.runs import measured_channels
 from terrain.effects import CHANNELS
 from terrain.records import Array
 

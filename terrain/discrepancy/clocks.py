@@ -15,9 +15,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from terrain.discrepancy.evidence import Evidence
-from terrain.discrepancy.residuals import low_pass_of, prepare_inputs
-from terrain.discrepancy.signals import Signals
-from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.runs import Signals, Simulation, low_pass_of, prepare_inputs
 from terrain.effects import CHANNELS, GYRO, HEADING, SPEED_X
 from terrain.errors import DataError
 from terrain.records import Array

@@ -12,9 +12,7 @@ from scipy.signal import welch
 from scipy.stats import t as student
 
 from terrain.discrepancy.noise import Noise
-from terrain.discrepancy.residuals import INPUTS, LowPass, rows_of
-from terrain.discrepancy.signals import Signals
-from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.runs import INPUTS, LowPass, Signals, Simulation, rows_of
 from terrain.discrepancy.verdict import Diagnosis
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.records import Array
@@ -39,7 +37,7 @@ class ComparedRun(NamedTuple):
     measured: Array  #: (m, channels)
     before: Array
     after: Array | None  #: (m, channels) with the causes built in; None where none was named
-    #: (m,) of the simulation, by the names of :data:`terrain.discrepancy.residuals.INPUTS`, and ``time_s``
+    #: (m,) of the simulation, by the names of :data:`terrain.discrepancy.runs.INPUTS`, and ``time_s``
     inputs: Mapping[str, Array]
 
     def part(self, start_s: float, end_s: float) -> ComparedRun:

@@ -18,9 +18,9 @@ from scipy.stats import t as student
 
 from terrain.discrepancy.evidence import N_BLOCKS, Evidence
 from terrain.discrepancy.robot_terms import value_in_robot_terms
+from terrain.discrepancy.runs import Signals
 from terrain.discrepancy.search import CauseFit
 from terrain.discrepancy.selection import clustered_variance
-from terrain.discrepancy.signals import Signals
 from terrain.discrepancy.verdict import AGREE_P, INTERVAL_T, BySession, Cause, SessionValue, Value
 from terrain.effects import Effect
 from terrain.records import Array

@@ -22,12 +22,10 @@ from terrain.discrepancy.evidence import Evidence, fit_change, move_point, parti
 from terrain.discrepancy.health import Excluded, Fault, clocks_of, faults_of, repaired, unfit_runs
 from terrain.discrepancy.next_drive import MOST, next_drive
 from terrain.discrepancy.probes import TILT_INPUTS, ProbeResult, probe_residuals
-from terrain.discrepancy.residuals import low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.robot_terms import UNITS
+from terrain.discrepancy.runs import Signals, Simulation, low_pass_of, measured_channels, rows_of, signals_of
 from terrain.discrepancy.search import CauseFit, Problem, names_of, pooled, refit, rivals_of, search
 from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT, fits_without_each, gain_interval
-from terrain.discrepancy.signals import Signals, signals_of
-from terrain.discrepancy.simulation import Simulation
 from terrain.discrepancy.varying import VARIES_RATIO, run_scatter, varying_effects, with_conditions
 from terrain.discrepancy.verdict import (
     INTERVAL_T,

@@ -21,9 +21,7 @@ from typing import NamedTuple
 import numpy as np
 
 from terrain.discrepancy.noise import ORDER, ORDERS, WHITE, Noise, noise_of, whiten
-from terrain.discrepancy.residuals import LowPass, Rows, rows_of
-from terrain.discrepancy.signals import Signals
-from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.runs import LowPass, Rows, Signals, Simulation, rows_of
 from terrain.effects import BOUNDS, CHANNELS, INDEX
 from terrain.records import Array
 

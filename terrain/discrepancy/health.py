@@ -35,9 +35,7 @@ from terrain.discrepancy.clocks import (
     shifts_of,
 )
 from terrain.discrepancy.evidence import Evidence
-from terrain.discrepancy.residuals import INPUTS, LowPass, Rows, rows_of
-from terrain.discrepancy.signals import Signals
-from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.runs import INPUTS, LowPass, Rows, Signals, Simulation, rows_of
 from terrain.effects import CHANNELS, GYRO, HEADING, INDEX, SPEED_X
 from terrain.records import Array
 from terrain.robots import Robot

@@ -15,11 +15,9 @@ from terrain.discrepancy.compared import ComparedRun
 from terrain.discrepancy.diagnose import MIN_RUNS
 from terrain.discrepancy.evidence import N_BLOCKS, Evidence, evidence_at
 from terrain.discrepancy.health import Excluded, Fault, unfit_runs
-from terrain.discrepancy.residuals import LowPass, low_pass_of, measured_channels, rows_of
+from terrain.discrepancy.runs import LowPass, Signals, Simulation, low_pass_of, measured_channels, rows_of
 from terrain.discrepancy.search import names_of
 from terrain.discrepancy.selection import MIN_CLUSTERS
-from terrain.discrepancy.signals import Signals
-from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS
 from terrain.errors import DataError, TerrainError
 from terrain.estimation.estimate import Estimate, estimate_run, summarize

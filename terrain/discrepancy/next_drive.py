@@ -26,12 +26,17 @@ from terrain.discrepancy.evidence import (
     partial_information,
 )
 from terrain.discrepancy.noise import ORDER, Noise
-from terrain.discrepancy.residuals import low_pass_of, measured_channels
 from terrain.discrepancy.robot_terms import listed
+from terrain.discrepancy.runs import (
+    PARALLEL,
+    Signals,
+    Simulation,
+    TerrainMatch,
+    drivable,
+    low_pass_of,
+    measured_channels,
+)
 from terrain.discrepancy.selection import EXCITED_RATIO, Z_EFFECT
-from terrain.discrepancy.signals import PARALLEL, Signals
-from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.terrain_match import TerrainMatch, drivable
 from terrain.discrepancy.verdict import Limit, NextDrive
 from terrain.effects import (
     ACCEL,

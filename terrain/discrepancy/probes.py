@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from terrain.discrepancy.evidence import Evidence
 from terrain.discrepancy.noise import whiten
-from terrain.discrepancy.residuals import INPUTS, Rows
+from terrain.discrepancy.runs import INPUTS, Rows
 from terrain.discrepancy.selection import pooled_variance, z_of, z_of_t
 from terrain.effects import CHANNELS
 from terrain.records import Array

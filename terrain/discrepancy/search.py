@@ -20,10 +20,8 @@ from terrain.discrepancy.evidence import (
     partial_information,
     whiten_run,
 )
-from terrain.discrepancy.residuals import LowPass, rows_of
+from terrain.discrepancy.runs import LowPass, Signals, Simulation, rows_of
 from terrain.discrepancy.selection import WaldTest, wald_test
-from terrain.discrepancy.signals import Signals
-from terrain.discrepancy.simulation import Simulation
 from terrain.effects import BOUNDS, INDEX, Effect
 from terrain.records import Array
 

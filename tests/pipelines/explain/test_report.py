@@ -11,7 +11,7 @@ from pipelines.report.terminal import terminal_text
 from terrain.discrepancy import verdict
 from terrain.discrepancy.diagnosed_runs import HeldOutGain
 from terrain.discrepancy.held_out import Change, ChannelGain, ChannelReference, Comparison, Gain, Reference
-from terrain.discrepancy.residuals import measured_channels
+from terrain.discrepancy.runs import measured_channels
 from terrain.discrepancy.verdict import Clock, Excluded
 from terrain.robots import load_robot
 

@@ -17,7 +17,7 @@ from terrain.discrepancy.compared import (
 )
 from terrain.discrepancy.held_out import ChannelGain, Gain
 from terrain.discrepancy.robot_terms import in_robot_terms
-from terrain.discrepancy.terrain_match import TerrainMatch
+from terrain.discrepancy.runs import TerrainMatch
 from terrain.discrepancy.verdict import (
     Cause,
     Covariance,

@@ -54,9 +54,9 @@ from studies.blind_trials.hidden import (
 )
 from studies.blind_trials.limits import Limits, Sensing, confusable_class, limits_of
 from terrain.discrepancy.diagnose import diagnose
+from terrain.discrepancy.diagnosed_runs import simulation_for
 from terrain.discrepancy.held_out import split_runs
-from terrain.discrepancy.simulation import Simulation
-from terrain.discrepancy.terrain_match import simulation_for
+from terrain.discrepancy.runs import Simulation
 from terrain.discrepancy.verdict import Diagnosis, Verdict
 from terrain.effects import (
     ACCEL,

@@ -4,9 +4,8 @@ from studies.blind_trials.drives import rich_drives
 from studies.blind_trials.hidden import hidden_runs
 from studies.blind_trials.trial import simulation_of
 
-from terrain.discrepancy.residuals import low_pass_of
+from terrain.discrepancy.runs import low_pass_of, signals_of
 from terrain.discrepancy.search import Problem, search
-from terrain.discrepancy.signals import signals_of
 from terrain.effects import effect_named
 from terrain.robots import load_robot
 

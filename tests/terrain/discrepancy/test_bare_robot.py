@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.diagnosed_runs import diagnose_runs
-from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.runs import signals_of
 from terrain.effects import CHANNELS, effect_named, vector_of
 from terrain.estimation.estimate import enriched, estimate_run
 from terrain.robots import load_robot

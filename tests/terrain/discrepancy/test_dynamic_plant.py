@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.terrain_match import simulation_for
+from terrain.discrepancy.diagnosed_runs import simulation_for
 from terrain.discrepancy.verdict import Verdict
 from terrain.effects import library_of
 from terrain.records import Label

@@ -18,8 +18,8 @@ from terrain.discrepancy.evidence import (
     partial_information,
     scatter_of,
 )
+from terrain.discrepancy.runs import Simulation
 from terrain.discrepancy.search import misfit_of
-from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, SPEED_X, vector_of
 from terrain.robots import load_robot
 from terrain.simulation.plants.planar import load_scatter

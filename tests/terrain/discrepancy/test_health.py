@@ -30,8 +30,7 @@ from terrain.discrepancy.health import (
     reading_of,
     repaired,
 )
-from terrain.discrepancy.residuals import low_pass_of, rows_of
-from terrain.discrepancy.signals import Signals, signals_of
+from terrain.discrepancy.runs import Signals, low_pass_of, rows_of, signals_of
 from terrain.effects import CHANNELS
 from terrain.logs.drive import DriveRobot, find_runs
 from terrain.logs.imu_axes import GYRO_TURNED

@@ -19,9 +19,7 @@ from terrain.discrepancy.held_out import (
     repair_held_out,
     split_runs,
 )
-from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.runs import Simulation, low_pass_of, signals_of
 from terrain.discrepancy.verdict import INTERVAL_T, Cause, Value, Verdict
 from terrain.effects import CHANNELS, GYRO
 from terrain.errors import ConfigError, DataError

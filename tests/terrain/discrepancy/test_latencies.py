@@ -10,8 +10,7 @@ from studies.blind_trials.hidden import hidden_runs
 
 from pipelines.data.datasets import load_runs
 from terrain.discrepancy.clocks import latencies_of
-from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.runs import Simulation, signals_of
 from terrain.effects import GYRO, HEADING, SPEED_X
 from terrain.records import RunLog, Stream
 from terrain.robots import load_robot

@@ -9,8 +9,7 @@ from studies.blind_trials.trial import simulation_of
 
 from terrain.discrepancy.evidence import evidence_at
 from terrain.discrepancy.next_drive import next_command, next_drive
-from terrain.discrepancy.residuals import low_pass_of
-from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.runs import low_pass_of, signals_of
 from terrain.discrepancy.verdict import Limit, NextDrive
 from terrain.robots import load_robot
 from terrain.simulation.plants.planar import Ground, load_noise

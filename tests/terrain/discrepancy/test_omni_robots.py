@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from terrain.discrepancy.diagnose import diagnose
-from terrain.discrepancy.signals import signals_of
-from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy.runs import Simulation, signals_of
 from terrain.effects import CHANNELS, CURRENT, HEADING, SPEED_X, SPEED_Y, showing
 from terrain.errors import DataError
 from terrain.kinematics.logged_wheels import with_wheel_speeds

@@ -9,16 +9,17 @@ from numpy.testing import assert_allclose, assert_array_equal
 from terrain.discrepancy.compared import binned_means, noise_spectrum, run_means, spectrum
 from terrain.discrepancy.evidence import evidence_at, fit_change
 from terrain.discrepancy.noise import noise_of
-from terrain.discrepancy.residuals import (
+from terrain.discrepancy.runs import (
     SETTLE_S,
+    Signals,
+    Simulation,
     decimate,
     low_pass_of,
     measured_channels,
     prepare_inputs,
     rows_of,
+    signals_of,
 )
-from terrain.discrepancy.signals import Signals, signals_of
-from terrain.discrepancy.simulation import Simulation
 from terrain.effects import CHANNELS, INDEX, ONE_SIDED, SPEED_X, STEPS, vector_of
 from terrain.errors import DataError
 from terrain.robots import load_robot

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from terrain.discrepancy.signals import PARALLEL, signals_of
+from terrain.discrepancy.runs import PARALLEL, signals_of
 from terrain.effects import ACCEL, CHANNELS, CURRENT, GYRO, HEADING, SPEED_X, SPEED_Y, TURNING_CURRENT
 from terrain.errors import DataError
 from terrain.records import Label, Stream

@@ -8,7 +8,7 @@ from studies.blind_trials.limits import limits_of
 from terrain.discrepancy.health import candidate_changes
 from terrain.discrepancy.powertrain import traces_of
 from terrain.discrepancy.robot_terms import in_robot_terms, value_in_robot_terms
-from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.runs import signals_of
 from terrain.discrepancy.verdict import Value
 from terrain.effects import effect_named
 from terrain.errors import DataError

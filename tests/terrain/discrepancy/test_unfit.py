@@ -17,8 +17,7 @@ from terrain.discrepancy.health import (
     stalled_runs,
     unfit_runs,
 )
-from terrain.discrepancy.residuals import low_pass_of, rows_of
-from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.runs import low_pass_of, rows_of, signals_of
 from terrain.errors import DataError
 from terrain.records import Stream
 from terrain.robots import load_robot

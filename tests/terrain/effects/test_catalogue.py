@@ -162,8 +162,8 @@ from dataclasses import replace
 import numpy as np
 import terrain.effects as effects
 from terrain.discrepancy.robot_terms import in_robot_terms, limit_text, quantity
-from terrain.discrepancy import residuals, evidence
-from terrain.discrepancy.simulation import Simulation
+from terrain.discrepancy import evidence, runs
+from terrain.discrepancy.runs import Simulation
 from terrain.discrepancy.verdict import Limit, Value
 from terrain.extension import Correction, corrected
 from terrain.robots import load_robot
@@ -171,7 +171,7 @@ from terrain.simulation.plants.dynamic import _built
 
 robot, name = load_robot("agrimaro"), "gear_wear_ratio"
 for table in (effects.BOUNDS, effects.STEPS, effects.NUISANCES, effects.SENSED_ONLY, effects.ONE_SIDED,
-              effects.INDEX, residuals.STEPS, residuals.SENSED_ONLY, residuals.ONE_SIDED,
+              effects.INDEX, runs.STEPS, runs.SENSED_ONLY, runs.ONE_SIDED,
               evidence.PRIOR_STD, effects.nuisances_of("swerve")):
     assert name in table
 assert name not in effects.nuisances_of("skid_steer")

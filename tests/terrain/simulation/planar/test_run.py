@@ -9,7 +9,7 @@ from scipy.signal import welch
 from studies.blind_trials.limits import noise_psd
 
 from terrain.constants import GRAVITY_MPS2
-from terrain.discrepancy.signals import signals_of
+from terrain.discrepancy.runs import signals_of
 from terrain.effects import (
     ACCEL,
     CHANNELS,

@@ -1,0 +1,575 @@
+"""Runs beside the simulation under test: signals on one clock, low-pass filtered, with predictions and sensitivities.
+
+From streams to signals (:func:`signals_of`), the inputs of the simulation and what it is compared with; from these to
+rows (:func:`rows_of`): measured, predicted and the sensitivity to each parameter.  All pass the **same** low-pass: the
+prediction contains the noise of a differentiated encoder, which otherwise looks like latency or mass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from terrain.angles import unwrapped
+from terrain.constants import GRAVITY_MPS2
+from terrain.effects import (
+    ACCEL,
+    CHANNELS,
+    CURRENT,
+    GYRO,
+    HEADING,
+    INDEX,
+    ONE_SIDED,
+    SENSED_ONLY,
+    SPEED_X,
+    SPEED_Y,
+    STEPS,
+    TURNING_CURRENT,
+    Effect,
+    library_of,
+    vector_of,
+)
+from terrain.errors import ConfigError, DataError
+from terrain.kernels import njit
+from terrain.kinematics.camera import CHANNELS as CAMERA_CHANNELS
+from terrain.kinematics.camera import body_motion
+from terrain.logs.schema import POSE_CHANNELS
+from terrain.records import Array, RunLog, read_only
+from terrain.robots import BicycleRobot, Robot
+from terrain.simulation.plants.planar import (
+    Ground,
+    Planar,
+    corrected_inputs,
+    make_planar,
+    move,
+    planar_ground,
+    replay,
+    sense,
+)
+from terrain.slip_learning.measured import travelled
+from terrain.terramechanics.soil import load_soil
+
+# -- The simulation under test: a robot, its terrain, the effects built in, and scatter from run to run --------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """What :func:`terrain.discrepancy.diagnose.diagnose` compares measured runs with."""
+
+    robot: Robot
+    ground: Ground = field(default_factory=Ground)  #: default terrain
+    #: that are built in already; those not named are 0
+    effects: Mapping[str, float] = field(default_factory=dict)
+    #: standard deviation from run to run of parameters in NUISANCES; those not named are 0
+    scatter: Mapping[str, float] = field(default_factory=dict)
+    grounds: Mapping[str, Ground] = field(default_factory=dict)  #: terrains by the label of a run
+    #: how large the simulation's own error is in units of parameters, the same in all runs; what is no larger is not
+    #: stated
+    model_error: Mapping[str, float] = field(default_factory=dict)
+    #: mean over runs and scatter of them that conditions may make which differ from run to run, in units of parameters:
+    #: see :mod:`terrain.discrepancy.varying`
+    varied_error: Mapping[str, float] = field(default_factory=dict)
+    varied_scatter: Mapping[str, float] = field(default_factory=dict)
+    #: how much the residual of a channel depends on an input by the simulation's own error
+    probe_error: Mapping[tuple[str, str], float] = field(default_factory=dict)
+
+    @property
+    def library(self) -> tuple[Effect, ...]:
+        """Effects that apply to this robot."""
+        return library_of(self.robot.drive)
+
+    @property
+    def planar(self) -> Planar:
+        """Numbers for the kernels, on the default terrain."""
+        return make_planar(self.robot, self.ground)
+
+    def planar_on(self, terrain: str) -> Planar:
+        """Return the numbers for the kernels on the terrain of a label."""
+        return make_planar(self.robot, self.grounds.get(terrain, self.ground))
+
+    def tilt_is_slope(self, terrain: str) -> bool:
+        """Return whether all of the measured tilt on the terrain of a label counts as a slope."""
+        return self.grounds.get(terrain, self.ground).effective_ratio >= 1.0
+
+    @property
+    def known_scatter(self) -> dict[str, float]:
+        """Scatter from run to run that is no news: what is assumed, or what conditions may make."""
+        both = {*self.scatter, *self.varied_scatter}
+        return {n: max(self.scatter.get(n, 0.0), self.varied_scatter.get(n, 0.0)) for n in both}
+
+    @property
+    def vector(self) -> Array:
+        """Parameters (len(PARAMETERS),) of the effects built in."""
+        return vector_of(self.effects)
+
+    def with_effects(self, values: Mapping[str, float]) -> Simulation:
+        """Return the same with effects added to those that are built in already."""
+        added = {name: self.effects.get(name, 0.0) + value for name, value in values.items()}
+        return replace(self, effects={**self.effects, **added})
+
+
+class TerrainMatch(NamedTuple):
+    """The terrain on which runs of a label are simulated."""
+
+    terrain: str  #: label of the runs; empty for runs without a label or with several
+    soil: str | None  #: its soil of the package; None for the default terrain
+    effective_ratio: float | None
+    """Part of the tilt that acts as a slope, 0 to 1; None on the default terrain."""
+
+    @property
+    def text(self) -> str:
+        """On which terrain the runs were simulated, in words."""
+        if self.soil:
+            return f"soil {self.soil}"
+        runs = f"label {self.terrain}" if self.terrain else "runs without a label (or with several)"
+        return f"{runs}: default terrain"
+
+
+def drivable(robot: Robot, soil: str) -> bool:
+    """Return whether a robot does not get stuck on a soil of the package."""
+    try:
+        planar_ground(robot, load_soil(soil))
+    except ConfigError:
+        return False
+    return True
+
+
+# -- From streams to signals on one clock ---------------------------------------------------------------------
+
+MAX_RATE_HZ = 50.0  #: Clock of the replay, unless the wheels are logged slower.
+MAX_GAP_PERIODS = 3.5  #: Longest hole of a stream that is bridged by a straight line, in its own periods.
+MIN_LENGTH_S = 4.0  #: Of a shorter run nothing is left once filters have settled.
+#: A camera speed is a jump of its map if it differs from the median over the first before and after by the second,
+#: and by so many times the usual deviation.
+JUMP_S, JUMP_MPS, JUMP_SIGMAS = 0.05, 0.1, 8.0
+
+#: A wheel turns backward if it is faster than that on at least so many samples.
+BACKWARD_MPS, MIN_BACKWARD = 0.02, 5
+#: Least norm of the mean of the wheels' unit vectors at which the sum of currents measures traction: wheels within 18
+#: degrees of each other.
+PARALLEL = 0.95
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Signals:
+    """A run on one clock."""
+
+    run_id: str  #: of the run; the terrain is empty where it has no label or several
+    terrain: str
+    dt_s: float  #: period of the clock
+    start_s: float  #: first instant on the run's own clock
+    #: (n, wheels) wheel speeds with the nominal radius, of a car-like robot (n, 1) that of the rear axle; NaN where a
+    #: logger was silent
+    wheel_speed_mps: Array
+    #: (n, steered wheels) steering angles, zeros taken off; (n, wheels) zeros of a robot without
+    steer_rad: Array
+    grade_rad: Array  #: (n,) measured tilt, uphill and left side up positive; 0 where none is measured
+    roll_rad: Array
+    #: (n, len(CHANNELS)) what the simulation is compared with; NaN where nothing was measured
+    measured: Array
+    session: str = ""  #: that the run is part of; empty where that is not known
+
+    def __post_init__(self) -> None:
+        for name in ("wheel_speed_mps", "steer_rad", "grade_rad", "roll_rad", "measured"):
+            object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def __len__(self) -> int:
+        return len(self.measured)
+
+    @property
+    def time_s(self) -> Array:
+        """Time (n,) on the run's own clock."""
+        return self.start_s + self.dt_s * np.arange(len(self))
+
+
+def signals_of(run: RunLog, robot: Robot) -> Signals:
+    """Return the signals of a run, resampled to one clock.
+
+    Currents of omni wheels, which drive in three directions, are magnitudes.  Others get the sign of the wheel speed
+    where the motor driver logs magnitudes only: if a wheel turns backward and its current is never negative.  Braking
+    cannot be seen in such a log.
+
+    Raises
+    ------
+    DataError
+        if the run is of another robot or lacks inputs of the simulation, if none of its channels is
+        simulated, or if it is too short.
+    """
+    name = f"run {run.run_id}"
+    if run.robot != robot.name:
+        raise DataError(f"{name} is of the robot {run.robot!r}, the simulation is of {robot.name!r}")
+    inputs = ("wheels", "steering") if robot.steered else ("wheels",)
+    for stream in inputs:
+        if stream not in run.streams:
+            raise DataError(f"{name}: it has no stream {stream!r}, which drives the simulation")
+    wheels, imu = run.streams["wheels"], run.streams.get("imu")
+    # a robot whose motors are not described logs speeds
+    for pattern in ("motor_{}_radps", "speed_{}_mps"):
+        names = [pattern.format(wheel) for wheel in robot.logged_wheels]
+        if set(names) <= set(wheels.channels):
+            break
+    else:
+        raise DataError(
+            f"{name}: its wheels have the channels {', '.join(wheels.channels)}; a speed of each of "
+            f"{', '.join(robot.logged_wheels)} is required"
+        )
+    is_motor = names[0].startswith("motor")
+    scale = robot.wheel_radius_m / robot.motors.reduction_ratio if is_motor else 1.0
+    speeds = np.column_stack([wheels.channel(channel) for channel in names]) * scale
+    # poses of an omni robot's body (of a camera above, motion capture) count where nothing else measures its speed
+    pose, lidar = run.streams.get("pose"), run.streams.get("lidar")
+    others = "odometry" in run.streams or (lidar is not None and "speed_x_mps" in lidar.channels)
+    by_pose = (
+        robot.on_omni_wheels and pose is not None and set(POSE_CHANNELS) <= set(pose.channels) and not others
+    )
+
+    used = [*inputs, *(each for each in ("imu", "odometry", "lidar") if each in run.streams)]
+    spans_s = np.array([run.streams[each].time_s[[0, -1]] for each in [*used, "pose"][: len(used) + by_pose]])
+    start_s, end_s = float(spans_s[:, 0].max()), float(spans_s[:, 1].min())
+    rate_hz = min(MAX_RATE_HZ, wheels.rate_hz)
+    n = math.floor((end_s - start_s) * rate_hz + 1e-6) + 1 if end_s > start_s else 0
+    if n < MIN_LENGTH_S * rate_hz:
+        raise DataError(
+            f"{name}: its streams have {max(end_s - start_s, 0.0):.1f} s in common, "
+            f"at least {MIN_LENGTH_S:g} s are required"
+        )
+    time_s = start_s + np.arange(n) / rate_hz
+
+    def resampled(stamps_s: Array, columns: Array) -> Array:
+        return np.column_stack([_resample(time_s, stamps_s, column) for column in columns.T])
+
+    steer = np.zeros((n, len(robot.steer_channels) or len(robot.wheels)))
+    if robot.steered:
+        steering, angles = run.streams["steering"], []
+        for channel, zero in zip(robot.steer_channels, robot.steering_zeros_rad, strict=False):
+            raw = unwrapped(steering.channel(channel))
+            turn = 2 * math.pi * np.round((raw[np.isfinite(raw)][:1].sum() - zero) / (2 * math.pi))
+            angles.append(raw - zero - turn)
+        steer = resampled(steering.time_s, np.column_stack(angles))
+    tilt, has_tilt = np.zeros((n, 2)), imu is not None and {"roll_rad", "pitch_rad"} <= set(imu.channels)
+    if imu is not None and has_tilt:
+        tilt = resampled(imu.time_s, np.column_stack([-imu.channel("pitch_rad"), imu.channel("roll_rad")]))
+    measured = np.full((n, len(CHANNELS)), np.nan)
+    for channel, stamps_s, values in _measurements(run, robot, has_tilt, by_pose):
+        measured[:, CHANNELS.index(channel)] = _resample(time_s, stamps_s, values)
+    names = [f"current_{wheel}_a" for wheel in robot.wheels]
+    if set(names) <= set(wheels.channels):
+        currents = np.column_stack([wheels.channel(channel) for channel in names])
+        if robot.on_omni_wheels:
+            currents = np.abs(currents)
+        else:
+            for current, speed in zip(currents.T, speeds.T, strict=False):
+                if (speed < -BACKWARD_MPS).sum() >= MIN_BACKWARD and not np.nanmin(current) < 0:
+                    current *= np.sign(speed)
+        each = resampled(wheels.time_s, currents)
+        measured[:, CHANNELS.index(CURRENT)] = np.sum(list(each.T), axis=0)
+        parallel = np.abs(np.exp(1j * steer).mean(axis=1)) > PARALLEL
+        measured[~parallel, CHANNELS.index(CURRENT)] = np.nan
+        if robot.skids:
+            measured[:, CHANNELS.index(TURNING_CURRENT)] = each[:, 1] - each[:, 0]
+    if not np.isfinite(measured).any():
+        raise DataError(
+            f"{name}: none of its channels is simulated; a gyro, currents of all wheels, a speed "
+            "over ground or an accelerometer with its tilt is required"
+        )
+    terrain = run.terrains[0] if len(run.terrains) == 1 else ""
+    on_clock = resampled(wheels.time_s, speeds), steer, tilt[:, 0], tilt[:, 1], measured
+    return Signals(run.run_id, terrain, 1 / rate_hz, float(time_s[0]), *on_clock, run.session)
+
+
+def _measurements(
+    run: RunLog, robot: Robot, has_tilt: bool, by_pose: bool
+) -> Iterator[tuple[str, Array, Array]]:
+    """Yield what sensors measured: channel, stamps and values; of one channel the last counts.
+
+    Speeds over ground and the heading rate are from a camera's poses, its speeds, or a lidar, or from poses of the
+    body, none where these pause or jump.
+    """
+    direct = [("imu", "gyro_z_radps", GYRO)] + [("imu", "accel_x_mps2", ACCEL)] * has_tilt
+    if by_pose:
+        seen = travelled(run, robot)
+        step_s, inside = np.diff(seen.time_s), np.diff(seen.part) == 0
+        rates = np.where(inside[:, None], np.diff(seen.values, axis=0), np.nan) / step_s[:, None]
+        for channel, rate in zip((SPEED_X, SPEED_Y, HEADING), rates.T, strict=True):
+            yield channel, seen.time_s[:-1] + 0.5 * step_s, rate
+    camera = run.streams.get("odometry")
+    if camera is not None and set(CAMERA_CHANNELS) <= set(camera.channels):
+        speed = body_motion(camera, robot.camera).speed_mps
+        width = 2 * round(JUMP_S * camera.rate_hz) + 1
+        off = np.abs(speed - median_filter(speed, (width, 1), mode="nearest"))
+        usual = 1.48 * np.nanmedian(off, axis=0) if len(off) else np.zeros(2)
+        relocalised = (off > np.maximum(JUMP_MPS, JUMP_SIGMAS * usual)).any(axis=1)
+        speed = np.where(relocalised[:, None], np.nan, speed)
+        yield SPEED_X, camera.time_s, speed[:, 0]
+        yield SPEED_Y, camera.time_s, speed[:, 1]
+    else:
+        direct += [("odometry", "speed_x_mps", SPEED_X), ("odometry", "speed_y_mps", SPEED_Y)]
+    direct += [("lidar", "speed_x_mps", SPEED_X), ("lidar", "speed_y_mps", SPEED_Y)]
+    for stream, name, channel in [*direct, ("lidar", "yaw_rate_radps", HEADING)]:
+        if stream in run.streams and name in run.streams[stream].channels:
+            yield channel, run.streams[stream].time_s, run.streams[stream].channel(name)
+
+
+def _resample(time_s: Array, stamps_s: Array, values: Array) -> Array:
+    """Return a signal on the clock by straight lines between its samples; NaN in its holes."""
+    known = np.isfinite(values)
+    if known.sum() < 2:
+        return np.full(time_s.size, np.nan)
+    stamps, samples = stamps_s[known], values[known]
+    period_s = float(np.median(np.diff(stamps_s)))
+    at = np.interp(time_s, stamps, samples)
+    after = np.searchsorted(stamps, time_s, side="left").clip(1, stamps.size - 1)
+    hole = (stamps[after] - stamps[after - 1]) > MAX_GAP_PERIODS * period_s
+    inside = (time_s > stamps[after - 1]) & (time_s < stamps[after])
+    outside = (time_s < stamps[0] - period_s) | (time_s > stamps[-1] + period_s)
+    at[(hole & inside) | outside] = np.nan
+    return at
+
+
+# -- From signals to rows: behind one low-pass, with sensitivities ---------------------------------------------
+
+#: Cut-off of the common low-pass at the full clock; commands of a wheeled robot change within 2 Hz.
+CUTOFF_HZ = 2.5
+INPUT_CUTOFFS = 2.4  #: Cut-off of the inputs of the simulation, over that of the common low-pass.
+#: Cut-off of the wheel speeds that serve as instruments of the sensitivities, over that of the common low-pass: see
+#: :func:`rows_of`.
+INSTRUMENT_CUTOFF_RATIO = 0.6
+
+SAME_CLOCK = 0.05  #: Ratio by which the runs' clocks may differ: one window serves all of them.
+CLOCKS_PER_CUTOFF = 10.0  #: Rate of the replay's clock over the cut-off of the common low-pass.
+#: Rows a second over the cut-off: the low-pass is down by 50 dB at half the rate of the rows.
+ROWS_PER_CUTOFF = 2.5
+TAPS_PER_CUTOFF = 2.4  #: Half length of the low-pass times its cut-off.
+MIN_KNOWN = 0.75  #: Ratio of the low-pass's weight that has to be known for a row, where a channel has holes.
+#: Start and end of a run left out, beside those of the low-pass: the replay starts in steady motion.
+SETTLE_S = 0.5
+#: A shorter run may have its one change of command at its start, which is kept if it is in steady motion.
+SHORT_S = 10.0
+#: Steady motion: for so long no wheel's speed and no steering changes by more than that.
+STEADY_S, STEADY_MPS, STEADY_RAD = 0.25, 0.05, 0.02
+
+
+class LowPass(NamedTuple):
+    """A symmetric window, and the rate of its output."""
+
+    taps: Array  #: on the clock of the replay
+    every: int  #: samples of that clock a row
+    rate_hz: float  #: of the rows, and of the window
+    cutoff_hz: float
+    #: samples of the signals' clock a sample of the replay's; 0 where that clock is too slow for a window of its own
+    #: in between
+    inputs_every: int
+    #: cut-off of the wheel speeds that serve as instruments of the sensitivities, see :func:`rows_of`; infinite for
+    #: those of the prediction
+    instrument_cutoff_hz: float
+
+
+class Rows(NamedTuple):
+    """A low-pass filtered run, row by row."""
+
+    run_id: str  #: of the run
+    terrain: str
+    time_s: Array  #: (m,) from the start of the run
+    measured: Array  #: (m, channels)
+    predicted: Array
+    sensitivity: Array  #: (parameters, m, channels) change of the prediction per change of each parameter
+    inputs: Array  #: (m, len(INPUTS) - 1 + wheels) inputs of the simulation, for probes of the residual
+
+    @property
+    def residual(self) -> Array:
+        """Measured minus predicted (m, channels)."""
+        return self.measured - self.predicted
+
+    @property
+    def period_s(self) -> float:
+        """From row to row; 0 where there is none."""
+        return float(np.median(np.diff(self.time_s))) if self.time_s.size > 1 else 0.0
+
+    @property
+    def pace_mps(self) -> Array:
+        """Speed (m,) of the wheels, straight ahead or against each other; of omni wheels in any direction."""
+        speed = np.hypot(self.inputs[:, 0], self.inputs[:, INPUTS.index("sideways_mps")])
+        return np.maximum(speed, 0.5 * np.abs(self.inputs[:, 1]))
+
+
+#: Mean wheel speed, right minus left (last minus first) wheel speed, mean steering, tilt, traction over weight, 0,
+#: and how far the wheels have turned: a column for each of them.  Of an omni robot speed, turn and sideways are those
+#: that its wheels would roll ahead, in place (twice the speed of a wheel) and to the left; of a car-like robot turn
+#: is the difference of its rear wheels.
+INPUTS: tuple[str, ...] = (
+    *("speed_mps", "turn_mps", "steer_rad", "grade_rad", "roll_rad"),
+    *("force_ratio", "sideways_mps", "wheel_phase_rad"),
+)
+
+
+def low_pass_of(signals: Sequence[Signals]) -> LowPass:
+    """Return the low-pass of runs on one clock, which the slowest logger sets.
+
+    Raises
+    ------
+    DataError
+        if the runs' clocks differ by more than a twentieth.
+    """
+    slow, fast = max(signals, key=attrgetter("dt_s")), min(signals, key=attrgetter("dt_s"))
+    rate_hz = 1 / slow.dt_s
+    if 1 / fast.dt_s > (1 + SAME_CLOCK) * rate_hz:
+        raise DataError(
+            f"runs: {slow.run_id} is on a clock of {rate_hz:.3g} Hz, {fast.run_id} on one of "
+            f"{1 / fast.dt_s:.3g} Hz; clocks within {SAME_CLOCK:.0%} of each other are required"
+        )
+    cutoff_hz = min(CUTOFF_HZ, rate_hz / 5.0)
+    near = 1 + SAME_CLOCK  # a logger of 49.9 Hz is one of 50
+    inputs_every = int(near * rate_hz / (CLOCKS_PER_CUTOFF * cutoff_hz))
+    clock_hz = rate_hz / max(inputs_every, 1)
+    every = max(int(near * clock_hz / (ROWS_PER_CUTOFF * cutoff_hz)), 1)
+    of_rows = every, clock_hz / every, cutoff_hz
+    return LowPass(_window(cutoff_hz, clock_hz), *of_rows, inputs_every, INSTRUMENT_CUTOFF_RATIO * cutoff_hz)
+
+
+def _window(cutoff_hz: float, rate_hz: float) -> Array:
+    half = math.ceil(TAPS_PER_CUTOFF / cutoff_hz / 2 * rate_hz)
+    k = np.arange(-half, half + 1)
+    taps = np.sinc(2 * cutoff_hz / rate_hz * k) * np.hamming(k.size)
+    return np.asarray(taps / taps.sum())
+
+
+def rows_of(
+    signals: Signals, planar: Planar, vector: Array, parameters: Sequence[str], low_pass: LowPass
+) -> Rows:
+    """Return a low-pass filtered run, and the sensitivities to the parameters named, at a vector of them.
+
+    The prediction contains the noise of its input, the wheel speeds, and so does the residual, with the
+    opposite sign.  A sensitivity along the same wheel speeds contains it too, and where a robot hardly
+    changes its motion the noise is most of it: residual and sensitivity are correlated by their noise, and
+    a spurious acceleration looks like an error of the mass.  Sensitivities are therefore computed along
+    low-pass filtered wheel speeds, as instruments: the noise of a differentiated encoder grows with
+    frequency, the commands do not.
+    """
+    dt, wheel_speed, steer, grade, roll, measured = prepare_inputs(signals, low_pass)
+    n_rows = max((len(wheel_speed) - low_pass.taps.size) // low_pass.every + 1, 0)
+    first = slice(0, math.ceil(STEADY_S / dt) + 1)
+    change_mps, change_rad = (np.ptp(values[first], axis=0).max() for values in (wheel_speed, steer))
+    steady = change_mps <= STEADY_MPS and change_rad <= STEADY_RAD
+    skip = math.ceil(SETTLE_S * low_pass.rate_hz)
+    start = 0 if len(wheel_speed) * dt < SHORT_S and steady else skip
+    kept = slice(start, max(n_rows - skip, start))
+
+    known = np.isfinite(measured)
+    holes = known[:, :0] if known[:, known.any(axis=0)].all() else known
+    window = low_pass.taps, low_pass.every
+    instruments = wheel_speed
+    if math.isfinite(low_pass.instrument_cutoff_hz):
+        instruments = _decimated(wheel_speed, _window(low_pass.instrument_cutoff_hz, 1.0 / dt), 1)
+    true_wheel_speed, true_grade, true_roll = corrected_inputs(planar, vector, dt, instruments, grade, roll)
+    truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll)
+
+    def shown(point: Array, speeds: Array, only_sensed: bool) -> Array:
+        """Return the low-pass filtered prediction (rows, channels); the motion stays where only sensors change."""
+        seen = sense(planar, point, dt, truth) if only_sensed else replay(planar, point, dt, speeds, *inputs)
+        return np.asarray(decimate(seen, holes, *window))[kept]
+
+    inputs = steer, grade, roll
+    now = shown(vector, wheel_speed, False)
+    change = np.empty((len(parameters), *now.shape))
+    for j, name in enumerate(parameters):
+        i, (ahead, back) = INDEX[name], np.tile(vector, (2, 1))
+        ahead[i] += STEPS[name]
+        if name not in ONE_SIDED or vector[i] >= STEPS[name]:
+            back[i] -= STEPS[name]
+        here, there = (shown(point, instruments, name in SENSED_ONLY) for point in (ahead, back))
+        change[j] = (here - there) / (ahead[i] - back[i])
+    speed, turn, sideways = _rolled(planar, instruments, steer)
+    force = truth["force_n"] / (GRAVITY_MPS2 * planar.robot.mass_kg)
+    driven = np.column_stack([speed, turn, steer.mean(axis=1), grade, roll, force, sideways])
+    phase = np.cumsum(instruments, axis=0) * (dt / planar.robot.wheel_radius_m)
+    at = low_pass.taps.size // 2 + low_pass.every * np.arange(n_rows)[kept]
+    shown = decimate(np.ascontiguousarray(measured), holes, *window)[kept]
+    driven = np.column_stack([decimate(driven, known[:, :0], *window)[kept], phase[at]])
+    return Rows(signals.run_id, signals.terrain, at * dt, shown, now, change, driven)
+
+
+def _rolled(planar: Planar, wheel_speed: Array, steer: Array) -> tuple[Array, Array, Array]:
+    """Return speed, turn and sideways speed (n,) of wheels, as :data:`INPUTS` has them."""
+    speed, robot = wheel_speed.mean(axis=1), planar.robot
+    if robot.on_omni_wheels:
+        rollers = planar.params[0]
+        ahead, left, turn = rollers["to_rolled"] @ wheel_speed.T
+        return ahead, 2.0 * rollers["wheel_distance_m"] * turn, left
+    if isinstance(robot, BicycleRobot):
+        return speed, speed * np.tan(steer[:, 0]) * (robot.track_m / robot.wheelbase_m), 0.0 * speed
+    return speed, wheel_speed[:, -1] - wheel_speed[:, 0], np.zeros_like(speed)
+
+
+def _decimated(values: Array, taps: Array, every: int) -> Array:
+    """Return columns behind a window, of the same length where none is left out, held at both ends."""
+    half = taps.size // 2
+    padded = np.pad(values, ((half, half), (0, 0)), mode="edge")
+    return np.asarray(decimate(padded, np.zeros((0, 0), dtype=np.bool_), taps, every))
+
+
+def prepare_inputs(signals: Signals, low_pass: LowPass) -> tuple[float, Array, Array, Array, Array, Array]:
+    """Return the clock's period, wheel speeds, steering, grade, roll and measurements without holes.
+
+    Holes of the inputs are bridged, and measurements there are dropped.  Both pass a window far above the
+    low-pass: nonlinearities of the simulation, as friction about rest, turn noise of the wheels into a bias.
+    """
+    tilt = signals.grade_rad, signals.roll_rad
+    columns = np.column_stack([signals.wheel_speed_mps, signals.steer_rad, *tilt])
+    measured = np.array(signals.measured)
+    holes = ~np.isfinite(columns).all(axis=1)
+    if holes.any():
+        at = np.arange(len(columns))
+        for column in columns.T:
+            known = np.isfinite(column)
+            column[:] = np.interp(at, at[known], column[known]) if known.any() else 0.0
+        measured[holes] = np.nan
+    if low_pass.inputs_every > 0:
+        taps = _window(INPUT_CUTOFFS * low_pass.cutoff_hz, 1 / signals.dt_s)
+        both = _decimated(np.column_stack([columns, measured]), taps, low_pass.inputs_every)
+        columns, measured = both[:, : columns.shape[1]], both[:, columns.shape[1] :]
+    wheels = signals.wheel_speed_mps.shape[1]
+    parts = np.split(columns, [wheels, 2 * wheels, 2 * wheels + 1], axis=1)
+    wheel_speed, steer, grade, roll = (np.ascontiguousarray(part) for part in parts)
+    return signals.dt_s * max(low_pass.inputs_every, 1), wheel_speed, steer, grade[:, 0], roll[:, 0], measured
+
+
+@njit
+def decimate(values: Array, known: Array, taps: Array, every: int) -> Array:
+    """Return columns (m, c) of ``values`` (n, c) filtered by a window and decimated; a NaN spreads.
+
+    Where ``known`` (n, c) is not empty, it is the window's mean over what is known of each: the same samples have to
+    be left out of whatever is compared.  Where less than :data:`MIN_KNOWN` of the window's weight is known, it is the
+    mean over all: NaN, if there is one among them.
+    """
+    n, c = values.shape
+    m = max((n - taps.size) // every + 1, 0)
+    out = np.zeros((m, c))
+    whole = np.abs(taps).sum()
+    for row in range(m):
+        start = row * every
+        for t in range(taps.size):
+            for j in range(c):
+                out[row, j] += taps[t] * values[start + t, j]
+        for j in range(known.shape[1]):
+            total, weight, there = 0.0, 0.0, 0.0
+            for t in range(taps.size):
+                if known[start + t, j]:
+                    total += taps[t] * values[start + t, j]
+                    weight += taps[t]
+                    there += abs(taps[t])
+            if there >= MIN_KNOWN * whole:
+                out[row, j] = total / weight
+    return out
+
+
+def measured_channels(rows: Sequence[Any]) -> tuple[str, ...]:
+    """Return the channels that any run, with what it measured, has, in the order of ``CHANNELS``."""
+    return tuple(
+        name for c, name in enumerate(CHANNELS) if any(np.isfinite(run.measured[:, c]).any() for run in rows)
+    )
