@@ -772,7 +772,7 @@ def unfit_runs(
     shift = shifts_of(info) if shift is None else shift
     runs = on_own_clocks(info.rows, shift)
     follows, every = agreement_of(runs), range(len(runs))
-    has_clock: list[bool] = np.isfinite(shift.lag_s).any(axis=1).tolist()
+    has_clock = [bool(known.any()) for known in np.isfinite(shift.lag_s)]
     reasons = _frozen(signals, info.rows)
     reasons |= stalled_runs(runs, follows, has_clock, MAX_LAG_S + MARGIN_S - STRETCH_S)
     reasons |= _late(info, shift) | _dead(signals, runs, follows)  # the last of these counts

@@ -469,20 +469,20 @@ def rows_of(
     true_wheel_speed, true_grade, true_roll = corrected_inputs(planar, vector, dt, instruments, grade, roll)
     truth = move(planar, vector, dt, true_wheel_speed, steer, true_grade, true_roll)
 
-    def shown(point: Array, speeds: Array, only_sensed: bool) -> Array:
+    def predicted(point: Array, speeds: Array, only_sensed: bool) -> Array:
         """Return the low-pass filtered prediction (rows, channels); the motion stays where only sensors change."""
         seen = sense(planar, point, dt, truth) if only_sensed else replay(planar, point, dt, speeds, *inputs)
         return np.asarray(decimate(seen, holes, *window))[kept]
 
     inputs = steer, grade, roll
-    now = shown(vector, wheel_speed, False)
+    now = predicted(vector, wheel_speed, False)
     change = np.empty((len(parameters), *now.shape))
     for j, name in enumerate(parameters):
         i, (ahead, back) = INDEX[name], np.tile(vector, (2, 1))
         ahead[i] += STEPS[name]
         if name not in ONE_SIDED or vector[i] >= STEPS[name]:
             back[i] -= STEPS[name]
-        here, there = (shown(point, instruments, name in SENSED_ONLY) for point in (ahead, back))
+        here, there = (predicted(point, instruments, name in SENSED_ONLY) for point in (ahead, back))
         change[j] = (here - there) / (ahead[i] - back[i])
     speed, turn, sideways = _rolled(planar, instruments, steer)
     force = truth["force_n"] / (GRAVITY_MPS2 * planar.robot.mass_kg)
